@@ -1,0 +1,66 @@
+# Everything runs inside .venv, which is made on first use from pyproject.toml and constraints.txt.
+# Python 3.11 or newer, with its venv module, is all that has to be there: PYTHON=python3.12 make test
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+# One thread for each process: the test suite runs in two of them.
+export OMP_NUM_THREADS ?= 1
+# No advertisement in the output of mkdocs.
+export NO_MKDOCS_2_WARNING := 1
+TEST_PROCESSES ?= 2
+
+.DELETE_ON_ERROR:
+.PHONY: help demo test lint format docs docs-serve install clean
+
+help:
+	@echo "make demo       track the animated performer; pictures and scores in demo-output/"
+	@echo "make test       run the tests"
+	@echo "make lint       ruff and mypy"
+	@echo "make docs       build the documentation into site/, warnings are errors"
+	@echo "make docs-serve show the documentation while it is edited"
+	@echo "make format     format the code"
+	@echo "make clean      remove the environment and everything that was built"
+
+demo: $(VENV)/.installed-plots
+	$(BIN)/torchpose demo --out demo-output
+
+test: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) $(PYTEST_ARGS)
+
+lint: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/.installed-dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+docs: $(VENV)/.installed-dev
+	$(BIN)/mkdocs build --strict --quiet
+
+docs-serve: $(VENV)/.installed-dev
+	$(BIN)/mkdocs serve
+
+install: $(VENV)/.installed-dev
+
+# The stamps are written last. An installation that was killed leaves .installing behind, and the
+# next one starts with a new environment.
+$(VENV)/.installed-%: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	    { echo "torchpose needs Python 3.11 or newer: PYTHON=/path/to/python make $(MAKECMDGOALS)" >&2; exit 1; }
+	@if [ -e $(VENV)/.installing ] || ! $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+	    $(PYTHON) -m venv --clear $(VENV); fi
+	@touch $(VENV)/.installing
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$*]'
+	@rm $(VENV)/.installing
+	@touch $@
+
+# Development includes what the demo needs.
+ifneq ($(wildcard $(VENV)/.installed-dev),)
+$(VENV)/.installed-plots: $(VENV)/.installed-dev
+	@touch $@
+endif
+
+clean:
+	rm -rf $(VENV) site demo-output build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
