@@ -1,0 +1,342 @@
+"""Keypoints: round trips between the forms, what counts as missing, OpenPose, and bad files."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.data import data_dir_or_skip
+from torchpose.errors import CameraError, FileFormatError, InputError, SkeletonError
+from torchpose.io import Keypoints, read_keypoints, write_keypoints
+from torchpose.skeleton import SKELETONS
+
+NAMES = ("head", "lhand", "RWrist")
+
+
+def points(n: int = 5) -> np.ndarray:
+    return np.random.default_rng(0).uniform(0, 640, (n, len(NAMES), 2))
+
+
+def write(path, **changes):
+    arrays = {"keypoints": points(), "names": np.array(NAMES), **changes}
+    np.savez(path, **{key: value for key, value in arrays.items() if value is not None})
+    return path
+
+
+def text(tmp_path, *lines):
+    path = tmp_path / "clip.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+# --- npz ------------------------------------------------------------------------------------------
+
+
+def test_npz(tmp_path):
+    confidence = np.full((5, 3), 0.9)
+    confidence[1, 0], confidence[2, 1] = 0, math.nan
+    given_points = points()
+    given_points[3, 2, 0] = math.nan  # one coordinate
+    read = read_keypoints(
+        write(tmp_path / "a.npz", keypoints=given_points, confidence=confidence, fps=25.0,
+              K=np.diag([500.0, 500, 1]), image_size=[640, 480], neck="mid-shoulder")
+    )  # fmt: skip
+    assert read.keypoints.dtype == torch.float64
+    assert (read.names, read.fps, read.image_size, len(read)) == (NAMES, 25.0, (640, 480), 5)
+    assert read.neck == "mid-shoulder"
+    assert read.K is not None
+    assert read.K[0, 0] == 500
+    missing = {(1, 0), (2, 1), (3, 2)}
+    assert {tuple(i) for i in (~read.measured).nonzero().tolist()} == missing
+    assert read.confidence is not None
+    assert {tuple(i) for i in (read.confidence == 0).nonzero().tolist()} == missing
+    np.testing.assert_array_equal(read.keypoints[0], given_points[0])
+
+
+def test_only_what_must_be_there(tmp_path):
+    read = read_keypoints(write(tmp_path / "a.npz", keypoints=points().astype(np.float32)))
+    assert (read.confidence, read.fps, read.K, read.image_size, read.neck) == (None,) * 5
+
+
+def test_the_neck_of_a_known_set(tmp_path):
+    names = SKELETONS["openpose-18"].joints
+    path = write(tmp_path / "a.npz", keypoints=np.ones((2, 18, 2)), names=np.array(names))
+    assert read_keypoints(path).neck == "mid-shoulder"
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "word"),
+    [
+        ({"keypoints": None}, FileFormatError, "keypoints, found names"),
+        ({"names": None}, FileFormatError, "names"),
+        ({"keypoints": points()[0]}, FileFormatError, "shape"),
+        ({"keypoints": np.ones((5, 3, 3))}, FileFormatError, "array of its own"),
+        ({"keypoints": points()[:, :2]}, FileFormatError, "3 names"),
+        ({"keypoints": points(0)}, InputError, "empty"),
+        ({"keypoints": points() * math.nan}, InputError, "no keypoint is measured in any of 5"),
+        ({"confidence": np.zeros((5, 3))}, InputError, "no keypoint is measured"),
+        ({"keypoints": points() * math.inf}, FileFormatError, "infinite"),
+        ({"keypoints": np.array([["a"]])}, FileFormatError, "numbers"),
+        ({"names": np.array(["head", "tail", "RWrist"])}, SkeletonError, "tail.*known are"),
+        ({"names": np.array(["head", "lhand", "hand_left"])}, SkeletonError, "both hand_left"),
+        ({"confidence": np.ones((5, 2))}, FileFormatError, "confidence"),
+        ({"confidence": -np.ones((5, 3))}, FileFormatError, "at least 0"),
+        ({"confidence": np.full((5, 3), math.inf)}, FileFormatError, "finite"),
+        ({"fps": -1.0}, FileFormatError, "fps"),
+        ({"fps": [25.0, 30.0]}, FileFormatError, "fps"),
+        ({"K": np.zeros((3, 3))}, CameraError, "focal"),
+        ({"K": np.eye(2)}, CameraError, "shape"),
+        ({"K": np.stack([np.eye(3)] * 2)}, CameraError, "shape"),
+        ({"image_size": [640]}, FileFormatError, "image_size"),
+        ({"image_size": [640, math.nan]}, FileFormatError, "image_size"),
+        ({"neck": "long"}, FileFormatError, "low-neck"),
+    ],
+)
+def test_what_is_no_keypoint_file(tmp_path, changes, error, word):
+    path = write(tmp_path / "clip.npz", **changes)
+    with pytest.raises(error, match=word) as caught:
+        read_keypoints(path)
+    assert "clip.npz" in str(caught.value)
+
+
+def test_other_files(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_keypoints(tmp_path / "none.npz")
+    (tmp_path / "a.mp4").write_bytes(b"")
+    with pytest.raises(FileFormatError, match="OpenPose JSON"):
+        read_keypoints(tmp_path / "a.mp4")
+    (tmp_path / "b.npz").write_bytes(write(tmp_path / "a.npz").read_bytes()[:400])
+    with pytest.raises(FileFormatError, match="truncated"):
+        read_keypoints(tmp_path / "b.npz")
+
+
+# --- csv and writing ------------------------------------------------------------------------------
+
+COORDINATE = st.floats(-1e4, 1e4) | st.just(math.nan)
+
+
+@settings(
+    deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    st.lists(st.lists(COORDINATE, min_size=6, max_size=6), min_size=1, max_size=6),
+    st.booleans(),
+    st.sampled_from([".csv", ".npz"]),
+)
+def test_what_is_written_reads_back(tmp_path, values, scored, suffix):
+    given_points = torch.tensor(values, dtype=torch.float64).reshape(-1, 3, 2)
+    given_points[0, 0] = 1.0
+    measured = torch.isfinite(given_points).all(-1)
+    given_points[~measured] = math.nan
+    confidence = torch.where(measured, 0.7, 0.0).double() if scored else None
+    data = Keypoints(given_points, NAMES, confidence, fps=29.97, image_size=(640, 480))
+    path = tmp_path / f"clip{suffix}"
+    write_keypoints(path, data)
+    back = read_keypoints(path)
+    torch.testing.assert_close(back.keypoints, given_points, rtol=0, atol=0, equal_nan=True)
+    if confidence is None:
+        assert back.confidence is None
+    else:
+        assert back.confidence is not None
+        torch.testing.assert_close(back.confidence, confidence, rtol=0, atol=0)
+    assert (back.names, back.fps, back.image_size) == (NAMES, 29.97, (640, 480))
+
+
+def test_writing_keeps_the_camera(tmp_path):
+    K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
+    data = Keypoints(torch.ones(2, 3, 2).double(), NAMES, K=K, neck="neck")
+    write_keypoints(tmp_path / "a.npz", data)
+    back = read_keypoints(tmp_path / "a.npz")
+    assert back.K is not None
+    assert torch.equal(back.K, K)
+    assert back.neck == "neck"
+    with pytest.raises(InputError, match=r"\.npz or \.csv"):
+        write_keypoints(tmp_path / "a.json", data)
+
+
+def test_wide_rows(tmp_path):
+    path = text(
+        tmp_path,
+        "# fps = 25",
+        "frame,head_x,head_y,head_confidence,lhand_x,lhand_y",
+        "10, 1,2,0.5, 3,4",
+        "11, 1,2,0,   3,",
+        "",
+        "13, ,,,      5,6",
+    )
+    read = read_keypoints(path)
+    assert read.fps == 25
+    assert read.names == ("head", "lhand")
+    assert read.measured.tolist() == [[True, True], [False, False], [False, False], [False, True]]
+    assert read.confidence is not None
+    assert read.confidence.tolist() == [[0.5, 1], [0, 0], [0, 0], [0, 1]]
+    assert read.keypoints[3, 1].tolist() == [5, 6]
+
+
+def test_long_rows(tmp_path):
+    path = text(
+        tmp_path,
+        "frame,name,x,y,confidence",
+        "0,head,1,2,0.9",
+        "0,lhand,3,4,0.8",
+        "2,lhand,5,6,0.7",
+    )
+    read = read_keypoints(path)
+    assert read.names == ("head", "lhand")
+    assert read.measured.tolist() == [[True, True], [False, False], [False, True]]
+    plain = read_keypoints(text(tmp_path, "frame,name,x,y", "7,head,1,2"))
+    assert plain.keypoints.tolist() == [[[1, 2]]]
+    assert plain.confidence is None
+
+
+@pytest.mark.parametrize(
+    ("lines", "word"),
+    [
+        ([""], "empty"),
+        (["time,head_x,head_y", "0,1,2"], "line 1.*header"),
+        (["frame"], "columns"),
+        (["frame,head_x", "0,1"], r"head_y \(absent\)"),
+        (["frame,head_x,head_y,colour", "0,1,2,3"], "colour"),
+        (["frame,head_x,head_y,head_x", "0,1,2,3"], "each once"),
+        (["frame,head_x,head_y", "0,1"], "line 2.*3 cells"),
+        (["frame,head_x,head_y", "0,1,two"], "line 2.*'two'"),
+        (["frame,head_x,head_y", "0,1,2", "0,1,2"], "line 3.*increase"),
+        (["frame,head_x,head_y", "0,1,2", ",1,2"], "line 3.*got none"),
+        (["frame,head_x,head_y", "0.5,1,2"], "line 2.*whole"),
+        (["frame,head_x,head_y", "0,1,2", "999999999,1,2"], "line 3.*999999999"),
+        (["frame,name,x,y", "0,head,1,2", "0,head,1,2"], "twice"),
+        (["frame,name,x,y", "1,head,1,2", "0,head,1,2"], "line 3.*increase"),
+        (["frame,name,x,y,colour", "0,head,1,2,3"], "confidence"),
+        (["# fps = fast", "frame,head_x,head_y", "0,1,2"], "fps"),
+        (["# fps = 0", "frame,head_x,head_y", "0,1,2"], "fps"),
+    ],
+)
+def test_bad_rows(tmp_path, lines, word):
+    with pytest.raises(FileFormatError, match=word) as caught:
+        read_keypoints(text(tmp_path, *lines))
+    assert "clip.csv" in str(caught.value)
+
+
+def test_rows_without_measurements(tmp_path):
+    with pytest.raises(InputError, match="empty"):
+        read_keypoints(text(tmp_path, "frame,head_x,head_y"))
+    with pytest.raises(InputError, match="no keypoint is measured"):
+        read_keypoints(text(tmp_path, "frame,head_x,head_y", "0,,"))
+    with pytest.raises(SkeletonError, match=r"clip.csv.*tail"):
+        read_keypoints(text(tmp_path, "frame,tail_x,tail_y", "0,1,2"))
+    path = tmp_path / "clip.csv"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(FileFormatError, match="clip"):
+        read_keypoints(path)
+
+
+# --- OpenPose -------------------------------------------------------------------------------------
+
+
+def person(x: float, confidence: float = 0.8, joints: int = 25) -> dict:
+    values = np.tile([x, 100.0, confidence], (joints, 1))
+    return {"pose_keypoints_2d": values.ravel().tolist()}
+
+
+def frame(folder, number: int | str, *people: dict):
+    folder.mkdir(exist_ok=True)
+    label = f"{number:012d}" if isinstance(number, int) else number
+    (folder / f"clip_{label}_keypoints.json").write_text(json.dumps({"people": people}))
+
+
+@pytest.mark.parametrize("joints", [25, 18])
+def test_openpose_folder(tmp_path, joints):
+    folder = tmp_path / "json"
+    silent = person(11, joints=joints)
+    silent["pose_keypoints_2d"][:3] = [0, 0, 0]  # OpenPose writes zeros for what it did not see
+    frame(folder, 9, person(10, joints=joints))
+    frame(folder, 10, silent)
+    frame(folder, 11)
+    frame(folder, 13, person(13, joints=joints))
+    read = read_keypoints(folder)
+    assert read.names == SKELETONS[f"openpose-{joints}"].joints
+    assert read.keypoints.shape == (5, joints, 2)
+    assert read.measured.all(-1).tolist() == [True, False, False, False, True]
+    assert read.measured.any(-1).tolist() == [True, True, False, False, True]
+    assert read.keypoints[:, 3, 0].nan_to_num(-1).tolist() == [10, 11, -1, -1, 13]
+    assert read.neck == "mid-shoulder"
+
+
+def test_the_most_confident_person_is_followed(tmp_path):
+    folder = tmp_path / "json"
+    frame(folder, 0)
+    frame(folder, 1, person(500, 0.5), person(100, 0.9), person(300, 0.7))
+    frame(folder, 2, person(490, 0.95), person(120, 0.4))  # another one is more confident now
+    frame(folder, 3, {"pose_keypoints_2d": []}, person(480, 0.9))  # ours is not there
+    frame(folder, 4, person(470, 0.5), person(130, 0.9))
+    read = read_keypoints(folder)
+    assert read.keypoints[1:, 0, 0].tolist() == [100, 120, 480, 470]
+
+
+def test_nothing_in_common_means_the_most_confident(tmp_path):
+    folder = tmp_path / "json"
+    upper, lower, faint = person(100), person(200, 0.9), person(300, 0.2)
+    upper["pose_keypoints_2d"][30:] = [0.0] * 45
+    for other in (lower, faint):
+        other["pose_keypoints_2d"][:30] = [0.0] * 30
+    frame(folder, 0, upper)
+    frame(folder, 1, faint, lower)
+    assert read_keypoints(folder).keypoints[1, -1, 0] == 200
+
+
+def test_files_without_numbers_and_old_key(tmp_path):
+    folder = tmp_path / "json"
+    frame(folder, "b", {"pose_keypoints": person(2)["pose_keypoints_2d"]})
+    frame(folder, "a", {"pose_keypoints": person(1)["pose_keypoints_2d"]})
+    assert read_keypoints(folder).keypoints[:, 0, 0].tolist() == [1, 2]
+
+
+def test_bad_openpose_folders(tmp_path):
+    with pytest.raises(InputError, match="found none"):
+        read_keypoints(tmp_path)
+    frame(tmp_path / "nobody", 0)
+    with pytest.raises(InputError, match="nobody was found in any of 1"):
+        read_keypoints(tmp_path / "nobody")
+    frame(tmp_path / "mixed", 0, person(1), person(1, joints=18))
+    frame(tmp_path / "other", 0, person(1, joints=17))
+    for name in ("mixed", "other"):
+        with pytest.raises(FileFormatError, match="BODY_25"):
+            read_keypoints(tmp_path / name)
+    frame(tmp_path / "odd", 3, {"pose_keypoints_2d": [1.0, 2.0]})
+    with pytest.raises(FileFormatError, match=r"000003_keypoints.json.*2 values"):
+        read_keypoints(tmp_path / "odd")
+    frame(tmp_path / "far", 0, person(1))
+    frame(tmp_path / "far", 10**11, person(1))
+    with pytest.raises(FileFormatError, match="no single video"):
+        read_keypoints(tmp_path / "far")
+    frame(tmp_path / "two", 0, person(1))
+    (tmp_path / "two" / "b_0_keypoints.json").write_text('{"people": []}')
+    with pytest.raises(FileFormatError, match="one frame number"):
+        read_keypoints(tmp_path / "two")
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["", "{", "[]", "3", '{"people": 3}', '{"people": [3]}', '{"people": [{}]}',
+     '{"people": [{"pose_keypoints_2d": "x"}]}', '{"people": [{"pose_keypoints_2d": [1, 2, NaN]}]}'],
+)  # fmt: skip
+def test_what_is_not_openposes_json(tmp_path, content):
+    (tmp_path / "a_0_keypoints.json").write_text(content)
+    with pytest.raises(FileFormatError, match=r"a_0_keypoints.json"):
+        read_keypoints(tmp_path)
+
+
+# --- real files -----------------------------------------------------------------------------------
+
+
+@pytest.mark.data
+def test_mediapipe_files():
+    read = read_keypoints(data_dir_or_skip("video_asl") / "again_mediapipe_pose1.npz")
+    assert read.keypoints.shape == (77, 15, 2)
+    assert (read.fps, read.image_size) == (30.0, (640, 480))
+    left, right = (read.names.index(f"{side}_shoulder") for side in ("left", "right"))
+    assert (read.keypoints[:, left, 0] > read.keypoints[:, right, 0]).all()

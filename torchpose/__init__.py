@@ -1,0 +1,83 @@
+"""Bayesian human-pose tracking: from 2D keypoints, gaps and all, to 3D poses with covariances.
+
+The names below are imported when they are first used, so `import torchpose` itself is quick and
+needs neither matplotlib nor Lightning nor OpenCV, and never a network.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torchpose.camera import PinholeCamera as PinholeCamera
+    from torchpose.errors import TorchposeError as TorchposeError
+    from torchpose.priors.gmm import GaussianMixture as GaussianMixture
+    from torchpose.priors.upper_body import UpperBodyPrior as UpperBodyPrior
+    from torchpose.priors.upper_body import load_prior as load_prior
+    from torchpose.tracking import PoseTrack as PoseTrack
+    from torchpose.tracking import UpperBodyTracker as UpperBodyTracker
+
+    __version__: str
+
+_SUBMODULES = frozenset(
+    {
+        "camera",
+        "demo",
+        "errors",
+        "filters",
+        "gaussian",
+        "io",
+        "metrics",
+        "priors",
+        "projection",
+        "protocols",
+        "rotations",
+        "skeleton",
+        "tracking",
+        "viz",
+    }
+)
+_HOME = {
+    "GaussianMixture": "torchpose.priors.gmm",
+    "PinholeCamera": "torchpose.camera",
+    "PoseTrack": "torchpose.tracking",
+    "TorchposeError": "torchpose.errors",
+    "UpperBodyPrior": "torchpose.priors.upper_body",
+    "UpperBodyTracker": "torchpose.tracking",
+    "load_prior": "torchpose.priors.upper_body",
+}
+
+__all__ = [
+    "GaussianMixture",
+    "PinholeCamera",
+    "PoseTrack",
+    "TorchposeError",
+    "UpperBodyPrior",
+    "UpperBodyTracker",
+    "load_prior",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        value: Any = _version()
+    elif name in _SUBMODULES:
+        value = import_module(f"torchpose.{name}")
+    elif name in _HOME:
+        value = getattr(import_module(_HOME[name]), name)
+    else:
+        raise AttributeError(f"module 'torchpose' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_SUBMODULES, *_HOME, "__version__"})
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("torchpose")
+    except PackageNotFoundError:  # run from a source tree that is not installed
+        return "0+unknown"

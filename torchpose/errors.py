@@ -1,0 +1,159 @@
+"""Typed errors, and the checks that raise them.
+
+Every message says what was expected, what came, and what to do about it.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+__all__ = [
+    "CameraError",
+    "CovarianceError",
+    "DegenerateFilterWarning",
+    "FileFormatError",
+    "InputError",
+    "MissingDependencyError",
+    "OutputError",
+    "OverlapError",
+    "PriorError",
+    "ShapeError",
+    "SkeletonError",
+    "TorchposeError",
+    "check_covariance",
+    "check_finite",
+    "check_shape",
+    "check_weights",
+]
+
+
+class TorchposeError(Exception):
+    """Base class of every error that torchpose raises on purpose."""
+
+
+class ShapeError(TorchposeError, ValueError):
+    """A tensor has the wrong number of dimensions or a wrong size."""
+
+
+class InputError(TorchposeError, ValueError):
+    """A value is outside what is allowed: NaN, infinity, a negative weight, an empty sequence."""
+
+
+class CovarianceError(InputError):
+    """A covariance is not symmetric or not positive definite."""
+
+
+class CameraError(InputError):
+    """A camera lacks a focal length, or no camera can be told for the input."""
+
+
+class SkeletonError(InputError):
+    """Joint names are unknown, or the joints do not form the expected skeleton."""
+
+
+class PriorError(InputError):
+    """A prior does not fit the task: other skeleton, rotation order, neck, or state size."""
+
+
+class OverlapError(InputError):
+    """A model would be scored on persons whom it was fitted on."""
+
+
+class FileFormatError(TorchposeError, ValueError):
+    """A file is truncated, of another kind, or holds other keys than expected."""
+
+
+class OutputError(TorchposeError, OSError):
+    """Output cannot be written where it was asked for."""
+
+
+class MissingDependencyError(TorchposeError, ImportError):
+    """An optional package is needed for this call and is not installed."""
+
+
+class DegenerateFilterWarning(UserWarning):
+    """Some elements of a batch degenerated; the others finished."""
+
+
+def check_shape(name: str, tensor: Tensor, expected: Sequence[int | str | None]) -> None:
+    """Raise `ShapeError` unless `tensor` has the expected sizes.
+
+    Args:
+        name: what the tensor is called in the message.
+        tensor: the tensor to look at.
+        expected: one entry per dimension; an int is a fixed size, a str or None is any size. A
+            leading ``"..."`` stands for any number of leading dimensions.
+
+    Raises:
+        ShapeError: with the expected and the given shape.
+    """
+    sizes = list(expected)
+    open_ended = bool(sizes) and sizes[0] == "..."
+    if open_ended:
+        sizes = sizes[1:]
+    shape = tuple(tensor.shape)
+    tail = shape[len(shape) - len(sizes) :] if len(shape) >= len(sizes) else ()
+    wrong_rank = len(shape) < len(sizes) or (not open_ended and len(shape) != len(sizes))
+    wrong_size = any(isinstance(e, int) and e != s for e, s in zip(sizes, tail, strict=False))
+    if wrong_rank or wrong_size:
+        wanted = ", ".join("any" if e is None else str(e) for e in expected)
+        raise ShapeError(f"{name} must have shape [{wanted}], got {list(shape)}")
+
+
+def check_finite(name: str, tensor: Tensor, where: Tensor | None = None, hint: str = "") -> None:
+    """Raise `InputError` if an element is NaN or infinite (where `where` is True, if given)."""
+    bad = ~torch.isfinite(tensor)
+    if where is not None:
+        bad = bad & where
+    if bool(bad.any()):
+        index = tuple(int(i) for i in torch.nonzero(bad)[0])
+        value = float(tensor[index])
+        count = int(bad.sum())
+        message = f"{name} must be finite, got {value} at index {index} ({count} such values)"
+        raise InputError(f"{message}; {hint}" if hint else message)
+
+
+def check_weights(name: str, weights: Tensor) -> None:
+    """Raise `InputError` unless all weights are positive and finite."""
+    check_finite(name, weights)
+    if weights.numel() == 0:
+        raise InputError(f"{name} must hold at least one weight, got none")
+    if bool((weights <= 0).any()):
+        index = int(torch.nonzero((weights <= 0).reshape(-1))[0])
+        raise InputError(
+            f"{name} must be positive, got {float(weights.reshape(-1)[index]):g} at index {index}; "
+            "drop components of zero weight"
+        )
+
+
+def check_covariance(name: str, covariance: Tensor, tolerance: float = 1e-6) -> None:
+    """Raise `CovarianceError` unless every matrix is symmetric and positive definite.
+
+    Args:
+        name: what the covariance is called in the message.
+        covariance: [..., D, D].
+        tolerance: largest asymmetry, relative to the largest entry of each matrix.
+
+    Raises:
+        ShapeError: not square. InputError: not finite. CovarianceError: not symmetric or not
+            positive definite (the index of the first such matrix is named).
+    """
+    if covariance.ndim < 2 or covariance.shape[-1] != covariance.shape[-2]:
+        raise ShapeError(f"{name} must have shape [..., D, D], got {list(covariance.shape)}")
+    check_finite(name, covariance)
+    scale = covariance.abs().amax((-2, -1)).clamp_min(torch.finfo(covariance.dtype).tiny)
+    skew = (covariance - covariance.mT).abs().amax((-2, -1)) / scale
+    if bool((skew > tolerance).any()):
+        index = tuple(int(i) for i in torch.nonzero(skew > tolerance)[0])
+        raise CovarianceError(
+            f"{name} must be symmetric, got a matrix with relative asymmetry {float(skew.max()):.2g} "
+            f"at index {index}; pass (C + C.mT) / 2 if that is what you mean"
+        )
+    info = torch.linalg.cholesky_ex((covariance + covariance.mT) / 2).info
+    if bool((info != 0).any()):
+        index = tuple(int(i) for i in torch.nonzero(info)[0])
+        raise CovarianceError(
+            f"{name} must be positive definite, got a matrix that is not at index {index}; "
+            "add a small multiple of the identity or drop its dependent dimensions"
+        )

@@ -1,0 +1,292 @@
+"""Batched Gaussian algebra, shared by every prior and filter.
+
+Pure functions on tensors. Covariances are never inverted: everything goes through Cholesky factors,
+and what comes back is symmetric by construction.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+__all__ = [
+    "Gain",
+    "condition",
+    "kalman_correct",
+    "kalman_gain",
+    "kalman_predict",
+    "kalman_update",
+    "log_prob",
+    "marginal",
+    "mixture_moments",
+    "product",
+    "safe_cholesky",
+    "sigma_points",
+    "symmetrise",
+    "unscented_transform",
+]
+
+LOG_2PI = math.log(2 * math.pi)
+_JITTER = (1e-14, 1e-12, 1e-10, 1e-8, 1e-6)
+
+
+def symmetrise(matrix: Float[Tensor, "... D D"]) -> Float[Tensor, "... D D"]:
+    """Return (A + A^T) / 2."""
+    return (matrix + matrix.mT) / 2
+
+
+def safe_cholesky(matrix: Float[Tensor, "... D D"]) -> Float[Tensor, "... D D"]:
+    """Cholesky factor of each matrix, with an answer for what is not positive definite.
+
+    A matrix that rounding has pushed off the positive definite cone gets the smallest multiple of
+    its mean diagonal, from 1e-14 to 1e-6, that makes it factorise. A matrix that no such multiple
+    mends gets a factor of NaN, so that its batch element is lost and no other.
+
+    Args:
+        matrix: [..., D, D], symmetric; only the lower triangle is read.
+
+    Returns:
+        Lower triangular L [..., D, D] with L L^T = matrix.
+    """
+    factor, info = torch.linalg.cholesky_ex(matrix)
+    if not bool(info.any()):
+        return factor
+    scale = matrix.diagonal(dim1=-2, dim2=-1).abs().mean(-1)[..., None, None]
+    eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    for jitter in _JITTER:
+        retry, retry_info = torch.linalg.cholesky_ex(matrix + jitter * scale * eye)
+        mended = (info != 0) & (retry_info == 0)
+        factor = torch.where(mended[..., None, None], retry, factor)
+        info = torch.where(mended, retry_info, info)
+        if not bool(info.any()):
+            return factor
+    return torch.where((info != 0)[..., None, None], torch.full_like(factor, math.nan), factor)
+
+
+def log_prob(
+    x: Float[Tensor, "... D"],
+    mean: Float[Tensor, "... D"],
+    cholesky: Float[Tensor, "... D D"],
+) -> Float[Tensor, "..."]:
+    """Log density of N(mean, L L^T).
+
+    log N(x) = -1/2 ||L^-1 (x - mu)||^2 - sum log diag L - D/2 log 2 pi   (BL 52)
+
+    Args:
+        x, mean: [..., D]. cholesky: lower factor [..., D, D]. Batch dimensions broadcast.
+    """
+    residual = torch.linalg.solve_triangular(cholesky, (x - mean)[..., None], upper=False)[..., 0]
+    log_det = cholesky.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return -0.5 * (residual.square().sum(-1) + x.shape[-1] * LOG_2PI) - log_det
+
+
+def product(
+    mean_a: Float[Tensor, "... D"],
+    cov_a: Float[Tensor, "... D D"],
+    mean_b: Float[Tensor, "... D"],
+    cov_b: Float[Tensor, "... D D"],
+) -> tuple[Float[Tensor, "... D"], Float[Tensor, "... D D"], Float[Tensor, "..."]]:
+    """Product of two Gaussian densities over the same variable.
+
+    N(x|a, A) N(x|b, B) = c N(x|m, C),  C = (A^-1 + B^-1)^-1,  c = N(a|b, A + B)   (BL 9-12)
+
+    C is formed without an inverse: with S = A + B and G = A S^-1, C = G B G^T + (I - G) A (I - G)^T,
+    which is symmetric and positive semidefinite term by term.
+
+    Returns:
+        m [..., D], C [..., D, D], log c [...].
+    """
+    factor = safe_cholesky(symmetrise(cov_a + cov_b))
+    gain = torch.cholesky_solve(cov_a, factor).mT
+    rest = torch.eye(gain.shape[-1], dtype=gain.dtype, device=gain.device) - gain
+    mean = mean_a + (gain @ (mean_b - mean_a)[..., None])[..., 0]
+    cov = symmetrise(gain @ cov_b @ gain.mT + rest @ cov_a @ rest.mT)
+    return mean, cov, log_prob(mean_a, mean_b, factor)
+
+
+def marginal(
+    mean: Float[Tensor, "... D"], cov: Float[Tensor, "... D D"], indices: Int[Tensor, " A"]
+) -> tuple[Float[Tensor, "... A"], Float[Tensor, "... A A"]]:
+    """Mean and covariance of a subset of the dimensions."""
+    return mean[..., indices], cov[..., indices[:, None], indices]
+
+
+def condition(
+    mean: Float[Tensor, "... D"],
+    cov: Float[Tensor, "... D D"],
+    indices: Int[Tensor, " A"],
+    values: Float[Tensor, "... A"],
+) -> tuple[Float[Tensor, "... U"], Float[Tensor, "... U U"], Float[Tensor, "..."]]:
+    """Condition a Gaussian on known values of some of its dimensions.
+
+    mu_u|a = mu_u + S_ua S_aa^-1 (a - mu_a),   S_u|a = S_uu - S_ua S_aa^-1 S_au
+
+    Returns:
+        Mean [..., U] and covariance [..., U, U] of the other dimensions, in their old order, and
+        log N(values | mu_a, S_aa) [...].
+    """
+    dim = mean.shape[-1]
+    rest = torch.tensor([i for i in range(dim) if i not in set(indices.tolist())])
+    rest = rest.to(indices.device).long()
+    factor = safe_cholesky(cov[..., indices[:, None], indices])
+    white = torch.linalg.solve_triangular(factor, cov[..., indices[:, None], rest], upper=False)
+    residual = (values - mean[..., indices])[..., None]
+    residual = torch.linalg.solve_triangular(factor, residual, upper=False)
+    new_mean = mean[..., rest] + (white.mT @ residual)[..., 0]
+    new_cov = cov[..., rest[:, None], rest] - white.mT @ white
+    log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    squared = residual.square().sum((-2, -1))
+    return new_mean, new_cov, -0.5 * (squared + indices.numel() * LOG_2PI) - log_det
+
+
+class Gain(NamedTuple):
+    """The part of a Kalman update that does not depend on the measured values.
+
+    Attributes:
+        factor: lower Cholesky factor L of the innovation covariance (BL 39), [..., Z, Z]; a missing
+            measurement has the row and column of the identity.
+        white: W = L^-1 H P [..., Z, D], so that K = W^T L^-1 and P - K S K^T = P - W^T W.
+        log_norm: -sum log diag L - n/2 log 2 pi, n the number of measured dimensions, [...].
+    """
+
+    factor: Tensor
+    white: Tensor
+    log_norm: Tensor
+
+
+def kalman_predict(
+    mean: Float[Tensor, "... D"],
+    cov: Float[Tensor, "... D D"],
+    transition: Float[Tensor, "... D D"],
+    offset: Float[Tensor, "... D"],
+    noise: Float[Tensor, "... D D"],
+) -> tuple[Float[Tensor, "... D"], Float[Tensor, "... D D"]]:
+    """Time update x' = F x + b + N(0, N) (BL 34, 37)."""
+    mean = (transition @ mean[..., None])[..., 0] + offset
+    return mean, symmetrise(transition @ cov @ transition.mT + noise)
+
+
+def kalman_gain(
+    cov: Float[Tensor, "... D D"],
+    measurement_cov: Float[Tensor, "... Z Z"],
+    observed: Int[Tensor, " Z"],
+    mask: Bool[Tensor, "... Z"] | None = None,
+) -> tuple[Gain, Float[Tensor, "... D D"]]:
+    """Gain and updated covariance of a measurement of some state dimensions (BL 39-41).
+
+    A missing dimension is taken out exactly: its row of H is zero and its row and column of the
+    innovation covariance are those of the identity, so it adds nothing to state or likelihood.
+
+    Args:
+        cov: predicted covariance [..., D, D].
+        measurement_cov: R [..., Z, Z].
+        observed: the Z state dimensions that are measured.
+        mask: [..., Z], True where measured; None means all.
+
+    Returns:
+        The `Gain` and the covariance after the update [..., D, D].
+    """
+    cross = cov[..., observed, :]
+    innovation = cross[..., observed] + measurement_cov
+    if mask is not None:
+        both = mask[..., :, None] & mask[..., None, :]
+        eye = torch.eye(mask.shape[-1], dtype=cov.dtype, device=cov.device)
+        innovation = torch.where(both, innovation, eye)
+        cross = cross * mask[..., None]
+        count = mask.sum(-1).to(cov.dtype)
+    else:
+        count = torch.tensor(float(observed.numel()), dtype=cov.dtype, device=cov.device)
+    factor = safe_cholesky(innovation)
+    white = torch.linalg.solve_triangular(factor, cross, upper=False)
+    log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return Gain(factor, white, -log_det - 0.5 * count * LOG_2PI), cov - white.mT @ white
+
+
+def kalman_correct(
+    mean: Float[Tensor, "... D"],
+    z: Float[Tensor, "... Z"],
+    gain: Gain,
+    observed: Int[Tensor, " Z"],
+    mask: Bool[Tensor, "... Z"] | None = None,
+) -> tuple[Float[Tensor, "... D"], Float[Tensor, "..."]]:
+    """Updated mean (BL 40) and log N(z | H x, S) given a gain; values of z off the mask are ignored."""
+    residual = z - mean[..., observed]
+    if mask is not None:
+        residual = torch.where(mask, residual, torch.zeros_like(residual))
+    residual = torch.linalg.solve_triangular(gain.factor, residual[..., None], upper=False)
+    mean = mean + (gain.white.mT @ residual)[..., 0]
+    return mean, gain.log_norm - 0.5 * residual.square().sum((-2, -1))
+
+
+def kalman_update(
+    mean: Float[Tensor, "... D"],
+    cov: Float[Tensor, "... D D"],
+    z: Float[Tensor, "... Z"],
+    measurement_cov: Float[Tensor, "... Z Z"],
+    observed: Int[Tensor, " Z"],
+    mask: Bool[Tensor, "... Z"] | None = None,
+) -> tuple[Float[Tensor, "... D"], Float[Tensor, "... D D"], Float[Tensor, "..."]]:
+    """Measurement update of a Gaussian (BL 38-41).
+
+    Returns:
+        Mean, covariance and log-likelihood log N(z | H x, H P H^T + R) of what was measured.
+    """
+    gain, new_cov = kalman_gain(cov, measurement_cov, observed, mask)
+    new_mean, log_likelihood = kalman_correct(mean, z, gain, observed, mask)
+    return new_mean, new_cov, log_likelihood
+
+
+def mixture_moments(
+    log_weights: Float[Tensor, "... M"],
+    means: Float[Tensor, "... M D"],
+    covs: Float[Tensor, "... M D D"],
+) -> tuple[Float[Tensor, "... D"], Float[Tensor, "... D D"]]:
+    """Mean and covariance of a Gaussian mixture: within plus between components (BL 48)."""
+    weights = log_weights.softmax(-1)
+    mean = (weights[..., None] * means).sum(-2)
+    spread = (means - mean[..., None, :]) * weights[..., None].sqrt()
+    return mean, (weights[..., None, None] * covs).sum(-3) + spread.mT @ spread
+
+
+def sigma_points(
+    mean: Float[Tensor, "... D"], cov: Float[Tensor, "... D D"], kappa: float = 0.5
+) -> tuple[Float[Tensor, "... S D"], Float[Tensor, " S"]]:
+    """2 D + 1 symmetric sigma points at distance sqrt(D + kappa) and their weights (DX 2).
+
+    Args:
+        mean: [..., D]. cov: [..., D, D]. kappa: weight of the centre, kappa / (D + kappa).
+    """
+    dim = mean.shape[-1]
+    spread = math.sqrt(dim + kappa) * safe_cholesky(cov).mT
+    points = torch.cat(
+        [mean[..., None, :], mean[..., None, :] + spread, mean[..., None, :] - spread], -2
+    )
+    weights = torch.full(
+        (2 * dim + 1,), 0.5 / (dim + kappa), dtype=mean.dtype, device=mean.device
+    )
+    weights[0] = kappa / (dim + kappa)
+    return points, weights
+
+
+def unscented_transform(
+    mean: Float[Tensor, "... D"],
+    cov: Float[Tensor, "... D D"],
+    function: Callable[[Tensor], Tensor],
+    kappa: float = 0.5,
+) -> tuple[Tensor, Tensor]:
+    """Mean and covariance of a function of a Gaussian variable, by sigma points (DX 2).
+
+    Args:
+        mean: [..., D]. cov: [..., D, D]. function: maps [..., S, D] to [..., S, E].
+
+    Returns:
+        Mean [..., E] and covariance [..., E, E].
+    """
+    points, weights = sigma_points(mean, cov, kappa)
+    values = function(points)
+    new_mean = (weights[:, None] * values).sum(-2)
+    spread = (values - new_mean[..., None, :]) * weights[:, None].sqrt()
+    return new_mean, spread.mT @ spread

@@ -1,0 +1,186 @@
+"""From points to pixels and back, on tensors: project, lift, and change of camera matrix.
+
+Camera axes: x right, y down, z forward. Metres and pixels. (BL n) is an equation of Burke &
+Lasenby, "Single camera pose estimation using Bayesian filtering and Kinect motion priors". Every
+function is differentiable, takes any dtype and broadcasts over leading dimensions.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.errors import CameraError, check_shape
+
+__all__ = [
+    "backproject",
+    "check_intrinsics",
+    "intrinsics",
+    "lift",
+    "map_pixel_covariance",
+    "map_pixels",
+    "project",
+]
+
+
+def project(
+    points: Float[Tensor, "... J 3"],
+    K: Float[Tensor, "... 3 3"],
+    R: Float[Tensor, "... 3 3"],
+    t: Float[Tensor, "... 3"],
+) -> Float[Tensor, "... J 3"]:
+    """Pixels and projective depth of body points.
+
+    [u, v, lambda] = K [R | t] [X, Y, Z, 1]   (BL 3), returned as (u/lambda, v/lambda, lambda).
+
+    Args:
+        points: [..., J, 3] in body axes, metres.
+        K: camera matrix [3, 3] or [..., 3, 3], pixels, as (BL 4).
+        R: rotation [..., 3, 3], body axes to camera axes.
+        t: translation [..., 3], metres, in camera axes.
+
+    Leading dimensions broadcast. A point with lambda <= 0 lies behind the camera and its pixels
+    mean nothing; a point with lambda = 0 gives infinite pixels.
+
+    Returns:
+        (u, v, lambda) [..., J, 3]: pixels, pixels, metres.
+
+    Reference: Burke & Lasenby, equations (3) and (4).
+
+    >>> K, eye = torch.eye(3), torch.eye(3)
+    >>> project(torch.tensor([[1.0, 2.0, 2.0]]), K, eye, torch.tensor([0.0, 0.0, 2.0]))
+    tensor([[0.2500, 0.5000, 4.0000]])
+    """
+    check_shape("points", points, ["...", None, 3])
+    _check_pose(K, R, t)
+    homogeneous = (points @ R.mT + t.unsqueeze(-2)) @ K.mT
+    depth = homogeneous[..., 2:]
+    return torch.cat([homogeneous[..., :2] / depth, depth], -1)
+
+
+def backproject(
+    uvl: Float[Tensor, "... J 3"], K: Float[Tensor, "... 3 3"]
+) -> Float[Tensor, "... J 3"]:
+    """Points in camera axes of pixels and projective depth: K^-1 (u lambda, v lambda, lambda).
+
+    Args:
+        uvl: (u, v, lambda) [..., J, 3]: pixels, pixels, metres.
+        K: camera matrix [3, 3] or [..., 3, 3]: upper triangular, last row (0, 0, 1).
+
+    Returns:
+        [..., J, 3], camera axes, metres.
+    """
+    check_shape("uvl", uvl, ["...", None, 3])
+    check_shape("K", K, ["...", 3, 3])
+    u, v, depth = uvl.unbind(-1)
+    # K is triangular, so its inverse needs no solver (there is none for half precision).
+    fx, fy, skew, cx, cy = (e.unsqueeze(-1) for e in intrinsics(K))
+    y = (v - cy) / fy
+    x = (u - cx - skew * y) / fx
+    return torch.stack([x * depth, y * depth, depth.expand_as(x)], -1)
+
+
+def lift(
+    uvl: Float[Tensor, "... J 3"],
+    K: Float[Tensor, "... 3 3"],
+    R: Float[Tensor, "... 3 3"],
+    t: Float[Tensor, "... 3"],
+) -> Float[Tensor, "... J 3"]:
+    """Body points of pixels and projective depth; the inverse of `project`.
+
+    [X, Y, Z] = [p1 p2 p3]^-1 ([u, v, lambda] - p4)   (BL 5), here R^T (K^-1 [u, v, lambda] - t).
+
+    Args:
+        uvl: (u, v, lambda) [..., J, 3], u and v divided by lambda as in the state.
+        K: camera matrix [3, 3] or [..., 3, 3]: upper triangular, last row (0, 0, 1).
+        R: rotation [..., 3, 3], orthonormal. t: translation [..., 3], metres.
+
+    Returns:
+        [..., J, 3] in body axes, metres.
+
+    Reference: Burke & Lasenby, equation (5).
+    """
+    _check_pose(K, R, t)
+    return (backproject(uvl, K) - t.unsqueeze(-2)) @ R
+
+
+def map_pixels(
+    uv: Float[Tensor, "... 2"], K_from: Float[Tensor, "... 3 3"], K_to: Float[Tensor, "... 3 3"]
+) -> Float[Tensor, "... 2"]:
+    """Pixels of one camera as another camera in the same place would see them: K_to K_from^-1.
+
+    Args:
+        uv: [..., 2], pixels of the first camera; NaN stays NaN.
+        K_from, K_to: camera matrices [3, 3] (or with leading dimensions that broadcast).
+
+    Returns:
+        [..., 2], pixels of the second camera.
+    """
+    check_shape("uv", uv, ["...", 2])
+    slope = _pixel_slope(K_from, K_to).to(uv)
+    centre_from, centre_to = K_from[..., :2, 2].to(uv), K_to[..., :2, 2].to(uv)
+    return (slope @ (uv - centre_from).unsqueeze(-1)).squeeze(-1) + centre_to
+
+
+def map_pixel_covariance(
+    covariance: Float[Tensor, "... 2 2"],
+    K_from: Float[Tensor, "... 3 3"],
+    K_to: Float[Tensor, "... 3 3"],
+) -> Float[Tensor, "... 2 2"]:
+    """Covariance of pixels after `map_pixels`: A C A^T with its Jacobian A (the map is affine).
+
+    Args:
+        covariance: [..., 2, 2], squared pixels of the first camera.
+        K_from, K_to: camera matrices [3, 3].
+
+    Returns:
+        [..., 2, 2], squared pixels of the second camera.
+    """
+    check_shape("covariance", covariance, ["...", 2, 2])
+    slope = _pixel_slope(K_from, K_to).to(covariance)
+    return slope @ covariance @ slope.mT
+
+
+def check_intrinsics(name: str, K: Tensor) -> None:
+    """Raise `CameraError` unless K is a camera matrix (BL 4).
+
+    Args:
+        name: what the matrix is called in the message.
+        K: [..., 3, 3]: finite, positive focal lengths, zeros below the diagonal, last row
+            (0, 0, 1).
+    """
+    if K.ndim < 2 or tuple(K.shape[-2:]) != (3, 3):
+        raise CameraError(f"{name} must have shape [3, 3], got {list(K.shape)}")
+    if not bool(torch.isfinite(K).all()):
+        raise CameraError(f"{name} must be finite, got {K.tolist()}")
+    fx, fy, *_ = intrinsics(K)
+    if bool((fx <= 0).any()) or bool((fy <= 0).any()):
+        raise CameraError(
+            f"{name} needs positive focal lengths in pixels, got fx={fx.tolist()}, fy={fy.tolist()}"
+        )
+    last = torch.tensor([0.0, 0.0, 1.0], dtype=K.dtype, device=K.device)
+    if bool((K[..., 1, 0] != 0).any()) or bool((K[..., 2, :] != last).any()):
+        raise CameraError(
+            f"{name} must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; "
+            "divide by the last entry, and give the rotation apart"
+        )
+
+
+def intrinsics(K: Float[Tensor, "... 3 3"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """fx, fy, skew, cx, cy of a camera matrix (BL 4), each [...], pixels."""
+    return K[..., 0, 0], K[..., 1, 1], K[..., 0, 1], K[..., 0, 2], K[..., 1, 2]
+
+
+def _check_pose(K: Tensor, R: Tensor, t: Tensor) -> None:
+    check_shape("K", K, ["...", 3, 3])
+    check_shape("R", R, ["...", 3, 3])
+    check_shape("t", t, ["...", 3])
+
+
+def _pixel_slope(K_from: Tensor, K_to: Tensor) -> Tensor:
+    """Linear part [..., 2, 2] of K_to K_from^-1."""
+    check_intrinsics("K_from", K_from)
+    check_intrinsics("K_to", K_to)
+    fx, fy, skew, *_ = intrinsics(K_from)
+    zero = torch.zeros_like(fx)
+    inverse = torch.stack([1 / fx, -skew / (fx * fy), zero, 1 / fy], -1).unflatten(-1, (2, 2))
+    return K_to[..., :2, :2].to(inverse) @ inverse
