@@ -1,0 +1,371 @@
+"""The interface of every tracker, its checks, and the one loop over time.
+
+A filter is a fixed model (buffers) and pure steps over a state, which is a NamedTuple. A new tracker
+implements `init` and `advance`; shapes, masks, lengths and failures are handled here.
+"""
+
+import warnings
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from torchpose.errors import (
+    DegenerateFilterWarning,
+    InputError,
+    ShapeError,
+    check_covariance,
+    check_finite,
+    check_shape,
+)
+
+__all__ = [
+    "FilterOutput",
+    "Generators",
+    "Measurements",
+    "RecursiveFilter",
+    "StepOutput",
+    "as_covariance",
+    "effective_sample_size",
+    "standard_normal",
+    "uniform",
+]
+
+Generators = torch.Generator | Sequence[torch.Generator] | None
+
+
+class StepOutput(NamedTuple):
+    """The estimate after one time step.
+
+    Attributes:
+        mean: [B, D]. log_weights: of the M tracks or particles, normalised, [B, M].
+        log_evidence: log p(z_t | z_1:t-1), [B]; 0 where nothing is measured, NaN for variants
+            that drop the evidence term. cov: [B, D, D] on request.
+    """
+
+    mean: Tensor
+    log_weights: Tensor
+    log_evidence: Tensor
+    cov: Tensor | None = None
+
+
+class FilterOutput(NamedTuple):
+    """Estimates of a batch of sequences; past the length of a sequence its last one is repeated.
+
+    Attributes:
+        mean: [B, T, D]. log_weights: [B, T, M], of the estimate, normalised.
+        log_evidence: increments log p(z_t | z_1:t-1) [B, T]; 0 where nothing is measured and past
+            the length, NaN for variants that drop the evidence term.
+        cov: [B, T, D, D], or None unless asked for.
+        failed_at: [B], the first frame at which an element degenerated, -1 where it did not. From
+            that frame on the element's estimates are NaN.
+    """
+
+    mean: Tensor
+    log_weights: Tensor
+    log_evidence: Tensor
+    cov: Tensor | None
+    failed_at: Tensor
+
+    @property
+    def effective_sample_size(self) -> Tensor:
+        """1 / sum_j w_j^2 (BL 25), [B, T]."""
+        return effective_sample_size(self.log_weights)
+
+
+class Measurements(NamedTuple):
+    """Checked measurements of a batch of sequences.
+
+    Attributes:
+        z: [B, T, Z], zero where missing. mask: [B, T, Z], True where measured.
+        cov: R [Z, Z], or [B, T, Z, Z] if it changes. lengths: [B].
+    """
+
+    z: Tensor
+    mask: Tensor
+    cov: Tensor
+    lengths: Tensor
+
+    def frame(self, t: int) -> "Measurements":
+        """The measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z]."""
+        cov = self.cov if self.cov.ndim == 2 else self.cov[:, t]
+        return Measurements(self.z[:, t], self.mask[:, t], cov, self.lengths)
+
+
+def effective_sample_size(log_weights: Float[Tensor, "*batch M"]) -> Float[Tensor, "*batch"]:
+    """N_eff = 1 / sum_j w_j^2 for normalised log-weights (BL 25)."""
+    return torch.exp(-torch.logsumexp(2 * log_weights, -1))
+
+
+def standard_normal(
+    batch: int, shape: Sequence[int], generator: Generators, like: Tensor
+) -> Float[Tensor, "B *shape"]:
+    """Standard normal numbers [B, *shape]; with a list of generators, each element draws from its own."""
+    kind = {"dtype": like.dtype, "device": like.device}
+    if isinstance(generator, torch.Generator) or generator is None:
+        return torch.randn(batch, *shape, generator=generator, **kind)
+    return torch.stack([torch.randn(*shape, generator=g, **kind) for g in generator])
+
+
+def uniform(
+    batch: int, shape: Sequence[int], generator: Generators, like: Tensor
+) -> Float[Tensor, "B *shape"]:
+    """Uniform numbers in [0, 1), as `standard_normal`."""
+    kind = {"dtype": like.dtype, "device": like.device}
+    if isinstance(generator, torch.Generator) or generator is None:
+        return torch.rand(batch, *shape, generator=generator, **kind)
+    return torch.stack([torch.rand(*shape, generator=g, **kind) for g in generator])
+
+
+def as_covariance(name: str, value: Tensor, dim: int, trailing: int = 2) -> Tensor:
+    """A covariance [..., D, D] from one or from its diagonal [..., D]; checked.
+
+    Args:
+        trailing: number of dimensions of a single full covariance with its leading ones (2 for
+            [D, D], 4 for [B, T, D, D]).
+
+    Raises:
+        ShapeError, InputError, CovarianceError.
+    """
+    value = torch.as_tensor(value, dtype=torch.float64)
+    if value.ndim == trailing - 1:
+        check_shape(name, value, ["...", dim])
+        value = torch.diag_embed(value)
+    check_shape(name, value, ["...", dim, dim])
+    if value.ndim != trailing:
+        raise ShapeError(
+            f"{name} must have {trailing} dimensions (or {trailing - 1} for diagonals), "
+            f"got shape {list(value.shape)}"
+        )
+    with torch.no_grad():
+        check_covariance(name, value)
+    return value
+
+
+class RecursiveFilter(nn.Module):
+    """A recursive Bayesian filter over batches of sequences.
+
+    Args:
+        measurement_cov: R, [Z, Z] or its diagonal [Z].
+        observed: the Z state indices that are measured (the rows of H in BL 15).
+        dim: number of state dimensions D.
+        dtype: of means, particles and measurements; covariances are always float64.
+    """
+
+    def __init__(
+        self, measurement_cov: Tensor, observed: Sequence[int] | Tensor, dim: int, dtype: torch.dtype
+    ) -> None:
+        super().__init__()
+        index = torch.as_tensor(observed, dtype=torch.long)
+        check_shape("observed", index, ["Z"])
+        inside = bool(((index >= 0) & (index < dim)).all())
+        if index.numel() == 0 or not inside or index.unique().numel() != index.numel():
+            raise InputError(
+                f"observed must hold distinct state indices in [0, {dim}), got {index.tolist()}"
+            )
+        self.dim = dim
+        self.dtype = dtype
+        self.register_buffer("observed", index)
+        self.register_buffer(
+            "measurement_cov", as_covariance("measurement_cov", measurement_cov, index.numel())
+        )
+        self.observed: Tensor
+        self.measurement_cov: Tensor
+
+    @abstractmethod
+    def init(self, batch_size: int, generator: Generators = None) -> Any:
+        """The state before the first measurement; the first step predicts, then updates."""
+
+    @abstractmethod
+    def advance(
+        self, state: Any, frame: Measurements, generator: Generators, return_cov: bool
+    ) -> tuple[Any, StepOutput]:
+        """One time step on checked measurements of one frame."""
+
+    def step(
+        self,
+        state: Any,
+        z: Float[Tensor, "B Z"],
+        mask: Bool[Tensor, "B Z"] | None = None,
+        measurement_cov: Tensor | None = None,
+        generator: Generators = None,
+        return_cov: bool = False,
+    ) -> tuple[Any, StepOutput]:
+        """One time step online: the same numbers as the same frame of `forward`.
+
+        Args:
+            state: from `init` or the step before. z: [B, Z], pixels. mask: [B, Z], True = measured.
+            measurement_cov: R of this frame, [Z, Z] or [B, Z, Z]; None is the filter's own.
+            generator: for filters that draw; a generator, or a list of one for each element.
+            return_cov: whether to return the covariance as well.
+
+        Returns:
+            The next state and a `StepOutput`.
+
+        Raises:
+            ShapeError, InputError, CovarianceError: as `forward`.
+        """
+        check_shape("z", z, ["B", self.observed.numel()])
+        if measurement_cov is not None and measurement_cov.ndim == 3:
+            measurement_cov = measurement_cov[:, None]
+        frames = self.check(
+            z[:, None], None if mask is None else mask[:, None], measurement_cov, None, generator
+        )
+        return self.advance(state, frames.frame(0), generator, return_cov)
+
+    def forward(
+        self,
+        z: Float[Tensor, "B T Z"],
+        mask: Bool[Tensor, "B T Z"] | None = None,
+        measurement_cov: Tensor | None = None,
+        lengths: Int[Tensor, " B"] | None = None,
+        generator: Generators = None,
+        return_cov: bool = False,
+        progress: bool = False,
+    ) -> FilterOutput:
+        """Filter a batch of sequences.
+
+        Args:
+            z: measurements [B, T, Z] in the units of the state (pixels). mask: [B, T, Z], True where
+                measured; what z holds elsewhere is ignored. measurement_cov: R [Z, Z] or
+                [B, T, Z, Z], overrides the filter's own. lengths: [B], frames of each sequence.
+            generator: for filters that draw; a generator, or a list of B generators, one for each
+                element, which makes an element's numbers independent of its batch.
+            return_cov: whether to return covariances. progress: whether to show a progress bar.
+
+        Returns:
+            `FilterOutput`.
+
+        Raises:
+            ShapeError: wrong shapes. InputError: empty sequences, NaN or infinite values that are
+            not masked, lengths outside 1..T. CovarianceError: R not symmetric positive definite.
+        """
+        frames = self.check(z, mask, measurement_cov, lengths, generator)
+        return self.run(frames, generator, return_cov, progress)
+
+    def run(
+        self, frames: Measurements, generator: Generators, return_cov: bool, progress: bool
+    ) -> FilterOutput:
+        """The loop over time, on checked measurements."""
+        batch, n_frames = frames.z.shape[:2]
+        state = self.init(batch, generator)
+        steps = []
+        for t in tqdm(range(n_frames), disable=not progress, unit="frame"):
+            state, out = self.advance(state, frames.frame(t), generator, return_cov)
+            steps.append(out)
+        return collect(steps, frames.lengths)
+
+    def check(
+        self,
+        z: Tensor,
+        mask: Tensor | None,
+        measurement_cov: Tensor | None,
+        lengths: Tensor | None,
+        generator: Generators,
+    ) -> Measurements:
+        """Check the arguments of `forward` before any work is done."""
+        check_shape("z", z, ["B", "T", self.observed.numel()])
+        batch, n_frames = z.shape[:2]
+        if batch == 0 or n_frames == 0:
+            raise InputError(f"z must hold at least one sequence of one frame, got {list(z.shape)}")
+        z = z.to(self.observed.device, self.dtype)
+        lengths = self._check_lengths(lengths, batch, n_frames)
+        if mask is None:
+            inside = torch.arange(n_frames, device=z.device) < lengths[:, None]
+            mask = inside[..., None].expand(z.shape)
+        else:
+            if mask.dtype != torch.bool:
+                raise InputError(f"mask must be bool (True = measured), got {mask.dtype}")
+            check_shape("mask", mask, list(z.shape))
+            mask = mask.to(z.device)
+            if bool((lengths < n_frames).any()):
+                inside = torch.arange(n_frames, device=z.device) < lengths[:, None]
+                mask = mask & inside[..., None]
+        check_finite("z", z, mask, "mark missing values with mask=False")
+        z = torch.where(mask, z, torch.zeros_like(z))
+        if measurement_cov is None:
+            cov = self.measurement_cov
+        else:
+            n = self.observed.numel()
+            trailing = 4 if measurement_cov.ndim >= 3 else 2
+            cov = as_covariance("measurement_cov", measurement_cov, n, trailing).to(z.device)
+            if trailing == 4:
+                check_shape("measurement_cov", cov, [batch, n_frames, n, n])
+        if isinstance(generator, Sequence) and len(generator) != batch:
+            raise InputError(
+                f"a list of generators must hold one for each of the {batch} sequences, "
+                f"got {len(generator)}"
+            )
+        return Measurements(z, mask, cov, lengths)
+
+    def _check_lengths(self, lengths: Tensor | None, batch: int, n_frames: int) -> Tensor:
+        device = self.observed.device
+        if lengths is None:
+            return torch.full((batch,), n_frames, device=device)
+        lengths = torch.as_tensor(lengths, device=device)
+        check_shape("lengths", lengths, [batch])
+        if lengths.dtype.is_floating_point or bool(((lengths < 1) | (lengths > n_frames)).any()):
+            raise InputError(
+                f"lengths must be integers from 1 to {n_frames}, got {lengths.tolist()}"
+            )
+        return lengths.long()
+
+
+def collect(steps: Sequence[StepOutput], lengths: Int[Tensor, " B"]) -> FilterOutput:
+    """Stack the steps of a run into its output."""
+    cov = None
+    if steps[0].cov is not None:
+        cov = torch.stack([s.cov for s in steps if s.cov is not None], 1)
+    return finish_output(
+        torch.stack([s.mean for s in steps], 1),
+        torch.stack([s.log_weights for s in steps], 1),
+        torch.stack([s.log_evidence for s in steps], 1),
+        cov,
+        lengths,
+    )
+
+
+def finish_output(
+    mean: Float[Tensor, "B T D"],
+    log_weights: Float[Tensor, "B T M"],
+    log_evidence: Float[Tensor, "B T"],
+    cov: Float[Tensor, "B T D D"] | None,
+    lengths: Int[Tensor, " B"],
+) -> FilterOutput:
+    """Repeat the last estimate past each length, and report the elements that degenerated."""
+    batch, n_frames = log_evidence.shape
+    frames = torch.arange(n_frames, device=mean.device)
+    if bool((lengths < n_frames).any()):
+        held = torch.minimum(frames, lengths[:, None] - 1)
+        rows = torch.arange(batch, device=mean.device)[:, None]
+        mean, log_weights = mean[rows, held], log_weights[rows, held]
+        cov = None if cov is None else cov[rows, held]
+        inside = frames < lengths[:, None]
+        log_evidence = torch.where(inside, log_evidence, torch.zeros_like(log_evidence))
+    failed_at = _first_failure(mean)
+    if bool((failed_at >= 0).any()):
+        lost = frames >= failed_at[:, None]
+        lost = lost & (failed_at >= 0)[:, None]
+        log_weights = log_weights.masked_fill(lost[..., None], float("nan"))
+        listed = ", ".join(
+            f"element {b} at frame {int(failed_at[b])}"
+            for b in torch.nonzero(failed_at >= 0).reshape(-1).tolist()[:8]
+        )
+        warnings.warn(
+            f"{int((failed_at >= 0).sum())} of {batch} sequences degenerated ({listed}); "
+            "their estimates are NaN from there on, the others finished. Check the scale of the "
+            "measurements, or widen the measurement covariance",
+            DegenerateFilterWarning,
+            stacklevel=3,
+        )
+    return FilterOutput(mean, log_weights, log_evidence, cov, failed_at)
+
+
+def _first_failure(mean: Float[Tensor, "B T D"]) -> Int[Tensor, " B"]:
+    bad = ~torch.isfinite(mean).all(-1)
+    first = bad.int().argmax(1)
+    return torch.where(bad.any(1), first, torch.full_like(first, -1))

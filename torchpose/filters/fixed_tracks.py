@@ -1,0 +1,286 @@
+"""Mixture Kalman filter with fixed tracks: one step, and whole batches of sequences.
+
+A track never changes its component, so its covariances depend only on which joints were measured.
+`run` takes the gains from a graph of mask histories, solves constant stretches in blocks, and falls
+back to the plain recursion for gradients, for noise that changes in each frame, and for burn-in.
+"""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from torchpose.filters.base import FilterOutput, Measurements, StepOutput, collect, finish_output
+from torchpose.filters.gains import MAX_EDGES, Edge, GainGraph
+from torchpose.filters.scan import Workspace, scan_blocks
+from torchpose.filters.tracks import MKFState, estimate_of, within_and_between
+from torchpose.filters.weights import mix_uniform, sequence_weights, step_weights
+from torchpose.gaussian import kalman_correct, kalman_gain, symmetrise
+
+if TYPE_CHECKING:
+    from torchpose.filters.mkf import MixtureKalmanFilter
+
+_BUFFER_NUMBERS = 1 << 18  # track means held at a time: 4 MB, which stay in the cache
+
+
+def advance(
+    model: "MixtureKalmanFilter", state: MKFState, frame: Measurements, return_cov: bool
+) -> tuple[MKFState, StepOutput]:
+    """One step (BL 34-41, 48-49)."""
+    matrix, offset, noise = model.transition(state.time)
+    cov, group, mask, noise_cov = distinct_histories(state, frame)
+    predicted_cov = symmetrise(matrix @ cov @ matrix.mT + noise)
+    gain, cov = kalman_gain(predicted_cov, noise_cov, model.observed, mask)
+    mean = (matrix.to(model.dtype) @ state.mean[..., None])[..., 0] + offset.to(model.dtype)
+    gain = type(gain)(*(g.to(model.dtype)[group] for g in gain))
+    mean, log_likelihood = kalman_correct(
+        mean, frame.z[:, None], gain, model.observed, frame.mask[:, None]
+    )
+    log_weights, log_evidence = step_weights(
+        state.log_weights, model.log_prior.to(model.dtype), log_likelihood, model.reset_below
+    )
+    log_evidence = torch.where(frame.mask.any(-1), log_evidence, torch.zeros_like(log_evidence))
+    estimate, total = estimate_of(log_weights, mean, cov[group] if return_cov else None)
+    carried = mix_uniform(log_weights, model.uniform_weight)
+    new_state = MKFState(carried, mean, cov, group, state.time + 1)
+    return new_state, StepOutput(estimate, log_weights, log_evidence, total)
+
+
+def distinct_histories(state: MKFState, frame: Measurements) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Covariances, groups, masks and noise for the distinct histories of this frame."""
+    if frame.cov.ndim == 3:
+        own = torch.arange(frame.z.shape[0], device=frame.z.device)
+        return state.cov[state.group], own, frame.mask[:, None], frame.cov[:, None]
+    if state.cov.shape[0] == 1 and bool((frame.mask == frame.mask[:1]).all()):
+        return state.cov, state.group, frame.mask[:1, None], frame.cov
+    bits = 2 ** torch.arange(frame.mask.shape[1], device=frame.mask.device)
+    code = state.group * 2 ** frame.mask.shape[1] + (frame.mask * bits).sum(-1)
+    _, group = torch.unique(code, return_inverse=True)
+    n_groups = int(group.max()) + 1
+    first = torch.zeros(n_groups, dtype=torch.long, device=group.device)
+    first[group] = torch.arange(group.numel(), device=group.device)
+    return state.cov[state.group[first]], group, frame.mask[first, None], frame.cov
+
+
+def run(
+    model: "MixtureKalmanFilter", frames: Measurements, return_cov: bool, progress: bool
+) -> FilterOutput:
+    """All frames of a batch."""
+    history = None if _needs_plain_loop(model, frames) else _history(model, frames)
+    if history is None:
+        state = model.init(frames.z.shape[0])
+        steps = []
+        for t in tqdm(range(frames.z.shape[1]), disable=not progress, unit="frame"):
+            state, out = advance(model, state, frames.frame(t), return_cov)
+            steps.append(out)
+        return collect(steps, frames.lengths)
+    return _run_shared(model, frames, history, return_cov, progress)
+
+
+def _needs_plain_loop(model: "MixtureKalmanFilter", frames: Measurements) -> bool:
+    tensors = (frames.z, frames.cov, model.transition_matrix, model.transition_noise)
+    tensors += (model.log_prior, model.means, model.initial_cov, model.transition_offset)
+    learning = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
+    return learning or frames.cov.ndim == 4 or model.burn_in > 0
+
+
+class _History(NamedTuple):
+    """Steps through the gain graph for H distinct histories of masks.
+
+    Attributes:
+        graph: the graph. edges: per frame, one edge for each history, or a single one for all.
+        steady: per frame, the steady node that all elements stay at, or -1.
+        group: the history of each element, [B].
+    """
+
+    graph: GainGraph
+    edges: list[list[Edge]]
+    steady: list[int]
+    group: Tensor
+
+
+def _history(model: "MixtureKalmanFilter", frames: Measurements) -> _History | None:
+    """Walk the gain graph; None if the masks have too many histories to be worth sharing."""
+    graph = model.gain_graph(frames.cov)
+    patterns = _patterns(frames)
+    distinct, group = torch.unique(patterns, dim=0, return_inverse=True)
+    nodes = [0] * distinct.shape[0]
+    edges, steady = [], []
+    for row in distinct.T.tolist():
+        keys = set(zip(nodes, row, strict=True))
+        found = {key: graph.edge(*key) for key in keys}
+        if len(graph.edges) > MAX_EDGES:
+            return None
+        first = (nodes[0], row[0])
+        same = len(keys) == 1
+        steady.append(nodes[0] if same and graph.is_steady(*first) else -1)
+        edges.append([found[first]] if same else [found[key] for key in zip(nodes, row)])
+        nodes = [found[key].target for key in zip(nodes, row)]
+    return _History(graph, edges, steady, group)
+
+
+def _patterns(frames: Measurements) -> Tensor:
+    """The measured dimensions as bits [B, T]; finished sequences share those of the longest."""
+    n_frames, n_obs = frames.z.shape[1:]
+    bits = 2 ** torch.arange(n_obs, device=frames.z.device)
+    patterns = (frames.mask * bits).sum(-1)
+    over = torch.arange(n_frames, device=frames.z.device) >= frames.lengths[:, None]
+    return torch.where(over, patterns[frames.lengths.argmax()], patterns)
+
+
+def _run_shared(
+    model: "MixtureKalmanFilter",
+    frames: Measurements,
+    history: _History,
+    return_cov: bool,
+    progress: bool,
+) -> FilterOutput:
+    batch, n_frames = frames.z.shape[:2]
+    log_prior, means = model.log_prior.to(model.dtype), model.means.to(model.dtype)
+    log_weights = model.init(batch).log_weights
+    # Results are written in place, time first: gathering them afterwards would copy all of them.
+    estimates = means.new_empty(n_frames, batch, model.dim)
+    posteriors = means.new_empty(n_frames, batch, model.n_tracks)
+    evidences = means.new_empty(n_frames, batch)
+    covs = means.new_empty(n_frames, batch, model.dim, model.dim) if return_cov else None
+    workspace = Workspace()
+    bar = tqdm(total=n_frames, disable=not progress, unit="frame")
+    done = 0
+    for tracks in _stretches(model, frames, history, workspace):
+        log_likelihood = tracks.log_likelihood.permute(1, 3, 2, 0).flatten(0, 1)
+        span = slice(done, done + len(log_likelihood))
+        posteriors[span], evidences[span], log_weights = sequence_weights(
+            log_weights, log_prior, log_likelihood, model.uniform_weight, model.reset_below
+        )
+        mixed = posteriors[span].exp()
+        shares = mixed.view(*tracks.deviation.shape[1:4:2], batch, -1).permute(3, 0, 2, 1)
+        weighted = workspace.take("weighted", tuple(tracks.deviation.shape), means)
+        torch.mul(tracks.deviation, shares[..., None], out=weighted)
+        centred = weighted.sum(0).transpose(1, 2).flatten(0, 1)
+        torch.add(centred, mixed @ means, out=estimates[span])
+        if covs is not None:
+            covs[span] = _covariances(tracks, means, mixed, estimates[span])
+        bar.update(len(log_likelihood))
+        done += len(log_likelihood)
+    bar.close()
+    evidence = torch.where(frames.mask.any(-1), evidences.mT, torch.zeros_like(evidences.mT))
+    cov = None if covs is None else covs.transpose(0, 1)
+    return finish_output(
+        estimates.transpose(0, 1), posteriors.transpose(0, 1), evidence, cov, frames.lengths
+    )
+
+
+class _Stretch(NamedTuple):
+    """Tracks over a stretch of T = N L frames, N blocks of L.
+
+    Attributes:
+        deviation: track means minus component means [M, N, B, L, D].
+        log_likelihood: [M, N, B, L]. cov: per frame, track covariances [H, M, D, D].
+        group: row of `cov` for each element [B].
+    """
+
+    deviation: Tensor
+    log_likelihood: Tensor
+    cov: list[Tensor]
+    group: Tensor
+
+
+def _stretches(
+    model: "MixtureKalmanFilter", frames: Measurements, history: _History, workspace: Workspace
+) -> Iterator[_Stretch]:
+    """Track means and likelihoods, a bounded stretch of frames at a time."""
+    batch, n_frames, _ = frames.z.shape
+    n_tracks, dim = model.means.shape
+    state = torch.zeros(n_tracks, batch, dim, dtype=model.dtype, device=frames.z.device)
+    length = _block_length(batch)
+    longest = max(length, _BUFFER_NUMBERS // (batch * n_tracks * dim))
+    t = 0
+    while t < n_frames:
+        node, end = history.steady[t], t + 1
+        while end < n_frames and end - t < longest and history.steady[end] == node:
+            end += 1
+        if node >= 0 and end - t >= length:
+            end = t + (end - t) // length * length
+            stretch, state = _block_stretch(model, frames, history, state, (t, end), workspace)
+        else:
+            stretch, state = _stepped_stretch(model, frames, history, state, (t, end))
+        yield stretch
+        t = end
+
+
+def _block_length(batch: int) -> int:
+    # Longer blocks cost arithmetic and save calls; with many sequences the calls matter less.
+    return 8 if batch <= 8 else 4
+
+
+def _block_stretch(
+    model: "MixtureKalmanFilter",
+    frames: Measurements,
+    history: _History,
+    state: Tensor,
+    span: tuple[int, int],
+    workspace: Workspace,
+) -> tuple[_Stretch, Tensor]:
+    start, end = span
+    edge, node = history.edges[start][0], history.steady[start]
+    length = _block_length(frames.z.shape[0])
+    blocks = history.graph.blocks(node, model.means, length, model.dtype)
+    deviation, squared, state = scan_blocks(blocks, state, frames.z[:, start:end], workspace)
+    log_norm = edge.log_norm.to(model.dtype)[:, None, None, None]
+    cov = [history.graph.nodes[node][None]] * (end - start)
+    return _Stretch(deviation, log_norm - 0.5 * squared, cov, history.group), state
+
+
+def _stepped_stretch(
+    model: "MixtureKalmanFilter",
+    frames: Measurements,
+    history: _History,
+    state: Tensor,
+    span: tuple[int, int],
+) -> tuple[_Stretch, Tensor]:
+    matrix = model.transition_matrix.to(model.dtype).mT.contiguous()
+    offset = model.means[:, None, model.observed].to(model.dtype)
+    deviations, likelihoods, covs = [], [], []
+    for t in range(*span):
+        inverse, white, log_norm = _frame_gains(model, history, t)
+        state = torch.bmm(state, matrix)
+        residual = frames.z[:, t] - offset - state[..., model.observed]
+        if inverse.ndim == 3:
+            residual = torch.bmm(residual, inverse.mT)
+            state = torch.baddbmm(state, residual, white)
+        else:
+            residual = (inverse @ residual[..., None])[..., 0]
+            state = state + (white.mT @ residual[..., None])[..., 0]
+        likelihoods.append(log_norm - 0.5 * residual.square().sum(-1))
+        deviations.append(state)
+        targets = [history.graph.nodes[edge.target] for edge in history.edges[t]]
+        covs.append(torch.stack(targets) if len(targets) > 1 else targets[0][None])
+    deviation, likelihood = torch.stack(deviations, 1), torch.stack(likelihoods, 1)
+    return _Stretch(deviation[:, :, :, None], likelihood[..., None], covs, history.group), state
+
+
+def _frame_gains(
+    model: "MixtureKalmanFilter", history: _History, t: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """L^-1, W and the likelihood's constant of frame t: [M, ...], or [M, B, ...] if they differ."""
+    edges = history.edges[t]
+    if len(edges) == 1:
+        edge = edges[0]
+        gains = (edge.inverse_factor, edge.white, edge.log_norm[:, None])
+    else:
+        gains = tuple(
+            torch.stack([getattr(edge, name) for edge in edges], 1)[:, history.group]
+            for name in ("inverse_factor", "white", "log_norm")
+        )
+    return tuple(g.to(model.dtype) for g in gains)
+
+
+def _covariances(tracks: _Stretch, means: Tensor, weights: Tensor, mean: Tensor) -> Tensor:
+    positions = tracks.deviation.permute(1, 3, 2, 0, 4).flatten(0, 1) + means
+    frames = []
+    for t, cov in enumerate(tracks.cov):
+        shared = cov[0] if cov.shape[0] == 1 else cov[tracks.group]
+        frames.append(within_and_between(weights[t], positions[t], mean[t], shared))
+    return torch.stack(frames)

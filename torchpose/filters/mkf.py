@@ -1,0 +1,274 @@
+"""The mixture Kalman filter: fixed, sampled and split tracks (paper section 3.4)."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchpose.errors import InputError, check_shape
+from torchpose.filters import fixed_tracks, sampled_tracks, split_tracks
+from torchpose.filters.base import (
+    FilterOutput,
+    Generators,
+    Measurements,
+    RecursiveFilter,
+    StepOutput,
+    as_covariance,
+)
+from torchpose.filters.gains import GainGraph
+from torchpose.filters.smoothing import smooth_fixed_tracks
+from torchpose.filters.tracks import MKFState
+from torchpose.filters.transition import TRANSITIONS, Transition, make_transition
+from torchpose.filters.weights import normalise
+from torchpose.priors.gmm import GaussianMixture
+
+__all__ = ["MKFState", "MixtureKalmanFilter"]
+
+TRACKS = ("fixed", "sampled", "split")
+
+
+class MixtureKalmanFilter(RecursiveFilter):
+    """Mixture Kalman filter of a mixture of Ornstein-Uhlenbeck motion models.
+
+    Given its indicator i, the state follows (BL 32)
+        x_t = F_i x_{t-1} + (I - F_i) mu_i + N(0, N_i),  F_i = Sigma_i (Q + Sigma_i)^-1,
+    and is measured through z_t = H x_t + N(0, R) (BL 33). Each track is one history of indicators
+    with a Kalman filter of its own (BL 34-42); the estimate is the weighted mean (BL 48).
+
+    - ``fixed``: track j keeps indicator j for ever (BL 49); w_j prop. to pi_j N_j w_{t-1,j}, then
+      w <- (w + epsilon) / (1 + M epsilon), so that no component is lost.
+    - ``sampled``: indicators are drawn from pi (BL 47) and tracks are resampled when the effective
+      sample size falls below `resample_threshold` M.
+    - ``split``: every track is continued by every component, and the M likeliest are kept
+      (Smith & Winter).
+
+    Args:
+        prior: the mixture prior (BL 7), K components over D dimensions.
+        process_cov: Q, [D, D] or its diagonal [D], per frame.
+        measurement_cov: R, [Z, Z] or its diagonal [Z].
+        observed: the Z state indices that are measured.
+        tracks: "fixed", "sampled" or "split".
+        n_tracks: M; K by default, and always K for fixed tracks.
+        uniform_weight: epsilon, only for fixed tracks.
+        initial_cov: covariance of every track before the first prediction, [D, D], [D] or [K, D, D];
+            by default that of its component.
+        transition: "paper", "stationary" or "ou", see `make_transition`. gamma, subspace: of "ou".
+        resample_threshold: share of M, only for sampled tracks.
+        burn_in: number of frames over which Q starts inflated by `burn_in_scale` and decays to
+            itself geometrically (paper section 3.3, after BL 26). 0 is no burn-in.
+        reset_below: fixed tracks only; see `step_weights`.
+        dtype: of means and measurements; covariances are always float64.
+
+    Raises:
+        InputError, ShapeError, CovarianceError: for what does not fit, before any work.
+
+    Reference:
+        M. Burke, J. Lasenby, "Single camera pose estimation using Bayesian filtering and Kinect
+        motion priors", eqs 27-49. H. Smith, P. Winter, "On-line outlier detection and correction
+        with a split-track filter" (1978), as cited there.
+
+    Example:
+        >>> import torch
+        >>> from torchpose.filters import MixtureKalmanFilter
+        >>> from torchpose.priors import GaussianMixture
+        >>> prior = GaussianMixture(
+        ...     torch.tensor([0.5, 0.5]), torch.tensor([[0.0, 0.0], [4.0, 4.0]]),
+        ...     torch.eye(2).expand(2, 2, 2))
+        >>> f = MixtureKalmanFilter(prior, torch.ones(2), torch.ones(1), observed=[0])
+        >>> out = f(torch.full((1, 20, 1), 4.0))
+        >>> bool((out.mean[0, -1] > 3).all())
+        True
+    """
+
+    def __init__(
+        self,
+        prior: GaussianMixture,
+        process_cov: Tensor,
+        measurement_cov: Tensor,
+        observed: Sequence[int] | Tensor,
+        tracks: str = "fixed",
+        n_tracks: int | None = None,
+        uniform_weight: float = 1e-3,
+        initial_cov: Tensor | None = None,
+        transition: str = "paper",
+        gamma: Tensor | float | None = None,
+        subspace: int | None = None,
+        resample_threshold: float = 0.5,
+        burn_in: int = 0,
+        burn_in_scale: float = 100.0,
+        reset_below: float | None = None,
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        super().__init__(measurement_cov, observed, prior.means.shape[-1], dtype)
+        n_components = prior.means.shape[0]
+        _check_options(tracks, n_tracks, n_components, uniform_weight, transition)
+        self.tracks = tracks
+        self.n_tracks = n_tracks or n_components
+        self.uniform_weight = float(uniform_weight) if tracks == "fixed" else 0.0
+        self.transition_kind = transition
+        self.subspace = subspace
+        self.resample_threshold = resample_threshold
+        self.burn_in = burn_in
+        self.burn_in_scale = burn_in_scale
+        self.reset_below = reset_below
+        self._graph: GainGraph | None = None
+        if gamma is not None:
+            gamma = torch.as_tensor(gamma, dtype=torch.float64, device=prior.means.device)
+        self._set_model(prior, as_covariance("process_cov", process_cov, self.dim), gamma)
+        self.register_buffer("initial_cov", self._initial_cov(initial_cov, n_components))
+        self.to(prior.means.device)
+
+    def _set_model(self, prior: GaussianMixture, process_cov: Tensor, gamma: Tensor | None) -> None:
+        wide = torch.float64
+        weights = prior.weights.to(wide)
+        self.register_buffer("log_prior", (weights / weights.sum()).log())
+        self.register_buffer("means", prior.means.to(wide))
+        self.register_buffer("covariances", prior.covariances.to(wide))
+        self.register_buffer("process_cov", process_cov.to(prior.means.device))
+        self.register_buffer("gamma", gamma)
+        model = make_transition(
+            self.transition_kind, self.means, self.covariances, self.process_cov, gamma, self.subspace
+        )
+        for name, value in zip(model._fields, model, strict=True):
+            self.register_buffer(f"transition_{name}", value, persistent=False)
+
+    log_prior: Tensor
+    means: Tensor
+    covariances: Tensor
+    process_cov: Tensor
+    initial_cov: Tensor
+    gamma: Tensor | None
+    transition_matrix: Tensor
+    transition_offset: Tensor
+    transition_noise: Tensor
+
+    def _initial_cov(self, initial_cov: Tensor | None, n_components: int) -> Tensor:
+        if initial_cov is None:
+            return self.covariances
+        if initial_cov.ndim == 3:
+            check_shape("initial_cov", initial_cov, [n_components, self.dim, self.dim])
+            return as_covariance("initial_cov", initial_cov, self.dim, 3)
+        cov = as_covariance("initial_cov", initial_cov, self.dim)
+        return cov.expand(n_components, -1, -1).contiguous()
+
+    def transition(self, time: int) -> Transition:
+        """The transition into frame `time` (0-based), with the inflated Q of the burn-in."""
+        if time >= self.burn_in:
+            return Transition(self.transition_matrix, self.transition_offset, self.transition_noise)
+        scale = self.burn_in_scale ** (1 - time / self.burn_in)
+        return make_transition(
+            self.transition_kind,
+            self.means,
+            self.covariances,
+            self.process_cov * scale,
+            self.gamma,
+            self.subspace,
+        )
+
+    def init(self, batch_size: int, generator: Generators = None) -> MKFState:
+        """Tracks at the component means, weighted by pi; sampled tracks draw their component."""
+        if batch_size < 1:
+            raise InputError(f"batch_size must be at least 1, got {batch_size}")
+        if self.tracks == "sampled":
+            return sampled_tracks.init(self, batch_size, generator)
+        device = self.means.device
+        return MKFState(
+            normalise(self.log_prior).to(self.dtype).expand(batch_size, -1),
+            self.means.to(self.dtype).expand(batch_size, -1, -1),
+            self.initial_cov[None],
+            torch.zeros(batch_size, dtype=torch.long, device=device),
+            0,
+        )
+
+    def advance(
+        self, state: MKFState, frame: Measurements, generator: Generators, return_cov: bool
+    ) -> tuple[MKFState, StepOutput]:
+        """One step; see `RecursiveFilter.step`."""
+        if self.tracks == "sampled":
+            return sampled_tracks.advance(self, state, frame, generator, return_cov)
+        if self.tracks == "split":
+            return split_tracks.advance(self, state, frame, return_cov)
+        return fixed_tracks.advance(self, state, frame, return_cov)
+
+    def run(
+        self, frames: Measurements, generator: Generators, return_cov: bool, progress: bool
+    ) -> FilterOutput:
+        """All frames: fixed tracks share their gains and need no loop where those are constant."""
+        if self.tracks == "fixed":
+            return fixed_tracks.run(self, frames, return_cov, progress)
+        return super().run(frames, generator, return_cov, progress)
+
+    def smooth(
+        self,
+        z: Float[Tensor, "B T Z"],
+        mask: Bool[Tensor, "B T Z"] | None = None,
+        measurement_cov: Tensor | None = None,
+        lengths: Int[Tensor, " B"] | None = None,
+        lag: int | None = None,
+        return_cov: bool = False,
+    ) -> FilterOutput:
+        """Estimates that use later measurements too; fixed tracks only.
+
+        Args:
+            z, mask, measurement_cov, lengths, return_cov: as `forward`.
+            lag: number of later frames that each estimate may use; None is the whole sequence.
+
+        Returns:
+            `FilterOutput` with smoothed mean, weights and covariance, and the filter's log-evidence.
+
+        Raises:
+            InputError: tracks are not fixed, or lag is negative; else as `forward`.
+
+        Reference:
+            H. Rauch, F. Tung, C. Striebel (1965); see `smooth_fixed_tracks`.
+        """
+        if self.tracks != "fixed":
+            raise InputError(
+                f"smoothing needs tracks='fixed', whose tracks have a past each, got {self.tracks!r}"
+            )
+        frames = self.check(z, mask, measurement_cov, lengths, None)
+        return smooth_fixed_tracks(self, frames, lag, return_cov)
+
+    def gain_graph(self, measurement_cov: Tensor) -> GainGraph:
+        """The graph of gains for constant R, kept while model and R stay as they are."""
+        graph = self._graph
+        fresh = graph is None or graph.full()
+        if (
+            fresh
+            or graph is None
+            or graph.transition.matrix is not self.transition_matrix
+            or graph.nodes[0] is not self.initial_cov
+            or not torch.equal(graph.measurement_cov, measurement_cov)
+        ):
+            graph = GainGraph(
+                self.transition(self.burn_in), self.observed, measurement_cov, self.initial_cov
+            )
+            self._graph = graph
+        return graph
+
+    def extra_repr(self) -> str:
+        """Main settings, for printing."""
+        return (
+            f"tracks={self.tracks}, n_tracks={self.n_tracks}, dim={self.dim}, "
+            f"observed={self.observed.tolist()}, transition={self.transition_kind}"
+        )
+
+
+def _check_options(
+    tracks: str, n_tracks: int | None, n_components: int, uniform_weight: float, transition: str
+) -> None:
+    if tracks not in TRACKS:
+        raise InputError(f"tracks must be one of {', '.join(TRACKS)}, got {tracks!r}")
+    if transition not in TRANSITIONS:
+        raise InputError(f"transition must be one of {', '.join(TRANSITIONS)}, got {transition!r}")
+    if n_tracks is not None and n_tracks < 1:
+        raise InputError(f"n_tracks must be at least 1, got {n_tracks}")
+    if tracks == "fixed" and n_tracks not in (None, n_components):
+        raise InputError(
+            f"fixed tracks are one for each of the {n_components} components, got "
+            f"n_tracks={n_tracks}; leave it out, or use tracks='sampled'"
+        )
+    if not (uniform_weight >= 0 and math.isfinite(uniform_weight)):
+        raise InputError(f"uniform_weight must be at least 0, got {uniform_weight}")

@@ -1,0 +1,255 @@
+"""Smoothing of fixed tracks: over the whole sequence, or with a fixed lag.
+
+Inside a track, Rauch-Tung-Striebel; over the tracks, forward-backward on the indicator. The states of
+different tracks are not mixed, so this is an approximation when the indicator changes.
+"""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.errors import InputError
+from torchpose.filters.base import FilterOutput, Measurements, finish_output
+from torchpose.filters.fixed_tracks import distinct_histories
+from torchpose.filters.tracks import MKFState, estimate_of
+from torchpose.filters.weights import mix_uniform, normalise, step_weights
+from torchpose.gaussian import kalman_correct, kalman_gain, safe_cholesky, symmetrise
+
+if TYPE_CHECKING:
+    from torchpose.filters.mkf import MixtureKalmanFilter
+
+__all__ = ["indicator_transition", "smooth_fixed_tracks"]
+
+_BUFFER_NUMBERS = 1 << 26  # numbers held for one part of the batch: half a gigabyte
+
+
+class _Pass(NamedTuple):
+    """A forward pass, time first.
+
+    Attributes:
+        mean: filtered track means [T, B, M, D]. correction: filtered minus predicted [T, B, M, D].
+        log_likelihood: [T, B, M]. log_evidence: of the filter [T, B].
+        cov, predicted_cov: per frame, [G, M, D, D]. group: per frame, row for each element [B].
+    """
+
+    mean: Tensor
+    correction: Tensor
+    log_likelihood: Tensor
+    log_evidence: Tensor
+    cov: list[Tensor]
+    predicted_cov: list[Tensor]
+    group: list[Tensor]
+
+
+def indicator_transition(log_prior: Float[Tensor, " M"], epsilon: float) -> Float[Tensor, "M M"]:
+    """T_ij prop. to ((1 - e) delta_ij + e / M) pi_j, rows normalised, e = M eps / (1 + M eps).
+
+    The Markov chain of indicators that the uniform weight epsilon (paper, after BL 49) stands for.
+    """
+    n_tracks = log_prior.numel()
+    share = n_tracks * epsilon / (1 + n_tracks * epsilon)
+    stay = torch.eye(n_tracks, dtype=log_prior.dtype, device=log_prior.device)
+    rows = ((1 - share) * stay + share / n_tracks) * log_prior.exp()
+    return rows / rows.sum(1, keepdim=True)
+
+
+def smooth_fixed_tracks(
+    model: "MixtureKalmanFilter", frames: Measurements, lag: int | None, return_cov: bool
+) -> FilterOutput:
+    """Estimates given all measurements of a sequence, or those up to `lag` frames later.
+
+    m_t|n = m_t + C_t (m_t+1|n - m^_t+1),  C_t = P_t F^T P^_t+1^-1,
+    P_t|n = P_t + C_t (P_t+1|n - P^_t+1) C_t^T  in each track; weights by forward-backward with
+    `indicator_transition`.
+
+    Args:
+        model: a filter with fixed tracks. frames: checked measurements.
+        lag: number of later frames that an estimate may use; None is all.
+        return_cov: whether to return covariances.
+
+    Raises:
+        InputError: lag below 0.
+    """
+    if lag is not None and lag < 0:
+        raise InputError(f"lag must be at least 0 frames, or None for the whole sequence, got {lag}")
+    batch, n_frames, _ = frames.z.shape
+    n_tracks, dim = model.means.shape
+    per_sequence = n_frames * n_tracks * dim * (3 * dim if return_cov else 4)
+    part = max(1, _BUFFER_NUMBERS // per_sequence)
+    outputs = []
+    for first in range(0, batch, part):
+        rows = slice(first, first + part)
+        cov = frames.cov if frames.cov.ndim == 2 else frames.cov[rows]
+        piece = Measurements(frames.z[rows], frames.mask[rows], cov, frames.lengths[rows])
+        outputs.append(_smooth(model, piece, lag, return_cov))
+    merged = [torch.cat(values) for values in zip(*(o[:3] for o in outputs), strict=True)]
+    covs = torch.cat([o[3] for o in outputs]) if return_cov else None
+    return finish_output(*merged, covs, frames.lengths)
+
+
+def _smooth(
+    model: "MixtureKalmanFilter", frames: Measurements, lag: int | None, return_cov: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    past = _forward(model, frames, return_cov)
+    n_frames = frames.z.shape[1]
+    reach = n_frames - 1 if lag is None else min(lag, n_frames - 1)
+    gains = _smoother_gains(model, past)
+    later = torch.arange(1, n_frames + 1, device=frames.z.device) < frames.lengths[:, None]
+    means = past.mean + _mean_corrections(past, gains, later.mT, reach)
+    log_weights = _smoothed_weights(model, past.log_likelihood, later.mT, reach)
+    covs = _smoothed_covs(past, gains, later, reach) if return_cov else None
+    estimates, totals = [], []
+    for t in range(n_frames):
+        cov = None if covs is None else covs[t][past.group[t]]
+        estimate, total = estimate_of(log_weights[t], means[t], cov)
+        estimates.append(estimate)
+        totals.append(total)
+    total = torch.stack(totals, 1) if return_cov else None
+    evidence = past.log_evidence.mT
+    return torch.stack(estimates, 1), log_weights.transpose(0, 1), evidence, total
+
+
+def _forward(model: "MixtureKalmanFilter", frames: Measurements, by_length: bool) -> _Pass:
+    """Filter, and keep what the backward pass needs."""
+    state = model.init(frames.z.shape[0])
+    if by_length:
+        # Smoothed covariances depend on where a sequence ends: lengths make histories distinct.
+        lengths, group = torch.unique(frames.lengths, return_inverse=True)
+        state = state._replace(cov=state.cov.expand(lengths.numel(), -1, -1, -1), group=group)
+    log_prior = model.log_prior.to(model.dtype)
+    kept: list[list[Tensor]] = [[] for _ in _Pass._fields]
+    for t in range(frames.z.shape[1]):
+        frame = frames.frame(t)
+        matrix, offset, noise = model.transition(t)
+        cov, group, mask, noise_cov = distinct_histories(state, frame)
+        predicted_cov = symmetrise(matrix @ cov @ matrix.mT + noise)
+        gain, cov = kalman_gain(predicted_cov, noise_cov, model.observed, mask)
+        predicted = (matrix.to(model.dtype) @ state.mean[..., None])[..., 0] + offset.to(model.dtype)
+        gain = type(gain)(*(g.to(model.dtype)[group] for g in gain))
+        mean, log_likelihood = kalman_correct(
+            predicted, frame.z[:, None], gain, model.observed, frame.mask[:, None]
+        )
+        log_weights, evidence = step_weights(
+            state.log_weights, log_prior, log_likelihood, model.reset_below
+        )
+        evidence = torch.where(frame.mask.any(-1), evidence, torch.zeros_like(evidence))
+        values = (mean, mean - predicted, log_likelihood, evidence, cov, predicted_cov, group)
+        for store, value in zip(kept, values, strict=True):
+            store.append(value)
+        log_weights = mix_uniform(log_weights, model.uniform_weight)
+        state = MKFState(log_weights, mean, cov, group, t + 1)
+    return _Pass(*(torch.stack(store) for store in kept[:4]), *kept[4:])
+
+
+def _smoother_gains(model: "MixtureKalmanFilter", past: _Pass) -> list[Tensor]:
+    """C_t for t = 0..T-2, in the groups of frame t+1, [G, M, D, D]."""
+    gains = []
+    for t in range(len(past.cov) - 1):
+        matrix = model.transition(t + 1).matrix
+        cov = past.cov[t][_parents(past.group[t], past.group[t + 1])]
+        factor = safe_cholesky(past.predicted_cov[t + 1])
+        gains.append(torch.cholesky_solve(matrix @ cov, factor).mT)
+    return gains
+
+
+def _parents(group: Tensor, following: Tensor) -> Tensor:
+    """The group of frame t that each group of frame t+1 came from."""
+    parents = torch.zeros(int(following.max()) + 1, dtype=torch.long, device=group.device)
+    parents[following] = group
+    return parents
+
+
+def _mean_corrections(past: _Pass, gains: list[Tensor], later: Tensor, reach: int) -> Tensor:
+    """m_t|t+reach - m_t by Horner's rule: e_t = C_t (d_t+1 + e_t+1), from e = 0, [T, B, M, D].
+
+    With a short reach all frames take each of the `reach` steps at once; with a long one a single
+    pass backwards over time is cheaper, and the same when the reach is the whole sequence.
+    """
+    dtype = past.mean.dtype
+    total = torch.zeros_like(past.mean)
+    n_frames = past.mean.shape[0]
+    if reach >= n_frames - 1:
+        for t in range(n_frames - 2, -1, -1):
+            step = past.correction[t + 1] + total[t + 1]
+            gain = gains[t][past.group[t + 1]].to(dtype)
+            moved = (gain @ step[..., None])[..., 0]
+            total[t] = torch.where(later[t][:, None, None], moved, torch.zeros_like(moved))
+        return total
+    for _ in range(reach):
+        following = torch.zeros_like(total)
+        for t in range(n_frames - 1):
+            step = past.correction[t + 1] + total[t + 1]
+            gain = gains[t][past.group[t + 1]].to(dtype)
+            moved = (gain @ step[..., None])[..., 0]
+            following[t] = torch.where(later[t][:, None, None], moved, torch.zeros_like(moved))
+        total = following
+    return total
+
+
+def _smoothed_weights(
+    model: "MixtureKalmanFilter", log_likelihood: Tensor, later: Tensor, reach: int
+) -> Tensor:
+    """log w_t|t+reach, [T, B, M]."""
+    transition = indicator_transition(model.log_prior, model.uniform_weight)
+    transition = transition.to(log_likelihood.dtype)
+    n_frames = log_likelihood.shape[0]
+    start = mix_uniform(normalise(model.log_prior), model.uniform_weight)
+    alpha = start.to(log_likelihood.dtype).expand(log_likelihood.shape[1], -1)
+    forward = []
+    for frame in log_likelihood:
+        alpha = normalise(_log_matmul(alpha, transition) + frame)
+        forward.append(alpha)
+    beta = torch.zeros_like(log_likelihood)
+    if reach >= n_frames - 1:
+        for t in range(n_frames - 2, -1, -1):
+            step = _log_matmul(log_likelihood[t + 1] + beta[t + 1], transition.mT)
+            beta[t] = torch.where(later[t][:, None], step, torch.zeros_like(step))
+    else:
+        for _ in range(reach):
+            step = _log_matmul(log_likelihood[1:] + beta[1:], transition.mT)
+            step = torch.where(later[:-1][..., None], step, torch.zeros_like(step))
+            beta = torch.cat([step, torch.zeros_like(beta[-1:])])
+    return normalise(torch.stack(forward) + beta)
+
+
+def _log_matmul(log_rows: Tensor, matrix: Tensor) -> Tensor:
+    """log(exp(log_rows) @ matrix), safe against overflow."""
+    top = log_rows.amax(-1, keepdim=True)
+    product = (log_rows - top).exp() @ matrix
+    floor = torch.finfo(product.dtype).tiny
+    return product.clamp_min(floor).log() + top
+
+
+def _smoothed_covs(past: _Pass, gains: list[Tensor], later: Tensor, reach: int) -> list[Tensor]:
+    """P_t|t+reach in the groups of the last frame, which are the finest, per frame [G, M, D, D]."""
+    n_frames = len(past.cov)
+    finest = past.group[-1]
+    first = _parents(torch.arange(finest.numel(), device=finest.device), finest)
+    at = [group[first] for group in past.group]
+    for t in range(n_frames):
+        past.group[t] = finest
+    covs = [past.cov[t][at[t]] for t in range(n_frames)]
+    predicted = [past.predicted_cov[t][at[t]] for t in range(n_frames)]
+    smoother = [gains[t][at[t + 1]] for t in range(n_frames - 1)]
+    reachable = later[first]
+    if reach >= n_frames - 1:
+        for t in range(n_frames - 2, -1, -1):
+            covs[t] = _smooth_cov(covs[t], covs[t + 1], predicted[t + 1], smoother[t], reachable[:, t])
+        return covs
+    current = covs
+    for _ in range(reach):
+        following = [
+            _smooth_cov(covs[t], current[t + 1], predicted[t + 1], smoother[t], reachable[:, t])
+            for t in range(n_frames - 1)
+        ]
+        current = [*following, covs[-1]]
+    return current
+
+
+def _smooth_cov(
+    cov: Tensor, later_cov: Tensor, predicted: Tensor, gain: Tensor, reachable: Tensor
+) -> Tensor:
+    smoothed = symmetrise(cov + gain @ (later_cov - predicted) @ gain.mT)
+    return torch.where(reachable[:, None, None, None], smoothed, cov)

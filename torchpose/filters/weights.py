@@ -1,0 +1,138 @@
+"""Weights and evidence of fixed tracks, one step at a time or a whole sequence at once."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+__all__ = ["mix_uniform", "normalise", "sequence_weights", "step_weights"]
+
+
+def normalise(log_weights: Float[Tensor, "*batch M"]) -> Float[Tensor, "*batch M"]:
+    """Log-weights whose exponentials sum to one."""
+    return log_weights - torch.logsumexp(log_weights, -1, keepdim=True)
+
+
+def mix_uniform(log_weights: Float[Tensor, "*batch M"], epsilon: float) -> Float[Tensor, "*batch M"]:
+    """w <- (w + epsilon) / (1 + M epsilon), in logarithms (paper, after BL 49)."""
+    if epsilon == 0:
+        return log_weights
+    total = 1 + log_weights.shape[-1] * epsilon
+    floor = torch.full_like(log_weights, math.log(epsilon / total))
+    return torch.logaddexp(log_weights - math.log(total), floor)
+
+
+def step_weights(
+    log_weights: Float[Tensor, "*batch M"],
+    log_prior: Float[Tensor, " M"],
+    log_likelihood: Float[Tensor, "*batch M"],
+    reset_below: float | None = None,
+) -> tuple[Float[Tensor, "*batch M"], Float[Tensor, "*batch"]]:
+    """One update of the track weights (BL 49).
+
+    a_j prop. to pi_j w_{t-1,j}, normalised before the likelihood;
+    log p(z_t | z_1:t-1) = logsumexp_j(log a_j + log N_j);   w_j prop. to a_j N_j.
+
+    Args:
+        log_weights: log w_{t-1}, epsilon already mixed in. log_prior: log pi.
+        log_likelihood: log N_j. reset_below: weights go back to pi where
+            logsumexp(log pi_j + log w_j + log N_j) is below this, as in the authors' released code,
+            whose linear weights then are all zero.
+
+    Returns:
+        log w_t, normalised [..., M], and the increment of the log-evidence [...].
+    """
+    joint = normalise(log_weights + log_prior) + log_likelihood
+    log_evidence = torch.logsumexp(joint, -1)
+    new = joint - log_evidence[..., None]
+    if reset_below is not None:
+        mass = torch.logsumexp(log_weights + log_prior + log_likelihood, -1, keepdim=True)
+        new = torch.where(mass < reset_below, normalise(log_prior).expand_as(new), new)
+    return new, log_evidence
+
+
+def sequence_weights(
+    log_weights: Float[Tensor, "B M"],
+    log_prior: Float[Tensor, " M"],
+    log_likelihood: Float[Tensor, "T B M"],
+    epsilon: float,
+    reset_below: float | None = None,
+) -> tuple[Float[Tensor, "T B M"], Float[Tensor, "T B"], Float[Tensor, "B M"]]:
+    """`step_weights` over T frames, time first.
+
+    Without epsilon the weights are a cumulative sum. With it they are a linear recursion,
+    alpha_t = N_t pi (c_1 alpha_{t-1} + c_2 sum alpha_{t-1}), which runs on scaled linear numbers:
+    epsilon keeps every predicted weight above c_2 pi_j, so nothing is lost to underflow.
+
+    Returns:
+        log w_t before epsilon [T, B, M], log-evidence increments [T, B], and the log-weights that
+        the next frame starts from, with epsilon [B, M].
+    """
+    differentiable = torch.is_grad_enabled() and (
+        log_likelihood.requires_grad or log_prior.requires_grad or log_weights.requires_grad
+    )
+    safe = epsilon == 0 or _steps_between_rescaling(log_prior, epsilon) >= 1
+    if differentiable or reset_below is not None or not safe:
+        return _stepwise(log_weights, log_prior, log_likelihood, epsilon, reset_below)
+    if epsilon == 0:
+        estimate, evidence = _cumulative(log_weights, log_prior, log_likelihood)
+    else:
+        estimate, evidence = _scaled_linear(log_weights, log_prior, log_likelihood, epsilon)
+    return estimate, evidence, mix_uniform(estimate[-1], epsilon)
+
+
+def _stepwise(
+    log_weights: Tensor,
+    log_prior: Tensor,
+    log_likelihood: Tensor,
+    epsilon: float,
+    reset_below: float | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    estimates, evidences = [], []
+    for frame in log_likelihood:
+        estimate, evidence = step_weights(log_weights, log_prior, frame, reset_below)
+        estimates.append(estimate)
+        evidences.append(evidence)
+        log_weights = mix_uniform(estimate, epsilon)
+    return torch.stack(estimates), torch.stack(evidences), log_weights
+
+
+def _cumulative(
+    log_weights: Tensor, log_prior: Tensor, log_likelihood: Tensor
+) -> tuple[Tensor, Tensor]:
+    joint = (log_prior + log_likelihood).cumsum(0) + log_weights
+    predicted = joint - log_likelihood
+    mass = torch.logsumexp(joint, -1)
+    return joint - mass[..., None], mass - torch.logsumexp(predicted, -1)
+
+
+def _steps_between_rescaling(log_prior: Tensor, epsilon: float) -> int:
+    smallest = math.log(epsilon) + float(log_prior.detach().min()) - math.log(log_prior.numel())
+    return int(min(32, 600 // max(-smallest, 1e-9)))
+
+
+def _scaled_linear(
+    log_weights: Tensor, log_prior: Tensor, log_likelihood: Tensor, epsilon: float
+) -> tuple[Tensor, Tensor]:
+    n_tracks = log_prior.numel()
+    top = log_likelihood.amax(-1, keepdim=True)
+    likelihood = (log_likelihood - top).exp_()
+    prior = log_prior.exp()
+    total = 1 + n_tracks * epsilon
+    mixing = torch.full((n_tracks, n_tracks), epsilon / total, dtype=prior.dtype).to(prior.device)
+    mixing.diagonal().add_(1 / total)
+    # Column j of the transition carries pi_j, so one product gives pi_j (c_1 alpha_j + c_2 sum alpha).
+    transition = mixing * prior
+    predicted = torch.empty_like(log_likelihood)
+    alpha = log_weights.exp()
+    every = _steps_between_rescaling(log_prior, epsilon)
+    for t, (now, frame) in enumerate(zip(predicted.unbind(), likelihood.unbind(), strict=True)):
+        torch.mm(alpha, transition, out=now) if t else torch.mul(alpha, prior, out=now)
+        alpha = now * frame
+        if t % every == every - 1:
+            alpha /= alpha.sum(-1, keepdim=True)
+    log_predicted = normalise(predicted.log_())
+    joint = log_predicted + log_likelihood
+    evidence = torch.logsumexp(joint, -1)
+    return joint - evidence[..., None], evidence
