@@ -264,9 +264,7 @@ def sigma_points(
     points = torch.cat(
         [mean[..., None, :], mean[..., None, :] + spread, mean[..., None, :] - spread], -2
     )
-    weights = torch.full(
-        (2 * dim + 1,), 0.5 / (dim + kappa), dtype=mean.dtype, device=mean.device
-    )
+    weights = torch.full((2 * dim + 1,), 0.5 / (dim + kappa), dtype=mean.dtype, device=mean.device)
     weights[0] = kappa / (dim + kappa)
     return points, weights
 

@@ -68,7 +68,9 @@ def dense_posterior(models, mean0, cov0, observed, noise_cov, z, mask):
     return mean.reshape(n_frames, dim), diagonal, log_evidence
 
 
-def enumerate_trajectories(weights, means, covs, models_of, observed, noise_cov, z, mask, chain=None):
+def enumerate_trajectories(
+    weights, means, covs, models_of, observed, noise_cov, z, mask, chain=None
+):
     """Exact posterior mean at each frame, given all frames, over every trajectory of indicators.
 
     Args:

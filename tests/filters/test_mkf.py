@@ -49,7 +49,9 @@ class Problem:
 
     def models(self):
         """(F, b, N) of each component."""
-        return [paper_transition(m, c, self.process) for m, c in zip(self.means, self.covs, strict=True)]
+        return [
+            paper_transition(m, c, self.process) for m, c in zip(self.means, self.covs, strict=True)
+        ]
 
 
 def online(model, z, mask, **options):
@@ -122,7 +124,11 @@ def test_sampled_tracks_agree_with_split_tracks_within_monte_carlo_error():
     exact = p.filter(tracks="split", n_tracks=32)(z, mask)
     model = p.filter(tracks="sampled", n_tracks=400)
     runs = 40
-    out = model(z.expand(runs, -1, -1), mask.expand(runs, -1, -1), generator=torch.Generator().manual_seed(0))
+    out = model(
+        z.expand(runs, -1, -1),
+        mask.expand(runs, -1, -1),
+        generator=torch.Generator().manual_seed(0),
+    )
     error = out.mean.std(0) / runs**0.5
     bias = out.mean.mean(0) - exact.mean[0]
     assert (bias.abs() < 4.5 * error + 1e-3).all()
@@ -167,7 +173,9 @@ def test_a_batch_of_different_lengths_equals_single_calls(tracks):
     generators = [torch.Generator().manual_seed(b) for b in range(12)]
     out = model(z, mask, lengths=lengths, generator=generators)
     for b, n in enumerate(lengths.tolist()):
-        alone = model(z[b : b + 1, :n], mask[b : b + 1, :n], generator=torch.Generator().manual_seed(b))
+        alone = model(
+            z[b : b + 1, :n], mask[b : b + 1, :n], generator=torch.Generator().manual_seed(b)
+        )
         for name in ("mean", "log_weights", "log_evidence"):
             ours, theirs = getattr(out, name)[b, :n], getattr(alone, name)[0]
             torch.testing.assert_close(ours, theirs, rtol=1e-10, atol=1e-10)
@@ -320,7 +328,9 @@ def test_smoothing_a_batch_of_different_lengths_equals_single_calls():
     for lag in (None, 4):
         out = p.filter().smooth(z, mask, lengths=lengths, lag=lag, return_cov=True)
         for b, n in enumerate(lengths.tolist()):
-            alone = p.filter().smooth(z[b : b + 1, :n], mask[b : b + 1, :n], lag=lag, return_cov=True)
+            alone = p.filter().smooth(
+                z[b : b + 1, :n], mask[b : b + 1, :n], lag=lag, return_cov=True
+            )
             for ours, theirs in zip(out[:4], alone[:4], strict=True):
                 torch.testing.assert_close(ours[b, :n], theirs[0], rtol=1e-10, atol=1e-10)
 

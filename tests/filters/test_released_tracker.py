@@ -48,7 +48,10 @@ def test_means_and_weights_are_those_of_the_released_code(video, side, online):
     else:
         out = model(z)
         mean, weights = out.mean[0], out.log_weights[0].exp()
-    for ours, theirs in ((mean, reference[f"{side}_mean"]), (weights, reference[f"{side}_weights"])):
+    for ours, theirs in (
+        (mean, reference[f"{side}_mean"]),
+        (weights, reference[f"{side}_weights"]),
+    ):
         error = np.abs(ours.numpy() - theirs) / np.maximum(np.abs(theirs), 1)
         assert error.max() < 1e-6
 
@@ -56,7 +59,9 @@ def test_means_and_weights_are_those_of_the_released_code(video, side, online):
 def test_weights_reset_to_the_prior_when_all_of_them_vanish():
     folder = data_dir_or_skip("signer")
     model = released_filter(folder, "left", reset_below=float(np.log(np.finfo(float).tiny)))
-    z = tensor(np.load(folder / "reference_fixed_tracks_video_000.npz")["left_measurements"])[None, :9]
+    z = tensor(np.load(folder / "reference_fixed_tracks_video_000.npz")["left_measurements"])[
+        None, :9
+    ]
     lost = z.clone()
     lost[:, 5] += 1e4  # no component explains this frame within double precision
     out = model(lost)

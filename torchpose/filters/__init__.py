@@ -2,11 +2,16 @@
 
 from torchpose.filters.base import FilterOutput, RecursiveFilter, StepOutput
 from torchpose.filters.mkf import MixtureKalmanFilter, MKFState
+from torchpose.filters.particle import BootstrapParticleFilter, ParticleState
+from torchpose.filters.resampling import resample
 
 __all__ = [
+    "BootstrapParticleFilter",
     "FilterOutput",
     "MKFState",
     "MixtureKalmanFilter",
+    "ParticleState",
     "RecursiveFilter",
     "StepOutput",
+    "resample",
 ]

@@ -157,7 +157,11 @@ class RecursiveFilter(nn.Module):
     """
 
     def __init__(
-        self, measurement_cov: Tensor, observed: Sequence[int] | Tensor, dim: int, dtype: torch.dtype
+        self,
+        measurement_cov: Tensor,
+        observed: Sequence[int] | Tensor,
+        dim: int,
+        dtype: torch.dtype,
     ) -> None:
         super().__init__()
         index = torch.as_tensor(observed, dtype=torch.long)

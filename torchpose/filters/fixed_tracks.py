@@ -39,7 +39,11 @@ def advance(
         mean, frame.z[:, None], gain, model.observed, frame.mask[:, None]
     )
     log_weights, log_evidence = step_weights(
-        state.log_weights, model.log_prior.to(model.dtype), log_likelihood, model.reset_below
+        state.log_weights,
+        model.log_prior.to(model.dtype),
+        log_likelihood,
+        model.likelihood_power,
+        model.reset_below,
     )
     log_evidence = torch.where(frame.mask.any(-1), log_evidence, torch.zeros_like(log_evidence))
     estimate, total = estimate_of(log_weights, mean, cov[group] if return_cov else None)
@@ -48,7 +52,9 @@ def advance(
     return new_state, StepOutput(estimate, log_weights, log_evidence, total)
 
 
-def distinct_histories(state: MKFState, frame: Measurements) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def distinct_histories(
+    state: MKFState, frame: Measurements
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Covariances, groups, masks and noise for the distinct histories of this frame."""
     if frame.cov.ndim == 3:
         own = torch.arange(frame.z.shape[0], device=frame.z.device)
@@ -80,8 +86,8 @@ def run(
 
 
 def _needs_plain_loop(model: "MixtureKalmanFilter", frames: Measurements) -> bool:
-    tensors = (frames.z, frames.cov, model.transition_matrix, model.transition_noise)
-    tensors += (model.log_prior, model.means, model.initial_cov, model.transition_offset)
+    tensors = [frames.z, frames.cov, model.transition_matrix, model.transition_noise]
+    tensors += [model.log_prior, model.means, model.initial_cov, model.transition_offset]
     learning = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     return learning or frames.cov.ndim == 4 or model.burn_in > 0
 
@@ -116,8 +122,9 @@ def _history(model: "MixtureKalmanFilter", frames: Measurements) -> _History | N
         first = (nodes[0], row[0])
         same = len(keys) == 1
         steady.append(nodes[0] if same and graph.is_steady(*first) else -1)
-        edges.append([found[first]] if same else [found[key] for key in zip(nodes, row)])
-        nodes = [found[key].target for key in zip(nodes, row)]
+        taken = [found[key] for key in zip(nodes, row, strict=True)]
+        edges.append(taken[:1] if same else taken)
+        nodes = [edge.target for edge in taken]
     return _History(graph, edges, steady, group)
 
 
@@ -152,7 +159,12 @@ def _run_shared(
         log_likelihood = tracks.log_likelihood.permute(1, 3, 2, 0).flatten(0, 1)
         span = slice(done, done + len(log_likelihood))
         posteriors[span], evidences[span], log_weights = sequence_weights(
-            log_weights, log_prior, log_likelihood, model.uniform_weight, model.reset_below
+            log_weights,
+            log_prior,
+            log_likelihood,
+            model.uniform_weight,
+            model.likelihood_power,
+            model.reset_below,
         )
         mixed = posteriors[span].exp()
         shares = mixed.view(*tracks.deviation.shape[1:4:2], batch, -1).permute(3, 0, 2, 1)
@@ -265,16 +277,15 @@ def _frame_gains(
     model: "MixtureKalmanFilter", history: _History, t: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """L^-1, W and the likelihood's constant of frame t: [M, ...], or [M, B, ...] if they differ."""
-    edges = history.edges[t]
+    edges, dtype = history.edges[t], model.dtype
     if len(edges) == 1:
         edge = edges[0]
-        gains = (edge.inverse_factor, edge.white, edge.log_norm[:, None])
-    else:
-        gains = tuple(
-            torch.stack([getattr(edge, name) for edge in edges], 1)[:, history.group]
-            for name in ("inverse_factor", "white", "log_norm")
-        )
-    return tuple(g.to(model.dtype) for g in gains)
+        log_norm = edge.log_norm[:, None].to(dtype)
+        return edge.inverse_factor.to(dtype), edge.white.to(dtype), log_norm
+    inverse = torch.stack([edge.inverse_factor for edge in edges], 1)[:, history.group]
+    white = torch.stack([edge.white for edge in edges], 1)[:, history.group]
+    log_norm = torch.stack([edge.log_norm for edge in edges], 1)[:, history.group]
+    return inverse.to(dtype), white.to(dtype), log_norm.to(dtype)
 
 
 def _covariances(tracks: _Stretch, means: Tensor, weights: Tensor, mean: Tensor) -> Tensor:

@@ -79,8 +79,7 @@ class GainGraph:
             edge = self.edge(node, pattern)
             gains = (edge.inverse_factor, edge.white, self.transition.matrix)
             model = block_model(*gains, means, self.observed, length)
-            cast = [v.to(dtype) if isinstance(v, Tensor) else v for v in model]
-            self._blocks[key] = BlockModel(*cast)
+            self._blocks[key] = BlockModel(length, *(part.to(dtype) for part in model[1:]))
         return self._blocks[key]
 
     def _make(self, node: int, pattern: int) -> Edge:

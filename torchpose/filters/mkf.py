@@ -58,6 +58,8 @@ class MixtureKalmanFilter(RecursiveFilter):
         resample_threshold: share of M, only for sampled tracks.
         burn_in: number of frames over which Q starts inflated by `burn_in_scale` and decays to
             itself geometrically (paper section 3.3, after BL 26). 0 is no burn-in.
+        likelihood_power: exponent of the likelihood in the weights of fixed tracks; 1 as published,
+            below 1 where the components are surer of themselves than they should be.
         reset_below: fixed tracks only; see `step_weights`.
         dtype: of means and measurements; covariances are always float64.
 
@@ -98,12 +100,15 @@ class MixtureKalmanFilter(RecursiveFilter):
         resample_threshold: float = 0.5,
         burn_in: int = 0,
         burn_in_scale: float = 100.0,
+        likelihood_power: float = 1.0,
         reset_below: float | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__(measurement_cov, observed, prior.means.shape[-1], dtype)
         n_components = prior.means.shape[0]
         _check_options(tracks, n_tracks, n_components, uniform_weight, transition)
+        if not 0 < likelihood_power <= 1:
+            raise InputError(f"likelihood_power must lie in (0, 1], got {likelihood_power}")
         self.tracks = tracks
         self.n_tracks = n_tracks or n_components
         self.uniform_weight = float(uniform_weight) if tracks == "fixed" else 0.0
@@ -112,6 +117,7 @@ class MixtureKalmanFilter(RecursiveFilter):
         self.resample_threshold = resample_threshold
         self.burn_in = burn_in
         self.burn_in_scale = burn_in_scale
+        self.likelihood_power = float(likelihood_power)
         self.reset_below = reset_below
         self._graph: GainGraph | None = None
         if gamma is not None:
@@ -129,7 +135,12 @@ class MixtureKalmanFilter(RecursiveFilter):
         self.register_buffer("process_cov", process_cov.to(prior.means.device))
         self.register_buffer("gamma", gamma)
         model = make_transition(
-            self.transition_kind, self.means, self.covariances, self.process_cov, gamma, self.subspace
+            self.transition_kind,
+            self.means,
+            self.covariances,
+            self.process_cov,
+            gamma,
+            self.subspace,
         )
         for name, value in zip(model._fields, model, strict=True):
             self.register_buffer(f"transition_{name}", value, persistent=False)

@@ -61,9 +61,7 @@ def advance(
     )
 
 
-def _draw_components(
-    model: "MixtureKalmanFilter", batch: int, generator: Generators
-) -> Tensor:
+def _draw_components(model: "MixtureKalmanFilter", batch: int, generator: Generators) -> Tensor:
     cumulative = model.log_prior.exp().cumsum(0)
     draws = uniform(batch, (model.n_tracks,), generator, cumulative)
     return torch.searchsorted(cumulative, draws).clamp_max(cumulative.numel() - 1)

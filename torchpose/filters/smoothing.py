@@ -13,9 +13,9 @@ from torch import Tensor
 from torchpose.errors import InputError
 from torchpose.filters.base import FilterOutput, Measurements, finish_output
 from torchpose.filters.fixed_tracks import distinct_histories
-from torchpose.filters.tracks import MKFState, estimate_of
+from torchpose.filters.tracks import MKFState, within_and_between
 from torchpose.filters.weights import mix_uniform, normalise, step_weights
-from torchpose.gaussian import kalman_correct, kalman_gain, safe_cholesky, symmetrise
+from torchpose.gaussian import Gain, kalman_correct, kalman_gain, safe_cholesky, symmetrise
 
 if TYPE_CHECKING:
     from torchpose.filters.mkf import MixtureKalmanFilter
@@ -73,7 +73,9 @@ def smooth_fixed_tracks(
         InputError: lag below 0.
     """
     if lag is not None and lag < 0:
-        raise InputError(f"lag must be at least 0 frames, or None for the whole sequence, got {lag}")
+        raise InputError(
+            f"lag must be at least 0 frames, or None for the whole sequence, got {lag}"
+        )
     batch, n_frames, _ = frames.z.shape
     n_tracks, dim = model.means.shape
     per_sequence = n_frames * n_tracks * dim * (3 * dim if return_cov else 4)
@@ -81,12 +83,15 @@ def smooth_fixed_tracks(
     outputs = []
     for first in range(0, batch, part):
         rows = slice(first, first + part)
-        cov = frames.cov if frames.cov.ndim == 2 else frames.cov[rows]
-        piece = Measurements(frames.z[rows], frames.mask[rows], cov, frames.lengths[rows])
+        noise = frames.cov if frames.cov.ndim == 2 else frames.cov[rows]
+        piece = Measurements(frames.z[rows], frames.mask[rows], noise, frames.lengths[rows])
         outputs.append(_smooth(model, piece, lag, return_cov))
-    merged = [torch.cat(values) for values in zip(*(o[:3] for o in outputs), strict=True)]
-    covs = torch.cat([o[3] for o in outputs]) if return_cov else None
-    return finish_output(*merged, covs, frames.lengths)
+    mean = torch.cat([out[0] for out in outputs])
+    log_weights = torch.cat([out[1] for out in outputs])
+    evidence = torch.cat([out[2] for out in outputs])
+    parts = [out[3] for out in outputs if out[3] is not None]
+    cov = torch.cat(parts) if parts else None
+    return finish_output(mean, log_weights, evidence, cov, frames.lengths)
 
 
 def _smooth(
@@ -100,15 +105,14 @@ def _smooth(
     means = past.mean + _mean_corrections(past, gains, later.mT, reach)
     log_weights = _smoothed_weights(model, past.log_likelihood, later.mT, reach)
     covs = _smoothed_covs(past, gains, later, reach) if return_cov else None
-    estimates, totals = [], []
-    for t in range(n_frames):
-        cov = None if covs is None else covs[t][past.group[t]]
-        estimate, total = estimate_of(log_weights[t], means[t], cov)
-        estimates.append(estimate)
-        totals.append(total)
-    total = torch.stack(totals, 1) if return_cov else None
+    estimate = (log_weights.exp()[:, :, None] @ means)[:, :, 0]
+    total = None
+    if covs is not None:
+        finest = past.group[-1]
+        frames_of = zip(log_weights.exp(), means, estimate, covs, strict=True)
+        total = torch.stack([within_and_between(w, m, e, c[finest]) for w, m, e, c in frames_of], 1)
     evidence = past.log_evidence.mT
-    return torch.stack(estimates, 1), log_weights.transpose(0, 1), evidence, total
+    return estimate.transpose(0, 1), log_weights.transpose(0, 1), evidence, total
 
 
 def _forward(model: "MixtureKalmanFilter", frames: Measurements, by_length: bool) -> _Pass:
@@ -119,28 +123,35 @@ def _forward(model: "MixtureKalmanFilter", frames: Measurements, by_length: bool
         lengths, group = torch.unique(frames.lengths, return_inverse=True)
         state = state._replace(cov=state.cov.expand(lengths.numel(), -1, -1, -1), group=group)
     log_prior = model.log_prior.to(model.dtype)
-    kept: list[list[Tensor]] = [[] for _ in _Pass._fields]
+    means, corrections, likelihoods, evidences = [], [], [], []
+    covs, predicted_covs, groups = [], [], []
     for t in range(frames.z.shape[1]):
         frame = frames.frame(t)
         matrix, offset, noise = model.transition(t)
         cov, group, mask, noise_cov = distinct_histories(state, frame)
         predicted_cov = symmetrise(matrix @ cov @ matrix.mT + noise)
         gain, cov = kalman_gain(predicted_cov, noise_cov, model.observed, mask)
-        predicted = (matrix.to(model.dtype) @ state.mean[..., None])[..., 0] + offset.to(model.dtype)
-        gain = type(gain)(*(g.to(model.dtype)[group] for g in gain))
+        predicted = (matrix.to(model.dtype) @ state.mean[..., None])[..., 0] + offset.to(
+            model.dtype
+        )
+        gain = Gain(*(part.to(model.dtype)[group] for part in gain))
         mean, log_likelihood = kalman_correct(
             predicted, frame.z[:, None], gain, model.observed, frame.mask[:, None]
         )
         log_weights, evidence = step_weights(
-            state.log_weights, log_prior, log_likelihood, model.reset_below
+            state.log_weights, log_prior, log_likelihood, model.likelihood_power, model.reset_below
         )
-        evidence = torch.where(frame.mask.any(-1), evidence, torch.zeros_like(evidence))
-        values = (mean, mean - predicted, log_likelihood, evidence, cov, predicted_cov, group)
-        for store, value in zip(kept, values, strict=True):
-            store.append(value)
-        log_weights = mix_uniform(log_weights, model.uniform_weight)
-        state = MKFState(log_weights, mean, cov, group, t + 1)
-    return _Pass(*(torch.stack(store) for store in kept[:4]), *kept[4:])
+        means.append(mean)
+        corrections.append(mean - predicted)
+        likelihoods.append(log_likelihood)
+        evidences.append(torch.where(frame.mask.any(-1), evidence, torch.zeros_like(evidence)))
+        covs.append(cov)
+        predicted_covs.append(predicted_cov)
+        groups.append(group)
+        carried = mix_uniform(log_weights, model.uniform_weight)
+        state = MKFState(carried, mean, cov, group, t + 1)
+    stacked = [torch.stack(values) for values in (means, corrections, likelihoods, evidences)]
+    return _Pass(stacked[0], stacked[1], stacked[2], stacked[3], covs, predicted_covs, groups)
 
 
 def _smoother_gains(model: "MixtureKalmanFilter", past: _Pass) -> list[Tensor]:
@@ -164,28 +175,34 @@ def _parents(group: Tensor, following: Tensor) -> Tensor:
 def _mean_corrections(past: _Pass, gains: list[Tensor], later: Tensor, reach: int) -> Tensor:
     """m_t|t+reach - m_t by Horner's rule: e_t = C_t (d_t+1 + e_t+1), from e = 0, [T, B, M, D].
 
-    With a short reach all frames take each of the `reach` steps at once; with a long one a single
-    pass backwards over time is cheaper, and the same when the reach is the whole sequence.
+    With a short reach all frames take each of the `reach` steps at once; when the reach is the
+    whole sequence a single pass backwards over time gives the same.
     """
-    dtype = past.mean.dtype
     total = torch.zeros_like(past.mean)
     n_frames = past.mean.shape[0]
     if reach >= n_frames - 1:
         for t in range(n_frames - 2, -1, -1):
             step = past.correction[t + 1] + total[t + 1]
-            gain = gains[t][past.group[t + 1]].to(dtype)
-            moved = (gain @ step[..., None])[..., 0]
+            moved = _pull_back(gains[t : t + 1], past.group[t + 1 : t + 2], step[None])[0]
             total[t] = torch.where(later[t][:, None, None], moved, torch.zeros_like(moved))
         return total
     for _ in range(reach):
-        following = torch.zeros_like(total)
-        for t in range(n_frames - 1):
-            step = past.correction[t + 1] + total[t + 1]
-            gain = gains[t][past.group[t + 1]].to(dtype)
-            moved = (gain @ step[..., None])[..., 0]
-            following[t] = torch.where(later[t][:, None, None], moved, torch.zeros_like(moved))
-        total = following
+        moved = _pull_back(gains, past.group[1:], past.correction[1:] + total[1:])
+        moved = torch.where(later[:-1][..., None, None], moved, torch.zeros_like(moved))
+        total = torch.cat([moved, torch.zeros_like(total[-1:])])
     return total
+
+
+def _pull_back(gains: list[Tensor], groups: list[Tensor], step: Tensor) -> Tensor:
+    """C_t step_t for each frame, [T, B, M, D]; gains are [G, M, D, D] in the groups given."""
+    if all(gain.shape[0] == 1 for gain in gains):
+        shared = torch.cat(gains).to(step.dtype)
+        return (shared @ step.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+    moved = [
+        (gain[group].to(step.dtype) @ frame[..., None])[..., 0]
+        for gain, group, frame in zip(gains, groups, step, strict=True)
+    ]
+    return torch.stack(moved)
 
 
 def _smoothed_weights(
@@ -194,6 +211,7 @@ def _smoothed_weights(
     """log w_t|t+reach, [T, B, M]."""
     transition = indicator_transition(model.log_prior, model.uniform_weight)
     transition = transition.to(log_likelihood.dtype)
+    log_likelihood = model.likelihood_power * log_likelihood
     n_frames = log_likelihood.shape[0]
     start = mix_uniform(normalise(model.log_prior), model.uniform_weight)
     alpha = start.to(log_likelihood.dtype).expand(log_likelihood.shape[1], -1)
@@ -228,28 +246,21 @@ def _smoothed_covs(past: _Pass, gains: list[Tensor], later: Tensor, reach: int) 
     finest = past.group[-1]
     first = _parents(torch.arange(finest.numel(), device=finest.device), finest)
     at = [group[first] for group in past.group]
-    for t in range(n_frames):
-        past.group[t] = finest
-    covs = [past.cov[t][at[t]] for t in range(n_frames)]
-    predicted = [past.predicted_cov[t][at[t]] for t in range(n_frames)]
-    smoother = [gains[t][at[t + 1]] for t in range(n_frames - 1)]
+    filtered = [cov[rows] for cov, rows in zip(past.cov, at, strict=True)]
+    predicted = [cov[rows] for cov, rows in zip(past.predicted_cov, at, strict=True)]
+    smoother = [gain[rows] for gain, rows in zip(gains, at[1:], strict=True)]
     reachable = later[first]
+
+    def pulled(t: int, following: Tensor) -> Tensor:
+        change = smoother[t] @ (following - predicted[t + 1]) @ smoother[t].mT
+        smoothed = symmetrise(filtered[t] + change)
+        return torch.where(reachable[:, t, None, None, None], smoothed, filtered[t])
+
+    current = list(filtered)
     if reach >= n_frames - 1:
         for t in range(n_frames - 2, -1, -1):
-            covs[t] = _smooth_cov(covs[t], covs[t + 1], predicted[t + 1], smoother[t], reachable[:, t])
-        return covs
-    current = covs
+            current[t] = pulled(t, current[t + 1])
+        return current
     for _ in range(reach):
-        following = [
-            _smooth_cov(covs[t], current[t + 1], predicted[t + 1], smoother[t], reachable[:, t])
-            for t in range(n_frames - 1)
-        ]
-        current = [*following, covs[-1]]
+        current = [*(pulled(t, current[t + 1]) for t in range(n_frames - 1)), filtered[-1]]
     return current
-
-
-def _smooth_cov(
-    cov: Tensor, later_cov: Tensor, predicted: Tensor, gain: Tensor, reachable: Tensor
-) -> Tensor:
-    smoothed = symmetrise(cov + gain @ (later_cov - predicted) @ gain.mT)
-    return torch.where(reachable[:, None, None, None], smoothed, cov)

@@ -14,7 +14,9 @@ def normalise(log_weights: Float[Tensor, "*batch M"]) -> Float[Tensor, "*batch M
     return log_weights - torch.logsumexp(log_weights, -1, keepdim=True)
 
 
-def mix_uniform(log_weights: Float[Tensor, "*batch M"], epsilon: float) -> Float[Tensor, "*batch M"]:
+def mix_uniform(
+    log_weights: Float[Tensor, "*batch M"], epsilon: float
+) -> Float[Tensor, "*batch M"]:
     """w <- (w + epsilon) / (1 + M epsilon), in logarithms (paper, after BL 49)."""
     if epsilon == 0:
         return log_weights
@@ -27,29 +29,38 @@ def step_weights(
     log_weights: Float[Tensor, "*batch M"],
     log_prior: Float[Tensor, " M"],
     log_likelihood: Float[Tensor, "*batch M"],
+    power: float = 1.0,
     reset_below: float | None = None,
 ) -> tuple[Float[Tensor, "*batch M"], Float[Tensor, "*batch"]]:
     """One update of the track weights (BL 49).
 
     a_j prop. to pi_j w_{t-1,j}, normalised before the likelihood;
-    log p(z_t | z_1:t-1) = logsumexp_j(log a_j + log N_j);   w_j prop. to a_j N_j.
+    log p(z_t | z_1:t-1) = logsumexp_j(log a_j + log N_j);   w_j prop. to a_j N_j^power.
 
     Args:
         log_weights: log w_{t-1}, epsilon already mixed in. log_prior: log pi.
-        log_likelihood: log N_j. reset_below: weights go back to pi where
-            logsumexp(log pi_j + log w_j + log N_j) is below this, as in the authors' released code,
-            whose linear weights then are all zero.
+        log_likelihood: log N_j. power: exponent of the likelihood in the weights, 1 as published.
+        reset_below: weights go back to pi where logsumexp(log pi_j + log w_j + log N_j) is below
+            this, as in the authors' released code, whose linear weights then are all zero.
 
     Returns:
         log w_t, normalised [..., M], and the increment of the log-evidence [...].
     """
-    joint = normalise(log_weights + log_prior) + log_likelihood
-    log_evidence = torch.logsumexp(joint, -1)
-    new = joint - log_evidence[..., None]
+    predicted = normalise(log_weights + log_prior)
+    new, log_evidence = _posterior(predicted, log_likelihood, power)
     if reset_below is not None:
         mass = torch.logsumexp(log_weights + log_prior + log_likelihood, -1, keepdim=True)
         new = torch.where(mass < reset_below, normalise(log_prior).expand_as(new), new)
     return new, log_evidence
+
+
+def _posterior(predicted: Tensor, log_likelihood: Tensor, power: float) -> tuple[Tensor, Tensor]:
+    """Normalised log-weights and log-evidence from predicted log-weights."""
+    joint = predicted + log_likelihood
+    log_evidence = torch.logsumexp(joint, -1)
+    if power == 1:
+        return joint - log_evidence[..., None], log_evidence
+    return normalise(predicted + power * log_likelihood), log_evidence
 
 
 def sequence_weights(
@@ -57,6 +68,7 @@ def sequence_weights(
     log_prior: Float[Tensor, " M"],
     log_likelihood: Float[Tensor, "T B M"],
     epsilon: float,
+    power: float = 1.0,
     reset_below: float | None = None,
 ) -> tuple[Float[Tensor, "T B M"], Float[Tensor, "T B"], Float[Tensor, "B M"]]:
     """`step_weights` over T frames, time first.
@@ -74,11 +86,12 @@ def sequence_weights(
     )
     safe = epsilon == 0 or _steps_between_rescaling(log_prior, epsilon) >= 1
     if differentiable or reset_below is not None or not safe:
-        return _stepwise(log_weights, log_prior, log_likelihood, epsilon, reset_below)
+        return _stepwise(log_weights, log_prior, log_likelihood, epsilon, power, reset_below)
     if epsilon == 0:
-        estimate, evidence = _cumulative(log_weights, log_prior, log_likelihood)
+        predicted = _cumulative(log_weights, log_prior, power * log_likelihood)
     else:
-        estimate, evidence = _scaled_linear(log_weights, log_prior, log_likelihood, epsilon)
+        predicted = _scaled_linear(log_weights, log_prior, power * log_likelihood, epsilon)
+    estimate, evidence = _posterior(predicted, log_likelihood, power)
     return estimate, evidence, mix_uniform(estimate[-1], epsilon)
 
 
@@ -87,37 +100,38 @@ def _stepwise(
     log_prior: Tensor,
     log_likelihood: Tensor,
     epsilon: float,
+    power: float,
     reset_below: float | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     estimates, evidences = [], []
     for frame in log_likelihood:
-        estimate, evidence = step_weights(log_weights, log_prior, frame, reset_below)
+        estimate, evidence = step_weights(log_weights, log_prior, frame, power, reset_below)
         estimates.append(estimate)
         evidences.append(evidence)
         log_weights = mix_uniform(estimate, epsilon)
     return torch.stack(estimates), torch.stack(evidences), log_weights
 
 
-def _cumulative(
-    log_weights: Tensor, log_prior: Tensor, log_likelihood: Tensor
-) -> tuple[Tensor, Tensor]:
+def _cumulative(log_weights: Tensor, log_prior: Tensor, log_likelihood: Tensor) -> Tensor:
+    """Predicted log-weights log a_t without epsilon."""
     joint = (log_prior + log_likelihood).cumsum(0) + log_weights
-    predicted = joint - log_likelihood
-    mass = torch.logsumexp(joint, -1)
-    return joint - mass[..., None], mass - torch.logsumexp(predicted, -1)
+    return normalise(joint - log_likelihood)
 
 
 def _steps_between_rescaling(log_prior: Tensor, epsilon: float) -> int:
-    smallest = math.log(epsilon) + float(log_prior.detach().min()) - math.log(log_prior.numel())
+    share = epsilon / (1 + log_prior.numel() * epsilon)
+    smallest = math.log(share) + float(log_prior.detach().min())
     return int(min(32, 600 // max(-smallest, 1e-9)))
 
 
 def _scaled_linear(
     log_weights: Tensor, log_prior: Tensor, log_likelihood: Tensor, epsilon: float
-) -> tuple[Tensor, Tensor]:
+) -> Tensor:
+    """Predicted log-weights log a_t with epsilon."""
     n_tracks = log_prior.numel()
     top = log_likelihood.amax(-1, keepdim=True)
-    likelihood = (log_likelihood - top).exp_()
+    # Exponentials that underflow are slow; e^-500 next to a sum of order one is nothing.
+    likelihood = (log_likelihood - top).clamp_min_(-500.0).exp_()
     prior = log_prior.exp()
     total = 1 + n_tracks * epsilon
     mixing = torch.full((n_tracks, n_tracks), epsilon / total, dtype=prior.dtype).to(prior.device)
@@ -128,11 +142,11 @@ def _scaled_linear(
     alpha = log_weights.exp()
     every = _steps_between_rescaling(log_prior, epsilon)
     for t, (now, frame) in enumerate(zip(predicted.unbind(), likelihood.unbind(), strict=True)):
-        torch.mm(alpha, transition, out=now) if t else torch.mul(alpha, prior, out=now)
+        if t:
+            torch.mm(alpha, transition, out=now)
+        else:
+            torch.mul(alpha, prior, out=now)
         alpha = now * frame
         if t % every == every - 1:
             alpha /= alpha.sum(-1, keepdim=True)
-    log_predicted = normalise(predicted.log_())
-    joint = log_predicted + log_likelihood
-    evidence = torch.logsumexp(joint, -1)
-    return joint - evidence[..., None], evidence
+    return normalise(predicted.log_())

@@ -1,0 +1,347 @@
+"""Bootstrap particle filters with the three proposals of Burke & Lasenby, section 3.3."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchpose.errors import InputError, check_shape
+from torchpose.filters.base import (
+    Generators,
+    Measurements,
+    RecursiveFilter,
+    StepOutput,
+    as_covariance,
+    effective_sample_size,
+    standard_normal,
+    uniform,
+)
+from torchpose.filters.resampling import RESAMPLING, resample
+from torchpose.filters.transition import TRANSITIONS, make_transition
+from torchpose.filters.walk import MixtureWalk, Moves, grouped_affine
+from torchpose.gaussian import LOG_2PI, safe_cholesky
+from torchpose.priors.gmm import GaussianMixture
+
+__all__ = ["PROPOSALS", "BootstrapParticleFilter", "ParticleState"]
+
+PROPOSALS = ("mixture", "random-walk", "random-walk-unscaled")
+
+
+class ParticleState(NamedTuple):
+    """Weighted particles after a step, before they are resampled.
+
+    Attributes:
+        white: particles [B, N, D] in the whitened coordinates of the filter; see
+            `BootstrapParticleFilter.particles`.
+        log_weights: normalised, [B, N], float64.
+        time: number of frames seen.
+        log_scaling: log sum_i pi_i c_i (BL 13) of the next step at each particle [B, N], which is
+            resampled along with it; only for the proposal "random-walk".
+    """
+
+    white: Tensor
+    log_weights: Tensor
+    time: int
+    log_scaling: Tensor | None
+
+
+class BootstrapParticleFilter(RecursiveFilter):
+    """Particle filter under the mixture of discrete Ornstein-Uhlenbeck processes.
+
+    Proposals and weights, w_t = w_{t-1} times
+
+    - ``mixture``: x_t from (BL 14): component i with probability proportional to
+      pi_i c_i(x_{t-1}), then N(mu_c^i, Sigma_c^i);  p(z_t | x_t)   (BL 23)
+    - ``random-walk``: x_t from N(x_{t-1}, Q);
+      p(z_t | x_t) Phi(x_t) / sum_i pi_i c_i(x_{t-1})   (BL 26)
+    - ``random-walk-unscaled``: the same without the division.
+
+    The first two have the same posterior. Particles are resampled at the start of a step when the
+    effective sample size (BL 25) of the step before fell below `resample_threshold` times N;
+    otherwise the old weights stay. Estimates are weighted means before resampling.
+
+    Log-evidence. With V_t proportional to W_{t-1} v_t, the normalised weights of the prediction (v_t
+    is the factor above without p(z_t | x_t), W_{t-1} the normalised old weights, uniform after
+    resampling), the increment is log sum_k V_t^k p(z_t | x_t^k): right whether or not step t - 1 was
+    resampled, and 0 where nothing is measured. For "mixture" V_t = W_{t-1}, and the evidence of a
+    sequence is an unbiased estimate. For "random-walk" sum_k W_{t-1}^k v_t^k estimates 1; dividing
+    by it costs a bias of order 1/N in exchange for a smaller variance, and keeps what a gap did to
+    the weights out of the next increment. For "random-walk-unscaled" it is NaN.
+
+    Args:
+        gmm: the prior Phi. process_cov: Q [D, D] or its diagonal [D], per frame.
+        measurement_cov: R [Z, Z] or its diagonal [Z]. observed: the Z state indices measured.
+        proposal: "mixture", "random-walk" or "random-walk-unscaled".
+        n_particles: N. resample_threshold: share of N, 0 (never) to 1 (always).
+        resampling: "systematic", "stratified", "multinomial" or "residual".
+        burn_in: number of frames over which Q starts inflated by `burn_in_scale` and decays to itself
+            geometrically, Q_t = scale^(1 - t / burn_in) Q. 0 is no burn-in.
+        initial_cov: the first particles are drawn from the prior, or if this is given ([D, D], [D]
+            or [K, D, D]) from sum_i pi_i N(mu_i, initial_cov), as the mixture Kalman filter starts.
+        transition, gamma, subspace: as `make_transition`. The random walks need "paper", from
+            which (BL 26) follows. For "stationary" and "ou", c_i = N(x_{t-1} | mu_i, Sigma_i), so
+            that the mixture of processes leaves Phi unchanged.
+        dtype: of the particles and of `log_weights` in the output. Covariances are factorised, and
+            weights and evidence summed, in float64; means and covariances are returned in float64.
+
+    Raises:
+        InputError, ShapeError, CovarianceError: an argument is not as described.
+
+    Reference:
+        Burke & Lasenby, section 3.3.
+
+    >>> gmm = GaussianMixture(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])
+    >>> tracker = BootstrapParticleFilter(gmm, torch.ones(2), torch.ones(1), [0], n_particles=100)
+    >>> out = tracker(torch.zeros(1, 3, 1), generator=torch.Generator().manual_seed(0))
+    >>> out.mean.shape, out.log_evidence.shape
+    (torch.Size([1, 3, 2]), torch.Size([1, 3]))
+    """
+
+    process_cov: Tensor
+    weights: Tensor
+    means: Tensor
+    covariances: Tensor
+    initial_matrix: Tensor
+    initial_offset: Tensor
+    steady_matrix: Tensor
+    steady_offset: Tensor
+    walk_factor: Tensor
+    gamma: Tensor | None
+
+    def __init__(
+        self,
+        gmm: GaussianMixture,
+        process_cov: Tensor,
+        measurement_cov: Tensor,
+        observed: Sequence[int] | Tensor,
+        proposal: str = "mixture",
+        n_particles: int = 10_000,
+        resample_threshold: float = 0.5,
+        resampling: str = "systematic",
+        burn_in: int = 0,
+        burn_in_scale: float = 100.0,
+        initial_cov: Tensor | None = None,
+        transition: str = "paper",
+        gamma: Tensor | float | None = None,
+        subspace: int | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        super().__init__(measurement_cov, observed, gmm.dim, dtype)
+        _check_options(proposal, n_particles, resample_threshold, resampling, dtype)
+        _check_model(proposal, transition, burn_in, burn_in_scale)
+        self.proposal, self.transition, self.subspace = proposal, transition, subspace
+        self.n_particles, self.resample_threshold = n_particles, resample_threshold
+        self.resampling = resampling
+        self.burn_in, self.burn_in_scale = burn_in, float(burn_in_scale)
+        device = gmm.means.device
+        self.to(device)
+        rate = None if gamma is None else torch.as_tensor(gamma, dtype=torch.float64).to(device)
+        process_cov = as_covariance("process_cov", process_cov, gmm.dim).to(device)
+        self.register_buffer("process_cov", process_cov.detach())
+        self.register_buffer("gamma", None if rate is None else rate.detach())
+        for name, value in zip(
+            ("weights", "means", "covariances"), gmm.parameters_tuple(), strict=True
+        ):
+            self.register_buffer(name, value.detach().double())
+        self.walk = MixtureWalk(gmm, self.process_cov, dtype)
+        self._register_constants(initial_cov)
+
+    @torch.no_grad()
+    def _register_constants(self, initial_cov: Tensor | None) -> None:
+        spread = self.covariances
+        if initial_cov is not None:
+            per_component = initial_cov.ndim == 3
+            spread = as_covariance("initial_cov", initial_cov, self.dim, 3 if per_component else 2)
+            if per_component:
+                check_shape("initial_cov", spread, list(self.covariances.shape))
+            spread = spread.to(self.covariances).expand_as(self.covariances)
+        initial = self.walk.moves(torch.zeros_like(spread), self.means, spread)
+        steady = self._moves_at(1.0) if self.proposal == "mixture" else initial
+        whitener = torch.linalg.solve_triangular(
+            self.walk.scale, torch.eye(self.dim).to(spread), upper=False
+        )
+        walk_cov = whitener @ self.process_cov @ whitener.mT
+        constants = {
+            "initial_matrix": initial.matrix[:, self.dim :],
+            "initial_offset": initial.offset,
+            "steady_matrix": steady.matrix,
+            "steady_offset": steady.offset,
+            "walk_factor": safe_cholesky(walk_cov).mT.contiguous().to(self.dtype),
+        }
+        for name, value in constants.items():
+            self.register_buffer(name, value, persistent=False)
+
+    def _moves_at(self, inflation: float) -> Moves:
+        cov = inflation * self.process_cov
+        kind = self.transition
+        parts = make_transition(kind, self.means, self.covariances, cov, self.gamma, self.subspace)
+        return self.walk.moves(*parts)
+
+    def inflation(self, time: int) -> float:
+        """Factor of Q in frame `time` (0-based): from `burn_in_scale` geometrically to 1."""
+        if time >= self.burn_in:
+            return 1.0
+        return self.burn_in_scale ** (1 - time / self.burn_in)
+
+    @torch.no_grad()
+    def init(self, batch_size: int, generator: Generators = None) -> ParticleState:
+        """Draw the particles before the first frame.
+
+        Args:
+            batch_size: B. generator: one generator, or a list of one for each element.
+        """
+        if batch_size < 1:
+            raise InputError(f"batch_size must be at least 1, got {batch_size}")
+        n, like = self.n_particles, self.initial_offset
+        u = uniform(batch_size, (n,), generator, like.new_empty(0, dtype=torch.float64))
+        noise = standard_normal(batch_size, (n, self.dim), generator, like)
+        edges = self.weights.cumsum(0)
+        component = torch.searchsorted(edges, u * edges[-1], right=True)
+        component = component.clamp_max(len(edges) - 1).view(-1)
+        moves = Moves(self.initial_matrix, self.initial_offset)
+        white = grouped_affine(noise.view(-1, self.dim), component, moves).view_as(noise)
+        log_weights = torch.full_like(u, -math.log(n))
+        scaling = self._prior_and_scaling(white, 0)[1] if self.proposal == "random-walk" else None
+        return ParticleState(white, log_weights, 0, scaling)
+
+    def particles(self, state: ParticleState) -> Float[Tensor, "B N D"]:
+        """The particles in the units of the state (pixels, metres, radians), float64."""
+        return self.walk.unwhiten(state.white)
+
+    @torch.no_grad()
+    def advance(
+        self, state: ParticleState, frame: Measurements, generator: Generators, return_cov: bool
+    ) -> tuple[ParticleState, StepOutput]:
+        """Resample if due, propose, weigh, and estimate."""
+        state = self._resample(state, generator)
+        white = self._propose(state, generator)
+        predicted = state.log_weights
+        scaling = None
+        if self.proposal != "mixture":
+            log_prior, scaling = self._prior_and_scaling(white, state.time + 1)
+            predicted = predicted + log_prior
+            if state.log_scaling is not None:
+                predicted = predicted - state.log_scaling
+            predicted = predicted - torch.logsumexp(predicted, -1, keepdim=True)
+        log_weights = predicted + self._log_likelihood(white, frame)
+        evidence = torch.logsumexp(log_weights, -1)
+        # An element whose weights all vanished, or hold NaN, is NaN from here on.
+        evidence = torch.where(torch.isfinite(evidence), evidence, torch.nan)
+        log_weights = log_weights - evidence[:, None]
+        mean, cov = self._moments(white, log_weights, return_cov)
+        new_state = ParticleState(white, log_weights, state.time + 1, scaling)
+        evidence = self._reported(evidence, frame.mask)
+        # kept for every frame by `forward`, so no wider than the particles
+        return new_state, StepOutput(mean, log_weights.to(self.dtype), evidence, cov)
+
+    def _resample(self, state: ParticleState, generator: Generators) -> ParticleState:
+        """Resample the elements whose effective sample size is low (BL 25); the others stay."""
+        n = self.n_particles
+        due = effective_sample_size(state.log_weights) < self.resample_threshold * n
+        # drawn for all: what an element draws must not depend on its neighbours
+        ancestors = resample(state.log_weights, self.resampling, generator)
+        if not bool(due.any()):
+            return state
+        own = torch.arange(n, device=ancestors.device)
+        ancestors = torch.where(due[:, None], ancestors, own)
+        first = torch.arange(len(due), device=ancestors.device)[:, None] * n
+        flat = (ancestors + first).view(-1)
+        white = state.white.view(-1, self.dim).index_select(0, flat).view_as(state.white)
+        log_weights = torch.where(due[:, None], -math.log(n), state.log_weights)
+        scaling = state.log_scaling
+        if scaling is not None:
+            scaling = scaling.view(-1).index_select(0, flat).view_as(scaling)
+        return state._replace(white=white, log_weights=log_weights, log_scaling=scaling)
+
+    def _propose(self, state: ParticleState, generator: Generators) -> Float[Tensor, "B N D"]:
+        batch, n, dim = state.white.shape
+        inflation = self.inflation(state.time)
+        noise = standard_normal(batch, (n, dim), generator, state.white)
+        if self.proposal != "mixture":
+            factor = self.walk_factor * math.sqrt(inflation)
+            return (state.white.view(-1, dim).addmm(noise.view(-1, dim), factor)).view_as(noise)
+        moves = Moves(self.steady_matrix, self.steady_offset)
+        if inflation != 1.0:
+            moves = self._moves_at(inflation)
+        u = uniform(batch, (n,), generator, state.white)
+        reach = inflation if self.transition == "paper" else 0.0
+        component = self.walk.choose(state.white, u, reach).view(-1)
+        rows = torch.cat([state.white, noise], -1).view(batch * n, 2 * dim)
+        return grouped_affine(rows, component, moves).view_as(noise)
+
+    def _prior_and_scaling(self, white: Tensor, time: int) -> tuple[Tensor, Tensor | None]:
+        """log Phi and, where it is used, the log evidence (BL 13) for the step from these points."""
+        if self.proposal == "random-walk-unscaled":
+            return self.walk.log_prior(white), None
+        return self.walk.log_prior_and_evidence(white, self.inflation(time))
+
+    def _log_likelihood(
+        self, white: Float[Tensor, "B N D"], frame: Measurements
+    ) -> Float[Tensor, "B N"]:
+        """log N(z | H x, R) (BL 15) over the measured dimensions, zero where there are none."""
+        mask, z = frame.mask, frame.z.double()
+        eye = torch.eye(z.shape[1], dtype=z.dtype, device=z.device)
+        factor = safe_cholesky(torch.where(mask[:, :, None] & mask[:, None, :], frame.cov, eye))
+        rows = self.walk.scale[self.observed] * mask[..., None]
+        target = torch.where(mask, z - self.walk.mean[self.observed], 0.0)
+        both = torch.cat([rows, target[..., None]], -1)
+        both = torch.linalg.solve_triangular(factor, both, upper=False).to(white.dtype)
+        residual = torch.baddbmm(both[:, None, :, -1], white, both[..., :-1].mT, alpha=-1)
+        log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        log_norm = -log_det - 0.5 * LOG_2PI * mask.sum(-1)
+        return log_norm[:, None] - 0.5 * residual.square().sum(-1)
+
+    def _reported(
+        self, evidence: Float[Tensor, " B"], mask: Bool[Tensor, "B Z"]
+    ) -> Float[Tensor, " B"]:
+        if self.proposal == "random-walk-unscaled":
+            return torch.full_like(evidence, torch.nan)
+        # without a measurement it is 0 up to rounding
+        return torch.where(mask.any(-1) | torch.isnan(evidence), evidence, 0.0)
+
+    def _moments(
+        self, white: Tensor, log_weights: Tensor, return_cov: bool
+    ) -> tuple[Float[Tensor, "B D"], Float[Tensor, "B D D"] | None]:
+        weights = log_weights.exp()[:, None].to(white.dtype)
+        white_mean = weights @ white
+        mean = self.walk.unwhiten(white_mean[:, 0])
+        if not return_cov:
+            return mean, None
+        spread = (white - white_mean) * weights.mT.sqrt()
+        cov = (spread.mT @ spread).double()
+        return mean, self.walk.scale @ cov @ self.walk.scale.mT
+
+
+def _check_options(
+    proposal: str, n_particles: int, threshold: float, resampling: str, dtype: torch.dtype
+) -> None:
+    if proposal not in PROPOSALS:
+        raise InputError(f"proposal must be one of {', '.join(PROPOSALS)}, got {proposal!r}")
+    if resampling not in RESAMPLING:
+        raise InputError(f"resampling must be one of {', '.join(RESAMPLING)}, got {resampling!r}")
+    if isinstance(n_particles, bool) or not isinstance(n_particles, int) or n_particles < 1:
+        raise InputError(f"n_particles must be a whole number of at least 1, got {n_particles!r}")
+    if not 0 <= threshold <= 1:
+        raise InputError(f"resample_threshold must be a share from 0 to 1, got {threshold}")
+    if dtype not in (torch.float32, torch.float64):
+        raise InputError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+
+
+def _check_model(proposal: str, transition: str, burn_in: int, burn_in_scale: float) -> None:
+    if transition not in TRANSITIONS:
+        raise InputError(f"transition must be one of {', '.join(TRANSITIONS)}, got {transition!r}")
+    if proposal != "mixture" and transition != "paper":
+        raise InputError(
+            f"proposal {proposal!r} weighs by (BL 26), which holds for transition 'paper' only, "
+            f"got {transition!r}; use proposal 'mixture'"
+        )
+    if burn_in and transition == "ou":
+        raise InputError("burn_in inflates Q, which transition 'ou' does not use; leave it at 0")
+    if burn_in < 0 or not (math.isfinite(burn_in_scale) and burn_in_scale > 0):
+        raise InputError(
+            "burn_in must be a number of frames >= 0 and burn_in_scale a positive factor of Q, "
+            f"got {burn_in} and {burn_in_scale}"
+        )

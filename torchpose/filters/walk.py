@@ -1,0 +1,230 @@
+"""The random walk of a state under a mixture prior: densities and moves for many particles at once.
+
+Everything happens in coordinates whitened by the mean and covariance of the whole prior. There the
+particles are of order one, so that float32 is enough for a prior whose scales span 1e-6 to 1e4.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from torchpose.gaussian import LOG_2PI, safe_cholesky
+from torchpose.priors.gmm import GaussianMixture
+
+__all__ = ["MixtureWalk", "Moves", "grouped_affine"]
+
+CHUNK_ELEMENTS = 630 * 512  # residuals per product: 1.3 MB in float32, so that they stay in cache
+TILE = 32
+NEGLIGIBLE = -80.0  # exp(-80) = 2e-35: no share of a sum, and not yet denormal in float32
+
+
+class Moves(NamedTuple):
+    """One affine map for each component: y' = [y, noise] @ matrix + offset.
+
+    Attributes:
+        matrix: [K, 2 D, D]. offset: [K, D].
+    """
+
+    matrix: Tensor
+    offset: Tensor
+
+
+class MixtureWalk(nn.Module):
+    """Prior density and random-walk evidence of a mixture, from one product of residuals.
+
+    In the generalised eigenbasis E_i of (Sigma_i, Q), with E_i E_i^T = Sigma_i and
+    E_i diag(l_i) E_i^T = Q, the residuals r = E_i^-1 (x - mu_i) serve both densities:
+
+    log N(x | mu_i, Sigma_i)         = -1/2 sum_d r_d^2             - log det E_i - D/2 log 2 pi
+    log N(x | mu_i, Sigma_i + s Q)   = -1/2 sum_d r_d^2 / (1 + s l) - 1/2 sum_d log(1 + s l) - ...
+
+    so that Phi(x) (BL 7) and the evidence sum_i pi_i c_i(x) (BL 10, 13) cost one product, also
+    while a burn-in inflates Q by s. Points are whitened, y = L^-1 (x - m), with L L^T the
+    covariance of the whole mixture; log densities are those of y.
+
+    Args:
+        gmm: the prior Phi.
+        process_cov: Q [D, D], float64.
+        dtype: of points and densities, torch.float32 or torch.float64.
+    """
+
+    mean: Tensor
+    scale: Tensor
+    rows: Tensor
+    ratio: Tensor
+    log_norm: Tensor
+
+    def __init__(self, gmm: GaussianMixture, process_cov: Tensor, dtype: torch.dtype) -> None:
+        super().__init__()
+        self.n_components, self.dim = gmm.n_components, gmm.dim
+        for name, value in _diagonalise(gmm, process_cov, dtype).items():
+            self.register_buffer(name, value, persistent=False)
+
+    def whiten(self, x: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D"]:
+        """y = L^-1 (x - m), computed in float64 and returned in the dtype of the walk."""
+        centred = (x.double() - self.mean)[..., None]
+        white = torch.linalg.solve_triangular(self.scale, centred, upper=False)
+        return white[..., 0].to(self.rows.dtype)
+
+    def unwhiten(self, y: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D"]:
+        """x = m + L y, in float64."""
+        return self.mean + y.double() @ self.scale.mT
+
+    def log_prior(self, y: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch"]:
+        """log Phi (BL 7) at every whitened point."""
+        weights = torch.ones_like(self._shrink(0.0))[:, None]
+        out = y.new_empty(y[..., 0].numel())
+        for start, terms in self._terms(y, weights, self.log_norm[None]):
+            out[start : start + terms.shape[-1]] = _log_sum_exp_(terms[0])
+        return out.view(y.shape[:-1])
+
+    def log_prior_and_evidence(
+        self, y: Float[Tensor, "*batch D"], inflation: float = 1.0
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+        """log Phi (BL 7) and log sum_i pi_i c_i (BL 10, 13) at every point.
+
+        Args:
+            y: whitened points. inflation: factor s of Q.
+        """
+        shrink = self._shrink(inflation)
+        weights = torch.stack([torch.ones_like(shrink), shrink], 1)
+        constant = torch.stack([self.log_norm, self._log_norm(inflation)])
+        out = y.new_empty(2, y[..., 0].numel())
+        for start, terms in self._terms(y, weights, constant):
+            out[:, start : start + terms.shape[-1]] = _log_sum_exp_(terms)
+        return out[0].view(y.shape[:-1]), out[1].view(y.shape[:-1])
+
+    def choose(
+        self, y: Float[Tensor, "*batch D"], u: Float[Tensor, "*batch"], inflation: float = 1.0
+    ) -> Int[Tensor, "*batch"]:
+        """Draw a component for every point with probability proportional to pi_i c_i(y) (BL 14).
+
+        Args:
+            y: whitened points. u: a uniform number for each. inflation: factor s of Q; with 0 the
+                probabilities are the responsibilities under the prior itself.
+        """
+        weights = self._shrink(inflation)[:, None]
+        constant = self._log_norm(inflation)[None]
+        out = torch.empty(u.numel(), dtype=torch.long, device=y.device)
+        triangle = torch.ones(self.n_components, self.n_components, dtype=y.dtype, device=y.device)
+        triangle, u = triangle.tril(), u.reshape(-1)
+        for start, terms in self._terms(y, weights, constant):
+            stop = start + terms.shape[-1]
+            logits = terms[0]
+            # a product with a triangle is a cumulative sum, three times as fast
+            edges = triangle @ _exp_(logits.sub_(logits.amax(0)))
+            out[start:stop] = (edges <= u[start:stop] * edges[-1]).sum(0)
+        return out.clamp_max_(self.n_components - 1).view(y.shape[:-1])
+
+    def moves(
+        self,
+        transition: Float[Tensor, "K D D"],
+        offset: Float[Tensor, "K D"],
+        noise: Float[Tensor, "K D D"],
+    ) -> Moves:
+        """The map of every component, x' = F x + b + N(0, N), for whitened points."""
+        matrix = torch.linalg.solve_triangular(self.scale, transition @ self.scale, upper=False)
+        centred = (transition @ self.mean + offset - self.mean)[..., None]
+        shift = torch.linalg.solve_triangular(self.scale, centred, upper=False)[..., 0]
+        half = torch.linalg.solve_triangular(self.scale, noise, upper=False)
+        factor = safe_cholesky(torch.linalg.solve_triangular(self.scale, half.mT, upper=False))
+        dtype = self.rows.dtype
+        return Moves(torch.cat([matrix.mT, factor.mT], 1).to(dtype), shift.to(dtype))
+
+    def _shrink(self, inflation: float) -> Float[Tensor, "K D"]:
+        return (1 / (1 + inflation * self.ratio)).to(self.rows.dtype)
+
+    def _log_norm(self, inflation: float) -> Float[Tensor, " K"]:
+        return self.log_norm - 0.5 * torch.log1p(inflation * self.ratio).sum(-1)
+
+    def _terms(
+        self, y: Tensor, weights: Float[Tensor, "K S D"], constant: Float[Tensor, "S K"]
+    ) -> Iterator[tuple[int, Float[Tensor, "S K n"]]]:
+        """Log terms of S mixtures, for chunks of points whose residuals stay in cache."""
+        points = y.reshape(-1, self.dim)
+        # the row of ones carries the offset: cheaper than adding it to every residual
+        points = torch.cat([points.T, points.new_ones(1, len(points))])
+        constant = constant.to(y.dtype)[..., None]
+        n_rows = len(self.rows)
+        budget = CHUNK_ELEMENTS if points.device.type == "cpu" else 64 * CHUNK_ELEMENTS
+        size = min(max(1, budget // n_rows), points.shape[1])
+        # one buffer for all chunks: fresh pages would cost more than the product
+        buffer = points.new_empty(n_rows * size)
+        for start in range(0, points.shape[1], size):
+            chunk = points[:, start : start + size]
+            residual = buffer[: n_rows * chunk.shape[1]].view(n_rows, -1)
+            torch.mm(self.rows, chunk, out=residual)
+            squared = residual.square_().view(self.n_components, self.dim, -1)
+            quadratic = torch.bmm(weights, squared).transpose(0, 1)
+            yield start, torch.add(constant, quadratic, alpha=-0.5)
+
+
+def grouped_affine(
+    x: Float[Tensor, "n E"], group: Int[Tensor, " n"], moves: Moves
+) -> Float[Tensor, "n D"]:
+    """x @ matrix[group] + offset[group], without a copy of the matrix for every row.
+
+    Rows are sorted by group into tiles of 32 that hold one group each, so one batched product of at
+    most n / 32 + K tiles does the work, however uneven the groups are.
+
+    Args:
+        x: rows [n, E]. group: the map of each row, in 0..K-1. moves: matrix [K, E, D], offset [K, D].
+    """
+    n, n_groups = len(group), len(moves.offset)
+    order = group.argsort()
+    count = torch.bincount(group, minlength=n_groups)
+    tiles = (count + TILE - 1) // TILE
+    last_tile, last_row = tiles.cumsum(0), count.cumsum(0)
+    # from the place of a row in the sorted order to its place in the padded tiles
+    padding = (last_tile - tiles) * TILE - (last_row - count)
+    slot = torch.empty_like(order)
+    slot[order] = torch.arange(n, device=x.device) + padding[group[order]]
+    n_tiles = n // TILE + n_groups
+    source = torch.zeros(n_tiles * TILE, dtype=torch.long, device=x.device)
+    source[slot] = torch.arange(n, device=x.device)
+    owner = torch.searchsorted(last_tile, torch.arange(n_tiles, device=x.device), right=True)
+    owner = owner.clamp_max(n_groups - 1)
+    rows = x.index_select(0, source).view(n_tiles, TILE, -1)
+    out = torch.baddbmm(
+        moves.offset.index_select(0, owner)[:, None], rows, moves.matrix.index_select(0, owner)
+    )
+    return out.view(n_tiles * TILE, -1).index_select(0, slot)
+
+
+def _log_sum_exp_(terms: Float[Tensor, "*batch K n"]) -> Float[Tensor, "*batch n"]:
+    """log sum exp over K, in place; torch.logsumexp takes three times as long."""
+    top = terms.amax(-2, keepdim=True).clamp_min_(torch.finfo(terms.dtype).min)
+    return _exp_(terms.sub_(top)).sum(-2).log_().add_(top.squeeze(-2))
+
+
+def _exp_(terms: Tensor) -> Tensor:
+    """exp in place of numbers of which the largest is 0; denormal results would be slow."""
+    return terms.clamp_min_(NEGLIGIBLE).exp_()
+
+
+@torch.no_grad()
+def _diagonalise(
+    gmm: GaussianMixture, process_cov: Tensor, dtype: torch.dtype
+) -> dict[str, Tensor]:
+    weights, means, covariances = (p.detach().double() for p in gmm.parameters_tuple())
+    mean = weights @ means
+    centred = means - mean
+    total = torch.einsum("k,kij->ij", weights, covariances)
+    scale = safe_cholesky(total + torch.einsum("k,ki,kj->ij", weights, centred, centred))
+    factor = safe_cholesky(covariances)
+    eye = torch.eye(gmm.dim, dtype=torch.float64, device=means.device)
+    inverse = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
+    ratio, basis = torch.linalg.eigh(inverse @ process_cov @ inverse.mT)
+    rows = basis.mT @ inverse @ scale  # E_i^-1 L, for whitened points
+    shift = basis.mT @ (inverse @ centred[..., None])
+    log_det = scale.diagonal().log().sum() - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return {
+        "mean": mean,
+        "scale": scale,
+        "rows": torch.cat([rows, -shift], -1).reshape(-1, gmm.dim + 1).to(dtype).contiguous(),
+        "ratio": ratio.clamp_min(0),
+        "log_norm": weights.log() + log_det - 0.5 * gmm.dim * LOG_2PI,
+    }
