@@ -1,0 +1,52 @@
+"""Learned priors over body states: Gaussian mixtures, their fit, and the pair of both arms."""
+
+from torchpose.priors.arm_state import arm_state, arm_states, mirror_arm_state, mirror_mixture
+from torchpose.priors.density import FastMixtureDensity
+from torchpose.priors.em import (
+    FitReport,
+    MixtureParameters,
+    SufficientStatistics,
+    e_step,
+    expectation_maximisation,
+    m_step,
+)
+from torchpose.priors.gmm import ConditionedMixture, GaussianMixture
+from torchpose.priors.model_card import model_card, write_model_card
+from torchpose.priors.neck import NeckOffset, learn_neck_offset, place_neck
+from torchpose.priors.prior_file import PriorInfo
+from torchpose.priors.training import TRAINING_VIEWS, collect_poses, training_states
+from torchpose.priors.upper_body import (
+    UpperBodyPrior,
+    fit_upper_body_prior,
+    known_priors,
+    load_prior,
+)
+
+__all__ = [
+    "TRAINING_VIEWS",
+    "ConditionedMixture",
+    "FastMixtureDensity",
+    "FitReport",
+    "GaussianMixture",
+    "MixtureParameters",
+    "NeckOffset",
+    "PriorInfo",
+    "SufficientStatistics",
+    "UpperBodyPrior",
+    "arm_state",
+    "arm_states",
+    "collect_poses",
+    "e_step",
+    "expectation_maximisation",
+    "fit_upper_body_prior",
+    "known_priors",
+    "learn_neck_offset",
+    "load_prior",
+    "m_step",
+    "mirror_arm_state",
+    "mirror_mixture",
+    "model_card",
+    "place_neck",
+    "training_states",
+    "write_model_card",
+]

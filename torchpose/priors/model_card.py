@@ -1,0 +1,148 @@
+"""Model card of a prior, written from what its file says about itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from torchpose.io.files import atomic_path
+from torchpose.priors.upper_body import UpperBodyPrior
+
+__all__ = ["model_card", "write_model_card"]
+
+
+def model_card(prior: UpperBodyPrior, results: Mapping[str, str] | None = None) -> str:
+    """Markdown text on what a prior is, what it was fitted on, and what it is not good for.
+
+    Args:
+        prior: the prior.
+        results: lines of a table of results, value by what was measured. They have to come from
+            the same recipe fitted without the test persons.
+
+    Returns:
+        The card.
+    """
+    sections = {
+        "What it is": _description(prior),
+        "Fitted on": _data(prior),
+        "Conventions": _conventions(prior),
+        "Noise": _noise(prior),
+        "Results": _results(results or {}),
+        "Limits": _limits(prior),
+    }
+    body = [f"## {title}\n\n{text}\n" for title, text in sections.items() if text]
+    return f"# {prior.info.name or 'Upper-body prior'}\n\n" + "\n".join(body)
+
+
+def write_model_card(
+    prior: UpperBodyPrior, path: str | Path, results: Mapping[str, str] | None = None
+) -> None:
+    """Write `model_card` to a file, which appears whole or not at all.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_text(model_card(prior, results), encoding="utf-8")
+
+
+def _description(prior: UpperBodyPrior) -> str:
+    same = ", the right one the mirror image of the left one" if prior.info.mirrored else ""
+    return (
+        f"A Gaussian mixture with {prior.left.n_components} components for the left arm and "
+        f"{prior.right.n_components} for the right arm{same}, over (u, v, lambda) of hand, elbow, "
+        "shoulder, head and neck and the camera's roll, pitch, yaw and position, after Burke & "
+        "Lasenby (BL 7). Trackers use it to tell joints that are not measured, and depth, from "
+        "those that are."
+    )
+
+
+def _data(prior: UpperBodyPrior) -> str:
+    info = prior.info
+    rows: dict[str, Any] = {
+        "sources": _joined(info.sources),
+        "persons": f"{len(info.persons)}: {_joined(info.persons)}"
+        if info.persons
+        else "not stated",
+        "licence": info.licence or "not stated",
+        "recorded frames": f"{info.n_frames:,}" if info.n_frames else "not stated",
+        "training states per arm": f"{info.n_samples:,}" if info.n_samples else "not stated",
+        "viewpoints": _views(info.views),
+        "command": f"`{info.command}`" if info.command else "",
+    }
+    extra = info.extra
+    if "frames_left_out" in extra:
+        left_out = extra["frames_left_out"]
+        rows["frames left out for a missing joint"] = ", ".join(
+            f"{count:,} ({side} arm)" for side, count in left_out.items()
+        )
+    if "neck_offset" in extra:
+        residual = 100 * extra["neck_offset"]["residual"]
+        rows["necks converted"] = (
+            f"{extra['frames_with_converted_neck']:,} frames, to within {residual:.1f} cm "
+            "(root mean square on necks of the wanted kind)"
+        )
+    if "fit" in extra:
+        fit = extra["fit"]
+        rows["fit"] = (
+            f"mean log-likelihood {fit['log_likelihood']:.4f} after {fit['iterations']} iterations"
+            f"{'' if fit['converged'] else ' (not converged)'}, seed {extra.get('seed')}"
+        )
+    return _table(rows)
+
+
+def _conventions(prior: UpperBodyPrior) -> str:
+    info = prior.info
+    orders = {"zxy": "Rz(roll) Rx(pitch) Ry(yaw)", "zyx": "Rz(roll) Ry(yaw) Rx(pitch)"}
+    return _table(
+        {
+            "camera": f"fx {info.fx:g}, fy {info.fy:g}, centre ({info.cx:g}, {info.cy:g}) pixels",
+            "rotation": f"{info.rotation_order}: R = {orders[info.rotation_order]}",
+            "poses centred on": info.centre,
+            "kind of neck": info.neck or "not stated",
+            "kind of hand": info.hand or "not stated",
+            "frames per second": f"{info.fps:g}" if info.fps else "not stated",
+        }
+    )
+
+
+def _noise(prior: UpperBodyPrior) -> str:
+    if not prior.noise:
+        return ""
+    names = ", ".join(f"`{name}` {list(value.shape)}" for name, value in prior.noise.items())
+    return f"Learnt for the transition `{prior.info.transition}`: {names}."
+
+
+def _results(results: Mapping[str, str]) -> str:
+    if not results:
+        return ""
+    return "From the same recipe, fitted without the test persons.\n\n" + _table(results)
+
+
+def _limits(prior: UpperBodyPrior) -> str:
+    persons = len(prior.info.persons)
+    few = f"It knows {persons} person{'s' * (persons != 1)} and what they did. " if persons else ""
+    return (
+        f"{few}It is not to be scored on them. Persons of other build, seated persons, views from "
+        "the side or from behind and viewpoints outside the limits above are outside what it was "
+        "fitted on. It says nothing about who a person is."
+    )
+
+
+def _views(views: Mapping[str, Any]) -> str:
+    if not views:
+        return "not stated"
+    angles = ", ".join(f"|{a}| <= {math.degrees(views[a]):g}°" for a in ("roll", "pitch", "yaw"))
+    shifts = ", ".join(f"{t} {views[t][0]:g} to {views[t][1]:g} m" for t in ("tx", "ty", "tz"))
+    return f"{angles}, {shifts}"
+
+
+def _joined(items: Iterable[str]) -> str:
+    return "; ".join(items) or "not stated"
+
+
+def _table(rows: Mapping[str, Any]) -> str:
+    lines = [f"| {name} | {value} |" for name, value in rows.items() if value]
+    return "\n".join(["| | |", "|---|---|", *lines])

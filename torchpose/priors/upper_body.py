@@ -1,0 +1,341 @@
+"""Prior over the upper body: one Gaussian mixture per arm, and what it was fitted on."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchpose.camera import PinholeCamera, ViewRange
+from torchpose.errors import (
+    FileFormatError,
+    InputError,
+    OverlapError,
+    PriorError,
+    TorchposeError,
+    check_finite,
+)
+from torchpose.io.files import read_npz
+from torchpose.priors.arm_state import (
+    STATE_DIM,
+    arm_states,
+    check_rotation_order,
+    mirror_arm_state,
+    mirror_mixture,
+)
+from torchpose.priors.gmm import GaussianMixture
+from torchpose.priors.prior_file import PriorInfo, read_prior, require_tensor, write_prior
+from torchpose.priors.training import (
+    TRAINING_VIEWS,
+    RecordingLike,
+    collect_poses,
+    training_states,
+)
+
+__all__ = [
+    "TRAINING_VIEWS",
+    "PriorInfo",
+    "UpperBodyPrior",
+    "arm_states",
+    "fit_upper_body_prior",
+    "known_priors",
+    "load_prior",
+    "mirror_arm_state",
+    "mirror_mixture",
+]
+
+WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
+_KINECT_CAMERA = (525.0, 525.0, 319.5, 239.5)
+_SIDES = ("left", "right")
+_PARTS = ("weights", "means", "covariances")
+
+
+class UpperBodyPrior(nn.Module):
+    """Gaussian mixtures over the states of the left and the right arm (BL 7, section 3.1).
+
+    Args:
+        left, right: mixtures over the 21 dimensions of an arm's state (`arm_states`).
+        info: what they were fitted on, and in which conventions the states are.
+        noise: learnt noise as named tensors, such as process_cov_left, process_cov_right,
+            measurement_std, gamma or calibration. They become buffers and go into the file.
+
+    Raises:
+        PriorError: a mixture of another size.
+        InputError: noise that is not finite, or a name that is no identifier.
+    """
+
+    left: GaussianMixture
+    right: GaussianMixture
+
+    def __init__(
+        self,
+        left: GaussianMixture,
+        right: GaussianMixture,
+        info: PriorInfo | None = None,
+        noise: Mapping[str, Tensor] | None = None,
+    ) -> None:
+        super().__init__()
+        for side, mixture in zip(_SIDES, (left, right), strict=True):
+            if mixture.dim != STATE_DIM:
+                raise PriorError(
+                    f"the {side} mixture must be over the {STATE_DIM} dimensions of an arm's state, "
+                    f"got {mixture.dim}"
+                )
+        self.left, self.right = left, right
+        self.info = info or PriorInfo()
+        self._noise_names: list[str] = []
+        for name, value in (noise or {}).items():
+            self.set_noise(name, value)
+
+    @property
+    def noise(self) -> dict[str, Tensor]:
+        """Learnt noise by name."""
+        return {name: getattr(self, f"noise_{name}") for name in self._noise_names}
+
+    def set_noise(self, name: str, value: Tensor) -> None:
+        """Store a tensor of learnt noise under a name.
+
+        Raises:
+            InputError: not a finite floating-point tensor, or the name is no identifier.
+        """
+        if not name.isidentifier():
+            raise InputError(f"a name of noise must be an identifier, got {name!r}")
+        if not isinstance(value, Tensor) or not value.is_floating_point():
+            raise InputError(f"noise {name} must be a floating-point tensor, got {value!r:.60}")
+        check_finite(f"noise {name}", value)
+        self.register_buffer(f"noise_{name}", value)
+        if name not in self._noise_names:
+            self._noise_names.append(name)
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """The camera whose pixels the states are in."""
+        return self.info.camera
+
+    @property
+    def n_components(self) -> int:
+        """Number of Gaussians of the left arm."""
+        return self.left.n_components
+
+    def mirrored(self) -> UpperBodyPrior:
+        """Prior of the mirrored person: each arm is the mirror image of the other one.
+
+        Noise by side changes sides; `info` and the rest stay.
+        """
+        noise = {_other_side(name): value for name, value in self.noise.items()}
+        cx = self.info.cx
+        return UpperBodyPrior(
+            mirror_mixture(self.right, cx), mirror_mixture(self.left, cx), self.info, noise
+        )
+
+    def check_unseen(self, persons: Collection[str]) -> None:
+        """Raise `OverlapError` if the prior was fitted on one of these persons.
+
+        Args:
+            persons: ids, as `Recording.person_id`.
+        """
+        seen = sorted(set(persons) & set(self.info.persons))
+        if seen:
+            raise OverlapError(
+                f"the prior {self.info.name!r} was fitted on {', '.join(seen)}; score it on other "
+                "persons, or fit the same recipe without these"
+            )
+
+    def save(self, path: str | Path) -> None:
+        """Write the prior as safetensors; the file appears whole or not at all.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        tensors = {
+            f"{side}.{part}": getattr(getattr(self, side), part)
+            for side in _SIDES
+            for part in _PARTS
+        }
+        tensors |= {f"noise.{name}": value for name, value in self.noise.items()}
+        write_prior(path, self.info, tensors)
+
+    @classmethod
+    def load(cls, path: str | Path) -> UpperBodyPrior:
+        """Read a prior that `save` wrote; tensors come back in float64.
+
+        Raises:
+            InputError: no such file. FileFormatError: truncated, foreign, damaged, or of another
+                version. PriorError: other skeleton, unknown rotation order.
+        """
+        info, tensors = read_prior(path)
+        left, right = (_mixture(path, side, tensors) for side in _SIDES)
+        noise = {
+            key.removeprefix("noise."): value.to(torch.float64)
+            for key, value in sorted(tensors.items())
+            if key.startswith("noise.")
+        }
+        return cls(left, right, info, noise)
+
+    @classmethod
+    def from_released(cls, path: str | Path) -> UpperBodyPrior:
+        """Read a prior that Burke & Lasenby released with their sign-language tracker.
+
+        Its camera has f = 1550 and the centre (130, 105), its rotations are Rz Ry Rx, its poses
+        are centred on the head, its neck is the middle of the shoulders (the tracker measures it 45
+        pixels below the head). The noise is the tracker's Q.
+
+        Args:
+            path: .npz with {left,right}_{weights,means,covariances}.
+
+        Raises:
+            InputError: no such file. FileFormatError: not such an archive.
+        """
+        keys = [f"{side}_{part}" for side in _SIDES for part in _PARTS]
+        arrays = read_npz(path, keys)
+        tensors = {
+            f"{side}.{part}": torch.as_tensor(arrays[f"{side}_{part}"], dtype=torch.float64)
+            for side in _SIDES
+            for part in _PARTS
+        }
+        info = PriorInfo(
+            name=Path(path).stem.removeprefix("released_prior_"),
+            rotation_order="zyx",
+            fx=1550.0, fy=1550.0, cx=130.0, cy=105.0,
+            centre="head", neck="mid-shoulder", hand="hand", fps=25.0,
+            sources=("https://github.com/mgb45/SignerBodyPose",), licence="MIT",
+            extra={"neck_below_head_pixels": 45.0},
+        )  # fmt: skip
+        left, right = (_mixture(path, side, tensors) for side in _SIDES)
+        noise = {f"process_cov_{side}": released_process_cov() for side in _SIDES}
+        return cls(left, right, info, noise)
+
+
+def released_process_cov() -> Tensor:
+    """Diagonal [21] of Q in the authors' released sign-language tracker, pixels and metres."""
+    return torch.tensor(
+        [560, 560, 1, 56, 56, 1, *[25, 25, 1] * 3, 0.5, 0.5, 0.5, 0.01, 0.01, 0.01],
+        dtype=torch.float64,
+    )
+
+
+def fit_upper_body_prior(
+    recordings: Sequence[RecordingLike],
+    n_components: int = 30,
+    seed: int = 0,
+    views: ViewRange = TRAINING_VIEWS,
+    *,
+    camera: PinholeCamera | None = None,
+    rotation_order: str = "zxy",
+    centre: str = "neck",
+    neck: str | None = None,
+    mirror: bool = True,
+    n_samples: int | None = None,
+    views_per_pose: int | None = None,
+    nose_as_head: bool = False,
+    name: str = "",
+    licence: str = "",
+    command: str = "",
+    progress: bool = False,
+    **fit_options: Any,
+) -> UpperBodyPrior:
+    """Fit a prior to recorded 3D poses seen from random viewpoints (BL section 3.1).
+
+    Args:
+        recordings: in camera axes (`torchpose.io.read_recordings`).
+        n_components: Gaussians per arm.
+        seed: of viewpoints and start.
+        views: limits of the random viewpoints.
+        camera: whose pixels the states are in; Kinect's (f = 525, 640 x 480) if None.
+        rotation_order: "zxy" (paper) or "zyx" (released priors).
+        centre: "neck", "head" or "sequence" (`PriorInfo`).
+        neck: kind of neck; the highest among the recordings if None. Others are converted.
+        mirror: fit one mixture to left arms and mirrored right arms, and mirror it.
+        n_samples, views_per_pose: how many training states (`training_states`).
+        nose_as_head: take the nose where a joint set has no head.
+        name, licence, command: for `info`.
+        progress: show bars.
+        fit_options: to `GaussianMixture.fit`: n_init, max_iter, tol, covariance_floor, init.
+
+    Raises:
+        InputError: no recordings or no complete frames. PriorError: kinds of joints that cannot be
+            mixed, unknown rotation order.
+    """
+    check_rotation_order(rotation_order)
+    camera = camera or PinholeCamera(*_KINECT_CAMERA, width=640, height=480)
+    (fx, skew, cx), (_, fy, cy), _ = camera.matrix.tolist()
+    if skew:
+        raise PriorError(f"the camera of a prior must have no skew, got {skew:g} pixels")
+    generator = torch.Generator().manual_seed(seed)
+    poses = collect_poses(recordings, neck, centre, nose_as_head)
+    states = training_states(
+        poses, camera.matrix, generator, views, rotation_order, mirror, n_samples, views_per_pose
+    )
+    options: dict[str, Any] = {"n_components": n_components, "seed": generator}
+    options |= {"progress": progress} | fit_options
+    left = GaussianMixture.fit(states.left, **options)
+    right = (
+        mirror_mixture(left, cx)
+        if states.right is None
+        else GaussianMixture.fit(states.right, **options)
+    )
+    info = PriorInfo(
+        name=name, rotation_order=rotation_order, fx=fx, fy=fy, cx=cx, cy=cy, licence=licence,
+        command=command, views=asdict(views), **states.facts,
+    )  # fmt: skip
+    return UpperBodyPrior(left, right, replace(info, extra=info.extra | _fit_facts(left, seed)))
+
+
+def known_priors() -> list[str]:
+    """Names of the priors that come with the package."""
+    return sorted(p.stem for p in WEIGHTS.glob("*.safetensors"))
+
+
+def load_prior(name_or_path: str | Path) -> UpperBodyPrior:
+    """Load a prior that comes with the package, by its name, or one from a file.
+
+    Args:
+        name_or_path: a name (`known_priors`), or a .safetensors file.
+
+    Raises:
+        PriorError: neither a known name nor a file. FileFormatError: a damaged or foreign file.
+    """
+    shipped = WEIGHTS / f"{name_or_path}.safetensors"
+    if str(name_or_path) in known_priors():
+        return UpperBodyPrior.load(shipped)
+    if Path(name_or_path).is_file():
+        return UpperBodyPrior.load(name_or_path)
+    names = ", ".join(known_priors()) or "none in this installation"
+    raise PriorError(
+        f"expected the name of a prior ({names}) or a .safetensors file, got {str(name_or_path)!r}, "
+        "which is neither"
+    )
+
+
+def _mixture(path: str | Path, side: str, tensors: Mapping[str, Tensor]) -> GaussianMixture:
+    parts = [require_tensor(path, tensors, f"{side}.{part}") for part in _PARTS]
+    try:
+        return GaussianMixture(*parts)
+    except TorchposeError as error:
+        raise FileFormatError(f"{path}: the {side} mixture is damaged: {error}") from error
+
+
+def _fit_facts(mixture: GaussianMixture, seed: int) -> dict[str, Any]:
+    report = mixture.fit_report
+    if report is None:
+        return {"seed": seed}
+    return {
+        "seed": seed,
+        "fit": {
+            "iterations": report.iterations,
+            "log_likelihood": report.log_likelihood[-1],
+            "converged": report.converged,
+            "reseeded": report.reseeded,
+        },
+    }
+
+
+def _other_side(name: str) -> str:
+    for here, there in (_SIDES, _SIDES[::-1]):
+        if name.endswith(f"_{here}"):
+            return f"{name.removesuffix(here)}{there}"
+    return name
