@@ -1,0 +1,37 @@
+"""Pictures of poses and of how good they are, each a matplotlib `Figure`.
+
+matplotlib is imported when a picture is made, and only its object interface is used: no pyplot, no
+global settings. One look throughout: the person's left is blue, the right is orange, the middle is
+grey; a filled joint was measured, a hollow one was inferred. The colours are those of Okabe & Ito,
+which colour-blind readers can tell apart; lines differ in their dashes as well.
+"""
+
+from torchpose.viz.charts import (
+    plot_error_bars,
+    plot_errors_over_time,
+    plot_joint_curves,
+    plot_pcp,
+    plot_reliability,
+)
+from torchpose.viz.skeletons import (
+    draw_skeleton,
+    plot_pose,
+    plot_pose_3d,
+    plot_pose_strip,
+    plot_prior_means,
+)
+from torchpose.viz.style import save_figure
+
+__all__ = [
+    "draw_skeleton",
+    "plot_error_bars",
+    "plot_errors_over_time",
+    "plot_joint_curves",
+    "plot_pcp",
+    "plot_pose",
+    "plot_pose_3d",
+    "plot_pose_strip",
+    "plot_prior_means",
+    "plot_reliability",
+    "save_figure",
+]

@@ -1,0 +1,161 @@
+"""The look that all pictures share: colours, figures without global state, legends, saving."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from torchpose.errors import InputError, MissingDependencyError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+else:
+    Axes = Figure = Any
+
+__all__ = [
+    "INK",
+    "LARGE",
+    "LEFT",
+    "MIDDLE",
+    "MUTED",
+    "NORMAL",
+    "PALE",
+    "RIGHT",
+    "SMALL",
+    "add_legend",
+    "join_unit",
+    "joint_colors",
+    "method_styles",
+    "new_figure",
+    "readable",
+    "save_figure",
+    "style_axes",
+    "to_numpy",
+]
+
+INK, MUTED, PALE, GRID = "#222222", "#666666", "#B8B8B8", "#E4E4E4"
+LEFT, RIGHT, MIDDLE = "#0072B2", "#D55E00", "#555555"
+_METHODS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (5, 1, 1, 1)), (0, (8, 2)),
+                            (0, (3, 1, 1, 1, 1, 1)), "-")  # fmt: skip
+SMALL, NORMAL, LARGE = 9.0, 10.0, 11.5
+
+
+def new_figure(width: float, height: float, title: str | None = None) -> Figure:
+    """An empty white figure of the given size in inches, laid out so that nothing overlaps."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure as MatplotlibFigure
+    except ImportError as error:
+        raise MissingDependencyError(
+            "pictures need the package matplotlib, which is not installed; "
+            "run `pip install torchpose[plots]`"
+        ) from error
+    figure = MatplotlibFigure(figsize=(width, height), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    if title:
+        figure.suptitle(title, fontsize=LARGE, color=INK, fontweight="bold")
+    return figure
+
+
+def style_axes(ax: Axes, x: str = "", y: str = "", title: str = "", grid: bool = True) -> Axes:
+    """Light grid, no box, labels of one size, ticks at round numbers."""
+    from matplotlib.ticker import MaxNLocator
+
+    for axis in (ax.xaxis, ax.yaxis):
+        locator = axis.get_major_locator()
+        if isinstance(locator, MaxNLocator):
+            locator.set_params(steps=[1, 2, 5, 10])
+    ax.set_xlabel(x, fontsize=NORMAL, color=INK)
+    ax.set_ylabel(y, fontsize=NORMAL, color=INK)
+    ax.set_title(title, fontsize=NORMAL, color=INK)
+    ax.tick_params(labelsize=SMALL, colors=MUTED, length=3)
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        ax.spines[side].set_color(PALE)
+    ax.set_axisbelow(True)
+    if grid:
+        ax.grid(color=GRID, linewidth=0.8)
+    return ax
+
+
+def add_legend(figure: Figure, handles: Iterable[Any]) -> None:
+    """A legend below the panels, outside of the data, in as many columns as fit the width."""
+    entries = list(handles)
+    if not entries:
+        return
+    widest = max(0.075 * len(entry.get_label()) + 0.7 for entry in entries)  # inches
+    fitting = max(1, min(len(entries), int(figure.get_figwidth() / widest)))
+    columns = math.ceil(len(entries) / math.ceil(len(entries) / fitting))
+    figure.legend(
+        handles=entries,
+        loc="outside lower center",
+        ncols=columns,
+        frameon=False,
+        fontsize=SMALL + 0.5,
+        labelcolor=INK,
+        handlelength=2.6,
+    )
+
+
+def method_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Colour and dashes of each method, in the order given."""
+    if not names:
+        raise InputError("expected at least one named curve, got none")
+    return {
+        name: {"color": _METHODS[i % len(_METHODS)], "linestyle": _DASHES[i % len(_DASHES)]}
+        for i, name in enumerate(names)
+    }
+
+
+def joint_colors(names: Sequence[str]) -> list[str]:
+    """Blue for the person's left, orange for the right, grey for the rest."""
+    sides = {"left": LEFT, "right": RIGHT}
+    return [sides.get(name.rsplit("_", 1)[-1], MIDDLE) for name in names]
+
+
+def readable(name: str) -> str:
+    """``hand_left`` as ``left hand``.
+
+    >>> readable("hand_left")
+    'left hand'
+    """
+    stem, _, side = name.rpartition("_")
+    return f"{side} {stem}" if stem else name
+
+
+def join_unit(label: str, unit: str) -> str:
+    """``error (cm)``."""
+    return f"{label} ({unit})" if unit else label
+
+
+def to_numpy(tensor: Tensor | Any) -> Any:
+    """A tensor as a NumPy array in float64 (bool stays), on the CPU and out of the graph."""
+    import numpy as np
+
+    array = tensor.detach().cpu().numpy() if isinstance(tensor, Tensor) else np.asarray(tensor)
+    return array if array.dtype == bool else array.astype(float)
+
+
+def save_figure(figure: Figure, path: str | Path, dpi: int = 150) -> Path:
+    """Write a picture, whole or not at all; the suffix gives the format (png, svg, pdf).
+
+    Raises:
+        InputError: a suffix that matplotlib cannot write.
+        OutputError: the folder is missing or not writable.
+    """
+    from torchpose.io import atomic_path
+
+    path = Path(path)
+    kinds = figure.canvas.get_supported_filetypes()
+    if path.suffix[1:].lower() not in kinds:
+        raise InputError(f"{path}: expected a suffix among {', '.join(kinds)}")
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=dpi)
+    return path
