@@ -44,17 +44,21 @@ docs-serve: $(VENV)/.installed-dev
 
 install: $(VENV)/.installed-dev
 
-# The stamps are written last. An installation that was killed leaves .installing behind, and the
-# next one starts with a new environment.
+# The stamps are written last. An installation that was killed leaves .installing behind, with the id
+# of its process, and the next one starts with a new environment.
 $(VENV)/.installed-%: pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-	    { echo "torchpose needs Python 3.11 or newer: PYTHON=/path/to/python make $(MAKECMDGOALS)" >&2; exit 1; }
-	@if [ -e $(VENV)/.installing ] || ! $(BIN)/python -m pip --version >/dev/null 2>&1; then \
-	    $(PYTHON) -m venv --clear $(VENV); fi
-	@touch $(VENV)/.installing
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$*]'
-	@rm $(VENV)/.installing
-	@touch $@
+	@set -e; \
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	    { echo "torchpose needs Python 3.11 or newer: PYTHON=/path/to/python make" >&2; exit 1; }; \
+	if [ -e $(VENV)/.installing ] && kill -0 "$$(cat $(VENV)/.installing)" 2>/dev/null; then \
+	    echo "another installation into $(VENV) is under way; try again when it is done" >&2; exit 1; fi; \
+	if [ -e $(VENV)/.installing ] || ! $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+	    $(PYTHON) -m venv --clear $(VENV); fi; \
+	echo $$$$ > $(VENV)/.installing; \
+	echo "installing torchpose[$*] into $(VENV)"; \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$*]'; \
+	touch $@; \
+	rm $(VENV)/.installing
 
 # Development includes what the demo needs.
 ifneq ($(wildcard $(VENV)/.installed-dev),)

@@ -1,0 +1,52 @@
+"""The smallest tracker: one Kalman filter, with the prior's moments in place of its components."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchpose.filters import RecursiveFilter, StepOutput
+from torchpose.filters.transition import make_transition
+from torchpose.gaussian import kalman_predict, kalman_update
+from torchpose.priors import GaussianMixture
+
+
+class OneGaussianState(NamedTuple):
+    mean: Tensor  # [B, D]
+    cov: Tensor  # [B, D, D]
+
+
+class OneGaussianFilter(RecursiveFilter):
+    def __init__(self, prior, process_cov, measurement_cov, observed):
+        super().__init__(measurement_cov, observed, prior.dim, torch.float64)
+        mean, cov = (m.double() for m in prior.moments())
+        self.register_buffer("prior_mean", mean)
+        self.register_buffer("prior_cov", cov)
+        matrix, offset, noise = make_transition(
+            "stationary", mean[None], cov[None], torch.diag(process_cov).double()
+        )
+        self.register_buffer("matrix", matrix[0])
+        self.register_buffer("offset", offset[0])
+        self.register_buffer("noise", noise[0])
+
+    def init(self, batch_size, generator=None):
+        dim = self.dim
+        return OneGaussianState(
+            self.prior_mean.expand(batch_size, dim), self.prior_cov.expand(batch_size, dim, dim)
+        )
+
+    def advance(self, state, frame, generator, return_cov):
+        predicted = kalman_predict(*state, self.matrix, self.offset, self.noise)
+        mean, cov, log_evidence = kalman_update(
+            *predicted, frame.z, frame.cov, self.observed, frame.mask
+        )
+        log_weights = mean.new_zeros(len(mean), 1)  # one track, of weight one
+        estimate = StepOutput(mean, log_weights, log_evidence, cov if return_cov else None)
+        return OneGaussianState(mean, cov), estimate
+
+
+prior = GaussianMixture(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])
+tracker = OneGaussianFilter(prior, torch.ones(2), torch.ones(1), observed=[0])
+out = tracker(torch.randn(4, 20, 1), lengths=torch.tensor([20, 5, 9, 1]))
+print(out.mean.shape)
+# > torch.Size([4, 20, 2])

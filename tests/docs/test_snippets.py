@@ -1,0 +1,64 @@
+"""Every piece of code in the documentation runs, and prints what the pages say it prints.
+
+A snippet starts in an empty folder that holds `keypoints.npz`. Lines that begin with `# >` are its
+expected output. What docs/ includes and what README.md shows are these very files.
+"""
+
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+import torch
+
+ROOT = Path(__file__).parents[2]
+SNIPPETS = sorted((ROOT / "docs" / "snippets").glob("*.py"))
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """An empty working folder with the keypoints of head, neck and hands, three seconds long."""
+    from torchpose.io import Keypoints, write_keypoints
+
+    seconds = torch.arange(90, dtype=torch.float64) / 30
+    still = torch.tensor([[320.0, 160.0], [320.0, 205.0], [400.0, 330.0], [240.0, 330.0]])
+    points = still.double().repeat(90, 1, 1)
+    points[:, 2, 1] -= 60 * (1 - torch.cos(seconds * 2))
+    points[30:60, 3] = torch.nan
+    names = ("head", "neck", "hand_left", "hand_right")
+    clip = Keypoints(points, names, fps=30.0, image_size=(640, 480))
+    write_keypoints(tmp_path / "keypoints.npz", clip)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("path", SNIPPETS, ids=lambda p: p.stem)
+def test_snippet(path, folder, capsys):
+    state = torch.get_rng_state()
+    runpy.run_path(str(path), run_name="__main__")
+    torch.set_rng_state(state)
+    expected = [line[4:] for line in path.read_text().splitlines() if line.startswith("# > ")]
+    if expected:
+        assert capsys.readouterr().out.splitlines() == expected
+
+
+def test_code_on_the_pages_comes_from_files():
+    """Python on a page is included from docs/snippets; console sessions and data may be typed."""
+    names = {path.name for path in SNIPPETS}
+    used = set()
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for block in re.findall(r"```python[^\n]*\n(.*?)```", text, re.DOTALL):
+            included = re.fullmatch(r'--8<-- "snippets/(\w+\.py)"\n', block)
+            assert included, f"{page}: typed code, which no test runs:\n{block}"
+            used.add(included[1])
+    assert used == names
+
+
+def test_readme_shows_a_snippet():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    assert blocks
+    for block in blocks:
+        assert block in {path.read_text() for path in SNIPPETS}
