@@ -10,22 +10,24 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torchpose.camera import PinholeCamera as PinholeCamera
     from torchpose.errors import TorchposeError as TorchposeError
+    from torchpose.pose_track import PoseTrack as PoseTrack
     from torchpose.priors.gmm import GaussianMixture as GaussianMixture
     from torchpose.priors.upper_body import UpperBodyPrior as UpperBodyPrior
     from torchpose.priors.upper_body import load_prior as load_prior
-    from torchpose.tracking import PoseTrack as PoseTrack
     from torchpose.tracking import UpperBodyTracker as UpperBodyTracker
 
     __version__: str
 
 _SUBMODULES = frozenset(
     {
+        "calibration",
         "camera",
         "demo",
         "errors",
         "filters",
         "gaussian",
         "io",
+        "lifting",
         "metrics",
         "priors",
         "projection",
@@ -39,7 +41,7 @@ _SUBMODULES = frozenset(
 _HOME = {
     "GaussianMixture": "torchpose.priors.gmm",
     "PinholeCamera": "torchpose.camera",
-    "PoseTrack": "torchpose.tracking",
+    "PoseTrack": "torchpose.pose_track",
     "TorchposeError": "torchpose.errors",
     "UpperBodyPrior": "torchpose.priors.upper_body",
     "UpperBodyTracker": "torchpose.tracking",

@@ -31,6 +31,7 @@ __all__ = [
 
 LOG_2PI = math.log(2 * math.pi)
 _JITTER = (1e-14, 1e-12, 1e-10, 1e-8, 1e-6)
+_LEAST_SCALE = 1e-18  # of a matrix of zeros, such as the covariance of a single particle
 
 
 def symmetrise(matrix: Float[Tensor, "... D D"]) -> Float[Tensor, "... D D"]:
@@ -42,8 +43,9 @@ def safe_cholesky(matrix: Float[Tensor, "... D D"]) -> Float[Tensor, "... D D"]:
     """Cholesky factor of each matrix, with an answer for what is not positive definite.
 
     A matrix that rounding has pushed off the positive definite cone gets the smallest multiple of
-    its mean diagonal, from 1e-14 to 1e-6, that makes it factorise. A matrix that no such multiple
-    mends gets a factor of NaN, so that its batch element is lost and no other.
+    its mean diagonal, from 1e-14 to 1e-6, that makes it factorise (zeros count as
+    1e-18). A matrix that no such multiple mends gets a factor of NaN, so that its batch element is
+    lost and no other.
 
     Args:
         matrix: [..., D, D], symmetric; only the lower triangle is read.
@@ -54,7 +56,9 @@ def safe_cholesky(matrix: Float[Tensor, "... D D"]) -> Float[Tensor, "... D D"]:
     factor, info = torch.linalg.cholesky_ex(matrix)
     if not bool(info.any()):
         return factor
-    scale = matrix.diagonal(dim1=-2, dim2=-1).abs().mean(-1)[..., None, None]
+    scale = (
+        matrix.diagonal(dim1=-2, dim2=-1).abs().mean(-1)[..., None, None].clamp_min(_LEAST_SCALE)
+    )
     eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     for jitter in _JITTER:
         retry, retry_info = torch.linalg.cholesky_ex(matrix + jitter * scale * eye)
@@ -189,20 +193,27 @@ def kalman_gain(
     Returns:
         The `Gain` and the covariance after the update [..., D, D].
     """
-    cross = cov[..., observed, :]
-    innovation = cross[..., observed] + measurement_cov
-    if mask is not None:
-        both = mask[..., :, None] & mask[..., None, :]
-        eye = torch.eye(mask.shape[-1], dtype=cov.dtype, device=cov.device)
-        innovation = torch.where(both, innovation, eye)
-        cross = cross * mask[..., None]
-        count = mask.sum(-1).to(cov.dtype)
-    else:
-        count = torch.tensor(float(observed.numel()), dtype=cov.dtype, device=cov.device)
-    factor = safe_cholesky(innovation)
+    cross, factor, count = _innovation(cov, measurement_cov, observed, mask)
     white = torch.linalg.solve_triangular(factor, cross, upper=False)
-    log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    return Gain(factor, white, -log_det - 0.5 * count * LOG_2PI), cov - white.mT @ white
+    return Gain(factor, white, _log_norm(factor, count)), cov - white.mT @ white
+
+
+def _innovation(
+    cov: Tensor, measurement_cov: Tensor, observed: Tensor, mask: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor | int]:
+    """H P, the factor of H P H^T + R, and the number of measured dimensions."""
+    cross = cov.index_select(-2, observed)
+    innovation = cross.index_select(-1, observed) + measurement_cov
+    if mask is None:
+        return cross, safe_cholesky(innovation), observed.numel()
+    both = mask[..., :, None] & mask[..., None, :]
+    eye = torch.eye(mask.shape[-1], dtype=cov.dtype, device=cov.device)
+    innovation = torch.where(both, innovation, eye)
+    return cross * mask[..., None], safe_cholesky(innovation), mask.sum(-1).to(cov.dtype)
+
+
+def _log_norm(factor: Tensor, count: Tensor | int) -> Tensor:
+    return -factor.diagonal(dim1=-2, dim2=-1).log().sum(-1) - 0.5 * count * LOG_2PI
 
 
 def kalman_correct(
@@ -213,7 +224,7 @@ def kalman_correct(
     mask: Bool[Tensor, "... Z"] | None = None,
 ) -> tuple[Float[Tensor, "... D"], Float[Tensor, "..."]]:
     """Updated mean (BL 40) and log N(z | H x, S) given a gain; values of z off the mask are ignored."""
-    residual = z - mean[..., observed]
+    residual = z - mean.index_select(-1, observed)
     if mask is not None:
         residual = torch.where(mask, residual, torch.zeros_like(residual))
     residual = torch.linalg.solve_triangular(gain.factor, residual[..., None], upper=False)
@@ -234,9 +245,19 @@ def kalman_update(
     Returns:
         Mean, covariance and log-likelihood log N(z | H x, H P H^T + R) of what was measured.
     """
-    gain, new_cov = kalman_gain(cov, measurement_cov, observed, mask)
-    new_mean, log_likelihood = kalman_correct(mean, z, gain, observed, mask)
-    return new_mean, new_cov, log_likelihood
+    cross, factor, count = _innovation(cov, measurement_cov, observed, mask)
+    residual = z - mean.index_select(-1, observed)
+    if mask is not None:
+        residual = torch.where(mask, residual, torch.zeros_like(residual))
+    # One solve for the gain and the residual together.
+    batch = torch.broadcast_shapes(cross.shape[:-2], residual.shape[:-1])
+    columns = residual.expand(*batch, -1)[..., None]
+    solved = torch.cat([cross.expand(*batch, -1, -1), columns], -1)
+    solved = torch.linalg.solve_triangular(factor, solved, upper=False)
+    white, white_residual = solved[..., :-1], solved[..., -1:]
+    new_mean = mean + (white.mT @ white_residual)[..., 0]
+    log_likelihood = _log_norm(factor, count) - 0.5 * white_residual.square().sum((-2, -1))
+    return new_mean, cov - white.mT @ white, log_likelihood
 
 
 def mixture_moments(

@@ -13,11 +13,12 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchpose.filters.base import FilterOutput, Measurements, StepOutput, collect, finish_output
+from torchpose.filters.columns import run_columns, suits_columns
 from torchpose.filters.gains import MAX_EDGES, Edge, GainGraph
 from torchpose.filters.scan import Workspace, scan_blocks
 from torchpose.filters.tracks import MKFState, estimate_of, within_and_between
 from torchpose.filters.weights import mix_uniform, sequence_weights, step_weights
-from torchpose.gaussian import kalman_correct, kalman_gain, symmetrise
+from torchpose.gaussian import Gain, kalman_correct, kalman_gain, symmetrise
 
 if TYPE_CHECKING:
     from torchpose.filters.mkf import MixtureKalmanFilter
@@ -33,11 +34,15 @@ def advance(
     cov, group, mask, noise_cov = distinct_histories(state, frame)
     predicted_cov = symmetrise(matrix @ cov @ matrix.mT + noise)
     gain, cov = kalman_gain(predicted_cov, noise_cov, model.observed, mask)
-    mean = (matrix.to(model.dtype) @ state.mean[..., None])[..., 0] + offset.to(model.dtype)
-    gain = type(gain)(*(g.to(model.dtype)[group] for g in gain))
-    mean, log_likelihood = kalman_correct(
-        mean, frame.z[:, None], gain, model.observed, frame.mask[:, None]
-    )
+    gain = Gain(*(part.to(model.dtype) for part in gain))
+    moving = matrix.to(model.dtype), offset.to(model.dtype)
+    if cov.shape[0] == 1:
+        mean, log_likelihood = _correct_shared(model, state.mean, moving, gain, frame)
+    else:
+        predicted = (moving[0] @ state.mean[..., None])[..., 0] + moving[1]
+        own = Gain(*(part[group] for part in gain))
+        z, seen = frame.z[:, None], frame.mask[:, None]
+        mean, log_likelihood = kalman_correct(predicted, z, own, model.observed, seen)
     log_weights, log_evidence = step_weights(
         state.log_weights,
         model.log_prior.to(model.dtype),
@@ -50,6 +55,23 @@ def advance(
     carried = mix_uniform(log_weights, model.uniform_weight)
     new_state = MKFState(carried, mean, cov, group, state.time + 1)
     return new_state, StepOutput(estimate, log_weights, log_evidence, total)
+
+
+def _correct_shared(
+    model: "MixtureKalmanFilter",
+    mean: Tensor,
+    moving: tuple[Tensor, Tensor],
+    gain: Gain,
+    frame: Measurements,
+) -> tuple[Tensor, Tensor]:
+    """Predict and correct the means of elements that share one gain: products over tracks."""
+    matrix, offset = moving
+    predicted = torch.baddbmm(offset[:, None], mean.transpose(0, 1), matrix.mT)
+    residual = frame.z - predicted.index_select(-1, model.observed)
+    residual = torch.where(frame.mask[0], residual, torch.zeros_like(residual))
+    white = torch.linalg.solve_triangular(gain.factor[0], residual.mT, upper=False)
+    corrected = torch.baddbmm(predicted, white.mT, gain.white[0]).transpose(0, 1)
+    return corrected, gain.log_norm[0] - 0.5 * white.square().sum(1).mT
 
 
 def distinct_histories(
@@ -82,6 +104,9 @@ def run(
             state, out = advance(model, state, frames.frame(t), return_cov)
             steps.append(out)
         return collect(steps, frames.lengths)
+    shared = all(len(edges) == 1 for edges in history.edges)
+    if not return_cov and suits_columns(model, frames, shared):
+        return run_columns(model, frames, [edges[0] for edges in history.edges], progress)
     return _run_shared(model, frames, history, return_cov, progress)
 
 

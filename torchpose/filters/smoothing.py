@@ -14,7 +14,7 @@ from torchpose.errors import InputError
 from torchpose.filters.base import FilterOutput, Measurements, finish_output
 from torchpose.filters.fixed_tracks import distinct_histories
 from torchpose.filters.tracks import MKFState, within_and_between
-from torchpose.filters.weights import mix_uniform, normalise, step_weights
+from torchpose.filters.weights import indicator_mixing, mix_uniform, normalise, step_weights
 from torchpose.gaussian import Gain, kalman_correct, kalman_gain, safe_cholesky, symmetrise
 
 if TYPE_CHECKING:
@@ -48,10 +48,7 @@ def indicator_transition(log_prior: Float[Tensor, " M"], epsilon: float) -> Floa
 
     The Markov chain of indicators that the uniform weight epsilon (paper, after BL 49) stands for.
     """
-    n_tracks = log_prior.numel()
-    share = n_tracks * epsilon / (1 + n_tracks * epsilon)
-    stay = torch.eye(n_tracks, dtype=log_prior.dtype, device=log_prior.device)
-    rows = ((1 - share) * stay + share / n_tracks) * log_prior.exp()
+    rows = indicator_mixing(log_prior, epsilon)
     return rows / rows.sum(1, keepdim=True)
 
 

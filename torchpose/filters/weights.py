@@ -6,7 +6,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["mix_uniform", "normalise", "sequence_weights", "step_weights"]
+__all__ = [
+    "indicator_mixing",
+    "mix_uniform",
+    "normalise",
+    "sequence_weights",
+    "step_weights",
+    "steps_between_rescaling",
+]
 
 
 def normalise(log_weights: Float[Tensor, "*batch M"]) -> Float[Tensor, "*batch M"]:
@@ -84,7 +91,7 @@ def sequence_weights(
     differentiable = torch.is_grad_enabled() and (
         log_likelihood.requires_grad or log_prior.requires_grad or log_weights.requires_grad
     )
-    safe = epsilon == 0 or _steps_between_rescaling(log_prior, epsilon) >= 1
+    safe = epsilon == 0 or steps_between_rescaling(log_prior, epsilon) >= 1
     if differentiable or reset_below is not None or not safe:
         return _stepwise(log_weights, log_prior, log_likelihood, epsilon, power, reset_below)
     if epsilon == 0:
@@ -118,29 +125,40 @@ def _cumulative(log_weights: Tensor, log_prior: Tensor, log_likelihood: Tensor) 
     return normalise(joint - log_likelihood)
 
 
-def _steps_between_rescaling(log_prior: Tensor, epsilon: float) -> int:
+def steps_between_rescaling(log_prior: Float[Tensor, " M"], epsilon: float) -> int:
+    """How many steps the linear recursion may go without rescaling, in the range of its dtype."""
     share = epsilon / (1 + log_prior.numel() * epsilon)
     smallest = math.log(share) + float(log_prior.detach().min())
-    return int(min(32, 600 // max(-smallest, 1e-9)))
+    room = -0.85 * math.log(torch.finfo(log_prior.dtype).tiny)
+    return int(min(32, room // max(-smallest, 1e-9)))
+
+
+def indicator_mixing(log_prior: Float[Tensor, " M"], epsilon: float) -> Float[Tensor, "M M"]:
+    """C_ij = ((1 - e) delta_ij + e / M) pi_j, e = M epsilon / (1 + M epsilon).
+
+    alpha C is the predicted weight, up to a factor, of weights alpha before epsilon.
+    """
+    n_tracks = log_prior.numel()
+    total = 1 + n_tracks * epsilon
+    kind = {"dtype": log_prior.dtype, "device": log_prior.device}
+    mixing = torch.full((n_tracks, n_tracks), epsilon / total, **kind)
+    mixing.diagonal().add_(1 / total)
+    return mixing * log_prior.exp()
 
 
 def _scaled_linear(
     log_weights: Tensor, log_prior: Tensor, log_likelihood: Tensor, epsilon: float
 ) -> Tensor:
     """Predicted log-weights log a_t with epsilon."""
-    n_tracks = log_prior.numel()
     top = log_likelihood.amax(-1, keepdim=True)
-    # Exponentials that underflow are slow; e^-500 next to a sum of order one is nothing.
-    likelihood = (log_likelihood - top).clamp_min_(-500.0).exp_()
+    # Exponentials that underflow are slow; e^-500 (e^-80) next to a sum of order one is nothing.
+    least = -500.0 if log_likelihood.dtype == torch.float64 else -80.0
+    likelihood = (log_likelihood - top).clamp_min_(least).exp_()
     prior = log_prior.exp()
-    total = 1 + n_tracks * epsilon
-    mixing = torch.full((n_tracks, n_tracks), epsilon / total, dtype=prior.dtype).to(prior.device)
-    mixing.diagonal().add_(1 / total)
-    # Column j of the transition carries pi_j, so one product gives pi_j (c_1 alpha_j + c_2 sum alpha).
-    transition = mixing * prior
+    transition = indicator_mixing(log_prior, epsilon)
     predicted = torch.empty_like(log_likelihood)
     alpha = log_weights.exp()
-    every = _steps_between_rescaling(log_prior, epsilon)
+    every = steps_between_rescaling(log_prior, epsilon)
     for t, (now, frame) in enumerate(zip(predicted.unbind(), likelihood.unbind(), strict=True)):
         if t:
             torch.mm(alpha, transition, out=now)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -35,6 +35,7 @@ from torchpose.priors.training import (
     collect_poses,
     training_states,
 )
+from torchpose.priors.window import WindowPrior
 
 __all__ = [
     "TRAINING_VIEWS",
@@ -62,6 +63,7 @@ class UpperBodyPrior(nn.Module):
         info: what they were fitted on, and in which conventions the states are.
         noise: learnt noise as named tensors, such as process_cov_left, process_cov_right,
             measurement_std, gamma or calibration. They become buffers and go into the file.
+        windows: mixtures over short windows of motion by name ("causal", "full"; `WindowPrior`).
 
     Raises:
         PriorError: a mixture of another size.
@@ -77,6 +79,7 @@ class UpperBodyPrior(nn.Module):
         right: GaussianMixture,
         info: PriorInfo | None = None,
         noise: Mapping[str, Tensor] | None = None,
+        windows: Mapping[str, WindowPrior] | None = None,
     ) -> None:
         super().__init__()
         for side, mixture in zip(_SIDES, (left, right), strict=True):
@@ -90,6 +93,12 @@ class UpperBodyPrior(nn.Module):
         self._noise_names: list[str] = []
         for name, value in (noise or {}).items():
             self.set_noise(name, value)
+        self._windows = nn.ModuleDict(windows or {})
+
+    @property
+    def windows(self) -> dict[str, WindowPrior]:
+        """Mixtures over short windows of motion, by name."""
+        return {name: cast(WindowPrior, window) for name, window in self._windows.items()}
 
     @property
     def noise(self) -> dict[str, Tensor]:
@@ -128,9 +137,9 @@ class UpperBodyPrior(nn.Module):
         """
         noise = {_other_side(name): value for name, value in self.noise.items()}
         cx = self.info.cx
-        return UpperBodyPrior(
-            mirror_mixture(self.right, cx), mirror_mixture(self.left, cx), self.info, noise
-        )
+        windows = {name: window.mirrored(cx) for name, window in self.windows.items()}
+        arms = mirror_mixture(self.right, cx), mirror_mixture(self.left, cx)
+        return UpperBodyPrior(*arms, self.info, noise, windows)
 
     def check_unseen(self, persons: Collection[str]) -> None:
         """Raise `OverlapError` if the prior was fitted on one of these persons.
@@ -157,7 +166,15 @@ class UpperBodyPrior(nn.Module):
             for part in _PARTS
         }
         tensors |= {f"noise.{name}": value for name, value in self.noise.items()}
-        write_prior(path, self.info, tensors)
+        for name, window in self.windows.items():
+            tensors |= {
+                f"window.{name}.{side}.{part}": getattr(getattr(window, side), part)
+                for side in _SIDES
+                for part in _PARTS
+            }
+        facts = {name: window.facts() for name, window in self.windows.items()}
+        extra = self.info.extra | ({"windows": facts} if facts else {})
+        write_prior(path, replace(self.info, extra=extra), tensors)
 
     @classmethod
     def load(cls, path: str | Path) -> UpperBodyPrior:
@@ -174,7 +191,11 @@ class UpperBodyPrior(nn.Module):
             for key, value in sorted(tensors.items())
             if key.startswith("noise.")
         }
-        return cls(left, right, info, noise)
+        windows = {}
+        for name, facts in info.extra.get("windows", {}).items():
+            arms = [_mixture(path, f"window.{name}.{side}", tensors) for side in _SIDES]
+            windows[name] = WindowPrior.from_facts(arms[0], arms[1], facts)
+        return cls(left, right, info, noise, windows)
 
     @classmethod
     def from_released(cls, path: str | Path) -> UpperBodyPrior:

@@ -1,0 +1,99 @@
+"""The command `torchpose`: fit, track, evaluate, demo, info.
+
+Each command is a module with `build` (its parser), `run` (its work) and `main` (both). It is imported
+when it is called for, so that help comes up at once. Exit codes: 0 done; 1 done, but the result is
+not good; 2 refused (input, options, output), with one line on stderr; 130 interrupted.
+"""
+
+import os
+import sys
+from argparse import ArgumentError
+from collections.abc import Sequence
+from importlib import import_module
+
+__all__ = ["main"]
+
+COMMANDS = {
+    "track": "2D keypoints to 2D and 3D poses",
+    "fit": "fit a prior to recorded 3D poses",
+    "evaluate": "run an evaluation protocol: ub-people, ub-one, signer",
+    "demo": "track an animated performer; needs no data",
+    "info": "version, priors that are there, what a file holds",
+}
+_EXAMPLES = """\
+examples:
+  torchpose demo --out demo-output
+  torchpose track keypoints.npz --out result
+  torchpose track keypoints.csv --out result --camera 525,525,319.5,239.5 --smoothing full
+  torchpose fit recordings/ --out prior.safetensors --components 30 --seed 0
+  torchpose evaluate ub-people --data data/ --out result
+  torchpose info kinect-upper-body"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit code.
+
+    Args:
+        argv: what stands after `torchpose` on the command line; `sys.argv[1:]` if None.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in arguments or os.environ.get("TORCHPOSE_DEBUG", "0") not in ("", "0")
+    arguments = [a for a in arguments if a != "--debug"]
+    try:
+        return _dispatch(arguments)
+    except SystemExit as stop:  # --help and --print_config
+        return stop.code if isinstance(stop.code, int) else 0
+    except KeyboardInterrupt:
+        print(
+            "torchpose: interrupted; files that were not finished were not written", file=sys.stderr
+        )
+        return 130
+    except BrokenPipeError:  # the reader of a pipe has gone, as in `torchpose info | head -1`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except Exception as error:
+        if debug or not _is_refusal(error):
+            raise
+        from torchpose.cli.common import one_line
+
+        print(f"torchpose: error: {one_line(error)}", file=sys.stderr)
+        return 2
+
+
+def _is_refusal(error: Exception) -> bool:
+    """Whether it was raised on purpose, about what the user gave; anything else is a bug."""
+    if isinstance(error, ArgumentError):
+        return True
+    from torchpose.errors import TorchposeError  # here, because it imports torch
+
+    return isinstance(error, TorchposeError)
+
+
+def _dispatch(arguments: list[str]) -> int:
+    first = arguments[0] if arguments else ""
+    if first in ("", "-h", "--help"):
+        print(_help(), file=sys.stdout if first else sys.stderr)
+        return 0 if first else 2
+    if first == "--version":
+        import torchpose
+
+        print(f"torchpose {torchpose.__version__}")
+        return 0
+    if first not in COMMANDS:
+        raise ArgumentError(None, f"unknown command {first!r}; known are {', '.join(COMMANDS)}")
+    return import_module(f"torchpose.cli.{first}").main(arguments[1:])
+
+
+def _help() -> str:
+    commands = "\n".join(f"  {name:<10} {text}" for name, text in COMMANDS.items())
+    return (
+        "usage: torchpose COMMAND ...\n\n"
+        "Bayesian human-pose tracking: from 2D keypoints, gaps and all, to 3D poses.\n\n"
+        f"commands:\n{commands}\n\n"
+        "options:\n"
+        "  -h, --help  this text; `torchpose COMMAND --help` for the options of a command\n"
+        "  --version   print the version\n"
+        "  --debug     with any command: show the traceback of an error (as TORCHPOSE_DEBUG=1 does)\n\n"
+        "Every command takes --config FILE with its options as YAML; --print_config prints them.\n\n"
+        f"{_EXAMPLES}"
+    )

@@ -1,0 +1,101 @@
+"""What the commands share: parsers, error text, checks, pictures."""
+
+import re
+import sys
+import textwrap
+from argparse import RawDescriptionHelpFormatter
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from jsonargparse import ActionConfigFile, ArgumentParser
+
+from torchpose.errors import InputError
+
+__all__ = [
+    "add_seed",
+    "new_parser",
+    "one_line",
+    "pictures_possible",
+    "positive",
+    "save_pictures",
+    "show_progress",
+]
+
+_COMMON = """\
+exit codes: 0 done; 1 done, but the result is not good; 2 refused, with one line on stderr
+--debug shows the traceback of an error"""
+
+_POSITIONALS = {"keypoints": "KEYPOINTS", "recordings": "DIR"}
+
+
+def new_parser(command: str, description: str, examples: str) -> ArgumentParser:
+    """Parser of a command, with --config.
+
+    Args:
+        command: name after `torchpose`. description: first paragraph of the help.
+        examples: command lines, one each line, without indentation.
+    """
+    listed = "\n".join(f"  {line}" for line in examples.strip().splitlines())
+    parser = ArgumentParser(
+        prog=f"torchpose {command}",
+        description=textwrap.fill(description, 79),
+        epilog=f"examples:\n{listed}\n\n{_COMMON}",
+        formatter_class=RawDescriptionHelpFormatter,
+        exit_on_error=False,
+        allow_abbrev=False,
+    )
+    parser.add_argument(
+        "--config",
+        action=ActionConfigFile,
+        metavar="FILE",
+        help="options as YAML, as --print_config writes them; what follows it on the line wins",
+    )
+    return parser
+
+
+def add_seed(parser: ArgumentParser, of: str) -> None:
+    """Add --seed; `of` says what it is the seed of."""
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help=f"seed of {of} (default 0)"
+    )
+
+
+def positive(name: str, value: float | None) -> None:
+    """Raise `InputError` unless None or above zero."""
+    if value is not None and not 0 < value < float("inf"):
+        raise InputError(f"{name} must be positive, got {value:g}")
+
+
+def one_line(error: BaseException) -> str:
+    """Text of an error on one line, with options named as they are typed."""
+    text = " ".join(str(error).split())
+    text = re.sub(r'^Parser key "(\w+)":', lambda m: f"argument --{m[1].replace('_', '-')}:", text)
+    text = re.sub(r"<class '(\w+)'>", r"\1", text)
+    missing = re.search(r'arguments are required: (.*)|Key "(\w+)" is required', text)
+    if missing:
+        names = (missing[1] or missing[2]).split(", ")
+        options = (_POSITIONALS.get(name, f"--{name}") for name in names)
+        text = f"missing: {', '.join(options)}; see --help for examples"
+    return text
+
+
+def show_progress() -> bool:
+    """Whether bars go to somebody who looks at them."""
+    return sys.stderr.isatty()
+
+
+def pictures_possible(wanted: bool) -> bool:
+    """Whether pictures are wanted and can be drawn; says how to get them if they cannot."""
+    if wanted and find_spec("matplotlib") is None:
+        print("no pictures: matplotlib is not installed; `pip install torchpose[plots]` brings it")
+        return False
+    return wanted
+
+
+def save_pictures(folder: Path, pictures: dict[str, Callable[[], Any]]) -> list[Path]:
+    """Draw and write pictures by file name; returns their paths."""
+    from torchpose.viz import save_figure
+
+    return [save_figure(draw(), folder / name) for name, draw in pictures.items()]

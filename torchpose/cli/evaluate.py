@@ -1,0 +1,140 @@
+"""`torchpose evaluate`: the protocols that published figures come from."""
+
+import inspect
+import re
+import typing
+from argparse import ArgumentError
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from jsonargparse import ArgumentParser, Namespace
+
+from torchpose.cli.common import add_seed, new_parser, show_progress
+from torchpose.errors import InputError
+
+PROTOCOLS = {
+    "ub-people": ("ub_people", "persons whom the prior never saw (kinect_utd_mhad)"),
+    "ub-one": ("ub_one", "the paper's trackers on the authors' own recording (burke_kinect)"),
+    "signer": ("signer", "the authors' released sign-language tracker"),
+}
+_COMMON = ("data", "out", "seed", "progress")
+_PLAIN = (int, float, bool, str, type(None))
+
+
+def main(arguments: list[str]) -> int:
+    """Run the protocol that the arguments name, and return the exit code."""
+    name = _protocol_name(arguments)
+    if name is None:
+        if {"-h", "--help"} & {*arguments}:
+            build(None).parse_args(arguments)  # prints the help and ends
+        raise ArgumentError(None, f"the protocol is missing; known are {', '.join(PROTOCOLS)}")
+    rest = list(arguments)
+    rest.remove(name)
+    return run(name, build(name).parse_args(rest))
+
+
+def build(name: str | None) -> ArgumentParser:
+    """Parser of one protocol with the options that are its own; of none, for the help."""
+    known = "; ".join(f"{protocol}: {text}" for protocol, (_, text) in PROTOCOLS.items())
+    parser = new_parser(
+        f"evaluate {name or 'PROTOCOL'}",
+        "Run an evaluation protocol on recordings, print its tables, and write them with pictures "
+        f"into a folder. Protocols are {known}.",
+        "\n".join(f"torchpose evaluate {p} --data data/ --out result" for p in PROTOCOLS),
+    )
+    add = parser.add_argument
+    add("--data", type=str, required=True, metavar="DIR", help="folder with the recordings")
+    add("--out", type=str, required=True, metavar="DIR", help="folder of the results")
+    add_seed(parser, "noise, viewpoints and fits")
+    if name is not None:
+        _add_own_options(parser, _runner(name))
+    return parser
+
+
+def run(name: str, args: Namespace) -> int:
+    """Run a protocol after checking its folders, and print its summary."""
+    from torchpose.io import check_output_folder
+
+    data = Path(args.data)
+    if not data.is_dir():
+        raise InputError(f"--data {data}: no such folder; expected the one with the recordings")
+    function = _runner(name)
+    own = {key: getattr(args, key) for key in _own_options(function)}
+    if getattr(args, "prior", None) is not None:
+        from torchpose.priors import load_prior
+
+        own["prior"] = load_prior(args.prior)
+    out = check_output_folder(args.out)
+    report = function(data, out, seed=args.seed, progress=show_progress(), **own)
+    print(report.summary())
+    return 0
+
+
+def _protocol_name(arguments: list[str]) -> str | None:
+    """The first argument if it is no option, else the first one that names a protocol."""
+    if arguments and not arguments[0].startswith("-"):
+        if arguments[0] not in PROTOCOLS:
+            raise ArgumentError(
+                None, f"unknown protocol {arguments[0]!r}; known are {', '.join(PROTOCOLS)}"
+            )
+        return arguments[0]
+    return next((a for a in arguments if a in PROTOCOLS), None)
+
+
+def _runner(name: str) -> Callable[..., Any]:
+    module = import_module(f"torchpose.protocols.{PROTOCOLS[name][0]}")
+    return module.run
+
+
+def _add_own_options(parser: ArgumentParser, function: Callable[..., Any]) -> None:
+    """Add the options of a protocol, with their help from its docstring."""
+    own, parameters = _own_options(function), inspect.signature(function).parameters
+    texts = _documented(function)
+    hints = typing.get_type_hints(function)
+    for key in own:
+        numbers = {int, float} & {hints[key], *typing.get_args(hints[key])}
+        kind = "true|false" if hints[key] is bool else "N" if numbers else key.upper()
+        parser.add_argument(
+            f"--{key.replace('_', '-')}",
+            type=hints[key],
+            default=parameters[key].default,
+            metavar=kind,
+            help=texts.get(key),
+        )
+    if "prior" in parameters:
+        parser.add_argument(
+            "--prior",
+            type=str,
+            metavar="NAME|FILE",
+            help="score this prior, fitted on other persons, instead of fitting one",
+        )
+
+
+def _documented(function: Callable[..., Any]) -> dict[str, str]:
+    """Text of each parameter in the Args section; one line may hold several."""
+    section = re.search(r"\n\s*Args:\n(.*?)(\n\s*\n|$)", function.__doc__ or "", re.DOTALL)
+    text = " ".join(section[1].split()) if section else ""
+    parts = re.split(rf"\b({'|'.join(inspect.signature(function).parameters)}): ", text)
+    return {
+        name: words.strip().rstrip(".")
+        for name, words in zip(parts[1::2], parts[2::2], strict=True)
+    }
+
+
+def _own_options(function: Callable[..., Any]) -> list[str]:
+    """Parameters beside the common ones that a command line can give: numbers, words, lists."""
+    hints = typing.get_type_hints(function)
+    return [
+        key
+        for key in inspect.signature(function).parameters
+        if key not in _COMMON and _is_plain(hints.get(key))
+    ]
+
+
+def _is_plain(hint: Any) -> bool:
+    parts = [part for part in typing.get_args(hint) if part is not Ellipsis]
+    if typing.get_origin(hint) is typing.Literal:
+        return True
+    return hint in _PLAIN or (bool(parts) and all(_is_plain(part) for part in parts))

@@ -1,0 +1,240 @@
+"""`torchpose info`: the version, the priors that are there, and what a file holds."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from jsonargparse import ArgumentParser, Namespace
+
+from torchpose.cli.common import new_parser
+from torchpose.errors import InputError
+
+if TYPE_CHECKING:
+    from torchpose.io import Keypoints
+    from torchpose.priors import UpperBodyPrior
+
+_EXAMPLES = """
+torchpose info
+torchpose info kinect-upper-body
+torchpose info result/poses.npz
+torchpose info keypoints.csv"""
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command and return its exit code."""
+    parser = build()
+    args = parser.parse_args(arguments)
+    if args.what is None and args.config:  # what may be left out, and then is not read from there
+        args.what = parser.parse_path(args.config[-1]).what
+    return run(args)
+
+
+def build() -> ArgumentParser:
+    """Parser of the command."""
+    parser = new_parser(
+        "info",
+        "Say which version and priors are there, or what a prior, a file of poses, keypoints or "
+        "recordings, or a camera file holds.",
+        _EXAMPLES,
+    )
+    parser.add_argument(
+        "what",
+        nargs="?",
+        type=str,
+        metavar="PRIOR|FILE",
+        help="name of a prior, a file or a folder",
+    )
+    return parser
+
+
+def run(args: Namespace) -> int:
+    """Print facts."""
+    print(_installation() if args.what is None else _describe(args.what))
+    return 0
+
+
+def _installation() -> str:
+    import torch
+
+    import torchpose
+    from torchpose.priors import known_priors
+
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
+    return _table(
+        {
+            "torchpose": torchpose.__version__,
+            "torch": torch.__version__,
+            "CUDA device": device,
+            "priors": ", ".join(known_priors()) or "none in this installation",
+            "folder": str(Path(torchpose.__file__).parent),
+        }
+    )
+
+
+def _describe(what: str) -> str:
+    from torchpose.priors import known_priors, load_prior
+
+    path = Path(what)
+    if what in known_priors() or path.suffix == ".safetensors" or not path.exists():
+        return describe_prior(load_prior(what))
+    if path.suffix == ".toml":
+        return _describe_cameras(path)
+    if path.suffix == ".npz":
+        return _describe_npz(path)
+    if path.is_dir() and not any(path.glob("*_keypoints.json")):
+        return _describe_recordings(path)
+    if path.suffix in (".yaml", ".yml"):
+        return _describe_recordings(path)
+    if path.suffix == ".csv" and not _starts_as_keypoints(path):
+        return _describe_recordings(path)
+    from torchpose.io import read_keypoints
+
+    return describe_keypoints(read_keypoints(path))
+
+
+def _describe_npz(path: Path) -> str:
+    """Poses, recordings or keypoints, by the keys."""
+    from torchpose.io import read_keypoints, read_npz
+
+    keys = set(read_npz(path, optional=None))
+    if {"joints3d", "covariance3d"} <= keys:
+        return describe_poses(path)
+    if "joints" in keys:
+        return _describe_recordings(path)
+    if keys & {"keypoints", "joints2d"}:
+        return describe_keypoints(read_keypoints(path))
+    raise InputError(
+        f"{path}: expected poses (joints3d, covariance3d), keypoints (keypoints, names) or a "
+        f"recording (joints, names), got the keys {', '.join(sorted(keys)) or 'none'}"
+    )
+
+
+def describe_prior(prior: "UpperBodyPrior") -> str:
+    """What a prior's file says about itself."""
+    from torchpose.cli.track import camera_text
+
+    info = prior.info
+    noise = ", ".join(f"{name} {list(value.shape)}" for name, value in prior.noise.items())
+    same = ", right arm mirrored from the left" if info.mirrored else ""
+    frames = f"{info.n_samples} per arm from {info.n_frames} recorded frames"
+    return _table(
+        {
+            "prior": info.name or "without a name",
+            "components": f"{prior.left.n_components} left, {prior.right.n_components} right{same}",
+            "skeleton": info.skeleton,
+            "neck, hand": f"{info.neck or 'not stated'}, {info.hand or 'not stated'}",
+            "centred on": info.centre,
+            "camera": camera_text(prior.camera),
+            "rotations": info.rotation_order,
+            "fps": f"{info.fps:g}" if info.fps else "",
+            "transition": info.transition,
+            "windows": ", ".join(prior.windows),
+            "noise": noise or "not learnt: the tracker's defaults",
+            "states": frames if info.n_samples else "",
+            "persons": f"{len(info.persons)}: {', '.join(info.persons)}" if info.persons else "",
+            "sources": "; ".join(info.sources),
+            "licence": info.licence,
+            "command": info.command,
+        }
+    )
+
+
+def describe_poses(path: Path) -> str:
+    """Frames, shares, uncertainty and notes of a file of poses."""
+    from torchpose.pose_track import PoseTrack
+
+    track = PoseTrack.load(path)
+    std = track.covariance3d.diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(0).sqrt()
+    n_frames = track.joints3d.shape[1]
+    facts = {
+        "poses": str(path),
+        "sequences": "" if len(track) == 1 else str(len(track)),
+        "frames": _length(n_frames, track.fps),
+        "frame": {"camera": "camera axes: x right, y down, z forward"}.get(
+            track.frame, track.frame
+        ),
+        "score": f"{float(track.log_evidence.sum(-1).mean()):.3f} per frame (log evidence, both arms)",
+        "failed at": ", ".join(str(int(i)) for i in track.failed_at if i >= 0),
+        "notes": "; ".join(track.notes),
+    }
+    rows = ["joint            measured   std (cm)"]
+    shares = track.observed.double().mean((0, 1)).tolist()
+    spreads = std.nanmean((0, 1)).tolist()
+    for name, share, spread in zip(track.names, shares, spreads, strict=True):
+        rows.append(f"{name:<16}{100 * share:>7.1f} %{100 * spread:>11.1f}")
+    return _table(facts) + "\n\n" + "\n".join(rows)
+
+
+def describe_keypoints(keypoints: "Keypoints") -> str:
+    """Frames, joints, camera of a file of keypoints."""
+    from torchpose.camera import PinholeCamera
+    from torchpose.cli.track import camera_text, percent
+    from torchpose.skeleton import UPPER_BODY, upper_body_indices
+
+    found = upper_body_indices(keypoints.names)
+    shares = keypoints.measured.double().mean(0).tolist()
+    used = {
+        joint: percent(shares[i])
+        for joint, i in zip(UPPER_BODY, found.indices, strict=True)
+        if i >= 0
+    }
+    size, K = keypoints.image_size, keypoints.K
+    camera = "not stated: give --camera" if size is None else "not stated: guessed from the image"
+    return _table(
+        {
+            "keypoints": str(keypoints.path),
+            "frames": _length(len(keypoints), keypoints.fps),
+            "names": ", ".join(keypoints.names),
+            "measured": ", ".join(f"{joint} {share}" for joint, share in used.items()),
+            "missing": ", ".join(found.missing),
+            "neck, hand": f"{keypoints.neck or found.neck or 'not stated'}, {found.hand or 'none'}",
+            "image": "" if size is None else f"{size[0]} x {size[1]} pixels",
+            "camera": camera if K is None else camera_text(PinholeCamera.from_matrix(K)),
+        }
+    )
+
+
+def _describe_recordings(path: Path) -> str:
+    from torchpose.io import read_recordings
+
+    recordings = read_recordings(path)
+    frames = sum(len(r) for r in recordings)
+    rates = {r.fps for r in recordings}
+    necks = {str(r.upper_body().neck) for r in recordings}
+    return _table(
+        {
+            "recordings": f"{len(recordings)} in {path}",
+            "frames": _length(frames, rates.pop() if len(rates) == 1 else None),
+            "persons": ", ".join(sorted({r.person_id for r in recordings})),
+            "joint sets": ", ".join(sorted({r.skeleton or "other" for r in recordings})),
+            "necks": ", ".join(sorted(necks)),
+        }
+    )
+
+
+def _describe_cameras(path: Path) -> str:
+    from torchpose.camera import load_cameras
+    from torchpose.cli.track import camera_text
+
+    return _table({name: camera_text(camera) for name, camera in load_cameras(path).items()})
+
+
+def _starts_as_keypoints(path: Path) -> bool:
+    """Whether the first line that is no comment is a header, as keypoints have and Kinect has not."""
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        first = next((line for line in stream if line.strip() and not line.startswith("#")), "")
+    return first.lower().startswith("frame")
+
+
+def _length(n_frames: int, fps: float | None) -> str:
+    return (
+        f"{n_frames} ({n_frames / fps:.1f} s at {fps:g} fps)"
+        if fps
+        else f"{n_frames} (rate unknown)"
+    )
+
+
+def _table(facts: dict[str, str]) -> str:
+    """Lines of a name and a value; empty values are left out."""
+    rows = {name: value for name, value in facts.items() if value}
+    width = max(len(name) for name in rows) + 2
+    return "\n".join(f"{name:<{width}}{value}" for name, value in rows.items())

@@ -1,0 +1,62 @@
+"""Poses as a table for spreadsheets."""
+
+import math
+from pathlib import Path
+
+import torch
+
+from torchpose.errors import InputError
+from torchpose.io import atomic_path
+from torchpose.pose_track import PoseTrack
+
+__all__ = ["write_pose_csv"]
+
+_COLUMNS = ("x2d", "y2d", "x", "y", "z", "std_x", "std_y", "std_z", "observed")
+
+
+def write_pose_csv(track: PoseTrack, path: str | Path) -> None:
+    """Write one sequence as ``.csv``; the file appears whole or not at all.
+
+    Lines that begin with ``#`` stand above the header and say what the columns are. Then a row for
+    each frame: ``frame``, ``time`` (s), for each joint ``NAME_x2d``, ``NAME_y2d`` (pixels),
+    ``NAME_x``, ``NAME_y``, ``NAME_z`` and their standard deviations ``NAME_std_x``, ... (m),
+    ``NAME_observed`` (1 measured, 0 inferred), and at last ``log_evidence``. What is NaN is empty.
+
+    Raises:
+        InputError: not one sequence. OutputError: the file cannot be written.
+    """
+    if len(track) != 1:
+        raise InputError(f"a table holds one sequence, got {len(track)}; see PoseTrack.sequence")
+    fps = track.fps or 30.0
+    std = track.covariance3d[0].diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+    observed = track.observed[0, ..., None].to(std)
+    joints = torch.cat([track.joints2d[0].to(std), track.joints3d[0], std, observed], -1)
+    score = track.log_evidence[0].sum(-1).tolist()
+    header = ["frame", "time", *(f"{n}_{c}" for n in track.names for c in _COLUMNS), "log_evidence"]
+    lines = [*_preamble(track), ",".join(header)]
+    for frame, (row, evidence) in enumerate(zip(joints.tolist(), score, strict=True)):
+        cells = [_joint_cells(joint) for joint in row]
+        lines.append(",".join([str(frame), f"{frame / fps:.4f}", *cells, _cell(evidence, 6)]))
+    with atomic_path(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _preamble(track: PoseTrack) -> list[str]:
+    axes = "camera axes: x right, y down, z forward" if track.frame == "camera" else "body frame"
+    return [
+        "# NAME_x2d, NAME_y2d: pixels; NAME_x, NAME_y, NAME_z and their standard deviations "
+        f"NAME_std_*: metres ({axes})",
+        "# NAME_observed: 1 measured, 0 inferred; log_evidence: sum over both arms, a score",
+        f"# fps = {track.fps if track.fps is not None else 'unknown (time is for 30)'}",
+        *(f"# note: {note}" for note in track.notes),
+    ]
+
+
+def _joint_cells(joint: list[float]) -> str:
+    pixels, metres, seen = joint[:2], joint[2:8], joint[8]
+    cells = [*(_cell(v, 3) for v in pixels), *(_cell(v, 6) for v in metres), str(int(seen))]
+    return ",".join(cells)
+
+
+def _cell(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else ""

@@ -1,0 +1,29 @@
+"""Evaluation protocols on real recordings, each one function: ``run(data, out)`` gives a `Report`.
+
+- `ub_people`: persons whom the prior never saw (UTD-MHAD).
+- `ub_one`: the paper's comparison of trackers on the authors' own recording.
+- `signer`: the released sign-language tracker, and how well hand positions are predicted.
+"""
+
+from torchpose.protocols.report import Report, Table
+
+__all__ = ["PROTOCOLS", "Report", "Table", "run_protocol"]
+
+PROTOCOLS = ("ub-people", "ub-one", "signer")
+
+
+def run_protocol(name: str, data: str, out: str, **options: object) -> Report:
+    """Run a protocol by its name; options as its own `run` has them.
+
+    Raises:
+        InputError: an unknown name.
+    """
+    from importlib import import_module
+
+    from torchpose.errors import InputError
+
+    if name not in PROTOCOLS:
+        raise InputError(f"protocol must be one of {', '.join(PROTOCOLS)}, got {name!r}")
+    module = import_module(f"torchpose.protocols.{name.replace('-', '_')}")
+    report: Report = module.run(data, out, **options)
+    return report

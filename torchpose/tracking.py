@@ -1,0 +1,611 @@
+"""The main job: 2D keypoints of head, neck and hands to 2D and 3D poses of eight joints."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple, cast
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from torchpose.camera import PinholeCamera
+from torchpose.errors import CameraError, InputError, PriorError, check_finite, check_shape
+from torchpose.filters import BootstrapParticleFilter, FilterOutput, MixtureKalmanFilter
+from torchpose.filters.base import Generators, RecursiveFilter
+from torchpose.lifting import arm_in_body_frame
+from torchpose.pose_track import PoseTrack
+from torchpose.priors.arm_state import STATE_DIM
+from torchpose.priors.upper_body import UpperBodyPrior
+from torchpose.priors.window import WindowLayout, window_measurements
+from torchpose.projection import map_pixel_covariance, map_pixels
+from torchpose.rotations import RotationOrder, euler_to_matrix
+from torchpose.skeleton import ARM_JOINTS, LEFT_ARM, RIGHT_ARM, UPPER_BODY, upper_body_indices
+
+__all__ = ["METHODS", "PoseTrack", "UpperBodyTracker"]
+
+METHODS = ("mkf-fixed", "mkf-sampled", "mkf-split", "pf-mixture", "pf-walk", "pf-walk-unscaled")
+_PROPOSALS = {
+    "pf-mixture": "mixture",
+    "pf-walk": "random-walk",
+    "pf-walk-unscaled": "random-walk-unscaled",
+}
+_SIDES = {"left": LEFT_ARM, "right": RIGHT_ARM}
+_DEFAULT_STD = 3.0
+_LEAST_CONFIDENCE = 0.05
+# Standard deviations of one frame's motion at 30 frames per second where a prior brings none:
+# hand, elbow, shoulder, head, neck in metres; camera angles in radians, translation in metres.
+_STEP_JOINTS = (0.05, 0.025, 0.01, 0.01, 0.01)
+_STEP_ANGLE, _STEP_TRANSLATION = 0.02, 0.02
+
+
+class _Measured(NamedTuple):
+    """Keypoints of the eight joints in the prior's pixels.
+
+    Attributes:
+        uv: [B, T, 8, 2]. mask: [B, T, 8]. cov: R of each joint, [8, 2, 2] or [B, T, 8, 2, 2].
+        notes: what was assumed.
+    """
+
+    uv: Tensor
+    mask: Tensor
+    cov: Tensor
+    notes: tuple[str, ...]
+
+
+class UpperBodyTracker(nn.Module):
+    """Tracks eight joints in 2D and 3D from the keypoints of any of them, typically head and hands.
+
+    Two filters, one for each arm with head and neck, run on the same measurements (BL section 3.1);
+    head, neck and camera of the two are averaged and their covariances bounded, never fused as if
+    they were independent.
+
+    Args:
+        prior: from `load_prior` or `fit_upper_body_prior`.
+        camera: of the keypoints. One other than the prior's is mapped to it.
+        method: one of `METHODS`.
+        measurement_std: standard deviation of a keypoint in the camera's pixels, one number or one
+            for each of hand, elbow, shoulder, head, neck; by default what the prior brings, else 3.
+        fps: frame rate of the keypoints; by default that of the prior. Process noise is scaled.
+        smoothing: None, the number of later frames that an estimate may use, or "full"; only for
+            "mkf-fixed".
+        frame: "camera" (axes of the camera) or "body" (of the prior's recordings).
+        static_camera: put the body, turned by the estimated rotation, in front of a camera that
+            stays at the prior's mean place, as the authors' released demo does.
+        window: use the prior's mixtures over short windows of motion where it brings them (only for
+            "mkf-fixed"; smoothed estimates then look a few frames ahead); False tracks single poses,
+            as the paper does.
+        calibrated: recalibrate `covariance3d` as the prior's training persons showed, if it says how.
+        neck: kind of neck of the keypoints, where their names do not tell it (see
+            `torchpose.skeleton.NECK_KINDS`). A neck of another kind than the prior's is not measured.
+        max_gap: seconds over which nothing at all may be measured; None is no bound.
+        options: to the filter, such as n_particles, n_tracks, uniform_weight or transition.
+
+    Raises:
+        InputError: an unknown method or option. CameraError: no camera. PriorError: no such prior.
+
+    Example:
+        >>> import torch, torchpose
+        >>> prior = torchpose.load_prior("kinect-upper-body")
+        >>> tracker = torchpose.UpperBodyTracker(prior, camera=prior.camera)
+        >>> keypoints = torch.full((1, 10, 3, 2), 240.0)
+        >>> keypoints[..., 0] = torch.tensor([320.0, 420.0, 220.0])
+        >>> track = tracker(keypoints, names=["head", "hand_left", "hand_right"])
+        >>> track.joints3d.shape
+        torch.Size([1, 10, 8, 3])
+    """
+
+    def __init__(
+        self,
+        prior: UpperBodyPrior,
+        camera: PinholeCamera | None = None,
+        method: str = "mkf-fixed",
+        *,
+        measurement_std: float | Sequence[float] | Tensor | None = None,
+        fps: float | None = None,
+        smoothing: int | str | None = None,
+        frame: str = "camera",
+        static_camera: bool = False,
+        window: bool = True,
+        calibrated: bool = True,
+        neck: str | None = None,
+        max_gap: float | None = 5.0,
+        **options: Any,
+    ) -> None:
+        super().__init__()
+        _check_settings(prior, method, smoothing, frame, fps)
+        self.prior = prior
+        self.camera = _require_camera(camera)
+        self.method = method
+        self.fps = fps or prior.info.fps
+        self.smoothing = smoothing
+        self.window = window
+        self.calibrated = calibrated
+        self.frame = frame
+        self.static_camera = static_camera
+        self.neck = neck
+        self.max_gap = max_gap
+        self.options = options
+        self.register_buffer("measurement_cov", self._measurement_cov(measurement_std))
+        self.measurement_cov: Tensor
+        self.filters = nn.ModuleDict()
+        for side in _SIDES:
+            self._filter(side, ("hand", "head", "neck"))
+
+    def _measurement_cov(self, std: float | Sequence[float] | Tensor | None) -> Tensor:
+        """R of each of the eight joints in the prior's pixels, [8, 2, 2]."""
+        learnt = self.prior.noise.get("measurement_std")
+        if std is None and learnt is not None:
+            by_joint = learnt.double().expand(5) if learnt.ndim == 0 else learnt.double()
+            matrix = None
+        else:
+            given = torch.as_tensor(_DEFAULT_STD if std is None else std, dtype=torch.float64)
+            by_joint = given.expand(5) if given.ndim == 0 else given
+            matrix = self.camera.matrix
+        check_shape("measurement_std", by_joint, [5])
+        check_finite("measurement_std", by_joint)
+        if bool((by_joint <= 0).any()):
+            raise InputError(f"measurement_std must be positive, got {by_joint.tolist()}")
+        cov = torch.diag_embed(by_joint.square()[:, None].expand(5, 2))
+        if matrix is not None:
+            cov = map_pixel_covariance(cov, matrix, self.prior.info.matrix)
+        order = [_arm_index(joint) for joint in UPPER_BODY]
+        return cov[order]
+
+    def _filter(self, side: str, joints: tuple[str, ...]) -> RecursiveFilter:
+        """The filter of an arm that measures these joints."""
+        key = "_".join((side, *joints))
+        if key not in self.filters:
+            self.filters[key] = self._make_filter(side, joints)
+        return cast(RecursiveFilter, self.filters[key])
+
+    def _make_filter(self, side: str, joints: tuple[str, ...]) -> RecursiveFilter:
+        mixture = getattr(self.prior, side)
+        observed = _pixel_indices(joints)
+        arm = _SIDES[side]
+        blocks = [self.measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
+        options = self._noise_options(side) | self.options
+        process_cov = options.pop("process_cov")
+        arguments = (mixture, process_cov, torch.block_diag(*blocks), observed)
+        try:
+            if self.method in _PROPOSALS:
+                return BootstrapParticleFilter(
+                    *arguments, proposal=_PROPOSALS[self.method], **options
+                )
+            tracks = self.method.removeprefix("mkf-")
+            return MixtureKalmanFilter(*arguments, tracks=tracks, **options)
+        except TypeError as error:
+            raise InputError(
+                f"an option does not fit the method {self.method!r}: {error}"
+            ) from error
+
+    def _noise_options(self, side: str) -> dict[str, Any]:
+        """Noise and transition that the prior brings, scaled to the frame rate."""
+        noise, info = self.prior.noise, self.prior.info
+        ratio = 1.0 if not self.fps or not info.fps else info.fps / self.fps
+        process_cov = noise.get(f"process_cov_{side}", noise.get("process_cov"))
+        if process_cov is None:
+            process_cov = default_process_cov(self.prior, 30.0 / (info.fps or 30.0))
+        options: dict[str, Any] = {"process_cov": process_cov * ratio}
+        if self.method in _PROPOSALS:
+            return options
+        options["transition"] = info.transition
+        gamma = noise.get(f"gamma_{side}", noise.get("gamma"))
+        if gamma is not None and info.transition == "ou":
+            options["gamma"] = gamma**ratio
+        epsilon = noise.get("uniform_weight")
+        if epsilon is not None and self.method == "mkf-fixed":
+            options["uniform_weight"] = float(epsilon)
+        return options
+
+    def forward(
+        self,
+        keypoints: Float[Tensor, "B T J 2"],
+        confidence: Float[Tensor, "B T J"] | None = None,
+        names: Sequence[str] | None = None,
+        mask: Bool[Tensor, "B T J"] | None = None,
+        generator: Generators = None,
+        lengths: Int[Tensor, " B"] | None = None,
+        progress: bool = False,
+    ) -> PoseTrack:
+        """Track a batch of sequences.
+
+        Args:
+            keypoints: [B, T, J, 2], pixels of the camera; NaN = missing.
+            confidence: [B, T, J] in 0..1; 0 or NaN is missing, and the measurement covariance is
+                divided by what is between.
+            names: of the J joints, in any order and spelling that `torchpose.skeleton` knows; may be
+                left out if J = 8 and they are in the order of `UPPER_BODY`.
+            mask: [B, T, J], False = ignore the keypoint.
+            generator: for the methods that draw: one, or a list of one for each sequence.
+            lengths: [B], frames of each sequence. progress: whether to show a bar.
+
+        Returns:
+            `PoseTrack`.
+
+        Raises:
+            ShapeError, InputError: wrong shapes, infinite values, nothing measured in a sequence or
+            for longer than `max_gap`. SkeletonError: unknown names.
+        """
+        measured = self._prepare(keypoints, confidence, names, mask, lengths)
+        sources = _generators_of_arms(generator)
+        arms = {
+            side: self._run_arm(side, measured, lengths, source, progress)
+            for side, source in zip(_SIDES, sources, strict=True)
+        }
+        return self._poses(arms["left"], arms["right"], measured, lengths)
+
+    def _prepare(
+        self,
+        keypoints: Tensor,
+        confidence: Tensor | None,
+        names: Sequence[str] | None,
+        mask: Tensor | None,
+        lengths: Tensor | None,
+    ) -> _Measured:
+        """Keypoints of the eight joints in the prior's pixels, checked."""
+        check_shape("keypoints", keypoints, ["B", "T", "J", 2])
+        keypoints = keypoints.to(self.measurement_cov)
+        if keypoints.shape[0] == 0 or keypoints.shape[1] == 0:
+            raise InputError(
+                f"keypoints must hold at least one sequence of one frame, got {list(keypoints.shape)}"
+            )
+        indices, notes = self._joints(keypoints.shape[2], names)
+        measured = torch.isfinite(keypoints).all(-1)
+        check_finite("keypoints", keypoints, ~keypoints.isnan(), "missing keypoints are NaN")
+        if mask is not None:
+            check_shape("mask", mask, list(measured.shape))
+            measured = measured & mask.to(measured.device, torch.bool)
+        cov = self.measurement_cov
+        if confidence is not None:
+            check_shape("confidence", confidence, list(measured.shape))
+            measured = measured & (confidence.to(measured.device) > 0)
+        present = torch.tensor([i >= 0 for i in indices], device=measured.device)
+        picked = [max(i, 0) for i in indices]
+        measured = measured[:, :, picked] & present
+        uv = torch.where(
+            measured[..., None], keypoints[:, :, picked], torch.zeros_like(keypoints[:1, :1, :1])
+        )
+        if confidence is not None:
+            weight = confidence.to(uv)[:, :, picked].nan_to_num(1.0)
+            weight = weight.clamp(_LEAST_CONFIDENCE, 1.0)
+            if bool((weight[measured] < 1).any()):
+                cov = cov / torch.where(measured, weight, torch.ones_like(weight))[..., None, None]
+        self._check_gaps(measured, lengths)
+        uv = map_pixels(uv, self.camera.matrix.to(uv), self.prior.info.matrix.to(uv))
+        return _Measured(uv, measured, cov, notes)
+
+    def _joints(
+        self, n_joints: int, names: Sequence[str] | None
+    ) -> tuple[tuple[int, ...], tuple[str, ...]]:
+        """For each of the eight joints its index among the keypoints, -1 if absent; and notes."""
+        if names is None:
+            if n_joints != len(UPPER_BODY):
+                raise InputError(
+                    f"names may be left out only for the {len(UPPER_BODY)} joints "
+                    f"{', '.join(UPPER_BODY)}; got {n_joints} keypoints without names"
+                )
+            return tuple(range(n_joints)), ()
+        if len(names) != n_joints:
+            raise InputError(
+                f"names must name each of the {n_joints} keypoints, got {len(names)} names"
+            )
+        found = upper_body_indices(names)
+        indices, notes = list(found.indices), []
+        neck, wanted = self.neck or found.neck, self.prior.info.neck
+        at = UPPER_BODY.index("neck")
+        if indices[at] >= 0 and neck is not None and wanted is not None and neck != wanted:
+            indices[at] = -1
+            notes.append(
+                f"the keypoints' neck ({neck}) is not the prior's ({wanted}): not measured"
+            )
+        hand = self.prior.info.hand
+        if found.hand is not None and hand is not None and found.hand != hand:
+            notes.append(f"the keypoints' {found.hand}s stand for the prior's {hand}s")
+        return tuple(indices), tuple(notes)
+
+    def _check_gaps(self, measured: Tensor, lengths: Tensor | None) -> None:
+        """Refuse sequences in which nothing at all is measured, wholly or for too long."""
+        batch, n_frames, _ = measured.shape
+        seen = measured.any(-1)
+        if lengths is not None:
+            check_shape("lengths", lengths, [batch])
+            over = torch.arange(n_frames, device=seen.device) >= lengths.to(seen.device)[:, None]
+            if bool((seen & over).any()):
+                seen = seen & ~over
+        empty = torch.nonzero(~seen.any(1)).flatten().tolist()
+        if empty:
+            raise InputError(
+                f"no joint is measured in any frame of sequence {empty[0]} "
+                f"({len(empty)} such sequences); expected keypoints of some of {', '.join(UPPER_BODY)}"
+            )
+        if self.max_gap is None:
+            return
+        allowed = self.max_gap * (self.fps or 30.0)
+        frames = torch.arange(n_frames, device=seen.device).expand(batch, -1)
+        last_seen = torch.where(seen, frames, torch.full_like(frames, -1)).cummax(1).values
+        gap = frames - last_seen
+        if lengths is not None:
+            gap = torch.where(over, torch.zeros_like(gap), gap)
+        if bool((gap > allowed).any()):
+            b, t = (int(i) for i in torch.nonzero(gap == gap.max())[0])
+            raise InputError(
+                f"nothing is measured for {int(gap[b, t])} frames, from frame "
+                f"{int(last_seen[b, t]) + 1} of sequence {b} on, longer than max_gap = {self.max_gap} s; "
+                "cut the recording there, or raise max_gap to have the prior fill it"
+            )
+
+    def _run_arm(
+        self,
+        side: str,
+        measured: _Measured,
+        lengths: Tensor | None,
+        generator: Generators,
+        progress: bool,
+    ) -> FilterOutput:
+        joints = self._measured_joints(side, measured.mask)
+        z, mask, cov = _arm_measurements(_SIDES[side], joints, measured)
+        window = self._window()
+        if window is not None:
+            return self._run_window(side, joints, window, measured, (z, mask, cov), lengths)
+        model = self._filter(side, joints)
+        if self.smoothing is not None and isinstance(model, MixtureKalmanFilter):
+            lag = None if self.smoothing == "full" else int(self.smoothing)
+            return model.smooth(z, mask, cov, lengths, lag=lag, return_cov=True)
+        return model(z, mask, cov, lengths, generator, return_cov=True, progress=progress)
+
+    def _window(self) -> tuple[str, WindowLayout] | None:
+        """The window that suits the smoothing asked for: its name, and its lags at this frame rate."""
+        if self.method != "mkf-fixed" or not self.window:
+            return None
+        name = "causal" if self.smoothing is None else "full"
+        if name not in self.prior.windows:
+            return None
+        layout = self.prior.windows[name].layout.at_rate(self.fps or 30.0)
+        too_far = isinstance(self.smoothing, int) and self.smoothing < layout.ahead
+        return None if too_far else (name, layout)
+
+    def _run_window(
+        self,
+        side: str,
+        joints: tuple[str, ...],
+        window: tuple[str, WindowLayout],
+        measured: _Measured,
+        base: tuple[Tensor, Tensor, Tensor | None],
+        lengths: Tensor | None,
+    ) -> FilterOutput:
+        """Fixed tracks over window states; the evidence is that of this frame given the window."""
+        name, layout = window
+        z, mask, cov = base
+        hands, known = window_measurements(measured.uv, measured.mask, layout, side)
+        model = self._window_filter(side, name, joints)
+        hand_cov = self._window_hand_cov(side, name)
+        both = torch.cat([z, hands], -1), torch.cat([mask, known], -1)
+        noise = None if cov is None else _append_blocks(cov, hand_cov, hands.shape[-1] // 2)
+        out = model(*both, noise, lengths, return_cov=True)
+        context = self._window_filter(side, name, ())(hands, known, None, lengths)
+        evidence = out.log_evidence - context.log_evidence
+        evidence = torch.where(mask.any(-1), evidence, torch.zeros_like(evidence))
+        cov = _require_cov(out)[..., :STATE_DIM, :STATE_DIM]
+        return out._replace(mean=out.mean[..., :STATE_DIM], cov=cov, log_evidence=evidence)
+
+    def _window_filter(self, side: str, name: str, joints: tuple[str, ...]) -> MixtureKalmanFilter:
+        """Fixed tracks over window states that measure these joints and all hands of the window."""
+        key = "_".join(("window", name, side, *joints))
+        if key not in self.filters:
+            window = self.prior.windows[name]
+            arm = _SIDES[side]
+            blocks = [self.measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
+            n_hands = (window.layout.dim - STATE_DIM) // 2
+            blocks += [self._window_hand_cov(side, name)] * n_hands
+            observed = _pixel_indices(joints) + list(range(STATE_DIM, window.layout.dim))
+            settings = {
+                "uniform_weight": window.settings["uniform_weight"],
+                "likelihood_power": window.settings["likelihood_power"],
+            }
+            mixture = getattr(window, side)
+            # Poses of consecutive frames are tied by the window itself: no memory beyond it.
+            self.filters[key] = MixtureKalmanFilter(
+                mixture,
+                torch.ones(window.layout.dim, dtype=torch.float64),
+                torch.block_diag(*blocks),
+                observed,
+                transition="ou",
+                gamma=0.0,
+                **(settings | self.options),
+            )
+        return cast(MixtureKalmanFilter, self.filters[key])
+
+    def _window_hand_cov(self, side: str, name: str) -> Tensor:
+        """Noise of a hand of the window: that of a hand now, and what moving it here adds."""
+        std = self.prior.windows[name].settings["hand_std"]
+        own = self.measurement_cov[_SIDES[side][0]]
+        return own + std**2 * torch.eye(2, dtype=own.dtype, device=own.device)
+
+    def _measured_joints(self, side: str, mask: Tensor) -> tuple[str, ...]:
+        """Hand, head and neck, and any other joint of the arm that is measured somewhere."""
+        anywhere = mask.flatten(0, 1).any(0)[list(_SIDES[side])].tolist()
+        usual = ("hand", "head", "neck")
+        return tuple(
+            j for j, there in zip(ARM_JOINTS, anywhere, strict=True) if there or j in usual
+        )
+
+    def _poses(
+        self, left: FilterOutput, right: FilterOutput, measured: _Measured, lengths: Tensor | None
+    ) -> PoseTrack:
+        info = self.prior.info
+        matrix = info.matrix.to(left.mean)
+        order: RotationOrder = info.rotation_order  # type: ignore[assignment]
+        arm_covs = _require_cov(left), _require_cov(right)
+        means = left.mean, right.mean
+        lifted = [
+            arm_in_body_frame(mean, cov, matrix, order)
+            for mean, cov in zip(means, arm_covs, strict=True)
+        ]
+        joints3d = join_arms(*(joints for joints, _ in lifted))
+        covs3d = self._calibrated(join_arms(*(cov for _, cov in lifted)))
+        camera_pose = (left.mean[..., 15:] + right.mean[..., 15:]) / 2
+        if self.frame == "camera":
+            rotation = euler_to_matrix(camera_pose[..., :3], order)[..., None, :, :]
+            place = camera_pose[..., None, 3:]
+            if self.static_camera:
+                place = self.prior.left.moments()[0][18:].to(place).expand_as(place)
+            joints3d = (rotation @ joints3d[..., None])[..., 0] + place
+            covs3d = rotation @ covs3d @ rotation.mT
+        uv = join_arms(
+            *(arm.mean[..., :15].unflatten(-1, (5, 3))[..., :2] for arm in (left, right))
+        )
+        covs2d = join_arms(*(_pixel_blocks(cov) for cov in arm_covs))
+        own = self.camera.matrix.to(uv)
+        batch, n_frames = uv.shape[:2]
+        if lengths is None:
+            lengths = torch.full((batch,), n_frames, device=uv.device)
+        failures = torch.stack([left.failed_at, right.failed_at])
+        failed_at = torch.where(
+            (failures >= 0).any(0), failures.where(failures >= 0, n_frames).amin(0), -1
+        )
+        return PoseTrack(
+            joints2d=map_pixels(uv, matrix, own),
+            joints3d=joints3d,
+            covariance2d=map_pixel_covariance(covs2d, matrix, own),
+            covariance3d=covs3d,
+            observed=measured.mask,
+            log_evidence=torch.stack([left.log_evidence, right.log_evidence], -1),
+            lengths=lengths,
+            matrix=self.camera.matrix,
+            failed_at=failed_at,
+            fps=self.fps,
+            frame=self.frame,
+            notes=measured.notes,
+        )
+
+    def _calibrated(self, covs: Tensor) -> Tensor:
+        """Covariances recalibrated per joint on the prior's training persons, if it brings that."""
+        noise, window = self.prior.noise, self._window()
+        mode = "pose" if window is None else window[0]
+        scale = noise.get(f"calibration_scale_{mode}")
+        floor = noise.get(f"calibration_floor_{mode}")
+        if scale is None or floor is None or not self.calibrated:
+            return covs
+        eye = torch.eye(3, dtype=covs.dtype, device=covs.device)
+        return covs * scale.to(covs)[:, None, None] + floor.to(covs)[:, None, None] * eye
+
+
+def join_arms(left: Float[Tensor, "B T 5 *rest"], right: Float[Tensor, "B T 5 *rest"]) -> Tensor:
+    """Eight joints from hand, elbow, shoulder, head and neck of either arm.
+
+    Head and neck are averaged. For covariances the average bounds that of the averaged estimate
+    whatever the two errors have in common: Cov((a + b) / 2) <= (Cov a + Cov b) / 2.
+    """
+    shared = (left[:, :, 3:] + right[:, :, 3:]) / 2
+    return torch.cat([left[:, :, :3], shared, right[:, :, :3].flip(2)], 2)
+
+
+def default_process_cov(prior: UpperBodyPrior, seconds_ratio: float = 1.0) -> Float[Tensor, " 21"]:
+    """Diagonal of Q per frame where a prior brings none: steps in metres, seen at its mean distance.
+
+    Args:
+        prior: whose camera and mean depth are used. seconds_ratio: frame interval over 1/30 s.
+    """
+    depth = prior.left.moments()[0][2:15:3].mean().clamp_min(0.1)
+    steps = torch.tensor(_STEP_JOINTS, dtype=torch.float64)
+    pixels = steps * math.sqrt(prior.info.fx * prior.info.fy) / depth
+    joints = torch.stack([pixels, pixels, steps], 1).flatten()
+    camera = torch.tensor([_STEP_ANGLE] * 3 + [_STEP_TRANSLATION] * 3, dtype=torch.float64)
+    return torch.cat([joints, camera]).square() * seconds_ratio
+
+
+def _generators_of_arms(generator: Generators) -> tuple[Generators, Generators]:
+    """A generator for each arm, so that one arm's numbers do not depend on how many the other drew."""
+    if generator is None:
+        return None, None
+    if isinstance(generator, torch.Generator):
+        left, right = torch.randint(2**62, (2,), generator=generator, device=generator.device)
+        device = generator.device
+        return (
+            torch.Generator(device).manual_seed(int(left)),
+            torch.Generator(device).manual_seed(int(right)),
+        )
+    pairs = [_generators_of_arms(g) for g in generator]
+    lefts = [left for left, _ in pairs if isinstance(left, torch.Generator)]
+    return lefts, [right for _, right in pairs if isinstance(right, torch.Generator)]
+
+
+def _pixel_indices(joints: Sequence[str]) -> list[int]:
+    """State dimensions of u and v of these joints of an arm."""
+    return [3 * ARM_JOINTS.index(joint) + axis for joint in joints for axis in (0, 1)]
+
+
+def _arm_measurements(
+    arm: tuple[int, ...], joints: tuple[str, ...], measured: _Measured
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """z, mask and R of an arm's joints; R is None where it is the filter's own."""
+    rows = [arm[ARM_JOINTS.index(joint)] for joint in joints]
+    z = measured.uv[:, :, rows].flatten(-2)
+    mask = measured.mask[:, :, rows].repeat_interleave(2, -1)
+    if measured.cov.ndim == 3:
+        return z, mask, None
+    return z, mask, _block_diagonal(measured.cov[:, :, rows])
+
+
+def _block_diagonal(blocks: Float[Tensor, "B T N 2 2"]) -> Float[Tensor, "B T Z Z"]:
+    n = blocks.shape[2]
+    eye = torch.eye(n, dtype=blocks.dtype, device=blocks.device)
+    return torch.einsum("btnij,nm->btnimj", blocks, eye).flatten(-2).flatten(-3, -2)
+
+
+def _append_blocks(cov: Float[Tensor, "B T Z Z"], block: Tensor, count: int) -> Tensor:
+    """R with `count` more diagonal blocks."""
+    blocks = torch.block_diag(*[block] * count).expand(*cov.shape[:2], -1, -1)
+    n, extra = cov.shape[-1], blocks.shape[-1]
+    whole = cov.new_zeros(*cov.shape[:2], n + extra, n + extra)
+    whole[..., :n, :n], whole[..., n:, n:] = cov, blocks
+    return whole
+
+
+def _require_cov(out: FilterOutput) -> Tensor:
+    if out.cov is None:
+        raise RuntimeError("the filter was run without return_cov=True")
+    return out.cov
+
+
+def _arm_index(joint: str) -> int:
+    """Index in `ARM_JOINTS` of one of the eight joints."""
+    return ARM_JOINTS.index(joint.split("_")[0])
+
+
+def _pixel_blocks(cov: Float[Tensor, "B T 21 21"]) -> Float[Tensor, "B T 5 2 2"]:
+    blocks = cov[..., :15, :15].unflatten(-1, (5, 3)).unflatten(-3, (5, 3))
+    return blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)[..., :2, :2]
+
+
+def _require_camera(camera: PinholeCamera | None) -> PinholeCamera:
+    if camera is None:
+        raise CameraError(
+            "a camera is needed, got None; pass camera=PinholeCamera(fx, fy, cx, cy), "
+            "PinholeCamera.from_image_size(width, height), or prior.camera if it is the same"
+        )
+    return camera
+
+
+def _check_settings(
+    prior: UpperBodyPrior,
+    method: str,
+    smoothing: int | str | None,
+    frame: str,
+    fps: float | None,
+) -> None:
+    if not isinstance(prior, UpperBodyPrior):
+        raise PriorError(
+            f"prior must be an UpperBodyPrior, got {type(prior).__name__}; see torchpose.load_prior"
+        )
+    if method not in METHODS:
+        raise InputError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    if frame not in ("camera", "body"):
+        raise InputError(f"frame must be 'camera' or 'body', got {frame!r}")
+    if fps is not None and not (fps > 0 and math.isfinite(fps)):
+        raise InputError(f"fps must be positive, got {fps}")
+    wrong_lag = isinstance(smoothing, int) and smoothing < 0
+    if wrong_lag or (isinstance(smoothing, str) and smoothing != "full"):
+        raise InputError(f"smoothing must be None, a number of frames or 'full', got {smoothing!r}")
+    if smoothing is not None and method != "mkf-fixed":
+        raise InputError(f"smoothing needs method 'mkf-fixed', got {method!r}")
