@@ -139,7 +139,7 @@ def test_sampled_tracks_agree_with_split_tracks_within_monte_carlo_error():
 
 
 @pytest.mark.parametrize("gaps", [False, True])
-@pytest.mark.parametrize("batch", [1, 3, 20])
+@pytest.mark.parametrize("batch", [1, 3, 20, 100])
 def test_online_and_offline_give_the_same_numbers(batch, gaps):
     p = Problem(n_frames=260, batch=batch, missing=0.0)
     if gaps:

@@ -1,0 +1,227 @@
+"""What every benchmark shares: taking turns, medians, the limits of the machine, tables.
+
+Methods take turns (A B A B), so that other work on the machine hits all of them, and ratios are of
+medians from one run. CPU time stands beside wall time: on a machine that is not idle, the CPU time of
+a run with one thread is the figure to compare, since waiting for a core does not count.
+"""
+
+import argparse
+import contextlib
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable, Iterable, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+THREAD_VARIABLES = ("OMP", "MKL", "OPENBLAS", "NUMBA")
+
+
+class Case(NamedTuple):
+    """One method under test.
+
+    Attributes:
+        name: as printed. call: one run, without arguments. units: frames, steps, ... of one call.
+        inner: calls between two looks at the clock, for calls of less than about a millisecond.
+    """
+
+    name: str
+    call: Callable[[], Any]
+    units: float = 1
+    inner: int = 1
+
+
+class Timing(NamedTuple):
+    """Seconds per unit of a case, one number for each run."""
+
+    case: Case
+    wall: list[float]
+    cpu: list[float]
+
+    @property
+    def median(self) -> float:
+        """Median wall time."""
+        return statistics.median(self.wall)
+
+    @property
+    def best(self) -> float:
+        """Smallest wall time."""
+        return min(self.wall)
+
+    @property
+    def median_cpu(self) -> float:
+        """Median CPU time of this process, over all of its threads."""
+        return statistics.median(self.cpu)
+
+
+class Ratio(NamedTuple):
+    """How many times as long the peer takes, by wall time and by CPU time."""
+
+    wall: float
+    cpu: float
+
+
+class Limits(NamedTuple):
+    """What the machine can do: products of large matrices, copies, and the cost of one small call."""
+
+    gflops_float64: float
+    gflops_float32: float
+    copy_gb: float
+    call_us: float
+
+
+def parser(description: str, runs: int) -> argparse.ArgumentParser:
+    """A command line with the options of every benchmark."""
+    made = argparse.ArgumentParser(description=description)
+    made.add_argument("--threads", type=int, default=2, help="cores for every library")
+    made.add_argument("--runs", type=int, default=runs, help="timed runs of each method")
+    made.add_argument("--quick", action="store_true", help="a tiny problem, to see that it runs")
+    made.add_argument("--out", type=Path, help="write what is printed to this file as Markdown")
+    return made
+
+
+def limit_threads(threads: int) -> None:
+    """The same cores for every library; call it before peers are imported."""
+    for name in THREAD_VARIABLES:
+        os.environ[f"{name}_NUM_THREADS"] = str(threads)
+    torch.set_num_threads(threads)
+    with contextlib.suppress(AttributeError, OSError):
+        # JAX sizes its pool by the cores that it may use.
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:threads])
+    with contextlib.suppress(ImportError):
+        from threadpoolctl import threadpool_limits
+
+        threadpool_limits(threads)
+
+
+def take_turns(cases: Sequence[Case], runs: int, warm: int = 1) -> list[Timing]:
+    """Warm every case up, then time one run of each in turn, `runs` times over."""
+    timings = [Timing(case, [], []) for case in cases]
+    for case in cases:
+        for _ in range(warm):
+            case.call()
+    for _ in range(runs):
+        for timing in timings:
+            _time_once(timing)
+    return timings
+
+
+def _time_once(timing: Timing) -> None:
+    call, inner = timing.case.call, timing.case.inner
+    wall, cpu = time.perf_counter(), time.process_time()
+    for _ in range(inner):
+        call()
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    timing.wall.append(wall / inner / timing.case.units)
+    timing.cpu.append(cpu / inner / timing.case.units)
+
+
+def ratio(peer: Timing, ours: Timing) -> Ratio:
+    """Ratio of medians per unit."""
+    return Ratio(peer.median / ours.median, peer.median_cpu / max(ours.median_cpu, 1e-12))
+
+
+def measure_limits(quick: bool = False) -> Limits:
+    """The floor's ingredients, each the best of several runs."""
+    size, runs = (256, 3) if quick else (1536, 7)
+    rates = []
+    for dtype in (torch.float64, torch.float32):
+        a, b = torch.randn(2, size, size, dtype=dtype)
+        product = Case("product", lambda a=a, b=b: a @ b)  # type: ignore[misc]
+        rates.append(2e-9 * size**3 / take_turns([product], runs)[0].best)
+    source = torch.randn((1 if quick else 32) * 2**20, dtype=torch.float64)
+    target = torch.empty_like(source)
+    copy = take_turns([Case("copy", lambda: target.copy_(source))], runs)[0].best
+    one = torch.ones(1)
+    call = take_turns([Case("call", lambda: one + one, inner=2000)], runs)[0].best
+    return Limits(rates[0], rates[1], 2e-9 * source.nbytes / copy, 1e6 * call)
+
+
+def limits_line(limits: Limits) -> str:
+    """One line on what `measure_limits` found."""
+    return (
+        f"This machine: {limits.gflops_float64:.0f} GFLOP/s in float64, "
+        f"{limits.gflops_float32:.0f} in float32 (products of large matrices), "
+        f"{limits.copy_gb:.0f} GB/s (copies, read and written), {limits.call_us:.2f} us for one small call."
+    )
+
+
+def machine_line(threads: int, packages: Iterable[str] = ()) -> str:
+    """Processor, cores, versions, threads and load; nothing that names the machine."""
+    versions = [f"Python {platform.python_version()}", f"torch {torch.__version__}"]
+    versions += [f"{name} {found}" for name in packages if (found := _version(name))]
+    load = f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
+    return (
+        f"{processor_model()}, {os.cpu_count()} cores, {threads} used; {', '.join(versions)}; "
+        f"load {load}."
+    )
+
+
+def processor_model() -> str:
+    """The processor's name, as far as the system tells."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return " ".join(line.split(":", 1)[1].split())
+    return platform.processor() or platform.machine()
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table, padded so that it reads as text too; all columns but the first to the right."""
+    table = [list(header), *(list(row) for row in rows)]
+    widths = [max(len(row[i]) for row in table) for i in range(len(header))]
+    lines = [_table_line(row, widths) for row in table]
+    rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
+    return "\n".join([lines[0], f"| {' | '.join(rule)} |", *lines[1:]])
+
+
+def _table_line(row: Sequence[str], widths: Sequence[int]) -> str:
+    first, *others = (
+        cell.ljust(width) if i == 0 else cell.rjust(width)
+        for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+    )
+    return f"| {' | '.join([first, *others])} |"
+
+
+def number(value: float, digits: int = 3) -> str:
+    """`value` to a few significant digits, without an exponent where it is not needed."""
+    if value == 0 or not 1e-4 <= abs(value) < 1e7:
+        return f"{value:.{digits - 1}e}" if value else "0"
+    whole = len(str(int(abs(value)))) if abs(value) >= 1 else 0
+    text = f"{value:,.{max(digits - whole, 0)}f}" if whole else f"{value:.{digits}g}"
+    return text
+
+
+class Report:
+    """Prints as it goes, and writes the same text as Markdown at the end if asked to."""
+
+    def __init__(self, title: str, out: Path | None) -> None:
+        self.out = out
+        self.parts: list[str] = []
+        self.add(f"## {title}")
+
+    def add(self, text: str) -> None:
+        """One paragraph or table."""
+        print(text, end="\n\n", flush=True)
+        self.parts.append(text)
+
+    def table(self, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+        """A Markdown table."""
+        self.add(markdown_table(header, rows))
+
+    def close(self) -> None:
+        """Write the file."""
+        if self.out is not None:
+            self.out.parent.mkdir(parents=True, exist_ok=True)
+            self.out.write_text("\n\n".join(self.parts) + "\n", encoding="utf-8")

@@ -1,0 +1,228 @@
+"""Learned regressors beside the mixture Kalman filter on UB-people.
+
+Trained on persons s1 to s6 of UTD-MHAD seen from the same random views as the prior, tested on s7
+and s8 with the same measurements as `torchpose evaluate ub-people`:
+
+- MLP, 8-256-256-24: every frame alone, on 100,000 projected poses;
+- GRU, 2 x 128, causal: 1,500 steps of 32 sequences of 64 frames;
+- GRU, 2 x 128, both directions: the same, and it sees the future.
+
+Half of the training sequences are mirrored. Inputs are head and hands relative to the neck and the
+neck itself, with the test's noise. Targets are the joints relative to the neck, either in the
+body's own axes (`--targets body`) or in those of the camera (`--targets camera`), which need no view
+to be undone; the error is taken after Procrustes, so both are scored alike. The mean over the seeds
+and its spread are printed.
+
+    python benchmarks/ub_people_regressors.py --data DIR [--report OUT/report.json]
+
+`--report` prints the rows of a finished `torchpose evaluate ub-people` beside them.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from torchpose.camera import PinholeCamera, sample_viewpoints
+from torchpose.priors import TRAINING_VIEWS
+from torchpose.projection import project
+from torchpose.protocols.common import (
+    MEASURED,
+    Estimate,
+    Trials,
+    centred_on_neck,
+    make_test_set,
+    mirror_pose,
+    score,
+)
+from torchpose.protocols.people_tables import SHORT_NAMES
+from torchpose.protocols.report import Report
+from torchpose.protocols.ub_people import people, sway
+from torchpose.rotations import euler_to_matrix
+from torchpose.skeleton import UPPER_BODY
+
+CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
+COLUMNS = [UPPER_BODY.index(name) for name in MEASURED]
+NOISE = 3.0
+PIXELS = 100.0  # scale of the inputs
+METRES = 0.2  # scale of the targets
+
+
+def features(keypoints: Tensor) -> Tensor:
+    """Head and hands relative to the neck, and the neck, [..., 8], about 1 in size."""
+    neck = keypoints[..., 1:2, :]
+    centre = keypoints.new_tensor([319.5, 239.5])
+    rest = keypoints[..., [0, 2, 3], :] - neck
+    return (torch.cat([rest, neck - centre], -2) / PIXELS).flatten(-2)
+
+
+def views(n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Rotation [n, 3, 3] and translation [n, 3] of random training viewpoints, float32."""
+    found = sample_viewpoints(n, TRAINING_VIEWS, generator)
+    return euler_to_matrix(found.angles, "zxy").float(), found.translation.float()
+
+
+def examples(poses: Tensor, targets: str, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Inputs [N, T, 8] and targets [N, T, 24] of sequences [N, T, 8, 3], each from one viewpoint."""
+    flip = torch.rand(len(poses), generator=generator) < 0.5
+    poses = torch.where(flip[:, None, None, None], mirror_pose(poses), poses)
+    rotation, translation = views(len(poses), generator)
+    rotation, translation = rotation[:, None], translation[:, None]
+    uv = project(poses, CAMERA.matrix.float(), rotation, translation)[..., :2]
+    keypoints = uv[..., COLUMNS, :]
+    keypoints = keypoints + NOISE * torch.randn(keypoints.shape, generator=generator)
+    wanted = poses if targets == "body" else poses @ rotation.mT
+    return features(keypoints), (wanted / METRES).flatten(-2)
+
+
+class Recurrent(nn.Module):
+    """Two layers of 128 gated units, in one direction or both."""
+
+    def __init__(self, both: bool) -> None:
+        super().__init__()
+        self.cells = nn.GRU(8, 128, 2, batch_first=True, bidirectional=both)
+        self.out = nn.Linear(256 if both else 128, 24)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.out(self.cells(x)[0])
+
+
+def multilayer() -> nn.Module:
+    return nn.Sequential(
+        nn.Linear(8, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, 24)
+    )
+
+
+def train_frames(poses: list[Tensor], targets: str, seed: int, quick: bool) -> nn.Module:
+    """The per-frame MLP on 100,000 projected poses."""
+    generator = torch.Generator().manual_seed(seed)
+    torch.manual_seed(seed)
+    frames = torch.cat(poses)
+    n, epochs = (5_000, 5) if quick else (100_000, 40)
+    chosen = frames[torch.randint(len(frames), (n,), generator=generator)]
+    x, y = examples(chosen[:, None], targets, generator)
+    x, y = x[:, 0], y[:, 0]
+    batches = [
+        part for _ in range(epochs) for part in torch.randperm(n, generator=generator).split(512)
+    ]
+    model = multilayer()
+    fit(model, lambda step: (x[batches[step]], y[batches[step]]), len(batches), "MLP")
+    return model
+
+
+def train_sequences(
+    poses: list[Tensor], targets: str, seed: int, quick: bool, both: bool
+) -> nn.Module:
+    """A GRU on random pieces of 64 frames of the training sequences."""
+    generator = torch.Generator().manual_seed(seed)
+    torch.manual_seed(seed)
+    lengths = torch.tensor([len(p) for p in poses])
+    stacked = torch.nn.utils.rnn.pad_sequence(poses, True)
+    model = Recurrent(both)
+
+    def batch(step: int) -> tuple[Tensor, Tensor]:
+        row = torch.multinomial(lengths.double(), 32, True, generator=generator)
+        first = torch.rand(32, generator=generator) * (lengths[row] - 64).clamp_min(0)
+        # a sequence that is too short stands still at its end
+        place = torch.minimum(first.long()[:, None] + torch.arange(64), lengths[row][:, None] - 1)
+        return examples(stacked[row[:, None], place], targets, generator)
+
+    fit(model, batch, 40 if quick else 1_500, "GRU, both directions" if both else "GRU")
+    return model
+
+
+def fit(
+    model: nn.Module, batch: Callable[[int], tuple[Tensor, Tensor]], n_steps: int, label: str
+) -> None:
+    """Adam with one cycle of the learning rate; the loss is the mean distance of the joints."""
+    adam = torch.optim.Adam(model.parameters(), lr=2e-3)
+    cycle = torch.optim.lr_scheduler.OneCycleLR(adam, 2e-3, total_steps=n_steps)
+    for step in tqdm(range(n_steps), desc=label, leave=False):
+        x, y = batch(step)
+        adam.zero_grad()
+        distance = (model(x) - y).unflatten(-1, (8, 3)).square().sum(-1).add(1e-6).sqrt()
+        distance.mean().backward()
+        nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        adam.step()
+        cycle.step()
+
+
+def estimate(model: nn.Module, test: Trials) -> Estimate:
+    """Poses of a test set. The regressors give no pixels: those are NaN."""
+    with torch.inference_mode():
+        found = model(features(test.keypoints).nan_to_num().float())
+    joints = METRES * found.unflatten(-1, (8, 3)).double()
+    return Estimate(torch.full_like(test.truth2d, torch.nan), joints)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, required=True, help="folder kinect_utd_mhad")
+    parser.add_argument("--report", type=Path, help="report.json of torchpose evaluate ub-people")
+    parser.add_argument("--seeds", type=int, default=1, help="runs of each; ten minutes each")
+    parser.add_argument("--targets", choices=("body", "camera"), default="body")
+    parser.add_argument("--quick", action="store_true", help="a minute, to see that it works")
+    args = parser.parse_args()
+    train, tested = people(args.data, args.quick)
+    poses = [centred_on_neck(r.upper_body().joints).float() for r in train]
+    unseen = [centred_on_neck(r.upper_body().joints) for r in tested]
+    fps = tested[0].fps or 30.0
+    still = make_test_set(unseen, CAMERA, fps)
+    paths = [sway(len(p), fps, i / len(unseen)) for i, p in enumerate(unseen)]
+    moving = make_test_set(unseen, CAMERA, fps, paths=paths)
+    trainers: dict[str, Callable[[int], nn.Module]] = {
+        "MLP, per frame": lambda s: train_frames(poses, args.targets, s, args.quick),
+        "GRU, causal": lambda s: train_sequences(poses, args.targets, s, args.quick, False),
+        "GRU, both directions": lambda s: train_sequences(poses, args.targets, s, args.quick, True),
+    }
+    n_seeds = 1 if args.quick else args.seeds
+    report = Report("UB-people, learned regressors")
+    table = report.table(
+        "errors_3d",
+        f"3D error after Procrustes (cm), {n_seeds} seed(s), targets in {args.targets} axes",
+        ["mean", "spread", "moving root", "jitter (m/s2)", *SHORT_NAMES, "training (s)"],
+        digits=(2, 2, 2, 1, *[1] * 8, 0),
+    )
+    for name, trainer in trainers.items():
+        rows = []
+        for seed in range(n_seeds):
+            start = time.perf_counter()
+            model = trainer(seed)
+            seconds = time.perf_counter() - start
+            found = score(estimate(model, still), still)
+            moved = score(estimate(model, moving), moving)
+            rows.append([
+                100 * float(found.errors3d.nanmean()), 100 * float(moved.errors3d.nanmean()),
+                float(found.jitter.mean()), *(100 * found.errors3d.flatten(0, 1).nanmean(0)).tolist(),
+                seconds,
+            ])  # fmt: skip
+        values = torch.tensor(rows)
+        spread = float(values[:, 0].std()) if len(rows) > 1 else float("nan")
+        mean = values.mean(0).tolist()
+        table.add(name, [mean[0], spread, *mean[1:]])
+    if args.report:
+        add_finished_rows(report, args.report)
+    print(report.summary())
+
+
+def add_finished_rows(report: Report, path: Path) -> None:
+    """The methods of a finished run of the protocol, below the regressors."""
+    tables = json.loads(path.read_text(encoding="utf-8"))["tables"]
+    moved = tables["moving_root_3d"]["rows"]
+    for name, row in tables["errors_3d"]["rows"].items():
+        other = moved.get(name, {}).get("mean")
+        joints = [row[joint] for joint in SHORT_NAMES]
+        report["errors_3d"].add(
+            name, [row["mean"], None, other, row["jitter (m/s2)"], *joints, None]
+        )
+
+
+if __name__ == "__main__":
+    main()

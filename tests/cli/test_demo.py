@@ -1,0 +1,102 @@
+"""`torchpose demo`: files, scores, exit code."""
+
+import pytest
+import torch
+
+from torchpose.camera import euler_to_matrix, lift
+from torchpose.cli import demo as command
+from torchpose.io import read_keypoints
+from torchpose.pose_track import PoseTrack
+from torchpose.priors import load_prior
+from torchpose.skeleton import LEFT_ARM, RIGHT_ARM, UPPER_BODY
+
+
+@pytest.fixture
+def shipped(files, tmp_path, monkeypatch):
+    """The small prior under the name of the shipped one."""
+    weights = tmp_path / "weights"
+    weights.mkdir()
+    prior = (files / "prior.safetensors").read_bytes()
+    (weights / "kinect-upper-body.safetensors").write_bytes(prior)
+    monkeypatch.setattr("torchpose.priors.upper_body.WEIGHTS", weights)
+
+
+def test_demo_beats_the_mean_pose(torchpose, shipped, tmp_path):
+    pytest.importorskip("matplotlib")
+    out = tmp_path / "out"
+    done = torchpose("demo", "--out", out, "--seconds", 4)
+    assert done.code == 0, done.err
+    assert "smoke test on an animated performer" in done.out
+    pictures = [line.strip() for line in done.out.splitlines()[-4:]]
+    names = ["pose_strip.png", "joint_curves.png", "pose_3d.png", "errors.png"]
+    assert pictures == [str(out / name) for name in names]
+    assert done.out.splitlines()[-5] == "Pictures:"
+    assert all((out / name).read_bytes().startswith(b"\x89PNG") for name in names)
+    everything = {*names, "keypoints.npz", "poses.npz", "poses.csv"}
+    assert {p.name for p in out.iterdir()} == everything
+
+    clip, poses = read_keypoints(out / "keypoints.npz"), PoseTrack.load(out / "poses.npz")
+    gap = ~clip.measured[:, clip.names.index("hand_right")]
+    assert int(gap.sum()) == 30 and len(clip) == 120
+    assert torch.equal(gap, ~poses.observed[0, :, UPPER_BODY.index("hand_right")])
+    table = {row[:42].strip(): row[42:].split() for row in done.out.splitlines() if row[:1].strip()}
+    filtered, smoothed, mean = (float(cell) for cell in table["all joints"])
+    assert max(filtered, smoothed) < mean
+    assert table["2D error, all joints (pixels)"][2] == "-"
+    assert "right hand while hidden (30 frames)" in table
+
+    tracked = torchpose("track", out / "keypoints.npz", "--out", tmp_path / "again")
+    assert tracked.code == 0, tracked.err
+    again = PoseTrack.load(tmp_path / "again" / "poses.npz")
+    torch.testing.assert_close(again.joints3d, poses.joints3d, rtol=0, atol=1e-9)
+
+
+def test_failure_has_an_exit_code(torchpose, shipped, tmp_path, monkeypatch):
+    perfect = command.Scores(torch.zeros(60, 8))
+    monkeypatch.setattr(command, "score_mean_pose", lambda *_: perfect)
+    done = torchpose("demo", "--out", tmp_path / "out", "--seconds", 2, "--pictures", "false")
+    assert done.code == 1
+    assert "no better than the mean pose" in done.err
+    assert (tmp_path / "out" / "poses.npz").exists()
+
+
+def test_mean_pose_is_that_of_samples(files):
+    """The oracle draws states, lifts each by (BL 5) and averages."""
+    prior = load_prior(files / "prior.safetensors")
+    g = torch.Generator().manual_seed(0)
+    mean = command.mean_pose(prior)
+    for mixture, arm in ((prior.left, LEFT_ARM), (prior.right, RIGHT_ARM)):
+        x = mixture.sample((20_000,), generator=g)
+        R = euler_to_matrix(x[:, 15:18], prior.info.rotation_order)
+        joints = lift(x[:, :15].reshape(-1, 5, 3), prior.info.matrix, R, x[:, 18:])
+        rows = list(arm[:3])  # head and neck are averaged over the arms
+        error = (mean[rows] - joints.mean(0)[:3]).abs()
+        assert float((error / (joints.std(0)[:3] / 20_000**0.5)).max()) < 6
+
+
+def test_scores_of_the_truth_itself(files):
+    performance, clip, _ = command.perform(2.0, seed=1)
+    track = command.track_clip(load_prior(files / "prior.safetensors"), clip, None)
+    track.joints3d = performance.joints[None]
+    scores = command.score(track, performance)
+    assert float(scores.errors3d.abs().max()) < 1e-9
+    assert scores.inside == (1.0, 1.0)
+
+
+@pytest.mark.parametrize("seconds", [1.0, 2.5, 20.0])
+def test_gap_lies_inside(seconds):
+    performance, clip, gap = command.perform(seconds, seed=0)
+    missing = ~clip.measured[:, clip.names.index("hand_right")]
+    assert torch.nonzero(missing).flatten().tolist() == list(range(gap.start, gap.stop))
+    assert 0 < gap.start < gap.stop < len(clip) == len(performance.joints)
+
+
+def test_refusals(torchpose, shipped, tmp_path):
+    for options, message in (
+        (("--seconds", 0), "from 1 to 3600"),
+        (("--prior", "nobody"), "kinect-upper-body"),
+        (("--out", tmp_path / "weights" / "kinect-upper-body.safetensors"), "cannot be written"),
+    ):
+        done = torchpose("demo", "--out", tmp_path / "out", *options)
+        assert done.code == 2 and message in done.err and len(done.err.splitlines()) == 1
+        assert not (tmp_path / "out").exists()

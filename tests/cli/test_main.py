@@ -1,0 +1,94 @@
+"""`torchpose` itself: help, version, exit codes, and that written command lines parse."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from torchpose.cli import COMMANDS, evaluate
+from torchpose.cli import main as main_function
+
+ROOT = Path(__file__).parents[2]
+HELP = [(name,) for name in COMMANDS] + [("evaluate", name) for name in evaluate.PROTOCOLS]
+
+
+def python(*arguments: str) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, *arguments], capture_output=True, text=True, timeout=120, cwd=ROOT
+    )
+
+
+def test_as_a_module():
+    done = python("-m", "torchpose", "--version")
+    assert done.returncode == 0 and re.fullmatch(r"torchpose \d.*\n", done.stdout)
+    done = python("-m", "torchpose", "trakc")
+    assert done.returncode == 2
+    known = ", ".join(COMMANDS)
+    assert done.stderr == f"torchpose: error: unknown command 'trakc'; known are {known}\n"
+
+
+def test_help_comes_without_torch():
+    code = "import sys; from torchpose.cli import main; main(['--help'])\nprint(*sys.modules)"
+    assert "torch" not in python("-c", code).stdout.splitlines()[-1].split()
+
+
+def test_help(torchpose):
+    for done in (torchpose("--help"), torchpose("-h")):
+        assert done.code == 0 and done.err == ""
+        assert all(command in done.out for command in COMMANDS)
+    done = torchpose()
+    assert done.code == 2 and "usage: torchpose COMMAND" in done.err
+
+
+@pytest.mark.parametrize("command", HELP, ids=" ".join)
+def test_help_of_commands(command, torchpose):
+    done = torchpose(*command, "--help")
+    assert done.code == 0 and "examples:" in done.out and "--config" in done.out
+    assert max(map(len, done.out.splitlines())) <= 110
+
+
+def test_interruption(torchpose, monkeypatch):
+    def interrupt(arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("torchpose.cli.info.main", interrupt)
+    assert torchpose("info").code == 130
+
+
+def test_bugs_are_not_hidden(torchpose, monkeypatch):
+    def broken(arguments):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("torchpose.cli.info.main", broken)
+    with pytest.raises(ZeroDivisionError):
+        torchpose("info")
+
+
+def console_lines() -> list[str]:
+    """Every line that a page or a help text tells the reader to type."""
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    found = []
+    for page in pages:
+        text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+        found += re.findall(r"^\$ (torchpose .*)$", text, re.MULTILINE)
+    for path in sorted((ROOT / "torchpose" / "cli").glob("*.py")):
+        found += re.findall(r"^ *(torchpose [a-z]+ .*?)\"*$", path.read_text(), re.MULTILINE)
+    return sorted({re.split(r" +[#>] ?", line)[0].strip() for line in found})
+
+
+@pytest.mark.parametrize("line", console_lines())
+def test_written_command_lines_parse(line, monkeypatch, tmp_path):
+    """The parser of each takes it; the work is not done."""
+    parsed = []
+    for name in COMMANDS:
+        monkeypatch.setattr(f"torchpose.cli.{name}.run", lambda *args: parsed.append(args) or 0)
+    words = shlex.split(line)[1:]
+    if "--config" in words:  # the file has to be there
+        config = tmp_path / "config.yaml"
+        config.write_text("keypoints: keypoints.npz\nout: result\n")
+        words[words.index("--config") + 1] = str(config)
+    assert main_function(words) == 0
+    assert parsed or {"--help", "--version", "--print_config"} & {*words}

@@ -1,0 +1,334 @@
+"""`torchpose track`: files, options, cameras, and what it refuses."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.cli.conftest import GAP, N_FRAMES, keypoints
+from torchpose.camera import PinholeCamera, save_cameras
+from torchpose.cli import track as command
+from torchpose.io import read_keypoints, write_keypoints
+from torchpose.pose_track import PoseTrack
+from torchpose.priors import load_prior
+from torchpose.skeleton import UPPER_BODY
+from torchpose.tracking import METHODS, UpperBodyTracker
+
+KEYS = ("joints2d", "joints3d", "covariance3d", "observed", "log_evidence")
+
+
+@pytest.fixture
+def track(torchpose, files, tmp_path):
+    """track(*options) -> Result, PoseTrack; without pictures, into tmp_path / "out"."""
+
+    def run(*options, clip=files / "keypoints.npz"):
+        out = tmp_path / "out"
+        base = ("--out", out, "--prior", files / "prior.safetensors", "--pictures", "false")
+        done = torchpose("track", clip, *base, *options)
+        assert done.code == 0, done.err
+        return done, PoseTrack.load(out / "poses.npz")
+
+    return run
+
+
+def expected(files, clip=None, camera=None, **options) -> PoseTrack:
+    """The same by the library."""
+    clip = clip or read_keypoints(files / "keypoints.npz")
+    camera = camera or PinholeCamera.from_matrix(clip.K)
+    prior = load_prior(files / "prior.safetensors")
+    tracker = UpperBodyTracker(prior, camera, fps=30.0, **options)
+    generator = torch.Generator().manual_seed(0)
+    return tracker(clip.keypoints[None], clip.confidence, clip.names, generator=generator)
+
+
+def same(one: PoseTrack, other: PoseTrack) -> None:
+    for key in KEYS:
+        a, b = getattr(one, key), getattr(other, key)
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12, equal_nan=True)
+
+
+# --- files ----------------------------------------------------------------------------------------
+
+
+def test_poses_are_those_of_the_library(track, files, tmp_path):
+    done, poses = track()
+    same(poses, expected(files))
+    arrays = np.load(tmp_path / "out" / "poses.npz")
+    shapes = {"joints2d": (8, 2), "joints3d": (8, 3), "covariance3d": (8, 3, 3), "observed": (8,)}
+    for key, shape in shapes.items():
+        assert arrays[key].shape == (N_FRAMES, *shape)
+    assert arrays["log_evidence"].shape == (N_FRAMES,)
+    assert tuple(arrays["names"]) == UPPER_BODY
+    assert float(arrays["fps"]) == 30
+    hand = UPPER_BODY.index("hand_right")
+    assert np.flatnonzero(~arrays["observed"][:, hand]).tolist() == list(range(N_FRAMES))[GAP]
+    assert "frames   90 (3.0 s at 30 fps)" in done.out
+    assert "hand_right 88.9 %" in done.out
+    assert "inferred elbow_left" in done.out
+
+
+def test_table_holds_the_same(track, tmp_path):
+    _, poses = track()
+    lines = (tmp_path / "out" / "poses.csv").read_text().splitlines()
+    assert lines[0].startswith("# ") and "camera axes" in lines[0]
+    rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
+    assert [int(r["frame"]) for r in rows] == list(range(N_FRAMES))
+    assert float(rows[30]["time"]) == 1.0
+    std = poses.covariance3d[0].diagonal(dim1=-2, dim2=-1).sqrt()
+    columns = {
+        "x2d": poses.joints2d[0, ..., 0], "y2d": poses.joints2d[0, ..., 1],
+        "x": poses.joints3d[0, ..., 0], "y": poses.joints3d[0, ..., 1],
+        "z": poses.joints3d[0, ..., 2], "std_x": std[..., 0], "std_y": std[..., 1],
+        "std_z": std[..., 2], "observed": poses.observed[0].double(),
+    }  # fmt: skip
+    for suffix, values in columns.items():
+        for j, name in enumerate(UPPER_BODY):
+            read = np.array([float(r[f"{name}_{suffix}"]) for r in rows])
+            atol = 6e-4 if suffix in ("x2d", "y2d") else 6e-7
+            np.testing.assert_allclose(read, values[:, j], rtol=0, atol=atol)
+    assert len(rows[0]) == 2 + 8 * len(columns) + 1
+    read = [float(r["log_evidence"]) for r in rows]
+    np.testing.assert_allclose(read, poses.log_evidence[0].sum(-1), atol=6e-7)
+
+
+def test_pictures(torchpose, files, tmp_path):
+    pytest.importorskip("matplotlib")
+    prior = files / "prior.safetensors"
+    done = torchpose("track", files / "keypoints.npz", "--out", tmp_path, "--prior", prior)
+    assert done.code == 0, done.err
+    for name in ("pose_strip.png", "joint_curves.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+        assert f"wrote    {tmp_path / name}" in done.out
+    assert {p.name for p in tmp_path.iterdir()} == {
+        "poses.npz", "poses.csv", "pose_strip.png", "joint_curves.png",
+    }  # fmt: skip
+
+
+def test_without_matplotlib_it_says_how_to_get_pictures(torchpose, files, tmp_path, monkeypatch):
+    monkeypatch.setattr("torchpose.cli.common.find_spec", lambda name: None)
+    prior = files / "prior.safetensors"
+    done = torchpose("track", files / "keypoints.npz", "--out", tmp_path, "--prior", prior)
+    assert done.code == 0
+    assert "pip install torchpose[plots]" in done.out
+    assert not list(tmp_path.glob("*.png"))
+
+
+# --- options --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_methods(track, files, method):
+    options = ("--n-particles", 50) if method.startswith("pf-") else ()
+    _, poses = track("--method", method, *options)
+    more = {"n_particles": 50} if options else {}
+    same(poses, expected(files, method=method, **more))
+
+
+def test_options_reach_the_tracker(track, files):
+    same(track("--smoothing", "full")[1], expected(files, smoothing="full"))
+    same(track("--smoothing", 3)[1], expected(files, smoothing=3))
+    same(track("--frame", "body")[1], expected(files, frame="body"))
+    stds = (5.0, 6.0, 6.0, 2.0, 3.0)
+    text = ",".join(str(s) for s in stds)
+    same(track("--measurement-std", text)[1], expected(files, measurement_std=stds))
+    same(track("--window", "false")[1], expected(files, window=False))
+    same(track("--static-camera", "true")[1], expected(files, static_camera=True))
+
+
+def test_another_neck_is_not_measured(track):
+    done, poses = track("--neck", "mid-shoulder")
+    assert not poses.observed[..., UPPER_BODY.index("neck")].any()
+    assert "note     the keypoints' neck (mid-shoulder) is not the prior's (neck)" in done.out
+
+
+def test_nose_as_head(track, tmp_path):
+    path = tmp_path / "nose.npz"
+    write_keypoints(path, keypoints(names=("nose", "neck", "lwrist", "rwrist")))
+    done, poses = track(clip=path)
+    assert not poses.observed[..., UPPER_BODY.index("head")].any()
+    assert "note     there is no head among the keypoints; --nose-as-head" in done.out
+    done, poses = track("--nose-as-head", "true", clip=path)
+    assert poses.observed[..., UPPER_BODY.index("head")].all()
+    assert "note     the nose stands for the head" in done.out
+    assert any("nose" in note for note in poses.notes)
+
+
+def test_frame_rate(track, tmp_path, files):
+    clip = keypoints(fps=None)
+    write_keypoints(tmp_path / "clip.npz", clip)
+    done, poses = track(clip=tmp_path / "clip.npz")
+    assert "note     the keypoint file states no frame rate: 30 fps assumed" in done.out
+    same(poses, expected(files))
+    done, poses = track("--fps", 15, clip=tmp_path / "clip.npz")
+    assert poses.fps == 15 and "note" not in done.out
+
+
+# --- cameras --------------------------------------------------------------------------------------
+
+
+def test_camera_comes_from_the_first_source_that_has_one(track, files, tmp_path):
+    other = PinholeCamera(600, 610, 330, 250, name="other")
+    wanted = expected(files, camera=other)
+    same(track("--camera", "600,610,330,250")[1], wanted)
+    other.save(tmp_path / "camera.toml")
+    same(track("--camera", tmp_path / "camera.toml")[1], wanted)
+    save_cameras([other, PinholeCamera(1, 1, 0, 0, name="x")], tmp_path / "two.toml")
+    same(track("--camera", tmp_path / "two.toml", "--camera-name", "other")[1], wanted)
+
+    clip = keypoints(K=None, image_size=(1280, 960))
+    write_keypoints(tmp_path / "guess.npz", clip)
+    done, poses = track(clip=tmp_path / "guess.npz")
+    same(poses, expected(files, clip, PinholeCamera.from_image_size(1280, 960)))
+    assert "1050 pixels (525/640 of the image width) was assumed" in done.out
+    assert any("was assumed" in note for note in poses.notes)
+
+
+def test_distortions_are_not_applied_silently(track, tmp_path):
+    PinholeCamera(525, 525, 319.5, 239.5, distortions=(0.1, 0, 0, 0)).save(tmp_path / "c.toml")
+    assert "distortions are not applied" in track("--camera", tmp_path / "c.toml")[0].out
+
+
+# --- config ---------------------------------------------------------------------------------------
+
+
+def test_config_file_round_trip(torchpose, files, tmp_path):
+    out, prior = tmp_path / "out", files / "prior.safetensors"
+    line = ("track", files / "keypoints.npz", "--out", out, "--prior", prior, "--smoothing", "5",
+            "--measurement-std", "5,6,6,2,3", "--pictures", "false")  # fmt: skip
+    printed = torchpose(*line, "--print_config")
+    assert printed.code == 0 and not out.exists()
+    (tmp_path / "track.yaml").write_text(printed.out)
+    assert torchpose(*line).code == 0
+    first = PoseTrack.load(out / "poses.npz")
+    (out / "poses.npz").unlink()
+    assert torchpose("track", "--config", tmp_path / "track.yaml").code == 0
+    same(PoseTrack.load(out / "poses.npz"), first)
+    changed = torchpose(
+        "track", "--config", tmp_path / "track.yaml", "--smoothing", "full", "--out", tmp_path / "b"
+    )
+    assert changed.code == 0 and (tmp_path / "b" / "poses.npz").exists()
+    same(
+        PoseTrack.load(tmp_path / "b" / "poses.npz"),
+        expected(files, smoothing="full", measurement_std=(5.0, 6.0, 6.0, 2.0, 3.0)),
+    )
+
+
+def test_help_lists_every_method(torchpose):
+    text = "".join(torchpose("track", "--help").out.split())
+    assert all(method in text for method in METHODS)
+
+
+# --- refusals -------------------------------------------------------------------------------------
+
+PRIOR, CLIP = "{files}/prior.safetensors", "{files}/keypoints.npz"
+BAD_INPUT = {
+    "no keypoints": ([], "missing: KEYPOINTS"),
+    "missing file": (["{tmp}/no.npz"], "no.npz: no such file"),
+    "truncated": (["{tmp}/truncated.npz"], "expected an .npz file"),
+    "foreign keys": (["{files}/recordings/p1.npz"], "expected the key keypoints"),
+    "other suffix": (["{tmp}/notes.txt"], "expected keypoints as .npz, .csv or a folder"),
+    "unknown names": (["{tmp}/names.npz"], "antenna"),
+    "no upper body": (["{tmp}/knees.npz"], "expected some of hand_left"),
+    "no camera": (["{tmp}/no_camera.npz"], "expected --camera FILE"),
+    "long gap": (["{tmp}/gap.npz"], "longer than max_gap"),
+    "unwritable": ([CLIP, "--out", "{tmp}/notes.txt/below"], "cannot be written to this folder"),
+    "no such prior": ([CLIP, "--prior", "nobody"], "expected the name of a prior"),
+    "foreign prior": ([CLIP, "--prior", CLIP], "expected a prior as safetensors"),
+    "unknown method": ([CLIP, "--method", "kf"], ", ".join(METHODS)),
+    "method has no particles": ([CLIP, "--n-particles", "9"], "does not apply"),
+    "no particles": ([CLIP, "--method", "pf-walk", "--n-particles", "0"], "at least 1"),
+    "smoothing of particles": ([CLIP, "--method", "pf-walk", "--smoothing", "3"], "mkf-fixed"),
+    "bad smoothing": ([CLIP, "--smoothing", "half"], "a number of frames or 'full'"),
+    "negative smoothing": ([CLIP, "--smoothing", "-1"], "a number of frames or 'full'"),
+    "bad std": ([CLIP, "--measurement-std", "wide"], "a number or five"),
+    "four stds": ([CLIP, "--measurement-std", "1,2,3,4"], "one number or five"),
+    "negative std": ([CLIP, "--measurement-std=-2"], "must be positive"),
+    "three numbers": ([CLIP, "--camera", "1,2,3"], "fx,fy,cx,cy"),
+    "no focal length": ([CLIP, "--camera", "0,0,320,240"], "positive focal lengths"),
+    "no camera file": ([CLIP, "--camera", "{tmp}/no.toml"], "no such camera file"),
+    "camera of other images": ([CLIP, "--camera", "{tmp}/small.toml"], "320 x 240"),
+    "unknown frame": ([CLIP, "--frame", "world"], "'camera' or 'body'"),
+    "unknown neck": ([CLIP, "--neck", "long"], "mid-shoulder"),
+    "no nose": (["{tmp}/no_head.npz", "--nose-as-head", "true"], "needs a nose"),
+    "bad fps": ([CLIP, "--fps", "0"], "--fps must be positive"),
+    "bad number": ([CLIP, "--seed", "one"], "argument --seed"),
+    "bad flag": ([CLIP, "--pictures", "maybe"], "argument --pictures"),
+    "unknown option": ([CLIP, "--speed", "9"], "--speed"),
+    "no config": ([CLIP, "--config", "{tmp}/no.yaml"], "no.yaml"),
+    "bad config": ([CLIP, "--config", "{tmp}/bad.yaml"], "parsing"),
+    "unknown key in config": ([CLIP, "--config", "{tmp}/key.yaml"], "'speed'"),
+}
+
+
+@pytest.fixture
+def bad_files(tmp_path, files):
+    (tmp_path / "notes.txt").write_text("no keypoints")
+    (tmp_path / "bad.yaml").write_text("{out: [")
+    (tmp_path / "key.yaml").write_text("speed: 9\n")
+    whole = (files / "keypoints.npz").read_bytes()
+    (tmp_path / "truncated.npz").write_bytes(whole[: len(whole) // 2])
+    write_keypoints(tmp_path / "no_camera.npz", keypoints(K=None, image_size=None))
+    knees = ("knee_left", "knee_right", "ankle_left", "ankle_right")
+    write_keypoints(tmp_path / "knees.npz", keypoints(names=knees))
+    write_keypoints(
+        tmp_path / "names.npz", keypoints(names=("head", "neck", "antenna", "hand_left"))
+    )
+    gap = keypoints(fps=10.0)
+    gap.keypoints[20:75] = torch.nan
+    write_keypoints(tmp_path / "gap.npz", gap)
+    headless = keypoints(names=("neck", "elbow_left", "hand_left", "hand_right"))
+    write_keypoints(tmp_path / "no_head.npz", headless)
+    PinholeCamera(250, 250, 160, 120, 320, 240).save(tmp_path / "small.toml")
+    return {"tmp": tmp_path, "files": files}
+
+
+@pytest.mark.parametrize("case", BAD_INPUT)
+def test_refusals(case, torchpose, bad_files, tmp_path):
+    arguments, message = BAD_INPUT[case]
+    given = [a.format(**bad_files) for a in arguments]
+    base = [] if "--out" in given else ["--out", str(tmp_path / "out")]
+    base += [] if "--prior" in given else ["--prior", PRIOR.format(**bad_files)]
+    done = torchpose("track", *given, *base)
+    assert done.code == 2
+    assert message in done.err
+    assert done.err.startswith("torchpose: error: ") and len(done.err.splitlines()) == 1
+    assert done.out == ""
+    assert not list((tmp_path / "out").glob("*"))
+
+
+def test_missing_out(torchpose, files):
+    done = torchpose("track", files / "keypoints.npz")
+    assert (
+        done.code == 2 and done.err == "torchpose: error: missing: --out; see --help for examples\n"
+    )
+
+
+def test_debug_shows_where(torchpose, tmp_path, monkeypatch):
+    from torchpose.errors import InputError
+
+    with pytest.raises(InputError):
+        torchpose("track", tmp_path / "no.npz", "--out", tmp_path, "--debug")
+    monkeypatch.setenv("TORCHPOSE_DEBUG", "1")
+    with pytest.raises(InputError):
+        torchpose("track", tmp_path / "no.npz", "--out", tmp_path)
+
+
+def test_interruption_leaves_nothing_half_written(torchpose, files, tmp_path, monkeypatch):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "savez_compressed", interrupt)
+    out = tmp_path / "out"
+    prior = files / "prior.safetensors"
+    done = torchpose("track", files / "keypoints.npz", "--out", out, "--prior", prior)
+    assert done.code == 130 and "interrupted" in done.err
+    assert list(out.iterdir()) == []
+
+
+def test_degenerate_filter_is_told(track, capsys):
+    _, poses = track()
+    assert command.report_failure(poses) == 0
+    assert command.report_failure(replace(poses, failed_at=torch.tensor([7]))) == 1
+    assert "degenerated at frame 7" in capsys.readouterr().err
