@@ -88,8 +88,15 @@ class Recurrent(nn.Module):
         self.cells = nn.GRU(8, 128, 2, batch_first=True, bidirectional=both)
         self.out = nn.Linear(256 if both else 128, 24)
 
-    def forward(self, x: Tensor) -> Tensor:
-        return self.out(self.cells(x)[0])
+    def forward(self, x: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """Outputs [B, T, 24]; what lies past a length is not read, backwards neither."""
+        if lengths is None:
+            return self.out(self.cells(x)[0])
+        packed = nn.utils.rnn.pack_padded_sequence(x, lengths, True, enforce_sorted=False)
+        hidden, _ = nn.utils.rnn.pad_packed_sequence(
+            self.cells(packed)[0], True, total_length=x.shape[1]
+        )
+        return self.out(hidden)
 
 
 def multilayer() -> nn.Module:
@@ -155,7 +162,8 @@ def fit(
 def estimate(model: nn.Module, test: Trials) -> Estimate:
     """Poses of a test set. The regressors give no pixels: those are NaN."""
     with torch.inference_mode():
-        found = model(features(test.keypoints).nan_to_num().float())
+        inputs = features(test.keypoints).nan_to_num().float()
+        found = model(inputs, test.lengths) if isinstance(model, Recurrent) else model(inputs)
     joints = METRES * found.unflatten(-1, (8, 3)).double()
     return Estimate(torch.full_like(test.truth2d, torch.nan), joints)
 

@@ -8,8 +8,9 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 from tqdm.auto import tqdm
 
 from torchpose.calibration import chi2_quantile
@@ -49,7 +50,7 @@ _MODES: dict[str, dict[str, Any]] = {
     "causal": {},
     "full": {"smoothing": "full"},
 }
-_CALIBRATION_FRAMES = 6000
+_CALIBRATION_FRAMES, _CALIBRATION_SEQUENCES = 8000, 48  # in all, and of each group of persons
 
 
 class _Size(NamedTuple):
@@ -81,7 +82,7 @@ def fit_kinect_prior(
     *,
     window_components: int = 120,
     window_samples: int = _WINDOW_SAMPLES,
-    calibration_folds: int = 2,
+    calibration_folds: int = 6,
     name: str = "",
     licence: str = "",
     command: str = "",
@@ -217,28 +218,36 @@ def _residuals(
     sequences: _Sequences,
     rows: list[int],
     seed: int,
-    options: dict[str, Any],
+    settings: dict[str, Any],
 ) -> tuple[Tensor, Tensor]:
     """Errors [N, 8, 3] after Procrustes and covariances [N, 8, 3, 3] on some sequences."""
+    rows = rows[:: max(1, len(rows) // _CALIBRATION_SEQUENCES)]
+    keypoints, poses, inside = _held_out_views(prior, [sequences.poses[row] for row in rows], seed)
+    tracker = UpperBodyTracker(prior, prior.camera, **settings)
+    track = tracker(keypoints, lengths=inside.sum(1))
+    aligned = align(track.joints3d[inside], poses[inside], covariance=track.covariance3d[inside])
+    if aligned.covariance is None:
+        raise RuntimeError("align was given covariances and returned none")
+    return aligned.points - poses[inside], aligned.covariance
+
+
+def _held_out_views(
+    prior: UpperBodyPrior, sequences: list[Tensor], seed: int
+) -> tuple[Float[Tensor, "B T 8 2"], Float[Tensor, "B T 8 3"], Bool[Tensor, "B T"]]:
+    """Noisy keypoints of head, neck and hands, each sequence from a viewpoint of its own."""
     generator = torch.Generator().manual_seed(seed + 1)
-    views = ViewRange(**prior.info.views)
-    rows = rows[:: max(1, len(rows) // 100)]
-    errors, covs = [], []
-    for row in rows:
-        poses, rate = sequences.poses[row], sequences.rates[row]
-        view = sample_viewpoints(1, views, generator)
-        rotation = euler_to_matrix(view.angles, prior.info.rotation_order)  # type: ignore[arg-type]
-        uvl = project(poses, prior.info.matrix, rotation, view.translation)
-        noise = torch.randn(len(poses), 8, 2, generator=generator, dtype=torch.float64)
-        keypoints = uvl[..., :2] + _MEASUREMENT_STD * noise
-        keypoints[:, [1, 2, 5, 6]] = torch.nan
-        tracker = UpperBodyTracker(prior, prior.camera, fps=rate, **options)
-        track = tracker(keypoints[None])
-        aligned = align(track.joints3d[0], poses, covariance=track.covariance3d[0])
-        errors.append(aligned.points - poses)
-        if aligned.covariance is not None:
-            covs.append(aligned.covariance)
-    return torch.cat(errors), torch.cat(covs)
+    lengths = torch.tensor([len(sequence) for sequence in sequences])
+    poses = pad_sequence(sequences, batch_first=True).double()
+    inside = torch.arange(poses.shape[1]) < lengths[:, None]
+    view = sample_viewpoints(len(sequences), ViewRange(**prior.info.views), generator)
+    rotation = euler_to_matrix(view.angles, prior.info.rotation_order)  # type: ignore[arg-type]
+    place = view.translation[:, None]
+    uvl = project(poses, prior.info.matrix, rotation[:, None], place)
+    noise = torch.randn(uvl[..., :2].shape, generator=generator, dtype=torch.float64)
+    keypoints = uvl[..., :2] + _MEASUREMENT_STD * noise
+    keypoints[:, :, [1, 2, 5, 6]] = torch.nan
+    keypoints[~inside] = torch.nan
+    return keypoints, poses, inside
 
 
 def fit_calibration(

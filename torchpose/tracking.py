@@ -15,7 +15,7 @@ from torchpose.filters.base import Generators, RecursiveFilter
 from torchpose.lifting import arm_in_body_frame
 from torchpose.pose_track import PoseTrack
 from torchpose.priors.arm_state import STATE_DIM
-from torchpose.priors.upper_body import UpperBodyPrior
+from torchpose.priors.upper_body import UpperBodyPrior, released_process_cov
 from torchpose.priors.window import WindowLayout, window_measurements
 from torchpose.projection import map_pixel_covariance, map_pixels
 from torchpose.rotations import RotationOrder, euler_to_matrix
@@ -32,10 +32,8 @@ _PROPOSALS = {
 _SIDES = {"left": LEFT_ARM, "right": RIGHT_ARM}
 _DEFAULT_STD = 3.0
 _LEAST_CONFIDENCE = 0.05
-# Standard deviations of one frame's motion at 30 frames per second where a prior brings none:
-# hand, elbow, shoulder, head, neck in metres; camera angles in radians, translation in metres.
-_STEP_JOINTS = (0.05, 0.025, 0.01, 0.01, 0.01)
-_STEP_ANGLE, _STEP_TRANSLATION = 0.02, 0.02
+# These options are those of a filter over single poses.
+_POSE_OPTIONS = {"transition", "gamma", "subspace", "initial_cov", "process_cov"}
 
 
 class _Measured(NamedTuple):
@@ -73,7 +71,7 @@ class UpperBodyTracker(nn.Module):
             stays at the prior's mean place, as the authors' released demo does.
         window: use the prior's mixtures over short windows of motion where it brings them (only for
             "mkf-fixed"; smoothed estimates then look a few frames ahead); False tracks single poses,
-            as the paper does.
+            as the paper does, and so do options that only make sense there (transition, gamma).
         calibrated: recalibrate `covariance3d` as the prior's training persons showed, if it says how.
         neck: kind of neck of the keypoints, where their names do not tell it (see
             `torchpose.skeleton.NECK_KINDS`). A neck of another kind than the prior's is not measured.
@@ -184,7 +182,7 @@ class UpperBodyTracker(nn.Module):
         ratio = 1.0 if not self.fps or not info.fps else info.fps / self.fps
         process_cov = noise.get(f"process_cov_{side}", noise.get("process_cov"))
         if process_cov is None:
-            process_cov = default_process_cov(self.prior, 30.0 / (info.fps or 30.0))
+            process_cov = default_process_cov(self.prior)
         options: dict[str, Any] = {"process_cov": process_cov * ratio}
         if self.method in _PROPOSALS:
             return options
@@ -355,7 +353,7 @@ class UpperBodyTracker(nn.Module):
 
     def _window(self) -> tuple[str, WindowLayout] | None:
         """The window that suits the smoothing asked for: its name, and its lags at this frame rate."""
-        if self.method != "mkf-fixed" or not self.window:
+        if self.method != "mkf-fixed" or not self.window or _POSE_OPTIONS & self.options.keys():
             return None
         name = "causal" if self.smoothing is None else "full"
         if name not in self.prior.windows:
@@ -500,18 +498,22 @@ def join_arms(left: Float[Tensor, "B T 5 *rest"], right: Float[Tensor, "B T 5 *r
     return torch.cat([left[:, :, :3], shared, right[:, :, :3].flip(2)], 2)
 
 
-def default_process_cov(prior: UpperBodyPrior, seconds_ratio: float = 1.0) -> Float[Tensor, " 21"]:
-    """Diagonal of Q per frame where a prior brings none: steps in metres, seen at its mean distance.
+def default_process_cov(prior: UpperBodyPrior) -> Float[Tensor, " 21"]:
+    """Diagonal of Q per frame where a prior brings none: that of the authors' released tracker.
+
+    They set it by hand for f = 1550 pixels, a person 4.5 m away and 25 frames per second; the same
+    movement in metres is f / depth times as many pixels elsewhere.
 
     Args:
-        prior: whose camera and mean depth are used. seconds_ratio: frame interval over 1/30 s.
+        prior: whose camera, mean depth and frame rate are used.
     """
     depth = prior.left.moments()[0][2:15:3].mean().clamp_min(0.1)
-    steps = torch.tensor(_STEP_JOINTS, dtype=torch.float64)
-    pixels = steps * math.sqrt(prior.info.fx * prior.info.fy) / depth
-    joints = torch.stack([pixels, pixels, steps], 1).flatten()
-    camera = torch.tensor([_STEP_ANGLE] * 3 + [_STEP_TRANSLATION] * 3, dtype=torch.float64)
-    return torch.cat([joints, camera]).square() * seconds_ratio
+    pixels = math.sqrt(prior.info.fx * prior.info.fy) / depth / (1550 / 4.5)
+    released = released_process_cov().to(pixels)
+    in_pixels = torch.zeros(STATE_DIM, dtype=torch.bool, device=released.device)
+    in_pixels[_pixel_indices(ARM_JOINTS)] = True
+    scaled = torch.where(in_pixels, released * pixels.square(), released)
+    return scaled * (25.0 / (prior.info.fps or 30.0))
 
 
 def _generators_of_arms(generator: Generators) -> tuple[Generators, Generators]:

@@ -57,7 +57,7 @@ def dense_posterior(models, mean0, cov0, observed, noise_cov, z, mask):
         s = cov[np.ix_(rows, rows)] + noise
         gain = np.linalg.solve(s, cov[rows]).T
         residual = values - mean[rows]
-        sign, log_det = np.linalg.slogdet(s)
+        _, log_det = np.linalg.slogdet(s)
         quad = residual @ np.linalg.solve(s, residual)
         log_evidence = -0.5 * (quad + log_det + len(rows) * np.log(2 * np.pi))
         mean, cov = mean + gain @ residual, cov - gain @ cov[rows]

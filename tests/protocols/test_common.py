@@ -14,7 +14,6 @@ from torchpose.protocols.common import (
     Estimate,
     cached_prior,
     centred_on_neck,
-    hand_set_process_cov,
     make_test_set,
     mirror_pose,
     score,
@@ -22,6 +21,7 @@ from torchpose.protocols.common import (
 )
 from torchpose.protocols.gaps import back_and_forth
 from torchpose.protocols.ub_people import mean_pose, nearest_neighbour, people, sway
+from torchpose.tracking import default_process_cov
 
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5)
 
@@ -132,7 +132,7 @@ def test_nearest_neighbour_and_mean_pose():
 
 
 def test_hand_set_noise_is_that_of_the_released_tracker_in_other_pixels(prior):
-    process_cov = hand_set_process_cov(prior)
+    process_cov = default_process_cov(prior)
     metres = process_cov[0].sqrt() * prior.left.moments()[0][2:15:3].mean() / prior.info.fx
     released = math.sqrt(560) * 4.5 / 1550 * math.sqrt(25 / 30)
     assert float(metres) == pytest.approx(released, rel=1e-9)

@@ -310,8 +310,9 @@ class BootstrapParticleFilter(RecursiveFilter):
         mean = self.walk.unwhiten(white_mean[:, 0])
         if not return_cov:
             return mean, None
-        spread = (white - white_mean) * weights.mT.sqrt()
-        cov = (spread.mT @ spread).double()
+        # float32 sums of ten thousand products can come out indefinite
+        spread = ((white - white_mean) * weights.mT.sqrt()).double()
+        cov = spread.mT @ spread
         return mean, self.walk.scale @ cov @ self.walk.scale.mT
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib import import_module
@@ -32,12 +31,12 @@ from torchpose.metrics import (
     reliability,
 )
 from torchpose.priors.training import TRAINING_VIEWS, collect_poses
-from torchpose.priors.upper_body import UpperBodyPrior, released_process_cov
+from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.projection import project
 from torchpose.protocols.report import Report
 from torchpose.rotations import euler_to_matrix
 from torchpose.skeleton import UPPER_BODY
-from torchpose.tracking import UpperBodyTracker
+from torchpose.tracking import UpperBodyTracker, default_process_cov
 
 __all__ = [
     "HANDS",
@@ -52,7 +51,6 @@ __all__ = [
     "cached_prior",
     "centred_on_neck",
     "data_folder",
-    "hand_set_process_cov",
     "learnt_recipe",
     "make_test_set",
     "mirror_pose",
@@ -73,7 +71,6 @@ MEASURED = ("head", "neck", "hand_left", "hand_right")
 HANDS = (UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right"))
 _MEASURED_AT = tuple(UPPER_BODY.index(name) for name in MEASURED)
 _NECK = UPPER_BODY.index("neck")
-_RELEASED_PIXELS_PER_METRE, _RELEASED_FPS = 1550.0 / 4.5, 25.0
 # Reversed, the joints are those of the other side; head and neck have to be put back.
 _MIRRORED = [0, 1, 2, 4, 3, 5, 6, 7]
 
@@ -127,27 +124,12 @@ def settings_hash(facts: Sequence[Any]) -> str:
 
 
 def plain_prior(prior: UpperBodyPrior) -> UpperBodyPrior:
-    """The same mixtures over poses with the paper's transition and `hand_set_process_cov`.
+    """The same mixtures over poses with the paper's transition and `default_process_cov`.
 
     Without windows, calibration or anything else that a recipe learns.
     """
-    noise = {"process_cov": hand_set_process_cov(prior)}
+    noise = {"process_cov": default_process_cov(prior)}
     return UpperBodyPrior(prior.left, prior.right, replace(prior.info, transition="paper"), noise)
-
-
-def hand_set_process_cov(prior: UpperBodyPrior) -> Float[Tensor, " 21"]:
-    """Diagonal of the released tracker's Q in the pixels of a prior and for its frame rate.
-
-    The authors set it by hand for f = 1550 pixels, a person 4.5 m away and 25 frames per second; the
-    same movement in metres is f / depth times as many pixels elsewhere.
-    """
-    depth = prior.left.moments()[0][2:15:3].mean()
-    pixels = math.sqrt(prior.info.fx * prior.info.fy) / depth / _RELEASED_PIXELS_PER_METRE
-    process_cov = released_process_cov().to(pixels)
-    in_pixels = torch.zeros(21, dtype=torch.bool)
-    in_pixels[:15] = torch.tensor([True, True, False]).repeat(5)
-    scaled = torch.where(in_pixels, process_cov * pixels.square(), process_cov)
-    return scaled * (_RELEASED_FPS / (prior.info.fps or 30.0))
 
 
 def projected_training_poses(
