@@ -386,7 +386,7 @@ def test_a_degenerate_element_is_reported_and_the_others_finish():
 def good_arguments():
     p = Problem()
     return {
-        "prior": p.mixture(),
+        "gmm": p.mixture(),
         "process_cov": tensor(p.process),
         "measurement_cov": tensor(p.noise),
         "observed": OBSERVED,

@@ -45,7 +45,7 @@ class MixtureKalmanFilter(RecursiveFilter):
       (Smith & Winter).
 
     Args:
-        prior: the mixture prior (BL 7), K components over D dimensions.
+        gmm: the mixture prior (BL 7), K components over D dimensions.
         process_cov: Q, [D, D] or its diagonal [D], per frame.
         measurement_cov: R, [Z, Z] or its diagonal [Z].
         observed: the Z state indices that are measured.
@@ -86,7 +86,7 @@ class MixtureKalmanFilter(RecursiveFilter):
 
     def __init__(
         self,
-        prior: GaussianMixture,
+        gmm: GaussianMixture,
         process_cov: Tensor,
         measurement_cov: Tensor,
         observed: Sequence[int] | Tensor,
@@ -104,8 +104,8 @@ class MixtureKalmanFilter(RecursiveFilter):
         reset_below: float | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> None:
-        super().__init__(measurement_cov, observed, prior.means.shape[-1], dtype)
-        n_components = prior.means.shape[0]
+        super().__init__(measurement_cov, observed, gmm.means.shape[-1], dtype)
+        n_components = gmm.means.shape[0]
         _check_options(tracks, n_tracks, n_components, uniform_weight, transition)
         if not 0 < likelihood_power <= 1:
             raise InputError(f"likelihood_power must lie in (0, 1], got {likelihood_power}")
@@ -121,10 +121,10 @@ class MixtureKalmanFilter(RecursiveFilter):
         self.reset_below = reset_below
         self._graph: GainGraph | None = None
         if gamma is not None:
-            gamma = torch.as_tensor(gamma, dtype=torch.float64, device=prior.means.device)
-        self._set_model(prior, as_covariance("process_cov", process_cov, self.dim), gamma)
+            gamma = torch.as_tensor(gamma, dtype=torch.float64, device=gmm.means.device)
+        self._set_model(gmm, as_covariance("process_cov", process_cov, self.dim), gamma)
         self.register_buffer("initial_cov", self._initial_cov(initial_cov, n_components))
-        self.to(prior.means.device)
+        self.to(gmm.means.device)
 
     def _set_model(self, prior: GaussianMixture, process_cov: Tensor, gamma: Tensor | None) -> None:
         wide = torch.float64

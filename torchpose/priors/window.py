@@ -26,6 +26,7 @@ _HANDS = {"left": (0, 7), "right": (7, 0)}  # own hand, other hand
 _ARMS = {"left": LEFT_ARM, "right": RIGHT_ARM}
 _BONES = ((4, 3), (4, 2), (2, 1), (1, 0), (4, 5), (5, 6), (6, 7))  # parent first, from the neck
 _SAME_BONE = (0, 1, 2, 3, 1, 2, 3)  # left and right limbs are of one length
+_MIRROR = (7, 6, 5, 3, 4, 2, 1, 0)  # left and right change places, head and neck stay
 
 
 class WindowLayout(NamedTuple):
@@ -185,7 +186,9 @@ def window_states(
     windows = augment_bodies(windows[torch.cat(order)], generator, size, bones)
     mirrored = torch.rand(len(windows), generator=generator) < mirror_share
     flip = windows.new_tensor([-1.0, 1.0, 1.0])
-    windows = torch.where(mirrored[:, None, None, None], windows.flip(2) * flip, windows)
+    windows = torch.where(
+        mirrored[:, None, None, None], windows[:, :, list(_MIRROR)] * flip, windows
+    )
     view = sample_viewpoints(len(windows), views, generator)
     rotation = euler_to_matrix(view.angles, rotation_order)  # type: ignore[arg-type]
     uvl = project(windows, matrix, rotation[:, None], view.translation[:, None])

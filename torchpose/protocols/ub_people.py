@@ -71,7 +71,7 @@ def run(
     progress: bool = True,
     quick: bool = False,
     n_components: int | None = None,
-    lag: int = 10,
+    lag: int = 0,
     n_gap_sequences: int = 72,
     recipe: Recipe = learnt_recipe,
     prior: UpperBodyPrior | None = None,
@@ -85,7 +85,8 @@ def run(
         seed: of prior and noise. progress: whether to show bars.
         quick: a small prior, a few sequences and no fixed lag, to see that all of it works.
         n_components: Gaussians per arm; what the recipe has by default if None.
-        lag: frames of the fixed-lag smoother, 0 to leave it out.
+        lag: frames of a fixed-lag smoother, 0 to leave it out. Smoothing with windows looks 16 frames
+            ahead whatever the lag above that.
         n_gap_sequences: sequences in which a hand is hidden; 0 leaves that part out.
         recipe: fits the prior to the training persons. prior: one to score instead.
 

@@ -1,0 +1,161 @@
+"""Window states: which pixels they hold, how they are measured, and that mirrors and files keep them."""
+
+import pytest
+import torch
+
+from tests.priors.poses import poses
+from torchpose.camera import ViewRange
+from torchpose.errors import InputError, PriorError
+from torchpose.priors import GaussianMixture
+from torchpose.priors.arm_state import mirror_arm_state
+from torchpose.priors.window import (
+    WindowLayout,
+    WindowPrior,
+    augment_bodies,
+    window_measurements,
+    window_states,
+)
+
+MATRIX = torch.tensor([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]], dtype=torch.float64)
+FRONT = ViewRange(roll=0, pitch=0, yaw=0, tx=(0, 0), ty=(0, 0), tz=(2, 2))
+LAYOUT = WindowLayout(own=(2, -1), other=(0,))
+
+
+def sequence(n=12):
+    moving = poses(n, seed=1, offset=(0, 0, 0))
+    return moving - moving[:, 4:5]
+
+
+def states(layout=LAYOUT, **options):
+    g = torch.Generator().manual_seed(0)
+    settings = {"n_samples": 12, "size": 0.0, "bones": 0.0} | options
+    return window_states([sequence()], [30.0], layout, MATRIX, FRONT, "zxy", g, **settings)
+
+
+def pixels(point):
+    return point[..., :2] / (point[..., 2:] + 2.0) * 525.0 + torch.tensor([319.5, 239.5])
+
+
+def test_windows_hold_the_hands_at_their_lags_and_ends_are_held():
+    body, found = sequence(), states()
+    assert found["left"].shape == (12, LAYOUT.dim) == (12, 27)
+    t = torch.arange(12)
+    for side, own, other in (("left", 0, 7), ("right", 7, 0)):
+        extra = found[side][:, 21:].view(12, 3, 2)
+        torch.testing.assert_close(extra[:, 0], pixels(body[(t - 2).clamp_min(0), own]))
+        torch.testing.assert_close(extra[:, 1], pixels(body[(t + 1).clamp_max(11), own]))
+        torch.testing.assert_close(extra[:, 2], pixels(body[t, other]))
+        torch.testing.assert_close(found[side][:, :2], pixels(body[t, own]))
+
+
+def test_measurements_of_a_projected_sequence_are_the_window_states():
+    body = sequence()
+    uv = pixels(body)[None]
+    mask = torch.ones(1, 12, 8, dtype=torch.bool)
+    for side in ("left", "right"):
+        values, known = window_measurements(uv, mask, LAYOUT, side)
+        inner = slice(2, 11)
+        # The head moves a little against the neck in these poses, and counts as motion of the body.
+        moved = (uv[0, :, 3] - uv[0, :, 3].roll(2, 0))[inner] / 2
+        expected = states()[side][inner, 21:]
+        expected = expected + torch.cat(
+            [moved, (uv[0, inner, 3] - uv[0, 3:12, 3]) / 2, torch.zeros(9, 2)], 1
+        )
+        torch.testing.assert_close(values[0, inner], expected)
+        assert known[0, inner].all()
+        assert not known[0, :2, :2].any() and not known[0, 11, 2:4].any()
+
+
+def test_a_walking_body_has_the_same_window_as_one_that_stands():
+    uv = pixels(sequence())[None]
+    mask = torch.ones(1, 12, 8, dtype=torch.bool)
+    walk = torch.linspace(0, 90, 12, dtype=torch.float64)[None, :, None, None] * torch.tensor(
+        [1.0, 0]
+    )
+    still, _ = window_measurements(uv, mask, LAYOUT, "left")
+    moving, known = window_measurements(uv + walk, mask, LAYOUT, "left")
+    expected = still + walk[:, :, 0].repeat(1, 1, 3)
+    torch.testing.assert_close(moving[known], expected[known])
+
+
+def test_hidden_hands_are_missing_in_every_window_that_holds_them():
+    uv = pixels(sequence())[None]
+    mask = torch.ones(1, 12, 8, dtype=torch.bool)
+    mask[0, 5, 0] = False
+    _, known = window_measurements(uv, mask, LAYOUT, "left")
+    assert not known[0, 7, :2].any() and not known[0, 4, 2:4].any() and known[0, 5, 4:].all()
+    _, known = window_measurements(uv, mask, LAYOUT, "right")
+    assert not known[0, 5, 4:].any()
+
+
+def test_lags_follow_the_frame_rate():
+    assert LAYOUT.at_rate(60.0).own == (4, -2)
+    assert LAYOUT.ahead == 1 and WindowLayout((4,), (0,)).ahead == 0
+
+
+def test_augmented_bodies_keep_their_angles_and_their_symmetry():
+    body = sequence()[:, None]
+    other = augment_bodies(body, torch.Generator().manual_seed(0), size=0.2, bones=0.1)
+    for parent, child in ((2, 1), (1, 0), (4, 3)):
+        before, after = (
+            body[:, 0, child] - body[:, 0, parent],
+            other[:, 0, child] - other[:, 0, parent],
+        )
+        torch.testing.assert_close(torch.cosine_similarity(before, after), torch.ones(12).double())
+        assert ((after.norm(dim=1) / before.norm(dim=1) - 1).abs() < 0.33).all()
+    left = (other[:, 0, 1] - other[:, 0, 2]).norm(dim=1) / (body[:, 0, 1] - body[:, 0, 2]).norm(
+        dim=1
+    )
+    right = (other[:, 0, 6] - other[:, 0, 5]).norm(dim=1) / (body[:, 0, 6] - body[:, 0, 5]).norm(
+        dim=1
+    )
+    torch.testing.assert_close(left, right)
+    same = augment_bodies(body, torch.Generator().manual_seed(0), size=0.0, bones=0.0)
+    torch.testing.assert_close(same, body)
+
+
+def test_mirrored_windows_are_windows_of_the_mirrored_person():
+    plain, mirrored = states(), states(mirror_share=1.0)
+    flip = torch.tensor([-1.0, 1.0]).repeat(3)
+    shift = torch.tensor([639.0, 0.0]).repeat(3)
+    expected = torch.cat(
+        [mirror_arm_state(plain["left"][:, :21], 319.5), plain["left"][:, 21:] * flip + shift], 1
+    )
+    torch.testing.assert_close(mirrored["right"], expected)
+
+
+def prior():
+    g = torch.Generator().manual_seed(0)
+    arms = []
+    for _ in range(2):
+        factor = torch.randn(2, 27, 27, generator=g, dtype=torch.float64)
+        cov = factor @ factor.mT + torch.eye(27)
+        means = 100 * torch.randn(2, 27, generator=g, dtype=torch.float64)
+        arms.append(GaussianMixture(torch.tensor([0.3, 0.7], dtype=torch.float64), means, cov))
+    return WindowPrior(*arms, LAYOUT, {"hand_std": 3.0})
+
+
+def test_mirroring_a_prior_twice_gives_it_back():
+    first = prior()
+    twice = first.mirrored(319.5).mirrored(319.5)
+    torch.testing.assert_close(twice.left.means, first.left.means)
+    torch.testing.assert_close(twice.right.covariances, first.right.covariances)
+    x = torch.randn(5, 27, dtype=torch.float64) * 50
+    flip, shift = torch.tensor([-1.0, 1.0]).repeat(3), torch.tensor([639.0, 0.0]).repeat(3)
+    mirrored = torch.cat([mirror_arm_state(x[:, :21], 319.5), x[:, 21:] * flip + shift], 1)
+    torch.testing.assert_close(
+        first.mirrored(319.5).right.log_prob(mirrored), first.left.log_prob(x)
+    )
+
+
+def test_bad_windows_are_refused():
+    good = prior()
+    with pytest.raises(PriorError, match="27 dimensions"):
+        WindowPrior(good.left.marginal(range(21)), good.right, LAYOUT, {})
+    g = torch.Generator()
+    with pytest.raises(InputError, match="at least one"):
+        window_states([], [], LAYOUT, MATRIX, FRONT, "zxy", g, n_samples=3)
+    broken = sequence()
+    broken[3, 2] = torch.nan
+    with pytest.raises(InputError, match="complete"):
+        window_states([broken], [30.0], LAYOUT, MATRIX, FRONT, "zxy", g, n_samples=3)
