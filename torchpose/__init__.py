@@ -30,6 +30,7 @@ _SUBMODULES = frozenset(
         "joint_sets",
         "lifting",
         "mannequin",
+        "measurements",
         "metrics",
         "pose_track",
         "priors",

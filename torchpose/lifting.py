@@ -1,7 +1,5 @@
 """From the state of an arm, in the image plane, to joints in metres with covariances (BL 5)."""
 
-from collections.abc import Callable
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -10,7 +8,7 @@ from torchpose.gaussian import unscented_transform
 from torchpose.projection import backproject, lift
 from torchpose.rotations import RotationOrder, euler_to_matrix
 
-__all__ = ["arm_in_body_frame", "arm_in_camera_frame"]
+__all__ = ["arm_in_body_frame", "arm_in_camera_frame", "join_arms", "pixel_covariances"]
 
 _CHUNK = 4096  # states at a time: 43 sigma points of 21 numbers each make 30 MB
 
@@ -75,4 +73,17 @@ def _joint_blocks(mean: Tensor, cov: Tensor) -> tuple[Tensor, Tensor]:
     return mean.unflatten(-1, (5, 3)), blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
 
 
-Lifter = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+def join_arms(left: Float[Tensor, "B T 5 *rest"], right: Float[Tensor, "B T 5 *rest"]) -> Tensor:
+    """Eight joints from hand, elbow, shoulder, head and neck of either arm.
+
+    Head and neck are averaged. For covariances the average bounds that of the averaged estimate
+    whatever the two errors have in common: Cov((a + b) / 2) <= (Cov a + Cov b) / 2.
+    """
+    shared = (left[:, :, 3:] + right[:, :, 3:]) / 2
+    return torch.cat([left[:, :, :3], shared, right[:, :, :3].flip(2)], 2)
+
+
+def pixel_covariances(cov: Float[Tensor, "B T 21 21"]) -> Float[Tensor, "B T 5 2 2"]:
+    """Covariances of (u, v) of the five joints of an arm, pixels squared."""
+    blocks = cov[..., :15, :15].unflatten(-1, (5, 3)).unflatten(-3, (5, 3))
+    return blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)[..., :2, :2]

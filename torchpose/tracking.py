@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,14 +12,23 @@ from torchpose.camera import PinholeCamera
 from torchpose.errors import CameraError, InputError, PriorError, check_finite, check_shape
 from torchpose.filters import BootstrapParticleFilter, FilterOutput, MixtureKalmanFilter
 from torchpose.filters.base import Generators, RecursiveFilter
-from torchpose.lifting import arm_in_body_frame
+from torchpose.lifting import arm_in_body_frame, join_arms, pixel_covariances
+from torchpose.measurements import (
+    MeasuredJoints,
+    append_blocks,
+    arm_measurements,
+    check_gaps,
+    measure_joints,
+    pick_joints,
+    pixel_indices,
+)
 from torchpose.pose_track import PoseTrack
 from torchpose.priors.arm_state import STATE_DIM
 from torchpose.priors.upper_body import UpperBodyPrior, released_process_cov
 from torchpose.priors.window import WindowLayout, window_measurements
 from torchpose.projection import map_pixel_covariance, map_pixels
 from torchpose.rotations import RotationOrder, euler_to_matrix
-from torchpose.skeleton import ARM_JOINTS, LEFT_ARM, RIGHT_ARM, UPPER_BODY, upper_body_indices
+from torchpose.skeleton import ARM_JOINTS, LEFT_ARM, RIGHT_ARM, UPPER_BODY
 
 __all__ = ["METHODS", "PoseTrack", "UpperBodyTracker"]
 
@@ -31,23 +40,8 @@ _PROPOSALS = {
 }
 _SIDES = {"left": LEFT_ARM, "right": RIGHT_ARM}
 _DEFAULT_STD = 3.0
-_LEAST_CONFIDENCE = 0.05
 # These options are those of a filter over single poses.
 _POSE_OPTIONS = {"transition", "gamma", "subspace", "initial_cov", "process_cov"}
-
-
-class _Measured(NamedTuple):
-    """Keypoints of the eight joints in the prior's pixels.
-
-    Attributes:
-        uv: [B, T, 8, 2]. mask: [B, T, 8]. cov: R of each joint, [8, 2, 2] or [B, T, 8, 2, 2].
-        notes: what was assumed.
-    """
-
-    uv: Tensor
-    mask: Tensor
-    cov: Tensor
-    notes: tuple[str, ...]
 
 
 class UpperBodyTracker(nn.Module):
@@ -158,7 +152,7 @@ class UpperBodyTracker(nn.Module):
 
     def _make_filter(self, side: str, joints: tuple[str, ...]) -> RecursiveFilter:
         mixture = getattr(self.prior, side)
-        observed = _pixel_indices(joints)
+        observed = pixel_indices(joints)
         arm = _SIDES[side]
         blocks = [self.measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
         options = self._noise_options(side) | self.options
@@ -224,124 +218,47 @@ class UpperBodyTracker(nn.Module):
             ShapeError, InputError: wrong shapes, infinite values, nothing measured in a sequence or
             for longer than `max_gap`. SkeletonError: unknown names.
         """
-        measured = self._prepare(keypoints, confidence, names, mask, lengths)
+        measured, notes = self._measure(keypoints, confidence, names, mask, lengths)
         sources = _generators_of_arms(generator)
         arms = {
             side: self._run_arm(side, measured, lengths, source, progress)
             for side, source in zip(_SIDES, sources, strict=True)
         }
-        return self._poses(arms["left"], arms["right"], measured, lengths)
+        return self._poses(arms["left"], arms["right"], measured.mask, lengths, notes)
 
-    def _prepare(
+    def _measure(
         self,
         keypoints: Tensor,
         confidence: Tensor | None,
         names: Sequence[str] | None,
         mask: Tensor | None,
         lengths: Tensor | None,
-    ) -> _Measured:
-        """Keypoints of the eight joints in the prior's pixels, checked."""
+    ) -> tuple[MeasuredJoints, tuple[str, ...]]:
+        """The eight joints in the prior's pixels, checked; and what was assumed."""
         check_shape("keypoints", keypoints, ["B", "T", "J", 2])
         keypoints = keypoints.to(self.measurement_cov)
         if keypoints.shape[0] == 0 or keypoints.shape[1] == 0:
             raise InputError(
                 f"keypoints must hold at least one sequence of one frame, got {list(keypoints.shape)}"
             )
-        indices, notes = self._joints(keypoints.shape[2], names)
-        measured = torch.isfinite(keypoints).all(-1)
-        check_finite("keypoints", keypoints, ~keypoints.isnan(), "missing keypoints are NaN")
-        if mask is not None:
-            check_shape("mask", mask, list(measured.shape))
-            measured = measured & mask.to(measured.device, torch.bool)
+        info = self.prior.info
+        indices, notes = pick_joints(keypoints.shape[2], names, self.neck, info.neck, info.hand)
         cov = self.measurement_cov
-        if confidence is not None:
-            check_shape("confidence", confidence, list(measured.shape))
-            measured = measured & (confidence.to(measured.device) > 0)
-        present = torch.tensor([i >= 0 for i in indices], device=measured.device)
-        picked = [max(i, 0) for i in indices]
-        measured = measured[:, :, picked] & present
-        uv = torch.where(
-            measured[..., None], keypoints[:, :, picked], torch.zeros_like(keypoints[:1, :1, :1])
-        )
-        if confidence is not None:
-            weight = confidence.to(uv)[:, :, picked].nan_to_num(1.0)
-            weight = weight.clamp(_LEAST_CONFIDENCE, 1.0)
-            if bool((weight[measured] < 1).any()):
-                cov = cov / torch.where(measured, weight, torch.ones_like(weight))[..., None, None]
-        self._check_gaps(measured, lengths)
-        uv = map_pixels(uv, self.camera.matrix.to(uv), self.prior.info.matrix.to(uv))
-        return _Measured(uv, measured, cov, notes)
-
-    def _joints(
-        self, n_joints: int, names: Sequence[str] | None
-    ) -> tuple[tuple[int, ...], tuple[str, ...]]:
-        """For each of the eight joints its index among the keypoints, -1 if absent; and notes."""
-        if names is None:
-            if n_joints != len(UPPER_BODY):
-                raise InputError(
-                    f"names may be left out only for the {len(UPPER_BODY)} joints "
-                    f"{', '.join(UPPER_BODY)}; got {n_joints} keypoints without names"
-                )
-            return tuple(range(n_joints)), ()
-        if len(names) != n_joints:
-            raise InputError(
-                f"names must name each of the {n_joints} keypoints, got {len(names)} names"
-            )
-        found = upper_body_indices(names)
-        indices, notes = list(found.indices), []
-        neck, wanted = self.neck or found.neck, self.prior.info.neck
-        at = UPPER_BODY.index("neck")
-        if indices[at] >= 0 and neck is not None and wanted is not None and neck != wanted:
-            indices[at] = -1
-            notes.append(
-                f"the keypoints' neck ({neck}) is not the prior's ({wanted}): not measured"
-            )
-        hand = self.prior.info.hand
-        if found.hand is not None and hand is not None and found.hand != hand:
-            notes.append(f"the keypoints' {found.hand}s stand for the prior's {hand}s")
-        return tuple(indices), tuple(notes)
-
-    def _check_gaps(self, measured: Tensor, lengths: Tensor | None) -> None:
-        """Refuse sequences in which nothing at all is measured, wholly or for too long."""
-        batch, n_frames, _ = measured.shape
-        seen = measured.any(-1)
-        if lengths is not None:
-            check_shape("lengths", lengths, [batch])
-            over = torch.arange(n_frames, device=seen.device) >= lengths.to(seen.device)[:, None]
-            if bool((seen & over).any()):
-                seen = seen & ~over
-        empty = torch.nonzero(~seen.any(1)).flatten().tolist()
-        if empty:
-            raise InputError(
-                f"no joint is measured in any frame of sequence {empty[0]} "
-                f"({len(empty)} such sequences); expected keypoints of some of {', '.join(UPPER_BODY)}"
-            )
-        if self.max_gap is None:
-            return
-        allowed = self.max_gap * (self.fps or 30.0)
-        frames = torch.arange(n_frames, device=seen.device).expand(batch, -1)
-        last_seen = torch.where(seen, frames, torch.full_like(frames, -1)).cummax(1).values
-        gap = frames - last_seen
-        if lengths is not None:
-            gap = torch.where(over, torch.zeros_like(gap), gap)
-        if bool((gap > allowed).any()):
-            b, t = (int(i) for i in torch.nonzero(gap == gap.max())[0])
-            raise InputError(
-                f"nothing is measured for {int(gap[b, t])} frames, from frame "
-                f"{int(last_seen[b, t]) + 1} of sequence {b} on, longer than max_gap = {self.max_gap} s; "
-                "cut the recording there, or raise max_gap to have the prior fill it"
-            )
+        measured = measure_joints(keypoints, confidence, mask, indices, cov)
+        check_gaps(measured.mask, lengths, self.max_gap, self.fps or 30.0)
+        own, prior = self.camera.matrix.to(keypoints), info.matrix.to(keypoints)
+        return measured._replace(uv=map_pixels(measured.uv, own, prior)), notes
 
     def _run_arm(
         self,
         side: str,
-        measured: _Measured,
+        measured: MeasuredJoints,
         lengths: Tensor | None,
         generator: Generators,
         progress: bool,
     ) -> FilterOutput:
         joints = self._measured_joints(side, measured.mask)
-        z, mask, cov = _arm_measurements(_SIDES[side], joints, measured)
+        z, mask, cov = arm_measurements(_SIDES[side], joints, measured)
         window = self._window()
         if window is not None:
             return self._run_window(side, joints, window, measured, (z, mask, cov), lengths)
@@ -367,7 +284,7 @@ class UpperBodyTracker(nn.Module):
         side: str,
         joints: tuple[str, ...],
         window: tuple[str, WindowLayout],
-        measured: _Measured,
+        measured: MeasuredJoints,
         base: tuple[Tensor, Tensor, Tensor | None],
         lengths: Tensor | None,
     ) -> FilterOutput:
@@ -378,7 +295,7 @@ class UpperBodyTracker(nn.Module):
         model = self._window_filter(side, name, joints)
         hand_cov = self._window_hand_cov(side, name)
         both = torch.cat([z, hands], -1), torch.cat([mask, known], -1)
-        noise = None if cov is None else _append_blocks(cov, hand_cov, hands.shape[-1] // 2)
+        noise = None if cov is None else append_blocks(cov, hand_cov, hands.shape[-1] // 2)
         out = model(*both, noise, lengths, return_cov=True)
         context = self._window_filter(side, name, ())(hands, known, None, lengths)
         evidence = out.log_evidence - context.log_evidence
@@ -395,7 +312,7 @@ class UpperBodyTracker(nn.Module):
             blocks = [self.measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
             n_hands = (window.layout.dim - STATE_DIM) // 2
             blocks += [self._window_hand_cov(side, name)] * n_hands
-            observed = _pixel_indices(joints) + list(range(STATE_DIM, window.layout.dim))
+            observed = pixel_indices(joints) + list(range(STATE_DIM, window.layout.dim))
             settings = {
                 "uniform_weight": window.settings["uniform_weight"],
                 "likelihood_power": window.settings["likelihood_power"],
@@ -428,7 +345,12 @@ class UpperBodyTracker(nn.Module):
         )
 
     def _poses(
-        self, left: FilterOutput, right: FilterOutput, measured: _Measured, lengths: Tensor | None
+        self,
+        left: FilterOutput,
+        right: FilterOutput,
+        observed: Tensor,
+        lengths: Tensor | None,
+        notes: tuple[str, ...],
     ) -> PoseTrack:
         info = self.prior.info
         matrix = info.matrix.to(left.mean)
@@ -452,7 +374,7 @@ class UpperBodyTracker(nn.Module):
         uv = join_arms(
             *(arm.mean[..., :15].unflatten(-1, (5, 3))[..., :2] for arm in (left, right))
         )
-        covs2d = join_arms(*(_pixel_blocks(cov) for cov in arm_covs))
+        covs2d = join_arms(*(pixel_covariances(cov) for cov in arm_covs))
         own = self.camera.matrix.to(uv)
         batch, n_frames = uv.shape[:2]
         if lengths is None:
@@ -466,14 +388,14 @@ class UpperBodyTracker(nn.Module):
             joints3d=joints3d,
             covariance2d=map_pixel_covariance(covs2d, matrix, own),
             covariance3d=covs3d,
-            observed=measured.mask,
+            observed=observed,
             log_evidence=torch.stack([left.log_evidence, right.log_evidence], -1),
             lengths=lengths,
             matrix=self.camera.matrix,
             failed_at=failed_at,
             fps=self.fps,
             frame=self.frame,
-            notes=measured.notes,
+            notes=notes,
         )
 
     def _calibrated(self, covs: Tensor) -> Tensor:
@@ -486,16 +408,6 @@ class UpperBodyTracker(nn.Module):
             return covs
         eye = torch.eye(3, dtype=covs.dtype, device=covs.device)
         return covs * scale.to(covs)[:, None, None] + floor.to(covs)[:, None, None] * eye
-
-
-def join_arms(left: Float[Tensor, "B T 5 *rest"], right: Float[Tensor, "B T 5 *rest"]) -> Tensor:
-    """Eight joints from hand, elbow, shoulder, head and neck of either arm.
-
-    Head and neck are averaged. For covariances the average bounds that of the averaged estimate
-    whatever the two errors have in common: Cov((a + b) / 2) <= (Cov a + Cov b) / 2.
-    """
-    shared = (left[:, :, 3:] + right[:, :, 3:]) / 2
-    return torch.cat([left[:, :, :3], shared, right[:, :, :3].flip(2)], 2)
 
 
 def default_process_cov(prior: UpperBodyPrior) -> Float[Tensor, " 21"]:
@@ -511,7 +423,7 @@ def default_process_cov(prior: UpperBodyPrior) -> Float[Tensor, " 21"]:
     pixels = math.sqrt(prior.info.fx * prior.info.fy) / depth / (1550 / 4.5)
     released = released_process_cov().to(pixels)
     in_pixels = torch.zeros(STATE_DIM, dtype=torch.bool, device=released.device)
-    in_pixels[_pixel_indices(ARM_JOINTS)] = True
+    in_pixels[pixel_indices(ARM_JOINTS)] = True
     scaled = torch.where(in_pixels, released * pixels.square(), released)
     return scaled * (25.0 / (prior.info.fps or 30.0))
 
@@ -532,38 +444,6 @@ def _generators_of_arms(generator: Generators) -> tuple[Generators, Generators]:
     return lefts, [right for _, right in pairs if isinstance(right, torch.Generator)]
 
 
-def _pixel_indices(joints: Sequence[str]) -> list[int]:
-    """State dimensions of u and v of these joints of an arm."""
-    return [3 * ARM_JOINTS.index(joint) + axis for joint in joints for axis in (0, 1)]
-
-
-def _arm_measurements(
-    arm: tuple[int, ...], joints: tuple[str, ...], measured: _Measured
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """z, mask and R of an arm's joints; R is None where it is the filter's own."""
-    rows = [arm[ARM_JOINTS.index(joint)] for joint in joints]
-    z = measured.uv[:, :, rows].flatten(-2)
-    mask = measured.mask[:, :, rows].repeat_interleave(2, -1)
-    if measured.cov.ndim == 3:
-        return z, mask, None
-    return z, mask, _block_diagonal(measured.cov[:, :, rows])
-
-
-def _block_diagonal(blocks: Float[Tensor, "B T N 2 2"]) -> Float[Tensor, "B T Z Z"]:
-    n = blocks.shape[2]
-    eye = torch.eye(n, dtype=blocks.dtype, device=blocks.device)
-    return torch.einsum("btnij,nm->btnimj", blocks, eye).flatten(-2).flatten(-3, -2)
-
-
-def _append_blocks(cov: Float[Tensor, "B T Z Z"], block: Tensor, count: int) -> Tensor:
-    """R with `count` more diagonal blocks."""
-    blocks = torch.block_diag(*[block] * count).expand(*cov.shape[:2], -1, -1)
-    n, extra = cov.shape[-1], blocks.shape[-1]
-    whole = cov.new_zeros(*cov.shape[:2], n + extra, n + extra)
-    whole[..., :n, :n], whole[..., n:, n:] = cov, blocks
-    return whole
-
-
 def _require_cov(out: FilterOutput) -> Tensor:
     if out.cov is None:
         raise RuntimeError("the filter was run without return_cov=True")
@@ -573,11 +453,6 @@ def _require_cov(out: FilterOutput) -> Tensor:
 def _arm_index(joint: str) -> int:
     """Index in `ARM_JOINTS` of one of the eight joints."""
     return ARM_JOINTS.index(joint.split("_")[0])
-
-
-def _pixel_blocks(cov: Float[Tensor, "B T 21 21"]) -> Float[Tensor, "B T 5 2 2"]:
-    blocks = cov[..., :15, :15].unflatten(-1, (5, 3)).unflatten(-3, (5, 3))
-    return blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)[..., :2, :2]
 
 
 def _require_camera(camera: PinholeCamera | None) -> PinholeCamera:
