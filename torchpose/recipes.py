@@ -42,7 +42,7 @@ LAYOUTS = {
 _POWER = {"causal": 0.3, "full": 0.25}
 _BODY_SIZE, _BONE_LENGTHS, _MIRROR_SHARE = 0.15, 0.10, 0.25
 _MEMORYLESS = 1e6  # epsilon so large that the weights of a frame are its own
-_WINDOW_SAMPLES = 80_000
+_WINDOW_SAMPLES, _WINDOWS_PER_FRAME = 80_000, 40
 _EM_STEPS = 30
 _MEASUREMENT_STD = 3.0
 _MODES: dict[str, dict[str, Any]] = {
@@ -80,8 +80,8 @@ def fit_kinect_prior(
     seed: int = 0,
     views: ViewRange = TRAINING_VIEWS,
     *,
-    window_components: int = 120,
-    window_samples: int = _WINDOW_SAMPLES,
+    window_components: int | None = None,
+    window_samples: int | None = None,
     calibration_folds: int = 6,
     name: str = "",
     licence: str = "",
@@ -100,8 +100,9 @@ def fit_kinect_prior(
     Args:
         recordings: in camera axes (`torchpose.io.read_recordings`).
         n_components: Gaussians per arm over single poses. seed: of everything random.
-        views: limits of the random viewpoints. window_components: Gaussians per arm over windows; 0
-            leaves windows out. window_samples: training windows.
+        views: limits of the random viewpoints. window_components: Gaussians per arm over windows, by
+            default four times as many as over poses; 0 leaves windows out.
+        window_samples: training windows, by default 40 for each frame and 80,000 at most.
         calibration_folds: groups of persons that are held out in turn; below 2, or with a single
             person, nothing is calibrated.
         name, licence, command: for `PriorInfo`. progress: whether to show bars.
@@ -110,6 +111,11 @@ def fit_kinect_prior(
     Raises:
         InputError, PriorError: as `fit_upper_body_prior`.
     """
+    if window_components is None:
+        window_components = 4 * n_components
+    if window_samples is None:
+        frames = sum(len(r.upper_body().joints) for r in recordings)
+        window_samples = min(_WINDOW_SAMPLES, _WINDOWS_PER_FRAME * frames)
     size = _Size(n_components, window_components, window_samples, _EM_STEPS)
     facts = {"name": name, "licence": licence, "command": command}
     bar = tqdm(total=1 + calibration_folds, disable=not progress, unit="fit", desc="fit")
