@@ -11,7 +11,7 @@ import torch
 pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 
 from torchpose import demo, metrics, viz
-from torchpose.errors import InputError, OutputError, ShapeError
+from torchpose.errors import InputError, MissingDependencyError, OutputError, ShapeError
 from torchpose.viz import style
 from torchpose.viz.charts import _spans
 
@@ -167,3 +167,10 @@ def test_bad_input_is_named(scene) -> None:
         viz.plot_joint_curves(scene.joints, show=["foot"])
     with pytest.raises(InputError, match="at least one"):
         viz.plot_pcp({})
+
+
+@pytest.mark.parametrize("draw", [viz.plot_joint_curves, viz.plot_pose_strip])
+def test_without_matplotlib_the_error_says_what_to_install(draw, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(MissingDependencyError, match="plots"):
+        draw(torch.zeros(5, 8, 3))

@@ -25,6 +25,7 @@ from torchpose.viz.style import (
     method_styles,
     new_figure,
     readable,
+    require_matplotlib,
     style_axes,
     to_numpy,
 )
@@ -70,6 +71,7 @@ def plot_joint_curves(
         level: probability of the bands. title: above the picture.
     """
     check_shape("joints", joints, [None, 8, None])
+    require_matplotlib()
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -208,6 +210,7 @@ def plot_error_bars(
         unit, scale: as in `plot_errors_over_time`.
         title: above the picture.
     """
+    require_matplotlib()
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -289,6 +292,7 @@ def plot_reliability(
         tolerance: half width of the grey band about the diagonal (0.05 = 5 points).
         title: above the picture.
     """
+    require_matplotlib()
     from matplotlib.patches import Patch
 
     by_name = {"estimate": curves} if isinstance(curves, Coverage) else dict(curves)

@@ -33,6 +33,7 @@ __all__ = [
     "method_styles",
     "new_figure",
     "readable",
+    "require_matplotlib",
     "save_figure",
     "style_axes",
     "to_numpy",
@@ -46,16 +47,23 @@ _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (5, 1, 1, 1))
 SMALL, NORMAL, LARGE = 9.0, 10.0, 11.5
 
 
-def new_figure(width: float, height: float, title: str | None = None) -> Figure:
-    """An empty white figure of the given size in inches, laid out so that nothing overlaps."""
+def require_matplotlib() -> None:
+    """Raise `MissingDependencyError` if matplotlib is not installed."""
     try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure as MatplotlibFigure
+        import matplotlib  # noqa: F401
     except ImportError as error:
         raise MissingDependencyError(
             "pictures need the package matplotlib, which is not installed; "
             "run `pip install torchpose[plots]`"
         ) from error
+
+
+def new_figure(width: float, height: float, title: str | None = None) -> Figure:
+    """An empty white figure of the given size in inches, laid out so that nothing overlaps."""
+    require_matplotlib()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure as MatplotlibFigure
+
     figure = MatplotlibFigure(figsize=(width, height), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     if title:
