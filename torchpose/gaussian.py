@@ -19,6 +19,7 @@ __all__ = [
     "kalman_gain",
     "kalman_predict",
     "kalman_update",
+    "least_exponent",
     "log_prob",
     "marginal",
     "mixture_moments",
@@ -68,6 +69,14 @@ def safe_cholesky(matrix: Float[Tensor, "... D D"]) -> Float[Tensor, "... D D"]:
         if not bool(info.any()):
             return factor
     return torch.where((info != 0)[..., None, None], torch.full_like(factor, math.nan), factor)
+
+
+def least_exponent(dtype: torch.dtype) -> float:
+    """Where to clamp exponents below a largest one of zero: what is lost is nothing beside one.
+
+    Exponentials that underflow are about ten times as slow as others.
+    """
+    return -500.0 if dtype == torch.float64 else -80.0
 
 
 def log_prob(

@@ -14,6 +14,7 @@ from tqdm.auto import tqdm
 from torchpose.filters.base import FilterOutput, Measurements, finish_output
 from torchpose.filters.gains import Edge
 from torchpose.filters.weights import indicator_mixing, steps_between_rescaling
+from torchpose.gaussian import least_exponent
 
 if TYPE_CHECKING:
     from torchpose.filters.mkf import MixtureKalmanFilter
@@ -146,7 +147,7 @@ class _LinearWeights:
     def update(self, log_likelihood: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Weights, log-weights [S, M, B] and log-evidence [S, B] of the next S frames."""
         top = log_likelihood.amax(1, keepdim=True)
-        likelihood = (log_likelihood - top).clamp_min_(_underflow(log_likelihood.dtype)).exp_()
+        likelihood = (log_likelihood - top).clamp_min_(least_exponent(log_likelihood.dtype)).exp_()
         predicted = torch.empty_like(likelihood)
         for now, frame in zip(predicted.unbind(), likelihood.unbind(), strict=True):
             now.copy_(self._predicted)
@@ -161,8 +162,3 @@ class _LinearWeights:
         log_mass = mass.log().add_(top)
         logs = predicted.log_().add_(log_likelihood).sub_(log_mass)
         return joint.div_(mass), logs, evidence
-
-
-def _underflow(dtype: torch.dtype) -> float:
-    """An exponent so low that its exponential is nothing, yet not so low that it is slow."""
-    return -500.0 if dtype == torch.float64 else -80.0

@@ -26,10 +26,25 @@ if TYPE_CHECKING:
 _BUFFER_NUMBERS = 1 << 18  # track means held at a time: 4 MB, which stay in the cache
 
 
-def advance(
-    model: "MixtureKalmanFilter", state: MKFState, frame: Measurements, return_cov: bool
-) -> tuple[MKFState, StepOutput]:
-    """One step (BL 34-41, 48-49)."""
+class TrackStep(NamedTuple):
+    """All tracks after one step, before their weights.
+
+    Attributes:
+        predicted, mean: track means before and after the measurement [B, M, D].
+        log_likelihood: [B, M]. predicted_cov, cov: before and after, [G, M, D, D].
+        group: row of the covariances for each element [B].
+    """
+
+    predicted: Tensor
+    mean: Tensor
+    log_likelihood: Tensor
+    predicted_cov: Tensor
+    cov: Tensor
+    group: Tensor
+
+
+def step_tracks(model: "MixtureKalmanFilter", state: MKFState, frame: Measurements) -> TrackStep:
+    """Predict and correct every track (BL 34-41); elements of one history share their gains."""
     matrix, offset, noise = model.transition(state.time)
     cov, group, mask, noise_cov = distinct_histories(state, frame)
     predicted_cov = symmetrise(matrix @ cov @ matrix.mT + noise)
@@ -37,12 +52,19 @@ def advance(
     gain = Gain(*(part.to(model.dtype) for part in gain))
     moving = matrix.to(model.dtype), offset.to(model.dtype)
     if cov.shape[0] == 1:
-        mean, log_likelihood = _correct_shared(model, state.mean, moving, gain, frame)
+        means = _correct_shared(model, state.mean, moving, gain, frame)
     else:
         predicted = (moving[0] @ state.mean[..., None])[..., 0] + moving[1]
         own = Gain(*(part[group] for part in gain))
         z, seen = frame.z[:, None], frame.mask[:, None]
-        mean, log_likelihood = kalman_correct(predicted, z, own, model.observed, seen)
+        means = predicted, *kalman_correct(predicted, z, own, model.observed, seen)
+    return TrackStep(*means, predicted_cov, cov, group)
+
+
+def step_fixed_weights(
+    model: "MixtureKalmanFilter", state: MKFState, log_likelihood: Tensor, frame: Measurements
+) -> tuple[Tensor, Tensor]:
+    """Log-weights of the estimate [B, M] and log-evidence, 0 where nothing is measured [B]."""
     log_weights, log_evidence = step_weights(
         state.log_weights,
         model.log_prior.to(model.dtype),
@@ -50,10 +72,20 @@ def advance(
         model.likelihood_power,
         model.reset_below,
     )
-    log_evidence = torch.where(frame.mask.any(-1), log_evidence, torch.zeros_like(log_evidence))
-    estimate, total = estimate_of(log_weights, mean, cov[group] if return_cov else None)
+    measured = frame.mask.any(-1)
+    return log_weights, torch.where(measured, log_evidence, torch.zeros_like(log_evidence))
+
+
+def advance(
+    model: "MixtureKalmanFilter", state: MKFState, frame: Measurements, return_cov: bool
+) -> tuple[MKFState, StepOutput]:
+    """One step (BL 34-41, 48-49)."""
+    step = step_tracks(model, state, frame)
+    log_weights, log_evidence = step_fixed_weights(model, state, step.log_likelihood, frame)
+    covs = step.cov[step.group] if return_cov else None
+    estimate, total = estimate_of(log_weights, step.mean, covs)
     carried = mix_uniform(log_weights, model.uniform_weight)
-    new_state = MKFState(carried, mean, cov, group, state.time + 1)
+    new_state = MKFState(carried, step.mean, step.cov, step.group, state.time + 1)
     return new_state, StepOutput(estimate, log_weights, log_evidence, total)
 
 
@@ -63,15 +95,16 @@ def _correct_shared(
     moving: tuple[Tensor, Tensor],
     gain: Gain,
     frame: Measurements,
-) -> tuple[Tensor, Tensor]:
-    """Predict and correct the means of elements that share one gain: products over tracks."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Predicted and corrected means and likelihoods of elements that share one gain."""
     matrix, offset = moving
     predicted = torch.baddbmm(offset[:, None], mean.transpose(0, 1), matrix.mT)
     residual = frame.z - predicted.index_select(-1, model.observed)
     residual = torch.where(frame.mask[0], residual, torch.zeros_like(residual))
     white = torch.linalg.solve_triangular(gain.factor[0], residual.mT, upper=False)
-    corrected = torch.baddbmm(predicted, white.mT, gain.white[0]).transpose(0, 1)
-    return corrected, gain.log_norm[0] - 0.5 * white.square().sum(1).mT
+    corrected = torch.baddbmm(predicted, white.mT, gain.white[0])
+    log_likelihood = gain.log_norm[0] - 0.5 * white.square().sum(1).mT
+    return predicted.transpose(0, 1), corrected.transpose(0, 1), log_likelihood
 
 
 def distinct_histories(

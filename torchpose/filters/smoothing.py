@@ -12,10 +12,10 @@ from torch import Tensor
 
 from torchpose.errors import InputError
 from torchpose.filters.base import FilterOutput, Measurements, finish_output
-from torchpose.filters.fixed_tracks import distinct_histories
+from torchpose.filters.fixed_tracks import step_fixed_weights, step_tracks
 from torchpose.filters.tracks import MKFState, within_and_between
-from torchpose.filters.weights import indicator_mixing, mix_uniform, normalise, step_weights
-from torchpose.gaussian import Gain, kalman_correct, kalman_gain, safe_cholesky, symmetrise
+from torchpose.filters.weights import indicator_mixing, mix_uniform, normalise
+from torchpose.gaussian import safe_cholesky, symmetrise
 
 if TYPE_CHECKING:
     from torchpose.filters.mkf import MixtureKalmanFilter
@@ -119,34 +119,21 @@ def _forward(model: "MixtureKalmanFilter", frames: Measurements, by_length: bool
         # Smoothed covariances depend on where a sequence ends: lengths make histories distinct.
         lengths, group = torch.unique(frames.lengths, return_inverse=True)
         state = state._replace(cov=state.cov.expand(lengths.numel(), -1, -1, -1), group=group)
-    log_prior = model.log_prior.to(model.dtype)
     means, corrections, likelihoods, evidences = [], [], [], []
     covs, predicted_covs, groups = [], [], []
     for t in range(frames.z.shape[1]):
         frame = frames.frame(t)
-        matrix, offset, noise = model.transition(t)
-        cov, group, mask, noise_cov = distinct_histories(state, frame)
-        predicted_cov = symmetrise(matrix @ cov @ matrix.mT + noise)
-        gain, cov = kalman_gain(predicted_cov, noise_cov, model.observed, mask)
-        predicted = (matrix.to(model.dtype) @ state.mean[..., None])[..., 0] + offset.to(
-            model.dtype
-        )
-        gain = Gain(*(part.to(model.dtype)[group] for part in gain))
-        mean, log_likelihood = kalman_correct(
-            predicted, frame.z[:, None], gain, model.observed, frame.mask[:, None]
-        )
-        log_weights, evidence = step_weights(
-            state.log_weights, log_prior, log_likelihood, model.likelihood_power, model.reset_below
-        )
-        means.append(mean)
-        corrections.append(mean - predicted)
-        likelihoods.append(log_likelihood)
-        evidences.append(torch.where(frame.mask.any(-1), evidence, torch.zeros_like(evidence)))
-        covs.append(cov)
-        predicted_covs.append(predicted_cov)
-        groups.append(group)
+        step = step_tracks(model, state, frame)
+        log_weights, evidence = step_fixed_weights(model, state, step.log_likelihood, frame)
+        means.append(step.mean)
+        corrections.append(step.mean - step.predicted)
+        likelihoods.append(step.log_likelihood)
+        evidences.append(evidence)
+        covs.append(step.cov)
+        predicted_covs.append(step.predicted_cov)
+        groups.append(step.group)
         carried = mix_uniform(log_weights, model.uniform_weight)
-        state = MKFState(carried, mean, cov, group, t + 1)
+        state = MKFState(carried, step.mean, step.cov, step.group, t + 1)
     stacked = [torch.stack(values) for values in (means, corrections, likelihoods, evidences)]
     return _Pass(stacked[0], stacked[1], stacked[2], stacked[3], covs, predicted_covs, groups)
 

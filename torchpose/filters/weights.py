@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose.gaussian import least_exponent
+
 __all__ = [
     "indicator_mixing",
     "mix_uniform",
@@ -151,9 +153,7 @@ def _scaled_linear(
 ) -> Tensor:
     """Predicted log-weights log a_t with epsilon."""
     top = log_likelihood.amax(-1, keepdim=True)
-    # Exponentials that underflow are slow; e^-500 (e^-80) next to a sum of order one is nothing.
-    least = -500.0 if log_likelihood.dtype == torch.float64 else -80.0
-    likelihood = (log_likelihood - top).clamp_min_(least).exp_()
+    likelihood = (log_likelihood - top).clamp_min_(least_exponent(log_likelihood.dtype)).exp_()
     prior = log_prior.exp()
     transition = indicator_mixing(log_prior, epsilon)
     predicted = torch.empty_like(log_likelihood)

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.errors import CovarianceError, InputError, check_finite, check_shape
-from torchpose.gaussian import symmetrise
+from torchpose.gaussian import least_exponent, symmetrise
 
 __all__ = [
     "FitReport",
@@ -31,7 +31,6 @@ __all__ = [
 
 CHUNK = 1024  # points per product: 253 features of 1,024 points in float64 are 2 MB
 LOG_2PI = math.log(2.0 * math.pi)
-UNDERFLOW = {torch.float64: -500.0, torch.float32: -80.0}  # exponentials that underflow are slow
 
 
 class MixtureParameters(NamedTuple):
@@ -136,7 +135,7 @@ def e_step(
         phi = _fill_features(features[:, : chunk.shape[1]], chunk)
         terms = theta @ phi
         top = terms.amax(0)
-        terms.sub_(top).clamp_min_(UNDERFLOW.get(x.dtype, -80.0)).exp_()
+        terms.sub_(top).clamp_min_(least_exponent(x.dtype)).exp_()
         norm = terms.sum(0)
         log_density = norm.log().add_(top)
         if sample_weight is None:
