@@ -1,0 +1,112 @@
+"""Gaussian algebra against SciPy, plain inverses and Monte Carlo."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import multivariate_normal
+
+from tests.filters.oracles import random_covariance, tensor
+from torchpose import gaussian
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+def test_log_prob_is_scipys(rng):
+    mean, cov, x = rng.standard_normal(4), random_covariance(rng, 4), rng.standard_normal((5, 4))
+    ours = gaussian.log_prob(tensor(x), tensor(mean), torch.linalg.cholesky(tensor(cov)))
+    np.testing.assert_allclose(ours, multivariate_normal(mean, cov).logpdf(x), rtol=1e-12)
+
+
+def test_a_product_of_densities_is_a_density_times_a_constant(rng):
+    a, b, x = rng.standard_normal((3, 4))
+    cov_a, cov_b = random_covariance(rng, 4), random_covariance(rng, 4, 0.5)
+    mean, cov, log_c = gaussian.product(tensor(a), tensor(cov_a), tensor(b), tensor(cov_b))
+    inverse = np.linalg.inv(np.linalg.inv(cov_a) + np.linalg.inv(cov_b))
+    np.testing.assert_allclose(cov, inverse, atol=1e-12)
+    product = multivariate_normal(a, cov_a).logpdf(x) + multivariate_normal(b, cov_b).logpdf(x)
+    ours = gaussian.log_prob(tensor(x), mean, torch.linalg.cholesky(cov)) + log_c
+    np.testing.assert_allclose(ours, product, rtol=1e-10)
+
+
+def test_conditional_times_marginal_is_the_joint(rng):
+    mean, cov, x = rng.standard_normal(5), random_covariance(rng, 5), rng.standard_normal(5)
+    known, rest = [3, 1], [0, 2, 4]
+    index = torch.tensor(known)
+    new_mean, new_cov, log_known = gaussian.condition(
+        tensor(mean), tensor(cov), index, tensor(x[known])
+    )
+    part_mean, part_cov = gaussian.marginal(tensor(mean), tensor(cov), index)
+    np.testing.assert_allclose(
+        log_known, multivariate_normal(part_mean.numpy(), part_cov.numpy()).logpdf(x[known])
+    )
+    log_rest = multivariate_normal(new_mean.numpy(), new_cov.numpy()).logpdf(x[rest])
+    joint = multivariate_normal(mean, cov).logpdf(x)
+    np.testing.assert_allclose(log_rest + float(log_known), joint, rtol=1e-10)
+
+
+@pytest.mark.parametrize("mask", [None, [True, True], [True, False], [False, False]])
+def test_an_update_is_that_of_plain_inverses_and_of_gain_and_correction(rng, mask):
+    mean, z = rng.standard_normal((3, 4)), rng.standard_normal((3, 2))
+    cov = np.stack([random_covariance(rng, 4) for _ in range(3)])
+    noise, observed = random_covariance(rng, 2), torch.tensor([2, 0])
+    seen = None if mask is None else torch.tensor(mask).expand(3, 2)
+    arguments = tensor(noise), observed, seen
+    new_mean, new_cov, log_likelihood = gaussian.kalman_update(
+        tensor(mean), tensor(cov), tensor(z), *arguments
+    )
+    gain, apart_cov = gaussian.kalman_gain(tensor(cov), *arguments)
+    apart_mean, apart_log = gaussian.kalman_correct(tensor(mean), tensor(z), gain, observed, seen)
+    torch.testing.assert_close(new_mean, apart_mean)
+    torch.testing.assert_close(new_cov, apart_cov)
+    torch.testing.assert_close(log_likelihood, apart_log)
+    kept = [k for k in range(2) if mask is None or mask[k]]
+    rows = observed.numpy()[kept]
+    for i in range(3):
+        s = cov[i][np.ix_(rows, rows)] + noise[np.ix_(kept, kept)]
+        k = cov[i][:, rows] @ np.linalg.inv(s)
+        residual = z[i, kept] - mean[i, rows]
+        np.testing.assert_allclose(new_mean[i], mean[i] + k @ residual, atol=1e-12)
+        np.testing.assert_allclose(new_cov[i], cov[i] - k @ s @ k.T, atol=1e-12)
+        expected = multivariate_normal(np.zeros(len(kept)), s).logpdf(residual) if kept else 0.0
+        np.testing.assert_allclose(log_likelihood[i], expected, atol=1e-12)
+
+
+def test_a_factor_is_found_for_what_rounding_made_indefinite_and_nan_for_what_is(rng):
+    good, thin = random_covariance(rng, 3), np.outer([1.0, 2.0, 3.0], [1.0, 2.0, 3.0])
+    negative = -np.eye(3)
+    matrices = tensor(np.stack([good, thin - 1e-13 * np.eye(3), negative, np.zeros((3, 3))]))
+    factor = gaussian.safe_cholesky(matrices)
+    torch.testing.assert_close(factor[0], torch.linalg.cholesky(matrices[0]))
+    torch.testing.assert_close(factor[1] @ factor[1].mT, matrices[1], atol=1e-4, rtol=0)
+    assert torch.isnan(factor[2]).all()
+    assert torch.isfinite(factor[3]).all() and factor[3].abs().max() < 1e-8
+
+
+def test_moments_of_a_mixture_are_those_of_its_draws(rng):
+    weights, means = rng.dirichlet(np.ones(3)), rng.standard_normal((3, 2)) * 3
+    covs = np.stack([random_covariance(rng, 2, 0.5) for _ in range(3)])
+    mean, cov = gaussian.mixture_moments(tensor(np.log(weights)), tensor(means), tensor(covs))
+    n = 200_000
+    chosen = rng.choice(3, n, p=weights)
+    noise = rng.standard_normal((n, 2, 1))
+    draws = means[chosen] + (np.linalg.cholesky(covs)[chosen] @ noise)[..., 0]
+    np.testing.assert_allclose(mean, draws.mean(0), atol=5 * draws.std() / n**0.5)
+    np.testing.assert_allclose(cov, np.cov(draws.T), atol=0.1)
+
+
+def test_the_unscented_transform_is_exact_for_linear_maps_and_means_of_squares(rng):
+    mean, cov, matrix = (
+        rng.standard_normal(4),
+        random_covariance(rng, 4),
+        rng.standard_normal((3, 4)),
+    )
+    new_mean, new_cov = gaussian.unscented_transform(
+        tensor(mean), tensor(cov), lambda x: x @ tensor(matrix).mT
+    )
+    np.testing.assert_allclose(new_mean, matrix @ mean, atol=1e-12)
+    np.testing.assert_allclose(new_cov, matrix @ cov @ matrix.T, atol=1e-12)
+    squares, _ = gaussian.unscented_transform(tensor(mean), tensor(cov), torch.square)
+    np.testing.assert_allclose(squares, mean**2 + np.diag(cov), atol=1e-12)
