@@ -10,8 +10,9 @@ from sklearn.mixture import GaussianMixture as Sklearn
 
 from tests.priors.mixtures import random_mixture
 from torchpose.errors import CovarianceError, InputError, ShapeError
-from torchpose.priors import GaussianMixture, MixtureParameters
+from torchpose.priors import GaussianMixture, MixtureParameters, em
 from torchpose.priors.em import e_step, expectation_maximisation, m_step, natural_parameters
+from torchpose.priors.features import CyclicFeatures, cyclic_order
 from torchpose.priors.start import STARTS, floor_variances, k_means, start_mixture
 
 
@@ -67,16 +68,39 @@ def test_features_times_theta_is_the_log_density():
     torch.testing.assert_close(phi @ theta.T, mixture.component_log_prob(x))
 
 
-def test_statistics_are_the_sums_they_say():
-    mixture, x = random_mixture(), sample(2500, dim=3)  # more than two chunks
+@pytest.mark.parametrize(("k", "dim"), [(1, 1), (5, 2), (4, 3), (6, 8), (3, 21)])
+def test_statistics_are_the_sums_they_say(k, dim, monkeypatch):
+    monkeypatch.setattr(em, "POINTS", 600 // torch.get_num_threads())  # several chunks
+    mixture, x = random_mixture(k, dim), sample(2500, dim=dim)
     r = mixture.component_log_prob(x).softmax(-1)
     statistics = e_step(x, mixture.parameters_tuple())
-    rows, columns = torch.triu_indices(3, 3)
+    rows, columns = torch.triu_indices(dim, dim)
     torch.testing.assert_close(statistics.table[:, 0], r.sum(0))
-    torch.testing.assert_close(statistics.table[:, 1:4], r.T @ x)
-    torch.testing.assert_close(statistics.table[:, 4:], r.T @ (x[:, rows] * x[:, columns]))
+    torch.testing.assert_close(statistics.table[:, 1 : 1 + dim], r.T @ x)
+    torch.testing.assert_close(statistics.table[:, 1 + dim :], r.T @ (x[:, rows] * x[:, columns]))
     assert float(statistics.log_likelihood) == pytest.approx(float(mixture.log_prob(x).sum()))
     assert float(statistics.weight) == 2500
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_points_far_from_every_component_have_responsibilities(dtype):
+    mixture, x = random_mixture(5, 2), torch.tensor([[1e9, 0.0], [0.0, -1e12]], dtype=dtype)
+    statistics = e_step(x, mixture.parameters_tuple())
+    assert float(statistics.table[:, 0].sum()) == pytest.approx(2)
+    expected = float(mixture.log_prob(x.double()).sum())
+    assert float(statistics.log_likelihood) == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("dim", range(1, 8))
+def test_cyclic_features_are_all_products(dim):
+    x = sample(50, dim=dim)
+    rows, columns = torch.triu_indices(dim, dim)
+    phi = torch.cat([torch.ones(50, 1), x, x[:, rows] * x[:, columns]], 1)
+    order = cyclic_order(dim, x.device)
+    assert sorted(order.tolist()) == list(range(phi.shape[1]))
+    features = CyclicFeatures(x, 16)
+    for chunk, expected in zip(x.split(16), phi.split(16), strict=True):
+        assert torch.equal(features.of(chunk.T).T, expected[:, order])
 
 
 def test_statistics_of_parts_merge():

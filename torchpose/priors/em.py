@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchpose.errors import CovarianceError, InputError, check_finite, check_shape
 from torchpose.gaussian import least_exponent, symmetrise
+from torchpose.priors.features import CyclicFeatures, cyclic_order
 
 __all__ = [
     "FitReport",
@@ -29,8 +30,8 @@ __all__ = [
     "natural_parameters",
 ]
 
-CHUNK = 1024  # points per product: 253 features of 1,024 points in float64 are 2 MB
-LOG_2PI = math.log(2.0 * math.pi)
+POINTS = 1008  # at a time and core: 253 features are 2 MB; a power of two is 10 % slower
+LOG_2, LOG_2PI = math.log(2.0), math.log(2.0 * math.pi)
 
 
 class MixtureParameters(NamedTuple):
@@ -127,27 +128,40 @@ def e_step(
         The statistics of `m_step`.
     """
     theta = natural_parameters(parameters)
-    n_features, points = theta.shape[1], x.T
-    table, total = torch.zeros_like(theta), theta.new_zeros(())
-    features, theta = _feature_buffer(points, n_features), theta.to(x.dtype)
-    for start in range(0, points.shape[1], CHUNK):
-        chunk = points[:, start : start + CHUNK]
-        phi = _fill_features(features[:, : chunk.shape[1]], chunk)
-        terms = theta @ phi
+    order = cyclic_order(x.shape[1], x.device)
+    # powers of two, 2^(theta . phi(x) / log 2), take a third of the time that those of e take
+    powers = _pad_components((theta[:, order] / LOG_2).to(x.dtype))
+    table, total = torch.zeros_like(powers, dtype=theta.dtype), theta.new_zeros(())
+    chunk, least = _chunk_size(x.device), least_exponent(x.dtype) / LOG_2
+    features, points = CyclicFeatures(x, chunk), x.T
+    for start in range(0, len(x), chunk):
+        phi = features.of(points[:, start : start + chunk])
+        terms = powers @ phi
         top = terms.amax(0)
-        terms.sub_(top).clamp_min_(least_exponent(x.dtype)).exp_()
-        norm = terms.sum(0)
-        log_density = norm.log().add_(top)
-        if sample_weight is None:
-            terms.div_(norm)
-        else:
-            weight = sample_weight[start : start + CHUNK].to(x.dtype)
-            terms.mul_(weight / norm)
+        norm = terms.sub_(top).clamp_min_(least).exp2_().sum(0)
+        log_density, scale = norm.log2().add_(top), norm.reciprocal_()
+        if sample_weight is not None:
+            weight = sample_weight[start : start + chunk].to(x.dtype)
+            scale.mul_(weight)
             log_density.mul_(weight)
-        table += terms @ phi.T
+        table += terms.mul_(scale) @ phi.T
         total += log_density.sum(dtype=total.dtype)
     count = sample_weight.sum() if sample_weight is not None else total.new_tensor(len(x))
-    return SufficientStatistics(table, total, count.to(total.dtype))
+    sums = torch.empty_like(theta)
+    sums[:, order] = table[: len(theta)]
+    return SufficientStatistics(sums, total * LOG_2, count.to(total.dtype))
+
+
+def _chunk_size(device: torch.device) -> int:
+    """Points per product: 2 MB of features for each core, which stay in its cache."""
+    return POINTS * (torch.get_num_threads() if device.type == "cpu" else 64)
+
+
+def _pad_components(theta: Tensor) -> Tensor:
+    """Terms that vanish, up to a multiple of four: products are 10 % faster than with 30."""
+    extra = theta.new_zeros(-len(theta) % 4, theta.shape[1])
+    extra[:, 0] = torch.finfo(theta.dtype).min
+    return torch.cat([theta, extra])
 
 
 def m_step(
@@ -267,9 +281,9 @@ def expectation_maximisation(
     if sample_weight is not None:
         sample_weight = sample_weight.detach().double()
     diagonal = torch.zeros_like(x[0]) if floor is None else floor.to(x)
-    mean, factor = _scale_of(x, sample_weight, diagonal)
+    mean, centred, factor = _scale_of(x, sample_weight, diagonal)
     inverse = torch.linalg.solve_triangular(factor, torch.eye(len(mean)).to(x), upper=False)
-    white = (inverse @ (x - mean).T).to(dtype)  # [D, N] in memory, as `e_step` wants it
+    white = (inverse @ centred).to(dtype)  # [D, N] in memory, as `e_step` wants it
     weights, means, covariances = (p.detach().double() for p in start)
     state = _map_mixture(MixtureParameters(weights, means - mean, covariances), inverse)
     state, report = _iterate(
@@ -340,17 +354,19 @@ def _map_mixture(state: MixtureParameters, matrix: Tensor) -> MixtureParameters:
     return MixtureParameters(state.weights, state.means @ matrix.T, covariances)
 
 
-def _scale_of(x: Tensor, sample_weight: Tensor | None, diagonal: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean [D] and Cholesky factor [D, D] of the covariance of the data, made regular."""
-    weight = torch.full_like(x[:, 0], 1 / len(x)) if sample_weight is None else sample_weight
-    weight = weight / weight.sum()
-    mean = weight @ x
-    centred = x - mean
-    covariance = (centred * weight.unsqueeze(-1)).T @ centred
+def _scale_of(
+    x: Tensor, sample_weight: Tensor | None, diagonal: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean [D], x less it [D, N], and the factor [D, D] of the covariance of x, made regular."""
+    share = None if sample_weight is None else sample_weight / sample_weight.sum()
+    mean = x.mean(0) if share is None else share @ x
+    centred = torch.sub(x.T, mean.unsqueeze(-1), out=x.new_empty(x.shape[1], len(x)))
+    covariance = centred @ centred.T / len(x) if share is None else centred * share @ centred.T
     variance = covariance.diagonal()
     # a direction without any spread must not be blown up; any regular factor serves
     ridge = torch.where(variance > 0, 1e-9 * variance, torch.ones_like(variance))
-    return mean, torch.linalg.cholesky(covariance + torch.diag(torch.maximum(ridge, diagonal)))
+    factor = torch.linalg.cholesky(covariance + torch.diag(torch.maximum(ridge, diagonal)))
+    return mean, centred, factor
 
 
 def _check_points(x: Tensor, start: MixtureParameters, sample_weight: Tensor | None) -> None:
@@ -377,19 +393,3 @@ def _check_points(x: Tensor, start: MixtureParameters, sample_weight: Tensor | N
 def _upper_triangle(dim: int, device: torch.device) -> tuple[Tensor, Tensor]:
     rows, columns = torch.triu_indices(dim, dim, device=device)
     return rows, columns
-
-
-def _feature_buffer(points: Tensor, n_features: int) -> Tensor:
-    width = min(CHUNK, max(points.shape[1], 1))
-    return torch.ones(n_features, width, dtype=points.dtype, device=points.device)
-
-
-def _fill_features(phi: Tensor, points: Tensor) -> Tensor:
-    """phi = [1, x_i, x_i x_j (i <= j)] for points [D, n]; the first row is one already."""
-    dim = len(points)
-    phi[1 : 1 + dim] = points
-    start = 1 + dim
-    for i in range(dim):
-        torch.mul(points[i : i + 1], points[i:], out=phi[start : start + dim - i])
-        start += dim - i
-    return phi
