@@ -71,7 +71,7 @@ def main() -> None:
     args = parser(__doc__.split("\n")[0], runs=15).parse_args()
     limit_threads(args.threads)
     report = Report("One Kalman step, 21 dimensions, 8 measured", args.out)
-    sizes, inner = ((8,), 1) if args.quick else (SIZES, 10)
+    sizes, inner = ((8,), 1) if args.quick else (SIZES, 50)
     limits, failed = measure_limits(args.quick), False
     rows: list[list[str]] = []
     for n_filters in sizes:

@@ -74,6 +74,59 @@ def test_an_update_is_that_of_plain_inverses_and_of_gain_and_correction(rng, mas
         np.testing.assert_allclose(log_likelihood[i], expected, atol=1e-12)
 
 
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+@pytest.mark.parametrize("shared_cov", [False, True])
+def test_a_step_is_that_of_plain_inverses_whatever_is_shared(rng, batch, shared_cov):
+    dim, rows = 5, np.array([4, 1])
+    mean, z = rng.standard_normal((*batch, dim)), rng.standard_normal((*batch, 2))
+    cov, noise = random_covariance(rng, dim), random_covariance(rng, dim, 0.1)
+    F, b, R = rng.standard_normal((dim, dim)), rng.standard_normal(dim), random_covariance(rng, 2)
+    covs = tensor(cov) if shared_cov else tensor(cov).expand(*batch, -1, -1)
+    predicted = gaussian.kalman_predict(tensor(mean), covs, tensor(F), tensor(b), tensor(noise))
+    assert predicted[1].shape == covs.shape and torch.equal(predicted[1], predicted[1].mT)
+    mean, cov = mean @ F.T + b, F @ cov @ F.T + noise
+    np.testing.assert_allclose(predicted[0], mean, atol=1e-12)
+    np.testing.assert_allclose(predicted[1], np.broadcast_to(cov, covs.shape), atol=1e-12)
+    new_mean, new_cov, log_likelihood = gaussian.kalman_update(
+        *predicted, tensor(z), tensor(R), torch.tensor(rows)
+    )
+    S = cov[np.ix_(rows, rows)] + R
+    K = cov[:, rows] @ np.linalg.inv(S)
+    residual = z - mean[..., rows]
+    np.testing.assert_allclose(new_mean, mean + residual @ K.T, atol=1e-11)
+    np.testing.assert_allclose(new_cov - tensor(cov - K @ S @ K.T), 0, atol=1e-11)
+    expected = multivariate_normal(np.zeros(2), S).logpdf(residual)
+    np.testing.assert_allclose(log_likelihood, expected, rtol=1e-11)
+
+
+def test_gradients_flow_through_a_step(rng):
+    cov = random_covariance(rng, 3)
+    start = tensor(np.stack([rng.standard_normal(3), *cov])).requires_grad_()
+
+    def step(start):
+        root, eye = start[1:], torch.eye(3, dtype=start.dtype)
+        state = gaussian.kalman_predict(start[0], root @ root.mT, root, start[0], eye)
+        z, seen = torch.ones(2, dtype=start.dtype), torch.tensor([0, 2])
+        return gaussian.kalman_update(*state, z, eye[:2, :2], seen)
+
+    assert torch.autograd.gradcheck(step, start)
+
+
+def test_a_step_factorises_once_and_loses_only_what_is_not_positive_definite(rng, monkeypatch):
+    calls, plain = [], torch.linalg.cholesky_ex
+    monkeypatch.setattr(torch.linalg, "cholesky_ex", lambda a: calls.append(a) or plain(a))
+    cov = tensor(np.stack([random_covariance(rng, 3) for _ in range(2)]))
+    mean, z, R = cov.new_zeros(2, 3), cov.new_ones(2, 2), torch.eye(2, dtype=cov.dtype)
+    observed = torch.tensor([0, 1])
+    expected = gaussian.kalman_update(mean, cov, z, R, observed)
+    assert len(calls) == 1
+    cov[1] = -9 * torch.eye(3, dtype=cov.dtype)
+    for found, value in zip(
+        gaussian.kalman_update(mean, cov, z, R, observed), expected, strict=True
+    ):
+        assert torch.equal(found[0], value[0]) and bool(torch.isnan(found[1]).any())
+
+
 def test_a_factor_is_found_for_what_rounding_made_indefinite_and_nan_for_what_is(rng):
     good, thin = random_covariance(rng, 3), np.outer([1.0, 2.0, 3.0], [1.0, 2.0, 3.0])
     negative = -np.eye(3)
