@@ -95,6 +95,11 @@ class Measurements(NamedTuple):
         cov = self.cov if self.cov.ndim == 2 else self.cov[:, t]
         return Measurements(self.z[:, t], self.mask[:, t], cov, self.lengths)
 
+    def as_sequences(self) -> "Measurements":
+        """Those of one frame, as sequences of a single frame."""
+        cov = self.cov if self.cov.ndim == 2 else self.cov[:, None]
+        return Measurements(self.z[:, None], self.mask[:, None], cov, self.lengths)
+
 
 def effective_sample_size(log_weights: Float[Tensor, "*batch M"]) -> Float[Tensor, "*batch"]:
     """N_eff = 1 / sum_j w_j^2 for normalised log-weights (BL 25)."""

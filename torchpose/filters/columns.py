@@ -41,7 +41,9 @@ class _Step(NamedTuple):
 
 def suits_columns(model: "MixtureKalmanFilter", frames: Measurements, shared: bool) -> bool:
     """Whether `run_columns` may run: many sequences of one history, and weights as published."""
-    published = model.likelihood_power == 1 and model.reset_below is None
+    published = (
+        model.likelihood_power == 1 and model.reset_below is None and model.weighting == "sequence"
+    )
     mixed = model.uniform_weight > 0
     safe = (
         mixed and steps_between_rescaling(model.log_prior.to(model.dtype), model.uniform_weight) > 0

@@ -14,6 +14,12 @@ from tqdm.auto import tqdm
 
 from torchpose.filters.base import FilterOutput, Measurements, StepOutput, collect, finish_output
 from torchpose.filters.columns import run_columns, suits_columns
+from torchpose.filters.frame_weights import (
+    advance_memoryless,
+    frame_log_likelihood,
+    frame_weights,
+    run_memoryless,
+)
 from torchpose.filters.gains import MAX_EDGES, Edge, GainGraph
 from torchpose.filters.scan import Workspace, scan_blocks
 from torchpose.filters.tracks import MKFState, estimate_of, within_and_between
@@ -65,13 +71,14 @@ def step_fixed_weights(
     model: "MixtureKalmanFilter", state: MKFState, log_likelihood: Tensor, frame: Measurements
 ) -> tuple[Tensor, Tensor]:
     """Log-weights of the estimate [B, M] and log-evidence, 0 where nothing is measured [B]."""
-    log_weights, log_evidence = step_weights(
-        state.log_weights,
-        model.log_prior.to(model.dtype),
-        log_likelihood,
-        model.likelihood_power,
-        model.reset_below,
-    )
+    log_prior, power = model.log_prior.to(model.dtype), model.likelihood_power
+    if model.weighting == "frame":
+        marginal = frame_log_likelihood(model, frame.as_sequences())[:, 0]
+        log_weights, log_evidence = frame_weights(log_prior, marginal, log_likelihood, power)
+    else:
+        log_weights, log_evidence = step_weights(
+            state.log_weights, log_prior, log_likelihood, power, model.reset_below
+        )
     measured = frame.mask.any(-1)
     return log_weights, torch.where(measured, log_evidence, torch.zeros_like(log_evidence))
 
@@ -80,6 +87,8 @@ def advance(
     model: "MixtureKalmanFilter", state: MKFState, frame: Measurements, return_cov: bool
 ) -> tuple[MKFState, StepOutput]:
     """One step (BL 34-41, 48-49)."""
+    if model.is_memoryless and not _learning(model, frame):
+        return advance_memoryless(model, state, frame, return_cov)
     step = step_tracks(model, state, frame)
     log_weights, log_evidence = step_fixed_weights(model, state, step.log_likelihood, frame)
     covs = step.cov[step.group] if return_cov else None
@@ -129,6 +138,8 @@ def run(
     model: "MixtureKalmanFilter", frames: Measurements, return_cov: bool, progress: bool
 ) -> FilterOutput:
     """All frames of a batch."""
+    if model.is_memoryless and not _learning(model, frames):
+        return run_memoryless(model, frames, return_cov, progress)
     history = None if _needs_plain_loop(model, frames) else _history(model, frames)
     if history is None:
         state = model.init(frames.z.shape[0])
@@ -144,10 +155,13 @@ def run(
 
 
 def _needs_plain_loop(model: "MixtureKalmanFilter", frames: Measurements) -> bool:
+    return _learning(model, frames) or frames.cov.ndim == 4 or model.burn_in > 0
+
+
+def _learning(model: "MixtureKalmanFilter", frames: Measurements) -> bool:
     tensors = [frames.z, frames.cov, model.transition_matrix, model.transition_noise]
     tensors += [model.log_prior, model.means, model.initial_cov, model.transition_offset]
-    learning = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
-    return learning or frames.cov.ndim == 4 or model.burn_in > 0
+    return torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
 
 
 class _History(NamedTuple):
@@ -203,8 +217,8 @@ def _run_shared(
     progress: bool,
 ) -> FilterOutput:
     batch, n_frames = frames.z.shape[:2]
-    log_prior, means = model.log_prior.to(model.dtype), model.means.to(model.dtype)
-    log_weights = model.init(batch).log_weights
+    means = model.means.to(model.dtype)
+    weights = _Weights(model, frames)
     # Results are written in place, time first: gathering them afterwards would copy all of them.
     estimates = means.new_empty(n_frames, batch, model.dim)
     posteriors = means.new_empty(n_frames, batch, model.n_tracks)
@@ -216,14 +230,7 @@ def _run_shared(
     for tracks in _stretches(model, frames, history, workspace):
         log_likelihood = tracks.log_likelihood.permute(1, 3, 2, 0).flatten(0, 1)
         span = slice(done, done + len(log_likelihood))
-        posteriors[span], evidences[span], log_weights = sequence_weights(
-            log_weights,
-            log_prior,
-            log_likelihood,
-            model.uniform_weight,
-            model.likelihood_power,
-            model.reset_below,
-        )
+        posteriors[span], evidences[span] = weights.update(log_likelihood, span)
         mixed = posteriors[span].exp()
         shares = mixed.view(*tracks.deviation.shape[1:4:2], batch, -1).permute(3, 0, 2, 1)
         weighted = workspace.take("weighted", tuple(tracks.deviation.shape), means)
@@ -240,6 +247,32 @@ def _run_shared(
     return finish_output(
         estimates.transpose(0, 1), posteriors.transpose(0, 1), evidence, cov, frames.lengths
     )
+
+
+class _Weights:
+    """Weights and evidence of consecutive stretches of frames, time first."""
+
+    def __init__(self, model: "MixtureKalmanFilter", frames: Measurements) -> None:
+        self._model = model
+        self._log_prior = model.log_prior.to(model.dtype)
+        self._carried = model.init(frames.z.shape[0]).log_weights
+        by_frame = model.weighting == "frame"
+        self._marginal = frame_log_likelihood(model, frames).transpose(0, 1) if by_frame else None
+
+    def update(self, log_likelihood: Tensor, span: slice) -> tuple[Tensor, Tensor]:
+        """Log-weights [T, B, M] and log-evidence [T, B] of the frames `span`, which come next."""
+        model, power = self._model, self._model.likelihood_power
+        if self._marginal is not None:
+            return frame_weights(self._log_prior, self._marginal[span], log_likelihood, power)
+        estimate, evidence, self._carried = sequence_weights(
+            self._carried,
+            self._log_prior,
+            log_likelihood,
+            model.uniform_weight,
+            power,
+            model.reset_below,
+        )
+        return estimate, evidence
 
 
 class _Stretch(NamedTuple):

@@ -17,6 +17,7 @@ from torchpose.filters.base import (
     StepOutput,
     as_covariance,
 )
+from torchpose.filters.frame_weights import FrameGains
 from torchpose.filters.gains import GainGraph
 from torchpose.filters.smoothing import smooth_fixed_tracks
 from torchpose.filters.tracks import MKFState
@@ -27,6 +28,7 @@ from torchpose.priors.gmm import GaussianMixture
 __all__ = ["MKFState", "MixtureKalmanFilter"]
 
 TRACKS = ("fixed", "sampled", "split")
+WEIGHTINGS = ("sequence", "frame")
 
 
 class MixtureKalmanFilter(RecursiveFilter):
@@ -60,6 +62,10 @@ class MixtureKalmanFilter(RecursiveFilter):
             itself geometrically (paper section 3.3, after BL 26). 0 is no burn-in.
         likelihood_power: exponent of the likelihood in the weights of fixed tracks; 1 as published,
             below 1 where the components are surer of themselves than they should be.
+        weighting: "sequence" as published, or "frame" (fixed tracks only): the weights of a frame are
+            those that the mixture gives to its measurement alone, w_j prop. to
+            pi_j N(z_t; H mu_j, H Sigma_j H^T + R), see `frame_weights`. For mixtures whose state
+            holds the past already; epsilon and `reset_below` then play no part.
         reset_below: fixed tracks only; see `step_weights`.
         dtype: of means and measurements; covariances are always float64.
 
@@ -101,12 +107,14 @@ class MixtureKalmanFilter(RecursiveFilter):
         burn_in: int = 0,
         burn_in_scale: float = 100.0,
         likelihood_power: float = 1.0,
+        weighting: str = "sequence",
         reset_below: float | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__(measurement_cov, observed, gmm.means.shape[-1], dtype)
         n_components = gmm.means.shape[0]
         _check_options(tracks, n_tracks, n_components, uniform_weight, transition)
+        _check_weighting(weighting, tracks, reset_below)
         if not 0 < likelihood_power <= 1:
             raise InputError(f"likelihood_power must lie in (0, 1], got {likelihood_power}")
         self.tracks = tracks
@@ -118,8 +126,10 @@ class MixtureKalmanFilter(RecursiveFilter):
         self.burn_in = burn_in
         self.burn_in_scale = burn_in_scale
         self.likelihood_power = float(likelihood_power)
+        self.weighting = weighting
         self.reset_below = reset_below
         self._graph: GainGraph | None = None
+        self.frame_gains = FrameGains()
         if gamma is not None:
             gamma = torch.as_tensor(gamma, dtype=torch.float64, device=gmm.means.device)
         self._set_model(gmm, as_covariance("process_cov", process_cov, self.dim), gamma)
@@ -242,6 +252,12 @@ class MixtureKalmanFilter(RecursiveFilter):
         frames = self.check(z, mask, measurement_cov, lengths, None)
         return smooth_fixed_tracks(self, frames, lag, return_cov)
 
+    @property
+    def is_memoryless(self) -> bool:
+        """Whether frames do not depend on each other: neither the weights nor the states do."""
+        still = self.gamma is not None and bool((self.gamma == 0).all())
+        return self.weighting == "frame" and self.transition_kind == "ou" and still
+
     def gain_graph(self, measurement_cov: Tensor) -> GainGraph:
         """The graph of gains for constant R, kept while model and R stay as they are."""
         graph = self._graph
@@ -283,3 +299,13 @@ def _check_options(
         )
     if not (uniform_weight >= 0 and math.isfinite(uniform_weight)):
         raise InputError(f"uniform_weight must be at least 0, got {uniform_weight}")
+
+
+def _check_weighting(weighting: str, tracks: str, reset_below: float | None) -> None:
+    if weighting not in WEIGHTINGS:
+        raise InputError(f"weighting must be one of {', '.join(WEIGHTINGS)}, got {weighting!r}")
+    if weighting == "frame" and (tracks != "fixed" or reset_below is not None):
+        raise InputError(
+            "weighting 'frame' needs tracks='fixed' and no reset_below, got "
+            f"tracks={tracks!r} and reset_below={reset_below}"
+        )

@@ -30,13 +30,14 @@ class _Pass(NamedTuple):
 
     Attributes:
         mean: filtered track means [T, B, M, D]. correction: filtered minus predicted [T, B, M, D].
-        log_likelihood: [T, B, M]. log_evidence: of the filter [T, B].
+        log_likelihood, log_weights: [T, B, M]. log_evidence: of the filter [T, B].
         cov, predicted_cov: per frame, [G, M, D, D]. group: per frame, row for each element [B].
     """
 
     mean: Tensor
     correction: Tensor
     log_likelihood: Tensor
+    log_weights: Tensor
     log_evidence: Tensor
     cov: list[Tensor]
     predicted_cov: list[Tensor]
@@ -100,7 +101,10 @@ def _smooth(
     gains = _smoother_gains(model, past)
     later = torch.arange(1, n_frames + 1, device=frames.z.device) < frames.lengths[:, None]
     means = past.mean + _mean_corrections(past, gains, later.mT, reach)
-    log_weights = _smoothed_weights(model, past.log_likelihood, later.mT, reach)
+    if model.weighting == "frame":
+        log_weights = past.log_weights
+    else:
+        log_weights = _smoothed_weights(model, past.log_likelihood, later.mT, reach)
     covs = _smoothed_covs(past, gains, later, reach) if return_cov else None
     estimate = (log_weights.exp()[:, :, None] @ means)[:, :, 0]
     total = None
@@ -119,7 +123,7 @@ def _forward(model: "MixtureKalmanFilter", frames: Measurements, by_length: bool
         # Smoothed covariances depend on where a sequence ends: lengths make histories distinct.
         lengths, group = torch.unique(frames.lengths, return_inverse=True)
         state = state._replace(cov=state.cov.expand(lengths.numel(), -1, -1, -1), group=group)
-    means, corrections, likelihoods, evidences = [], [], [], []
+    means, corrections, likelihoods, weights, evidences = [], [], [], [], []
     covs, predicted_covs, groups = [], [], []
     for t in range(frames.z.shape[1]):
         frame = frames.frame(t)
@@ -128,14 +132,16 @@ def _forward(model: "MixtureKalmanFilter", frames: Measurements, by_length: bool
         means.append(step.mean)
         corrections.append(step.mean - step.predicted)
         likelihoods.append(step.log_likelihood)
+        weights.append(log_weights)
         evidences.append(evidence)
         covs.append(step.cov)
         predicted_covs.append(step.predicted_cov)
         groups.append(step.group)
         carried = mix_uniform(log_weights, model.uniform_weight)
         state = MKFState(carried, step.mean, step.cov, step.group, t + 1)
-    stacked = [torch.stack(values) for values in (means, corrections, likelihoods, evidences)]
-    return _Pass(stacked[0], stacked[1], stacked[2], stacked[3], covs, predicted_covs, groups)
+    values = (means, corrections, likelihoods, weights, evidences)
+    mean, correction, likelihood, weight, evidence = (torch.stack(frames) for frames in values)
+    return _Pass(mean, correction, likelihood, weight, evidence, covs, predicted_covs, groups)
 
 
 def _smoother_gains(model: "MixtureKalmanFilter", past: _Pass) -> list[Tensor]:

@@ -1,0 +1,150 @@
+"""Weights of a frame by itself, against densities of scipy and the evidence of Kalman filters."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import multivariate_normal
+
+from tests.filters.oracles import random_covariance, random_mixture, tensor
+from torchpose.errors import InputError
+from torchpose.filters import MixtureKalmanFilter
+from torchpose.priors import GaussianMixture
+
+DIM, OBSERVED, POWER = 4, [0, 2, 3], 0.4
+
+
+def problem(batch=3, n_frames=7, missing=0.3, seed=0):
+    rng = np.random.default_rng(seed)
+    weights, means, covs = random_mixture(rng, 3, DIM, 2.0)
+    noise = random_covariance(rng, 3, 0.5)
+    z = rng.standard_normal((batch, n_frames, 3))
+    mask = rng.random((batch, n_frames, 3)) > missing
+    return (weights, means, covs, noise), z, mask
+
+
+def make_filter(model, **options):
+    weights, means, covs, noise = model
+    mixture = GaussianMixture(tensor(weights), tensor(means), tensor(covs))
+    options = {"transition": "ou", "gamma": 0.8, "likelihood_power": POWER} | options
+    return MixtureKalmanFilter(
+        mixture, torch.ones(DIM), tensor(noise), OBSERVED, weighting="frame", **options
+    )
+
+
+def posterior_of_frame(model, z, mask, noise=None):
+    """p(component | z_t) with a tempered likelihood, from scipy's densities."""
+    weights, means, covs, own = model
+    noise, seen = own if noise is None else noise, np.flatnonzero(mask)
+    at = np.array(OBSERVED)[seen]
+    log = np.log(weights)
+    if len(seen):
+        log = log + POWER * np.array(
+            [
+                multivariate_normal.logpdf(
+                    z[seen], m[at], c[np.ix_(at, at)] + noise[np.ix_(seen, seen)]
+                )
+                for m, c in zip(means, covs, strict=True)
+            ]
+        )
+    return np.exp(log - np.logaddexp.reduce(log))
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.3])
+def test_weights_are_the_tempered_posterior_of_the_frame(missing):
+    model, z, mask = problem(missing=missing)
+    out = make_filter(model)(tensor(z), torch.as_tensor(mask))
+    for b, t in np.ndindex(z.shape[:2]):
+        expected = posterior_of_frame(model, z[b, t], mask[b, t])
+        np.testing.assert_allclose(out.log_weights[b, t].exp(), expected, atol=1e-12)
+
+
+def test_noise_of_every_frame_enters_the_weights():
+    model, z, mask = problem()
+    rng = np.random.default_rng(4)
+    noise = np.stack([[random_covariance(rng, 3, 2.0) for _ in range(7)] for _ in range(3)])
+    out = make_filter(model)(tensor(z), torch.as_tensor(mask), tensor(noise))
+    for b, t in np.ndindex(z.shape[:2]):
+        expected = posterior_of_frame(model, z[b, t], mask[b, t], noise[b, t])
+        np.testing.assert_allclose(out.log_weights[b, t].exp(), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.8])
+@pytest.mark.parametrize("own_noise", [False, True])
+def test_online_offline_and_smoothed_weights_are_the_same(gamma, own_noise):
+    model, z, mask = problem(missing=0.2)
+    f, z, mask = make_filter(model, gamma=gamma), tensor(z), torch.as_tensor(mask)
+    noise = None
+    if own_noise:
+        scale = 1 + torch.arange(7, dtype=torch.float64)[:, None, None]
+        noise = (scale * tensor(model[3])).expand(3, 7, 3, 3)
+    out, state = f(z, mask, noise, return_cov=True), f.init(3)
+    for t in range(z.shape[1]):
+        now = None if noise is None else noise[:, t]
+        state, step = f.step(state, z[:, t], mask[:, t], now, return_cov=True)
+        for found, whole in zip(
+            step, (out.mean, out.log_weights, out.log_evidence, out.cov), strict=True
+        ):
+            torch.testing.assert_close(found, whole[:, t])
+    torch.testing.assert_close(f.smooth(z, mask, noise).log_weights, out.log_weights)
+
+
+def test_tracks_remember_but_weights_do_not():
+    model, z, _ = problem(missing=0.0)
+    other = z.copy()
+    other[:, :3] += 5.0
+    f = make_filter(model)
+    one, two = f(tensor(z)), f(tensor(other))
+    torch.testing.assert_close(one.log_weights[:, 3:], two.log_weights[:, 3:])
+    assert (one.mean[:, 3] - two.mean[:, 3]).abs().max() > 0.05
+
+
+def test_evidence_is_that_of_the_tracks_under_pi():
+    """With one component there is nothing to weight: the evidence is the Kalman filter's."""
+    rng = np.random.default_rng(1)
+    weights, means, covs = random_mixture(rng, 1, DIM)
+    model = weights, means, covs, random_covariance(rng, 3, 0.5)
+    z = tensor(rng.standard_normal((2, 6, 3)))
+    published = MixtureKalmanFilter(
+        GaussianMixture(tensor(weights), tensor(means), tensor(covs)), torch.ones(DIM),
+        tensor(model[3]), OBSERVED, transition="ou", gamma=0.8,
+    )  # fmt: skip
+    torch.testing.assert_close(make_filter(model)(z).log_evidence, published(z).log_evidence)
+
+
+def test_gradients_reach_the_prior_through_the_weights():
+    model, z, mask = problem(batch=1, n_frames=3)
+    weights, means, covs, noise = (tensor(value) for value in model)
+    z, mask = tensor(z), torch.as_tensor(mask)
+
+    def first_weight(means):
+        mixture = GaussianMixture(weights, means, covs)
+        f = MixtureKalmanFilter(
+            mixture, torch.ones(DIM), noise, OBSERVED, transition="ou", gamma=0.8,
+            likelihood_power=POWER, weighting="frame",
+        )  # fmt: skip
+        return f(z, mask).log_weights[..., 0].sum()
+
+    torch.autograd.gradcheck(first_weight, means.requires_grad_(True))
+
+
+def test_settings_that_contradict_it_are_refused():
+    model, *_ = problem()
+    with pytest.raises(InputError, match="weighting 'frame' needs tracks='fixed'"):
+        make_filter(model, tracks="sampled")
+    with pytest.raises(InputError, match="reset_below"):
+        make_filter(model, reset_below=-50.0)
+    with pytest.raises(InputError, match="weighting must be one of"):
+        MixtureKalmanFilter(
+            GaussianMixture(*(tensor(v) for v in model[:3])), torch.ones(DIM), torch.ones(1), [0],
+            weighting="never",
+        )  # fmt: skip
+
+
+def test_lengths_hold_the_last_estimate_without_memory_too():
+    model, z, mask = problem()
+    f, lengths = make_filter(model, gamma=0.0), torch.tensor([7, 3, 5])
+    out = f(tensor(z), torch.as_tensor(mask), lengths=lengths, return_cov=True)
+    alone = f(tensor(z[1:2, :3]), torch.as_tensor(mask[1:2, :3]), return_cov=True)
+    torch.testing.assert_close(out.mean[1, :3], alone.mean[0])
+    torch.testing.assert_close(out.cov[1, 3:], alone.cov[0, -1:].expand(4, -1, -1))
+    assert not out.log_evidence[1, 3:].any()

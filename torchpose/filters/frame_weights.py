@@ -1,0 +1,200 @@
+"""Weights of fixed tracks that a frame gives by itself, whatever was measured before it.
+
+The indicator of every frame is then drawn from pi anew, as for sampled tracks (BL 47), while each
+component's track goes on as if it had been right all along: weights without memory, states with. If
+the states have none either (transition "ou" with gamma = 0), frames do not depend on each other at
+all: `run_memoryless` conditions the mixture on all of them at once.
+"""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from torchpose.filters.base import FilterOutput, Measurements, StepOutput, finish_output
+from torchpose.filters.tracks import MKFState, estimate_of
+from torchpose.filters.weights import normalise
+from torchpose.gaussian import Gain, kalman_gain
+
+if TYPE_CHECKING:
+    from torchpose.filters.mkf import MixtureKalmanFilter
+
+__all__ = [
+    "FrameGains",
+    "advance_memoryless",
+    "frame_log_likelihood",
+    "frame_weights",
+    "run_memoryless",
+]
+
+_SHARED_FRAMES = 1024  # at a time, where they share their gains
+_PATTERNS = 24  # of measured dimensions whose gains are kept; about 4 MB each
+_OWN_FRAMES = 32  # at a time, where each has gains of its own
+
+
+def frame_weights(
+    log_prior: Float[Tensor, " M"],
+    log_marginal: Float[Tensor, "*batch M"],
+    log_likelihood: Float[Tensor, "*batch M"],
+    power: float = 1.0,
+) -> tuple[Float[Tensor, "*batch M"], Float[Tensor, "*batch"]]:
+    """w_j prop. to pi_j N(z_t; H mu_j, H Sigma_j H^T + R)^power, and sum_j pi_j N_j as evidence.
+
+    Args:
+        log_prior: log pi. log_marginal: of `frame_log_likelihood`. log_likelihood: log N_j, of the
+            tracks' predictions (BL 41). power: exponent of the marginal likelihood.
+
+    Returns:
+        log w_t, normalised [..., M], and the increment of the log-evidence [...].
+    """
+    log_prior = normalise(log_prior)
+    evidence = torch.logsumexp(log_prior + log_likelihood, -1)
+    return normalise(log_prior + power * log_marginal), evidence
+
+
+def frame_log_likelihood(
+    model: "MixtureKalmanFilter", frames: Measurements
+) -> Float[Tensor, "B T M"]:
+    """log N(z_t; H mu_j, H Sigma_j H^T + R) of the measured dimensions of every frame."""
+    found = [(group.rows, _condition(model, group)[1]) for group in _groups(frames)]
+    return _in_order(found).unflatten(0, frames.z.shape[:2])
+
+
+def run_memoryless(
+    model: "MixtureKalmanFilter", frames: Measurements, return_cov: bool, progress: bool
+) -> FilterOutput:
+    """All frames of a filter whose predictions are the components themselves (BL 39-41, 48)."""
+    log_prior, power = model.log_prior.to(model.dtype), model.likelihood_power
+    batch, n_frames, _ = frames.z.shape
+    parts: list[list[tuple[Tensor, Tensor]]] = [[], [], [], []]
+    bar = tqdm(total=batch * n_frames, disable=not progress, unit="frame")
+    for group in _groups(frames):
+        means, log_likelihood, cov = _condition(model, group)
+        log_weights, evidence = frame_weights(log_prior, log_likelihood, log_likelihood, power)
+        measured = frames.mask.flatten(0, 1)[group.rows].any(-1)
+        evidence = torch.where(measured, evidence, torch.zeros_like(evidence))
+        mean, total = estimate_of(log_weights, means, cov if return_cov else None)
+        for part, value in zip(parts, (mean, log_weights, evidence, total), strict=True):
+            if value is not None:
+                part.append((group.rows, value))
+        bar.update(len(group.rows))
+    bar.close()
+    mean, log_weights, evidence = (
+        _in_order(part).unflatten(0, (batch, n_frames)) for part in parts[:3]
+    )
+    covs = _in_order(parts[3]).unflatten(0, (batch, n_frames)) if return_cov else None
+    return finish_output(mean, log_weights, evidence, covs, frames.lengths)
+
+
+def advance_memoryless(
+    model: "MixtureKalmanFilter", state: MKFState, frame: Measurements, return_cov: bool
+) -> tuple[MKFState, StepOutput]:
+    """One frame of `run_memoryless`."""
+    out = run_memoryless(model, frame.as_sequences(), return_cov, progress=False)
+    cov = None if out.cov is None else out.cov[:, 0]
+    step = StepOutput(out.mean[:, 0], out.log_weights[:, 0], out.log_evidence[:, 0], cov)
+    return state._replace(time=state.time + 1), step
+
+
+class _Group(NamedTuple):
+    """Frames whose gains are computed together.
+
+    Attributes:
+        rows: which of the B T frames [N]. z: [N, Z].
+        mask, noise: [Z] and [Z, Z] for all of them, or [N, 1, Z] and [N, 1, Z, Z].
+    """
+
+    rows: Tensor
+    z: Tensor
+    mask: Tensor
+    noise: Tensor
+
+
+def _groups(frames: Measurements) -> Iterator[_Group]:
+    """Frames that measure the same dimensions with the same noise share their gains."""
+    z, mask = frames.z.flatten(0, 1), frames.mask.flatten(0, 1)
+    if frames.cov.ndim == 4:
+        noise = frames.cov.flatten(0, 1)
+        for rows in torch.arange(len(z), device=z.device).split(_OWN_FRAMES):
+            yield _Group(rows, z[rows], mask[rows][:, None], noise[rows][:, None])
+        return
+    patterns, group = torch.unique(mask, dim=0, return_inverse=True)
+    sizes = torch.bincount(group, minlength=len(patterns)).tolist()
+    for pattern, same in zip(patterns, group.argsort().split(sizes), strict=True):
+        for rows in same.split(_SHARED_FRAMES):
+            yield _Group(rows, z[rows], pattern, frames.cov)
+
+
+def _condition(model: "MixtureKalmanFilter", group: _Group) -> tuple[Tensor, Tensor, Tensor]:
+    """Every component given a frame: means [N, M, D], log-likelihoods [N, M], covariances."""
+    gain, cov = _gain(model, group)
+    centres = model.means.to(model.dtype)
+    residual = (group.z[:, None] - centres[:, model.observed]) * group.mask
+    if group.mask.ndim == 1:
+        white = torch.linalg.solve_triangular(gain.factor, residual.permute(1, 2, 0), upper=False)
+        means = (centres[:, None] + white.mT @ gain.white).transpose(0, 1)
+        return means, (gain.log_norm[:, None] - 0.5 * white.square().sum(1)).mT, cov
+    white = torch.linalg.solve_triangular(gain.factor, residual[..., None], upper=False)
+    means = centres + (gain.white.mT @ white)[..., 0]
+    return means, gain.log_norm - 0.5 * white.square().sum((-2, -1)), cov
+
+
+def _gain(model: "MixtureKalmanFilter", group: _Group) -> tuple[Gain, Tensor]:
+    """Gain and covariance of every component; those of a shared pattern are kept for later frames."""
+    if group.mask.ndim == 1:
+        found = model.frame_gains.get(model, group.noise, group.mask)
+        if found is not None:
+            return found
+    gain, cov = kalman_gain(model.covariances, group.noise, model.observed, group.mask)
+    gain = Gain(*(part.to(model.dtype) for part in gain))
+    if group.mask.ndim == 1:
+        model.frame_gains.put(model, group.noise, group.mask, (gain, cov))
+    return gain, cov
+
+
+class FrameGains:
+    """The gains of the latest patterns of measured dimensions, while model and R stay as they are."""
+
+    def __init__(self) -> None:
+        self._made_for: tuple[Tensor, Tensor] | None = None
+        self._found: dict[tuple[bool, ...], tuple[Gain, Tensor]] = {}
+
+    def get(
+        self, model: "MixtureKalmanFilter", noise: Tensor, mask: Tensor
+    ) -> tuple[Gain, Tensor] | None:
+        """What is known for this pattern."""
+        if not self._suits(model, noise):
+            return None
+        return self._found.get(tuple(mask.tolist()))
+
+    def put(
+        self,
+        model: "MixtureKalmanFilter",
+        noise: Tensor,
+        mask: Tensor,
+        value: tuple[Gain, Tensor],
+    ) -> None:
+        """Keep it, unless a gradient runs through it; the oldest of many goes."""
+        if value[1].requires_grad:
+            return
+        if not self._suits(model, noise):
+            self._made_for, self._found = (model.covariances, noise.clone()), {}
+        if len(self._found) >= _PATTERNS:
+            self._found.pop(next(iter(self._found)))
+        self._found[tuple(mask.tolist())] = value
+
+    def _suits(self, model: "MixtureKalmanFilter", noise: Tensor) -> bool:
+        if self._made_for is None:
+            return False
+        covariances, own_noise = self._made_for
+        return covariances is model.covariances and torch.equal(own_noise, noise)
+
+
+def _in_order(parts: list[tuple[Tensor, Tensor]]) -> Tensor:
+    """Values of all frames, in the order of the frames."""
+    rows = torch.cat([rows for rows, _ in parts])
+    values = torch.cat([values for _, values in parts])
+    return torch.empty_like(values).index_copy(0, rows, values)
