@@ -1,0 +1,161 @@
+"""A Kalman filter and smoother for numbers that move at nearly constant velocity."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from torchpose.errors import InputError, check_shape
+from torchpose.gaussian import kalman_gain, safe_cholesky, symmetrise
+
+__all__ = ["ConstantVelocityFilter", "ConstantVelocityState"]
+
+_SETTLED = 1e-13
+_MOST_STEPS = 10_000
+_VELOCITY_VARIANCE = 100.0  # at the start, in units of r per s^2
+
+
+class ConstantVelocityState(NamedTuple):
+    """Position and velocity of every number.
+
+    Attributes:
+        mean: [B, 2, N], in the units of the numbers and per second. time: frames seen.
+    """
+
+    mean: Tensor
+    time: int
+
+
+class ConstantVelocityFilter(nn.Module):
+    """Takes the noise out of numbers that are measured in every frame and move smoothly.
+
+    Each number by itself, at all times with the same gains:
+        (x, v)_t = [1 dt; 0 1] (x, v)_{t-1} + N(0, q [dt^3/3 dt^2/2; dt^2/2 dt]),   z_t = x_t + N(0, r).
+    Only the ratio q/r matters for the estimates. Large ratios follow the measurements, small ones are
+    smooth and late.
+
+    Args:
+        ratio: q/r, 1/s^3. fps: frames per second.
+
+    Raises:
+        InputError: either is not positive and finite.
+
+    Reference:
+        Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and
+        Navigation" (2001), section 6.2.2; H. Rauch, F. Tung, C. Striebel (1965) for the smoother.
+
+    Example:
+        >>> import torch
+        >>> f = ConstantVelocityFilter(ratio=1e3, fps=30.0)
+        >>> z = torch.linspace(0, 1, 100, dtype=torch.float64)[None, :, None]
+        >>> bool((f(z)[0, -1] - 1).abs() < 1e-3)
+        True
+    """
+
+    def __init__(self, ratio: float, fps: float) -> None:
+        super().__init__()
+        for name, value in (("ratio", ratio), ("fps", fps)):
+            if not 0 < value < float("inf"):
+                raise InputError(f"{name} must be positive and finite, got {value}")
+        self.ratio, self.fps = float(ratio), float(fps)
+        dt = 1.0 / self.fps
+        matrix = torch.tensor([[1.0, dt], [0.0, 1.0]], dtype=torch.float64)
+        noise = torch.tensor([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], dtype=torch.float64)
+        gains, smoother = _riccati(matrix, self.ratio * noise)
+        self.register_buffer("matrix", matrix)
+        self.register_buffer("gains", gains)
+        self.register_buffer("smoother_gains", smoother)
+
+    matrix: Tensor
+    gains: Tensor
+    smoother_gains: Tensor
+
+    def init(self, z: Float[Tensor, "B N"]) -> ConstantVelocityState:
+        """The state before the first frame, whose values are `z`."""
+        return ConstantVelocityState(torch.stack([z, torch.zeros_like(z)], 1), 0)
+
+    def step(
+        self, state: ConstantVelocityState, z: Float[Tensor, "B N"]
+    ) -> tuple[ConstantVelocityState, Float[Tensor, "B N"]]:
+        """One frame: the same numbers as the same frame of `forward`."""
+        predicted = self._predict(state)
+        gain = self.gains[min(state.time, len(self.gains) - 1)].to(z)
+        mean = predicted + gain[:, None] * (z - predicted[:, 0])[:, None]
+        return ConstantVelocityState(mean, state.time + 1), mean[:, 0]
+
+    def _predict(self, state: ConstantVelocityState) -> Tensor:
+        return state.mean if state.time == 0 else self.matrix.to(state.mean) @ state.mean
+
+    def forward(self, z: Float[Tensor, "B T N"]) -> Float[Tensor, "B T N"]:
+        """Filtered numbers: each uses its own frame and those before."""
+        check_shape("z", z, ["B", "T", "N"])
+        return self._filter(z)[0][:, :, 0]
+
+    def _filter(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Filtered means, and filtered minus predicted, [B, T, 2, N]."""
+        state = self.init(z[:, 0])
+        means, corrections = [], []
+        for frame in z.unbind(1):
+            predicted = self._predict(state)
+            state, _ = self.step(state, frame)
+            means.append(state.mean)
+            corrections.append(state.mean - predicted)
+        return torch.stack(means, 1), torch.stack(corrections, 1)
+
+    def smooth(
+        self,
+        z: Float[Tensor, "B T N"],
+        lengths: Int[Tensor, " B"] | None = None,
+        lag: int | None = None,
+    ) -> Float[Tensor, "B T N"]:
+        """Numbers that use later frames too.
+
+        Args:
+            z: [B, T, N]. lengths: frames of each sequence [B]; those after are not used.
+            lag: number of later frames that each may use; None is all.
+
+        Raises:
+            ShapeError, InputError: wrong shapes, or a negative lag.
+        """
+        check_shape("z", z, ["B", "T", "N"])
+        if lag is not None and lag < 0:
+            raise InputError(f"lag must be at least 0 frames, or None for all, got {lag}")
+        means, corrections = self._filter(z)
+        n_frames = z.shape[1]
+        frames = torch.arange(n_frames, device=z.device)
+        if lengths is None:
+            lengths = torch.full((len(z),), n_frames, device=z.device)
+        later = (frames + 1 < lengths[:, None])[..., None, None]
+        gains = self.smoother_gains[frames.clamp(max=len(self.smoother_gains) - 1)].to(z)
+        change = torch.zeros_like(means)
+        if lag is None or lag >= n_frames - 1:
+            for t in range(n_frames - 2, -1, -1):
+                pulled = gains[t] @ (corrections[:, t + 1] + change[:, t + 1])
+                change[:, t] = torch.where(later[:, t], pulled, torch.zeros_like(pulled))
+            return (means + change)[:, :, 0]
+        for _ in range(lag):
+            pulled = gains[:-1] @ (corrections[:, 1:] + change[:, 1:])
+            change[:, :-1] = torch.where(later[:, :-1], pulled, torch.zeros_like(pulled))
+        return (means + change)[:, :, 0]
+
+    def extra_repr(self) -> str:
+        """Settings, for printing."""
+        return f"ratio={self.ratio:g}, fps={self.fps:g}"
+
+
+def _riccati(matrix: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Kalman gains [S, 2] and smoother gains [S, 2, 2], frame by frame until they settle; r = 1."""
+    observed, unit = torch.tensor([0]), torch.ones(1, 1, dtype=matrix.dtype)
+    predicted = torch.diag(torch.tensor([1.0, _VELOCITY_VARIANCE], dtype=matrix.dtype))
+    gains, smoothers = [], []
+    for _ in range(_MOST_STEPS):
+        gain, cov = kalman_gain(predicted, unit, observed)
+        gains.append(gain.white[0] / gain.factor[0, 0])
+        following = symmetrise(matrix @ cov @ matrix.mT + noise)
+        smoothers.append(torch.cholesky_solve(matrix @ cov, safe_cholesky(following)).mT)
+        settled = bool(((following - predicted).abs() <= _SETTLED * following.abs()).all())
+        predicted = following
+        if settled:
+            break
+    return torch.stack(gains), torch.stack(smoothers)
