@@ -386,3 +386,12 @@ def test_the_pose2sim_calibration():
         detected = detected[:, detected_names.index("Neck")]
         seen = detected[:, 2] > 0.3
         assert float((uv - detected[:, :2]).norm(dim=-1)[seen].median()) < 20  # of 1920
+
+
+def test_scaled_views_keep_their_middle() -> None:
+    views = ViewRange(roll=0.2, pitch=0.1, yaw=0.4, tx=(-0.2, 0.4), ty=(0.1, 0.1), tz=(1.0, 3.0))
+    narrow = views.scaled(0.5)
+    assert (narrow.roll, narrow.pitch, narrow.yaw) == (0.1, 0.05, 0.2)
+    assert narrow.tx == pytest.approx((-0.05, 0.25)) and narrow.ty == pytest.approx((0.1, 0.1))
+    assert narrow.tz == pytest.approx((1.5, 2.5))
+    assert views.scaled(1.0).tx == pytest.approx(views.tx)

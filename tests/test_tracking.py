@@ -22,6 +22,7 @@ from torchpose.lifting import arm_in_body_frame, arm_in_camera_frame
 from torchpose.metrics import joint_errors_3d
 from torchpose.pose_track import PoseTrack
 from torchpose.priors import UpperBodyPrior, fit_upper_body_prior
+from torchpose.priors.neck import KINECT_NECK
 from torchpose.projection import map_pixels, project
 from torchpose.recipes import fit_calibration, fit_kinect_prior
 from torchpose.rotations import euler_to_matrix
@@ -264,9 +265,46 @@ def test_a_stretch_without_any_measurement_is_bounded(prior):
 
 def test_a_neck_of_another_kind_is_left_out_and_said(prior):
     keypoints = torch.full((1, 10, 4, 2), 240.0)
-    track = UpperBodyTracker(prior, demo_camera(), neck="mid-shoulder")(keypoints, names=NAMES)
+    track = UpperBodyTracker(prior, demo_camera(), neck="low-neck")(keypoints, names=NAMES)
     assert not track.observed[..., 4].any()
-    assert any("mid-shoulder" in note for note in track.notes)
+    assert any("low-neck" in note and "not measured" in note for note in track.notes)
+
+
+def test_a_neck_between_the_shoulders_is_put_where_the_prior_has_it(prior, scene):
+    truth, keypoints = scene
+    lower = keypoints.clone()
+    head, neck = NAMES.index("head"), NAMES.index("neck")
+    share = KINECT_NECK.fraction
+    lower[:, neck] = (keypoints[:, neck] - share * keypoints[:, head]) / (1 - share)
+    tracker = UpperBodyTracker(prior, demo_camera(), neck="mid-shoulder")
+    track = tracker(lower[None], names=NAMES)
+    assert any("mid-shoulder" in note and "37 %" in note for note in track.notes)
+    plain = UpperBodyTracker(prior, demo_camera())(keypoints[None], names=NAMES)
+    assert track.observed[0, :, 4].all()
+    # The same places, measured less surely.
+    assert mean_error(track, truth) == pytest.approx(mean_error(plain, truth), rel=0.15)
+    assert (track.covariance2d[0, 30:, 4] - plain.covariance2d[0, 30:, 4]).diagonal(
+        dim1=-2, dim2=-1
+    ).mean() > 0
+    hidden = lower.clone()
+    hidden[:, head] = torch.nan
+    assert not tracker(hidden[None], names=NAMES).observed[..., 4].any()
+
+
+def test_shoulders_stand_for_a_neck_that_is_not_there(prior, scene):
+    truth, keypoints = scene
+    eye, zeros = torch.eye(3).double(), torch.zeros(3).double()
+    shoulders = project(truth, demo_camera().matrix, eye, zeros)[:, [2, 5], :2]
+    wide = torch.cat([keypoints, shoulders], 1)[None]
+    names = [*NAMES, "shoulder_left", "shoulder_right"]
+    keep = [i for i, name in enumerate(names) if name != "neck"]
+    tracker = UpperBodyTracker(prior, demo_camera())
+    track = tracker(wide[:, :, keep], names=[names[i] for i in keep])
+    assert track.observed[0, :, 4].all()
+    assert any("no neck among the keypoints" in note for note in track.notes)
+    own = UpperBodyTracker(prior, demo_camera(), neck="low-neck")(wide, names=names)
+    torch.testing.assert_close(own.joints3d, track.joints3d)
+    torch.testing.assert_close(tracker(wide, names=names).notes, ())
 
 
 def test_a_prior_without_noise_gets_a_default(prior):

@@ -97,6 +97,23 @@ class ViewRange:
                     f"got ({low}, {high})"
                 )
 
+    def scaled(self, factor: float) -> "ViewRange":
+        """Limits of another width about the same middle; 1 changes nothing."""
+
+        def about_middle(limits: tuple[float, float]) -> tuple[float, float]:
+            low, high = limits
+            middle, half = (low + high) / 2, factor * (high - low) / 2
+            return middle - half, middle + half
+
+        return ViewRange(
+            factor * self.roll,
+            factor * self.pitch,
+            factor * self.yaw,
+            about_middle(self.tx),
+            about_middle(self.ty),
+            about_middle(self.tz),
+        )
+
 
 PAPER_VIEWS = ViewRange()
 

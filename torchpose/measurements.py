@@ -8,19 +8,25 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.errors import InputError, check_finite, check_shape
+from torchpose.priors.neck import KINECT_NECK, NeckFraction
 from torchpose.skeleton import ARM_JOINTS, UPPER_BODY, upper_body_indices
 
 __all__ = [
     "MeasuredJoints",
+    "Picked",
     "append_blocks",
     "arm_measurements",
     "check_gaps",
     "measure_joints",
     "pick_joints",
     "pixel_indices",
+    "place_measured_neck",
 ]
 
 _LEAST_CONFIDENCE = 0.05
+_LEFT, _HEAD, _NECK, _RIGHT = (
+    UPPER_BODY.index(name) for name in ("shoulder_left", "head", "neck", "shoulder_right")
+)
 
 
 class MeasuredJoints(NamedTuple):
@@ -36,19 +42,35 @@ class MeasuredJoints(NamedTuple):
     cov: Tensor
 
 
+class Picked(NamedTuple):
+    """Where the eight joints are among the keypoints.
+
+    Attributes:
+        indices: of each, -1 if absent; with `middle`, that of the neck is the keypoint that lies in
+            the middle of the shoulders.
+        middle: whether the neck is to be put between that, or else the middle of the measured
+            shoulders, and the head (`place_measured_neck`).
+        notes: what was assumed.
+    """
+
+    indices: tuple[int, ...]
+    middle: bool
+    notes: tuple[str, ...]
+
+
 def pick_joints(
     n_joints: int,
     names: Sequence[str] | None,
     neck: str | None,
     wanted_neck: str | None,
     wanted_hand: str | None,
-) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """For each of the eight joints its index among the keypoints, -1 if absent; and notes.
+) -> Picked:
+    """Find the eight joints among the keypoints.
 
     Args:
         n_joints: number of keypoints. names: of them, None if they are the eight in order.
         neck: kind of neck of the keypoints where the names do not tell; one of another kind than
-            `wanted_neck` is left out. wanted_neck, wanted_hand: the prior's kinds.
+            `wanted_neck` is not measured as it is. wanted_neck, wanted_hand: the prior's kinds.
 
     Raises:
         InputError: names missing, or not as many as keypoints. SkeletonError: unknown names.
@@ -65,17 +87,73 @@ def pick_joints(
             f"names must name each of the {n_joints} keypoints, got {len(names)} names"
         )
     found = upper_body_indices(names)
-    indices, notes = list(found.indices), []
-    neck = neck or found.neck
-    at = UPPER_BODY.index("neck")
-    if indices[at] >= 0 and neck is not None and wanted_neck is not None and neck != wanted_neck:
-        indices[at] = -1
-        notes.append(
-            f"the keypoints' neck ({neck}) is not the prior's ({wanted_neck}): not measured"
+    indices = list(found.indices)
+    kind = neck or found.neck
+    middle, notes = False, []
+    other = indices[_NECK] >= 0 and None not in (kind, wanted_neck) and kind != wanted_neck
+    if other or indices[_NECK] < 0:
+        indices[_NECK] = indices[_NECK] if kind == "mid-shoulder" else -1
+        shoulders = min(indices[_LEFT], indices[_RIGHT]) >= 0
+        middle = (
+            wanted_neck == "neck" and indices[_HEAD] >= 0 and (shoulders or indices[_NECK] >= 0)
         )
+        if not middle:
+            indices[_NECK] = -1
+        notes += _neck_notes(kind if other else None, wanted_neck, middle)
     if found.hand is not None and wanted_hand is not None and found.hand != wanted_hand:
         notes.append(f"the keypoints' {found.hand}s stand for the prior's {wanted_hand}s")
-    return tuple(indices), tuple(notes)
+    return Picked(tuple(indices), middle, tuple(notes))
+
+
+def _neck_notes(kind: str | None, wanted: str | None, middle: bool) -> list[str]:
+    """What is done about a neck of another kind, or about one that is missing (None)."""
+    if middle:
+        own = (
+            "there is no neck among the keypoints"
+            if kind is None
+            else (f"the keypoints' neck ({kind}) is not the prior's ({wanted})")
+        )
+        share = f"{100 * KINECT_NECK.fraction:.0f} %"
+        return [f"{own}: put {share} of the way from the middle of the shoulders to the head"]
+    if kind is None:
+        return []
+    return [f"the keypoints' neck ({kind}) is not the prior's ({wanted}): not measured"]
+
+
+def place_measured_neck(
+    measured: MeasuredJoints, pixels_per_metre: float, neck: NeckFraction = KINECT_NECK
+) -> MeasuredJoints:
+    """Put the neck between the middle of the shoulders and the head.
+
+    n = m + f (h - m),   R_n = (1 - f)^2 R_m + f^2 R_h + s^2 I
+
+    Where head or middle is missing, so is the neck. Its errors go with those of the head, which the
+    filter does not know.
+
+    Args:
+        measured: whose neck is a keypoint in the middle of the shoulders; where that is missing, the
+            middle of two measured shoulders does. pixels_per_metre: at the body's usual distance.
+        neck: f and s.
+    """
+    uv, mask, cov = (x.clone() for x in measured)
+    both = mask[..., _LEFT] & mask[..., _RIGHT] & ~mask[..., _NECK]
+    middle = torch.where(
+        both[..., None], (uv[..., _LEFT, :] + uv[..., _RIGHT, :]) / 2, uv[..., _NECK, :]
+    )
+    known = (mask[..., _NECK] | both) & mask[..., _HEAD]
+    place = middle + neck.fraction * (uv[..., _HEAD, :] - middle)
+    uv[..., _NECK, :] = torch.where(known[..., None], place, torch.zeros_like(place))
+    mask[..., _NECK] = known
+    spread = (neck.spread * pixels_per_metre) ** 2 * torch.eye(
+        2, dtype=cov.dtype, device=cov.device
+    )
+    share = neck.fraction
+    of_middle = cov[..., _NECK, :, :]
+    if cov.ndim > 3:
+        of_shoulders = (cov[..., _LEFT, :, :] + cov[..., _RIGHT, :, :]) / 4
+        of_middle = torch.where(both[..., None, None], of_shoulders, of_middle)
+    cov[..., _NECK, :, :] = (1 - share) ** 2 * of_middle + share**2 * cov[..., _HEAD, :, :] + spread
+    return MeasuredJoints(uv, mask, cov)
 
 
 def measure_joints(
@@ -163,26 +241,24 @@ def pixel_indices(joints: Sequence[str]) -> list[int]:
 
 def arm_measurements(
     arm: tuple[int, ...], joints: tuple[str, ...], measured: MeasuredJoints
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """z, mask and R of an arm's joints; R is None where it is the filter's own."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """z, mask and R of an arm's joints; R is [Z, Z], or [B, T, Z, Z] if it changes."""
     rows = [arm[ARM_JOINTS.index(joint)] for joint in joints]
     z = measured.uv[:, :, rows].flatten(-2)
     mask = measured.mask[:, :, rows].repeat_interleave(2, -1)
-    if measured.cov.ndim == 3:
-        return z, mask, None
-    return z, mask, _block_diagonal(measured.cov[:, :, rows])
+    return z, mask, _block_diagonal(measured.cov[..., rows, :, :])
 
 
-def _block_diagonal(blocks: Float[Tensor, "B T N 2 2"]) -> Float[Tensor, "B T Z Z"]:
-    n = blocks.shape[2]
+def _block_diagonal(blocks: Float[Tensor, "*batch N 2 2"]) -> Float[Tensor, "*batch Z Z"]:
+    n = blocks.shape[-3]
     eye = torch.eye(n, dtype=blocks.dtype, device=blocks.device)
-    return torch.einsum("btnij,nm->btnimj", blocks, eye).flatten(-2).flatten(-3, -2)
+    return torch.einsum("...nij,nm->...nimj", blocks, eye).flatten(-2).flatten(-3, -2)
 
 
-def append_blocks(cov: Float[Tensor, "B T Z Z"], block: Tensor, count: int) -> Tensor:
+def append_blocks(cov: Float[Tensor, "*batch Z Z"], block: Tensor, count: int) -> Tensor:
     """R with `count` more diagonal blocks."""
-    blocks = torch.block_diag(*[block] * count).expand(*cov.shape[:2], -1, -1)
+    blocks = torch.block_diag(*[block] * count)
     n, extra = cov.shape[-1], blocks.shape[-1]
-    whole = cov.new_zeros(*cov.shape[:2], n + extra, n + extra)
+    whole = cov.new_zeros(*cov.shape[:-2], n + extra, n + extra)
     whole[..., :n, :n], whole[..., n:, n:] = cov, blocks
     return whole

@@ -8,27 +8,40 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torchpose import streaming
+from torchpose.arms import SeenInView, generators_of_arms, pose_of_window
+from torchpose.body_view import (
+    BodyView,
+    PathModel,
+    body_path,
+    to_view,
+    view_body,
+    view_jacobian,
+)
 from torchpose.camera import PinholeCamera
 from torchpose.errors import CameraError, InputError, PriorError, check_finite, check_shape
 from torchpose.filters import BootstrapParticleFilter, FilterOutput, MixtureKalmanFilter
 from torchpose.filters.base import Generators, RecursiveFilter
-from torchpose.lifting import arm_in_body_frame, join_arms, pixel_covariances
 from torchpose.measurements import (
     MeasuredJoints,
+    Picked,
     append_blocks,
     arm_measurements,
     check_gaps,
     measure_joints,
     pick_joints,
     pixel_indices,
+    place_measured_neck,
 )
 from torchpose.pose_track import PoseTrack
 from torchpose.priors.arm_state import STATE_DIM
 from torchpose.priors.upper_body import UpperBodyPrior, released_process_cov
 from torchpose.priors.window import WindowLayout, window_measurements
 from torchpose.projection import map_pixel_covariance, map_pixels
+from torchpose.read_out import MotionStage, ReadOut, read_out
 from torchpose.rotations import RotationOrder, euler_to_matrix
 from torchpose.skeleton import ARM_JOINTS, LEFT_ARM, RIGHT_ARM, UPPER_BODY
+from torchpose.streaming import LivePose, StreamState
 
 __all__ = ["METHODS", "PoseTrack", "UpperBodyTracker"]
 
@@ -39,6 +52,8 @@ _PROPOSALS = {
     "pf-walk-unscaled": "random-walk-unscaled",
 }
 _SIDES = {"left": LEFT_ARM, "right": RIGHT_ARM}
+_HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
+_HANDS = [UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")]
 _DEFAULT_STD = 3.0
 # These options are those of a filter over single poses.
 _POSE_OPTIONS = {"transition", "gamma", "subspace", "initial_cov", "process_cov"}
@@ -49,7 +64,9 @@ class UpperBodyTracker(nn.Module):
 
     Two filters, one for each arm with head and neck, run on the same measurements (BL section 3.1);
     head, neck and camera of the two are averaged and their covariances bounded, never fused as if
-    they were independent.
+    they were independent. Mixtures over windows see the body through a virtual camera that follows
+    it, so that it may move about, farther away or beside the views that the prior was fitted to.
+    `forward` tracks whole sequences, `init` and `step` live streams.
 
     Args:
         prior: from `load_prior` or `fit_upper_body_prior`.
@@ -66,9 +83,12 @@ class UpperBodyTracker(nn.Module):
         window: use the prior's mixtures over short windows of motion where it brings them (only for
             "mkf-fixed"; smoothed estimates then look a few frames ahead); False tracks single poses,
             as the paper does, and so do options that only make sense there (transition, gamma).
+        steady: pass what windows give through filters of constant velocity (`MotionStage`), which take
+            the trembling out; smoothers if `smoothing` is asked for.
         calibrated: recalibrate `covariance3d` as the prior's training persons showed, if it says how.
         neck: kind of neck of the keypoints, where their names do not tell it (see
-            `torchpose.skeleton.NECK_KINDS`). A neck of another kind than the prior's is not measured.
+            `torchpose.skeleton.NECK_KINDS`). A neck of another kind than the prior's is put where the
+            prior has it, between the middle of the shoulders and the head, or else not measured.
         max_gap: seconds over which nothing at all may be measured; None is no bound.
         options: to the filter, such as n_particles, n_tracks, uniform_weight or transition.
 
@@ -98,6 +118,7 @@ class UpperBodyTracker(nn.Module):
         frame: str = "camera",
         static_camera: bool = False,
         window: bool = True,
+        steady: bool = True,
         calibrated: bool = True,
         neck: str | None = None,
         max_gap: float | None = 5.0,
@@ -111,6 +132,7 @@ class UpperBodyTracker(nn.Module):
         self.fps = fps or prior.info.fps
         self.smoothing = smoothing
         self.window = window
+        self.steady = steady
         self.calibrated = calibrated
         self.frame = frame
         self.static_camera = static_camera
@@ -219,12 +241,65 @@ class UpperBodyTracker(nn.Module):
             for longer than `max_gap`. SkeletonError: unknown names.
         """
         measured, notes = self._measure(keypoints, confidence, names, mask, lengths)
-        sources = _generators_of_arms(generator)
+        sources = generators_of_arms(generator)
+        seen = self._look(measured, lengths)
         arms = {
-            side: self._run_arm(side, measured, lengths, source, progress)
+            side: self._run_arm(side, measured, seen, lengths, source, progress)
             for side, source in zip(_SIDES, sources, strict=True)
         }
-        return self._poses(arms["left"], arms["right"], measured.mask, lengths, notes)
+        view = None if seen is None else seen.view
+        left, right = arms["left"], arms["right"]
+        reading = self._steady(self._read_out(left, right, view), left, right, lengths)
+        return self._poses(reading, left, right, measured.mask, lengths, notes)
+
+    def init(
+        self, batch_size: int, names: Sequence[str] | None = None, generator: Generators = None
+    ) -> StreamState:
+        """Begin to track live streams, frame by frame (`step`).
+
+        Args:
+            batch_size: B, number of streams. names: of the keypoints, as in `forward`; any of them
+                may be missing in any frame. generator: as in `forward`; the state holds it.
+
+        Raises:
+            InputError: a tracker that smooths, no stream. SkeletonError: unknown names.
+
+        Example:
+            >>> import torch, torchpose
+            >>> prior = torchpose.load_prior("kinect-upper-body")
+            >>> tracker = torchpose.UpperBodyTracker(prior, camera=prior.camera)
+            >>> state = tracker.init(1, names=["head", "hand_left", "hand_right"])
+            >>> frame = torch.tensor([[[320.0, 120.0], [420.0, 240.0], [220.0, 240.0]]])
+            >>> state, pose = tracker.step(state, frame)
+            >>> pose.joints3d.shape
+            torch.Size([1, 8, 3])
+        """
+        return streaming.begin(self, batch_size, names, generator)
+
+    def step(
+        self,
+        state: StreamState,
+        keypoints: Float[Tensor, "B J 2"],
+        confidence: Float[Tensor, "B J"] | None = None,
+        mask: Bool[Tensor, "B J"] | None = None,
+    ) -> tuple[StreamState, LivePose]:
+        """Track one more frame of each stream: the same numbers as that frame of `forward`.
+
+        A camera does not stop, so `max_gap` raises nothing here: while nothing is measured the prior
+        fills in, covariances grow, and `LivePose.unseen` says for how long it has been so. Frames
+        that were dropped are to be passed as missing (NaN), since a step is one frame at `fps`.
+
+        Args:
+            state: from `init` or the step before; it is not changed, so a step may be repeated
+                (but a generator goes on). keypoints, confidence, mask: of one frame, as in `forward`.
+
+        Returns:
+            The next state, and the `LivePose` of this frame.
+
+        Raises:
+            ShapeError, InputError: wrong shapes, infinite values.
+        """
+        return streaming.track_frame(self, state, keypoints, confidence, mask)
 
     def _measure(
         self,
@@ -242,26 +317,39 @@ class UpperBodyTracker(nn.Module):
                 f"keypoints must hold at least one sequence of one frame, got {list(keypoints.shape)}"
             )
         info = self.prior.info
-        indices, notes = pick_joints(keypoints.shape[2], names, self.neck, info.neck, info.hand)
-        cov = self.measurement_cov
-        measured = measure_joints(keypoints, confidence, mask, indices, cov)
+        picked = pick_joints(keypoints.shape[2], names, self.neck, info.neck, info.hand)
+        measured = self._in_prior_pixels(keypoints, confidence, mask, picked)
         check_gaps(measured.mask, lengths, self.max_gap, self.fps or 30.0)
-        own, prior = self.camera.matrix.to(keypoints), info.matrix.to(keypoints)
-        return measured._replace(uv=map_pixels(measured.uv, own, prior)), notes
+        return measured, picked.notes
+
+    def _in_prior_pixels(
+        self, keypoints: Tensor, confidence: Tensor | None, mask: Tensor | None, picked: Picked
+    ) -> MeasuredJoints:
+        measured = measure_joints(keypoints, confidence, mask, picked.indices, self.measurement_cov)
+        own, prior = self.camera.matrix.to(keypoints), self.prior.info.matrix.to(keypoints)
+        measured = measured._replace(uv=map_pixels(measured.uv, own, prior))
+        if not picked.middle:
+            return measured
+        return place_measured_neck(measured, self._pixels_per_metre())
+
+    def _pixels_per_metre(self) -> float:
+        """Of the prior's camera at its mean pose's neck."""
+        depth = float(self.prior.left.moments()[0][14] + self.prior.right.moments()[0][14]) / 2
+        return math.sqrt(self.prior.info.fx * self.prior.info.fy) / depth
 
     def _run_arm(
         self,
         side: str,
         measured: MeasuredJoints,
+        seen: SeenInView | None,
         lengths: Tensor | None,
         generator: Generators,
         progress: bool,
     ) -> FilterOutput:
         joints = self._measured_joints(side, measured.mask)
+        if seen is not None:
+            return self._run_window(side, joints, seen, lengths)
         z, mask, cov = arm_measurements(_SIDES[side], joints, measured)
-        window = self._window()
-        if window is not None:
-            return self._run_window(side, joints, window, measured, (z, mask, cov), lengths)
         model = self._filter(side, joints)
         if self.smoothing is not None and isinstance(model, MixtureKalmanFilter):
             lag = None if self.smoothing == "full" else int(self.smoothing)
@@ -279,29 +367,70 @@ class UpperBodyTracker(nn.Module):
         too_far = isinstance(self.smoothing, int) and self.smoothing < layout.ahead
         return None if too_far else (name, layout)
 
+    def _look(
+        self, measured: MeasuredJoints, lengths: Tensor | None = None, start: int = 0
+    ) -> SeenInView | None:
+        """The measurements of windows in a virtual camera that follows the body, from a frame on.
+
+        None where no window is used.
+        """
+        window = self._window()
+        if window is None:
+            return None
+        name, layout = window
+        uv, mask, matrix = measured.uv, measured.mask, self.prior.info.matrix.to(measured.uv)
+        if lengths is not None:
+            frames = torch.arange(mask.shape[1], device=mask.device)
+            mask = mask & (frames < lengths.to(mask.device)[:, None])[..., None]
+        start = start % mask.shape[1]
+        model = self._path_model(uv)
+        noise = None
+        if measured.cov.ndim > 3:
+            noise = _of_anchors(measured.cov)
+        else:
+            model = model._replace(variance=_of_anchors(measured.cov))
+        path = body_path(uv, mask, layout.lags, layout.ahead, layout.fps, model, start, noise)
+        neck, height = path.at(0)
+        apart = (uv[:, start:, _HANDS] - neck[:, :, None]).norm(dim=-1)
+        reach = torch.where(mask[:, start:, _HANDS], apart, torch.zeros_like(apart)).amax(-1)
+        view = view_body(neck, height, model, matrix, reach)
+        hands = {}
+        for side in _SIDES:
+            values, known = window_measurements(uv, mask, layout, side, path, start)
+            hands[side] = to_view(values, view, matrix).flatten(-2), known.repeat_interleave(2, -1)
+        now = to_view(uv[:, start:], view, matrix)
+        now = torch.where(mask[:, start:, :, None], now, torch.zeros_like(now))
+        cov = measured.cov if measured.cov.ndim == 3 else measured.cov[:, start:]
+        log_scale = -view_jacobian(now, view, matrix).det().abs().log()
+        return SeenInView(name, MeasuredJoints(now, mask[:, start:], cov), hands, view, log_scale)
+
+    def _path_model(self, like: Tensor) -> PathModel:
+        """Head and neck of the prior's mean pose, and their measurement noise."""
+        both = (self.prior.left.moments()[0] + self.prior.right.moments()[0]) / 2
+        head, neck = both[9:11].to(like), both[12:14].to(like)
+        return PathModel(
+            neck, head - neck, _of_anchors(self.measurement_cov), self._pixels_per_metre()
+        )
+
     def _run_window(
-        self,
-        side: str,
-        joints: tuple[str, ...],
-        window: tuple[str, WindowLayout],
-        measured: MeasuredJoints,
-        base: tuple[Tensor, Tensor, Tensor | None],
-        lengths: Tensor | None,
+        self, side: str, joints: tuple[str, ...], seen: SeenInView, lengths: Tensor | None
     ) -> FilterOutput:
         """Fixed tracks over window states; the evidence is that of this frame given the window."""
-        name, layout = window
-        z, mask, cov = base
-        hands, known = window_measurements(measured.uv, measured.mask, layout, side)
-        model = self._window_filter(side, name, joints)
-        hand_cov = self._window_hand_cov(side, name)
-        both = torch.cat([z, hands], -1), torch.cat([mask, known], -1)
-        noise = None if cov is None else append_blocks(cov, hand_cov, hands.shape[-1] // 2)
+        both, noise, hands = self._window_inputs(side, joints, seen)
+        model = self._window_filter(side, seen.window, joints)
         out = model(*both, noise, lengths, return_cov=True)
-        context = self._window_filter(side, name, ())(hands, known, None, lengths)
-        evidence = out.log_evidence - context.log_evidence
-        evidence = torch.where(mask.any(-1), evidence, torch.zeros_like(evidence))
-        cov = _require_cov(out)[..., :STATE_DIM, :STATE_DIM]
-        return out._replace(mean=out.mean[..., :STATE_DIM], cov=cov, log_evidence=evidence)
+        context = self._window_filter(side, seen.window, ())(*hands, None, lengths)
+        return pose_of_window(out, context, seen, _SIDES[side])
+
+    def _window_inputs(
+        self, side: str, joints: tuple[str, ...], seen: SeenInView
+    ) -> tuple[tuple[Tensor, Tensor], Tensor, tuple[Tensor, Tensor]]:
+        """Values and mask of joints and hands, their R, and values and mask of the hands alone."""
+        z, mask, cov = arm_measurements(_SIDES[side], joints, seen.measured)
+        hands, known = seen.hands[side]
+        hand_cov = self._window_hand_cov(side, seen.window)
+        noise = append_blocks(cov, hand_cov, hands.shape[-1] // 2)
+        return (torch.cat([z, hands], -1), torch.cat([mask, known], -1)), noise, (hands, known)
 
     def _window_filter(self, side: str, name: str, joints: tuple[str, ...]) -> MixtureKalmanFilter:
         """Fixed tracks over window states that measure these joints and all hands of the window."""
@@ -313,19 +442,16 @@ class UpperBodyTracker(nn.Module):
             n_hands = (window.layout.dim - STATE_DIM) // 2
             blocks += [self._window_hand_cov(side, name)] * n_hands
             observed = pixel_indices(joints) + list(range(STATE_DIM, window.layout.dim))
-            settings = {
-                "uniform_weight": window.settings["uniform_weight"],
-                "likelihood_power": window.settings["likelihood_power"],
-            }
-            mixture = getattr(window, side)
+            settings = {"likelihood_power": window.settings["likelihood_power"]}
             # Poses of consecutive frames are tied by the window itself: no memory beyond it.
             self.filters[key] = MixtureKalmanFilter(
-                mixture,
+                getattr(window, side),
                 torch.ones(window.layout.dim, dtype=torch.float64),
                 torch.block_diag(*blocks),
                 observed,
                 transition="ou",
                 gamma=0.0,
+                weighting="frame",
                 **(settings | self.options),
             )
         return cast(MixtureKalmanFilter, self.filters[key])
@@ -346,57 +472,78 @@ class UpperBodyTracker(nn.Module):
 
     def _poses(
         self,
+        reading: ReadOut,
         left: FilterOutput,
         right: FilterOutput,
         observed: Tensor,
         lengths: Tensor | None,
         notes: tuple[str, ...],
     ) -> PoseTrack:
+        """The result in the frame and the pixels that were asked for."""
         info = self.prior.info
-        matrix = info.matrix.to(left.mean)
         order: RotationOrder = info.rotation_order  # type: ignore[assignment]
-        arm_covs = _require_cov(left), _require_cov(right)
-        means = left.mean, right.mean
-        lifted = [
-            arm_in_body_frame(mean, cov, matrix, order)
-            for mean, cov in zip(means, arm_covs, strict=True)
-        ]
-        joints3d = join_arms(*(joints for joints, _ in lifted))
-        covs3d = self._calibrated(join_arms(*(cov for _, cov in lifted)))
-        camera_pose = (left.mean[..., 15:] + right.mean[..., 15:]) / 2
+        joints3d, covs3d = reading.joints, self._calibrated(reading.covs)
         if self.frame == "camera":
-            rotation = euler_to_matrix(camera_pose[..., :3], order)[..., None, :, :]
-            place = camera_pose[..., None, 3:]
+            rotation = euler_to_matrix(reading.angles, order)[..., None, :, :]
+            place = reading.place[..., None, :]
             if self.static_camera:
                 place = self.prior.left.moments()[0][18:].to(place).expand_as(place)
             joints3d = (rotation @ joints3d[..., None])[..., 0] + place
             covs3d = rotation @ covs3d @ rotation.mT
-        uv = join_arms(
-            *(arm.mean[..., :15].unflatten(-1, (5, 3))[..., :2] for arm in (left, right))
-        )
-        covs2d = join_arms(*(pixel_covariances(cov) for cov in arm_covs))
-        own = self.camera.matrix.to(uv)
-        batch, n_frames = uv.shape[:2]
+        matrix, own = info.matrix.to(reading.uv), self.camera.matrix.to(reading.uv)
+        batch, n_frames = reading.uv.shape[:2]
         if lengths is None:
-            lengths = torch.full((batch,), n_frames, device=uv.device)
-        failures = torch.stack([left.failed_at, right.failed_at])
-        failed_at = torch.where(
-            (failures >= 0).any(0), failures.where(failures >= 0, n_frames).amin(0), -1
-        )
+            lengths = torch.full((batch,), n_frames, device=reading.uv.device)
         return PoseTrack(
-            joints2d=map_pixels(uv, matrix, own),
+            joints2d=map_pixels(reading.uv, matrix, own),
             joints3d=joints3d,
-            covariance2d=map_pixel_covariance(covs2d, matrix, own),
+            covariance2d=map_pixel_covariance(reading.uv_covs, matrix, own),
             covariance3d=covs3d,
             observed=observed,
             log_evidence=torch.stack([left.log_evidence, right.log_evidence], -1),
             lengths=lengths,
             matrix=self.camera.matrix,
-            failed_at=failed_at,
+            failed_at=_first_failure(left, right),
             fps=self.fps,
             frame=self.frame,
             notes=notes,
         )
+
+    def _read_out(self, left: FilterOutput, right: FilterOutput, view: BodyView | None) -> ReadOut:
+        info = self.prior.info
+        order: RotationOrder = info.rotation_order  # type: ignore[assignment]
+        return read_out(left, right, info.matrix.to(left.mean), order, view)
+
+    def _motion_stage(self) -> MotionStage | None:
+        """The filter over what windows give, if the prior says how brisk its motions are."""
+        window = self._window()
+        if window is None or not self.steady:
+            return None
+        settings = self.prior.windows[window[0]].settings
+        if "joint_ratio" not in settings:
+            return None
+        joint, pixel, placement = (
+            settings[f"{name}_ratio"] for name in ("joint", "pixel", "placement")
+        )
+        stage = MotionStage(joint, pixel, placement, self.fps or 30.0)
+        return stage.to(self.measurement_cov.device)
+
+    def _steady(
+        self, reading: ReadOut, left: FilterOutput, right: FilterOutput, lengths: Tensor | None
+    ) -> ReadOut:
+        """The reading after the motion stage; frames from a failure on play no part."""
+        stage, window = self._motion_stage(), self._window()
+        if stage is None or window is None:
+            return reading
+        batch, n_frames = reading.uv.shape[:2]
+        ends = torch.full((batch,), n_frames) if lengths is None else lengths
+        ends = ends.to(reading.uv.device)
+        failed_at = _first_failure(left, right)
+        ends = torch.where(failed_at >= 0, torch.minimum(ends, failed_at.clamp_min(1)), ends)
+        lag: int | None = 0
+        if self.smoothing is not None:
+            lag = None if self.smoothing == "full" else int(self.smoothing) - window[1].ahead
+        return stage(reading, ends, lag)
 
     def _calibrated(self, covs: Tensor) -> Tensor:
         """Covariances recalibrated per joint on the prior's training persons, if it brings that."""
@@ -428,26 +575,17 @@ def default_process_cov(prior: UpperBodyPrior) -> Float[Tensor, " 21"]:
     return scaled * (25.0 / (prior.info.fps or 30.0))
 
 
-def _generators_of_arms(generator: Generators) -> tuple[Generators, Generators]:
-    """A generator for each arm, so that one arm's numbers do not depend on how many the other drew."""
-    if generator is None:
-        return None, None
-    if isinstance(generator, torch.Generator):
-        left, right = torch.randint(2**62, (2,), generator=generator, device=generator.device)
-        device = generator.device
-        return (
-            torch.Generator(device).manual_seed(int(left)),
-            torch.Generator(device).manual_seed(int(right)),
-        )
-    pairs = [_generators_of_arms(g) for g in generator]
-    lefts = [left for left, _ in pairs if isinstance(left, torch.Generator)]
-    return lefts, [right for _, right in pairs if isinstance(right, torch.Generator)]
+def _first_failure(left: FilterOutput, right: FilterOutput) -> Tensor:
+    """The first frame at which either arm degenerated, -1 where none did, [B]."""
+    n_frames = left.mean.shape[1]
+    failures = torch.stack([left.failed_at, right.failed_at])
+    first = failures.where(failures >= 0, n_frames).amin(0)
+    return torch.where((failures >= 0).any(0), first, -1)
 
 
-def _require_cov(out: FilterOutput) -> Tensor:
-    if out.cov is None:
-        raise RuntimeError("the filter was run without return_cov=True")
-    return out.cov
+def _of_anchors(cov: Float[Tensor, "*batch 8 2 2"]) -> Float[Tensor, "*batch 2"]:
+    """Variance of a coordinate of head and neck, pixels squared."""
+    return cov[..., [_HEAD, _NECK], :, :].diagonal(dim1=-2, dim2=-1).mean(-1)
 
 
 def _arm_index(joint: str) -> int:

@@ -138,9 +138,12 @@ def test_options_reach_the_tracker(track, files):
 
 
 def test_another_neck_is_not_measured(track):
-    done, poses = track("--neck", "mid-shoulder")
+    done, poses = track("--neck", "low-neck")
     assert not poses.observed[..., UPPER_BODY.index("neck")].any()
-    assert "note     the keypoints' neck (mid-shoulder) is not the prior's (neck)" in done.out
+    assert "note     the keypoints' neck (low-neck) is not the prior's (neck): not" in done.out
+    done, poses = track("--neck", "mid-shoulder")
+    assert poses.observed[..., UPPER_BODY.index("neck")].any()
+    assert "note     the keypoints' neck (mid-shoulder) is not the prior's (neck): put" in done.out
 
 
 def test_nose_as_head(track, tmp_path):

@@ -9,7 +9,8 @@ from tests.priors.poses import lowered_neck, poses
 from torchpose.camera import euler_to_matrix
 from torchpose.errors import PriorError
 from torchpose.io import read_recording
-from torchpose.priors import NeckOffset, learn_neck_offset, place_neck
+from torchpose.priors import NeckOffset, learn_neck_fraction, learn_neck_offset, place_neck
+from torchpose.priors.neck import KINECT_NECK
 
 
 def test_offset_that_was_put_in_comes_out():
@@ -70,3 +71,26 @@ def test_neck_of_an_unseen_person_is_found():
     error = (placed - upper[2])[:, 4].norm(dim=-1).mean()
     before = (lowered_neck(upper[2]) - upper[2])[:, 4].norm(dim=-1).mean()
     assert float(before) > 0.09 and float(error) < 0.04
+
+
+def test_the_fraction_of_the_way_to_the_head_is_the_least_squares_solution():
+    joints = poses()
+    learnt = learn_neck_fraction(joints)
+    middle = (joints[:, 2] + joints[:, 5])[:, :2] / 2
+    height, offset = ((joints[:, i, :2] - middle).flatten().numpy() for i in (3, 4))
+    solution, residual, *_ = np.linalg.lstsq(height[:, None], offset, rcond=None)
+    assert learnt.fraction == pytest.approx(solution[0])
+    assert learnt.spread == pytest.approx(np.sqrt(residual[0] / len(offset)))
+    assert learnt.frames == len(joints)
+    with pytest.raises(PriorError, match="got 5 such frames"):
+        learn_neck_fraction(joints[:5])
+
+
+def test_the_constant_of_kinect_is_what_the_recordings_say():
+    folder = data_dir_or_skip("kinect_utd_mhad")
+    files = [f for p in range(1, 7) for f in sorted(folder.glob(f"s{p:02d}_*.npz"))[::20]]
+    learnt = learn_neck_fraction(
+        torch.cat([read_recording(f)[0].upper_body().joints for f in files])
+    )
+    assert learnt.fraction == pytest.approx(KINECT_NECK.fraction, abs=0.01)
+    assert learnt.spread == pytest.approx(KINECT_NECK.spread, abs=0.002)

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from tests.priors.poses import poses
+from torchpose.body_view import BodyPath
 from torchpose.camera import ViewRange
 from torchpose.errors import InputError, PriorError
 from torchpose.priors import GaussianMixture
@@ -48,33 +49,42 @@ def test_windows_hold_the_hands_at_their_lags_and_ends_are_held():
         torch.testing.assert_close(found[side][:, :2], pixels(body[t, own]))
 
 
+def still_path(layout=LAYOUT, n=12):
+    """A body that stays where it is."""
+    neck = pixels(torch.zeros(3)).expand(1, n, len(layout.lags), 2).double()
+    return BodyPath(layout.lags, neck, torch.tensor([0.0, -50.0]).double().expand_as(neck))
+
+
 def test_measurements_of_a_projected_sequence_are_the_window_states():
-    body = sequence()
-    uv = pixels(body)[None]
+    uv = pixels(sequence())[None]
     mask = torch.ones(1, 12, 8, dtype=torch.bool)
     for side in ("left", "right"):
-        values, known = window_measurements(uv, mask, LAYOUT, side)
+        values, known = window_measurements(uv, mask, LAYOUT, side, still_path())
         inner = slice(2, 11)
-        # The head moves a little against the neck in these poses, and counts as motion of the body.
-        moved = (uv[0, :, 3] - uv[0, :, 3].roll(2, 0))[inner] / 2
-        expected = states()[side][inner, 21:]
-        expected = expected + torch.cat(
-            [moved, (uv[0, inner, 3] - uv[0, 3:12, 3]) / 2, torch.zeros(9, 2)], 1
-        )
-        torch.testing.assert_close(values[0, inner], expected)
+        torch.testing.assert_close(values[0, inner].flatten(1), states()[side][inner, 21:])
         assert known[0, inner].all()
-        assert not known[0, :2, :2].any() and not known[0, 11, 2:4].any()
+        assert not known[0, :2, 0].any() and not known[0, 11, 1].any()
+        late, seen = window_measurements(
+            uv,
+            mask,
+            LAYOUT,
+            side,
+            BodyPath(*(LAYOUT.lags, *(x[:, 5:] for x in still_path()[1:]))),
+            5,
+        )
+        torch.testing.assert_close(late, values[:, 5:])
+        assert torch.equal(seen, known[:, 5:])
 
 
 def test_a_walking_body_has_the_same_window_as_one_that_stands():
     uv = pixels(sequence())[None]
     mask = torch.ones(1, 12, 8, dtype=torch.bool)
-    walk = torch.linspace(0, 90, 12, dtype=torch.float64)[None, :, None, None] * torch.tensor(
-        [1.0, 0]
-    )
-    still, _ = window_measurements(uv, mask, LAYOUT, "left")
-    moving, known = window_measurements(uv + walk, mask, LAYOUT, "left")
-    expected = still + walk[:, :, 0].repeat(1, 1, 3)
+    walk = torch.linspace(0, 90, 12, dtype=torch.float64)[None, :, None] * torch.tensor([1.0, 0])
+    still, _ = window_measurements(uv, mask, LAYOUT, "left", still_path())
+    places = torch.stack([walk.roll(lag, 1) for lag in LAYOUT.lags], 2)
+    path = still_path()._replace(neck=still_path().neck + places)
+    moving, known = window_measurements(uv + walk[:, :, None], mask, LAYOUT, "left", path)
+    expected = still + walk[:, :, None]
     torch.testing.assert_close(moving[known], expected[known])
 
 
@@ -82,10 +92,10 @@ def test_hidden_hands_are_missing_in_every_window_that_holds_them():
     uv = pixels(sequence())[None]
     mask = torch.ones(1, 12, 8, dtype=torch.bool)
     mask[0, 5, 0] = False
-    _, known = window_measurements(uv, mask, LAYOUT, "left")
-    assert not known[0, 7, :2].any() and not known[0, 4, 2:4].any() and known[0, 5, 4:].all()
-    _, known = window_measurements(uv, mask, LAYOUT, "right")
-    assert not known[0, 5, 4:].any()
+    _, known = window_measurements(uv, mask, LAYOUT, "left", still_path())
+    assert not known[0, 7, 0] and not known[0, 4, 1] and known[0, 5, 2]
+    _, known = window_measurements(uv, mask, LAYOUT, "right", still_path())
+    assert not known[0, 5, 2]
 
 
 def test_lags_follow_the_frame_rate():

@@ -164,8 +164,7 @@ def track_clip(prior: "UpperBodyPrior", clip: "Keypoints", smoothing: str | None
 
 def mean_pose(prior: "UpperBodyPrior") -> "Tensor":
     """Mean of the prior over poses, [8, 3] in the body frame, metres: the least one has to beat."""
-    from torchpose.lifting import arm_in_body_frame
-    from torchpose.tracking import join_arms
+    from torchpose.lifting import arm_in_body_frame, join_arms
 
     order: Any = prior.info.rotation_order
     arms = []

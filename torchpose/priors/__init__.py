@@ -12,7 +12,13 @@ from torchpose.priors.em import (
 )
 from torchpose.priors.gmm import ConditionedMixture, GaussianMixture
 from torchpose.priors.model_card import model_card, write_model_card
-from torchpose.priors.neck import NeckOffset, learn_neck_offset, place_neck
+from torchpose.priors.neck import (
+    NeckFraction,
+    NeckOffset,
+    learn_neck_fraction,
+    learn_neck_offset,
+    place_neck,
+)
 from torchpose.priors.prior_file import PriorInfo
 from torchpose.priors.training import TRAINING_VIEWS, collect_poses, training_states
 from torchpose.priors.upper_body import (
@@ -29,6 +35,7 @@ __all__ = [
     "FitReport",
     "GaussianMixture",
     "MixtureParameters",
+    "NeckFraction",
     "NeckOffset",
     "PriorInfo",
     "SufficientStatistics",
@@ -40,6 +47,7 @@ __all__ = [
     "expectation_maximisation",
     "fit_upper_body_prior",
     "known_priors",
+    "learn_neck_fraction",
     "learn_neck_offset",
     "load_prior",
     "m_step",

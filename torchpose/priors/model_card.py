@@ -9,6 +9,7 @@ from typing import Any
 
 from torchpose.io.files import atomic_path
 from torchpose.priors.upper_body import UpperBodyPrior
+from torchpose.priors.window import WindowPrior
 
 __all__ = ["model_card", "write_model_card"]
 
@@ -56,6 +57,17 @@ def _description(prior: UpperBodyPrior) -> str:
         "shoulder, head and neck and the camera's roll, pitch, yaw and position, after Burke & "
         "Lasenby (BL 7). Trackers use it to tell joints that are not measured, and depth, from "
         "those that are."
+    ) + "".join(_window(name, window) for name, window in sorted(prior.windows.items()))
+
+
+def _window(name: str, window: WindowPrior) -> str:
+    layout = window.layout
+    own, other = (", ".join(str(lag) for lag in lags) for lags in (layout.own, layout.other))
+    settings = ", ".join(f"{key} {value:g}" for key, value in sorted(window.settings.items()))
+    return (
+        f"\n\nWindows `{name}`: {window.left.n_components} components over an arm's state with its "
+        f"own hand {own} and the other hand {other} frames before (negative: after), at "
+        f"{layout.fps:g} frames per second; {settings}."
     )
 
 

@@ -11,7 +11,14 @@ from torch import Tensor
 from torchpose.errors import PriorError, check_shape
 from torchpose.skeleton import UPPER_BODY
 
-__all__ = ["NeckOffset", "learn_neck_offset", "place_neck"]
+__all__ = [
+    "KINECT_NECK",
+    "NeckFraction",
+    "NeckOffset",
+    "learn_neck_fraction",
+    "learn_neck_offset",
+    "place_neck",
+]
 
 _LEFT, _HEAD, _NECK, _RIGHT = (
     UPPER_BODY.index(name) for name in ("shoulder_left", "head", "neck", "shoulder_right")
@@ -36,6 +43,53 @@ class NeckOffset(NamedTuple):
     forward: float
     residual: float
     frames: int
+
+
+class NeckFraction(NamedTuple):
+    """The neck in an image, on the line from the middle of the shoulders to the head.
+
+    neck = middle + fraction (head - middle) + N(0, spread^2)
+
+    Attributes:
+        fraction: of the way. spread: metres, in either direction of the image.
+        frames: from how many poses.
+    """
+
+    fraction: float
+    spread: float
+    frames: int
+
+
+KINECT_NECK = NeckFraction(0.369, 0.0151, 43314)
+"""Kinect's neck (v1 shoulder_center), from persons s1 to s6 of UTD-MHAD by `learn_neck_fraction`."""
+
+
+def learn_neck_fraction(joints: Float[Tensor, "N 8 3"]) -> NeckFraction:
+    """Least-squares place of the neck in the image, from poses that have one.
+
+    Seen from afar the image is the plane of x and y, up to scale:
+        fraction = sum (neck - middle) . (head - middle) / sum |head - middle|^2.
+
+    Args:
+        joints: poses in the order of `UPPER_BODY`, camera axes, metres; NaN where a joint is missing.
+
+    Raises:
+        PriorError: fewer than ten poses with head, neck and both shoulders.
+    """
+    check_shape("joints", joints, (None, 8, 3))
+    left, head, neck, right = joints[:, [_LEFT, _HEAD, _NECK, _RIGHT], :2].double().unbind(1)
+    middle = (left + right) / 2
+    height, offset = head - middle, neck - middle
+    usable = torch.isfinite(torch.cat([height, offset], 1)).all(1)
+    height, offset = height[usable], offset[usable]
+    if len(height) < LEAST_FRAMES:
+        raise PriorError(
+            "the neck's place needs recordings with head, neck and both shoulders, got "
+            f"{len(height)} such frames; add a recording with a neck"
+        )
+    fraction = (offset * height).sum() / height.square().sum()
+    spread = (offset - fraction * height).square().mean().sqrt()
+    return NeckFraction(float(fraction), float(spread), len(height))
 
 
 def learn_neck_offset(joints: Float[Tensor, "N 8 3"]) -> NeckOffset:

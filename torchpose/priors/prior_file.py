@@ -147,9 +147,16 @@ def write_prior(path: str | Path, info: PriorInfo, tensors: Mapping[str, Tensor]
         header = {"format": FILE_FORMAT, "version": FILE_VERSION, "info": info.to_json()}
     except (TypeError, ValueError) as error:
         raise PriorError(f"info.extra must hold only what JSON can hold: {error}") from error
-    plain = {k: t.detach().cpu().contiguous().clone() for k, t in tensors.items()}
+    plain = {k: _compact(t.detach().cpu()).contiguous().clone() for k, t in tensors.items()}
     with atomic_path(path) as temporary:
         save_file(plain, temporary, metadata={_HEADER: json.dumps(header, sort_keys=True)})
+
+
+def _compact(tensor: Tensor) -> Tensor:
+    """The same numbers in single precision, if all of them fit into it."""
+    single = tensor.float()
+    lossless = tensor.is_floating_point() and torch.equal(single.to(tensor.dtype), tensor)
+    return single if lossless else tensor
 
 
 def read_prior(path: str | Path) -> tuple[PriorInfo, dict[str, Tensor]]:

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from torchpose.body_view import BodyPath
 from torchpose.camera import ViewRange, sample_viewpoints
 from torchpose.errors import InputError, PriorError
 from torchpose.priors.arm_state import STATE_DIM, mirror_arm_state
@@ -47,6 +48,11 @@ class WindowLayout(NamedTuple):
         return STATE_DIM + 2 * (len(self.own) + len(self.other))
 
     @property
+    def lags(self) -> tuple[int, ...]:
+        """All lags, with 0, in order."""
+        return tuple(sorted({0, *self.own, *self.other}))
+
+    @property
     def ahead(self) -> int:
         """Number of later frames that a window needs."""
         return max(0, -min((*self.own, *self.other), default=0))
@@ -63,8 +69,8 @@ class WindowPrior(nn.Module):
 
     Args:
         left, right: mixtures over `layout.dim` dimensions. layout: the hands in a window.
-        settings: numbers by name: hand_std (pixels, of the window's hands), likelihood_power,
-            uniform_weight.
+        settings: numbers by name: hand_std (pixels, of the window's hands), likelihood_power, and
+            joint_ratio, pixel_ratio and placement_ratio (1/s^3, of `torchpose.read_out.MotionStage`).
 
     Raises:
         PriorError: mixtures of another size.
@@ -171,7 +177,7 @@ def window_states(
     """
     if not sequences:
         raise InputError("window states need at least one sequence, got none")
-    lags = sorted({0, *layout.own, *layout.other})
+    lags = layout.lags
     windows = torch.cat(
         [
             _windows(sequence, [round(lag * rate / layout.fps) for lag in lags])
@@ -214,49 +220,43 @@ def window_measurements(
     mask: Bool[Tensor, "B T 8"],
     layout: WindowLayout,
     side: str,
-) -> tuple[Float[Tensor, "B T W"], Bool[Tensor, "B T W"]]:
+    path: BodyPath,
+    start: int = 0,
+) -> tuple[Float[Tensor, "B S H 2"], Bool[Tensor, "B S H"]]:
     """Where the hands of each frame's window were measured, relative to where the body is now.
 
-    Poses of the prior are centred on the neck, so a hand of another frame is moved by how far head
-    and neck, where they are measured in both frames, have moved since. A hand that was not measured,
-    or that lies beyond the ends of the sequence, is missing.
+    Poses of the prior are centred on the neck and seen from one place, so a hand of another frame is
+    carried along with the body (`BodyPath.carried`). A hand that was not measured, or that lies
+    beyond the ends of the sequence, is missing.
 
     Args:
         uv, mask: the eight joints in the prior's pixels. layout: lags in frames of this sequence.
-        side: "left" or "right".
+        side: "left" or "right". path: of the body, at the lags of the layout.
+        start: first frame that is wanted, as in `body_path`.
 
     Returns:
-        Values and mask [B, T, 2 (own + other)], in the order of the window state.
+        Pixels [B, S, H, 2] and mask [B, S, H] of S = T - start frames and H = own + other hands, in
+        the order of the window state.
     """
     own, other = _HANDS[side]
     taken = [(own, lag) for lag in layout.own] + [(other, lag) for lag in layout.other]
     values, known = [], []
     for joint, lag in taken:
-        then_uv, then_mask = _shifted(uv, mask, lag)
-        moved = (
-            _displacement(uv, mask, then_uv, then_mask) if lag else torch.zeros_like(uv[:, :, 0])
-        )
-        values.append(then_uv[:, :, joint] + moved)
-        known.append(then_mask[:, :, joint, None].expand(-1, -1, 2))
+        then, seen = _shifted(uv[:, :, joint], mask[:, :, joint], lag)
+        values.append(path.carried(then[:, start:], lag))
+        known.append(seen[:, start:])
     if not values:
-        return uv.new_zeros(*uv.shape[:2], 0), mask.new_zeros(*mask.shape[:2], 0)
-    return torch.cat(values, -1), torch.cat(known, -1)
+        shape = (uv.shape[0], uv.shape[1] - start, 0)
+        return uv.new_zeros(*shape, 2), mask.new_zeros(shape)
+    return torch.stack(values, 2), torch.stack(known, 2)
 
 
-def _shifted(uv: Tensor, mask: Tensor, lag: int) -> tuple[Tensor, Tensor]:
+def _shifted(
+    uv: Float[Tensor, "B T 2"], mask: Bool[Tensor, "B T"], lag: int
+) -> tuple[Tensor, Tensor]:
     """Values `lag` frames ago, missing where that is outside the sequence."""
     n_frames = uv.shape[1]
     source = torch.arange(n_frames, device=uv.device) - lag
     inside = (source >= 0) & (source < n_frames)
     source = source.clamp(0, n_frames - 1)
-    return uv[:, source], mask[:, source] & inside[:, None]
-
-
-def _displacement(uv: Tensor, mask: Tensor, then_uv: Tensor, then_mask: Tensor) -> Tensor:
-    """Mean motion of head and neck since then, [B, T, 2]; zero where neither is known twice."""
-    anchors = [3, 4]
-    both = (mask & then_mask)[:, :, anchors, None]
-    moved = torch.where(
-        both, uv[:, :, anchors] - then_uv[:, :, anchors], torch.zeros_like(uv[:, :, anchors])
-    )
-    return moved.sum(2) / both.sum(2).clamp_min(1)
+    return uv[:, source], mask[:, source] & inside

@@ -51,7 +51,6 @@ __all__ = [
     "cached_prior",
     "centred_on_neck",
     "data_folder",
-    "learnt_recipe",
     "make_test_set",
     "mirror_pose",
     "plain_prior",
@@ -76,13 +75,6 @@ _MIRRORED = [0, 1, 2, 4, 3, 5, 6, 7]
 
 Recipe = Callable[..., UpperBodyPrior]
 """recordings, n_components, seed, progress, name -> prior with its noise and calibration."""
-
-
-def learnt_recipe(recordings: Sequence[Recording], **options: Any) -> UpperBodyPrior:
-    """The recipe of the shipped prior (`torchpose.recipes.fit_kinect_prior`)."""
-    from torchpose.recipes import fit_kinect_prior
-
-    return fit_kinect_prior(recordings, **options)
 
 
 def cached_prior(

@@ -40,7 +40,6 @@ from torchpose.protocols.common import (
     cached_prior,
     centred_on_neck,
     data_folder,
-    learnt_recipe,
     make_test_set,
     plain_prior,
     score,
@@ -49,6 +48,7 @@ from torchpose.protocols.common import (
 )
 from torchpose.protocols.one_tables import SAMPLED, add_findings, add_pictures, add_tables
 from torchpose.protocols.report import Report
+from torchpose.recipes import fit_kinect_prior
 from torchpose.tracking import UpperBodyTracker
 
 __all__ = ["TRACKERS", "run", "split_recording"]
@@ -84,7 +84,7 @@ def run(
     n_components: int | None = None,
     mixture_q: float = MIXTURE_Q,
     walk_q: float = WALK_Q,
-    recipe: Recipe = learnt_recipe,
+    recipe: Recipe = fit_kinect_prior,
 ) -> Report:
     """Run the protocol; writes report.json, report.md and pictures to `out`.
 

@@ -31,7 +31,6 @@ from torchpose.protocols.common import (
     cached_prior,
     centred_on_neck,
     data_folder,
-    learnt_recipe,
     make_test_set,
     plain_prior,
     projected_training_poses,
@@ -54,6 +53,7 @@ from torchpose.protocols.people_tables import (
     add_pictures,
 )
 from torchpose.protocols.report import Report
+from torchpose.recipes import fit_kinect_prior
 
 __all__ = ["TEST_PERSONS", "TRAIN_PERSONS", "people", "run", "sway"]
 
@@ -73,7 +73,7 @@ def run(
     n_components: int | None = None,
     lag: int = 0,
     n_gap_sequences: int = 72,
-    recipe: Recipe = learnt_recipe,
+    recipe: Recipe = fit_kinect_prior,
     prior: UpperBodyPrior | None = None,
 ) -> Report:
     """Run the protocol; writes report.json, report.md and pictures to `out`.

@@ -1,0 +1,144 @@
+"""From the estimates of two arms' filters to a pose, and its motion made steady.
+
+A filter over windows estimates every frame for itself, so that the noise of keypoints and the change
+from one component to the next show as trembling. `MotionStage` filters (or smooths) what is read out.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from torchpose.arms import require_cov
+from torchpose.body_view import BodyView, from_view, view_jacobian
+from torchpose.filters.base import FilterOutput
+from torchpose.filters.constant_velocity import ConstantVelocityFilter, ConstantVelocityState
+from torchpose.lifting import arm_in_body_frame, join_arms, pixel_covariances
+from torchpose.rotations import RotationOrder, euler_to_matrix, matrix_to_euler
+
+__all__ = ["MotionStage", "MotionState", "ReadOut", "read_out"]
+
+
+class ReadOut(NamedTuple):
+    """Poses, and where their bodies are.
+
+    Attributes:
+        joints: in the body's frame [B, T, 8, 3], metres. covs: [B, T, 8, 3, 3].
+        angles: roll, pitch, yaw that turn the body's axes into the camera's [B, T, 3], radians.
+        place: of the body's centre in camera axes [B, T, 3], metres.
+        uv: [B, T, 8, 2], pixels of the prior's camera. uv_covs: [B, T, 8, 2, 2].
+    """
+
+    joints: Tensor
+    covs: Tensor
+    angles: Tensor
+    place: Tensor
+    uv: Tensor
+    uv_covs: Tensor
+
+
+def read_out(
+    left: FilterOutput,
+    right: FilterOutput,
+    matrix: Float[Tensor, "3 3"],
+    order: RotationOrder,
+    view: BodyView | None,
+) -> ReadOut:
+    """Both arms lifted into the body's frame (BL 5) and joined; what they share is averaged.
+
+    Args:
+        left, right: outputs of the arms' filters, with covariances. matrix: K of the states' pixels.
+        order: of roll, pitch and yaw. view: the virtual camera that the states are seen by, if any.
+    """
+    covs = require_cov(left), require_cov(right)
+    means = left.mean, right.mean
+    lifted = [
+        arm_in_body_frame(mean, cov, matrix, order) for mean, cov in zip(means, covs, strict=True)
+    ]
+    joints = join_arms(*(joints for joints, _ in lifted))
+    joint_covs = join_arms(*(cov for _, cov in lifted))
+    camera = (left.mean[..., 15:] + right.mean[..., 15:]) / 2
+    angles, place = camera[..., :3], camera[..., 3:]
+    uv = join_arms(*(mean[..., :15].unflatten(-1, (5, 3))[..., :2] for mean in means))
+    uv_covs = join_arms(*(pixel_covariances(cov) for cov in covs))
+    if view is not None:
+        back = view.rotation.mT
+        angles = matrix_to_euler(back @ euler_to_matrix(angles, order), order)
+        place = (back @ place[..., None])[..., 0] * view.zoom[..., None]
+        slopes = view_jacobian(uv, view, matrix)
+        uv, uv_covs = from_view(uv, view, matrix), slopes @ uv_covs @ slopes.mT
+    return ReadOut(joints, joint_covs, angles, place, uv, uv_covs)
+
+
+class MotionState(NamedTuple):
+    """States of the filters of joints in metres, in pixels, and of the body's placement."""
+
+    joints: ConstantVelocityState
+    pixels: ConstantVelocityState
+    placement: ConstantVelocityState
+
+
+class MotionStage(nn.Module):
+    """Constant-velocity filters over joints, their pixels and the body's placement.
+
+    Covariances stay as they are.
+
+    Args:
+        joint_ratio, pixel_ratio, placement_ratio: q/r of `ConstantVelocityFilter`, 1/s^3. Pixels are
+            known better than joints in space, and a body moves less briskly than its hands.
+        fps: frames per second.
+    """
+
+    def __init__(
+        self, joint_ratio: float, pixel_ratio: float, placement_ratio: float, fps: float
+    ) -> None:
+        super().__init__()
+        self.joints = ConstantVelocityFilter(joint_ratio, fps)
+        self.pixels = ConstantVelocityFilter(pixel_ratio, fps)
+        self.placement = ConstantVelocityFilter(placement_ratio, fps)
+
+    def forward(
+        self, reading: ReadOut, lengths: Int[Tensor, " B"] | None = None, lag: int | None = 0
+    ) -> ReadOut:
+        """The steady reading.
+
+        Args:
+            reading: of whole sequences. lengths: [B]; frames past them are not used.
+            lag: number of later frames that each may use; None is all, 0 only filters.
+        """
+        pairs = zip(self._filters(), _numbers(reading), strict=True)
+        if lag == 0:
+            return _with_numbers(reading, *(model(values) for model, values in pairs))
+        return _with_numbers(
+            reading, *(model.smooth(values, lengths, lag) for model, values in pairs)
+        )
+
+    def init(self, reading: ReadOut) -> MotionState:
+        """The state before the first frame, `reading` [B, 1, ...]."""
+        pairs = zip(self._filters(), _numbers(reading), strict=True)
+        return MotionState(*(model.init(values[:, 0]) for model, values in pairs))
+
+    def step(self, state: MotionState, reading: ReadOut) -> tuple[MotionState, ReadOut]:
+        """One frame [B, 1, ...]: the same numbers as the same frame of `forward` with lag 0."""
+        triples = zip(self._filters(), state, _numbers(reading), strict=True)
+        stepped = [model.step(own, values[:, 0]) for model, own, values in triples]
+        steady = _with_numbers(reading, *(values[:, None] for _, values in stepped))
+        return MotionState(*(own for own, _ in stepped)), steady
+
+    def _filters(self) -> tuple[ConstantVelocityFilter, ...]:
+        return self.joints, self.pixels, self.placement
+
+
+def _numbers(reading: ReadOut) -> tuple[Tensor, Tensor, Tensor]:
+    placement = torch.cat([reading.angles, reading.place], -1)
+    return reading.joints.flatten(2), reading.uv.flatten(2), placement
+
+
+def _with_numbers(reading: ReadOut, joints: Tensor, pixels: Tensor, placement: Tensor) -> ReadOut:
+    return reading._replace(
+        joints=joints.unflatten(-1, (8, 3)),
+        uv=pixels.unflatten(-1, (8, 2)),
+        angles=placement[..., :3],
+        place=placement[..., 3:],
+    )

@@ -1,0 +1,227 @@
+"""Tracking live streams: the state between two frames, and one step of it."""
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchpose.arms import SeenInView, generators_of_arms, pose_of_window, require_cov
+from torchpose.body_view import memory_frames
+from torchpose.errors import InputError, check_shape
+from torchpose.filters.base import FilterOutput, Generators, RecursiveFilter
+from torchpose.measurements import MeasuredJoints, Picked, arm_measurements, pick_joints
+from torchpose.read_out import MotionState
+from torchpose.skeleton import ARM_JOINTS, LEFT_ARM, RIGHT_ARM, UPPER_BODY
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from torchpose.tracking import UpperBodyTracker
+
+__all__ = ["LivePose", "StreamState", "begin", "track_frame"]
+
+_SIDES = {"left": LEFT_ARM, "right": RIGHT_ARM}
+
+
+class Stream(NamedTuple):
+    """What stays the same from frame to frame.
+
+    Attributes:
+        n_keypoints: J. picked: where the eight joints are among them, and what was assumed.
+        joints: those that each arm's filter measures, left and right. generators: of each arm.
+    """
+
+    n_keypoints: int
+    picked: Picked
+    joints: dict[str, tuple[str, ...]]
+    generators: dict[str, Generators]
+
+
+class StreamState(NamedTuple):
+    """What `UpperBodyTracker.step` needs to know of the frames before.
+
+    Attributes:
+        recent: the eight joints of the last N frames in the prior's pixels, the latest last, with
+            R of each frame [B, N, 8, 2, 2]; N is 0 where no window is used.
+        filters: for each arm the states of its filters.
+        motion: state of the motion stage; None before the first frame, and where there is no stage.
+        unseen: number of frames since any joint was measured, [B].
+        stream: what does not change.
+    """
+
+    recent: MeasuredJoints
+    filters: dict[str, tuple[Any, ...]]
+    motion: MotionState | None
+    unseen: Tensor
+    stream: Stream
+
+
+class LivePose(NamedTuple):
+    """The poses of one frame of B streams; joints in the order of `UPPER_BODY`.
+
+    Attributes:
+        joints2d: [B, 8, 2], pixels of the camera. joints3d: [B, 8, 3], metres, in the tracker's frame.
+        covariance2d: [B, 8, 2, 2]. covariance3d: [B, 8, 3, 3].
+        observed: [B, 8], True where the joint was measured in this frame.
+        log_evidence: of the left and the right arm, [B, 2].
+        unseen: seconds since any joint was measured, [B]; 0 where one is.
+        failed: [B], True where the filter degenerated: poses are NaN until the stream is begun anew.
+    """
+
+    joints2d: Tensor
+    joints3d: Tensor
+    covariance2d: Tensor
+    covariance3d: Tensor
+    observed: Tensor
+    log_evidence: Tensor
+    unseen: Tensor
+    failed: Tensor
+
+
+def begin(
+    tracker: "UpperBodyTracker",
+    batch_size: int,
+    names: "Sequence[str] | None",
+    generator: Generators,
+) -> StreamState:
+    """The state before the first frame; see `UpperBodyTracker.init`."""
+    if tracker.smoothing is not None:
+        raise InputError(
+            "frame by frame an estimate cannot use later frames: expected smoothing=None, got "
+            f"{tracker.smoothing!r}"
+        )
+    if batch_size < 1:
+        raise InputError(f"batch_size must be at least 1, got {batch_size}")
+    n_keypoints = len(UPPER_BODY) if names is None else len(names)
+    info = tracker.prior.info
+    picked = pick_joints(n_keypoints, names, tracker.neck, info.neck, info.hand)
+    joints = {side: _joints_of(arm, picked.indices) for side, arm in _SIDES.items()}
+    sources = dict(zip(_SIDES, generators_of_arms(generator), strict=True))
+    filters = {
+        side: tuple(
+            model.init(batch_size, sources[side]) for model in _models(tracker, side, joints[side])
+        )
+        for side in _SIDES
+    }
+    window = tracker._window()
+    n_frames = 0 if window is None else 1 + memory_frames(window[1].lags, window[1].fps)
+    like = tracker.measurement_cov
+    recent = MeasuredJoints(
+        like.new_zeros(batch_size, n_frames, 8, 2),
+        torch.zeros(batch_size, n_frames, 8, dtype=torch.bool, device=like.device),
+        like.expand(batch_size, n_frames, -1, -1, -1),
+    )
+    unseen = torch.zeros(batch_size, dtype=torch.long, device=like.device)
+    return StreamState(recent, filters, None, unseen, Stream(n_keypoints, picked, joints, sources))
+
+
+def _joints_of(arm: tuple[int, ...], indices: tuple[int, ...]) -> tuple[str, ...]:
+    """Hand, head and neck, and any other joint of the arm that is among the keypoints."""
+    usual = ("hand", "head", "neck")
+    return tuple(
+        joint
+        for joint, row in zip(ARM_JOINTS, arm, strict=True)
+        if joint in usual or indices[row] >= 0
+    )
+
+
+def _models(
+    tracker: "UpperBodyTracker", side: str, joints: tuple[str, ...]
+) -> tuple[RecursiveFilter, ...]:
+    """The filter of an arm; with windows, also the one of the window's hands alone."""
+    window = tracker._window()
+    if window is None:
+        return (tracker._filter(side, joints),)
+    return tuple(tracker._window_filter(side, window[0], measured) for measured in (joints, ()))
+
+
+def track_frame(
+    tracker: "UpperBodyTracker",
+    state: StreamState,
+    keypoints: Float[Tensor, "B J 2"],
+    confidence: Float[Tensor, "B J"] | None,
+    mask: Bool[Tensor, "B J"] | None,
+) -> tuple[StreamState, LivePose]:
+    """One frame of every stream; see `UpperBodyTracker.step`."""
+    stream, batch = state.stream, len(state.unseen)
+    check_shape("keypoints", keypoints, [batch, stream.n_keypoints, 2])
+    measured = tracker._in_prior_pixels(
+        keypoints[:, None].to(tracker.measurement_cov),
+        None if confidence is None else confidence[:, None],
+        None if mask is None else mask[:, None],
+        stream.picked,
+    )
+    recent, seen = state.recent, None
+    if recent.uv.shape[1]:
+        recent = _shift_in(recent, measured)
+        seen = tracker._look(recent, None, -1)
+    if seen is not None:
+        seen = seen._replace(measured=seen.measured._replace(cov=measured.cov))
+    arms, filters = {}, {}
+    for side in _SIDES:
+        filters[side], arms[side] = _step_arm(tracker, side, state, measured, seen)
+    unseen = torch.where(measured.mask[:, 0].any(-1), 0, state.unseen + 1)
+    view = None if seen is None else seen.view
+    left, right = arms["left"], arms["right"]
+    reading = tracker._read_out(left, right, view)
+    stage, motion = tracker._motion_stage(), state.motion
+    if stage is not None:
+        motion, reading = stage.step(motion or stage.init(reading), reading)
+    track = tracker._poses(reading, left, right, measured.mask, None, ())
+    pose = LivePose(
+        track.joints2d[:, 0],
+        track.joints3d[:, 0],
+        track.covariance2d[:, 0],
+        track.covariance3d[:, 0],
+        track.observed[:, 0],
+        track.log_evidence[:, 0],
+        unseen / (tracker.fps or 30.0),
+        track.failed_at >= 0,
+    )
+    return StreamState(recent, filters, motion, unseen, stream), pose
+
+
+def _shift_in(frames: MeasuredJoints, frame: MeasuredJoints) -> MeasuredJoints:
+    """The last N frames with the newest one in place of the oldest."""
+    cov = frame.cov.expand(*frame.uv.shape[:2], *frame.cov.shape[-3:])
+    pairs = zip(frames, frame._replace(cov=cov), strict=True)
+    return MeasuredJoints(*(torch.cat([old[:, 1:], new], 1) for old, new in pairs))
+
+
+def _step_arm(
+    tracker: "UpperBodyTracker",
+    side: str,
+    state: StreamState,
+    measured: MeasuredJoints,
+    seen: SeenInView | None,
+) -> tuple[tuple[Any, ...], FilterOutput]:
+    """Next states of an arm's filters, and their estimate as a sequence of one frame."""
+    joints, generator = state.stream.joints[side], state.stream.generators[side]
+    models, states = _models(tracker, side, joints), state.filters[side]
+    if seen is None:
+        z, mask, cov = arm_measurements(_SIDES[side], joints, measured)
+        after, out = _step(models[0], states[0], z, mask, cov, generator)
+        return (after,), out
+    both, noise, hands = tracker._window_inputs(side, joints, seen)
+    after, out = _step(models[0], states[0], *both, noise, None)
+    after_hands, context = _step(models[1], states[1], *hands, None, None)
+    return (after, after_hands), pose_of_window(out, context, seen, _SIDES[side])
+
+
+def _step(
+    model: RecursiveFilter,
+    state: Any,
+    z: Float[Tensor, "B 1 Z"],
+    mask: Bool[Tensor, "B 1 Z"],
+    cov: Tensor | None,
+    generator: Generators,
+) -> tuple[Any, FilterOutput]:
+    """A step of a filter, with its estimate as a sequence of one frame."""
+    noise = cov[:, 0] if cov is not None and cov.ndim == 4 else cov
+    state, out = model.step(state, z[:, 0], mask[:, 0], noise, generator, return_cov=True)
+    lost = ~torch.isfinite(out.mean).all(-1)
+    failed_at = torch.where(lost, 0, -1)
+    cov = require_cov(out)[:, None]
+    mean, log_weights = out.mean[:, None], out.log_weights[:, None]
+    return state, FilterOutput(mean, log_weights, out.log_evidence[:, None], cov, failed_at)
