@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.data import data_dir_or_skip
+
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = (
     "mixture_kalman_filter",
@@ -39,3 +41,34 @@ def test_quick_run_agrees_and_is_written(script, tmp_path):
     assert "Agreement" in text
     assert "| ---" in text
     assert text.split() == done.stdout.split()
+
+
+def test_levers_run_without_the_test_persons_and_go_on_where_they_stopped(tmp_path):
+    recordings = tmp_path / "kinect_utd_mhad"
+    recordings.mkdir()
+    for path in data_dir_or_skip("kinect_utd_mhad").glob("s0[1-6]_*.npz"):
+        (recordings / path.name).symlink_to(path)
+    out = tmp_path / "levers"
+    arguments = ("--quick", "--data", str(recordings), "--out", str(out), "--only")
+    first = run("ub_people_levers", *arguments, "single")
+    assert first.returncode == 0, first.stdout + first.stderr
+    assert "| single poses, learnt Q and R " in first.stdout
+    assert "log-evidence" in first.stdout
+    fits = {path.name for path in out.glob("*.safetensors")}
+    second = run("ub_people_levers", *arguments, "single", "default")
+    assert second.returncode == 0, second.stdout + second.stderr
+    rows = [line.split() for line in first.stdout.splitlines() if line.startswith("| single")]
+    again = [line.split() for line in second.stdout.splitlines() if line.startswith("| single")]
+    assert len(rows) == 6
+    assert rows == again
+    assert len({path.name for path in out.glob("*.safetensors")} - fits) == 2
+    assert (out / "levers.md").read_text() == second.stdout
+
+
+def test_every_training_person_is_held_out_once(tmp_path):
+    data = data_dir_or_skip("kinect_utd_mhad")
+    done = run("ub_people_by_person", "--quick", "--data", str(data), "--out", str(tmp_path))
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = [line.split("|")[1].strip() for line in done.stdout.splitlines()[2:]]
+    assert rows == ["s1", "s2", "s3", "s4", "s5", "s6", "mean", "standard deviation"]
+    assert len(list(tmp_path.glob("*.safetensors"))) == 6

@@ -1,0 +1,87 @@
+"""What a wrong focal length costs.
+
+The test of `torchpose evaluate ub-people` (persons s7 and s8 of UTD-MHAD, head, neck and hands with
+3 px noise), tracked with a camera whose focal length is so many times the true one. A camera that is
+not calibrated is usually within 0.85 to 1.2.
+
+    python benchmarks/focal_length.py --data DIR [--prior OUT/prior-....safetensors]
+
+`--prior` takes the prior that the protocol fitted to s1 to s6 and left in its output folder. Without
+it the shipped prior is used, which has seen s7 and s8: then the table says so, and only the
+differences between its rows mean something.
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+
+from torchpose.camera import PinholeCamera
+from torchpose.errors import OverlapError
+from torchpose.priors import UpperBodyPrior, load_prior
+from torchpose.protocols.common import Trials, centred_on_neck, make_test_set, score, track
+from torchpose.protocols.ub_people import TEST_PERSONS, people, sway
+
+FOCAL, CENTRE = 525.0, (319.5, 239.5)
+TRUE = PinholeCamera(FOCAL, FOCAL, *CENTRE, 640, 480)
+FACTORS = (0.7, 0.85, 1.0, 1.2, 1.4)
+TRACKERS = {"as it comes": {}, "smoothed": {"smoothing": "full"}, "single poses": {"window": False}}
+HEADER = ("tracker", "f / true f", "3D error (cm)", "moving root (cm)", "pixel error")
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--data", type=Path, required=True, help="folder with kinect_utd_mhad/")
+    parser.add_argument("--prior", type=Path, help="fitted without the test persons")
+    parser.add_argument("--threads", type=int, default=2, help="cores")
+    parser.add_argument("--out", type=Path, help="write the same as Markdown")
+    parser.add_argument(
+        "--quick", action="store_true", help="a few sequences, to see that it works"
+    )
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    prior = load_prior(args.prior or "kinect-upper-body")
+    _, tested = people(args.data, args.quick)
+    poses = [centred_on_neck(recording.upper_body().joints) for recording in tested]
+    fps = tested[0].fps or 30.0
+    still = make_test_set(poses, TRUE, fps)
+    paths = [sway(len(p), fps, i / len(poses)) for i, p in enumerate(poses)]
+    moving = make_test_set(poses, TRUE, fps, paths=paths)
+    lines = [f"| {' | '.join(HEADER)} |", f"|{' --- |' * len(HEADER)}"]
+    trackers = dict(list(TRACKERS.items())[: 1 if args.quick else None])
+    for name, options in trackers.items():
+        for factor in FACTORS[: 3 if args.quick else None]:
+            row = [name, f"{factor:g}", *errors(prior, still, moving, factor, options)]
+            lines.append(f"| {' | '.join(row)} |")
+    text = "\n".join([*lines, "", f"{note(prior, {r.person_id for r in tested})}\n"])
+    print(text, end="")
+    if args.out:
+        args.out.write_text(text, encoding="utf-8")
+
+
+def errors(
+    prior: UpperBodyPrior, still: Trials, moving: Trials, factor: float, options: dict[str, object]
+) -> list[str]:
+    """Mean 3D error of both tests after fixed-scale Procrustes, and mean pixel error of the first."""
+    camera = PinholeCamera(factor * FOCAL, factor * FOCAL, *CENTRE, 640, 480)
+    first, second = (score(track(prior, camera, test, **options), test) for test in (still, moving))
+    means = (100 * first.errors3d.nanmean(), 100 * second.errors3d.nanmean())
+    return [f"{float(value):.2f}" for value in (*means, first.errors2d.nanmean())]
+
+
+def note(prior: UpperBodyPrior, persons: set[str]) -> str:
+    """Which prior it was, and whether it has seen the test persons."""
+    name = prior.info.name or "unnamed"
+    try:
+        prior.check_unseen(persons)
+    except OverlapError:
+        return (
+            f"Prior {name}, which HAS SEEN {' and '.join(TEST_PERSONS)}: the errors are too small, "
+            "only their differences count."
+        )
+    return f"Prior {name}, which has not seen {' and '.join(TEST_PERSONS)}."
+
+
+if __name__ == "__main__":
+    main()
