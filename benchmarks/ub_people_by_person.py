@@ -53,7 +53,11 @@ def hold_out(
     own = [r for r in recordings if r.person == person][:: arguments.every]
     settings = {"seed": arguments.seed, "calibration_folds": 0, "name": "ub-people-by-person"}
     if arguments.quick:
-        settings |= {"n_components": 4, "window_components": 8, "window_samples": 3000}
+        settings |= {"n_components": 4}
+    settings |= {
+        "window_components": 8 if arguments.quick else arguments.window_components,
+        "window_samples": 3000 if arguments.quick else arguments.window_samples,
+    }
     prior = cached_prior(arguments.out, seen, fit_kinect_prior, False, **settings)
     poses = [centred_on_neck(r.upper_body().joints) for r in own]
     test = make_test_set(poses, CAMERA, own[0].fps or 30.0, arguments.seed)
@@ -101,6 +105,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", required=True, type=Path, help="folder of kinect_utd_mhad")
     parser.add_argument("--out", required=True, type=Path, help="folder for the fitted priors")
+    parser.add_argument("--window-components", type=int, help="by default as the shipped prior")
+    parser.add_argument("--window-samples", type=int, help="by default as the shipped prior")
     parser.add_argument("--every", type=int, default=1, help="track every n-th sequence")
     parser.add_argument("--seed", type=int, default=0, help="of fits and noise")
     parser.add_argument("--threads", type=int, default=2)

@@ -134,6 +134,7 @@ def test_options_reach_the_tracker(track, files):
     text = ",".join(str(s) for s in stds)
     same(track("--measurement-std", text)[1], expected(files, measurement_std=stds))
     same(track("--window", "false")[1], expected(files, window=False))
+    same(track("--steady", "false")[1], expected(files, steady=False))
     same(track("--static-camera", "true")[1], expected(files, static_camera=True))
 
 

@@ -113,6 +113,14 @@ def build() -> ArgumentParser:
         "only); false tracks single poses, as the paper does (default true)",
     )
     add(
+        "--steady",
+        type=bool,
+        default=True,
+        metavar="true|false",
+        help="take the trembling out of what windows give, by filters of constant velocity (default "
+        "true)",
+    )
+    add(
         "--neck",
         type=str,
         metavar="KIND",
@@ -172,6 +180,7 @@ def run(args: Namespace) -> int:
         frame=args.frame,
         static_camera=args.static_camera,
         window=args.window,
+        steady=args.steady,
         neck=_neck(args.neck, keypoints),
         max_gap=args.max_gap,
         **_filter_options(args),
