@@ -72,3 +72,12 @@ def test_every_training_person_is_held_out_once(tmp_path):
     rows = [line.split("|")[1].strip() for line in done.stdout.splitlines()[2:]]
     assert rows == ["s1", "s2", "s3", "s4", "s5", "s6", "mean", "standard deviation"]
     assert len(list(tmp_path.glob("*.safetensors"))) == 6
+
+
+def test_every_place_is_tracked_by_all_three(tmp_path):
+    data = data_dir_or_skip("kinect_utd_mhad")
+    done = run("ub_people_places", "--quick", "--data", str(data), "--out", str(tmp_path))
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = [line.split("|")[1:-1] for line in done.stdout.splitlines()[2:]]
+    assert len(rows) == 8
+    assert all(0 < float(value) < 100 for row in rows for value in row[1:])
