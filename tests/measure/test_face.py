@@ -1,0 +1,146 @@
+"""Face tracks against single Kalman filters, and the detector on recordings of signers."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.data import data_dir_or_skip
+from torchpose.errors import InputError, ShapeError
+from torchpose.measure import FaceTracker, HaarFaceDetector, Region
+
+
+def nobody(image, region=None):
+    """A detector that finds nothing."""
+    return torch.zeros(0, 3, dtype=torch.float64)
+
+
+class Script:
+    """A detector that says what it is told, frame by frame, and notes where it was asked to look."""
+
+    def __init__(self, frames):
+        self.frames, self.asked = [torch.tensor(f).double().reshape(-1, 3) for f in frames], []
+
+    def __call__(self, image, region=None):
+        found = self.frames[int(image[0, 0])]
+        self.asked.append(region)
+        if region is None:
+            return found
+        x, y = found[:, 0], found[:, 1]
+        inside = (x >= region.left) & (x < region.right) & (y >= region.top) & (y < region.bottom)
+        return found[inside]
+
+
+def follow(frames, **options):
+    """All tracks after each of the frames."""
+    detector = Script(frames)
+    tracker = FaceTracker(detector, **options)
+    states = [tracker.init()]
+    for t in range(len(frames)):
+        image = np.zeros((480, 640), np.uint8)
+        image[0, 0] = t
+        states.append(tracker.step(states[-1], image))
+    return tracker, states[1:], detector
+
+
+def test_a_track_is_the_kalman_filter_of_its_detections():
+    rng = np.random.default_rng(0)
+    moving = np.array([[200 + 3 * t, 150 - t, 80] for t in range(12)])
+    frames = (moving + rng.normal(0, 2, moving.shape))[:, None]
+    tracker, states, _ = follow(frames, every=1, whole_every=1)
+    mean, cov = None, None
+    matrix = tracker.matrix.numpy()
+    for detection, state in zip(frames, states, strict=True):
+        z = detection[0]
+        if mean is None:
+            mean = np.concatenate([z, np.zeros(3)])
+            cov = np.diag(np.repeat([0.04, 0.08], 3) ** 2 * z[2] ** 2)
+        else:
+            noise = (tracker.acceleration * mean[2]) ** 2 * np.eye(6)
+            mean, cov = matrix @ mean, matrix @ cov @ matrix.T + noise
+            innovation = cov[:3, :3] + (tracker.std * mean[2]) ** 2 * np.eye(3)
+            gain = np.linalg.solve(innovation, cov[:3]).T
+            mean, cov = mean + gain @ (z - mean[:3]), cov - gain @ innovation @ gain.T
+        np.testing.assert_allclose(state.mean[0], mean, rtol=1e-9)
+        np.testing.assert_allclose(state.cov[0], cov, rtol=1e-7, atol=1e-9)
+
+
+def test_a_face_is_used_after_three_hits_and_survives_gaps():
+    face = [[300.0, 200.0, 90.0]]
+    tracker, states, _ = follow([face] * 20 + [[]] * 15 + [face] * 3, every=1, whole_every=1)
+    used = [bool(tracker.usable(s).any()) for s in states]
+    assert used == [False, False] + [True] * 36
+    assert states[34].unseen.tolist() == [15]
+    assert states[-1].identity.tolist() == [0] and states[-1].age.tolist() == [37]
+
+
+def test_sporadic_detections_are_never_used_and_die():
+    frames = [[[100.0, 100.0, 60.0]] if t % 5 == 0 else [] for t in range(30)]
+    tracker, states, _ = follow(frames, every=1, whole_every=1)
+    assert not any(bool(tracker.usable(s).any()) for s in states)
+    assert len(states[4].mean) == 0 and states[-1].next_identity > 1
+
+
+def test_two_faces_that_pass_keep_their_identities():
+    frames = [[[100.0 + 20 * t, 150, 80], [500.0 - 20 * t, 210, 84]] for t in range(20)]
+    _, states, _ = follow(frames, every=1, whole_every=1)
+    final = dict(zip(states[-1].identity.tolist(), states[-1].mean[:, 0].tolist(), strict=True))
+    assert final == pytest.approx({0: 480.0, 1: 120.0}, abs=12)
+
+
+def test_known_faces_are_searched_where_they_are():
+    face = [[300.0, 200.0, 90.0]]
+    _, _, detector = follow([face] * 12, every=2, whole_every=10)
+    assert detector.asked[:3] == [None, None, None]  # until it may be used
+    later = detector.asked[3:]
+    assert [region is None for region in later] == [False, False, False, True]
+    assert later[0].left == pytest.approx(201, abs=3) and later[0].right == pytest.approx(
+        399, abs=3
+    )
+    assert later[0].smallest == pytest.approx(67.5, abs=2)
+
+
+def test_one_face_in_two_overlapping_regions_is_one_detection():
+    near = [[200.0, 200.0, 80.0], [250.0, 200.0, 80.0]]
+    _, states, _ = follow([near] * 4 + [near[:1]] * 2, every=1, whole_every=100)
+    assert states[-1].unseen.tolist() == [0, 2] and states[-1].next_identity == 2
+
+
+def test_bad_input_is_refused():
+    with pytest.raises(InputError, match="memory at least"):
+        FaceTracker(nobody, min_hits=5, memory=4)
+    with pytest.raises(InputError, match="must be positive"):
+        FaceTracker(nobody, gate=0.0)
+    with pytest.raises(InputError, match="scale_factor"):
+        HaarFaceDetector(scale_factor=1.0)
+    with pytest.raises(InputError, match="grey"):
+        HaarFaceDetector()(np.zeros((10, 10, 3), np.uint8))
+    tracker = FaceTracker(nobody)
+    with pytest.raises(InputError):
+        tracker.update(tracker.init(), torch.tensor([[1.0, float("nan"), 2.0]]))
+    with pytest.raises(ShapeError):
+        tracker.update(tracker.init(), torch.zeros(1, 4))
+
+
+def test_the_detector_finds_nothing_in_an_empty_region():
+    image = np.full((200, 200), 128, np.uint8)
+    assert len(HaarFaceDetector()(image)) == 0
+    assert len(HaarFaceDetector()(image, Region(50, 50, 50, 90, 40, 60))) == 0
+
+
+@pytest.mark.parametrize("clip", ["again", "bird", "learn"])
+def test_faces_of_signers_are_followed_without_false_ones(clip):
+    """Within 40 pixels of MediaPipe's nose in every frame after fifteen, and nothing else is used."""
+    cv2 = pytest.importorskip("cv2")
+    folder = data_dir_or_skip("video_asl")
+    with np.load(folder / f"{clip}_mediapipe_pose1.npz") as landmarks:
+        nose = torch.from_numpy(landmarks["joints2d"][:, 0]).double()
+    video, tracker = cv2.VideoCapture(str(folder / f"{clip}.mkv")), FaceTracker()
+    state = tracker.init()
+    for t in range(40):
+        read, image = video.read()
+        assert read
+        state = tracker.step(state, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+        if t >= 15:
+            faces = state.mean[tracker.usable(state)]
+            assert len(faces) == 1
+            assert torch.dist(faces[0, :2], nose[t]) < 40
