@@ -348,7 +348,7 @@ class UpperBodyTracker(nn.Module):
     ) -> FilterOutput:
         joints = self._measured_joints(side, measured.mask)
         if seen is not None:
-            return self._run_window(side, joints, seen, lengths)
+            return self._run_window(side, joints, seen, lengths, progress)
         z, mask, cov = arm_measurements(_SIDES[side], joints, measured)
         model = self._filter(side, joints)
         if self.smoothing is not None and isinstance(model, MixtureKalmanFilter):
@@ -413,12 +413,17 @@ class UpperBodyTracker(nn.Module):
         )
 
     def _run_window(
-        self, side: str, joints: tuple[str, ...], seen: SeenInView, lengths: Tensor | None
+        self,
+        side: str,
+        joints: tuple[str, ...],
+        seen: SeenInView,
+        lengths: Tensor | None,
+        progress: bool,
     ) -> FilterOutput:
         """Fixed tracks over window states; the evidence is that of this frame given the window."""
         both, noise, hands = self._window_inputs(side, joints, seen)
         model = self._window_filter(side, seen.window, joints)
-        out = model(*both, noise, lengths, return_cov=True)
+        out = model(*both, noise, lengths, return_cov=True, progress=progress)
         context = self._window_filter(side, seen.window, ())(*hands, None, lengths)
         return pose_of_window(out, context, seen, _SIDES[side])
 
