@@ -1,4 +1,4 @@
-"""Measurements from images. So far: faces."""
+"""Measurements from images: faces and skin."""
 
 from torchpose.measure.face import (
     FaceDetector,
@@ -7,5 +7,15 @@ from torchpose.measure.face import (
     HaarFaceDetector,
     Region,
 )
+from torchpose.measure.skin import SkinModel, SkinState, rgb_to_lab
 
-__all__ = ["FaceDetector", "FaceTracker", "FaceTracks", "HaarFaceDetector", "Region"]
+__all__ = [
+    "FaceDetector",
+    "FaceTracker",
+    "FaceTracks",
+    "HaarFaceDetector",
+    "Region",
+    "SkinModel",
+    "SkinState",
+    "rgb_to_lab",
+]
