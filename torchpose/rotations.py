@@ -100,12 +100,22 @@ def matrix_to_euler(
 
 
 def rotvec_to_matrix(rotvec: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrix of a Rodrigues vector (axis times angle, radians), as in camera files."""
+    """Rotation matrix of a Rodrigues vector (axis times angle, radians), as in camera files.
+
+    R = I + (sin a / a) [v]x + ((1 - cos a) / a^2) [v]x^2,   a = |v|, by series near zero.
+    """
     check_shape("rotvec", rotvec, ["...", 3])
     x, y, z = rotvec.unbind(-1)
     o = torch.zeros_like(x)
     skew = torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
-    return torch.linalg.matrix_exp(skew)
+    squared = rotvec.square().sum(-1)[..., None, None]
+    near_zero = squared < 1e-8  # the next terms of the series are below the rounding of float64
+    angle = torch.where(near_zero, torch.ones_like(squared), squared).sqrt()
+    first = torch.where(near_zero, 1 - squared / 6, angle.sin() / angle)
+    half = (angle / 2).sin() / angle
+    second = torch.where(near_zero, 0.5 - squared / 24, 2 * half.square())
+    eye = torch.eye(3, dtype=rotvec.dtype, device=rotvec.device)
+    return eye + first * skew + second * (skew @ skew)
 
 
 def _check_order(order: str) -> None:
