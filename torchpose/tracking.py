@@ -142,6 +142,7 @@ class UpperBodyTracker(nn.Module):
         self.register_buffer("measurement_cov", self._measurement_cov(measurement_std))
         self.measurement_cov: Tensor
         self.filters = nn.ModuleDict()
+        self.stages = nn.ModuleDict()
         for side in _SIDES:
             self._filter(side, ("hand", "head", "neck"))
 
@@ -524,14 +525,17 @@ class UpperBodyTracker(nn.Module):
         window = self._window()
         if window is None or not self.steady:
             return None
-        settings = self.prior.windows[window[0]].settings
+        name = window[0]
+        settings = self.prior.windows[name].settings
         if "joint_ratio" not in settings:
             return None
-        joint, pixel, placement = (
-            settings[f"{name}_ratio"] for name in ("joint", "pixel", "placement")
-        )
-        stage = MotionStage(joint, pixel, placement, self.fps or 30.0)
-        return stage.to(self.measurement_cov.device)
+        if name not in self.stages:
+            joint, pixel, placement = (
+                settings[f"{kind}_ratio"] for kind in ("joint", "pixel", "placement")
+            )
+            stage = MotionStage(joint, pixel, placement, self.fps or 30.0)
+            self.stages[name] = stage.to(self.measurement_cov.device)
+        return cast(MotionStage, self.stages[name])
 
     def _steady(
         self, reading: ReadOut, left: FilterOutput, right: FilterOutput, lengths: Tensor | None

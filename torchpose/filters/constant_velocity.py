@@ -79,13 +79,17 @@ class ConstantVelocityFilter(nn.Module):
         self, state: ConstantVelocityState, z: Float[Tensor, "B N"]
     ) -> tuple[ConstantVelocityState, Float[Tensor, "B N"]]:
         """One frame: the same numbers as the same frame of `forward`."""
-        predicted = self._predict(state)
-        gain = self.gains[min(state.time, len(self.gains) - 1)].to(z)
-        mean = predicted + gain[:, None] * (z - predicted[:, 0])[:, None]
-        return ConstantVelocityState(mean, state.time + 1), mean[:, 0]
+        state, _ = self._advance(state, z)
+        return state, state.mean[:, 0]
 
-    def _predict(self, state: ConstantVelocityState) -> Tensor:
-        return state.mean if state.time == 0 else self.matrix.to(state.mean) @ state.mean
+    def _advance(
+        self, state: ConstantVelocityState, z: Tensor
+    ) -> tuple[ConstantVelocityState, Tensor]:
+        """The next state, and by how much it differs from its prediction [B, 2, N]."""
+        predicted = state.mean if state.time == 0 else self.matrix.to(state.mean) @ state.mean
+        gain = self.gains[min(state.time, len(self.gains) - 1)].to(z)
+        correction = gain[:, None] * (z - predicted[:, 0])[:, None]
+        return ConstantVelocityState(predicted + correction, state.time + 1), correction
 
     def forward(self, z: Float[Tensor, "B T N"]) -> Float[Tensor, "B T N"]:
         """Filtered numbers: each uses its own frame and those before."""
@@ -97,10 +101,9 @@ class ConstantVelocityFilter(nn.Module):
         state = self.init(z[:, 0])
         means, corrections = [], []
         for frame in z.unbind(1):
-            predicted = self._predict(state)
-            state, _ = self.step(state, frame)
+            state, correction = self._advance(state, frame)
             means.append(state.mean)
-            corrections.append(state.mean - predicted)
+            corrections.append(correction)
         return torch.stack(means, 1), torch.stack(corrections, 1)
 
     def smooth(
