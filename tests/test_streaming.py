@@ -74,6 +74,31 @@ def test_steps_are_the_frames_of_forward(prior, keypoints, method, uncertain):
     check_equal(poses, track)
 
 
+@pytest.mark.parametrize("options", [{}, {"window": False}, {"method": "mkf-sampled"}])
+def test_blocks_of_frames_are_those_of_forward(prior, keypoints, options):
+    tracker = UpperBodyTracker(prior, demo_camera(), max_gap=None, **options)
+    generators = [[torch.Generator().manual_seed(b) for b in range(3)] for _ in range(2)]
+    noise = torch.tensor([2.0, 5.0], dtype=torch.float64)[
+        torch.randint(0, 2, keypoints.shape[:3], generator=torch.Generator().manual_seed(4))
+    ]
+    cov = noise.square()[..., None, None] * torch.eye(2, dtype=torch.float64)
+    track = tracker(keypoints, names=NAMES, generator=generators[0], covariance=cov)
+    state = tracker.init(3, names=NAMES, generator=generators[1])
+    parts, start = [], 0
+    for length in (1, 7, 32, 20):
+        rows = slice(start, start + length)
+        state, part = tracker.advance(state, keypoints[:, rows], covariance=cov[:, rows])
+        parts.append(part)
+        start += length
+    for name in (*FIELDS, "observed"):
+        joined = torch.cat([getattr(part, name) for part in parts], 1)
+        torch.testing.assert_close(joined, getattr(track, name), rtol=1e-9, atol=1e-9)
+    assert state.unseen.tolist() == [0, 0, 0]
+    state, _ = tracker.advance(state, torch.full((3, 4, 4, 2), torch.nan))
+    state, _ = tracker.advance(state, torch.full((3, 3, 4, 2), torch.nan))
+    assert state.unseen.tolist() == [7, 7, 7]
+
+
 def test_one_generator_for_all_streams(prior, keypoints):
     tracker = UpperBodyTracker(prior, demo_camera(), "pf-mixture", n_particles=50, max_gap=None)
     track = tracker(keypoints, names=NAMES, generator=torch.Generator().manual_seed(1))

@@ -11,6 +11,7 @@ from torchpose.camera import PinholeCamera
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.errors import (
     CameraError,
+    CovarianceError,
     FileFormatError,
     InputError,
     OutputError,
@@ -142,6 +143,49 @@ def test_confidence_zero_is_missing_and_low_confidence_counts_less(prior, scene)
     low[:, :, 2] = 0.1
     wide = tracker(keypoints[None], low, NAMES)
     assert (wide.covariance2d[0, :, 0, 0, 0] > plain.covariance2d[0, :, 0, 0, 0]).all()
+
+
+@pytest.mark.parametrize("window", [True, False])
+def test_the_same_covariance_everywhere_is_a_measurement_std(prior, scene, window):
+    camera, keypoints = demo_camera(), scene[1]
+    points = keypoints[None, :30]
+    std = torch.tensor([4.0, 3.0, 3.0, 2.0, 5.0])
+    usual = UpperBodyTracker(prior, camera, measurement_std=std, window=window)
+    each = UpperBodyTracker(prior, camera, window=window)
+    by_name = {"head": 2.0, "neck": 5.0, "hand": 4.0}
+    own = torch.tensor([by_name[name.split("_")[0]] for name in NAMES], dtype=torch.float64)
+    cov = (own.square()[:, None, None] * torch.eye(2)).expand(1, 30, 4, 2, 2)
+    one, other = usual(points, names=NAMES), each(points, names=NAMES, covariance=cov)
+    if not window:
+        torch.testing.assert_close(one.joints3d, other.joints3d, rtol=1e-9, atol=1e-9)
+        return
+    # the hands of earlier frames keep the tracker's own noise
+    assert (one.joints3d - other.joints3d).abs().max() < 0.02
+
+
+def test_a_doubtful_hand_pulls_less(prior, scene):
+    camera, keypoints = demo_camera(), scene[1]
+    points = keypoints[None, :20].clone()
+    points[:, 10, NAMES.index("hand_left")] += 60
+    tracker = UpperBodyTracker(prior, camera)
+    cov = torch.eye(2, dtype=torch.float64).repeat(1, 20, 4, 1, 1) * 9
+    sure = tracker(points, names=NAMES, covariance=cov)
+    cov[:, 10, NAMES.index("hand_left")] *= 100
+    doubtful = tracker(points, names=NAMES, covariance=cov)
+    hand = UPPER_BODY.index("hand_left")
+    at = points[0, 10, NAMES.index("hand_left")]
+    near = (sure.joints2d[0, 10, hand] - at).norm()
+    assert (doubtful.joints2d[0, 10, hand] - at).norm() > near + 5
+
+
+def test_a_covariance_that_is_none_is_refused(prior, scene):
+    camera, keypoints = demo_camera(), scene[1]
+    tracker = UpperBodyTracker(prior, camera)
+    cov = -torch.eye(2, dtype=torch.float64).expand(1, 5, 4, 2, 2)
+    with pytest.raises(CovarianceError, match="covariance"):
+        tracker(keypoints[None, :5], names=NAMES, covariance=cov)
+    with pytest.raises(ShapeError, match="covariance"):
+        tracker(keypoints[None, :5], names=NAMES, covariance=cov[:, :4])
 
 
 def test_covariances_grow_in_the_gap(prior, scene):

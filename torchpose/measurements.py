@@ -162,6 +162,7 @@ def measure_joints(
     mask: Tensor | None,
     indices: Sequence[int],
     cov: Float[Tensor, "8 2 2"],
+    own_cov: Float[Tensor, "B T J 2 2"] | None = None,
 ) -> MeasuredJoints:
     """The eight joints among the keypoints, in the pixels of the keypoints.
 
@@ -169,6 +170,7 @@ def measure_joints(
         keypoints: NaN where missing. confidence: [B, T, J] in 0..1, or None: at 0 or NaN a keypoint is
             missing, and between, R is divided by it. mask: [B, T, J], False = ignore, or None.
         indices: of the eight joints among the keypoints, -1 if absent. cov: R at full confidence.
+        own_cov: R of every single keypoint in place of that.
 
     Raises:
         InputError: infinite values. ShapeError: confidence or mask do not fit the keypoints.
@@ -185,6 +187,8 @@ def measure_joints(
     present = torch.tensor([i >= 0 for i in indices], device=measured.device)
     measured = measured[:, :, picked] & present
     uv = torch.where(measured[..., None], keypoints[:, :, picked], keypoints.new_zeros(()))
+    if own_cov is not None:
+        cov = torch.where(measured[..., None, None], own_cov.to(cov)[:, :, picked], cov)
     if confidence is not None:
         weight = confidence.to(uv)[:, :, picked].nan_to_num(1.0).clamp(_LEAST_CONFIDENCE, 1.0)
         weight = torch.where(measured, weight, torch.ones_like(weight))

@@ -115,16 +115,16 @@ class MotionStage(nn.Module):
         )
 
     def init(self, reading: ReadOut) -> MotionState:
-        """The state before the first frame, `reading` [B, 1, ...]."""
+        """The state before the first frame, that of `reading` [B, T, ...]."""
         pairs = zip(self._filters(), _numbers(reading), strict=True)
         return MotionState(*(model.init(values[:, 0]) for model, values in pairs))
 
-    def step(self, state: MotionState, reading: ReadOut) -> tuple[MotionState, ReadOut]:
-        """One frame [B, 1, ...]: the same numbers as the same frame of `forward` with lag 0."""
+    def advance(self, state: MotionState, reading: ReadOut) -> tuple[MotionState, ReadOut]:
+        """Some more frames [B, T, ...]: the same numbers as those of `forward` with lag 0."""
         triples = zip(self._filters(), state, _numbers(reading), strict=True)
-        stepped = [model.step(own, values[:, 0]) for model, own, values in triples]
-        steady = _with_numbers(reading, *(values[:, None] for _, values in stepped))
-        return MotionState(*(own for own, _ in stepped)), steady
+        advanced = [model.advance(own, values) for model, own, values in triples]
+        steady = _with_numbers(reading, *(values for _, values in advanced))
+        return MotionState(*(own for own, _ in advanced)), steady
 
     def _filters(self) -> tuple[ConstantVelocityFilter, ...]:
         return self.joints, self.pixels, self.placement

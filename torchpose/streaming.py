@@ -1,5 +1,6 @@
-"""Tracking live streams: the state between two frames, and one step of it."""
+"""Tracking live streams: the state between two frames, and some frames more."""
 
+import warnings
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -8,8 +9,9 @@ from torch import Tensor
 
 from torchpose.arms import SeenInView, generators_of_arms, pose_of_window, require_cov
 from torchpose.body_view import memory_frames
-from torchpose.errors import InputError, check_shape
-from torchpose.filters.base import FilterOutput, Generators, RecursiveFilter
+from torchpose.errors import DegenerateFilterWarning, InputError, check_shape
+from torchpose.filters import MixtureKalmanFilter
+from torchpose.filters.base import FilterOutput, Generators, RecursiveFilter, collect
 from torchpose.measurements import MeasuredJoints, Picked, arm_measurements, pick_joints
 from torchpose.read_out import MotionState
 from torchpose.skeleton import ARM_JOINTS, LEFT_ARM, RIGHT_ARM, UPPER_BODY
@@ -17,9 +19,10 @@ from torchpose.skeleton import ARM_JOINTS, LEFT_ARM, RIGHT_ARM, UPPER_BODY
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from torchpose.pose_track import PoseTrack
     from torchpose.tracking import UpperBodyTracker
 
-__all__ = ["LivePose", "StreamState", "begin", "track_frame"]
+__all__ = ["LivePose", "StreamState", "begin", "track_frame", "track_frames"]
 
 _SIDES = {"left": LEFT_ARM, "right": RIGHT_ARM}
 
@@ -142,33 +145,14 @@ def track_frame(
     keypoints: Float[Tensor, "B J 2"],
     confidence: Float[Tensor, "B J"] | None,
     mask: Bool[Tensor, "B J"] | None,
+    covariance: Float[Tensor, "B J 2 2"] | None,
 ) -> tuple[StreamState, LivePose]:
     """One frame of every stream; see `UpperBodyTracker.step`."""
-    stream, batch = state.stream, len(state.unseen)
-    check_shape("keypoints", keypoints, [batch, stream.n_keypoints, 2])
-    measured = tracker._in_prior_pixels(
-        keypoints[:, None].to(tracker.measurement_cov),
-        None if confidence is None else confidence[:, None],
-        None if mask is None else mask[:, None],
-        stream.picked,
+    check_shape("keypoints", keypoints, [len(state.unseen), state.stream.n_keypoints, 2])
+    confidence, mask, covariance = (
+        None if x is None else x[:, None] for x in (confidence, mask, covariance)
     )
-    recent, seen = state.recent, None
-    if recent.uv.shape[1]:
-        recent = _shift_in(recent, measured)
-        seen = tracker._look(recent, None, -1)
-    if seen is not None:
-        seen = seen._replace(measured=seen.measured._replace(cov=measured.cov))
-    arms, filters = {}, {}
-    for side in _SIDES:
-        filters[side], arms[side] = _step_arm(tracker, side, state, measured, seen)
-    unseen = torch.where(measured.mask[:, 0].any(-1), 0, state.unseen + 1)
-    view = None if seen is None else seen.view
-    left, right = arms["left"], arms["right"]
-    reading = tracker._read_out(left, right, view)
-    stage, motion = tracker._motion_stage(), state.motion
-    if stage is not None:
-        motion, reading = stage.step(motion or stage.init(reading), reading)
-    track = tracker._poses(reading, left, right, measured.mask, None, ())
+    state, track = track_frames(tracker, state, keypoints[:, None], confidence, mask, covariance)
     pose = LivePose(
         track.joints2d[:, 0],
         track.joints3d[:, 0],
@@ -176,52 +160,105 @@ def track_frame(
         track.covariance3d[:, 0],
         track.observed[:, 0],
         track.log_evidence[:, 0],
-        unseen / (tracker.fps or 30.0),
+        state.unseen / (tracker.fps or 30.0),
         track.failed_at >= 0,
     )
-    return StreamState(recent, filters, motion, unseen, stream), pose
+    return state, pose
 
 
-def _shift_in(frames: MeasuredJoints, frame: MeasuredJoints) -> MeasuredJoints:
-    """The last N frames with the newest one in place of the oldest."""
-    cov = frame.cov.expand(*frame.uv.shape[:2], *frame.cov.shape[-3:])
-    pairs = zip(frames, frame._replace(cov=cov), strict=True)
-    return MeasuredJoints(*(torch.cat([old[:, 1:], new], 1) for old, new in pairs))
+def track_frames(
+    tracker: "UpperBodyTracker",
+    state: StreamState,
+    keypoints: Float[Tensor, "B T J 2"],
+    confidence: Float[Tensor, "B T J"] | None,
+    mask: Bool[Tensor, "B T J"] | None,
+    covariance: Float[Tensor, "B T J 2 2"] | None,
+) -> tuple[StreamState, "PoseTrack"]:
+    """Some more frames of every stream; see `UpperBodyTracker.advance`."""
+    stream, batch = state.stream, len(state.unseen)
+    check_shape("keypoints", keypoints, [batch, "T", stream.n_keypoints, 2])
+    n_frames = keypoints.shape[1]
+    if n_frames == 0:
+        raise InputError("keypoints must hold at least one frame, got none")
+    measured = tracker._in_prior_pixels(
+        keypoints.to(tracker.measurement_cov), confidence, mask, stream.picked, covariance
+    )
+    recent, seen = state.recent, None
+    if recent.uv.shape[1]:
+        frames = _append(recent, measured)
+        seen = tracker._look(frames, None, -n_frames)
+        recent = MeasuredJoints(*(x[:, n_frames:] for x in frames))
+    if seen is not None:
+        seen = seen._replace(measured=seen.measured._replace(cov=measured.cov))
+    arms, filters = {}, {}
+    for side in _SIDES:
+        filters[side], arms[side] = _advance_arm(tracker, side, state, measured, seen)
+    view = None if seen is None else seen.view
+    left, right = arms["left"], arms["right"]
+    reading = tracker._read_out(left, right, view)
+    stage, motion = tracker._motion_stage(), state.motion
+    if stage is not None:
+        motion, reading = stage.advance(motion or stage.init(reading), reading)
+    track = tracker._poses(reading, left, right, measured.mask, None, ())
+    unseen = _unseen(state.unseen, measured.mask.any(-1))
+    return StreamState(recent, filters, motion, unseen, stream), track
 
 
-def _step_arm(
+def _append(frames: MeasuredJoints, new: MeasuredJoints) -> MeasuredJoints:
+    """The last frames, and the new ones after them."""
+    cov = new.cov.expand(*new.uv.shape[:2], *new.cov.shape[-3:])
+    pairs = zip(frames, new._replace(cov=cov), strict=True)
+    return MeasuredJoints(*(torch.cat([old, latest], 1) for old, latest in pairs))
+
+
+def _unseen(before: Tensor, seen: Bool[Tensor, "B T"]) -> Tensor:
+    """Number of frames since anything was seen, [B]."""
+    n_frames = seen.shape[1]
+    frames = torch.arange(1, n_frames + 1, device=seen.device)
+    last = torch.where(seen, frames, torch.zeros_like(frames)).amax(1)
+    return torch.where(last > 0, n_frames - last, before + n_frames)
+
+
+def _advance_arm(
     tracker: "UpperBodyTracker",
     side: str,
     state: StreamState,
     measured: MeasuredJoints,
     seen: SeenInView | None,
 ) -> tuple[tuple[Any, ...], FilterOutput]:
-    """Next states of an arm's filters, and their estimate as a sequence of one frame."""
+    """Next states of an arm's filters, and their estimates."""
     joints, generator = state.stream.joints[side], state.stream.generators[side]
     models, states = _models(tracker, side, joints), state.filters[side]
     if seen is None:
         z, mask, cov = arm_measurements(_SIDES[side], joints, measured)
-        after, out = _step(models[0], states[0], z, mask, cov, generator)
+        after, out = _advance(models[0], states[0], z, mask, cov, generator)
         return (after,), out
     both, noise, hands = tracker._window_inputs(side, joints, seen)
-    after, out = _step(models[0], states[0], *both, noise, None)
-    after_hands, context = _step(models[1], states[1], *hands, None, None)
+    after, out = _advance(models[0], states[0], *both, noise, None)
+    after_hands, context = _advance(models[1], states[1], *hands, None, None)
     return (after, after_hands), pose_of_window(out, context, seen, _SIDES[side])
 
 
-def _step(
+def _advance(
     model: RecursiveFilter,
     state: Any,
-    z: Float[Tensor, "B 1 Z"],
-    mask: Bool[Tensor, "B 1 Z"],
+    z: Float[Tensor, "B T Z"],
+    mask: Bool[Tensor, "B T Z"],
     cov: Tensor | None,
     generator: Generators,
 ) -> tuple[Any, FilterOutput]:
-    """A step of a filter, with its estimate as a sequence of one frame."""
-    noise = cov[:, 0] if cov is not None and cov.ndim == 4 else cov
-    state, out = model.step(state, z[:, 0], mask[:, 0], noise, generator, return_cov=True)
-    lost = ~torch.isfinite(out.mean).all(-1)
-    failed_at = torch.where(lost, 0, -1)
-    cov = require_cov(out)[:, None]
-    mean, log_weights = out.mean[:, None], out.log_weights[:, None]
-    return state, FilterOutput(mean, log_weights, out.log_evidence[:, None], cov, failed_at)
+    """The frames through a filter, and its estimates."""
+    if isinstance(model, MixtureKalmanFilter) and model.is_memoryless:
+        out = model(z, mask, cov, return_cov=True)
+        state = state._replace(time=state.time + z.shape[1])
+    else:
+        steps = []
+        for t in range(z.shape[1]):
+            noise = cov[:, t] if cov is not None and cov.ndim == 4 else cov
+            state, step = model.step(state, z[:, t], mask[:, t], noise, generator, return_cov=True)
+            steps.append(step)
+        lengths = torch.full((len(z),), z.shape[1], device=z.device)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DegenerateFilterWarning)  # told by `failed`
+            out = collect(steps, lengths)
+    return state, out._replace(cov=require_cov(out))

@@ -19,7 +19,14 @@ from torchpose.body_view import (
     view_jacobian,
 )
 from torchpose.camera import PinholeCamera
-from torchpose.errors import CameraError, InputError, PriorError, check_finite, check_shape
+from torchpose.errors import (
+    CameraError,
+    InputError,
+    PriorError,
+    check_covariance,
+    check_finite,
+    check_shape,
+)
 from torchpose.filters import BootstrapParticleFilter, FilterOutput, MixtureKalmanFilter
 from torchpose.filters.base import Generators, RecursiveFilter
 from torchpose.measurements import (
@@ -221,6 +228,7 @@ class UpperBodyTracker(nn.Module):
         generator: Generators = None,
         lengths: Int[Tensor, " B"] | None = None,
         progress: bool = False,
+        covariance: Float[Tensor, "B T J 2 2"] | None = None,
     ) -> PoseTrack:
         """Track a batch of sequences.
 
@@ -233,6 +241,8 @@ class UpperBodyTracker(nn.Module):
             mask: [B, T, J], False = ignore the keypoint.
             generator: for the methods that draw: one, or a list of one for each sequence.
             lengths: [B], frames of each sequence. progress: whether to show a bar.
+            covariance: of every single keypoint, pixels squared, in place of `measurement_std`; that
+                of a missing keypoint is not looked at. Frames with the same covariances share work.
 
         Returns:
             `PoseTrack`.
@@ -241,7 +251,7 @@ class UpperBodyTracker(nn.Module):
             ShapeError, InputError: wrong shapes, infinite values, nothing measured in a sequence or
             for longer than `max_gap`. SkeletonError: unknown names.
         """
-        measured, notes = self._measure(keypoints, confidence, names, mask, lengths)
+        measured, notes = self._measure(keypoints, confidence, names, mask, lengths, covariance)
         sources = generators_of_arms(generator)
         seen = self._look(measured, lengths)
         arms = {
@@ -283,6 +293,7 @@ class UpperBodyTracker(nn.Module):
         keypoints: Float[Tensor, "B J 2"],
         confidence: Float[Tensor, "B J"] | None = None,
         mask: Bool[Tensor, "B J"] | None = None,
+        covariance: Float[Tensor, "B J 2 2"] | None = None,
     ) -> tuple[StreamState, LivePose]:
         """Track one more frame of each stream: the same numbers as that frame of `forward`.
 
@@ -292,7 +303,8 @@ class UpperBodyTracker(nn.Module):
 
         Args:
             state: from `init` or the step before; it is not changed, so a step may be repeated
-                (but a generator goes on). keypoints, confidence, mask: of one frame, as in `forward`.
+                (but a generator goes on). keypoints, confidence, mask, covariance: of one frame, as
+                in `forward`.
 
         Returns:
             The next state, and the `LivePose` of this frame.
@@ -300,7 +312,30 @@ class UpperBodyTracker(nn.Module):
         Raises:
             ShapeError, InputError: wrong shapes, infinite values.
         """
-        return streaming.track_frame(self, state, keypoints, confidence, mask)
+        return streaming.track_frame(self, state, keypoints, confidence, mask, covariance)
+
+    def advance(
+        self,
+        state: StreamState,
+        keypoints: Float[Tensor, "B T J 2"],
+        confidence: Float[Tensor, "B T J"] | None = None,
+        mask: Bool[Tensor, "B T J"] | None = None,
+        covariance: Float[Tensor, "B T J 2 2"] | None = None,
+    ) -> tuple[StreamState, PoseTrack]:
+        """Track some more frames of each stream: the same numbers as `step` for one after the other.
+
+        Long recordings are tracked so in bounded memory, and quicker than frame by frame.
+
+        Args:
+            state: as in `step`. keypoints, confidence, mask, covariance: as in `forward`.
+
+        Returns:
+            The next state, and the poses of these frames.
+
+        Raises:
+            ShapeError, InputError: wrong shapes, no frames, infinite values.
+        """
+        return streaming.track_frames(self, state, keypoints, confidence, mask, covariance)
 
     def _measure(
         self,
@@ -309,6 +344,7 @@ class UpperBodyTracker(nn.Module):
         names: Sequence[str] | None,
         mask: Tensor | None,
         lengths: Tensor | None,
+        covariance: Tensor | None,
     ) -> tuple[MeasuredJoints, tuple[str, ...]]:
         """The eight joints in the prior's pixels, checked; and what was assumed."""
         check_shape("keypoints", keypoints, ["B", "T", "J", 2])
@@ -319,15 +355,25 @@ class UpperBodyTracker(nn.Module):
             )
         info = self.prior.info
         picked = pick_joints(keypoints.shape[2], names, self.neck, info.neck, info.hand)
-        measured = self._in_prior_pixels(keypoints, confidence, mask, picked)
+        measured = self._in_prior_pixels(keypoints, confidence, mask, picked, covariance)
         check_gaps(measured.mask, lengths, self.max_gap, self.fps or 30.0)
         return measured, picked.notes
 
     def _in_prior_pixels(
-        self, keypoints: Tensor, confidence: Tensor | None, mask: Tensor | None, picked: Picked
+        self,
+        keypoints: Tensor,
+        confidence: Tensor | None,
+        mask: Tensor | None,
+        picked: Picked,
+        covariance: Tensor | None,
     ) -> MeasuredJoints:
-        measured = measure_joints(keypoints, confidence, mask, picked.indices, self.measurement_cov)
         own, prior = self.camera.matrix.to(keypoints), self.prior.info.matrix.to(keypoints)
+        if covariance is not None:
+            covariance = _checked_covariance(covariance, keypoints)
+            covariance = map_pixel_covariance(covariance, own, prior)
+        measured = measure_joints(
+            keypoints, confidence, mask, picked.indices, self.measurement_cov, covariance
+        )
         measured = measured._replace(uv=map_pixels(measured.uv, own, prior))
         if not picked.middle:
             return measured
@@ -590,6 +636,18 @@ def _first_failure(left: FilterOutput, right: FilterOutput) -> Tensor:
     failures = torch.stack([left.failed_at, right.failed_at])
     first = failures.where(failures >= 0, n_frames).amin(0)
     return torch.where((failures >= 0).any(0), first, -1)
+
+
+def _checked_covariance(
+    covariance: Float[Tensor, "B T J 2 2"], keypoints: Float[Tensor, "B T J 2"]
+) -> Float[Tensor, "B T J 2 2"]:
+    """The covariances of the keypoints that are there, and the identity for the others."""
+    check_shape("covariance", covariance, [*keypoints.shape, 2])
+    eye = torch.eye(2).to(keypoints)
+    there = keypoints.isfinite().all(-1)[..., None, None]
+    covariance = torch.where(there, covariance.to(keypoints), eye)
+    check_covariance("covariance", covariance)
+    return covariance
 
 
 def _of_anchors(cov: Float[Tensor, "*batch 8 2 2"]) -> Float[Tensor, "*batch 2"]:

@@ -82,6 +82,13 @@ class ConstantVelocityFilter(nn.Module):
         state, _ = self._advance(state, z)
         return state, state.mean[:, 0]
 
+    def advance(
+        self, state: ConstantVelocityState, z: Float[Tensor, "B T N"]
+    ) -> tuple[ConstantVelocityState, Float[Tensor, "B T N"]]:
+        """Some more frames: the same numbers as `step` for one after the other."""
+        state, means, _ = self._run(state, z)
+        return state, means[:, :, 0]
+
     def _advance(
         self, state: ConstantVelocityState, z: Tensor
     ) -> tuple[ConstantVelocityState, Tensor]:
@@ -94,17 +101,18 @@ class ConstantVelocityFilter(nn.Module):
     def forward(self, z: Float[Tensor, "B T N"]) -> Float[Tensor, "B T N"]:
         """Filtered numbers: each uses its own frame and those before."""
         check_shape("z", z, ["B", "T", "N"])
-        return self._filter(z)[0][:, :, 0]
+        return self.advance(self.init(z[:, 0]), z)[1]
 
-    def _filter(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Filtered means, and filtered minus predicted, [B, T, 2, N]."""
-        state = self.init(z[:, 0])
+    def _run(
+        self, state: ConstantVelocityState, z: Tensor
+    ) -> tuple[ConstantVelocityState, Tensor, Tensor]:
+        """The state after all frames, filtered means, and filtered minus predicted, [B, T, 2, N]."""
         means, corrections = [], []
         for frame in z.unbind(1):
             state, correction = self._advance(state, frame)
             means.append(state.mean)
             corrections.append(correction)
-        return torch.stack(means, 1), torch.stack(corrections, 1)
+        return state, torch.stack(means, 1), torch.stack(corrections, 1)
 
     def smooth(
         self,
@@ -124,7 +132,7 @@ class ConstantVelocityFilter(nn.Module):
         check_shape("z", z, ["B", "T", "N"])
         if lag is not None and lag < 0:
             raise InputError(f"lag must be at least 0 frames, or None for all, got {lag}")
-        means, corrections = self._filter(z)
+        _, means, corrections = self._run(self.init(z[:, 0]), z)
         n_frames = z.shape[1]
         frames = torch.arange(n_frames, device=z.device)
         if lengths is None:

@@ -7,7 +7,7 @@ all: `run_memoryless` conditions the mixture on all of them at once.
 """
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -31,8 +31,9 @@ __all__ = [
 ]
 
 _SHARED_FRAMES = 1024  # at a time, where they share their gains
-_PATTERNS = 24  # of measured dimensions whose gains are kept; about 4 MB each
+_PATTERNS = 24  # of measured dimensions and noise whose gains are kept; about 4 MB each
 _OWN_FRAMES = 32  # at a time, where each has gains of its own
+_LEAST_SHARE = 2  # frames to a noise, on average, below which sharing does not pay
 
 
 def frame_weights(
@@ -116,16 +117,26 @@ class _Group(NamedTuple):
 def _groups(frames: Measurements) -> Iterator[_Group]:
     """Frames that measure the same dimensions with the same noise share their gains."""
     z, mask = frames.z.flatten(0, 1), frames.mask.flatten(0, 1)
-    if frames.cov.ndim == 4:
-        noise = frames.cov.flatten(0, 1)
-        for rows in torch.arange(len(z), device=z.device).split(_OWN_FRAMES):
-            yield _Group(rows, z[rows], mask[rows][:, None], noise[rows][:, None])
+    noise = None if frames.cov.ndim == 2 else frames.cov.flatten(0, 1)
+    settings = mask if noise is None else torch.cat([mask.to(noise), noise.flatten(1)], 1)
+    if noise is not None and noise.requires_grad:
+        yield from _groups_of_own(z, mask, noise)
         return
-    patterns, group = torch.unique(mask, dim=0, return_inverse=True)
-    sizes = torch.bincount(group, minlength=len(patterns)).tolist()
-    for pattern, same in zip(patterns, group.argsort().split(sizes), strict=True):
+    _, group = torch.unique(settings, dim=0, return_inverse=True)
+    sizes = torch.bincount(group)
+    if noise is not None and len(z) > 1 and len(sizes) > len(z) / _LEAST_SHARE:
+        yield from _groups_of_own(z, mask, noise)
+        return
+    for same in group.argsort(stable=True).split(sizes.tolist()):
+        own_noise = frames.cov if noise is None else noise[same[0]]
         for rows in same.split(_SHARED_FRAMES):
-            yield _Group(rows, z[rows], pattern, frames.cov)
+            yield _Group(rows, z[rows], mask[same[0]], own_noise)
+
+
+def _groups_of_own(z: Tensor, mask: Tensor, noise: Tensor) -> Iterator[_Group]:
+    """Frames that have gains of their own, some at a time."""
+    for rows in torch.arange(len(z), device=z.device).split(_OWN_FRAMES):
+        yield _Group(rows, z[rows], mask[rows][:, None], noise[rows][:, None])
 
 
 def _condition(model: "MixtureKalmanFilter", group: _Group) -> tuple[Tensor, Tensor, Tensor]:
@@ -156,19 +167,23 @@ def _gain(model: "MixtureKalmanFilter", group: _Group) -> tuple[Gain, Tensor]:
 
 
 class FrameGains:
-    """The gains of the latest patterns of measured dimensions, while model and R stay as they are."""
+    """The gains of the latest patterns of measured dimensions and noise, while the model stays."""
 
     def __init__(self) -> None:
-        self._made_for: tuple[Tensor, Tensor] | None = None
-        self._found: dict[tuple[bool, ...], tuple[Gain, Tensor]] = {}
+        self._made_for: Tensor | None = None
+        self._found: dict[tuple[Any, ...], tuple[Gain, Tensor]] = {}
 
     def get(
         self, model: "MixtureKalmanFilter", noise: Tensor, mask: Tensor
     ) -> tuple[Gain, Tensor] | None:
-        """What is known for this pattern."""
-        if not self._suits(model, noise):
+        """What is known for this pattern and noise."""
+        if self._made_for is not model.covariances or _wants_gradient(model, noise):
             return None
-        return self._found.get(tuple(mask.tolist()))
+        key = _key(noise, mask)
+        found = self._found.pop(key, None)
+        if found is not None:
+            self._found[key] = found  # the latest one used is the last to go
+        return found
 
     def put(
         self,
@@ -177,20 +192,23 @@ class FrameGains:
         mask: Tensor,
         value: tuple[Gain, Tensor],
     ) -> None:
-        """Keep it, unless a gradient runs through it; the oldest of many goes."""
+        """Keep it, unless a gradient runs through it; of many, the one unused longest goes."""
         if value[1].requires_grad:
             return
-        if not self._suits(model, noise):
-            self._made_for, self._found = (model.covariances, noise.clone()), {}
+        if self._made_for is not model.covariances:
+            self._made_for, self._found = model.covariances, {}
         if len(self._found) >= _PATTERNS:
             self._found.pop(next(iter(self._found)))
-        self._found[tuple(mask.tolist())] = value
+        self._found[_key(noise, mask)] = value
 
-    def _suits(self, model: "MixtureKalmanFilter", noise: Tensor) -> bool:
-        if self._made_for is None:
-            return False
-        covariances, own_noise = self._made_for
-        return covariances is model.covariances and torch.equal(own_noise, noise)
+
+def _wants_gradient(model: "MixtureKalmanFilter", noise: Tensor) -> bool:
+    wanted = noise.requires_grad or model.covariances.requires_grad
+    return torch.is_grad_enabled() and wanted
+
+
+def _key(noise: Tensor, mask: Tensor) -> tuple[Any, ...]:
+    return (*mask.tolist(), *noise.detach().flatten().tolist())
 
 
 def _in_order(parts: list[tuple[Tensor, Tensor]]) -> Tensor:

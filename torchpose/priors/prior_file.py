@@ -94,7 +94,8 @@ class PriorInfo:
     @property
     def matrix(self) -> Tensor:
         """Camera matrix K [3, 3], pixels."""
-        return self.camera.matrix
+        rows = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
+        return torch.tensor(rows, dtype=torch.float64)
 
     def to_json(self) -> str:
         """Text that `from_json` reads back."""
