@@ -92,7 +92,7 @@ def test_known_faces_are_searched_where_they_are():
     _, _, detector = follow([face] * 12, every=2, whole_every=10)
     assert detector.asked[:3] == [None, None, None]  # until it may be used
     later = detector.asked[3:]
-    assert [region is None for region in later] == [False, False, False, True]
+    assert [region is None for region in later] == [False, False, False, False, True]
     assert later[0].left == pytest.approx(201, abs=3) and later[0].right == pytest.approx(
         399, abs=3
     )
@@ -144,3 +144,28 @@ def test_faces_of_signers_are_followed_without_false_ones(clip):
             faces = state.mean[tracker.usable(state)]
             assert len(faces) == 1
             assert torch.dist(faces[0, :2], nose[t]) < 40
+
+
+@pytest.mark.parametrize("size", [20.0, 90.0, 400.0])
+def test_known_faces_are_looked_for_at_the_size_that_the_detector_likes(size):
+    """A detector that finds the brightest square, whatever its size, and remembers what it saw."""
+    seen = []
+
+    def brightest(image, region=None):
+        rows, columns = np.nonzero(image > 128)
+        side = float(columns.max() - columns.min() + 1)
+        if region is not None:
+            seen.append((side, region.smallest, region.largest))
+        place = [columns.mean(), rows.mean(), side]
+        return torch.tensor([place], dtype=torch.float64)
+
+    image = np.zeros((900, 1200), np.uint8)
+    half = round(size / 2)
+    image[400 - half : 400 + half, 500 - half : 500 + half] = 255
+    tracker = FaceTracker(brightest, every=1, detail=80.0)
+    state = tracker.init()
+    for _ in range(8):
+        state = tracker.step(state, image)
+    np.testing.assert_allclose(state.mean[0, :3], [499.5, 399.5, size], atol=0.02 * size)
+    assert all(side == pytest.approx(80.0, rel=0.2) for side, _, _ in seen)
+    assert all(low < side < high for side, low, high in seen)
