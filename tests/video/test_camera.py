@@ -1,0 +1,144 @@
+"""Cameras, played by a fake."""
+
+import cv2
+import numpy as np
+import pytest
+
+from torchpose.errors import FileFormatError, InputError
+from torchpose.video import CameraSource, open_video
+from torchpose.video import camera as module
+
+WARM_UP = 10
+
+
+class FakeCapture:
+    """Gives `frames` blue images, at its own pace; its clock is the test's."""
+
+    def __init__(self, frames, fps=30.0, opened=True, pace=None, failing=()):
+        self.left, self.fps, self.opened = frames, fps, opened
+        self.pace, self.failing = pace, set(failing)
+        self.reads, self.now, self.released, self.asked = 0, 0.0, 0, {}
+        self.size = (48, 64)
+
+    def isOpened(self):
+        return self.opened
+
+    def read(self):
+        self.reads += 1
+        if self.reads in self.failing or self.left == 0:
+            return False, None
+        self.left -= 1
+        self.now += 1 / (self.pace or self.fps)
+        image = np.zeros((*self.size, 3), np.uint8)
+        image[..., 0] = 200
+        return True, image
+
+    def get(self, prop):
+        return self.fps if prop == cv2.CAP_PROP_FPS else 0.0
+
+    def set(self, prop, value):
+        self.asked[prop] = value
+        return True
+
+    def release(self):
+        self.released += 1
+
+
+@pytest.fixture
+def camera(monkeypatch):
+    """Makes a source on a fake whose clock is the only one."""
+
+    def make(*args, ask=None, **kwargs):
+        fake = FakeCapture(*args, **kwargs)
+        monkeypatch.setattr(module.time, "monotonic", lambda: fake.now)
+        monkeypatch.setattr(module.time, "sleep", lambda seconds: None)
+        return CameraSource(3, ask, capture=lambda index: fake), fake
+
+    return make
+
+
+def test_frames_with_the_times_of_the_clock(camera):
+    source, fake = camera(WARM_UP + 20)
+    assert (source.name, source.fps, source.size) == ("camera 3", 30, (64, 48))
+    assert source.n_frames is None
+    assert not source.reopenable
+    assert source.notes == []
+    frames = list(source)
+    assert [frame.index for frame in frames] == list(range(20))
+    np.testing.assert_allclose([frame.time for frame in frames], np.arange(20) / 30, atol=1e-9)
+    assert frames[0].image[0, 0].tolist() == [0, 0, 200]
+    assert frames[0].image.flags.c_contiguous
+    source.close()
+    source.close()
+    assert fake.released == 1
+
+
+def test_unplugged_while_reading(camera):
+    source, _ = camera(WARM_UP + 5)
+    assert len(list(source)) == 5
+    assert "no more frames after 5: unplugged" in source.notes[-1]
+
+
+def test_a_read_that_fails_now_and_then_is_no_end(camera):
+    source, _ = camera(WARM_UP + 20, failing=[13, 17, 18, 19])
+    assert len(list(source)) == 20
+
+
+def test_a_slow_camera(camera):
+    source, _ = camera(WARM_UP + 5, fps=30.0, pace=15.0)
+    assert source.fps == pytest.approx(15)
+    assert "says 30 frames per second and gave 15" in source.notes[0]
+
+
+@pytest.mark.parametrize("reported", [0.0, -1.0, 1e6])
+def test_a_camera_that_does_not_know_its_rate(camera, reported):
+    source, _ = camera(WARM_UP + 5, fps=reported, pace=30.0)
+    assert source.fps == 30
+
+
+def test_a_rate_is_asked_for(camera):
+    _, fake = camera(WARM_UP + 5)
+    assert cv2.CAP_PROP_FPS not in fake.asked
+    _, fake = camera(WARM_UP + 5, ask=60.0)
+    assert fake.asked[cv2.CAP_PROP_FPS] == 60
+
+
+def test_not_there_in_use_or_silent(camera):
+    with pytest.raises(InputError, match="camera 3 cannot be opened"):
+        camera(5, opened=False)
+    with pytest.raises(InputError, match="gives no frames"):
+        camera(0)
+
+
+def test_what_could_not_be_prepared_is_released():
+    fake = FakeCapture(0)
+    with pytest.raises(InputError):
+        CameraSource(0, capture=lambda index: fake)
+    assert fake.released == 1
+
+
+def test_a_size_that_changes(camera):
+    source, fake = camera(WARM_UP + 5)
+    next(source)
+    fake.size = (24, 32)
+    with pytest.raises(FileFormatError, match="expected frames of 64x48"):
+        next(source)
+
+
+def test_cannot_be_read_twice(camera):
+    with pytest.raises(InputError, match="cannot be read a second time"):
+        camera(WARM_UP + 5)[0].reopen()
+
+
+def test_no_camera_on_this_machine(capfd):
+    with pytest.raises(InputError, match="camera 97 cannot be opened"):
+        open_video("97")
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("fps", [0.0, -1.0, float("nan")])
+def test_impossible_settings(fps):
+    with pytest.raises(InputError, match="fps must be positive"):
+        CameraSource(0, fps)
+    with pytest.raises(InputError, match="0 or more"):
+        CameraSource(-1)

@@ -1,0 +1,21 @@
+"""Video in and out: files, folders of images and cameras; H.264 files that a browser plays."""
+
+from torchpose.video.base import Image, VideoFrame, VideoSource
+from torchpose.video.camera import CameraSource
+from torchpose.video.file import FileSource
+from torchpose.video.images import FolderSource
+from torchpose.video.prefetch import prefetch
+from torchpose.video.source import open_video
+from torchpose.video.writer import VideoWriter
+
+__all__ = [
+    "CameraSource",
+    "FileSource",
+    "FolderSource",
+    "Image",
+    "VideoFrame",
+    "VideoSource",
+    "VideoWriter",
+    "open_video",
+    "prefetch",
+]
