@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from torchpose.errors import InputError, check_shape
@@ -31,13 +31,13 @@ class SkinState(NamedTuple):
     """Colours of B persons, exponentially averaged; each sums to one.
 
     Attributes:
-        face, clothes, far: [B, 8, 32, 32] over L, a and b. frames: seen so far.
+        face, clothes, far: [B, 8, 32, 32] over L, a and b. frames: seen so far [B].
     """
 
     face: Float[Tensor, "B 8 32 32"]
     clothes: Float[Tensor, "B 8 32 32"]
     far: Float[Tensor, "B 8 32 32"]
-    frames: int
+    frames: Int[Tensor, " B"]
 
 
 def rgb_to_lab(images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 H W"]:
@@ -108,17 +108,21 @@ class SkinModel(nn.Module):
         self.register_buffer("lowest", torch.tensor(_LOWEST))
         self.register_buffer("width", torch.tensor(_WIDTH))
         for axis, kernel in enumerate(_KERNELS):
-            self.register_buffer(f"kernel{axis}", torch.tensor(kernel))
+            self.register_buffer(f"smooth{axis}", _band(BINS[axis], kernel))
 
     lowest: Tensor
     width: Tensor
+    smooth0: Tensor
+    smooth1: Tensor
+    smooth2: Tensor
 
     def init(self, batch_size: int) -> SkinState:
         """Nothing is known yet."""
         if batch_size < 1:
             raise InputError(f"batch_size must be at least 1, got {batch_size}")
         even = self.lowest.new_full((batch_size, *BINS), 1 / np.prod(BINS))
-        return SkinState(even, even.clone(), even.clone(), 0)
+        frames = torch.zeros(batch_size, dtype=torch.long, device=even.device)
+        return SkinState(even, even.clone(), even.clone(), frames)
 
     def step(
         self,
@@ -145,10 +149,25 @@ class SkinModel(nn.Module):
         if not bool((faces[:, 2] > 0).all()):
             raise InputError(f"faces must have a positive size, got {faces[:, 2].tolist()}")
         bins = self.bins(lab)
-        state = self._learn(state, bins, faces.to(lab), hands)
-        return state, self.probability(
-            self.log_ratio(state).flatten(1).gather(1, bins.flatten(1)).view_as(lab[:, 0])
-        )
+        state = self.learn(state, bins, faces.to(self.lowest), hands)
+        return state, self.find(state, bins)
+
+    def find(self, state: SkinState, bins: Int[Tensor, "B H W"]) -> Float[Tensor, "B H W"]:
+        """Probability of skin of pixels whose bins are known (`bins`, `byte_bins`)."""
+        table = self.probability(self.log_ratio(state)).flatten()
+        first = torch.arange(len(bins), dtype=bins.dtype, device=bins.device) * int(np.prod(BINS))
+        flat = (bins + first[:, None, None]).flatten()
+        return table.index_select(0, flat).view(bins.shape)
+
+    def byte_bins(self, lab: UInt8[Tensor, "B 3 H W"]) -> Int[Tensor, "B H W"]:
+        """Numbers of the bins of Lab in bytes, as OpenCV has it: 255/100 L, a + 128, b + 128.
+
+        The steps of L are 32 of 255 instead of 12.5 of 100, which is the same to 0.4 %.
+        """
+        light, a, b = lab.to(torch.int16).unbind(1)
+        a = ((a - 104) >> 1).clamp_(0, BINS[1] - 1)
+        b = (((b - 104) * 171) >> 9).clamp_(0, BINS[2] - 1)  # a third, without a division
+        return (((light >> 5) << 10) + (a << 5) + b).int()
 
     def bins(self, lab: Float[Tensor, "B 3 H W"]) -> Int[Tensor, "B H W"]:
         """Number of each pixel's bin; colours beyond the histogram count to its border."""
@@ -168,51 +187,80 @@ class SkinModel(nn.Module):
         bounded = log_ratio.clamp(-_LARGEST_RATIO, _LARGEST_RATIO)
         return torch.sigmoid(self.slope * (bounded - self.bias))
 
-    def _learn(
-        self, state: SkinState, bins: Tensor, faces: Tensor, hands: Tensor | None
+    def learn(
+        self,
+        state: SkinState,
+        bins: Int[Tensor, "B H W"],
+        faces: Float[Tensor, "B 3"],
+        hands: Float[Tensor, "B H W"] | None = None,
+        valid: Bool[Tensor, "B H W"] | None = None,
     ) -> SkinState:
-        hands = torch.zeros_like(bins, dtype=faces.dtype) if hands is None else hands
-        in_face, in_clothes, in_far = _parts(faces, bins.shape[1:])
-        skin = in_face & (hands < _HAND_IN_FACE)
-        if state.frames:
-            ratio = self.log_ratio(state).flatten(1).gather(1, bins.flatten(1)).view(bins.shape)
-            skin = skin & (ratio > _HAIR)
-        clothes = in_clothes & (hands < _HAND_ELSEWHERE)
-        count = [part.flatten(1).sum(1).to(faces) for part in (skin, in_face, clothes, in_far)]
-        enough = count[0] > (_LEAST_FACE * count[1] if state.frames else 0)
-        face = self._averaged(state.face, self._histogram(bins, skin), enough, state.frames)
-        enough = count[3] >= _LEAST_PIXELS
-        far = self._averaged(state.far, self._histogram(bins, in_far), enough, state.frames)
-        enough = count[2] >= _LEAST_PIXELS
-        worn = self._averaged(state.clothes, self._histogram(bins, clothes), enough, state.frames)
-        return SkinState(face, worn, far, state.frames + 1)
+        """What is known after a frame.
 
-    def _averaged(self, old: Tensor, new: Tensor, usable: Tensor, frames: int) -> Tensor:
-        decay = self.decay if frames else 0.0
-        mixed = decay * old + (1 - decay) * new
-        return torch.where(usable[:, None, None, None], mixed, old)
+        Args:
+            state, faces, hands: see `step`. bins: of every pixel, or of every second one; faces are
+                in pixels of this tensor.
+            valid: which pixels belong to the image; the others teach nothing.
+        """
+        known = state.frames > 0
+        patch, clothes, far = self._parts(bins, faces, hands, valid)
+        hair = known[:, None] & (self.log_ratio(state).flatten(1) <= _HAIR)
+        skin = torch.where(hair, 0.0, patch[:, 0])
+        least = torch.where(known, _LEAST_FACE * patch.sum((1, 2)), 0.0)
+        counts = torch.stack([skin, clothes, far], 1)
+        total = counts.sum(2)
+        usable = torch.cat([total[:, :1] > least[:, None], total[:, 1:] >= _LEAST_PIXELS], 1)
+        old = torch.stack(state[:3], 1)
+        decay = torch.where(known, self.decay, 0.0).to(old)[:, None].expand_as(usable)
+        share = torch.where(usable, 1 - decay, 0.0)[..., None, None, None]
+        mixed = old.lerp(self._smoothed(counts), share)
+        return SkinState(mixed[:, 0], mixed[:, 1], mixed[:, 2], state.frames + 1)
 
-    def _histogram(self, bins: Tensor, part: Tensor) -> Tensor:
-        """Smoothed shares of the colours of a part of each image."""
-        counts = self.lowest.new_zeros(len(bins), int(np.prod(BINS)))
-        counts.scatter_add_(1, bins.flatten(1), part.flatten(1).to(counts))
-        smooth = counts.view(-1, 1, *BINS)
-        for axis in range(3):
-            kernel: Tensor = getattr(self, f"kernel{axis}")
-            shape, padding = [1, 1, 1], [0, 0, 0]
-            shape[axis], padding[axis] = len(kernel), len(kernel) // 2
-            smooth = torch.nn.functional.conv3d(
-                smooth, kernel.view(1, 1, *shape), padding=tuple(padding)
-            )
-        return smooth[:, 0] / smooth.flatten(1).sum(1).clamp_min(1e-6)[:, None, None, None]
+    def _parts(
+        self, bins: Tensor, faces: Tensor, hands: Tensor | None, valid: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Colours of the face and of hands in front of it [B, 2, C], clothes and far [B, C]."""
+        across, down = _from_face(faces, bins.shape[1:])
+        face = (across < _FACE[0]) & (down > _FACE[1]) & (down < _FACE[2])
+        clothes = (across < _CLOTHES[0]) & (down > _CLOTHES[1])
+        far = (across > _FAR[0]) | (down < _FAR[1])
+        label = face.to(bins.dtype) + 3 * clothes.to(bins.dtype) + 4 * far.to(bins.dtype)
+        if hands is not None:
+            label = label + (face & (hands >= _HAND_IN_FACE)).to(bins.dtype)
+            label = label.masked_fill_(clothes & (hands >= _HAND_ELSEWHERE), 0)
+        if valid is not None:
+            label = label * valid
+        counts = self._counts(bins, label)
+        return counts[:, 1:3], counts[:, 3], counts[:, 4]
+
+    def _counts(self, bins: Tensor, label: Tensor) -> Tensor:
+        """Number of pixels of each label (0 to 4) and bin [B, 5, C]."""
+        batch, size = len(bins), int(np.prod(BINS))
+        first = 5 * torch.arange(batch, dtype=bins.dtype, device=bins.device)
+        index = (first[:, None, None] + label) * size + bins
+        counts = torch.bincount(index.flatten(), minlength=5 * batch * size)
+        return counts.view(batch, 5, size).to(self.lowest)
+
+    def _smoothed(self, counts: Tensor) -> Tensor:
+        """Shares of the colours [B, 3, 8, 32, 32], each axis smoothed by a product with a band."""
+        smooth = counts.view(-1, *BINS) @ self.smooth2
+        smooth = self.smooth1 @ smooth
+        smooth = (self.smooth0 @ smooth.flatten(2)).view(*counts.shape[:2], *BINS)
+        return smooth / smooth.sum((2, 3, 4), keepdim=True).clamp_min(1e-6)
 
 
-def _parts(faces: Tensor, shape: torch.Size) -> tuple[Tensor, Tensor, Tensor]:
-    """Where the middle of the face, the clothes and the far background are, bool [B, H, W]."""
+def _band(size: int, kernel: tuple[float, ...]) -> Tensor:
+    """Symmetric matrix of a convolution with a symmetric kernel, zero beyond the ends."""
+    middle, eye = len(kernel) // 2, torch.eye(size)
+    rows = torch.nn.functional.pad(eye, (middle, middle))
+    return sum(  # type: ignore[return-value]
+        weight * rows[:, i : i + size] for i, weight in enumerate(kernel)
+    )
+
+
+def _from_face(faces: Tensor, shape: torch.Size) -> tuple[Tensor, Tensor]:
+    """Distance to the side [B, 1, W] and height below [B, H, 1] the face, in its sizes."""
     height, width = shape
     x, y, size = faces[:, :, None, None].unbind(1)
     across = ((torch.arange(width, device=faces.device) - x) / size).abs()
-    down = (torch.arange(height, device=faces.device)[:, None] - y) / size
-    face = (across < _FACE[0]) & (down > _FACE[1]) & (down < _FACE[2])
-    clothes = (across < _CLOTHES[0]) & (down > _CLOTHES[1])
-    return face, clothes, (across > _FAR[0]) | (down < _FAR[1])
+    return across, (torch.arange(height, device=faces.device)[:, None] - y) / size

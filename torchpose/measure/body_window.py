@@ -1,0 +1,240 @@
+"""Windows about persons, in units of their faces.
+
+All that looks for hands works in a window that goes with the person: a face height B is always ten
+cells, so the cost of a frame does not depend on its size, and constants hold for every distance. A
+window stays where it is while the face is near its anchor, so what rests in the image rests in the
+window. Coordinates of a window are in B from its anchor; those of a map of the window in its cells,
+the first cell's centre being 0.
+"""
+
+from functools import cache, lru_cache
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchpose.errors import InputError, check_shape
+
+__all__ = [
+    "CELL",
+    "CELLS",
+    "COLOURS",
+    "EVIDENCE",
+    "cell_centres",
+    "cells_to_pixels",
+    "cut_windows",
+    "follow_faces",
+    "gaussian_matrix",
+    "inside_image",
+    "move_maps",
+    "pixels_to_cells",
+    "place_windows",
+]
+
+Image = NDArray[np.uint8]
+CELL = 0.1  # side of a cell, in B
+CELLS = (80, 96)  # rows and columns of cells
+EVIDENCE, COLOURS = 2, 4  # pixels of the finer maps for each cell
+_LEFT, _TOP = -0.5 * CELLS[1] * CELL, -2.4  # edges, in B from the anchor
+_FINEST = 3  # up to this many pixels to one are averaged; of more, some are left out
+
+
+def place_windows(faces: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """Anchors (x, y, B) near faces, such that the window is made of whole pixels.
+
+    Place and size differ by less than 1 % of B and about 1 % from the face's. The window then is a
+    plain part of the image, which is quicker to cut than one between the pixels.
+    """
+    check_shape("faces", faces, ["N", 3])
+    if not bool((torch.isfinite(faces).all(1) & (faces[:, 2] > 0)).all()):
+        raise InputError(f"faces must be finite and of positive size, got {faces.tolist()}")
+    faces = faces.double()
+    step = _pixels_to_one(faces[:, 2])
+    columns = (CELLS[1] * CELL * faces[:, 2] / step / 6).round().clamp_min(1) * 6
+    size = columns * step / (CELLS[1] * CELL)
+    corner = faces[:, :2] + size[:, None] * faces.new_tensor([_LEFT, _TOP]) + 0.5
+    corner = (corner / step[:, None]).round() * step[:, None] - 0.5
+    return torch.cat([corner - size[:, None] * faces.new_tensor([_LEFT, _TOP]), size[:, None]], 1)
+
+
+def follow_faces(
+    anchors: Float[Tensor, "N 3"],
+    faces: Float[Tensor, "N 3"],
+    stray: float = 0.5,
+    rescale: float = 1.15,
+) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, " N"]]:
+    """Anchors for the next frame: the same unless the face has gone too far.
+
+    Args:
+        anchors: (x, y, B) of the windows, pixels. faces: (x, y, B), pixels.
+        stray: how far a face may be from its anchor, in B.
+        rescale: ratio of sizes that is borne.
+
+    Returns:
+        Anchors, and which ones were moved.
+    """
+    size = anchors[:, 2]
+    far = (faces[:, :2] - anchors[:, :2]).abs().amax(1) > stray * size
+    moved = far | ((faces[:, 2] / size).log().abs() > float(np.log(rescale)))
+    if not bool(moved.any()):
+        return anchors, moved
+    placed = place_windows(faces).to(anchors)
+    return torch.where(moved[:, None], placed, anchors), moved
+
+
+def cut_windows(
+    image: Image, anchors: Float[Tensor, "N 3"], replicate: bool = True
+) -> list[NDArray[np.uint8]]:
+    """What lies in each window, [320, 384] (or with channels), four pixels for a cell.
+
+    OpenCV cuts and resizes, one person at a time: parts of an image of different sizes are no tensor.
+    The image is averaged over whole blocks of pixels, then resized by bilinear interpolation.
+
+    Args:
+        image: [H, W] or [H, W, C]. anchors: from `place_windows`.
+        replicate: repeat the border of the image beyond it; else zeros.
+    """
+    import cv2
+
+    rows, columns = CELLS
+    border = cv2.BORDER_REPLICATE if replicate else cv2.BORDER_CONSTANT
+    steps = _pixels_to_one(anchors[:, 2]).int().tolist()
+    cut: list[NDArray[np.uint8]] = []
+    for (x, y, size), step in zip(anchors.tolist(), steps, strict=True):
+        width = round(columns * CELL * size / step)
+        height = width * rows // columns
+        left = round((x + _LEFT * size + 0.5) / step)
+        top = round((y + _TOP * size + 0.5) / step)
+        part, beyond = _blocks(image, left, top, width, height, step)
+        whole = cv2.copyMakeBorder(part, *beyond, border) if any(beyond) else part
+        target = (columns * COLOURS, rows * COLOURS)
+        cut.append(cv2.resize(whole, target, interpolation=cv2.INTER_LINEAR))  # type: ignore[arg-type]
+    return cut
+
+
+def _pixels_to_one(size: Tensor) -> Tensor:
+    """Pixels of the image, along a side, that become about one of the window."""
+    step = (size * CELL / COLOURS).round().clamp_min(1)
+    return torch.where(step > _FINEST, 2 * (step / 2).round(), step)
+
+
+def _blocks(
+    image: Image, left: int, top: int, width: int, height: int, step: int
+) -> tuple[Image, tuple[int, int, int, int]]:
+    """The part of a smaller image that exists, and how much is missing above, below, left, right."""
+    import cv2
+
+    rows, columns = max(1, image.shape[0] // step), max(1, image.shape[1] // step)
+    x0, x1 = (min(max(x, 0), columns) for x in (left, left + width))
+    y0, y1 = (min(max(y, 0), rows) for y in (top, top + height))
+    if x0 == x1:  # the window does not touch the image: the nearest column stands for it
+        x0, x1 = min(x0, columns - 1), min(x0, columns - 1) + 1
+    if y0 == y1:
+        y0, y1 = min(y0, rows - 1), min(y0, rows - 1) + 1
+    part = image[y0 * step : y1 * step, x0 * step : x1 * step]
+    if step > _FINEST:
+        some = (2 * (x1 - x0), 2 * (y1 - y0))
+        part = cv2.resize(part, some, interpolation=cv2.INTER_NEAREST)  # type: ignore[assignment]
+    if step > 1:
+        part = cv2.resize(part, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+    above, before = max(0, y0 - top), max(0, x0 - left)
+    above, before = min(above, height - 1), min(before, width - 1)
+    return part, (above, height - above - (y1 - y0), before, width - before - (x1 - x0))
+
+
+def inside_image(
+    anchors: Float[Tensor, "N 3"], width: int, height: int, per_cell: int = 1
+) -> Float[Tensor, "N h w"]:
+    """Share of each cell (or of its finer pixels) that lies in the image.
+
+    Args:
+        anchors: (x, y, B), pixels. width, height: of the image. per_cell: finer pixels to a cell.
+    """
+    return _inside(tuple(anchors.flatten().tolist()), width, height, per_cell)
+
+
+@lru_cache(maxsize=16)
+def _inside(anchors: tuple[float, ...], width: int, height: int, per_cell: int) -> Tensor:
+    """Kept, since windows mostly stay where they are."""
+    place, share = torch.tensor(anchors, dtype=torch.float64).view(-1, 3), []
+    sizes = ((CELLS[0], _TOP, 1, height), (CELLS[1], _LEFT, 0, width))
+    for count, first, axis, pixels in sizes:
+        edge = torch.arange(count * per_cell + 1) * (CELL / per_cell) + first
+        at = place[:, axis, None] + edge * place[:, 2:] + 0.5
+        at = at.clamp(0, pixels)
+        share.append((at.diff(dim=1) / (place[:, 2:] * CELL / per_cell)).clamp_max(1))
+    return (share[0][:, :, None] * share[1][:, None]).float()
+
+
+@cache
+def cell_centres(per_cell: int = 1) -> Float[Tensor, "h w 2"]:
+    """Places (x, y) of the cells (or of their finer pixels), in B from the anchor."""
+    rows, columns = CELLS[0] * per_cell, CELLS[1] * per_cell
+    x = _LEFT + (torch.arange(columns) + 0.5) * (CELL / per_cell)
+    y = _TOP + (torch.arange(rows) + 0.5) * (CELL / per_cell)
+    return torch.stack(torch.broadcast_tensors(x, y[:, None]), -1).contiguous()
+
+
+def pixels_to_cells(
+    points: Float[Tensor, "N K 2"], anchors: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N K 2"]:
+    """Places in the image to places in cells, the first cell's centre being 0."""
+    first = points.new_tensor([_LEFT, _TOP]) + CELL / 2
+    return ((points - anchors[:, None, :2]) / anchors[:, None, 2:] - first) / CELL
+
+
+def cells_to_pixels(
+    places: Float[Tensor, "N K 2"], anchors: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N K 2"]:
+    """Places in cells to places in the image."""
+    first = places.new_tensor([_LEFT, _TOP]) + CELL / 2
+    return anchors[:, None, :2] + (places * CELL + first) * anchors[:, None, 2:]
+
+
+def move_maps(
+    maps: Float[Tensor, "N C h w"],
+    old: Float[Tensor, "N 3"],
+    new: Float[Tensor, "N 3"],
+    replicate: bool = False,
+) -> Float[Tensor, "N C h w"]:
+    """Maps of the old windows as maps of the new ones; zero (or the border) where nothing was known."""
+    per_cell = maps.shape[-2] // CELLS[0]
+    middle = maps.new_tensor([0.0, _TOP + 0.5 * CELLS[0] * CELL])
+    half = maps.new_tensor([-_LEFT, 0.5 * CELLS[0] * CELL])
+    at = cell_centres(per_cell).to(maps)
+    scale = (new[:, 2] / old[:, 2]).to(maps)[:, None, None, None]
+    shift = ((new[:, :2] - old[:, :2]) / old[:, 2:]).to(maps)[:, None, None]
+    grid = (at * scale + shift - middle) / half
+    padding = "border" if replicate else "zeros"
+    return torch.nn.functional.grid_sample(
+        maps, grid, mode="bilinear", padding_mode=padding, align_corners=False
+    )
+
+
+def gaussian_matrix(
+    size: int, sigma: float, shift: Float[Tensor, "*batch"] | None = None
+) -> Float[Tensor, "*batch size size"]:
+    """Matrix G that blurs a row of `size` cells, and moves it by `shift` cells: out = G in.
+
+    Two of them blur a map: G_y map G_x^T. Every column sums to one, so no mass is lost at the border.
+
+    >>> gaussian_matrix(3, 0.5)[:, 1]
+    tensor([0.1065, 0.7870, 0.1065])
+    """
+    if shift is None:
+        return _still_matrix(size, sigma)
+    return _gaussian(size, sigma, shift[..., None, None])
+
+
+@cache
+def _still_matrix(size: int, sigma: float) -> Tensor:
+    return _gaussian(size, sigma, torch.zeros(()))
+
+
+def _gaussian(size: int, sigma: float, shift: Tensor) -> Tensor:
+    place = torch.arange(size, device=shift.device, dtype=shift.dtype)
+    exponent = -0.5 * ((place[:, None] - place - shift) / sigma).square()
+    weight = exponent.clamp_(min=-40).exp_()  # nothing so small that the processor becomes slow
+    return weight / weight.sum(-2, keepdim=True).clamp_min(1e-6)
