@@ -27,10 +27,13 @@ __all__ = [
     "Performance",
     "angles_to_joints",
     "demo_camera",
+    "hip_sway",
     "minimum_jerk",
     "noisy_keypoints",
     "performer",
     "performer_angles",
+    "stage",
+    "sway",
 ]
 
 KEYPOINT_NAMES = ("head", "neck", "hand_left", "hand_right")
@@ -173,18 +176,15 @@ def performer_angles(
     shoulders = minimum_jerk(time, keys, poses[..., :3])
     # The elbow follows the shoulder; the two together curve the path of the hand.
     elbow = minimum_jerk((time - 0.06).clamp_min(0), keys, poses[..., 3:])
-    arms = torch.cat([shoulders, elbow], -1) + _sway(clock, (2, 4), 1.3, (0.15, 0.7), generator)
+    arms = torch.cat([shoulders, elbow], -1) + sway(clock, (2, 4), 1.3, (0.15, 0.7), generator)
     low, high = torch.tensor(list(ANGLE_LIMITS.values()), dtype=torch.float64).unbind(-1)
     trunk_keys = torch.tensor([k[0] for k in _TORSO_KEYS], dtype=torch.float64)
     trunk_poses = torch.tensor([k[1:] for k in _TORSO_KEYS], dtype=torch.float64)
     trunk = minimum_jerk((time + 0.1).clamp_max(DURATION), trunk_keys, trunk_poses)
-    trunk = trunk + _sway(clock, (2, 3), 1.0, (0.1, 0.4), generator)
+    trunk = trunk + sway(clock, (2, 3), 1.0, (0.1, 0.4), generator)
     trunk = torch.deg2rad(trunk).to(dtype)
-    position = _sway(clock, (3,), 0.008, (0.08, 0.3), generator)
-    breathing = 0.003 * torch.sin(2 * math.pi * 0.25 * clock)
-    position[:, 1] = 0.3 * position[:, 1] + breathing
     angles = BodyAngles(
-        position.to(dtype),
+        hip_sway(clock, generator).to(dtype),
         trunk[:, 0],
         trunk[:, 1],
         torch.deg2rad(torch.maximum(torch.minimum(arms, high), low)).to(dtype),
@@ -193,14 +193,30 @@ def performer_angles(
     return angles, tuple(_KEYS[i][1] for i in after.tolist())
 
 
-def _sway(
+def hip_sway(clock: Tensor, generator: torch.Generator) -> Float[Tensor, "T 3"]:
+    """How the hips move while one stands and breathes, metres."""
+    position = sway(clock, (3,), 0.008, (0.08, 0.3), generator)
+    breathing = 0.003 * torch.sin(2 * math.pi * 0.25 * clock)
+    position[:, 1] = 0.3 * position[:, 1] + breathing
+    return position
+
+
+def sway(
     clock: Tensor,
     shape: tuple[int, ...],
     amplitude: float,
     band: tuple[float, float],
     generator: torch.Generator,
 ) -> Tensor:
-    """Four sinusoids [T, *shape] of random phase and frequency (Hz); rms about `amplitude`."""
+    """Nobody stands still: four sinusoids of random phase and frequency.
+
+    Args:
+        clock: seconds [T]. shape: of what sways. amplitude: about its root mean square.
+        band: lowest and highest frequency, Hz. generator: of phases and frequencies.
+
+    Returns:
+        [T, *shape].
+    """
     size = (4, *shape)
     unit = torch.rand((2, *size), generator=generator, dtype=torch.float64)
     hertz = band[0] + (band[1] - band[0]) * unit[0]
@@ -235,10 +251,36 @@ def performer(
     >>> performer(n_frames=2).joints.shape
     torch.Size([2, 8, 3])
     """
+    angles, labels = performer_angles(n_frames, fps, seed, dtype)
+    return stage(angles, labels, fps, size, distance)
+
+
+def stage(
+    angles: BodyAngles,
+    labels: tuple[str, ...],
+    fps: float,
+    size: BodySize | None = None,
+    distance: float = 2.0,
+) -> Performance:
+    """A movement in front of `demo_camera`.
+
+    Args:
+        angles: the movement, T frames. labels: a word for each frame. fps: frames per second.
+        size: bone lengths.
+        distance: of the neck from the camera, metres.
+
+    Raises:
+        InputError: too near for the camera to see the arms, or not a label for each frame.
+    """
     if not 0.8 <= distance < math.inf:
         raise InputError(f"distance must be at least 0.8 m to see the arms, got {distance}")
-    angles, labels = performer_angles(n_frames, fps, seed, dtype)
+    if len(labels) != len(angles.arms) or not fps > 0:
+        raise InputError(
+            f"need a label for each of {len(angles.arms)} frames and fps > 0, got {len(labels)} "
+            f"labels and {fps}"
+        )
     body, wrists = angles_to_joints(angles, size)
+    dtype = angles.arms.dtype
     rotation = euler_to_matrix(torch.tensor([0.01, -0.04, 0.05], dtype=dtype))
     translation = torch.tensor([0.04, -0.16, distance], dtype=dtype)
     return Performance(
