@@ -336,7 +336,8 @@ def test_what_is_not_openposes_json(tmp_path, content):
 @pytest.mark.data
 def test_mediapipe_files():
     read = read_keypoints(data_dir_or_skip("video_asl") / "again_mediapipe_pose1.npz")
-    assert read.keypoints.shape == (77, 15, 2)
+    assert read.keypoints.shape == (77, 19, 2)
+    assert read.names[15:] == ("head", "neck", "hand_left", "hand_right")
     assert (read.fps, read.image_size) == (30.0, (640, 480))
     left, right = (read.names.index(f"{side}_shoulder") for side in ("left", "right"))
     assert (read.keypoints[:, left, 0] > read.keypoints[:, right, 0]).all()

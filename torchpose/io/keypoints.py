@@ -6,7 +6,7 @@ says so too.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchpose.errors import CameraError, FileFormatError, InputError, SkeletonError
 from torchpose.io.files import atomic_path, read_npz, require_file, write_npz
+from torchpose.io.landmarks import derive_joints, lacks_joints
 from torchpose.io.openpose import read_openpose
 from torchpose.joint_sets import canonical_names, identify_skeleton
 from torchpose.projection import check_intrinsics
@@ -38,6 +39,7 @@ class Keypoints:
         image_size: (width, height), pixels, or None.
         neck: kind of neck if the joint set or the file tells, see `torchpose.skeleton`.
         path: the file or folder.
+        notes: what was made of the file's keypoints, in plain words.
     """
 
     keypoints: Tensor
@@ -48,6 +50,7 @@ class Keypoints:
     image_size: tuple[int, int] | None = None
     neck: str | None = None
     path: Path | None = None
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -76,7 +79,8 @@ def read_keypoints(path: str | Path) -> Keypoints:
 
     ``.npz``: `keypoints` [T, J, 2] and `names` [J]; optionally `confidence` [T, J], `fps`, `K`
     [3, 3], `image_size` (width, height) and `neck` (its kind). MediaPipe files with `joints2d` and
-    `visibility` in their place are read alike.
+    `visibility` in their place are read alike, and head, neck and hands are appended to the landmarks
+    as priors have them (`torchpose.io.landmarks`).
 
     ``.csv``: a header ``frame,NAME_x,NAME_y[,NAME_confidence],...`` and a row per frame, or the
     long form ``frame,name,x,y[,confidence]`` with a row per keypoint. Empty cells and absent frames
@@ -338,12 +342,27 @@ def _finish(path: Path, raw: _Raw) -> Keypoints:
             f"{path}: neck must be one of {', '.join(NECK_KINDS)}, got {raw.neck!r}"
         )
     skeleton = identify_skeleton(names)
-    return Keypoints(
+    keypoints = Keypoints(
         torch.from_numpy(np.where(missing[..., None], np.nan, points)), names,
         None if raw.confidence is None else torch.from_numpy(confidence), raw.fps,
         _check_matrix(path, raw.K), _check_size(path, raw.image_size),
         raw.neck or (None if skeleton is None else skeleton.neck), path,
     )  # fmt: skip
+    return _with_joints(keypoints) if lacks_joints(names) else keypoints
+
+
+def _with_joints(data: Keypoints) -> Keypoints:
+    """MediaPipe's landmarks with head, neck and hands appended."""
+    points, confidence, names = derive_joints(data.keypoints, data.confidence, data.names)
+    if confidence is not None:
+        confidence = torch.where(torch.isfinite(points).all(-1), confidence, 0.0)
+    note = (
+        "head, neck and hands are put where the prior's are, from MediaPipe's ears, shoulders, "
+        "wrists and index fingers"
+    )
+    return replace(
+        data, keypoints=points, confidence=confidence, names=names, neck="neck", notes=(note,)
+    )
 
 
 def _check_confidence(path: Path, confidence: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
