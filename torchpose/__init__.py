@@ -1,4 +1,4 @@
-"""Bayesian human-pose tracking: from 2D keypoints, gaps and all, to 3D poses with covariances.
+"""Bayesian human-pose tracking: from video or 2D keypoints to 3D poses with covariances.
 
 The names below are imported when they are first used, so `import torchpose` itself is quick and
 needs neither matplotlib nor Lightning nor OpenCV, and never a network.
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from torchpose.priors.upper_body import UpperBodyPrior as UpperBodyPrior
     from torchpose.priors.upper_body import load_prior as load_prior
     from torchpose.tracking import UpperBodyTracker as UpperBodyTracker
+    from torchpose.video_tracker import VideoTracker as VideoTracker
 
     __version__: str
 
@@ -30,6 +31,7 @@ _SUBMODULES = frozenset(
         "joint_sets",
         "lifting",
         "mannequin",
+        "measure",
         "measurements",
         "metrics",
         "pose_track",
@@ -37,10 +39,15 @@ _SUBMODULES = frozenset(
         "projection",
         "protocols",
         "recipes",
+        "recording",
+        "rendering",
+        "report",
         "rotations",
         "skeleton",
         "torchmetrics_adapters",
         "tracking",
+        "video",
+        "video_tracker",
         "viz",
     }
 )
@@ -51,6 +58,7 @@ _HOME = {
     "TorchposeError": "torchpose.errors",
     "UpperBodyPrior": "torchpose.priors.upper_body",
     "UpperBodyTracker": "torchpose.tracking",
+    "VideoTracker": "torchpose.video_tracker",
     "load_prior": "torchpose.priors.upper_body",
 }
 
@@ -61,6 +69,7 @@ __all__ = [
     "TorchposeError",
     "UpperBodyPrior",
     "UpperBodyTracker",
+    "VideoTracker",
     "load_prior",
 ]
 

@@ -230,7 +230,7 @@ class PinholeCamera(nn.Module):
 
     @classmethod
     def from_image_size(cls, width: float, height: float, name: str = "") -> Self:
-        """A guess from the image size alone: f = 525/640 of the width, centre in the middle.
+        """A guess from the image size alone: f = 525/640 of the longer side, centre in the middle.
 
         >>> PinholeCamera.from_image_size(640, 480).matrix[0].tolist()
         [525.0, 0.0, 319.5]
@@ -239,7 +239,7 @@ class PinholeCamera(nn.Module):
         h = _image_side("height", height)
         if w is None or h is None:
             raise CameraError(f"an image size is (width, height) in pixels, got {(width, height)}")
-        focal = FOCAL_PER_WIDTH * w
+        focal = FOCAL_PER_WIDTH * max(w, h)
         return cls(focal, focal, (w - 1) / 2, (h - 1) / 2, w, h, name)
 
     @classmethod

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchpose.camera import euler_to_matrix, lift
-from torchpose.cli import demo as command
+from torchpose.cli import demo_keypoints, demo_scores
 from torchpose.io import read_keypoints
 from torchpose.pose_track import PoseTrack
 from torchpose.priors import load_prior
@@ -24,7 +24,7 @@ def shipped(files, tmp_path, monkeypatch):
 def test_demo_beats_the_mean_pose(torchpose, shipped, tmp_path):
     pytest.importorskip("matplotlib")
     out = tmp_path / "out"
-    done = torchpose("demo", "--out", out, "--seconds", 4)
+    done = torchpose("demo", "--out", out, "--seconds", 4, "--input", "keypoints")
     assert done.code == 0, done.err
     assert "smoke test on an animated performer" in done.out
     pictures = [line.strip() for line in done.out.splitlines()[-4:]]
@@ -32,7 +32,7 @@ def test_demo_beats_the_mean_pose(torchpose, shipped, tmp_path):
     assert pictures == [str(out / name) for name in names]
     assert done.out.splitlines()[-5] == "Pictures:"
     assert all((out / name).read_bytes().startswith(b"\x89PNG") for name in names)
-    everything = {*names, "keypoints.npz", "poses.npz", "poses.csv"}
+    everything = {*names, "keypoints.npz", "poses.npz", "poses.csv", "poses.bvh"}
     assert {p.name for p in out.iterdir()} == everything
 
     clip, poses = read_keypoints(out / "keypoints.npz"), PoseTrack.load(out / "poses.npz")
@@ -52,9 +52,10 @@ def test_demo_beats_the_mean_pose(torchpose, shipped, tmp_path):
 
 
 def test_failure_has_an_exit_code(torchpose, shipped, tmp_path, monkeypatch):
-    perfect = command.Scores(torch.zeros(60, 8))
-    monkeypatch.setattr(command, "score_mean_pose", lambda *_: perfect)
-    done = torchpose("demo", "--out", tmp_path / "out", "--seconds", 2, "--pictures", "false")
+    perfect = demo_scores.Scores(torch.zeros(60, 8))
+    monkeypatch.setattr(demo_keypoints, "score_mean_pose", lambda *_: perfect)
+    options = ("--seconds", 2, "--pictures", "false", "--input", "keypoints")
+    done = torchpose("demo", "--out", tmp_path / "out", *options)
     assert done.code == 1
     assert "no better than the mean pose" in done.err
     assert (tmp_path / "out" / "poses.npz").exists()
@@ -64,7 +65,7 @@ def test_mean_pose_is_that_of_samples(files):
     """The oracle draws states, lifts each by (BL 5) and averages."""
     prior = load_prior(files / "prior.safetensors")
     g = torch.Generator().manual_seed(0)
-    mean = command.mean_pose(prior)
+    mean = demo_scores.mean_pose(prior)
     for mixture, arm in ((prior.left, LEFT_ARM), (prior.right, RIGHT_ARM)):
         x = mixture.sample((20_000,), generator=g)
         R = euler_to_matrix(x[:, 15:18], prior.info.rotation_order)
@@ -75,17 +76,17 @@ def test_mean_pose_is_that_of_samples(files):
 
 
 def test_scores_of_the_truth_itself(files):
-    performance, clip, _ = command.perform(2.0, seed=1)
-    track = command.track_clip(load_prior(files / "prior.safetensors"), clip, None)
+    performance, clip, _ = demo_keypoints.perform(2.0, seed=1)
+    track = demo_keypoints.track_clip(load_prior(files / "prior.safetensors"), clip, None)
     track.joints3d = performance.joints[None]
-    scores = command.score(track, performance)
+    scores = demo_scores.score(track, performance.joints)
     assert float(scores.errors3d.abs().max()) < 1e-9
     assert scores.inside == (1.0, 1.0)
 
 
 @pytest.mark.parametrize("seconds", [1.0, 2.5, 20.0])
 def test_gap_lies_inside(seconds):
-    performance, clip, gap = command.perform(seconds, seed=0)
+    performance, clip, gap = demo_keypoints.perform(seconds, seed=0)
     missing = ~clip.measured[:, clip.names.index("hand_right")]
     assert torch.nonzero(missing).flatten().tolist() == list(range(gap.start, gap.stop))
     assert 0 < gap.start < gap.stop < len(clip) == len(performance.joints)
@@ -94,6 +95,7 @@ def test_gap_lies_inside(seconds):
 def test_refusals(torchpose, shipped, tmp_path):
     for options, message in (
         (("--seconds", 0), "from 1 to 3600"),
+        (("--input", "radio"), "video, keypoints"),
         (("--prior", "nobody"), "kinect-upper-body"),
         (("--out", tmp_path / "weights" / "kinect-upper-body.safetensors"), "cannot be written"),
     ):

@@ -88,7 +88,7 @@ def test_written_command_lines_parse(line, monkeypatch, tmp_path):
     words = shlex.split(line)[1:]
     if "--config" in words:  # the file has to be there
         config = tmp_path / "config.yaml"
-        config.write_text("keypoints: keypoints.npz\nout: result\n")
+        config.write_text("input: keypoints.npz\nout: result\n")
         words[words.index("--config") + 1] = str(config)
     assert main_function(words) == 0
     assert parsed or {"--help", "--version", "--print_config"} & {*words}

@@ -9,7 +9,7 @@ import torch
 
 from tests.cli.conftest import GAP, N_FRAMES, keypoints
 from torchpose.camera import PinholeCamera, save_cameras
-from torchpose.cli import track as command
+from torchpose.cli import track_output
 from torchpose.io import read_keypoints, write_keypoints
 from torchpose.pose_track import PoseTrack
 from torchpose.priors import load_prior
@@ -102,7 +102,7 @@ def test_pictures(torchpose, files, tmp_path):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
         assert f"wrote    {tmp_path / name}" in done.out
     assert {p.name for p in tmp_path.iterdir()} == {
-        "poses.npz", "poses.csv", "pose_strip.png", "joint_curves.png",
+        "poses.npz", "poses.csv", "poses.bvh", "pose_strip.png", "joint_curves.png",
     }  # fmt: skip
 
 
@@ -185,7 +185,7 @@ def test_camera_comes_from_the_first_source_that_has_one(track, files, tmp_path)
     write_keypoints(tmp_path / "guess.npz", clip)
     done, poses = track(clip=tmp_path / "guess.npz")
     same(poses, expected(files, clip, PinholeCamera.from_image_size(1280, 960)))
-    assert "1050 pixels (525/640 of the image width) was assumed" in done.out
+    assert "1050 pixels (525/640 of the longer side of the image) was assumed" in done.out
     assert any("was assumed" in note for note in poses.notes)
 
 
@@ -228,11 +228,11 @@ def test_help_lists_every_method(torchpose):
 
 PRIOR, CLIP = "{files}/prior.safetensors", "{files}/keypoints.npz"
 BAD_INPUT = {
-    "no keypoints": ([], "missing: KEYPOINTS"),
+    "no keypoints": ([], "missing: INPUT"),
     "missing file": (["{tmp}/no.npz"], "no.npz: no such file"),
     "truncated": (["{tmp}/truncated.npz"], "expected an .npz file"),
     "foreign keys": (["{files}/recordings/p1.npz"], "expected the key keypoints"),
-    "other suffix": (["{tmp}/notes.txt"], "expected keypoints as .npz, .csv or a folder"),
+    "other suffix": (["{tmp}/notes.txt"], "keypoints are expected as .npz, .csv or a folder"),
     "unknown names": (["{tmp}/names.npz"], "antenna"),
     "no upper body": (["{tmp}/knees.npz"], "expected some of hand_left"),
     "no camera": (["{tmp}/no_camera.npz"], "expected --camera FILE"),
@@ -333,6 +333,6 @@ def test_interruption_leaves_nothing_half_written(torchpose, files, tmp_path, mo
 
 def test_degenerate_filter_is_told(track, capsys):
     _, poses = track()
-    assert command.report_failure(poses) == 0
-    assert command.report_failure(replace(poses, failed_at=torch.tensor([7]))) == 1
+    assert track_output.report_failure(poses) == 0
+    assert track_output.report_failure(replace(poses, failed_at=torch.tensor([7]))) == 1
     assert "degenerated at frame 7" in capsys.readouterr().err

@@ -1,53 +1,58 @@
-"""Which camera the keypoints are of: --camera, the keypoint file, or a guess that is said."""
+"""Which camera the input is of: --camera, what the input says, or a guess that is said."""
 
 from pathlib import Path
 
+from torch import Tensor
+
 from torchpose.camera import PinholeCamera
 from torchpose.errors import CameraError
-from torchpose.io import Keypoints
 
 __all__ = ["resolve_camera"]
 
 
 def resolve_camera(
-    given: str | None, name: str | None, keypoints: Keypoints
+    given: str | None,
+    name: str | None,
+    size: tuple[int, int] | None,
+    matrix: Tensor | None,
+    source: object,
 ) -> tuple[PinholeCamera, tuple[str, ...]]:
-    """The camera of the keypoints, and notes on what was assumed.
+    """The camera of keypoints or of a video, and notes on what was assumed.
 
-    In this order: what was given; K in the keypoint file; its image size with f = 525/640 of the
-    width.
+    In this order: what was given; K that came with the input; its image size with f = 525/640 of the
+    longer side.
 
     Args:
         given: a TOML file or ``fx,fy,cx,cy``. name: of the camera in a file with several.
-        keypoints: as read.
+        size: (width, height) of the images, if known. matrix: K of the input, if known.
+        source: the input, for messages.
 
     Raises:
         CameraError: no camera can be told, four numbers are not what was given, or its image size is
-            not that of the keypoints. InputError, FileFormatError: the file.
+            not that of the input. InputError, FileFormatError: the file.
     """
-    size = keypoints.image_size
     if given:
         camera = _given_camera(given, name)
         if size is not None and camera.image_size is not None and camera.image_size != size:
             raise CameraError(
-                f"{given}: the camera is for images of {_text(camera.image_size)}, the keypoints are "
-                f"of {_text(size)}; give the camera of the keypoints' images"
+                f"{given}: the camera is for images of {_text(camera.image_size)}, the input is "
+                f"of {_text(size)}; give the camera of the input's images"
             )
         notes: tuple[str, ...] = ()
         if bool((camera.distortions != 0).any()):
             notes = ("the camera's distortions are not applied: undistort keypoints beforehand",)
         return camera, notes
-    if keypoints.K is not None:
-        return PinholeCamera.from_matrix(keypoints.K, *(size or (None, None))), ()
+    if matrix is not None:
+        return PinholeCamera.from_matrix(matrix, *(size or (None, None))), ()
     if size is not None:
         camera = PinholeCamera.from_image_size(*size)
         focal = float(camera.matrix[0, 0])
         return camera, (
-            f"no camera was given: a focal length of {focal:.0f} pixels (525/640 of the image width) "
-            "was assumed; distances depend on it",
+            f"no camera was given: a focal length of {focal:.0f} pixels (525/640 of the longer side of "
+            "the image) was assumed; distances depend on it",
         )
     raise CameraError(
-        f"no camera can be told for {keypoints.path}: expected --camera FILE or "
+        f"no camera can be told for {source}: expected --camera FILE or "
         "--camera fx,fy,cx,cy, or K or image_size in the keypoint file; got none of them"
     )
 

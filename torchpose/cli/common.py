@@ -1,19 +1,21 @@
 """What the commands share: parsers, error text, checks, pictures."""
 
 import re
+import signal
 import sys
 import textwrap
 from argparse import RawDescriptionHelpFormatter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, Self, TypeVar
 
 from jsonargparse import ActionConfigFile, ArgumentParser
 
 from torchpose.errors import InputError
 
 __all__ = [
+    "UntilInterrupted",
     "add_seed",
     "new_parser",
     "one_line",
@@ -23,11 +25,13 @@ __all__ = [
     "show_progress",
 ]
 
+T = TypeVar("T")
+
 _COMMON = """\
 exit codes: 0 done; 1 done, but the result is not good; 2 refused, with one line on stderr
 --debug shows the traceback of an error"""
 
-_POSITIONALS = {"keypoints": "KEYPOINTS", "recordings": "DIR"}
+_POSITIONALS = {"input": "INPUT", "recordings": "DIR"}
 
 
 def new_parser(command: str, description: str, examples: str) -> ArgumentParser:
@@ -79,6 +83,40 @@ def one_line(error: BaseException) -> str:
         options = (_POSITIONALS.get(name, f"--{name}") for name in names)
         text = f"missing: {', '.join(options)}; see --help for examples"
     return text
+
+
+class UntilInterrupted(Generic[T]):
+    """Items of an iterable until Ctrl-C, or until `stop` says so; a second Ctrl-C is a real one.
+
+    A context manager, to be used in the main thread; the items may be taken in another.
+
+    Attributes:
+        count: items so far. interrupted: whether they ended early.
+    """
+
+    def __init__(self, items: Iterable[T], stop: Callable[[], bool] = lambda: False) -> None:
+        self._items, self._stop = items, stop
+        self.count, self.interrupted = 0, False
+
+    def __enter__(self) -> Self:
+        self._before = signal.signal(signal.SIGINT, self._interrupt)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        signal.signal(signal.SIGINT, self._before)
+
+    def __iter__(self) -> Iterator[T]:
+        for item in self._items:
+            if self.interrupted or self._stop():
+                self.interrupted = True
+                return
+            self.count += 1
+            yield item
+
+    def _interrupt(self, *_: object) -> None:
+        if self.interrupted:
+            raise KeyboardInterrupt
+        self.interrupted = True
 
 
 def show_progress() -> bool:

@@ -110,7 +110,7 @@ def _describe_npz(path: Path) -> str:
 
 def describe_prior(prior: "UpperBodyPrior") -> str:
     """What a prior's file says about itself."""
-    from torchpose.cli.track import camera_text
+    from torchpose.cli.track_output import camera_text
 
     info = prior.info
     noise = ", ".join(f"{name} {list(value.shape)}" for name, value in prior.noise.items())
@@ -167,7 +167,7 @@ def describe_poses(path: Path) -> str:
 def describe_keypoints(keypoints: "Keypoints") -> str:
     """Frames, joints, camera of a file of keypoints."""
     from torchpose.camera import PinholeCamera
-    from torchpose.cli.track import camera_text, percent
+    from torchpose.cli.track_output import camera_text, percent
     from torchpose.skeleton import UPPER_BODY, upper_body_indices
 
     found = upper_body_indices(keypoints.names)
@@ -213,7 +213,7 @@ def _describe_recordings(path: Path) -> str:
 
 def _describe_cameras(path: Path) -> str:
     from torchpose.camera import load_cameras
-    from torchpose.cli.track import camera_text
+    from torchpose.cli.track_output import camera_text
 
     return _table({name: camera_text(camera) for name, camera in load_cameras(path).items()})
 

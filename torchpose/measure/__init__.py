@@ -1,5 +1,14 @@
-"""Measurements from images: faces and skin."""
+"""Measurements from images: faces, skin, hands, edges, background."""
 
+from torchpose.measure.background import BackgroundModel
+from torchpose.measure.edges import (
+    AssociationState,
+    HandAssociation,
+    Segments,
+    edge_map,
+    find_segments,
+    limb_votes,
+)
 from torchpose.measure.face import (
     FaceDetector,
     FaceTracker,
@@ -7,15 +16,63 @@ from torchpose.measure.face import (
     HaarFaceDetector,
     Region,
 )
+from torchpose.measure.hand_prior import HandPrior
+from torchpose.measure.hands import HandMeasurements, HandSettings, HandState, HandTracker
+from torchpose.measure.head_neck import FACE_OFFSETS, FaceOffsets, HeadNeck
+from torchpose.measure.mean_shift import MeanShift, mean_shift
+from torchpose.measure.mean_shift_hands import MeanShiftHandState, MeanShiftHandTracker
+from torchpose.measure.mediapipe import MediaPipeFaceDetector, MediaPipePose, PoseLandmarks
+from torchpose.measure.persons import PersonRegister, Persons
 from torchpose.measure.skin import SkinModel, SkinState, rgb_to_lab
+from torchpose.measure.skin_mixture import SkinMixtureModel, SkinMixtureState
+from torchpose.measure.torso import TorsoElbows, clothes_likelihood, elbows_from_torso
+from torchpose.measure.upper_body import (
+    MEASURED,
+    FrameMeasurements,
+    MeasurerState,
+    UpperBodyMeasurer,
+)
 
 __all__ = [
+    "FACE_OFFSETS",
+    "MEASURED",
+    "AssociationState",
+    "BackgroundModel",
     "FaceDetector",
+    "FaceOffsets",
     "FaceTracker",
     "FaceTracks",
+    "FrameMeasurements",
     "HaarFaceDetector",
+    "HandAssociation",
+    "HandMeasurements",
+    "HandPrior",
+    "HandSettings",
+    "HandState",
+    "HandTracker",
+    "HeadNeck",
+    "MeanShift",
+    "MeanShiftHandState",
+    "MeanShiftHandTracker",
+    "MeasurerState",
+    "MediaPipeFaceDetector",
+    "MediaPipePose",
+    "PersonRegister",
+    "Persons",
+    "PoseLandmarks",
     "Region",
+    "Segments",
+    "SkinMixtureModel",
+    "SkinMixtureState",
     "SkinModel",
     "SkinState",
+    "TorsoElbows",
+    "UpperBodyMeasurer",
+    "clothes_likelihood",
+    "edge_map",
+    "elbows_from_torso",
+    "find_segments",
+    "limb_votes",
+    "mean_shift",
     "rgb_to_lab",
 ]

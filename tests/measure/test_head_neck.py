@@ -1,0 +1,38 @@
+"""Head and neck beside the face."""
+
+import pytest
+import torch
+
+from torchpose.errors import InputError
+from torchpose.measure.head_neck import FACE_OFFSETS, HeadNeck
+
+
+def test_offsets_and_covariances_are_those_of_drawn_faces():
+    generator = torch.Generator().manual_seed(0)
+    face = torch.tensor([[300.0, 100.0, 80.0]], dtype=torch.float64)
+    root = torch.tensor([[2.0, 0, 0], [0.5, 3, 0], [1.0, -1, 4]], dtype=torch.float64)
+    points, cov = HeadNeck()(face, (root @ root.T)[None])
+    n = 200_000
+    drawn = face + torch.randn(n, 3, generator=generator, dtype=torch.float64) @ root.T
+    for joint, (down, std) in enumerate(
+        [(FACE_OFFSETS.head, FACE_OFFSETS.head_std), (FACE_OFFSETS.neck, FACE_OFFSETS.neck_std)]
+    ):
+        noise = torch.randn(n, 2, generator=generator, dtype=torch.float64)
+        place = drawn[:, :2] + 80 * torch.tensor(std) * noise
+        place[:, 1] += down * drawn[:, 2]
+        torch.testing.assert_close(points[0, joint], place.mean(0), rtol=0, atol=0.1)
+        torch.testing.assert_close(cov[0, joint], place.T.cov(), rtol=0.02, atol=0.6)
+
+
+def test_everything_scales_with_the_face():
+    faces = torch.tensor([[300.0, 100.0, 80.0], [300.0, 100.0, 160.0]])
+    points, cov = HeadNeck()(faces)
+    centre = faces[:, None, :2].double()
+    torch.testing.assert_close(2 * (points[:1] - centre[:1]), points[1:] - centre[1:])
+    torch.testing.assert_close(4 * cov[0], cov[1])
+    assert HeadNeck()(faces[:0])[0].shape == (0, 2, 2)
+
+
+def test_bad_offsets_are_refused():
+    with pytest.raises(InputError, match="positive"):
+        HeadNeck(FACE_OFFSETS._replace(head_std=(0.0, 0.1)))

@@ -1,0 +1,108 @@
+"""What `torchpose track` writes and prints, from keypoints and from video alike."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torchpose.cli.common import save_pictures
+
+if TYPE_CHECKING:
+    from torchpose.pose_track import PoseTrack
+
+__all__ = [
+    "camera_text",
+    "percent",
+    "report_failure",
+    "smoothing_text",
+    "summary",
+    "track_pictures",
+    "write_track",
+]
+
+
+def write_track(track: "PoseTrack", out: Path, pictures: bool, suffix: str = "") -> list[Path]:
+    """Write poses.npz, .csv, .bvh and, if asked for, the pictures of one sequence.
+
+    Args:
+        suffix: of the names, such as "_p02".
+    """
+    from torchpose.cli.pose_csv import write_pose_csv
+    from torchpose.io.bvh import write_bvh
+
+    written = [out / f"poses{suffix}.{kind}" for kind in ("npz", "csv", "bvh")]
+    track.save(written[0])
+    write_pose_csv(track, written[1])
+    if not bool(track.joints3d.isfinite().all(-1).any()):
+        return written[:2]
+    write_bvh(track, written[2])
+    if pictures:
+        written += save_pictures(out, track_pictures(track))
+    return written
+
+
+def track_pictures(track: "PoseTrack", truth: Any = None, labels: Any = None) -> dict[str, Any]:
+    """Pictures of one sequence by file name, each as a function that draws it."""
+    from torchpose import viz
+
+    joints, observed, fps = track.joints3d[0], track.observed[0], track.fps or 30.0
+    return {
+        "pose_strip.png": lambda: viz.plot_pose_strip(
+            joints, fps=fps, observed=observed, truth=truth, labels=labels, title="Tracked poses"
+        ),
+        "joint_curves.png": lambda: viz.plot_joint_curves(
+            joints, track.covariance3d[0], observed, truth, fps=fps,
+            title="Hands and elbows with 90 % bands",
+        ),
+    }  # fmt: skip
+
+
+def summary(track: "PoseTrack", written: list[Path], settings: dict[str, str]) -> str:
+    """A few lines for people: frames, what was measured, what was assumed, which files."""
+    n, fps = track.joints3d.shape[1], track.fps
+    length = f" ({n / fps:.1f} s at {fps:g} fps)" if fps else ""
+    shares = track.observed[0].double().mean(0).tolist()
+    seen = {name: share for name, share in zip(track.names, shares, strict=True) if share > 0}
+    hidden = [name for name in track.names if name not in seen]
+    measured = ", ".join(f"{name} {percent(share)}" for name, share in seen.items())
+    return "\n".join(
+        [
+            f"frames   {n}{length}",
+            *(f"{name:<9}{value}" for name, value in settings.items()),
+            f"measured {measured}",
+            *([f"inferred {', '.join(hidden)}"] if hidden else []),
+            *(f"note     {note}" for note in track.notes),
+            *(f"wrote    {path}" for path in written),
+        ]
+    )
+
+
+def report_failure(track: "PoseTrack") -> int:
+    """Exit code: 1 and a line on stderr if the filter degenerated, else 0."""
+    at = int(track.failed_at[0])
+    if at < 0:
+        return 0
+    print(
+        f"torchpose: the filter degenerated at frame {at}; poses from there on are NaN. Measurements "
+        "far from what the prior knows do that: check the camera and left and right, or raise "
+        "--measurement-std",
+        file=sys.stderr,
+    )
+    return 1
+
+
+def camera_text(camera: Any) -> str:
+    """Focal lengths and centre of a camera in a few words."""
+    (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
+    return f"f = ({fx:g}, {fy:g}), centre ({cx:g}, {cy:g}) pixels"
+
+
+def smoothing_text(smoothing: int | str | None) -> str:
+    """How later frames were used, to follow the name of a method."""
+    if smoothing is None:
+        return ", filtered"
+    return ", smoothed" if smoothing == "full" else f", smoothed with {smoothing} later frames"
+
+
+def percent(share: float) -> str:
+    """Rounded, but 100 % only for all."""
+    return f"{min(100 * share, 99.9 if share < 1 else 100.0):.3g} %"

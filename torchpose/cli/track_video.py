@@ -1,0 +1,273 @@
+"""`torchpose track` on video: a file, a folder of images, or a camera."""
+
+import contextlib
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jsonargparse import Namespace
+
+from torchpose.cli.common import UntilInterrupted, pictures_possible, positive, show_progress
+from torchpose.cli.track_output import (
+    camera_text,
+    report_failure,
+    smoothing_text,
+    summary,
+    write_track,
+)
+from torchpose.errors import FileFormatError, InputError
+
+if TYPE_CHECKING:
+    from torchpose.camera import PinholeCamera
+    from torchpose.recording import TrackedPerson
+    from torchpose.video import VideoSource
+    from torchpose.video_tracker import VideoTracker
+
+_KEYPOINTS = "keypoints are expected as .npz, .csv or a folder of OpenPose JSON files"
+
+__all__ = ["track_video", "write_overlay", "write_people"]
+
+
+def track_video(args: Namespace) -> int:
+    """Track everybody, write and report; exit code 1 if there is nobody."""
+    from torchpose.cli.camera_option import resolve_camera
+    from torchpose.io import check_output_folder
+    from torchpose.priors import load_prior
+
+    for option, value in (("--fps", args.fps), ("--max-gap", args.max_gap)):
+        positive(option, value)
+    _refuse_keypoint_options(args)
+    prior = load_prior(args.prior)
+    pictures = pictures_possible(args.pictures)
+    with _open(args.input, args.fps) as source:
+        camera, notes = resolve_camera(args.camera, args.camera_name, source.size, None, args.input)
+        tracker = _tracker(args, prior, camera, source.fps)
+        out = check_output_folder(args.out)
+        start = time.perf_counter()
+        if source.reopenable:
+            people, n_frames = _track_recording(tracker, source, out)
+        else:
+            people, n_frames = _track_camera(tracker, source, out, args.overlay)
+        seconds = time.perf_counter() - start
+        notes += tuple(source.notes)
+        if args.overlay and source.reopenable and n_frames:
+            write_overlay(out / "overlay.mp4", source.reopen(), people, n_frames)
+    facts = {
+        "video": f"{args.input}, {source.size[0]} x {source.size[1]}, {source.fps:g} fps",
+        "prior": prior.info.name or args.prior,
+        "camera": camera_text(camera),
+        "method": f"{args.method}{smoothing_text(args.smoothing)}, hands by {args.hands}",
+        "speed": f"{n_frames / max(seconds, 1e-9):.0f} frames a second, without drawing",
+    }
+    if not people:
+        return _nobody(args, n_frames, notes)
+    people = [replace(p, track=replace(p.track, notes=notes + p.track.notes)) for p in people]
+    written = write_people(people, out, pictures)
+    if args.overlay:
+        written += _write_report(out, people, n_frames, facts, notes, Path(args.input).name)
+    print(_summary(people, written, facts, out))
+    return max(report_failure(person.track) for person in people)
+
+
+def _open(where: str, fps: float | None) -> "VideoSource":
+    from torchpose.video import open_video
+
+    try:
+        return open_video(where, fps=fps)
+    except FileFormatError as error:
+        raise FileFormatError(f"{error}; {_KEYPOINTS}") from error
+
+
+def _refuse_keypoint_options(args: Namespace) -> None:
+    """Options that only mean something for keypoints."""
+    given = {
+        "--nose-as-head": args.nose_as_head,
+        "--neck": args.neck is not None,
+        "--measurement-std": args.measurement_std is not None,
+    }
+    for option, used in given.items():
+        if used:
+            raise InputError(f"{option} is for keypoints; {args.input} is taken for a video")
+
+
+def _tracker(args: Namespace, prior: Any, camera: "PinholeCamera", fps: float) -> "VideoTracker":
+    from torchpose.cli.track import filter_options
+    from torchpose.video_tracker import VideoTracker
+
+    options = {
+        "method": args.method,
+        "smoothing": args.smoothing,
+        "frame": args.frame,
+        "static_camera": args.static_camera,
+        "window": args.window,
+        "steady": args.steady,
+    }
+    return VideoTracker(
+        prior,
+        camera,
+        fps=fps,
+        hands=args.hands,
+        background=args.background,
+        edges=args.edges,
+        elbows=args.elbows,
+        max_persons=args.max_persons,
+        max_gap=args.max_gap,
+        seed=args.seed,
+        **options,
+        **filter_options(args),
+    )
+
+
+def _track_recording(
+    tracker: "VideoTracker", source: "VideoSource", out: Path
+) -> tuple[list["TrackedPerson"], int]:
+    """Everybody in a file or folder, and how many frames it had. Ctrl-C ends the recording there."""
+    with UntilInterrupted(source) as frames:
+        people = tracker(frames, progress=show_progress(), n_frames=source.n_frames, folder=out)
+    return people, frames.count
+
+
+def _track_camera(
+    tracker: "VideoTracker", source: "VideoSource", out: Path, overlay: bool
+) -> tuple[list["TrackedPerson"], int]:
+    """Everybody before a camera, shown on a page while it runs, until q, stop or Ctrl-C."""
+    from torchpose.video import VideoWriter
+    from torchpose.video.live import LiveView
+
+    with contextlib.ExitStack() as stack:
+        view = stack.enter_context(LiveView())
+        print(f"live at {view.url}; q, the button on the page or Ctrl-C stop it")
+        writer = None
+        if overlay:
+            writer = stack.enter_context(VideoWriter(out / "overlay.mp4", source.fps, source.size))
+
+        def watch(image: Any, measured: Any, poses: dict[int, Any]) -> None:
+            drawn = _drawn(image, poses, 0, measured.faces)
+            view.show(drawn)
+            if writer is not None:
+                writer.write(drawn)
+
+        frames = stack.enter_context(UntilInterrupted(source, lambda: view.stop_requested))
+        people = tracker(frames, progress=show_progress(), folder=out, watch=watch)
+    return people, frames.count
+
+
+def write_overlay(
+    path: Path, source: "VideoSource", people: list["TrackedPerson"], n_frames: int
+) -> None:
+    """Draw the poses into the video that they were made from.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    from tqdm.auto import tqdm
+
+    from torchpose.video import VideoWriter, prefetch
+
+    with source, VideoWriter(path, source.fps, source.size) as writer:
+        bar = tqdm(total=n_frames, disable=not show_progress(), unit="frame", desc="overlay")
+        for frame in prefetch(_first(source, n_frames)):
+            at = {place: frame.index - p.first_frame for place, p in enumerate(people)}
+            there = {place: p.track for place, p in enumerate(people) if 0 <= at[place] < len(p)}
+            writer.write(_drawn(frame.image, there, at))
+            bar.update()
+        bar.close()
+
+
+def _first(source: "VideoSource", n_frames: int) -> Iterator[Any]:
+    for frame in source:
+        if frame.index >= n_frames:
+            return
+        yield frame
+
+
+def _drawn(
+    image: Any, tracks: dict[int, Any], frame: int | dict[int, int], faces: Any = None
+) -> Any:
+    """A frame with the poses of everybody there, by place, of a frame of their tracks."""
+    import torch
+
+    from torchpose.video.overlay import draw_overlay
+
+    at = {n: frame if isinstance(frame, int) else frame[n] for n in tracks}
+    if not tracks:
+        return draw_overlay(
+            image, torch.zeros(0, 8, 2), None, torch.zeros(0, 8, dtype=torch.bool), faces=faces
+        )
+    joints, cov, observed = (
+        torch.stack([getattr(track, name)[0, at[n]] for n, track in tracks.items()])
+        for name in ("joints2d", "covariance2d", "observed")
+    )
+    labels = [f"person {n + 1}" for n in tracks] if len(tracks) > 1 else None
+    return draw_overlay(
+        image, joints, cov, observed, faces=faces, labels=labels, tints=list(tracks)
+    )
+
+
+def write_people(people: list["TrackedPerson"], out: Path, pictures: bool) -> list[Path]:
+    """Poses of everybody: the one seen longest without a number, others as poses_p02 and so on.
+
+    Files of other persons from a run before are removed.
+    """
+    written = []
+    for place, person in enumerate(people):
+        suffix = "" if place == 0 else f"_p{place + 1:02d}"
+        written += write_track(person.track, out, pictures and place == 0, suffix)
+    for old in out.glob("poses_p[0-9][0-9]*.*"):
+        if old not in written:
+            old.unlink()
+    return written
+
+
+def _write_report(
+    out: Path,
+    people: list["TrackedPerson"],
+    n_frames: int,
+    facts: dict[str, str],
+    notes: tuple[str, ...],
+    title: str,
+) -> list[Path]:
+    from torchpose.report import write_report
+
+    overlay = out / "overlay.mp4"
+    write_report(
+        out / "report.html",
+        [person.track for person in people],
+        overlay=overlay,
+        title=title,
+        facts=facts,
+        notes=notes,
+        first_frames=[person.first_frame for person in people],
+        n_frames=n_frames,
+    )
+    return [overlay, out / "report.html"]
+
+
+def _nobody(args: Namespace, n_frames: int, notes: tuple[str, ...]) -> int:
+    """Say that there is no pose, and why."""
+    for note in notes:
+        print(f"note     {note}")
+    print(
+        f"torchpose: no face was seen for long enough in the {n_frames} frames of {args.input}, so "
+        "there are no poses. The detector wants faces from the front, upright and at least 40 "
+        "pixels high; keypoints of another detector can be tracked instead",
+        file=sys.stderr,
+    )
+    return 1
+
+
+def _summary(
+    people: list["TrackedPerson"], written: list[Path], facts: dict[str, str], out: Path
+) -> str:
+    """What was found, for people."""
+    first = summary(people[0].track, written, facts)
+    if len(people) == 1:
+        return first
+    others = [
+        f"person {place}: frames {p.first_frame} to {p.first_frame + len(p) - 1}"
+        for place, p in enumerate(people, 1)
+    ]
+    return "\n".join([*others, "of person 1:", first])

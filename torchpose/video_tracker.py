@@ -1,0 +1,220 @@
+"""The whole way from video to poses of everybody in it."""
+
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from torchpose.camera import PinholeCamera
+from torchpose.errors import InputError
+from torchpose.measure.edges import HandAssociation
+from torchpose.measure.face import FaceDetector, FaceTracks, Image
+from torchpose.measure.upper_body import (
+    FrameMeasurements,
+    MeasurerState,
+    UpperBodyMeasurer,
+)
+from torchpose.person_stream import Measured, PersonStream, PersonStreamState, measured_of
+from torchpose.pose_track import PoseTrack
+from torchpose.priors.upper_body import UpperBodyPrior
+from torchpose.recording import Recording, TrackedPerson
+from torchpose.tracking import UpperBodyTracker
+from torchpose.video.prefetch import prefetch
+
+__all__ = ["LivePerson", "TrackedPerson", "VideoState", "VideoTracker", "Watcher"]
+
+Watcher = Callable[[Image, FrameMeasurements, dict[int, PoseTrack]], None]
+"""Is shown a frame, what was measured in it, and the poses of everybody there by number."""
+
+_BLOCK = 32  # frames of a recording that are filtered together
+
+
+class VideoState(NamedTuple):
+    """What `VideoTracker.step` needs to know of the frames before: of measuring, and each stream."""
+
+    measurer: MeasurerState
+    streams: dict[int, PersonStreamState]
+
+
+class LivePerson(NamedTuple):
+    """The pose of somebody in one frame: number, pose (a track of one frame), and what was measured."""
+
+    number: int
+    pose: PoseTrack
+    measured: Measured
+
+
+class VideoTracker(nn.Module):
+    """Tracks everybody in a video: `UpperBodyMeasurer`, then an `UpperBodyTracker` for each person.
+
+    `forward` tracks a recording, `init` and `step` a camera.
+
+    Args:
+        prior: from `load_prior` or `fit_upper_body_prior`.
+        camera: of the video.
+        fps: frames per second. All frames are taken to be equally far apart.
+        hands, background, elbows, face_detector, max_persons: see `UpperBodyMeasurer`.
+        edges: correct hands that were taken for each other by the edges of the arms
+            (`HandAssociation`); takes about twice the time of the poses.
+        max_gap: seconds after which somebody who is not seen has no pose any more; None is never.
+        seed: of methods that draw; every person has a generator of their own.
+        options: to `UpperBodyTracker`, such as method, smoothing or frame.
+
+    Raises:
+        InputError, CameraError, PriorError: as those.
+
+    Example:
+        >>> import numpy as np, torchpose
+        >>> prior = torchpose.load_prior("kinect-upper-body")
+        >>> camera = torchpose.PinholeCamera.from_image_size(160, 120)
+        >>> tracker = torchpose.VideoTracker(prior, camera)
+        >>> tracker(np.zeros((5, 120, 160, 3), np.uint8))  # nobody there
+        []
+    """
+
+    def __init__(
+        self,
+        prior: UpperBodyPrior,
+        camera: PinholeCamera | None = None,
+        *,
+        fps: float = 30.0,
+        hands: str = "grid",
+        background: bool = False,
+        elbows: bool = False,
+        edges: bool = False,
+        face_detector: FaceDetector | None = None,
+        max_persons: int | None = None,
+        max_gap: float | None = 5.0,
+        seed: int = 0,
+        **options: Any,
+    ) -> None:
+        super().__init__()
+        if max_gap is not None and not max_gap > 0:
+            raise InputError(f"max_gap must be positive, got {max_gap}")
+        self.measurer = UpperBodyMeasurer(
+            prior, fps, hands, background, elbows, face_detector, max_persons
+        )
+        smoothing = options.pop("smoothing", None)
+        self.tracker = UpperBodyTracker(prior, camera, fps=fps, max_gap=None, **options)
+        self.smoother = None
+        if smoothing is not None:
+            self.smoother = UpperBodyTracker(
+                prior, camera, fps=fps, max_gap=None, smoothing=smoothing, **options
+            )
+        association = HandAssociation() if edges else None
+        self.stream = PersonStream(self.tracker, self.measurer.names, seed, association)
+        self.fps = float(fps)
+        self.gap = sys.maxsize if max_gap is None else round(max_gap * fps)
+
+    def init(self) -> VideoState:
+        """Nobody was seen yet."""
+        return VideoState(self.measurer.init(), {})
+
+    def step(self, state: VideoState, image: Image | Tensor) -> tuple[VideoState, list[LivePerson]]:
+        """Track one more frame of a camera.
+
+        Args:
+            state: from `init` or the step before. image: RGB, uint8, an array [H, W, 3] or a tensor
+                [3, H, W].
+
+        Returns:
+            The next state, and everybody who is there or was until `max_gap` ago.
+
+        Raises:
+            InputError: another kind of image, or a tracker that smooths.
+        """
+        if self.smoother is not None:
+            raise InputError("a camera is tracked frame by frame: expected smoothing=None")
+        image = as_image(image)
+        measurer, measured = self.measurer.step(state.measurer, image)
+        streams, people = {}, []
+        there = set(measured.person.tolist())
+        for number in sorted(state.streams.keys() | there):  # each with a state of its own
+            stream = state.streams.get(number) or self.stream.init(number)
+            own = measured_of([measured], number, len(self.stream.names))
+            stream, pose, chosen = self.stream.advance(stream, own, [image])
+            if stream.unseen <= self.gap:
+                streams[number] = stream
+                people.append(LivePerson(number, pose, chosen))
+        return VideoState(measurer, streams), people
+
+    def forward(
+        self,
+        frames: Iterable[Any] | Tensor,
+        progress: bool = False,
+        n_frames: int | None = None,
+        folder: str | Path | None = None,
+        watch: Watcher | None = None,
+    ) -> list[TrackedPerson]:
+        """Track a recording, however long: memory does not grow with it.
+
+        Args:
+            frames: RGB, uint8, arrays [H, W, 3], or what has such an `image` (a `VideoSource`); or a
+                tensor [T, 3, H, W].
+            progress: whether to show a bar. n_frames: for the bar.
+            folder: for temporary files, some 1.2 kB for every pose.
+            watch: is called for every frame; frames are then filtered one by one, which is slower.
+
+        Returns:
+            Everybody who was seen for half a second, the one seen longest first.
+
+        Raises:
+            InputError: another kind of image. OutputError: the disk is full.
+        """
+        recording = Recording(self.stream, self.gap, folder)
+        size = _BLOCK if watch is None else 1
+        block: list[FrameMeasurements] = []
+        images: list[Image] = []
+        measured = self._measure(frames)
+        for image, now in tqdm(measured, total=n_frames, disable=not progress, unit="frame"):
+            block.append(now)
+            images.append(image)
+            if len(block) < size:
+                continue
+            poses = recording.append(block, images)
+            block, images = [], []
+            if watch is not None:
+                there = {n: pose for n, pose in poses.items() if _is_pose(pose)}
+                watch(image, now, there)
+        if block:
+            recording.append(block, images)
+        return recording.finish(self.smoother)
+
+    def _measure(self, frames: Iterable[Any] | Tensor) -> Iterator[tuple[Image, FrameMeasurements]]:
+        """Frames and what is measured in them; faces are found ahead, in another thread."""
+        state = self.measurer.init()
+
+        def with_faces() -> Iterator[tuple[Image, FaceTracks]]:
+            tracks = state.faces
+            for frame in frames:
+                image = as_image(getattr(frame, "image", frame))
+                with torch.no_grad():
+                    tracks = self.measurer.follow_faces(tracks, image)
+                yield image, tracks
+
+        current = state
+        for image, tracks in prefetch(with_faces()):
+            with torch.no_grad():
+                current, measured = self.measurer.step(current, image, tracks)
+            yield image, measured
+
+
+def as_image(image: Image | Tensor) -> Image:
+    """A frame as an array [H, W, 3]; tensors are [3, H, W]."""
+    if isinstance(image, Tensor):
+        if image.ndim != 3 or image.shape[0] != 3 or image.dtype != torch.uint8:
+            raise InputError(
+                "a frame must be an RGB tensor [3, H, W] of uint8, got "
+                f"{list(image.shape)} of {image.dtype}"
+            )
+        return np.ascontiguousarray(image.permute(1, 2, 0).cpu().numpy())
+    return image
+
+
+def _is_pose(track: PoseTrack) -> bool:
+    return bool(track.joints3d.isfinite().all())
