@@ -75,7 +75,7 @@ def test_a_face_is_used_after_three_hits_and_survives_gaps():
 
 def test_sporadic_detections_are_never_used_and_die():
     frames = [[[100.0, 100.0, 60.0]] if t % 5 == 0 else [] for t in range(30)]
-    tracker, states, _ = follow(frames, every=1, whole_every=1)
+    tracker, states, _ = follow(frames, every=1, whole_every=1, detail=60.0)
     assert not any(bool(tracker.usable(s).any()) for s in states)
     assert len(states[4].mean) == 0 and states[-1].next_identity > 1
 
@@ -90,13 +90,23 @@ def test_two_faces_that_pass_keep_their_identities():
 def test_known_faces_are_searched_where_they_are():
     face = [[300.0, 200.0, 90.0]]
     _, _, detector = follow([face] * 12, every=2, whole_every=10)
-    assert detector.asked[:3] == [None, None, None]  # until it may be used
-    later = detector.asked[3:]
-    assert [region is None for region in later] == [False, False, False, False, True]
+    # everywhere at first, then near it: in every frame until it may be used, then in every second
+    later = detector.asked[1:]
+    assert detector.asked[0] is None
+    assert [region is None for region in later] == [False] * 6 + [True]
     assert later[0].left == pytest.approx(201, abs=3) and later[0].right == pytest.approx(
         399, abs=3
     )
     assert later[0].smallest == pytest.approx(67.5, abs=2)
+
+
+def test_without_a_face_the_whole_image_is_searched_now_and_then():
+    _, _, detector = follow([[]] * 11, search_every=5)
+    assert detector.asked == [None] * 3
+    later = [[]] * 6 + [[[300.0, 200.0, 90.0]]] * 8
+    tracker, states, _ = follow(later, search_every=5)
+    assert [len(s.mean) for s in states] == [0] * 10 + [1] * 4
+    assert bool(tracker.usable(states[-1]).all())
 
 
 def test_one_face_in_two_overlapping_regions_is_one_detection():

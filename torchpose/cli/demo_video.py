@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["demo_video"]
 
 _FPS = 30.0
+_DISTANCE = 1.8  # metres: near enough for the face, far enough for raised arms
 
 
 def demo_video(
@@ -30,7 +31,10 @@ def demo_video(
     from torchpose.demo import demo_camera, performer
     from torchpose.video import open_video
 
-    performance, camera = performer(round(seconds * _FPS), _FPS, seed), demo_camera()
+    performance, camera = (
+        performer(round(seconds * _FPS), _FPS, seed, distance=_DISTANCE),
+        demo_camera(),
+    )
     clip = out / "clip.mp4"
     _render(clip, performance, seed)
     tracker = VideoTracker(prior, camera, fps=_FPS)

@@ -69,7 +69,7 @@ def track_keypoints(args: Namespace) -> int:
             generator=torch.Generator().manual_seed(args.seed),
             progress=show_progress(),
         )
-    track = replace(track, notes=notes + more + track.notes)
+    track = replace(track, notes=notes + tuple(keypoints.notes) + more + track.notes)
     written = write_track(track, out, pictures)
     settings = {
         "prior": prior.info.name or args.prior,

@@ -142,9 +142,10 @@ class FaceTracker(nn.Module):
 
     Args:
         detector: by default `HaarFaceDetector`.
-        every: look for known faces in every n-th frame, in the region about them.
-        whole_every: look for new faces, in the whole image, in every n-th frame; and as long as no
-            face is known.
+        every: look for known faces in every n-th frame, in the region about them; while none may be
+            used yet, in every frame.
+        whole_every: look for new faces, in the whole image, in every n-th frame.
+        search_every: the same while no face may be used.
         gate: largest distance. min_hits: detections before a track is used.
         memory: most hits that a track can have; it survives three times as many misses.
         std: of a detection's place and size. acceleration: of the process, per frame and frame.
@@ -171,7 +172,8 @@ class FaceTracker(nn.Module):
         self,
         detector: FaceDetector | None = None,
         every: int = 2,
-        whole_every: int = 30,
+        whole_every: int = 45,
+        search_every: int = 5,
         gate: float = 0.5,
         min_hits: int = 3,
         memory: int = 30,
@@ -181,10 +183,10 @@ class FaceTracker(nn.Module):
         detail: float = 80.0,
     ) -> None:
         super().__init__()
-        if min(every, whole_every, min_hits, memory) < 1 or memory < min_hits:
+        if min(every, whole_every, search_every, min_hits, memory) < 1 or memory < min_hits:
             raise InputError(
-                "every, whole_every, min_hits and memory must be at least 1, and memory at least "
-                f"min_hits, got {every}, {whole_every}, {min_hits} and {memory}"
+                "every, whole_every, search_every, min_hits and memory must be at least 1, and memory "
+                f"at least min_hits, got {every}, {whole_every}, {search_every}, {min_hits}, {memory}"
             )
         if not (min(gate, std, acceleration, detail) > 0 and 0 <= damping <= 1):
             raise InputError(
@@ -192,7 +194,7 @@ class FaceTracker(nn.Module):
                 f"{gate}, {std}, {acceleration}, {detail} and {damping}"
             )
         self.detector = HaarFaceDetector() if detector is None else detector
-        self.every, self.whole_every = every, whole_every
+        self.every, self.whole_every, self.search_every = every, whole_every, search_every
         self.gate, self.min_hits, self.memory = gate, min_hits, memory
         self.std, self.acceleration, self.detail = std, acceleration, detail
         eye, zero = torch.eye(3, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
@@ -223,15 +225,16 @@ class FaceTracker(nn.Module):
         Raises:
             InputError: another kind of image.
         """
-        known = self.usable(tracks)
-        everywhere = not bool(known.any()) or tracks.frame % self.whole_every == 0
+        known = bool(self.usable(tracks).any())
+        everywhere = tracks.frame % (self.whole_every if known else self.search_every) == 0
         predicted = self._predict(tracks)
-        if not everywhere and tracks.frame % self.every:
+        if known and not everywhere and tracks.frame % self.every:
             return predicted
-        near = predicted.mean[known, :3] if everywhere else predicted.mean[:, :3]
-        found = [self._look_near(image, face) for face in near.tolist()]
+        found = [self._look_near(image, face) for face in predicted.mean[:, :3].tolist()]
         if everywhere:  # after those that are known, whose sizes are measured better so
             found.append(self.detector(image))
+        if not found:
+            return predicted
         return self.update(predicted, _without_doubles(torch.cat(found), self.gate))
 
     def _look_near(self, image: Image, face: list[float]) -> Float[Tensor, "N 3"]:

@@ -1,0 +1,370 @@
+"""What the filter adds to a modern detector: MediaPipe's landmarks as the measuring front end.
+
+On the seven webcam clips of `video_asl` (three signers) the tracker is fed with MediaPipe's head, neck
+and hands, and with all eight joints. Against MediaPipe's own 2D and 3D joints (`*_pose1.npz`, the full
+model): how much they tremble, how gaps are bridged, how far elbows and shoulders that follow from
+the hands are off, and how much the poses in space differ. MediaPipe is no truth, in space least of all:
+beside it stands how much its own full and heavy models differ.
+
+    python benchmarks/mediapipe_front_end.py --data DIR
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import torch
+from _asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, pad, read_clip
+from torch import Tensor
+
+from torchpose.camera import PinholeCamera
+from torchpose.metrics import jitter, joint_errors_3d
+from torchpose.pose_track import PoseTrack
+from torchpose.priors import UpperBodyPrior, load_prior
+from torchpose.protocols.report import Report
+from torchpose.skeleton import UPPER_BODY
+from torchpose.tracking import UpperBodyTracker
+
+HEAD, NECK, LEFT, RIGHT = (
+    UPPER_BODY.index(n) for n in ("head", "neck", "shoulder_left", "shoulder_right")
+)
+HANDS, ARMS = (0, 7), {0: (0, 1), 7: (7, 6)}
+FRONT_ENDS = {"head, neck, hands": (0, 3, 4, 7), "all eight": tuple(range(8))}
+MODES: dict[str, dict[str, Any]] = {"filtered": {}, "smoothed": {"smoothing": "full"}}
+GAPS = (10, 20, 30)
+SIGNERS = (("again", "brother", "help"), ("bird", "milk"), ("book", "learn"))
+HEADS, NECKS = (0.8, 0.9, 1.0, 1.1), (0.2, 0.27, 0.34)
+
+
+class Bench:
+    """The clips as one batch, and the tracker."""
+
+    def __init__(self, clips: list[Clip], heavy: list[Clip], prior: UpperBodyPrior) -> None:
+        self.clips = clips
+        self.points, self.lengths = pad([c.points for c in clips])
+        self.points3d, _ = pad([c.points3d for c in clips])
+        self.heavy3d, _ = pad([c.points3d for c in heavy])
+        self.heavy, _ = pad([c.points for c in heavy])
+        self.visibility, _ = pad([c.visibility for c in clips])
+        self.known, _ = pad([c.known for c in clips])
+        self.width = torch.tensor([c.width for c in clips]).double()
+        self.trackers = {
+            mode: UpperBodyTracker(
+                prior, PinholeCamera.from_image_size(*SIZE), fps=FPS, neck="neck", **options
+            )
+            for mode, options in MODES.items()
+        }
+
+    def track(
+        self,
+        mode: str,
+        joints: tuple[int, ...],
+        points: Tensor | None = None,
+        rows: Tensor | None = None,
+    ) -> PoseTrack:
+        """Poses from some of the eight joints; a joint of visibility below 0.5 is missing."""
+        rows = torch.arange(len(self.clips)) if rows is None else rows
+        points = self.points[rows] if points is None else points
+        chosen = list(joints)
+        with torch.no_grad():
+            return self.trackers[mode](
+                points[:, :, chosen],
+                names=[UPPER_BODY[j] for j in chosen],
+                mask=self.visibility[rows][:, :, chosen] >= VISIBLE,
+                lengths=self.lengths[rows],
+            )
+
+    def off_by_clip(self, estimate: Tensor, group: str) -> Tensor:
+        """The same in shoulder widths, for each clip [clips]."""
+        gap = (estimate - self.points).norm(dim=-1) / self.width[:, None, None]
+        gap = torch.where(self.known, gap, torch.nan)[..., list(GROUPS[group])]
+        return gap.flatten(1).nanmean(1)
+
+    def off(self, estimate: Tensor, widths: bool = False) -> dict[str, float]:
+        """Mean distance from MediaPipe's joints by group, where those are known."""
+        gap = (estimate - self.points).norm(dim=-1)
+        if widths:
+            gap = gap / self.width[:, None, None]
+        gap = torch.where(self.known, gap, torch.nan)
+        return {name: float(gap[..., list(js)].nanmean()) for name, js in GROUPS.items()}
+
+
+def jitter_tables(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) -> None:
+    """Mean acceleration in the image and in space."""
+    flat = report.table(
+        "jitter2d",
+        "Jitter in the image: mean acceleration (px/s²), and distance from MediaPipe's joints (px)",
+        [*GROUPS, *(f"{g}, distance" for g in GROUPS)],
+        digits=(0, 0, 0, 0, 1, 1, 1, 1),
+        note="The head is the prior's (see torchpose.io.landmarks), not MediaPipe's.",
+    )
+    space = report.table(
+        "jitter3d",
+        "Jitter in space, relative to the middle of the shoulders: mean acceleration (m/s²)",
+        GROUPS,
+        digits=1,
+    )
+
+    def accelerations(points: Tensor) -> list[float]:
+        values = jitter(torch.where(bench.known[..., None], points, torch.nan), FPS)
+        return [float(values[:, list(js)].nanmean()) for js in GROUPS.values()]
+
+    def relative(points: Tensor) -> Tensor:
+        return points - points[:, :, [LEFT, RIGHT]].mean(2, keepdim=True)
+
+    flat.add("MediaPipe full", [*accelerations(bench.points), 0.0, 0.0, 0.0, 0.0])
+    away = bench.off(bench.heavy)
+    flat.add("MediaPipe heavy", [*accelerations(bench.heavy), *away.values()])
+    for name, mean in (("mean of 3 frames so far", _mean(bench.points, 2, 0)),
+                       ("mean of 5 frames about", _mean(bench.points, 2, 2))):  # fmt: skip
+        flat.add(f"MediaPipe full, {name}", [*accelerations(mean), *bench.off(mean).values()])
+    space.add("MediaPipe full", accelerations(relative(bench.points3d)))
+    space.add("MediaPipe heavy", accelerations(relative(bench.heavy3d)))
+    for name, track in tracks.items():
+        away = bench.off(track.joints2d)
+        flat.add(name, [*accelerations(track.joints2d), *away.values()])
+        space.add(name, accelerations(relative(track.joints3d)))
+
+
+def _mean(points: Tensor, before: int, after: int) -> Tensor:
+    """Mean over a few frames, the plainest way to take out jitter."""
+    n = points.shape[1]
+    rows = torch.arange(n)[:, None] + torch.arange(-before, after + 1)
+    return points[:, rows.clamp(0, n - 1)].nanmean(2)
+
+
+def inferred_table(bench: Bench, report: Report) -> None:
+    """Elbows and shoulders from head, neck and hands, by what stands for head and hand."""
+    table = report.table(
+        "inferred",
+        "Joints that are not measured, from head, neck and hands alone (filtered): mean distance from "
+        "MediaPipe's",
+        ["elbows (px)", "shoulders (px)", "elbows (widths)", "shoulders (widths)"],
+        digits=(1, 1, 3, 3),
+        note="In widths of the clip's shoulders. "
+        "Where the neck is not given, the tracker puts it 37 % of the way from the middle of the "
+        "shoulders to the head.",
+    )
+    nose, _ = pad([c.nose for c in bench.clips])
+    ears, _ = pad([c.ears for c in bench.clips])
+    wrists, _ = pad([c.wrists for c in bench.clips])
+    middle = bench.points[:, :, [LEFT, RIGHT]].mean(2)
+    up = bench.points[:, :, HEAD] - middle
+    heads = {
+        "nose as head": (nose, middle + 0.369 * (nose - middle)),
+        "ears as head": (ears, middle + 0.369 * (ears - middle)),
+        "Kinect's mean place (0.92 and 0.34 widths)": (middle + 0.92 * up, middle + 0.34 * up),
+        "head and neck as read": (bench.points[:, :, HEAD], bench.points[:, :, NECK]),
+    }
+
+    def add(name: str, points: Tensor) -> None:
+        found = bench.track("filtered", FRONT_ENDS["head, neck, hands"], points).joints2d
+        pixels, widths = bench.off(found), bench.off(found, widths=True)
+        keys = ("elbows", "shoulders")
+        table.add(name, [*(pixels[k] for k in keys), *(widths[k] for k in keys)])
+
+    for name, (head, neck) in heads.items():
+        points = bench.points.clone()
+        points[:, :, HEAD], points[:, :, NECK] = head, neck
+        add(name, points)
+    points = bench.points.clone()
+    points[:, :, list(HANDS)] = wrists
+    add("the same with wrists as hands", points)
+
+
+def place_table(bench: Bench, report: Report) -> None:
+    """What the places of head and neck of `torchpose.io.landmarks` were chosen from."""
+    table = report.table(
+        "places",
+        "Where head and neck are put: inferred elbows / shoulders (shoulder widths)",
+        [f"neck at {share:.0%} of the way" for share in NECKS],
+        note="Head above the middle of the shoulders, towards the ears, in shoulder widths (the ears are "
+        "0.54 to 0.66 above it); neck from there to the head. MediaPipe's shoulders lie higher than "
+        "Kinect's, so that no place suits elbows and shoulders alike.",
+    )
+    middle = bench.points[:, :, [LEFT, RIGHT]].mean(2)
+    up = bench.points[:, :, HEAD] - middle
+    wide = (bench.points[:, :, LEFT] - bench.points[:, :, RIGHT]).norm(dim=-1, keepdim=True)
+    up = up / up.norm(dim=-1, keepdim=True) * wide
+    errors = {}
+    for height in HEADS:
+        cells = []
+        for share in NECKS:
+            points = bench.points.clone()
+            points[:, :, HEAD], points[:, :, NECK] = (
+                middle + height * up,
+                middle + share * height * up,
+            )
+            found = bench.track("filtered", FRONT_ENDS["head, neck, hands"], points).joints2d
+            widths = bench.off(found, widths=True)
+            cells.append(f"{widths['elbows']:.3f} / {widths['shoulders']:.3f}")
+            parts = [bench.off_by_clip(found, g) for g in ("elbows", "shoulders")]
+            errors[height, share] = torch.stack(parts)
+        table.add(f"head at {height:g}", cells)
+    report.findings += unseen_signers(bench, errors)
+
+
+def unseen_signers(bench: Bench, errors: dict[tuple[float, float], Tensor]) -> list[str]:
+    """Places chosen on the clips of two signers, scored on those of the third."""
+    sentences = []
+    for signer in SIGNERS:
+        own = torch.tensor([c.name in signer for c in bench.clips])
+        if own.all() or not own.any():
+            continue
+        place = min(errors, key=lambda p: float(errors[p][:, ~own].mean()))
+        elbows, shoulders = errors[place][:, own].mean(1).tolist()
+        sentences.append(
+            f"Head and neck chosen without {', '.join(signer)}: {place[0]:g} and {place[1]:.0%}; "
+            f"on those clips elbows {elbows:.3f}, shoulders {shoulders:.3f}."
+        )
+    return sentences
+
+
+def by_clip_table(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) -> None:
+    """Inferred elbows and shoulders of every clip."""
+    names = [n for n in tracks if n.startswith("head")]
+    table = report.table(
+        "by_clip",
+        "The same, clip by clip: elbows / shoulders (shoulder widths)",
+        names,
+        note="again, brother, help: dark long sleeves; bird, milk: bare forearms; book, learn: a "
+        "skin-coloured jumper.",
+    )
+    for i, clip in enumerate(bench.clips):
+        cells = []
+        for name in names:
+            gap = (tracks[name].joints2d[i] - bench.points[i]).norm(dim=-1) / clip.width
+            gap = torch.where(bench.known[i], gap, torch.nan)
+            pair = [float(gap[:, list(GROUPS[g])].nanmean()) for g in ("elbows", "shoulders")]
+            cells.append(f"{pair[0]:.3f} / {pair[1]:.3f}")
+        table.add(clip.name, cells)
+
+
+def space_table(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) -> None:
+    """Distance in space from MediaPipe's own 3D joints."""
+    table = report.table(
+        "space",
+        "Difference from MediaPipe's 3D joints after fixed-scale Procrustes on head, neck and "
+        "shoulders: mean (cm)",
+        GROUPS,
+        note="MediaPipe's 3D joints (full model) come from a single image, and are no truth; the "
+        "last row shows how much its own two models differ. Its shoulders are 0.34 to "
+        "0.36 m apart in the full and 0.28 to 0.31 m in the heavy model.",
+    )
+
+    def differences(points: Tensor) -> list[float]:
+        errors = 100 * joint_errors_3d(points, bench.points3d, None)
+        errors = torch.where(bench.known, errors, torch.nan)
+        return [float(errors[..., list(js)].nanmean()) for js in GROUPS.values()]
+
+    for name, track in tracks.items():
+        table.add(name, differences(track.joints3d))
+    table.add("MediaPipe heavy", differences(bench.heavy3d))
+
+
+def gap_cases(bench: Bench, length: int, step: int) -> list[tuple[int, int, int]]:
+    """(clip, hand, first frame) of hidden stretches whose ends are in view."""
+    cases = []
+    for clip in range(len(bench.clips)):
+        last = int(bench.lengths[clip]) - length - 1
+        for hand in HANDS:
+            for start in range(BURN_IN + 5, last + 1, step):
+                if bool(bench.known[clip, start - 3 : start + length + 1, hand].all()):
+                    cases.append((clip, hand, start))
+    return cases
+
+
+def gap_table(bench: Bench, report: Report, step: int, gaps: tuple[int, ...] = GAPS) -> None:
+    """Hidden hands: how far what is filled in lies from the hidden landmark."""
+    table = report.table(
+        "gaps",
+        "A hand hidden for n frames: mean distance of what is filled in from the hidden landmark (px)",
+        [f"{n} frames" for n in gaps],
+        note="Smoothers and interpolation see what comes after the gap; the others do not. Constant "
+        "velocity goes on with the mean of the last three differences.",
+    )
+    columns: dict[str, list[float]] = {}
+    counts = []
+    for length in gaps:
+        cases = gap_cases(bench, length, step)
+        counts.append(len(cases))
+        for name, value in gap_errors(bench, cases, length).items():
+            columns.setdefault(name, []).append(value)
+    for name, values in columns.items():
+        table.add(name, values)
+    table.note += f" Hidden stretches: {', '.join(map(str, counts))}."
+
+
+def gap_errors(bench: Bench, cases: list[tuple[int, int, int]], length: int) -> dict[str, float]:
+    """Mean error of every way to fill these gaps."""
+    clip, hand, start = torch.tensor(cases).T
+    n = torch.arange(len(cases))
+    frames = start[:, None] + torch.arange(length)
+    truth = bench.points[clip[:, None], frames, hand[:, None]]
+    known = bench.known[clip[:, None], frames, hand[:, None]]
+
+    def at(offset: int) -> Tensor:
+        return bench.points[clip, start + offset, hand][:, None]
+
+    share = (torch.arange(1, length + 1) / (length + 1))[:, None].double()
+    count = torch.arange(1, length + 1)[:, None].double()
+    filled = {
+        "hold the last": at(-1).expand(-1, length, 2),
+        "constant velocity": at(-1) + count * (at(-1) - at(-4)) / 3,
+    }
+    for front_end, joints in FRONT_ENDS.items():
+        for arm in (False, True) if "eight" in front_end else (False,):
+            points = bench.points[clip].clone()
+            points[n[:, None], frames, hand[:, None]] = torch.nan
+            if arm:
+                elbow = torch.where(hand == HANDS[0], ARMS[0][1], ARMS[7][1])
+                points[n[:, None], frames, elbow[:, None]] = torch.nan
+            for mode in MODES:
+                found = bench.track(mode, joints, points, clip).joints2d
+                name = f"{front_end}, {mode}" + (", elbow hidden too" if arm else "")
+                filled[name] = found[n[:, None], frames, hand[:, None]]
+    filled["interpolation"] = at(-1) + share * (at(length) - at(-1))
+    errors = {k: (v - truth).norm(dim=-1)[known].mean() for k, v in filled.items()}
+    return {name: float(value) for name, value in errors.items()}
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--data", type=Path, required=True, help="folder with video_asl/")
+    parser.add_argument("--prior", default="kinect-upper-body", help="name or file")
+    parser.add_argument("--threads", type=int, default=2, help="cores")
+    parser.add_argument("--out", type=Path, help="write the same as Markdown")
+    parser.add_argument("--quick", action="store_true", help="one clip, to see that it works")
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    folder = args.data / "video_asl" if (args.data / "video_asl").is_dir() else args.data
+    names = CLIPS[:1] if args.quick else CLIPS
+    clips, heavy = ([read_clip(folder, n, m) for n in names] for m in (1, 2))
+    prior = load_prior(args.prior)
+    bench = Bench(clips, heavy, prior)
+    report = Report("MediaPipe as the measuring front end")
+    tracks = {
+        f"{front_end}, {mode}": bench.track(mode, joints)
+        for front_end, joints in FRONT_ENDS.items()
+        for mode in MODES
+    }
+    jitter_tables(bench, report, tracks)
+    gap_table(bench, report, *((60, GAPS[:1]) if args.quick else (10,)))
+    inferred_table(bench, report)
+    place_table(bench, report)
+    by_clip_table(bench, report, tracks)
+    space_table(bench, report, tracks)
+    report.settings = {
+        "prior": prior.info.name,
+        "clips": {c.name: f"{len(c.points)} frames, shoulders {c.width:.0f} px" for c in clips},
+        "known": "visibility 0.5 or more, in the image, after 15 frames",
+        "camera": "f = 525 px (assumed), 640x480, 30 fps",
+    }
+    print(report.summary())
+    if args.out:
+        args.out.write_text(report.to_markdown(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

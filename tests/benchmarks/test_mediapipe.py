@@ -1,0 +1,55 @@
+"""The benchmarks on the webcam clips, on one of them."""
+
+import ast
+from pathlib import Path
+
+from tests.benchmarks.test_scripts_run import ROOT, run
+from tests.data import data_dir_or_skip
+
+
+def rows(text: str, title: str) -> dict[str, list[str]]:
+    """Cells of a Markdown table by its first column."""
+    block = text.split(f"**{title}", 1)[1].split("\n\n")[1]
+    cells = [[c.strip() for c in line.strip("| ").split("|")] for line in block.splitlines()]
+    return {row[0]: row[1:] for row in cells[2:]}
+
+
+def test_landmarks_as_the_front_end(tmp_path):
+    written = tmp_path / "table.md"
+    data = data_dir_or_skip("video_asl").parent
+    done = run("mediapipe_front_end", "--quick", "--data", str(data), "--out", str(written))
+    assert done.returncode == 0, done.stdout + done.stderr
+    text = written.read_text()
+    jitter = {name: float(row[-1]) for name, row in rows(text, "Jitter in space").items()}
+    assert jitter["all eight, smoothed"] < jitter["all eight, filtered"] < jitter["MediaPipe full"]
+    inferred = {name: float(row[2]) for name, row in rows(text, "Joints that are not").items()}
+    assert inferred["head and neck as read"] < 0.7 * inferred["ears as head"]
+    gaps = rows(text, "A hand hidden")
+    assert float(gaps["hold the last"][0]) > 0
+    assert {"interpolation", "all eight, filtered, elbow hidden too"} <= gaps.keys()
+
+
+def test_joints_from_video(tmp_path):
+    written, pictures = tmp_path / "joints.md", tmp_path / "joints"
+    data = data_dir_or_skip("video_asl").parent
+    options = ("--data", str(data), "--out", str(written), "--pictures", str(pictures))
+    done = run("video_asl_joints", "--quick", *options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    text = written.read_text()
+    means = rows(text, "Mean 2D distance")
+    elbows = {name: float(row[2].split()[0]) for name, row in means.items()}
+    assert all(0 < value < 80 for value in elbows.values())
+    assert (pictures / "pcp.png").stat().st_size > 10_000
+    assert "joints/pcp.png" in text
+    assert "Eichner" in text
+
+
+def test_the_landmark_script_needs_nothing_of_torchpose():
+    tree = ast.parse(Path(ROOT / "benchmarks" / "mediapipe_landmarks.py").read_text())
+    imported = {
+        alias.name.split(".")[0]
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for alias in ([ast.alias(node.module)] if isinstance(node, ast.ImportFrom) else node.names)
+    }
+    assert imported.isdisjoint({"torch", "torchpose"})

@@ -1,0 +1,228 @@
+"""`torchpose track` on video: a rendered performer, nobody, a camera, and what is refused."""
+
+import json
+import os
+import signal
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from torchpose import demo
+from torchpose.cli.common import UntilInterrupted
+from torchpose.pose_track import PoseTrack
+from torchpose.skeleton import UPPER_BODY
+from torchpose.video import CameraSource, VideoWriter, open_video
+
+N = 45
+SUFFIXES = (".npz", ".csv", ".bvh")
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    """1.5 s of a rendered performer, and where the joints are in it."""
+    pytest.importorskip("matplotlib", reason="the performer's face comes from matplotlib")
+    from torchpose.rendering import render_video
+
+    folder = tmp_path_factory.mktemp("clip")
+    truth = render_video(folder / "clip.mp4", demo.performer(N), demo.demo_camera())[0]
+    return folder / "clip.mp4", truth
+
+
+@pytest.fixture
+def track(torchpose, files, tmp_path):
+    """The command with the small prior and no pictures."""
+
+    def run(where, *options):
+        out = tmp_path / "out"
+        prior = files / "prior.safetensors"
+        given = ("--prior", prior, "--pictures", "false", *options)
+        return torchpose("track", where, "--out", out, *given), out
+
+    return run
+
+
+def test_a_video_gives_poses_overlay_and_report(clip, track):
+    path, truth = clip
+    done, out = track(path)
+    assert done.code == 0, done.err
+    expected = {*(f"poses{s}" for s in SUFFIXES), "overlay.mp4", "report.html"}
+    assert {p.name for p in out.iterdir()} == expected
+    poses = PoseTrack.load(out / "poses.npz")
+    n = poses.joints2d.shape[1]
+    assert n >= N - 5 and poses.fps == 30.0
+    measured = [UPPER_BODY.index(name) for name in ("head", "neck")]
+    error = (poses.joints2d[0, -n:] - truth.joints2d[N - n :])[:, measured].norm(dim=-1)
+    assert float(error.median()) < 12
+    assert bool(poses.observed[0, :, measured].all())
+    with open_video(out / "overlay.mp4") as overlay:
+        assert overlay.size == (640, 480) and sum(1 for _ in overlay) == N
+    page = (out / "report.html").read_text()
+    assert "clip.mp4" in page and "mkf-fixed" in page
+    assert "a focal length of 525 pixels" in done.out and "frames a second" in done.out
+
+
+def test_options_reach_the_tracker(clip, track):
+    path, _ = clip
+    options = ("--smoothing", "full", "--edges", "true", "--elbows", "true", "--background", "true")
+    done, out = track(path, *options, "--overlay", "false", "--camera", "525,525,319.5,239.5")
+    assert done.code == 0, done.err
+    assert {p.name for p in out.iterdir()} == {f"poses{s}" for s in SUFFIXES}
+    assert "smoothed" in done.out and "525" in done.out and "assumed" not in done.out
+    elbows = PoseTrack.load(out / "poses.npz").observed[0, :, UPPER_BODY.index("elbow_left")]
+    assert bool(elbows.any())
+
+
+def test_a_folder_of_images_at_another_rate(clip, track, tmp_path):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    with open_video(clip[0]) as source:
+        for frame in source:
+            if frame.index < 24:
+                name = str(folder / f"{frame.index}.png")
+                cv2.imwrite(name, cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR))
+    done, out = track(folder, "--fps", 25, "--hands", "mean-shift", "--overlay", "false")
+    assert done.code == 0, done.err
+    assert PoseTrack.load(out / "poses.npz").fps == 25.0
+
+
+def test_a_video_without_a_face_has_no_poses(track, tmp_path):
+    grey = tmp_path / "grey.mp4"
+    with VideoWriter(grey, 30.0, (160, 120)) as writer:
+        for _ in range(20):
+            writer.write(np.full((120, 160, 3), 90, np.uint8))
+    done, out = track(grey)
+    assert done.code == 1
+    assert "no face was seen for long enough in the 20 frames" in done.err
+    assert not list(out.glob("poses*"))
+
+
+def test_several_persons_and_what_a_run_before_left(clip, track, tmp_path):
+    path, _ = clip
+    wide = tmp_path / "wide.mp4"
+    with open_video(path) as source, VideoWriter(wide, 30.0, (1000, 480)) as writer:
+        for frame in source:
+            both = [frame.image[:, 70:570], np.roll(frame.image[:, 70:570], 5, 0)]
+            writer.write(np.concatenate(both, 1))
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "poses_p03.npz").write_bytes(b"of another video")
+    done, out = track(wide)
+    assert done.code == 0, done.err
+    names = {p.name for p in out.iterdir()}
+    assert {"poses.npz", "poses_p02.npz", "poses_p02.csv", "poses_p02.bvh"} <= names
+    assert "poses_p03.npz" not in names
+    assert "person 1: frames" in done.out and "person 2: frames" in done.out
+    first, second = (PoseTrack.load(out / f"poses{s}.npz") for s in ("", "_p02"))
+    apart = first.joints2d[0, 20, 3] - second.joints2d[0, 20, 3]
+    assert abs(abs(float(apart[0])) - 500) < 15
+
+
+def test_a_camera_is_shown_recorded_and_stopped(clip, track, monkeypatch):
+    with open_video(clip[0]) as source:
+        images = [cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR) for frame in source]
+
+    class Capture:
+        """Plays the clip."""
+
+        def __init__(self):
+            self.left = list(images)
+
+        def isOpened(self):
+            return True
+
+        def read(self):
+            return (True, self.left.pop(0)) if self.left else (False, None)
+
+        def get(self, prop):
+            return 30.0 if prop == cv2.CAP_PROP_FPS else 0.0
+
+        def set(self, prop, value):
+            return True
+
+        def release(self):
+            pass
+
+    capture = Capture()
+    monkeypatch.setattr("torchpose.video.camera.time.sleep", lambda seconds: None)
+    monkeypatch.setattr(
+        "torchpose.video.open_video",
+        lambda where, fps=None: CameraSource(int(where), fps, capture=lambda index: capture),
+    )
+    done, out = track("0")
+    assert done.code == 0, done.err
+    assert "live at http://127.0.0.1:" in done.out
+    assert {"poses.npz", "overlay.mp4", "report.html"} <= {p.name for p in out.iterdir()}
+    assert PoseTrack.load(out / "poses.npz").joints3d.shape[1] > 25
+
+
+def test_the_first_interruption_ends_the_recording_and_the_second_is_real():
+    def frames():
+        for index in range(10):
+            if index == 4:
+                os.kill(os.getpid(), signal.SIGINT)
+            yield index
+
+    before = signal.getsignal(signal.SIGINT)
+    with UntilInterrupted(frames()) as items:
+        assert list(items) == [0, 1, 2, 3]
+        assert items.interrupted and items.count == 4
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
+    with UntilInterrupted(range(10), stop=lambda: True) as items:
+        assert list(items) == []
+
+
+def test_refusals(torchpose, files, clip, tmp_path):
+    (tmp_path / "notes.mp4").write_text("no video")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "openpose").mkdir()
+    (tmp_path / "openpose" / "0_keypoints.json").write_text(json.dumps({"people": []}))
+    path = clip[0]
+    for where, options, message in (
+        (tmp_path / "notes.mp4", (), "keypoints are expected as .npz"),
+        (tmp_path / "empty", (), "image"),
+        (tmp_path / "nothing.mp4", (), "no such file"),
+        (path, ("--nose-as-head", "true"), "--nose-as-head is for keypoints"),
+        (path, ("--measurement-std", "3"), "--measurement-std is for keypoints"),
+        (path, ("--hands", "feet"), "grid, mean-shift"),
+        (path, ("--max-persons", "0"), "max_persons"),
+        (path, ("--fps", "0"), "--fps must be positive"),
+        (path, ("--method", "kf"), "mkf-fixed"),
+    ):
+        given = ("--prior", files / "prior.safetensors", *options)
+        done = torchpose("track", where, "--out", tmp_path / "out", *given)
+        assert done.code == 2 and message in done.err, (where, done.err)
+        assert len(done.err.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_full_disk_is_told_and_leaves_nothing_half_written(clip, track, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("torchpose.pose_spool._array", full)
+    done, out = track(clip[0])
+    assert done.code == 2 and "No space left" in done.err
+    assert list(out.iterdir()) == []
+
+
+def test_torch_frames_are_frames(clip, files):
+    from torchpose import VideoTracker
+    from torchpose.priors import load_prior
+
+    with open_video(clip[0]) as source:
+        frames = np.stack([frame.image for frame in source][:25])
+    tracker = VideoTracker(load_prior(files / "prior.safetensors"), demo.demo_camera())
+    tensor = torch.from_numpy(frames).permute(0, 3, 1, 2)
+    (one,), (other,) = tracker(frames), tracker(tensor)
+    assert torch.equal(one.track.joints3d, other.track.joints3d)
+    state, live = tracker.init(), []
+    for frame in tensor:
+        state, people = tracker.step(state, frame)
+        live += [person.pose.joints3d[0, 0] for person in people]
+    torch.testing.assert_close(
+        torch.stack(live[: len(one)]), one.track.joints3d[0], rtol=1e-9, atol=1e-9
+    )
