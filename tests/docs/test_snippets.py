@@ -1,11 +1,12 @@
 """Every piece of code in the documentation runs, and prints what the pages say it prints.
 
-A snippet starts in an empty folder that holds `keypoints.npz`. Lines that begin with `# >` are its
+A snippet starts in an empty folder that holds `keypoints.npz` and, if it reads it, `clip.mp4`. Lines that begin with `# >` are its
 expected output. What docs/ includes and what README.md shows are these very files.
 """
 
 import re
 import runpy
+import shutil
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,17 @@ import torch
 ROOT = Path(__file__).parents[2]
 SNIPPETS = sorted((ROOT / "docs" / "snippets").glob("*.py"))
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
+
+
+@pytest.fixture(scope="session")
+def clip(tmp_path_factory):
+    """Two seconds of a rendered performer."""
+    from torchpose.demo import demo_camera, performer
+    from torchpose.rendering import render_video
+
+    path = tmp_path_factory.mktemp("clip") / "clip.mp4"
+    render_video(path, performer(60, 30.0, 0), demo_camera())
+    return path
 
 
 @pytest.fixture
@@ -34,7 +46,9 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("path", SNIPPETS, ids=lambda p: p.stem)
-def test_snippet(path, folder, capsys):
+def test_snippet(path, folder, request, capsys):
+    if "clip.mp4" in path.read_text():
+        shutil.copy(request.getfixturevalue("clip"), folder)
     state = torch.get_rng_state()
     runpy.run_path(str(path), run_name="__main__")
     torch.set_rng_state(state)

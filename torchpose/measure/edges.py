@@ -294,7 +294,7 @@ class HandAssociation(nn.Module):
     def __init__(
         self,
         decay: float = 0.8,
-        margin: float = 0.2,
+        margin: float = 0.5,
         least: float = 0.5,
         apart: float = 1.0,
         position_std: float = 0.4,

@@ -33,6 +33,8 @@ def blur(
     maps: Float[Tensor, "*batch h w"], sigma: float, shift: Float[Tensor, "*batch 2"] | None = None
 ) -> Float[Tensor, "*batch h w"]:
     """Gaussian blur by two products with matrices, and a move by `shift` (x, y), in cells."""
+    if sigma == 0 and shift is None:
+        return maps
     height, width = maps.shape[-2:]
     if shift is None:
         return gaussian_matrix(height, sigma) @ maps @ gaussian_matrix(width, sigma).mT

@@ -71,6 +71,7 @@ class HandSettings:
         expected_share: of the rebirth about the expected hands, where these are given.
         near, far, near_share: the two widths of diffusion, and the share of the first.
         flow, flow_blur: share of belief that optical flow carries, and its blur.
+        rest: diffusion where nothing moves.
         velocity: share of the last displacement that goes on.
         exclusion, exclusion_radius: cost of both hands at one place, in nats, and how far it reaches.
         crossing, crossing_soft: cost of hands on each other's side, in nats, and its softness.
@@ -111,6 +112,7 @@ class HandSettings:
     near_share: float = 0.7
     flow: float = 0.5
     flow_blur: float = 0.06
+    rest: float = 0.035
     velocity: float = 0.8
     exclusion: float = 2.5
     exclusion_radius: float = 0.34
@@ -381,7 +383,7 @@ class HandTracker(nn.Module):
         predicted = predict(
             belief, rebirth, speed, flow, moves,
             near=s.near / CELL * rate, far=s.far / CELL * rate, near_share=s.near_share,
-            flow_share=s.flow, flow_blur=s.flow_blur / CELL, jump=1 - (1 - s.jump) ** rate,
+            flow_share=s.flow, flow_blur=s.flow_blur / CELL, jump=1 - (1 - s.jump) ** rate, rest=s.rest / CELL,
         )  # fmt: skip
         best = log_likelihood.amax((2, 3), keepdim=True)
         weight = (moves[:, None, None, None] * (log_likelihood - best)).clamp_min(-30).exp()

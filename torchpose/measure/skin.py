@@ -220,14 +220,10 @@ class SkinModel(nn.Module):
         self, bins: Tensor, faces: Tensor, hands: Tensor | None, valid: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Colours of the face and of hands in front of it [B, 2, C], clothes and far [B, C]."""
-        across, down = _from_face(faces, bins.shape[1:])
-        face = (across < _FACE[0]) & (down > _FACE[1]) & (down < _FACE[2])
-        clothes = (across < _CLOTHES[0]) & (down > _CLOTHES[1])
-        far = (across > _FAR[0]) | (down < _FAR[1])
-        label = face.to(bins.dtype) + 3 * clothes.to(bins.dtype) + 4 * far.to(bins.dtype)
+        label = _labels(faces, bins.shape[1:])
         if hands is not None:
-            label = label + (face & (hands >= _HAND_IN_FACE)).to(bins.dtype)
-            label = label.masked_fill_(clothes & (hands >= _HAND_ELSEWHERE), 0)
+            label = label + (label == 1) * (hands >= _HAND_IN_FACE)
+            label = label.masked_fill_((label == 3) & (hands >= _HAND_ELSEWHERE), 0.0)
         if valid is not None:
             label = label * valid
         counts = self._counts(bins, label)
@@ -237,7 +233,7 @@ class SkinModel(nn.Module):
         """Number of pixels of each label (0 to 4) and bin [B, 5, C]."""
         batch, size = len(bins), int(np.prod(BINS))
         first = 5 * torch.arange(batch, dtype=bins.dtype, device=bins.device)
-        index = (first[:, None, None] + label) * size + bins
+        index = (first[:, None, None] + label.to(bins.dtype)) * size + bins
         counts = torch.bincount(index.flatten(), minlength=5 * batch * size)
         return counts.view(batch, 5, size).to(self.lowest)
 
@@ -258,9 +254,17 @@ def _band(size: int, kernel: tuple[float, ...]) -> Tensor:
     )
 
 
-def _from_face(faces: Tensor, shape: torch.Size) -> tuple[Tensor, Tensor]:
-    """Distance to the side [B, 1, W] and height below [B, H, 1] the face, in its sizes."""
+def _labels(faces: Tensor, shape: torch.Size) -> Float[Tensor, "B H W"]:
+    """1 in the middle of the face, 3 on the clothes, 4 far from the person, else 0.
+
+    All four are rectangles, so the labels are a product of two thin matrices.
+    """
     height, width = shape
-    x, y, size = faces[:, :, None, None].unbind(1)
+    x, y, size = (column[:, None] for column in faces.unbind(1))
     across = ((torch.arange(width, device=faces.device) - x) / size).abs()
-    return across, (torch.arange(height, device=faces.device)[:, None] - y) / size
+    down = (torch.arange(height, device=faces.device) - y) / size
+    above, aside = down < _FAR[1], across > _FAR[0]
+    rows = [(down > _FACE[1]) & (down < _FACE[2]), down > _CLOTHES[1], above, ~above]
+    columns = [across < _FACE[0], across < _CLOTHES[0], torch.ones_like(aside), aside]
+    values = faces.new_tensor([1.0, 3.0, 4.0, 4.0])
+    return torch.stack(rows, 2).to(faces) @ (torch.stack(columns, 1) * values[:, None])
