@@ -33,9 +33,9 @@ def main() -> None:
     made.add_argument("--repeat", type=int, default=2, help="how often the clips follow each other")
     args = made.parse_args()
     limit_threads(args.threads)
-    import cv2
+    from torchpose.cli.common import share_cores
 
-    cv2.setNumThreads(args.threads)
+    share_cores()  # as the command does
     with tempfile.TemporaryDirectory() as folder:
         clip = Path(folder) / "clips.mp4"
         names = CLIPS[:1] if args.quick else CLIPS * args.repeat

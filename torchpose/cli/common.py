@@ -1,5 +1,6 @@
 """What the commands share: parsers, error text, checks, pictures."""
 
+import os
 import re
 import signal
 import sys
@@ -22,6 +23,7 @@ __all__ = [
     "pictures_possible",
     "positive",
     "save_pictures",
+    "share_cores",
     "show_progress",
 ]
 
@@ -117,6 +119,18 @@ class UntilInterrupted(Generic[T]):
         if self.interrupted:
             raise KeyboardInterrupt
         self.interrupted = True
+
+
+def share_cores() -> None:
+    """Threads for video: the tensors are small, and stages run side by side.
+
+    More threads inside a stage cost more than they bring where there is no core left for them.
+    """
+    import cv2
+    import torch
+
+    torch.set_num_threads(1)
+    cv2.setNumThreads(max(1, (os.cpu_count() or 1) - 1))
 
 
 def show_progress() -> bool:

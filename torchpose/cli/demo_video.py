@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchpose.cli.common import save_pictures, show_progress
+from torchpose.cli.common import save_pictures, share_cores, show_progress
 from torchpose.cli.demo_scores import MEAN_POSE, beaten, report, score, score_mean_pose
 from torchpose.cli.track_output import camera_text, track_pictures
 from torchpose.cli.track_video import write_overlay, write_people
@@ -31,6 +31,7 @@ def demo_video(
     from torchpose.demo import demo_camera, performer
     from torchpose.video import open_video
 
+    share_cores()
     performance, camera = (
         performer(round(seconds * _FPS), _FPS, seed, distance=_DISTANCE),
         demo_camera(),

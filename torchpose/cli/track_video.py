@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 from jsonargparse import Namespace
 
-from torchpose.cli.common import UntilInterrupted, pictures_possible, positive, show_progress
+from torchpose.cli.common import (
+    UntilInterrupted,
+    pictures_possible,
+    positive,
+    share_cores,
+    show_progress,
+)
 from torchpose.cli.track_output import (
     camera_text,
     report_failure,
@@ -40,6 +46,7 @@ def track_video(args: Namespace) -> int:
     for option, value in (("--fps", args.fps), ("--max-gap", args.max_gap)):
         positive(option, value)
     _refuse_keypoint_options(args)
+    share_cores()
     prior = load_prior(args.prior)
     pictures = pictures_possible(args.pictures)
     with _open(args.input, args.fps) as source:

@@ -203,15 +203,9 @@ class HandTracker(nn.Module):
         )  # fmt: skip
         self.motion = Motion(rate=rate, flow=s.flow > 0)
         self.likelihood = HandLikelihood(
-            s.disc,
-            s.core,
-            s.motion,
-            s.unusual,
-            s.beyond,
-            s.towards,
-            s.beside,
+            s.disc, s.core, s.motion, s.unusual, s.beyond, s.towards, s.beside,
             unknown=s.unknown_skin,
-        )
+        )  # fmt: skip
 
     def init(self) -> HandState:
         """No persons yet."""
@@ -249,8 +243,7 @@ class HandTracker(nn.Module):
             return self.init(), _nothing(faces)
         state, new = self._persons(state, faces, identity)
         state, faces = self._steady(state, faces)
-        state, moved_belief = self._follow(state, faces)
-        state = state._replace(belief=moved_belief)
+        state = self._follow(state, faces)
         inside = inside_image(state.anchors, frame.shape[1], frame.shape[0], EVIDENCE)
         state, means, flow = self._evidence(state, frame, faces, inside, foreground)
         log_prior, elbow = self._prior(faces, state.anchors)
@@ -269,14 +262,13 @@ class HandTracker(nn.Module):
     ) -> tuple[HandState, Tensor]:
         """Rows for the persons of this frame, and which of them are new."""
         if not torch.equal(state.identity, identity):
-            same = identity[:, None] == state.identity
-            row = torch.where(
-                same.any(1), same.int().argmax(1) if len(same[0]) else 0, len(same[0])
-            )
+            same = torch.nn.functional.pad(identity[:, None] == state.identity, (0, 1), value=True)
+            row = same.int().argmax(1)  # the first that is the same, or the fresh one behind all
+            new = row == len(state.identity)
             anchors = place_windows(faces)
-            first = self._fresh(anchors[:1])
-            state = _map(lambda old, made: torch.cat([old, made])[row], state, first)
-            new = row == len(same[0])
+            state = _map(
+                lambda old, made: torch.cat([old, made])[row], state, self._fresh(anchors[:1])
+            )
             anchors = torch.where(new[:, None], anchors, state.anchors)
             state = state._replace(identity=identity.clone(), anchors=anchors)
         return state, state.frames == 0
@@ -299,17 +291,17 @@ class HandTracker(nn.Module):
             even, anchors[:, 2].double(), nowhere, torch.zeros_like(nowhere), number.clone(),
         )  # fmt: skip
 
-    def _follow(self, state: HandState, faces: Tensor) -> tuple[HandState, Tensor]:
-        """Windows that go with their faces, and the belief in them."""
+    def _follow(self, state: HandState, faces: Tensor) -> HandState:
+        """Windows that go with their faces, and belief and images that go with the windows."""
         s = self.settings
         anchors, moved = follow_faces(state.anchors, faces, s.stray, s.rescale)
         if not bool(moved.any()):
-            return state, state.belief
+            return state
         motion = self.motion.move(state.motion, state.anchors, anchors, moved)
         belief = state.belief.clone()
         kept = move_maps(belief[moved], state.anchors[moved], anchors[moved]) + 1e-9
         belief[moved] = kept / kept.sum((2, 3), keepdim=True)
-        return state._replace(anchors=anchors, motion=motion), belief
+        return state._replace(anchors=anchors, motion=motion, belief=belief)
 
     def _evidence(
         self,
@@ -383,7 +375,8 @@ class HandTracker(nn.Module):
         predicted = predict(
             belief, rebirth, speed, flow, moves,
             near=s.near / CELL * rate, far=s.far / CELL * rate, near_share=s.near_share,
-            flow_share=s.flow, flow_blur=s.flow_blur / CELL, jump=1 - (1 - s.jump) ** rate, rest=s.rest / CELL,
+            flow_share=s.flow, flow_blur=s.flow_blur / CELL, jump=1 - (1 - s.jump) ** rate,
+            rest=s.rest / CELL,
         )  # fmt: skip
         best = log_likelihood.amax((2, 3), keepdim=True)
         weight = (moves[:, None, None, None] * (log_likelihood - best)).clamp_min(-30).exp()

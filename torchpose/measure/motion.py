@@ -146,7 +146,9 @@ def dense_flow(
 
 @cache
 def _method() -> Any:
-    """Making one takes longer than a frame; it keeps buffers only."""
+    """Making one takes longer than a frame; it keeps buffers only. Down to half the resolution."""
     import cv2
 
-    return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]
+    method = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]
+    method.setFinestScale(1)
+    return method
