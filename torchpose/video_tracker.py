@@ -18,6 +18,7 @@ from torchpose.measure.upper_body import (
     FrameMeasurements,
     MeasurerState,
     UpperBodyMeasurer,
+    check_image,
 )
 from torchpose.person_stream import Measured, PersonStream, PersonStreamState, measured_of
 from torchpose.pose_track import PoseTrack
@@ -204,7 +205,7 @@ class VideoTracker(nn.Module):
             yield image, measured
 
 
-def as_image(image: Image | Tensor) -> Image:
+def as_image(image: Any) -> Image:
     """A frame as an array [H, W, 3]; tensors are [3, H, W]."""
     if isinstance(image, Tensor):
         if image.ndim != 3 or image.shape[0] != 3 or image.dtype != torch.uint8:
@@ -213,7 +214,7 @@ def as_image(image: Image | Tensor) -> Image:
                 f"{list(image.shape)} of {image.dtype}"
             )
         return np.ascontiguousarray(image.permute(1, 2, 0).cpu().numpy())
-    return image
+    return check_image(image)
 
 
 def _is_pose(track: PoseTrack) -> bool:

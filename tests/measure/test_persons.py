@@ -72,6 +72,19 @@ def test_colours_are_shares():
     assert clothes_colours(image, torch.tensor([[100.0, 900.0, 30.0]])).sum() == 0
 
 
+def test_what_is_below_a_face_that_is_followed_blindly_is_not_learnt():
+    register = PersonRegister()
+    state = register.init()
+    worn, faces = scene((100, RED))
+    wall, _ = scene((100, GREEN))
+    who = torch.tensor([0])
+    state, _ = register.step(state, worn, faces, who, 0)
+    for time in range(1, 40):
+        state, _ = register.step(state, wall, faces, who, time, torch.tensor([False]))
+    state, number = register.step(state, worn, faces, torch.tensor([1]), 100)
+    assert number.tolist() == [0]
+
+
 def test_bad_settings_are_refused():
     with pytest.raises(InputError, match="likeness"):
         PersonRegister(likeness=0.0)

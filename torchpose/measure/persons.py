@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchpose.errors import InputError
@@ -81,11 +81,14 @@ class PersonRegister(nn.Module):
         faces: Float[Tensor, "N 3"],
         identity: Int[Tensor, " N"],
         frame: int,
+        detected: Bool[Tensor, " N"] | None = None,
     ) -> tuple[Persons, Int[Tensor, " N"]]:
         """Whose faces these are: the state with newcomers, and the number of each face's person.
 
         Args:
             image: RGB. faces: (x, y, size), pixels. identity: of the tracked faces. frame: number.
+            detected: False where a face was not found of late and is only followed blindly: what is
+                below it may be the wall. None trusts all.
         """
         colours = clothes_colours(image, faces)
         same = identity[:, None] == persons.face
@@ -94,7 +97,8 @@ class PersonRegister(nn.Module):
         for row in torch.nonzero(owner < 0).flatten().tolist():  # newcomers, seldom any
             persons, owner[row] = self._admit(persons, colours[row], identity, owner, row, frame)
         known = persons.colours.clone()
-        known[owner] += _LEARNING * (colours - known[owner])
+        rate = _LEARNING if detected is None else _LEARNING * detected.to(colours)[:, None]
+        known[owner] += rate * (colours - known[owner])
         last_seen = persons.last_seen.clone()
         last_seen[owner] = frame
         return persons._replace(colours=known, last_seen=last_seen), owner

@@ -26,6 +26,7 @@ __all__ = [
     "FrameMeasurements",
     "MeasurerState",
     "UpperBodyMeasurer",
+    "check_image",
     "rounded_covariance",
 ]
 
@@ -133,7 +134,7 @@ class UpperBodyMeasurer(nn.Module):
         """
         import cv2
 
-        grey = cv2.cvtColor(_checked(image), cv2.COLOR_RGB2GRAY)
+        grey = cv2.cvtColor(check_image(image), cv2.COLOR_RGB2GRAY)
         scale = _face_scale(image)
         if scale < 1:
             grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -153,8 +154,11 @@ class UpperBodyMeasurer(nn.Module):
         """
         if tracks is None:
             tracks = self.follow_faces(state.faces, image)
-        faces, face_cov, identity = self._used(tracks, _face_scale(image))
-        persons, number = self.register.step(state.persons, image, faces, identity, state.frame)
+        faces, face_cov, identity, unseen = self._used(tracks, _face_scale(image))
+        detected = unseen <= 2 * self.face_tracker.every
+        persons, number = self.register.step(
+            state.persons, image, faces, identity, state.frame, detected
+        )
         foreground = None if self.background is None else self.background.step(image, faces)
         hand_state, hands = self.hand_tracker.step(state.hands, image, faces, number, foreground)
         parts = [self.head_neck(faces, face_cov), (_where_seen(hands), hands.covariance)]
@@ -186,8 +190,8 @@ class UpperBodyMeasurer(nn.Module):
             (found.points + 0.5) / scale - 0.5, found.covariance / scale**2, found.seen
         )
 
-    def _used(self, tracks: FaceTracks, scale: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Faces that count, in pixels of the frame, with covariances and identities."""
+    def _used(self, tracks: FaceTracks, scale: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Faces that count, in pixels of the frame, with covariances, identities, frames unseen."""
         used = self.face_tracker.usable(tracks) & (tracks.unseen <= _UNSEEN * self.fps)
         rows = torch.nonzero(used).flatten()
         if self.max_persons is not None and len(rows) > self.max_persons:
@@ -195,7 +199,8 @@ class UpperBodyMeasurer(nn.Module):
             rows = rows[largest.sort().values]
         faces = tracks.mean[rows, :3]
         faces = torch.cat([(faces[:, :2] + 0.5) / scale - 0.5, faces[:, 2:] / scale], 1)
-        return faces, tracks.cov[rows, :3, :3] / scale**2, tracks.identity[rows]
+        cov = tracks.cov[rows, :3, :3] / scale**2
+        return faces, cov, tracks.identity[rows], tracks.unseen[rows]
 
 
 def _where_seen(found: HandMeasurements | TorsoElbows) -> Float[Tensor, "N 2 2"]:
@@ -212,12 +217,19 @@ def rounded_covariance(cov: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batc
     return std.square()[..., None, None] * torch.eye(2, dtype=cov.dtype, device=cov.device)
 
 
-def _checked(image: Image) -> Image:
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+def check_image(image: Any) -> Image:
+    """The image, if it is one.
+
+    Raises:
+        InputError: not RGB, [H, W, 3] of uint8.
+    """
+    shape: tuple[int, ...] = tuple(getattr(image, "shape", ()))
+    kind = getattr(image, "dtype", type(image))
+    if len(shape) != 3 or shape[2] != 3 or kind != np.uint8:
         raise InputError(
-            f"a frame must be RGB, [H, W, 3] of uint8, got {list(image.shape)} of {image.dtype}"
+            f"a frame must be RGB, [H, W, 3] of uint8, got {list(shape)} of {kind}"
         )
-    return image
+    return np.asarray(image)
 
 
 def _face_scale(image: Image) -> float:
