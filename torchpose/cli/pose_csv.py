@@ -1,6 +1,7 @@
 """Poses as a table for spreadsheets."""
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -11,6 +12,7 @@ from torchpose.pose_track import PoseTrack
 
 __all__ = ["write_pose_csv"]
 
+_FRAMES_AT_A_TIME = 4096
 _COLUMNS = ("x2d", "y2d", "x", "y", "z", "std_x", "std_y", "std_z", "observed")
 
 
@@ -27,18 +29,23 @@ def write_pose_csv(track: PoseTrack, path: str | Path) -> None:
     """
     if len(track) != 1:
         raise InputError(f"a table holds one sequence, got {len(track)}; see PoseTrack.sequence")
-    fps = track.fps or 30.0
-    std = track.covariance3d[0].diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
-    observed = track.observed[0, ..., None].to(std)
-    joints = torch.cat([track.joints2d[0].to(std), track.joints3d[0], std, observed], -1)
-    score = track.log_evidence[0].sum(-1).tolist()
     header = ["frame", "time", *(f"{n}_{c}" for n in track.names for c in _COLUMNS), "log_evidence"]
-    lines = [*_preamble(track), ",".join(header)]
-    for frame, (row, evidence) in enumerate(zip(joints.tolist(), score, strict=True)):
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as stream:
+        stream.write("\n".join([*_preamble(track), ",".join(header)]) + "\n")
+        for start in range(0, track.joints3d.shape[1], _FRAMES_AT_A_TIME):
+            stream.writelines(_rows(track, slice(start, start + _FRAMES_AT_A_TIME)))
+
+
+def _rows(track: PoseTrack, frames: slice) -> Iterator[str]:
+    """Lines of some frames."""
+    fps = track.fps or 30.0
+    std = track.covariance3d[0, frames].diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+    observed = track.observed[0, frames, :, None].to(std)
+    parts = [track.joints2d[0, frames].to(std), track.joints3d[0, frames], std, observed]
+    joints, score = torch.cat(parts, -1).tolist(), track.log_evidence[0, frames].sum(-1).tolist()
+    for frame, (row, evidence) in enumerate(zip(joints, score, strict=True), start=frames.start):
         cells = [_joint_cells(joint) for joint in row]
-        lines.append(",".join([str(frame), f"{frame / fps:.4f}", *cells, _cell(evidence, 6)]))
-    with atomic_path(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        yield ",".join([str(frame), f"{frame / fps:.4f}", *cells, _cell(evidence, 6)]) + "\n"
 
 
 def _preamble(track: PoseTrack) -> list[str]:
