@@ -17,9 +17,10 @@ failure: rings are the truth, crosses what was found, green the person's left ha
 
 import argparse
 import math
+import os
 import statistics
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -137,8 +138,10 @@ def main() -> None:
         report.table(HEADER, changed(makers, folder, clips))
     if args.pictures:
         name = next(iter(makers))
-        for line in draw_failures(args.pictures, materials, found[name]):
-            report.add(line)
+        for kind, count, file in draw_failures(args.pictures, materials, found[name]):
+            near = os.path.relpath(file, args.out.parent if args.out else ".")
+            report.add(f"{kind.capitalize()}, {count} hand-frames:")
+            report.add(f"![Hands found {kind}]({near})")
     report.add(
         "First 3: again, brother, help. px: median distance of what is not missing. Swapped and missing in "
         "percent. ms: median CPU time of a frame, without face detection, beside other work. "
@@ -338,7 +341,7 @@ def changed(
 
 def draw_failures(
     folder: Path, materials: dict[str, Material], found: dict[str, Found]
-) -> Iterable[str]:
+) -> Iterator[tuple[str, int, Path]]:
     """One sheet for each kind of failure, at most eight frames that are not neighbours."""
     import cv2
 
@@ -355,10 +358,10 @@ def draw_failures(
         name = f"{kind.replace(' ', '-')}.jpg"
         quality = [cv2.IMWRITE_JPEG_QUALITY, 80]
         cv2.imwrite(str(folder / name), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR), quality)
-        yield f"{kind}: {len(places)} hand-frames, {name}"
+        yield kind, len(places), folder / name
 
 
-def failures(points: Tensor, material: Material) -> Iterable[tuple[int, str]]:
+def failures(points: Tensor, material: Material) -> Iterator[tuple[int, str]]:
     """Frames with a hand that is wrong, and in which way."""
     truth, near = material.truth, material.tolerance
     for t, k in torch.nonzero(~truth.isnan().any(-1)).tolist():

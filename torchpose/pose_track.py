@@ -35,6 +35,7 @@ class PoseTrack:
         frame: "camera" (x right, y down, z forward) or "body" (that of the prior's recordings).
         failed_at: [B], the first frame that is NaN because the filter degenerated, -1 if none.
         notes: what was assumed about camera, neck and hands, in plain words.
+        first_frame: of the video or recording, that of the first pose.
     """
 
     joints2d: Tensor
@@ -50,6 +51,7 @@ class PoseTrack:
     fps: float | None = None
     frame: str = "camera"
     notes: tuple[str, ...] = field(default_factory=tuple)
+    first_frame: int = 0
 
     def __len__(self) -> int:
         return self.joints3d.shape[0]
@@ -73,6 +75,7 @@ class PoseTrack:
             fps=self.fps,
             frame=self.frame,
             notes=self.notes,
+            first_frame=self.first_frame,
         )
 
     def save(self, path: str | Path) -> None:
@@ -80,7 +83,8 @@ class PoseTrack:
 
         `log_evidence` in the file is the score, the sum over both arms; `log_evidence_arms` has them
         apart. Keys: joints2d, joints3d, covariance2d, covariance3d, observed, log_evidence,
-        log_evidence_arms, names, fps (NaN if unknown), K, frame, failed_at, lengths, notes.
+        log_evidence_arms, names, fps (NaN if unknown), K, frame, failed_at, lengths, notes,
+        first_frame.
 
         Raises:
             OutputError: the file cannot be written.
@@ -110,6 +114,7 @@ class PoseTrack:
         arrays["K"] = self.matrix.detach().cpu().numpy()
         arrays["frame"] = np.array(self.frame)
         arrays["notes"] = np.array(self.notes, dtype=str)
+        arrays["first_frame"] = np.array(self.first_frame)
         write_npz(path, arrays)
 
     @classmethod
@@ -147,4 +152,5 @@ class PoseTrack:
             fps=None if np.isnan(fps) else fps,
             frame=str(arrays["frame"]),
             notes=tuple(str(n) for n in arrays["notes"]),
+            first_frame=int(arrays.get("first_frame", 0)),  # files of older releases have none
         )

@@ -143,6 +143,7 @@ class Recording:
                 smooth = smoother(keypoints[None], names=self.stream.names, covariance=cov[None])
             seen = keypoints.isfinite().flatten(1).any(1)
             track = _without_long_gaps(smooth, seen, 0, self.gap)
+        track = replace(track, first_frame=person.first_frame)
         return TrackedPerson(person.number, person.first_frame, track, keypoints, cov)
 
 

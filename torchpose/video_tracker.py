@@ -14,6 +14,7 @@ from torchpose.camera import PinholeCamera
 from torchpose.errors import InputError
 from torchpose.measure.edges import HandAssociation
 from torchpose.measure.face import FaceDetector, FaceTracks, Image
+from torchpose.measure.head_neck import HeadNeck
 from torchpose.measure.upper_body import (
     FrameMeasurements,
     MeasurerState,
@@ -59,7 +60,8 @@ class VideoTracker(nn.Module):
         prior: from `load_prior` or `fit_upper_body_prior`.
         camera: of the video.
         fps: frames per second. All frames are taken to be equally far apart.
-        hands, background, elbows, face_detector, max_persons: see `UpperBodyMeasurer`.
+        hands, background, elbows, face_detector, max_persons, head_neck: see
+            `UpperBodyMeasurer`.
         edges: correct hands that were taken for each other by the edges of the arms
             (`HandAssociation`); takes about twice the time of the poses.
         max_gap: seconds after which somebody who is not seen has no pose any more; None is never.
@@ -90,6 +92,7 @@ class VideoTracker(nn.Module):
         edges: bool = False,
         face_detector: FaceDetector | None = None,
         max_persons: int | None = None,
+        head_neck: HeadNeck | None = None,
         max_gap: float | None = 5.0,
         seed: int = 0,
         **options: Any,
@@ -98,7 +101,7 @@ class VideoTracker(nn.Module):
         if max_gap is not None and not max_gap > 0:
             raise InputError(f"max_gap must be positive, got {max_gap}")
         self.measurer = UpperBodyMeasurer(
-            prior, fps, hands, background, elbows, face_detector, max_persons
+            prior, fps, hands, background, elbows, face_detector, max_persons, head_neck
         )
         smoothing = options.pop("smoothing", None)
         self.tracker = UpperBodyTracker(prior, camera, fps=fps, max_gap=None, **options)

@@ -1,7 +1,8 @@
 """Every piece of code in the documentation runs, and prints what the pages say it prints.
 
-A snippet starts in an empty folder that holds `keypoints.npz` and, if it reads it, `clip.mp4`. Lines that begin with `# >` are its
-expected output. What docs/ includes and what README.md shows are these very files.
+A snippet starts in an empty folder that holds `keypoints.npz` and, if it reads it, `clip.mp4`. Lines
+that begin with `# >` are its expected output. What docs/ includes and what README.md shows are these
+very files.
 """
 
 import re

@@ -20,7 +20,8 @@ def write_pose_csv(track: PoseTrack, path: str | Path) -> None:
     """Write one sequence as ``.csv``; the file appears whole or not at all.
 
     Lines that begin with ``#`` stand above the header and say what the columns are. Then a row for
-    each frame: ``frame``, ``time`` (s), for each joint ``NAME_x2d``, ``NAME_y2d`` (pixels),
+    each frame: ``frame`` (of the recording), ``time`` (s), for each joint ``NAME_x2d``,
+    ``NAME_y2d`` (pixels),
     ``NAME_x``, ``NAME_y``, ``NAME_z`` and their standard deviations ``NAME_std_x``, ... (m),
     ``NAME_observed`` (1 measured, 0 inferred), and at last ``log_evidence``. What is NaN is empty.
 
@@ -43,7 +44,8 @@ def _rows(track: PoseTrack, frames: slice) -> Iterator[str]:
     observed = track.observed[0, frames, :, None].to(std)
     parts = [track.joints2d[0, frames].to(std), track.joints3d[0, frames], std, observed]
     joints, score = torch.cat(parts, -1).tolist(), track.log_evidence[0, frames].sum(-1).tolist()
-    for frame, (row, evidence) in enumerate(zip(joints, score, strict=True), start=frames.start):
+    first = track.first_frame + frames.start
+    for frame, (row, evidence) in enumerate(zip(joints, score, strict=True), start=first):
         cells = [_joint_cells(joint) for joint in row]
         yield ",".join([str(frame), f"{frame / fps:.4f}", *cells, _cell(evidence, 6)]) + "\n"
 

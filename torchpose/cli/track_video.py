@@ -70,7 +70,7 @@ def track_video(args: Namespace) -> int:
         "speed": f"{n_frames / max(seconds, 1e-9):.0f} frames a second, without drawing",
     }
     if not people:
-        return _nobody(args, n_frames, notes)
+        return _nobody(args, n_frames, notes, out)
     people = [replace(p, track=replace(p.track, notes=notes + p.track.notes)) for p in people]
     written = write_people(people, out, pictures)
     if args.overlay:
@@ -253,8 +253,10 @@ def _write_report(
     return [overlay, out / "report.html"]
 
 
-def _nobody(args: Namespace, n_frames: int, notes: tuple[str, ...]) -> int:
+def _nobody(args: Namespace, n_frames: int, notes: tuple[str, ...], out: Path) -> int:
     """Say that there is no pose, and why."""
+    if (out / "poses.npz").exists():
+        notes += (f"{out / 'poses.npz'} is of an earlier run",)
     for note in notes:
         print(f"note     {note}")
     print(

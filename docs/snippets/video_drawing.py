@@ -1,0 +1,26 @@
+import torchpose
+from torchpose.io.bvh import write_bvh
+from torchpose.report import write_report
+from torchpose.video import VideoWriter, open_video, prefetch
+from torchpose.video.overlay import draw_overlay
+
+prior = torchpose.load_prior("kinect-upper-body")
+with open_video("clip.mp4") as video:
+    camera = torchpose.PinholeCamera.from_image_size(*video.size)
+    tracker = torchpose.VideoTracker(prior, camera, fps=video.fps, smoothing="full")
+    person = tracker(video)[0]  # the one seen longest
+track = person.track
+
+with open_video("clip.mp4") as video, VideoWriter("mine.mp4", video.fps, video.size) as writer:
+    for image, _, index in prefetch(video):  # decodes in a thread
+        t = index - person.first_frame
+        if 0 <= t < len(person):  # one row for each person
+            image = draw_overlay(
+                image, track.joints2d[:, t], track.covariance2d[:, t], track.observed[:, t]
+            )
+        writer.write(image)
+
+write_bvh(track, "mine.bvh")
+write_report(
+    "mine.html", [track], overlay="mine.mp4", first_frames=[person.first_frame], notes=track.notes
+)
