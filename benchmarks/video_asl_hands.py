@@ -55,6 +55,7 @@ ABLATION: dict[str, dict[str, Any]] = {
     "no alignment of the face": {"face_alignment": False},
     "still frames count fully": {"still": 1.0},
     "no rebirth": {"jump": 2e-4},
+    "rebirth before the face too": {"face_rebirth": 0.0},
     "no velocity": {"velocity": 0.0},
     "beyond the image is no skin": {"unknown_skin": 0.0},
     "no filter (wide diffusion)": {

@@ -37,6 +37,7 @@ __all__ = ["HandMeasurements", "HandSettings", "HandState", "HandTracker"]
 
 Image = NDArray[np.uint8]
 _REACH = -5.2  # log density per B squared above which a hand may be in a place
+_FACE = (0.7, 0.9)  # half the width and height of a face with what is about it, in B
 _NEAR = 4  # cells about a hand that are believed to be its own
 
 
@@ -68,6 +69,7 @@ class HandSettings:
         disc, core, motion, unusual, beyond, towards, beside: weights of the cues, see `HandLikelihood`.
         prior: weight of the log density of a hand given the face.
         jump: share of belief that is born anew from the prior in each frame.
+        face_rebirth: cost of that in front of the face, in nats.
         expected_share: of the rebirth about the expected hands, where these are given.
         near, far, near_share: the two widths of diffusion, and the share of the first.
         flow, flow_blur: share of belief that optical flow carries, and its blur.
@@ -106,6 +108,7 @@ class HandSettings:
     beside: float = 1.2
     prior: float = 1.0
     jump: float = 0.015
+    face_rebirth: float = 6.0
     expected_share: float = 0.5
     near: float = 0.06
     far: float = 0.25
@@ -248,7 +251,7 @@ class HandTracker(nn.Module):
         state, means, flow = self._evidence(state, frame, faces, inside, foreground)
         log_prior, elbow = self._prior(faces, state.anchors)
         log_likelihood = self.likelihood(means, elbow) + self.settings.prior * log_prior
-        rebirth = self._rebirth(log_prior, state.anchors, expected)
+        rebirth = self._rebirth(log_prior, faces, state.anchors, expected)
         belief = torch.where(new[:, None, None, None], rebirth, state.belief)
         reach = log_prior.amax(1) > _REACH
         moving = (means[:, 2] * reach).sum((1, 2)) * CELL**2 / self.settings.still_motion
@@ -346,9 +349,15 @@ class HandTracker(nn.Module):
         return log_density.movedim(1, 0), elbow
 
     def _rebirth(
-        self, log_prior: Tensor, anchors: Tensor, expected: tuple[Tensor, Tensor] | None
+        self,
+        log_prior: Tensor,
+        faces: Tensor,
+        anchors: Tensor,
+        expected: tuple[Tensor, Tensor] | None,
     ) -> Tensor:
-        born = torch.softmax(log_prior.flatten(2), 2).view_as(log_prior)
+        """Where a hand may be that was lost: before the face it would be seen to come."""
+        cost = self.settings.face_rebirth * _before_face(faces, anchors)[:, None]
+        born = torch.softmax((log_prior - cost).flatten(2), 2).view_as(log_prior)
         if expected is None:
             return born
         mean, cov = (x.double() for x in expected)
@@ -469,6 +478,15 @@ def _in_evidence(faces: Tensor, anchors: Tensor) -> Tensor:
     at = pixels_to_cells(faces[:, None, :2], anchors)[:, 0]
     size = faces[:, 2:] / (anchors[:, 2:] * CELL)
     return torch.cat([(at + 0.5) * EVIDENCE - 0.5, size * EVIDENCE], 1).float()
+
+
+def _before_face(faces: Tensor, anchors: Tensor) -> Tensor:
+    """One in the cells on the face, zero away from it [N, r, c]."""
+    at = (torch.cat([faces[:, :2] - anchors[:, :2], faces[:, 2:]], 1) / anchors[:, 2:]).float()
+    offset = (cell_centres() - at[:, None, None, :2]) / (at[:, 2:] * at.new_tensor(_FACE))[
+        :, None, None
+    ]
+    return torch.sigmoid(6 * (1 - offset.square().sum(-1)))
 
 
 def _hands_near(belief: Tensor) -> Tensor:
