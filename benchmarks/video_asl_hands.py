@@ -11,8 +11,9 @@ not and lies that near to the other hand, missing if the tracker says that it is
 
 `--ablation` switches parts of the tracker off, one at a time. `--changed` runs clips that were mirrored
 (left and right change places in the truth too), entered late, shrunk, halved in frame rate, darkened
-with noise, or reversed in time; nothing was chosen on those. `--pictures` draws frames of every kind of
-failure: rings are the truth, crosses what was found, green the person's left hand and red the right.
+with noise, or reversed in time; settings were compared on those too, so nothing is held out. `--pictures`
+draws frames of every kind of failure: rings are the truth, crosses what was found, green the person's
+left hand and red the right.
 """
 
 import argparse

@@ -51,6 +51,7 @@ def measure(report: Report, args: argparse.Namespace, n_frames: int, folder: Pat
         for index, frame in enumerate(loop(args.data / "video_asl" / "book.mkv", n_frames)):
             if index % every == every - 1:
                 seen.append(((index + 1) / FPS / 60, resident()))
+                tqdm.write(f"minute {seen[-1][0]:.1f}: {seen[-1][1]:.0f} MB")
             yield frame
 
     start = time.perf_counter()

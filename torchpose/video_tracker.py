@@ -174,7 +174,7 @@ class VideoTracker(nn.Module):
         size = _BLOCK if watch is None else 1
         block: list[FrameMeasurements] = []
         images: list[Image] = []
-        measured = self._measure(frames)
+        measured = prefetch(self._measure(frames), size)  # while the block before is filtered
         for image, now in tqdm(measured, total=n_frames, disable=not progress, unit="frame"):
             block.append(now)
             images.append(image)
