@@ -4,6 +4,7 @@ import shutil
 import tempfile
 import weakref
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -81,7 +82,7 @@ class PoseSpool:
         like, count = self._like, self._n_frames if n_frames is None else n_frames
         if like is None or not 0 < count <= self._n_frames:
             raise InputError(f"expected 1 to {self._n_frames} poses, got {count}")
-        fields = {}
+        fields: dict[str, Any] = {}
         for name in _FIELDS:
             sample = _array(getattr(like, name))
             shape = (self._n_frames, *sample.shape[1:])
@@ -96,6 +97,7 @@ class PoseSpool:
             fps=like.fps,
             frame=like.frame,
             notes=like.notes,
+            first_frame=like.first_frame,
         )
 
     def _path(self, name: str) -> Path:

@@ -11,12 +11,17 @@ import torch
 
 from torchpose import demo
 from torchpose.cli.common import UntilInterrupted
+from torchpose.errors import OutputError
 from torchpose.pose_track import PoseTrack
 from torchpose.skeleton import UPPER_BODY
 from torchpose.video import CameraSource, VideoWriter, open_video
 
 N = 45
 SUFFIXES = (".npz", ".csv", ".bvh")
+
+
+def _no_space(*_, **__):
+    raise OutputError("overlay.mp4: cannot be written (No space left on device)")
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +124,10 @@ def test_several_persons_and_what_a_run_before_left(clip, track, tmp_path):
     assert abs(abs(float(apart[0])) - 500) < 15
 
 
-def test_a_camera_is_shown_recorded_and_stopped(clip, track, monkeypatch):
+@pytest.mark.parametrize("full_disk", [False, True])
+def test_a_camera_is_shown_recorded_and_stopped(clip, track, monkeypatch, full_disk):
+    if full_disk:
+        monkeypatch.setattr("torchpose.video.VideoWriter.write", _no_space)
     with open_video(clip[0]) as source:
         images = [cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR) for frame in source]
 
@@ -153,6 +161,10 @@ def test_a_camera_is_shown_recorded_and_stopped(clip, track, monkeypatch):
     done, out = track("0")
     assert done.code == 0, done.err
     assert "live at http://127.0.0.1:" in done.out
+    if full_disk:
+        assert "tracking goes on without the overlay" in done.err
+        assert not (out / "overlay.mp4").exists() and (out / "report.html").exists()
+        return
     assert {"poses.npz", "overlay.mp4", "report.html"} <= {p.name for p in out.iterdir()}
     assert PoseTrack.load(out / "poses.npz").joints3d.shape[1] > 25
 
@@ -207,6 +219,13 @@ def test_a_full_disk_is_told_and_leaves_nothing_half_written(clip, track, monkey
     done, out = track(clip[0])
     assert done.code == 2 and "No space left" in done.err
     assert list(out.iterdir()) == []
+
+
+def test_poses_are_kept_when_the_overlay_does_not_fit(clip, track, monkeypatch):
+    monkeypatch.setattr("torchpose.video.VideoWriter.write", _no_space)
+    done, out = track(clip[0])
+    assert done.code == 2 and "No space left" in done.err
+    assert {f"poses{s}" for s in SUFFIXES} == {p.name for p in out.iterdir()}
 
 
 def test_torch_frames_are_frames(clip, files):

@@ -24,7 +24,7 @@ from torchpose.cli.track_output import (
     summary,
     write_track,
 )
-from torchpose.errors import FileFormatError, InputError
+from torchpose.errors import FileFormatError, InputError, OutputError
 
 if TYPE_CHECKING:
     from torchpose.camera import PinholeCamera
@@ -60,8 +60,6 @@ def track_video(args: Namespace) -> int:
             people, n_frames = _track_camera(tracker, source, out, args.overlay)
         seconds = time.perf_counter() - start
         notes += tuple(source.notes)
-        if args.overlay and source.reopenable and n_frames:
-            write_overlay(out / "overlay.mp4", source.reopen(), people, n_frames)
     facts = {
         "video": f"{args.input}, {source.size[0]} x {source.size[1]}, {source.fps:g} fps",
         "prior": prior.info.name or args.prior,
@@ -72,8 +70,10 @@ def track_video(args: Namespace) -> int:
     if not people:
         return _nobody(args, n_frames, notes, out)
     people = [replace(p, track=replace(p.track, notes=notes + p.track.notes)) for p in people]
-    written = write_people(people, out, pictures)
+    written = write_people(people, out, pictures)  # first of all: the rest only shows them
     if args.overlay:
+        if source.reopenable:
+            write_overlay(out / "overlay.mp4", source.reopen(), people, n_frames)
         written += _write_report(out, people, n_frames, facts, notes, Path(args.input).name)
     print(_summary(people, written, facts, out))
     return max(report_failure(person.track) for person in people)
@@ -147,19 +147,29 @@ def _track_camera(
     with contextlib.ExitStack() as stack:
         view = stack.enter_context(LiveView())
         print(f"live at {view.url}; q, the button on the page or Ctrl-C stop it")
-        writer = None
+        writers = []
         if overlay:
-            writer = stack.enter_context(VideoWriter(out / "overlay.mp4", source.fps, source.size))
+            writer = VideoWriter(out / "overlay.mp4", source.fps, source.size)
+            writers.append(stack.enter_context(writer))
 
         def watch(image: Any, measured: Any, poses: dict[int, Any]) -> None:
             drawn = _drawn(image, poses, 0, measured.faces)
             view.show(drawn)
-            if writer is not None:
-                writer.write(drawn)
+            if writers:
+                _record(writers, drawn)
 
         frames = stack.enter_context(UntilInterrupted(source, lambda: view.stop_requested))
         people = tracker(frames, progress=show_progress(), folder=out, watch=watch)
     return people, frames.count
+
+
+def _record(writers: list[Any], image: Any) -> None:
+    """Write a frame; when that is no longer possible, say so and go on without."""
+    try:
+        writers[0].write(image)
+    except OutputError as error:
+        writers.clear()
+        print(f"torchpose: {error}; tracking goes on without the overlay", file=sys.stderr)
 
 
 def write_overlay(
@@ -240,17 +250,18 @@ def _write_report(
     from torchpose.report import write_report
 
     overlay = out / "overlay.mp4"
+    written = [overlay] if overlay.exists() else []
     write_report(
         out / "report.html",
         [person.track for person in people],
-        overlay=overlay,
+        overlay=overlay if written else None,
         title=title,
         facts=facts,
         notes=notes,
         first_frames=[person.first_frame for person in people],
         n_frames=n_frames,
     )
-    return [overlay, out / "report.html"]
+    return [*written, out / "report.html"]
 
 
 def _nobody(args: Namespace, n_frames: int, notes: tuple[str, ...], out: Path) -> int:
