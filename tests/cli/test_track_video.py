@@ -203,6 +203,7 @@ def test_refusals(torchpose, files, clip, tmp_path):
         (path, ("--max-persons", "0"), "max_persons"),
         (path, ("--fps", "0"), "--fps must be positive"),
         (path, ("--method", "kf"), "mkf-fixed"),
+        (path, ("--face-model", tmp_path / "no.tflite"), "no.tflite"),
     ):
         given = ("--prior", files / "prior.safetensors", *options)
         done = torchpose("track", where, "--out", tmp_path / "out", *given)

@@ -171,6 +171,13 @@ def build() -> ArgumentParser:
         metavar="true|false",
         help="video: measure elbows where the torso with its sleeves is widest (default false)",
     )
+    add(
+        "--face-model",
+        type=str,
+        metavar="FILE",
+        help="video: a face detector of MediaPipe (.tflite) in place of OpenCV's cascade; needs "
+        "mediapipe",
+    )
     add("--max-persons", type=int, metavar="N", help="video: follow only the N largest faces")
     add(
         "--overlay",

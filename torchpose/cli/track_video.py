@@ -102,8 +102,10 @@ def _refuse_keypoint_options(args: Namespace) -> None:
 
 def _tracker(args: Namespace, prior: Any, camera: "PinholeCamera", fps: float) -> "VideoTracker":
     from torchpose.cli.track import filter_options
+    from torchpose.measure import MediaPipeFaceDetector
     from torchpose.video_tracker import VideoTracker
 
+    detector = None if args.face_model is None else MediaPipeFaceDetector(args.face_model)
     options = {
         "method": args.method,
         "smoothing": args.smoothing,
@@ -120,6 +122,7 @@ def _tracker(args: Namespace, prior: Any, camera: "PinholeCamera", fps: float) -
         background=args.background,
         edges=args.edges,
         elbows=args.elbows,
+        face_detector=detector,
         max_persons=args.max_persons,
         max_gap=args.max_gap,
         seed=args.seed,
