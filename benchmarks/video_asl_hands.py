@@ -33,7 +33,8 @@ from torch import Tensor
 
 from torchpose.measure.face import FaceTracker
 from torchpose.measure.hand_prior import HandPrior
-from torchpose.measure.hands import HandSettings, HandTracker
+from torchpose.measure.hand_settings import HandSettings
+from torchpose.measure.hands import HandTracker
 from torchpose.priors import load_prior
 from torchpose.video.source import open_video
 

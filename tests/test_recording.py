@@ -5,7 +5,7 @@ import torch
 
 from tests.priors.poses import recording
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
-from torchpose.measure.hands import HandMeasurements
+from torchpose.measure.hand_measurements import HandMeasurements
 from torchpose.measure.upper_body import MEASURED, FrameMeasurements, rounded_covariance
 from torchpose.person_stream import PersonStream
 from torchpose.recipes import fit_kinect_prior

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.priors.poses import recording
+from torchpose.arm_filters import default_process_cov
 from torchpose.camera import PinholeCamera
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.errors import (
@@ -28,7 +29,7 @@ from torchpose.projection import map_pixels, project
 from torchpose.recipes import fit_calibration, fit_kinect_prior
 from torchpose.rotations import euler_to_matrix
 from torchpose.skeleton import UPPER_BODY
-from torchpose.tracking import METHODS, UpperBodyTracker, default_process_cov
+from torchpose.tracking import METHODS, UpperBodyTracker
 
 NAMES = list(KEYPOINT_NAMES)
 

@@ -1,33 +1,32 @@
-"""What the two arms' filters need beside themselves: generators, views, and their parts of windows."""
+"""What both arms' filters need beside themselves."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from torchpose.body_view import BodyView
 from torchpose.filters.base import FilterOutput, Generators, StepOutput
-from torchpose.measurements import MeasuredJoints
-from torchpose.priors.arm_state import STATE_DIM
+from torchpose.skeleton import ARM_JOINTS, LEFT_ARM, RIGHT_ARM
 
-__all__ = ["SeenInView", "generators_of_arms", "pose_of_window", "require_cov"]
+__all__ = ["ARMS", "first_failure", "generators_of_arms", "joints_of_arm", "require_cov"]
+
+ARMS = {"left": LEFT_ARM, "right": RIGHT_ARM}
+"""Indices into `UPPER_BODY` of each arm, in the order of `ARM_JOINTS`."""
+
+_USUAL = ("hand", "head", "neck")
 
 
-class SeenInView(NamedTuple):
-    """Measurements for a filter over windows, in the pixels of a virtual camera.
+def joints_of_arm(side: str, there: Sequence[bool]) -> tuple[str, ...]:
+    """Hand, head and neck of an arm, and those of its other joints that are there.
 
-    Attributes:
-        window: which of the prior's windows. measured: the eight joints of each frame.
-        hands: values and mask [B, T, 2 H] of the hands of each frame's window, for both arms.
-        view: the virtual camera of each frame.
-        log_scale: log of the area that a pixel of the camera has in the virtual one, [B, T, 8].
+    Args:
+        side: "left" or "right". there: whether each of `UPPER_BODY` is.
+
+    >>> joints_of_arm("left", [True, True, False, True, False, False, False, True])
+    ('hand', 'elbow', 'head', 'neck')
     """
-
-    window: str
-    measured: MeasuredJoints
-    hands: dict[str, tuple[Tensor, Tensor]]
-    view: BodyView
-    log_scale: Tensor
+    rows = zip(ARM_JOINTS, ARMS[side], strict=True)
+    return tuple(joint for joint, row in rows if joint in _USUAL or there[row])
 
 
 def generators_of_arms(generator: Generators) -> tuple[Generators, Generators]:
@@ -46,19 +45,12 @@ def generators_of_arms(generator: Generators) -> tuple[Generators, Generators]:
     return lefts, [right for _, right in pairs if isinstance(right, torch.Generator)]
 
 
-def pose_of_window(
-    out: FilterOutput, context: FilterOutput, seen: SeenInView, arm: tuple[int, ...]
-) -> FilterOutput:
-    """The arm's part of a window's estimate, and its evidence beyond that of the window's hands.
-
-    The evidence is a density over pixels of the prior's camera, not of the virtual one.
-    """
-    measured = seen.measured.mask[:, :, list(arm)]
-    evidence = out.log_evidence - context.log_evidence
-    evidence = evidence + (seen.log_scale[:, :, list(arm)] * measured).sum(-1)
-    evidence = torch.where(measured.any(-1), evidence, torch.zeros_like(evidence))
-    cov = require_cov(out)[..., :STATE_DIM, :STATE_DIM]
-    return out._replace(mean=out.mean[..., :STATE_DIM], cov=cov, log_evidence=evidence)
+def first_failure(left: FilterOutput, right: FilterOutput) -> Tensor:
+    """The first frame at which either arm degenerated, -1 where none did, [B]."""
+    n_frames = left.mean.shape[1]
+    failures = torch.stack([left.failed_at, right.failed_at])
+    first = failures.where(failures >= 0, n_frames).amin(0)
+    return torch.where((failures >= 0).any(0), first, -1)
 
 
 def require_cov(out: FilterOutput | StepOutput) -> Tensor:

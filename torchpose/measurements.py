@@ -1,5 +1,6 @@
 """From the keypoints that a caller has to the measurements that the arms' filters take."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -7,8 +8,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose.errors import InputError, check_finite, check_shape
+from torchpose.errors import InputError, check_covariance, check_finite, check_shape
 from torchpose.priors.neck import KINECT_NECK, NeckFraction
+from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.skeleton import ARM_JOINTS, UPPER_BODY, upper_body_indices
 
 __all__ = [
@@ -17,9 +19,11 @@ __all__ = [
     "append_blocks",
     "arm_measurements",
     "check_gaps",
+    "known_covariances",
     "measure_joints",
     "pick_joints",
     "pixel_indices",
+    "pixels_per_metre",
     "place_measured_neck",
 ]
 
@@ -120,6 +124,12 @@ def _neck_notes(kind: str | None, wanted: str | None, middle: bool) -> list[str]
     return [f"the keypoints' neck ({kind}) is not the prior's ({wanted}): not measured"]
 
 
+def pixels_per_metre(prior: UpperBodyPrior) -> float:
+    """Of the prior's camera at its mean pose's neck."""
+    depth = float(prior.left.moments()[0][14] + prior.right.moments()[0][14]) / 2
+    return math.sqrt(prior.info.fx * prior.info.fy) / depth
+
+
 def place_measured_neck(
     measured: MeasuredJoints, pixels_per_metre: float, neck: NeckFraction = KINECT_NECK
 ) -> MeasuredJoints:
@@ -154,6 +164,18 @@ def place_measured_neck(
         of_middle = torch.where(both[..., None, None], of_shoulders, of_middle)
     cov[..., _NECK, :, :] = (1 - share) ** 2 * of_middle + share**2 * cov[..., _HEAD, :, :] + spread
     return MeasuredJoints(uv, mask, cov)
+
+
+def known_covariances(
+    covariance: Float[Tensor, "B T J 2 2"], keypoints: Float[Tensor, "B T J 2"]
+) -> Float[Tensor, "B T J 2 2"]:
+    """The covariances of the keypoints that are there, and the identity for the others."""
+    check_shape("covariance", covariance, [*keypoints.shape, 2])
+    eye = torch.eye(2).to(keypoints)
+    there = keypoints.isfinite().all(-1)[..., None, None]
+    covariance = torch.where(there, covariance.to(keypoints), eye)
+    check_covariance("covariance", covariance)
+    return covariance
 
 
 def measure_joints(

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose.measure.edges import AssociationState, HandAssociation
+from torchpose.measure.association import AssociationState, HandAssociation
 from torchpose.measure.face import Image
 from torchpose.measure.upper_body import FrameMeasurements
 from torchpose.pose_track import PoseTrack

@@ -4,6 +4,7 @@ A filter over windows estimates every frame for itself, so that the noise of key
 from one component to the next show as trembling. `MotionStage` filters (or smooths) what is read out.
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
@@ -17,7 +18,7 @@ from torchpose.filters.constant_velocity import ConstantVelocityFilter, Constant
 from torchpose.lifting import arm_in_body_frame, join_arms, pixel_covariances
 from torchpose.rotations import RotationOrder, euler_to_matrix, matrix_to_euler
 
-__all__ = ["MotionStage", "MotionState", "ReadOut", "read_out"]
+__all__ = ["MotionStage", "MotionState", "ReadOut", "read_out", "recalibrated"]
 
 
 class ReadOut(NamedTuple):
@@ -69,6 +70,22 @@ def read_out(
         slopes = view_jacobian(uv, view, matrix)
         uv, uv_covs = from_view(uv, view, matrix), slopes @ uv_covs @ slopes.mT
     return ReadOut(joints, joint_covs, angles, place, uv, uv_covs)
+
+
+def recalibrated(
+    covs: Float[Tensor, "B T 8 3 3"], noise: Mapping[str, Tensor], mode: str
+) -> Float[Tensor, "B T 8 3 3"]:
+    """s C + f I for each joint, as a prior's training persons showed; C if it does not say.
+
+    Args:
+        covs: C, metres squared. noise: of a prior. mode: name of the window, or "pose".
+    """
+    scale = noise.get(f"calibration_scale_{mode}")
+    floor = noise.get(f"calibration_floor_{mode}")
+    if scale is None or floor is None:
+        return covs
+    eye = torch.eye(3, dtype=covs.dtype, device=covs.device)
+    return covs * scale.to(covs)[:, None, None] + floor.to(covs)[:, None, None] * eye
 
 
 class MotionState(NamedTuple):

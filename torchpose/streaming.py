@@ -7,14 +7,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.arms import SeenInView, generators_of_arms, pose_of_window, require_cov
+from torchpose.arm_windows import SeenInView, pose_of_window, window_inputs
+from torchpose.arms import ARMS, generators_of_arms, joints_of_arm, require_cov
 from torchpose.body_view import memory_frames
 from torchpose.errors import DegenerateFilterWarning, InputError, check_shape
 from torchpose.filters import MixtureKalmanFilter
 from torchpose.filters.base import FilterOutput, Generators, RecursiveFilter, collect
 from torchpose.measurements import MeasuredJoints, Picked, arm_measurements, pick_joints
 from torchpose.read_out import MotionState
-from torchpose.skeleton import ARM_JOINTS, LEFT_ARM, RIGHT_ARM, UPPER_BODY
+from torchpose.skeleton import UPPER_BODY
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
     from torchpose.tracking import UpperBodyTracker
 
 __all__ = ["LivePose", "StreamState", "begin", "track_frame", "track_frames"]
-
-_SIDES = {"left": LEFT_ARM, "right": RIGHT_ARM}
 
 
 class Stream(NamedTuple):
@@ -99,13 +98,13 @@ def begin(
     n_keypoints = len(UPPER_BODY) if names is None else len(names)
     info = tracker.prior.info
     picked = pick_joints(n_keypoints, names, tracker.neck, info.neck, info.hand)
-    joints = {side: _joints_of(arm, picked.indices) for side, arm in _SIDES.items()}
-    sources = dict(zip(_SIDES, generators_of_arms(generator), strict=True))
+    joints = {side: joints_of_arm(side, [i >= 0 for i in picked.indices]) for side in ARMS}
+    sources = dict(zip(ARMS, generators_of_arms(generator), strict=True))
     filters = {
         side: tuple(
             model.init(batch_size, sources[side]) for model in _models(tracker, side, joints[side])
         )
-        for side in _SIDES
+        for side in ARMS
     }
     window = tracker._window()
     n_frames = 0 if window is None else 1 + memory_frames(window[1].lags, window[1].fps)
@@ -117,16 +116,6 @@ def begin(
     )
     unseen = torch.zeros(batch_size, dtype=torch.long, device=like.device)
     return StreamState(recent, filters, None, unseen, Stream(n_keypoints, picked, joints, sources))
-
-
-def _joints_of(arm: tuple[int, ...], indices: tuple[int, ...]) -> tuple[str, ...]:
-    """Hand, head and neck, and any other joint of the arm that is among the keypoints."""
-    usual = ("hand", "head", "neck")
-    return tuple(
-        joint
-        for joint, row in zip(ARM_JOINTS, arm, strict=True)
-        if joint in usual or indices[row] >= 0
-    )
 
 
 def _models(
@@ -191,7 +180,7 @@ def track_frames(
     if seen is not None:
         seen = seen._replace(measured=seen.measured._replace(cov=measured.cov))
     arms, filters = {}, {}
-    for side in _SIDES:
+    for side in ARMS:
         filters[side], arms[side] = _advance_arm(tracker, side, state, measured, seen)
     view = None if seen is None else seen.view
     left, right = arms["left"], arms["right"]
@@ -230,13 +219,14 @@ def _advance_arm(
     joints, generator = state.stream.joints[side], state.stream.generators[side]
     models, states = _models(tracker, side, joints), state.filters[side]
     if seen is None:
-        z, mask, cov = arm_measurements(_SIDES[side], joints, measured)
+        z, mask, cov = arm_measurements(ARMS[side], joints, measured)
         after, out = _advance(models[0], states[0], z, mask, cov, generator)
         return (after,), out
-    both, noise, hands = tracker._window_inputs(side, joints, seen)
+    window = tracker.prior.windows[seen.window]
+    both, noise, hands = window_inputs(seen, window, side, joints, tracker.measurement_cov)
     after, out = _advance(models[0], states[0], *both, noise, None)
     after_hands, context = _advance(models[1], states[1], *hands, None, None)
-    return (after, after_hands), pose_of_window(out, context, seen, _SIDES[side])
+    return (after, after_hands), pose_of_window(out, context, seen, ARMS[side])
 
 
 def _advance(

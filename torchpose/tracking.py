@@ -9,59 +9,43 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchpose import streaming
-from torchpose.arms import SeenInView, generators_of_arms, pose_of_window
-from torchpose.body_view import (
-    BodyView,
-    PathModel,
-    body_path,
-    to_view,
-    view_body,
-    view_jacobian,
+from torchpose.arm_filters import joint_covariances, pose_filter
+from torchpose.arm_windows import (
+    SeenInView,
+    pose_of_window,
+    see_in_view,
+    suitable_window,
+    window_filter,
+    window_inputs,
 )
+from torchpose.arms import ARMS, first_failure, generators_of_arms, joints_of_arm
+from torchpose.body_view import BodyView
 from torchpose.camera import PinholeCamera
-from torchpose.errors import (
-    CameraError,
-    InputError,
-    PriorError,
-    check_covariance,
-    check_finite,
-    check_shape,
-)
-from torchpose.filters import BootstrapParticleFilter, FilterOutput, MixtureKalmanFilter
+from torchpose.errors import CameraError, InputError, PriorError, check_shape
+from torchpose.filters import FilterOutput, MixtureKalmanFilter
 from torchpose.filters.base import Generators, RecursiveFilter
 from torchpose.measurements import (
     MeasuredJoints,
     Picked,
-    append_blocks,
     arm_measurements,
     check_gaps,
+    known_covariances,
     measure_joints,
     pick_joints,
-    pixel_indices,
+    pixels_per_metre,
     place_measured_neck,
 )
 from torchpose.pose_track import PoseTrack
-from torchpose.priors.arm_state import STATE_DIM
-from torchpose.priors.upper_body import UpperBodyPrior, released_process_cov
-from torchpose.priors.window import WindowLayout, window_measurements
+from torchpose.priors.upper_body import UpperBodyPrior
+from torchpose.priors.window import WindowLayout
 from torchpose.projection import map_pixel_covariance, map_pixels
-from torchpose.read_out import MotionStage, ReadOut, read_out
+from torchpose.read_out import MotionStage, ReadOut, read_out, recalibrated
 from torchpose.rotations import RotationOrder, euler_to_matrix
-from torchpose.skeleton import ARM_JOINTS, LEFT_ARM, RIGHT_ARM, UPPER_BODY
 from torchpose.streaming import LivePose, StreamState
 
 __all__ = ["METHODS", "PoseTrack", "UpperBodyTracker"]
 
 METHODS = ("mkf-fixed", "mkf-sampled", "mkf-split", "pf-mixture", "pf-walk", "pf-walk-unscaled")
-_PROPOSALS = {
-    "pf-mixture": "mixture",
-    "pf-walk": "random-walk",
-    "pf-walk-unscaled": "random-walk-unscaled",
-}
-_SIDES = {"left": LEFT_ARM, "right": RIGHT_ARM}
-_HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
-_HANDS = [UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")]
-_DEFAULT_STD = 3.0
 # These options are those of a filter over single poses.
 _POSE_OPTIONS = {"transition", "gamma", "subspace", "initial_cov", "process_cov"}
 
@@ -146,78 +130,22 @@ class UpperBodyTracker(nn.Module):
         self.neck = neck
         self.max_gap = max_gap
         self.options = options
-        self.register_buffer("measurement_cov", self._measurement_cov(measurement_std))
+        covariances = joint_covariances(prior, measurement_std, self.camera.matrix)
+        self.register_buffer("measurement_cov", covariances)
         self.measurement_cov: Tensor
         self.filters = nn.ModuleDict()
         self.stages = nn.ModuleDict()
-        for side in _SIDES:
+        for side in ARMS:
             self._filter(side, ("hand", "head", "neck"))
-
-    def _measurement_cov(self, std: float | Sequence[float] | Tensor | None) -> Tensor:
-        """R of each of the eight joints in the prior's pixels, [8, 2, 2]."""
-        learnt = self.prior.noise.get("measurement_std")
-        if std is None and learnt is not None:
-            by_joint = learnt.double().expand(5) if learnt.ndim == 0 else learnt.double()
-            matrix = None
-        else:
-            given = torch.as_tensor(_DEFAULT_STD if std is None else std, dtype=torch.float64)
-            by_joint = given.expand(5) if given.ndim == 0 else given
-            matrix = self.camera.matrix
-        check_shape("measurement_std", by_joint, [5])
-        check_finite("measurement_std", by_joint)
-        if bool((by_joint <= 0).any()):
-            raise InputError(f"measurement_std must be positive, got {by_joint.tolist()}")
-        cov = torch.diag_embed(by_joint.square()[:, None].expand(5, 2))
-        if matrix is not None:
-            cov = map_pixel_covariance(cov, matrix, self.prior.info.matrix)
-        order = [_arm_index(joint) for joint in UPPER_BODY]
-        return cov[order]
 
     def _filter(self, side: str, joints: tuple[str, ...]) -> RecursiveFilter:
         """The filter of an arm that measures these joints."""
         key = "_".join((side, *joints))
         if key not in self.filters:
-            self.filters[key] = self._make_filter(side, joints)
+            self.filters[key] = pose_filter(
+                self.prior, side, joints, self.measurement_cov, self.method, self.fps, self.options
+            )
         return cast(RecursiveFilter, self.filters[key])
-
-    def _make_filter(self, side: str, joints: tuple[str, ...]) -> RecursiveFilter:
-        mixture = getattr(self.prior, side)
-        observed = pixel_indices(joints)
-        arm = _SIDES[side]
-        blocks = [self.measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
-        options = self._noise_options(side) | self.options
-        process_cov = options.pop("process_cov")
-        arguments = (mixture, process_cov, torch.block_diag(*blocks), observed)
-        try:
-            if self.method in _PROPOSALS:
-                return BootstrapParticleFilter(
-                    *arguments, proposal=_PROPOSALS[self.method], **options
-                )
-            tracks = self.method.removeprefix("mkf-")
-            return MixtureKalmanFilter(*arguments, tracks=tracks, **options)
-        except TypeError as error:
-            raise InputError(
-                f"an option does not fit the method {self.method!r}: {error}"
-            ) from error
-
-    def _noise_options(self, side: str) -> dict[str, Any]:
-        """Noise and transition that the prior brings, scaled to the frame rate."""
-        noise, info = self.prior.noise, self.prior.info
-        ratio = 1.0 if not self.fps or not info.fps else info.fps / self.fps
-        process_cov = noise.get(f"process_cov_{side}", noise.get("process_cov"))
-        if process_cov is None:
-            process_cov = default_process_cov(self.prior)
-        options: dict[str, Any] = {"process_cov": process_cov * ratio}
-        if self.method in _PROPOSALS:
-            return options
-        options["transition"] = info.transition
-        gamma = noise.get(f"gamma_{side}", noise.get("gamma"))
-        if gamma is not None and info.transition == "ou":
-            options["gamma"] = gamma**ratio
-        epsilon = noise.get("uniform_weight")
-        if epsilon is not None and self.method == "mkf-fixed":
-            options["uniform_weight"] = float(epsilon)
-        return options
 
     def forward(
         self,
@@ -256,7 +184,7 @@ class UpperBodyTracker(nn.Module):
         seen = self._look(measured, lengths)
         arms = {
             side: self._run_arm(side, measured, seen, lengths, source, progress)
-            for side, source in zip(_SIDES, sources, strict=True)
+            for side, source in zip(ARMS, sources, strict=True)
         }
         view = None if seen is None else seen.view
         left, right = arms["left"], arms["right"]
@@ -369,7 +297,7 @@ class UpperBodyTracker(nn.Module):
     ) -> MeasuredJoints:
         own, prior = self.camera.matrix.to(keypoints), self.prior.info.matrix.to(keypoints)
         if covariance is not None:
-            covariance = _checked_covariance(covariance, keypoints)
+            covariance = known_covariances(covariance, keypoints)
             covariance = map_pixel_covariance(covariance, own, prior)
         measured = measure_joints(
             keypoints, confidence, mask, picked.indices, self.measurement_cov, covariance
@@ -377,12 +305,7 @@ class UpperBodyTracker(nn.Module):
         measured = measured._replace(uv=map_pixels(measured.uv, own, prior))
         if not picked.middle:
             return measured
-        return place_measured_neck(measured, self._pixels_per_metre())
-
-    def _pixels_per_metre(self) -> float:
-        """Of the prior's camera at its mean pose's neck."""
-        depth = float(self.prior.left.moments()[0][14] + self.prior.right.moments()[0][14]) / 2
-        return math.sqrt(self.prior.info.fx * self.prior.info.fy) / depth
+        return place_measured_neck(measured, pixels_per_metre(self.prior))
 
     def _run_arm(
         self,
@@ -393,10 +316,10 @@ class UpperBodyTracker(nn.Module):
         generator: Generators,
         progress: bool,
     ) -> FilterOutput:
-        joints = self._measured_joints(side, measured.mask)
+        joints = joints_of_arm(side, measured.mask.flatten(0, 1).any(0).tolist())
         if seen is not None:
             return self._run_window(side, joints, seen, lengths, progress)
-        z, mask, cov = arm_measurements(_SIDES[side], joints, measured)
+        z, mask, cov = arm_measurements(ARMS[side], joints, measured)
         model = self._filter(side, joints)
         if self.smoothing is not None and isinstance(model, MixtureKalmanFilter):
             lag = None if self.smoothing == "full" else int(self.smoothing)
@@ -404,15 +327,10 @@ class UpperBodyTracker(nn.Module):
         return model(z, mask, cov, lengths, generator, return_cov=True, progress=progress)
 
     def _window(self) -> tuple[str, WindowLayout] | None:
-        """The window that suits the smoothing asked for: its name, and its lags at this frame rate."""
+        """The window that suits what was asked for: its name, and its lags at this frame rate."""
         if self.method != "mkf-fixed" or not self.window or _POSE_OPTIONS & self.options.keys():
             return None
-        name = "causal" if self.smoothing is None else "full"
-        if name not in self.prior.windows:
-            return None
-        layout = self.prior.windows[name].layout.at_rate(self.fps or 30.0)
-        too_far = isinstance(self.smoothing, int) and self.smoothing < layout.ahead
-        return None if too_far else (name, layout)
+        return suitable_window(self.prior, self.smoothing, self.fps or 30.0)
 
     def _look(
         self, measured: MeasuredJoints, lengths: Tensor | None = None, start: int = 0
@@ -424,40 +342,7 @@ class UpperBodyTracker(nn.Module):
         window = self._window()
         if window is None:
             return None
-        name, layout = window
-        uv, mask, matrix = measured.uv, measured.mask, self.prior.info.matrix.to(measured.uv)
-        if lengths is not None:
-            frames = torch.arange(mask.shape[1], device=mask.device)
-            mask = mask & (frames < lengths.to(mask.device)[:, None])[..., None]
-        start = start % mask.shape[1]
-        model = self._path_model(uv)
-        noise = None
-        if measured.cov.ndim > 3:
-            noise = _of_anchors(measured.cov)
-        else:
-            model = model._replace(variance=_of_anchors(measured.cov))
-        path = body_path(uv, mask, layout.lags, layout.ahead, layout.fps, model, start, noise)
-        neck, height = path.at(0)
-        apart = (uv[:, start:, _HANDS] - neck[:, :, None]).norm(dim=-1)
-        reach = torch.where(mask[:, start:, _HANDS], apart, torch.zeros_like(apart)).amax(-1)
-        view = view_body(neck, height, model, matrix, reach)
-        hands = {}
-        for side in _SIDES:
-            values, known = window_measurements(uv, mask, layout, side, path, start)
-            hands[side] = to_view(values, view, matrix).flatten(-2), known.repeat_interleave(2, -1)
-        now = to_view(uv[:, start:], view, matrix)
-        now = torch.where(mask[:, start:, :, None], now, torch.zeros_like(now))
-        cov = measured.cov if measured.cov.ndim == 3 else measured.cov[:, start:]
-        log_scale = -view_jacobian(now, view, matrix).det().abs().log()
-        return SeenInView(name, MeasuredJoints(now, mask[:, start:], cov), hands, view, log_scale)
-
-    def _path_model(self, like: Tensor) -> PathModel:
-        """Head and neck of the prior's mean pose, and their measurement noise."""
-        both = (self.prior.left.moments()[0] + self.prior.right.moments()[0]) / 2
-        head, neck = both[9:11].to(like), both[12:14].to(like)
-        return PathModel(
-            neck, head - neck, _of_anchors(self.measurement_cov), self._pixels_per_metre()
-        )
+        return see_in_view(measured, self.prior, *window, self.measurement_cov, lengths, start)
 
     def _run_window(
         self,
@@ -468,59 +353,22 @@ class UpperBodyTracker(nn.Module):
         progress: bool,
     ) -> FilterOutput:
         """Fixed tracks over window states; the evidence is that of this frame given the window."""
-        both, noise, hands = self._window_inputs(side, joints, seen)
+        window = self.prior.windows[seen.window]
+        both, noise, hands = window_inputs(seen, window, side, joints, self.measurement_cov)
         model = self._window_filter(side, seen.window, joints)
         out = model(*both, noise, lengths, return_cov=True, progress=progress)
         context = self._window_filter(side, seen.window, ())(*hands, None, lengths)
-        return pose_of_window(out, context, seen, _SIDES[side])
-
-    def _window_inputs(
-        self, side: str, joints: tuple[str, ...], seen: SeenInView
-    ) -> tuple[tuple[Tensor, Tensor], Tensor, tuple[Tensor, Tensor]]:
-        """Values and mask of joints and hands, their R, and values and mask of the hands alone."""
-        z, mask, cov = arm_measurements(_SIDES[side], joints, seen.measured)
-        hands, known = seen.hands[side]
-        hand_cov = self._window_hand_cov(side, seen.window)
-        noise = append_blocks(cov, hand_cov, hands.shape[-1] // 2)
-        return (torch.cat([z, hands], -1), torch.cat([mask, known], -1)), noise, (hands, known)
+        return pose_of_window(out, context, seen, ARMS[side])
 
     def _window_filter(self, side: str, name: str, joints: tuple[str, ...]) -> MixtureKalmanFilter:
         """Fixed tracks over window states that measure these joints and all hands of the window."""
         key = "_".join(("window", name, side, *joints))
         if key not in self.filters:
             window = self.prior.windows[name]
-            arm = _SIDES[side]
-            blocks = [self.measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
-            n_hands = (window.layout.dim - STATE_DIM) // 2
-            blocks += [self._window_hand_cov(side, name)] * n_hands
-            observed = pixel_indices(joints) + list(range(STATE_DIM, window.layout.dim))
-            settings = {"likelihood_power": window.settings["likelihood_power"]}
-            # Poses of consecutive frames are tied by the window itself: no memory beyond it.
-            self.filters[key] = MixtureKalmanFilter(
-                getattr(window, side),
-                torch.ones(window.layout.dim, dtype=torch.float64),
-                torch.block_diag(*blocks),
-                observed,
-                transition="ou",
-                gamma=0.0,
-                weighting="frame",
-                **(settings | self.options),
+            self.filters[key] = window_filter(
+                window, side, joints, self.measurement_cov, self.options
             )
         return cast(MixtureKalmanFilter, self.filters[key])
-
-    def _window_hand_cov(self, side: str, name: str) -> Tensor:
-        """Noise of a hand of the window: that of a hand now, and what moving it here adds."""
-        std = self.prior.windows[name].settings["hand_std"]
-        own = self.measurement_cov[_SIDES[side][0]]
-        return own + std**2 * torch.eye(2, dtype=own.dtype, device=own.device)
-
-    def _measured_joints(self, side: str, mask: Tensor) -> tuple[str, ...]:
-        """Hand, head and neck, and any other joint of the arm that is measured somewhere."""
-        anywhere = mask.flatten(0, 1).any(0)[list(_SIDES[side])].tolist()
-        usual = ("hand", "head", "neck")
-        return tuple(
-            j for j, there in zip(ARM_JOINTS, anywhere, strict=True) if there or j in usual
-        )
 
     def _poses(
         self,
@@ -555,7 +403,7 @@ class UpperBodyTracker(nn.Module):
             log_evidence=torch.stack([left.log_evidence, right.log_evidence], -1),
             lengths=lengths,
             matrix=self.camera.matrix,
-            failed_at=_first_failure(left, right),
+            failed_at=first_failure(left, right),
             fps=self.fps,
             frame=self.frame,
             notes=notes,
@@ -593,7 +441,7 @@ class UpperBodyTracker(nn.Module):
         batch, n_frames = reading.uv.shape[:2]
         ends = torch.full((batch,), n_frames) if lengths is None else lengths
         ends = ends.to(reading.uv.device)
-        failed_at = _first_failure(left, right)
+        failed_at = first_failure(left, right)
         ends = torch.where(failed_at >= 0, torch.minimum(ends, failed_at.clamp_min(1)), ends)
         lag: int | None = 0
         if self.smoothing is not None:
@@ -602,62 +450,10 @@ class UpperBodyTracker(nn.Module):
 
     def _calibrated(self, covs: Tensor) -> Tensor:
         """Covariances recalibrated per joint on the prior's training persons, if it brings that."""
-        noise, window = self.prior.noise, self._window()
-        mode = "pose" if window is None else window[0]
-        scale = noise.get(f"calibration_scale_{mode}")
-        floor = noise.get(f"calibration_floor_{mode}")
-        if scale is None or floor is None or not self.calibrated:
+        if not self.calibrated:
             return covs
-        eye = torch.eye(3, dtype=covs.dtype, device=covs.device)
-        return covs * scale.to(covs)[:, None, None] + floor.to(covs)[:, None, None] * eye
-
-
-def default_process_cov(prior: UpperBodyPrior) -> Float[Tensor, " 21"]:
-    """Diagonal of Q per frame where a prior brings none: that of the authors' released tracker.
-
-    They set it by hand for f = 1550 pixels, a person 4.5 m away and 25 frames per second; the same
-    movement in metres is f / depth times as many pixels elsewhere.
-
-    Args:
-        prior: whose camera, mean depth and frame rate are used.
-    """
-    depth = prior.left.moments()[0][2:15:3].mean().clamp_min(0.1)
-    pixels = math.sqrt(prior.info.fx * prior.info.fy) / depth / (1550 / 4.5)
-    released = released_process_cov().to(pixels)
-    in_pixels = torch.zeros(STATE_DIM, dtype=torch.bool, device=released.device)
-    in_pixels[pixel_indices(ARM_JOINTS)] = True
-    scaled = torch.where(in_pixels, released * pixels.square(), released)
-    return scaled * (25.0 / (prior.info.fps or 30.0))
-
-
-def _first_failure(left: FilterOutput, right: FilterOutput) -> Tensor:
-    """The first frame at which either arm degenerated, -1 where none did, [B]."""
-    n_frames = left.mean.shape[1]
-    failures = torch.stack([left.failed_at, right.failed_at])
-    first = failures.where(failures >= 0, n_frames).amin(0)
-    return torch.where((failures >= 0).any(0), first, -1)
-
-
-def _checked_covariance(
-    covariance: Float[Tensor, "B T J 2 2"], keypoints: Float[Tensor, "B T J 2"]
-) -> Float[Tensor, "B T J 2 2"]:
-    """The covariances of the keypoints that are there, and the identity for the others."""
-    check_shape("covariance", covariance, [*keypoints.shape, 2])
-    eye = torch.eye(2).to(keypoints)
-    there = keypoints.isfinite().all(-1)[..., None, None]
-    covariance = torch.where(there, covariance.to(keypoints), eye)
-    check_covariance("covariance", covariance)
-    return covariance
-
-
-def _of_anchors(cov: Float[Tensor, "*batch 8 2 2"]) -> Float[Tensor, "*batch 2"]:
-    """Variance of a coordinate of head and neck, pixels squared."""
-    return cov[..., [_HEAD, _NECK], :, :].diagonal(dim1=-2, dim2=-1).mean(-1)
-
-
-def _arm_index(joint: str) -> int:
-    """Index in `ARM_JOINTS` of one of the eight joints."""
-    return ARM_JOINTS.index(joint.split("_")[0])
+        window = self._window()
+        return recalibrated(covs, self.prior.noise, "pose" if window is None else window[0])
 
 
 def _require_camera(camera: PinholeCamera | None) -> PinholeCamera:

@@ -12,7 +12,7 @@ from tqdm.auto import tqdm
 
 from torchpose.camera import PinholeCamera
 from torchpose.errors import InputError
-from torchpose.measure.edges import HandAssociation
+from torchpose.measure.association import HandAssociation
 from torchpose.measure.face import FaceDetector, FaceTracks, Image
 from torchpose.measure.head_neck import HeadNeck
 from torchpose.measure.upper_body import (

@@ -53,9 +53,7 @@ def test_after_too_long_nobody_is_expected_back():
 
 
 def test_somebody_who_is_still_there_is_not_mistaken_for_one_who_left():
-    numbers = follow(
-        PersonRegister(), [(0, [(0, 100, RED)]), (1, [(0, 100, RED), (1, 400, RED)])]
-    )
+    numbers = follow(PersonRegister(), [(0, [(0, 100, RED)]), (1, [(0, 100, RED), (1, 400, RED)])])
     assert numbers == [[0], [0, 1]]
 
 

@@ -64,7 +64,7 @@ def small_recipe(recordings, n_components=3, seed=0, progress=False, name=""):
     prior = fit_upper_body_prior(
         recordings, n_components, seed, n_samples=1500, max_iter=15, name=name, progress=progress
     )
-    from torchpose.tracking import default_process_cov
+    from torchpose.arm_filters import default_process_cov
 
     prior.set_noise("process_cov", 2 * default_process_cov(prior))
     prior.set_noise("gamma", torch.full((n_components,), 0.9, dtype=torch.float64))

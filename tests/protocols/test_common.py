@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from tests.protocols.recordings import poses, small_recipe, write_people
+from torchpose.arm_filters import default_process_cov
 from torchpose.camera import PinholeCamera
 from torchpose.errors import InputError
 from torchpose.protocols.common import (
@@ -21,7 +22,6 @@ from torchpose.protocols.common import (
 )
 from torchpose.protocols.gaps import back_and_forth
 from torchpose.protocols.ub_people import mean_pose, nearest_neighbour, people, sway
-from torchpose.tracking import default_process_cov
 
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5)
 

@@ -1,14 +1,8 @@
 """Measurements from images: faces, skin, hands, edges, background."""
 
+from torchpose.measure.association import AssociationState, HandAssociation
 from torchpose.measure.background import BackgroundModel
-from torchpose.measure.edges import (
-    AssociationState,
-    HandAssociation,
-    Segments,
-    edge_map,
-    find_segments,
-    limb_votes,
-)
+from torchpose.measure.edges import Segments, edge_map, find_segments, limb_votes
 from torchpose.measure.face import (
     FaceDetector,
     FaceTracker,
@@ -16,8 +10,10 @@ from torchpose.measure.face import (
     HaarFaceDetector,
     Region,
 )
+from torchpose.measure.hand_measurements import HandMeasurements
 from torchpose.measure.hand_prior import HandPrior
-from torchpose.measure.hands import HandMeasurements, HandSettings, HandState, HandTracker
+from torchpose.measure.hand_settings import HandSettings
+from torchpose.measure.hands import HandState, HandTracker
 from torchpose.measure.head_neck import FACE_OFFSETS, FaceOffsets, HeadNeck
 from torchpose.measure.mean_shift import MeanShift, mean_shift
 from torchpose.measure.mean_shift_hands import MeanShiftHandState, MeanShiftHandTracker

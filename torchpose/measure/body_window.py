@@ -11,7 +11,7 @@ from functools import cache, lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -24,7 +24,10 @@ __all__ = [
     "EVIDENCE",
     "cell_centres",
     "cells_to_pixels",
+    "cut_colours",
+    "cut_mask",
     "cut_windows",
+    "faces_in_evidence",
     "follow_faces",
     "gaussian_matrix",
     "inside_image",
@@ -114,6 +117,47 @@ def cut_windows(
     return cut
 
 
+def cut_colours(
+    frame: Image, anchors: Float[Tensor, "N 3"], part: tuple[slice, slice]
+) -> tuple[UInt8[Tensor, "N 3 h w"], Float[Tensor, "N 3 h w"], UInt8[Tensor, "N 3 p q"]]:
+    """Windows in Lab, bytes [N, 3, 160, 192], the same smoothed, and a finer part [N, 3, p, q].
+
+    By OpenCV, for one person after the other, as in `cut_windows`.
+
+    Args:
+        frame: RGB [H, W, 3]. anchors: from `place_windows`.
+        part: rows and columns of the finer part, four pixels for a cell.
+    """
+    import cv2
+
+    labs, smooth, parts = [], [], []
+    size = (CELLS[1] * EVIDENCE, CELLS[0] * EVIDENCE)
+    for window in cut_windows(frame, anchors):
+        small = cv2.resize(window, size, interpolation=cv2.INTER_AREA)
+        lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB)
+        fine = cv2.cvtColor(window[part], cv2.COLOR_RGB2LAB)
+        soft = cv2.GaussianBlur(lab.astype(np.float32), (0, 0), 0.8)
+        labs.append(cv2.split(lab))
+        smooth.append(cv2.split(soft))
+        parts.append(cv2.split(fine))
+    return tuple(torch.from_numpy(np.array(x)) for x in (labs, smooth, parts))  # type: ignore[return-value]
+
+
+def cut_mask(mask: Image, anchors: Float[Tensor, "N 3"]) -> Float[Tensor, "N h w"]:
+    """Windows of a mask of 0 and 255, as shares [N, 160, 192].
+
+    Args:
+        mask: [H, W]. anchors: from `place_windows`.
+    """
+    return _halved(torch.from_numpy(np.stack(cut_windows(mask, anchors))).float()) / 255
+
+
+def _halved(maps: Tensor) -> Tensor:
+    """Means of two by two."""
+    maps = maps[:, ::2] + maps[:, 1::2]
+    return (maps[..., ::2] + maps[..., 1::2]) / 4
+
+
 def _pixels_to_one(size: Tensor) -> Tensor:
     """Pixels of the image, along a side, that become about one of the window."""
     step = (size * CELL / COLOURS).round().clamp_min(1)
@@ -191,6 +235,15 @@ def cells_to_pixels(
     """Places in cells to places in the image."""
     first = places.new_tensor([_LEFT, _TOP]) + CELL / 2
     return anchors[:, None, :2] + (places * CELL + first) * anchors[:, None, 2:]
+
+
+def faces_in_evidence(
+    faces: Float[Tensor, "N 3"], anchors: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N 3"]:
+    """Faces (x, y, B) in pixels of the finer maps, the first pixel's centre being 0."""
+    at = pixels_to_cells(faces[:, None, :2], anchors)[:, 0]
+    size = faces[:, 2:] / (anchors[:, 2:] * CELL)
+    return torch.cat([(at + 0.5) * EVIDENCE - 0.5, size * EVIDENCE], 1).float()
 
 
 def move_maps(

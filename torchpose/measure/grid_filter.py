@@ -12,7 +12,7 @@ from torchpose.measure.body_window import gaussian_matrix
 
 _LEAST = 1e-12  # belief in a cell: smaller numbers slow the processor down
 
-__all__ = ["GridEstimate", "blur", "exclude", "predict", "read_out"]
+__all__ = ["GridEstimate", "blur", "exclude", "gaussian_bump", "predict", "read_out"]
 
 
 class GridEstimate(NamedTuple):
@@ -40,6 +40,23 @@ def blur(
         return gaussian_matrix(height, sigma) @ maps @ gaussian_matrix(width, sigma).mT
     x, y = shift.unbind(-1)
     return gaussian_matrix(height, sigma, y) @ maps @ gaussian_matrix(width, sigma, x).mT
+
+
+def gaussian_bump(
+    mean: Float[Tensor, "*batch 2"], cov: Float[Tensor, "*batch 2 2"], size: tuple[int, int]
+) -> Float[Tensor, "*batch h w"]:
+    """Gaussians over a grid, each of which sums to one.
+
+    Args:
+        mean: (x, y), in cells. cov: cells squared. size: rows and columns.
+    """
+    x = torch.arange(size[1], dtype=mean.dtype) - mean[..., :1]
+    y = torch.arange(size[0], dtype=mean.dtype) - mean[..., 1:]
+    precision = torch.linalg.inv(cov)[..., None, None]
+    xx = precision[..., 0, 0, :, :] * x[..., None, :].square()
+    yy = precision[..., 1, 1, :, :] * y[..., :, None].square()
+    xy = 2 * precision[..., 0, 1, :, :] * x[..., None, :] * y[..., :, None]
+    return torch.softmax(-0.5 * (xx + yy + xy).flatten(-2), -1).view(*mean.shape[:-1], *size)
 
 
 def predict(

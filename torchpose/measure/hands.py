@@ -1,13 +1,12 @@
 """Both hands of every person in colour video, by a histogram filter (after Burke & Lasenby, 5.2)."""
 
 import math
-from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -19,7 +18,9 @@ from torchpose.measure.body_window import (
     EVIDENCE,
     cell_centres,
     cells_to_pixels,
-    cut_windows,
+    cut_colours,
+    cut_mask,
+    faces_in_evidence,
     follow_faces,
     inside_image,
     move_maps,
@@ -27,110 +28,20 @@ from torchpose.measure.body_window import (
     place_windows,
 )
 from torchpose.measure.face_memory import FaceMemory, FaceMemoryState, head_part
-from torchpose.measure.grid_filter import exclude, predict, read_out
+from torchpose.measure.grid_filter import exclude, gaussian_bump, predict, read_out
 from torchpose.measure.hand_likelihood import HandLikelihood
+from torchpose.measure.hand_measurements import HandMeasurements
 from torchpose.measure.hand_prior import HandPrior
+from torchpose.measure.hand_settings import HandSettings
 from torchpose.measure.motion import Motion, MotionState
 from torchpose.measure.skin import SkinModel, SkinState
 
-__all__ = ["HandMeasurements", "HandSettings", "HandState", "HandTracker"]
+__all__ = ["HandState", "HandTracker"]
 
 Image = NDArray[np.uint8]
 _REACH = -5.2  # log density per B squared above which a hand may be in a place
 _FACE = (0.7, 0.9)  # half the width and height of a face with what is about it, in B
 _NEAR = 4  # cells about a hand that are believed to be its own
-
-
-class HandMeasurements(NamedTuple):
-    """Hands of N persons: left, right (the person's own), in pixels of the frame.
-
-    Attributes:
-        points: centres of the hands (x, y); NaN where there is nothing to say.
-        covariance: of the points, pixels squared.
-        mass: probability that the hand is there.
-        seen: False where a hand is lost, to be taken as missing.
-    """
-
-    points: Float[Tensor, "N 2 2"]
-    covariance: Float[Tensor, "N 2 2 2"]
-    mass: Float[Tensor, "N 2"]
-    seen: Bool[Tensor, "N 2"]
-
-
-@dataclass(frozen=True)
-class HandSettings:
-    """Constants of `HandTracker`; lengths in face heights B, rates for 30 frames per second.
-
-    Attributes:
-        skin_slope, skin_bias, skin_decay, skin_floor, clothes_share: see `SkinModel`.
-        unknown_skin: probability of skin where the image has ended.
-        face_memory: a hand in front of the face is a change of it; without, the face hides hands.
-        face_alignment, face_deviations, face_floor, face_median, face_scale: see `FaceMemory`.
-        disc, core, motion, unusual, beyond, towards, beside: weights of the cues, see `HandLikelihood`.
-        prior: weight of the log density of a hand given the face.
-        jump: share of belief that is born anew from the prior in each frame.
-        face_rebirth: cost of that in front of the face, in nats.
-        expected_share: of the rebirth about the expected hands, where these are given.
-        near, far, near_share: the two widths of diffusion, and the share of the first.
-        flow, flow_blur: share of belief that optical flow carries, and its blur.
-        rest: diffusion where nothing moves.
-        velocity: share of the last displacement that goes on.
-        exclusion, exclusion_radius: cost of both hands at one place, in nats, and how far it reaches.
-        crossing, crossing_soft: cost of hands on each other's side, in nats, and its softness.
-        still: weight of a frame in which nothing moves; what is seen again is old news.
-        still_motion: moving area, in B squared, from which a frame counts fully.
-        covariance_scale, covariance_floor: the reported covariance is the belief's times the scale,
-            plus the floor (a standard deviation).
-        least_mass, least_skin: below these a hand is not `seen`.
-        stray, rescale: see `follow_faces`.
-        face_follow: share of a face's new size that is taken over; face_change: ratio of sizes from
-            which all of it is.
-    """
-
-    skin_slope: float = 1.5
-    skin_bias: float = 0.8
-    skin_decay: float = 0.95
-    skin_floor: float = 2e-4
-    clothes_share: float = 0.5
-    unknown_skin: float = 0.15
-    face_memory: bool = True
-    face_alignment: bool = True
-    face_deviations: float = 1.5
-    face_floor: float = 2.0
-    face_median: float = 0.1
-    face_scale: float = 4.0
-    disc: float = 5.0
-    core: float = 4.0
-    motion: float = 4.0
-    unusual: float = 0.8
-    beyond: float = 3.0
-    towards: float = 0.75
-    beside: float = 1.2
-    prior: float = 1.0
-    jump: float = 0.015
-    face_rebirth: float = 6.0
-    expected_share: float = 0.5
-    near: float = 0.06
-    far: float = 0.25
-    near_share: float = 0.7
-    flow: float = 0.5
-    flow_blur: float = 0.06
-    rest: float = 0.035
-    velocity: float = 0.8
-    exclusion: float = 2.5
-    exclusion_radius: float = 0.34
-    crossing: float = 2.8
-    crossing_soft: float = 0.15
-    still: float = 0.12
-    still_motion: float = 0.8
-    covariance_scale: float = 2.0
-    covariance_floor: float = 0.05
-    least_mass: float = 0.3
-    least_skin: float = 0.15
-    stray: float = 0.5
-    rescale: float = 1.15
-    face_follow: float = 0.05
-    face_change: float = 1.3
 
 
 class HandState(NamedTuple):
@@ -315,13 +226,13 @@ class HandTracker(nn.Module):
         foreground: Image | None,
     ) -> tuple[HandState, Tensor, Tensor]:
         """Means of skin, motion and the unusual in every cell, and the flow."""
-        lab, smooth, head = _colours(frame, state.anchors)
+        lab, smooth, head = cut_colours(frame, state.anchors, head_part(COLOURS))
         hands = _hands_near(state.belief) * (state.frames > 0)[:, None, None]
         bins = self.skin.byte_bins(lab)
         learnt = self.skin.learn(
             state.skin,
             bins,
-            _in_evidence(faces, state.anchors),
+            faces_in_evidence(faces, state.anchors),
             hands.repeat_interleave(EVIDENCE, 1).repeat_interleave(EVIDENCE, 2),
             inside > 0.5,
         )
@@ -330,7 +241,7 @@ class HandTracker(nn.Module):
         rows, columns = head_part(EVIDENCE)
         skin[:, rows, columns] *= 1 - hidden
         if foreground is not None:
-            skin = skin * _foreground(foreground, state.anchors)
+            skin = skin * cut_mask(foreground, state.anchors)
         motion, moving, unusual, flow = self.motion.step(state.motion, smooth, lab[:, 0])
         maps = torch.stack([skin, moving, unusual], 1)
         if bool((inside < 1).any()):
@@ -366,7 +277,7 @@ class HandTracker(nn.Module):
         unit = (anchors[:, 2] * CELL).square()[:, None, None, None]
         eye = torch.eye(2, dtype=cov.dtype)
         cov = torch.where(known[..., None, None], cov / unit, eye) + 0.25 * eye
-        bump = _bump(pixels_to_cells(mean, anchors), cov).to(born)
+        bump = gaussian_bump(pixels_to_cells(mean, anchors), cov, CELLS).to(born)
         share = self.settings.expected_share * known[..., None, None]
         return born + share.to(born) * (bump - born)
 
@@ -443,43 +354,6 @@ def _nothing(faces: Tensor) -> HandMeasurements:
     )
 
 
-def _colours(frame: Image, anchors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Windows in Lab, bytes [N, 3, 160, 192], the same smoothed, and heads [N, 3, 216, 192].
-
-    By OpenCV, for one person after the other, as in `cut_windows`.
-    """
-    import cv2
-
-    labs, smooth, heads = [], [], []
-    size = (CELLS[1] * EVIDENCE, CELLS[0] * EVIDENCE)
-    for window in cut_windows(frame, anchors):
-        small = cv2.resize(window, size, interpolation=cv2.INTER_AREA)
-        lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB)
-        head = cv2.cvtColor(window[head_part(COLOURS)], cv2.COLOR_RGB2LAB)
-        soft = cv2.GaussianBlur(lab.astype(np.float32), (0, 0), 0.8)
-        labs.append(cv2.split(lab))
-        smooth.append(cv2.split(soft))
-        heads.append(cv2.split(head))
-    return tuple(torch.from_numpy(np.array(x)) for x in (labs, smooth, heads))  # type: ignore[return-value]
-
-
-def _foreground(mask: Image, anchors: Tensor) -> Tensor:
-    return _halved(torch.from_numpy(np.stack(cut_windows(mask, anchors))).float()) / 255
-
-
-def _halved(maps: Tensor) -> Tensor:
-    """Means of two by two."""
-    maps = maps[:, ::2] + maps[:, 1::2]
-    return (maps[..., ::2] + maps[..., 1::2]) / 4
-
-
-def _in_evidence(faces: Tensor, anchors: Tensor) -> Tensor:
-    """Faces in pixels of the evidence."""
-    at = pixels_to_cells(faces[:, None, :2], anchors)[:, 0]
-    size = faces[:, 2:] / (anchors[:, 2:] * CELL)
-    return torch.cat([(at + 0.5) * EVIDENCE - 0.5, size * EVIDENCE], 1).float()
-
-
 def _before_face(faces: Tensor, anchors: Tensor) -> Tensor:
     """One in the cells on the face, zero away from it [N, r, c]."""
     at = (torch.cat([faces[:, :2] - anchors[:, :2], faces[:, 2:]], 1) / anchors[:, 2:]).float()
@@ -499,17 +373,6 @@ def _hands_near(belief: Tensor) -> Tensor:
 def _band(size: int) -> Tensor:
     place = torch.arange(size)
     return ((place[:, None] - place).abs() <= _NEAR).float()
-
-
-def _bump(mean: Tensor, cov: Tensor) -> Tensor:
-    """Gaussians over the cells, each sums to one."""
-    x = torch.arange(CELLS[1], dtype=mean.dtype) - mean[..., :1]
-    y = torch.arange(CELLS[0], dtype=mean.dtype) - mean[..., 1:]
-    precision = torch.linalg.inv(cov)[..., None, None]
-    xx = precision[..., 0, 0, :, :] * x[..., None, :].square()
-    yy = precision[..., 1, 1, :, :] * y[..., :, None].square()
-    xy = 2 * precision[..., 0, 1, :, :] * x[..., None, :] * y[..., :, None]
-    return torch.softmax(-0.5 * (xx + yy + xy).flatten(-2), -1).view(*mean.shape[:-1], *CELLS)
 
 
 def _map(function: Any, *states: Any) -> Any:

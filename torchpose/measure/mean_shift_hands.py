@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from torchpose.errors import InputError, check_finite, check_shape
 from torchpose.gaussian import kalman_predict, kalman_update
+from torchpose.measure.hand_measurements import HandMeasurements
 from torchpose.measure.hand_prior import HandPrior
-from torchpose.measure.hands import HandMeasurements
 from torchpose.measure.mean_shift import mean_shift
 from torchpose.measure.skin import SkinModel, SkinState
 

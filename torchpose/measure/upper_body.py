@@ -11,8 +11,9 @@ from torch import Tensor, nn
 from torchpose.errors import InputError
 from torchpose.measure.background import BackgroundModel
 from torchpose.measure.face import FaceDetector, FaceTracker, FaceTracks, Image
+from torchpose.measure.hand_measurements import HandMeasurements
 from torchpose.measure.hand_prior import HandPrior
-from torchpose.measure.hands import HandMeasurements, HandTracker
+from torchpose.measure.hands import HandTracker
 from torchpose.measure.head_neck import HeadNeck
 from torchpose.measure.mean_shift_hands import MeanShiftHandTracker
 from torchpose.measure.persons import PersonRegister, Persons
@@ -226,9 +227,7 @@ def check_image(image: Any) -> Image:
     shape: tuple[int, ...] = tuple(getattr(image, "shape", ()))
     kind = getattr(image, "dtype", type(image))
     if len(shape) != 3 or shape[2] != 3 or kind != np.uint8:
-        raise InputError(
-            f"a frame must be RGB, [H, W, 3] of uint8, got {list(shape)} of {kind}"
-        )
+        raise InputError(f"a frame must be RGB, [H, W, 3] of uint8, got {list(shape)} of {kind}")
     return np.asarray(image)
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from torchpose.arm_filters import default_process_cov
 from torchpose.camera import PinholeCamera, sample_viewpoints
 from torchpose.errors import InputError, TorchposeError
 from torchpose.filters.base import Generators
@@ -36,7 +37,7 @@ from torchpose.projection import project
 from torchpose.protocols.report import Report
 from torchpose.rotations import euler_to_matrix
 from torchpose.skeleton import UPPER_BODY
-from torchpose.tracking import UpperBodyTracker, default_process_cov
+from torchpose.tracking import UpperBodyTracker
 
 __all__ = [
     "HANDS",

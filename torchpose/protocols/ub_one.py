@@ -5,7 +5,7 @@ with 3 pixels of noise. All trackers have the paper's transition and the same R.
 print its Q; here
 
 - the mixture Kalman filters have that of the authors' released tracker
-  (`torchpose.tracking.default_process_cov`);
+  (`torchpose.arm_filters.default_process_cov`);
 - the mixture proposal has, as published, no burn-in and a larger Q of its own (and is shown with the
   Q of the Kalman filters as well);
 - the random walks have a burn-in and a smaller Q: the released one lets lambda move by a metre in

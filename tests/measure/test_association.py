@@ -1,0 +1,116 @@
+"""Hands that were taken for each other, on drawn arms."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tests.measure.drawn_arms import drawing, pose
+from torchpose import load_prior
+from torchpose.errors import InputError, ShapeError
+from torchpose.measure.association import HandAssociation, arm_hypotheses
+from torchpose.measure.edges import limb_votes, segments_of_arms
+from torchpose.measure.hand_prior import HandPrior
+from torchpose.skeleton import UPPER_BODY
+
+pytest.importorskip("cv2")
+
+
+def swapped_pose():
+    """Elbows as a tracker infers them from hands that were exchanged."""
+    return pose(
+        hand_left=(70, 150), hand_right=(200, 150), elbow_left=(150, 130), elbow_right=(150, 150)
+    )
+
+
+def test_votes_of_a_hypothesis_are_those_of_its_limbs_by_their_length():
+    joints, size = torch.stack([pose(), swapped_pose()])[None], torch.tensor([40.0])
+    found, model = segments_of_arms(drawing(pose()), joints, 40.0), HandAssociation()
+    votes = model.votes(found, joints, size)
+    for h in range(2):
+        count, length = 0.0, 0.0
+        for side in ("left", "right"):
+            for names in ((f"shoulder_{side}", f"elbow_{side}"), (f"elbow_{side}", f"hand_{side}")):
+                a, b = (joints[0, h, UPPER_BODY.index(name)] for name in names)
+                count += float(limb_votes(found, a, b, 0.4 * 40, 0.4, 0.3))
+                length += math.dist(a.tolist(), b.tolist()) / 40
+        assert float(votes[0, h]) == pytest.approx(count / length, rel=1e-5)
+    unknown = model.votes(found, torch.full_like(joints, math.nan), size)
+    assert unknown.tolist() == [[0, 0]]
+
+
+def test_hands_that_were_taken_for_each_other_are_found_and_put_right():
+    image, model = drawing(pose()), HandAssociation()
+    right_way = torch.stack([pose(), swapped_pose()])
+    both = torch.stack([right_way, right_way.flip(0)])  # the second person's hands are exchanged
+    size, identity = torch.tensor([40.0, 40.0]), torch.tensor([4, 9])
+    state = model.init()
+    for _ in range(5):
+        state = model.step(state, image, both, size, identity)
+    assert state.swapped.tolist() == [False, True]
+    state = model.exchange(state, state.swapped)
+    for _ in range(5):
+        state = model.step(state, image, torch.stack([right_way] * 2), size, identity)
+        assert not state.swapped.any()
+
+
+def test_hypotheses_from_the_prior_alone_tell_hands_apart():
+    prior = HandPrior.from_prior(load_prior("kinect-upper-body"))
+    faces = torch.tensor([[160.0, 30.0, 40.0], [160.0, 30.0, 40.0]])
+    hands = torch.tensor([[[215.0, 150.0], [75.0, 150.0]], [[215.0, math.nan], [75.0, 150.0]]])
+    joints = arm_hypotheses(prior, faces, hands)
+    exchanged = arm_hypotheses(prior, faces, hands.flip(1))
+    torch.testing.assert_close(joints, exchanged.flip(1), equal_nan=True)
+    at = {name: UPPER_BODY.index(name) for name in UPPER_BODY}
+    torch.testing.assert_close(joints[0, 0, at["hand_left"]], hands[0, 0])
+    torch.testing.assert_close(joints[0, 1, at["hand_left"]], hands[0, 1])
+    for k, side in enumerate(("left", "right")):
+        _, elbow = prior((hands[0, k] - faces[0, :2]) / 40)
+        torch.testing.assert_close(joints[0, 0, at[f"elbow_{side}"]], elbow[k] * 40 + faces[0, :2])
+    assert torch.isnan(joints[1, 0, [at["hand_left"], at["elbow_left"]]]).all()
+    assert torch.isfinite(joints[1, 0, [at["hand_right"], at["elbow_right"]]]).all()
+    elbows = {f"elbow_{s}": joints[0, 0, at[f"elbow_{s}"]].tolist() for s in ("left", "right")}
+    ends = {"hand_left": (215, 150), "hand_right": (75, 150)}
+    image = drawing(pose(**elbows, **ends, shoulder_left=(195, 84), shoulder_right=(125, 84)))
+    model, identity = HandAssociation(), torch.tensor([0])
+    state = model.init()
+    for _ in range(5):
+        state = model.step(state, image, exchanged[:1], faces[:1, 2], identity)
+    assert state.swapped.tolist() == [True]
+
+
+def test_one_odd_frame_does_not_swap_and_persons_keep_their_votes():
+    image, model = drawing(pose()), HandAssociation(decay=0.9)
+    right_way = torch.stack([pose(), swapped_pose()])[None]
+    state, size = model.init(), torch.tensor([40.0])
+    for _ in range(10):
+        state = model.step(state, image, right_way, size, torch.tensor([4]))
+    once = model.step(state, image, right_way.flip(1), size, torch.tensor([4]))
+    assert not once.swapped.any()
+    two = model.step(
+        state, image, right_way.repeat(2, 1, 1, 1), size.repeat(2), torch.tensor([7, 4])
+    )
+    assert two.votes[1, 0] > 3 * two.votes[0, 0] > 0
+    near = pose(hand_left=(150, 150), hand_right=(140, 150))
+    joints = torch.stack([near, near])[None]
+    touching = model.step(
+        two, image, joints.repeat(2, 1, 1, 1), size.repeat(2), torch.tensor([7, 4])
+    )
+    assert torch.equal(touching.votes, two.votes)
+    none = model.step(two, image, right_way[:0], size[:0], torch.zeros(0, dtype=torch.long))
+    assert len(none.votes) == 0
+
+
+def test_bad_input_is_refused():
+    with pytest.raises(InputError, match="decay"):
+        HandAssociation(decay=1.0)
+    model = HandAssociation()
+    with pytest.raises(ShapeError, match="joints"):
+        model.step(
+            model.init(),
+            np.zeros((9, 9), np.uint8),
+            torch.zeros(1, 8, 2),
+            torch.ones(1),
+            torch.ones(1).long(),
+        )

@@ -1,0 +1,133 @@
+"""The filter over single poses of an arm, and the noise that it takes."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.arms import ARMS
+from torchpose.errors import InputError, check_finite, check_shape
+from torchpose.filters import BootstrapParticleFilter, MixtureKalmanFilter
+from torchpose.filters.base import RecursiveFilter
+from torchpose.measurements import pixel_indices
+from torchpose.priors.arm_state import STATE_DIM
+from torchpose.priors.upper_body import UpperBodyPrior, released_process_cov
+from torchpose.projection import map_pixel_covariance
+from torchpose.skeleton import ARM_JOINTS, UPPER_BODY
+
+__all__ = ["default_process_cov", "joint_covariances", "noise_options", "pose_filter"]
+
+_PROPOSALS = {
+    "pf-mixture": "mixture",
+    "pf-walk": "random-walk",
+    "pf-walk-unscaled": "random-walk-unscaled",
+}
+_DEFAULT_STD = 3.0
+
+
+def pose_filter(
+    prior: UpperBodyPrior,
+    side: str,
+    joints: tuple[str, ...],
+    measurement_cov: Float[Tensor, "8 2 2"],
+    method: str,
+    fps: float | None,
+    options: dict[str, Any],
+) -> RecursiveFilter:
+    """The filter of an arm that measures these joints.
+
+    Args:
+        prior: whose mixture and noise it takes. side: "left" or "right". joints: of `ARM_JOINTS`.
+        measurement_cov: R of the eight joints, the prior's pixels. method: one of
+            `torchpose.tracking.METHODS`. fps: frame rate. options: to the filter; what the prior
+            brings is used for the others.
+
+    Raises:
+        InputError: an option that the method does not know.
+    """
+    arm = ARMS[side]
+    blocks = [measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
+    options = noise_options(prior, side, method, fps) | options
+    process_cov = options.pop("process_cov")
+    mixture, observed = getattr(prior, side), pixel_indices(joints)
+    arguments = (mixture, process_cov, torch.block_diag(*blocks), observed)
+    try:
+        if method in _PROPOSALS:
+            return BootstrapParticleFilter(*arguments, proposal=_PROPOSALS[method], **options)
+        return MixtureKalmanFilter(*arguments, tracks=method.removeprefix("mkf-"), **options)
+    except TypeError as error:
+        raise InputError(f"an option does not fit the method {method!r}: {error}") from error
+
+
+def noise_options(
+    prior: UpperBodyPrior, side: str, method: str, fps: float | None
+) -> dict[str, Any]:
+    """Noise and transition that the prior brings, scaled to the frame rate."""
+    noise, info = prior.noise, prior.info
+    ratio = 1.0 if not fps or not info.fps else info.fps / fps
+    process_cov = noise.get(f"process_cov_{side}", noise.get("process_cov"))
+    if process_cov is None:
+        process_cov = default_process_cov(prior)
+    options: dict[str, Any] = {"process_cov": process_cov * ratio}
+    if method in _PROPOSALS:
+        return options
+    options["transition"] = info.transition
+    gamma = noise.get(f"gamma_{side}", noise.get("gamma"))
+    if gamma is not None and info.transition == "ou":
+        options["gamma"] = gamma**ratio
+    epsilon = noise.get("uniform_weight")
+    if epsilon is not None and method == "mkf-fixed":
+        options["uniform_weight"] = float(epsilon)
+    return options
+
+
+def default_process_cov(prior: UpperBodyPrior) -> Float[Tensor, " 21"]:
+    """Diagonal of Q per frame where a prior brings none: that of the authors' released tracker.
+
+    They set it by hand for f = 1550 pixels, a person 4.5 m away and 25 frames per second; the same
+    movement in metres is f / depth times as many pixels elsewhere.
+
+    Args:
+        prior: whose camera, mean depth and frame rate are used.
+    """
+    depth = prior.left.moments()[0][2:15:3].mean().clamp_min(0.1)
+    pixels = math.sqrt(prior.info.fx * prior.info.fy) / depth / (1550 / 4.5)
+    released = released_process_cov().to(pixels)
+    in_pixels = torch.zeros(STATE_DIM, dtype=torch.bool, device=released.device)
+    in_pixels[pixel_indices(ARM_JOINTS)] = True
+    scaled = torch.where(in_pixels, released * pixels.square(), released)
+    return scaled * (25.0 / (prior.info.fps or 30.0))
+
+
+def joint_covariances(
+    prior: UpperBodyPrior,
+    std: float | Sequence[float] | Tensor | None,
+    matrix: Float[Tensor, "3 3"],
+) -> Float[Tensor, "8 2 2"]:
+    """R of each of the eight joints in the prior's pixels.
+
+    Args:
+        prior: whose pixels are meant, and whose noise is taken where none is stated.
+        std: of a keypoint, pixels of the camera: None, one number, or one for each of `ARM_JOINTS`.
+        matrix: K of that camera.
+
+    Raises:
+        ShapeError, InputError: another number of deviations, or some that are not positive.
+    """
+    learnt = prior.noise.get("measurement_std") if std is None else None
+    if learnt is None:
+        given = torch.as_tensor(_DEFAULT_STD if std is None else std, dtype=torch.float64)
+    else:
+        given = learnt.double()
+    by_joint = given.expand(5) if given.ndim == 0 else given
+    check_shape("measurement_std", by_joint, [5])
+    check_finite("measurement_std", by_joint)
+    if bool((by_joint <= 0).any()):
+        raise InputError(f"measurement_std must be positive, got {by_joint.tolist()}")
+    cov = torch.diag_embed(by_joint.square()[:, None].expand(5, 2))
+    if learnt is None:
+        cov = map_pixel_covariance(cov, matrix, prior.info.matrix)
+    return cov[[ARM_JOINTS.index(joint.split("_")[0]) for joint in UPPER_BODY]]
