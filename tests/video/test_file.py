@@ -191,8 +191,10 @@ def test_video_with_sound(tmp_path):
     ],
 )
 def test_truncated_keeps_what_is_there(tmp_path, name, codec, pix_fmt, part):
-    images, kind = random_images(90), {"codec": codec, "pix_fmt": pix_fmt, "faststart": True}
-    path = make_video(tmp_path / name, 90, (160, 120), images=images, **kind)
+    kind = {"codec": codec, "pix_fmt": pix_fmt, "faststart": name.endswith("mp4")}
+    # frames of one size, however many cores the encoder uses
+    quality = {"options": {"qmin": "5", "qmax": "5"}} if codec == "mjpeg" else {}
+    path = make_video(tmp_path / name, 90, (160, 120), images=random_images(90), **kind, **quality)
     frames, source = read(cut(path, part))
     assert 0.8 * 90 * part < len(frames) < 90
     assert frames == list(range(len(frames)))
