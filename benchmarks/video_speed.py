@@ -137,7 +137,8 @@ def stages(report: Report, clip: Path, n_frames: int) -> None:
     parts = [
         ("faces: detection and tracks", measurer, "follow_faces"),
         ("hands: all", hands, "step"),
-        ("- skin", hands.skin, "step"),
+        ("- skin", hands.skin, "learn"),
+        ("- skin", hands.skin, "find"),
         ("- face memory", hands.memory, "step"),
         ("- motion and optical flow", hands.motion, "step"),
         ("- likelihood", hands.likelihood, "forward"),
@@ -154,12 +155,12 @@ def stages(report: Report, clip: Path, n_frames: int) -> None:
         for _ in source:
             pass
     spent["decoding"] = time.thread_time() - start
-    order = ["decoding", *(name for name, _, _ in parts)]
+    order = dict.fromkeys(["decoding", *(name for name, _, _ in parts)])
     rows = [(name, f"{1e3 * spent.get(name, 0.0) / n_frames:.2f}") for name in order]
     total = sum(value for name, value in spent.items() if not name.startswith("-"))
     rows.append(("sum", f"{1e3 * total / n_frames:.2f}"))
     report.table(("stage", "ms a frame"), rows)
-    report.add("Decoding and faces run in one thread, the rest in another.")
+    report.add("Decoding and faces run in one thread, hands in another, poses in a third.")
 
 
 def timed(call: Any, name: str, spent: dict[str, float]) -> Any:
