@@ -45,6 +45,7 @@ TRACKERS: dict[str, dict[str, Any]] = {
     "histogram filter": {},
     "histogram filter, background": {"background": True},
     "histogram filter, edges": {"edges": True},
+    "histogram filter, candidates": {"candidates": True},
     "mean shift": {"hands": "mean-shift"},
     "mean shift, background": {"hands": "mean-shift", "background": True},
     "mean shift, edges": {"hands": "mean-shift", "edges": True},

@@ -73,9 +73,35 @@ def test_only_the_largest_face_is_followed_if_asked_for(prior):
     assert len(people) == 1
 
 
+def test_candidates_of_the_last_pose_reach_the_hands_live_and_offline(prior):
+    shown = rendered(performer(30, distance=1.6))
+    tracker = VideoTracker(prior, demo_camera(), candidates=True)
+    asked = []
+    step = tracker.measurer.hand_tracker.step
+
+    def spy(*arguments):
+        asked.append(arguments[5])
+        return step(*arguments)
+
+    tracker.measurer.hand_tracker.__dict__["step"] = spy
+    (person,) = tracker(shown)
+    given = [e for e in asked if len(e.mean) and bool(e.mean.isfinite().all())]
+    assert len(given) >= 25
+    last = person.track.joints2d[0, -2, [0, 7]]
+    torch.testing.assert_close(given[-1].mean[0], last)
+    state, live = tracker.init(), []
+    for image in shown:
+        state, people = tracker.step(state, image)
+        live += [found.pose.joints3d[0, 0] for found in people]
+    whole = person.track.joints3d[0]
+    torch.testing.assert_close(torch.stack(live[: len(whole)]), whole, rtol=1e-9, atol=1e-9)
+
+
 def test_bad_use_is_refused(prior):
     with pytest.raises(InputError, match="hands must be one of"):
         VideoTracker(prior, demo_camera(), hands="feet")
+    with pytest.raises(InputError, match="candidates"):
+        VideoTracker(prior, demo_camera(), hands="mean-shift", candidates=True)
     with pytest.raises(InputError, match="max_gap"):
         VideoTracker(prior, demo_camera(), max_gap=0.0)
     tracker = VideoTracker(prior, demo_camera())

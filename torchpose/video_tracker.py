@@ -16,6 +16,7 @@ from torchpose.measure.association import HandAssociation
 from torchpose.measure.face import FaceDetector, FaceTracks, Image
 from torchpose.measure.head_neck import HeadNeck
 from torchpose.measure.upper_body import (
+    Candidates,
     FrameMeasurements,
     MeasurerState,
     UpperBodyMeasurer,
@@ -25,6 +26,7 @@ from torchpose.person_stream import Measured, PersonStream, PersonStreamState, m
 from torchpose.pose_track import PoseTrack
 from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.recording import Recording, TrackedPerson
+from torchpose.skeleton import UPPER_BODY
 from torchpose.tracking import UpperBodyTracker
 from torchpose.video.prefetch import prefetch
 
@@ -33,14 +35,16 @@ __all__ = ["LivePerson", "TrackedPerson", "VideoState", "VideoTracker", "Watcher
 Watcher = Callable[[Image, FrameMeasurements, dict[int, PoseTrack]], None]
 """Is shown a frame, what was measured in it, and the poses of everybody there by number."""
 
+_HANDS = [UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")]
 _BLOCK = 32  # frames of a recording that are filtered together
 
 
 class VideoState(NamedTuple):
-    """What `VideoTracker.step` needs to know of the frames before: of measuring, and each stream."""
+    """What `VideoTracker.step` knows of the frames before: of measuring, streams, the last poses."""
 
     measurer: MeasurerState
     streams: dict[int, PersonStreamState]
+    poses: dict[int, PoseTrack]
 
 
 class LivePerson(NamedTuple):
@@ -64,6 +68,8 @@ class VideoTracker(nn.Module):
             `UpperBodyMeasurer`.
         edges: correct hands that were taken for each other by the edges of the arms
             (`HandAssociation`); takes about twice the time of the poses.
+        candidates: let the hand tracker look where the last pose has the hands; frames are then
+            measured and filtered in turn, which is slower.
         max_gap: seconds after which somebody who is not seen has no pose any more; None is never.
         seed: of methods that draw; every person has a generator of their own.
         options: to `UpperBodyTracker`, such as method, smoothing or frame.
@@ -90,6 +96,7 @@ class VideoTracker(nn.Module):
         background: bool = False,
         elbows: bool = False,
         edges: bool = False,
+        candidates: bool = False,
         face_detector: FaceDetector | None = None,
         max_persons: int | None = None,
         head_neck: HeadNeck | None = None,
@@ -103,6 +110,9 @@ class VideoTracker(nn.Module):
         self.measurer = UpperBodyMeasurer(
             prior, fps, hands, background, elbows, face_detector, max_persons, head_neck
         )
+        if candidates and hands != "grid":
+            raise InputError(f"candidates need hands='grid', got {hands!r}")
+        self.candidates = candidates
         smoothing = options.pop("smoothing", None)
         self.tracker = UpperBodyTracker(prior, camera, fps=fps, max_gap=None, **options)
         self.smoother = None
@@ -117,7 +127,7 @@ class VideoTracker(nn.Module):
 
     def init(self) -> VideoState:
         """Nobody was seen yet."""
-        return VideoState(self.measurer.init(), {})
+        return VideoState(self.measurer.init(), {}, {})
 
     def step(self, state: VideoState, image: Image | Tensor) -> tuple[VideoState, list[LivePerson]]:
         """Track one more frame of a camera.
@@ -135,7 +145,8 @@ class VideoTracker(nn.Module):
         if self.smoother is not None:
             raise InputError("a camera is tracked frame by frame: expected smoothing=None")
         image = as_image(image)
-        measurer, measured = self.measurer.step(state.measurer, image)
+        candidates = _candidates(state.poses) if self.candidates else None
+        measurer, measured = self.measurer.step(state.measurer, image, None, candidates)
         streams, people = {}, []
         there = set(measured.person.tolist())
         for number in sorted(state.streams.keys() | there):  # each with a state of its own
@@ -145,7 +156,7 @@ class VideoTracker(nn.Module):
             if stream.unseen <= self.gap:
                 streams[number] = stream
                 people.append(LivePerson(number, pose, chosen))
-        return VideoState(measurer, streams), people
+        return VideoState(measurer, streams, {p.number: p.pose for p in people}), people
 
     def forward(
         self,
@@ -171,10 +182,13 @@ class VideoTracker(nn.Module):
             InputError: another kind of image. OutputError: the disk is full.
         """
         recording = Recording(self.stream, self.gap, folder)
-        size = _BLOCK if watch is None else 1
+        size = _BLOCK if watch is None and not self.candidates else 1
+        last: dict[int, PoseTrack] = {}
         block: list[FrameMeasurements] = []
         images: list[Image] = []
-        measured = prefetch(self._measure(frames), size)  # while the block before is filtered
+        measured = self._measure(frames, last)
+        if not self.candidates:
+            measured = prefetch(measured, size)  # while the block before is filtered
         for image, now in tqdm(measured, total=n_frames, disable=not progress, unit="frame"):
             block.append(now)
             images.append(image)
@@ -182,15 +196,21 @@ class VideoTracker(nn.Module):
                 continue
             poses = recording.append(block, images)
             block, images = [], []
+            last.clear()
+            last.update({n: pose for n, pose in poses.items() if _is_pose(pose)})
             if watch is not None:
-                there = {n: pose for n, pose in poses.items() if _is_pose(pose)}
-                watch(image, now, there)
+                watch(image, now, dict(last))
         if block:
             recording.append(block, images)
         return recording.finish(self.smoother)
 
-    def _measure(self, frames: Iterable[Any] | Tensor) -> Iterator[tuple[Image, FrameMeasurements]]:
-        """Frames and what is measured in them; faces are found ahead, in another thread."""
+    def _measure(
+        self, frames: Iterable[Any] | Tensor, last: dict[int, PoseTrack]
+    ) -> Iterator[tuple[Image, FrameMeasurements]]:
+        """Frames and what is measured in them; faces are found ahead, in another thread.
+
+        `last` holds the poses of the frame before, for candidates.
+        """
         state = self.measurer.init()
 
         def with_faces() -> Iterator[tuple[Image, FaceTracks]]:
@@ -204,7 +224,8 @@ class VideoTracker(nn.Module):
         current = state
         for image, tracks in prefetch(with_faces()):
             with torch.no_grad():
-                current, measured = self.measurer.step(current, image, tracks)
+                candidates = _candidates(last) if self.candidates else None
+                current, measured = self.measurer.step(current, image, tracks, candidates)
             yield image, measured
 
 
@@ -218,6 +239,14 @@ def as_image(image: Any) -> Image:
             )
         return np.ascontiguousarray(image.permute(1, 2, 0).cpu().numpy())
     return check_image(image)
+
+
+def _candidates(poses: dict[int, PoseTrack]) -> dict[int, Candidates]:
+    """Where the poses of a frame have the hands, by person."""
+    return {
+        n: Candidates(pose.joints2d[0, -1, _HANDS], pose.covariance2d[0, -1, _HANDS])
+        for n, pose in poses.items()
+    }
 
 
 def _is_pose(track: PoseTrack) -> bool:

@@ -165,6 +165,13 @@ def build() -> ArgumentParser:
         "false)",
     )
     add(
+        "--candidates",
+        type=bool,
+        default=False,
+        metavar="true|false",
+        help="video: look for hands where the last pose has them as well; slower (default false)",
+    )
+    add(
         "--elbows",
         type=bool,
         default=False,

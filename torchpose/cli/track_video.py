@@ -121,6 +121,7 @@ def _tracker(args: Namespace, prior: Any, camera: "PinholeCamera", fps: float) -
         hands=args.hands,
         background=args.background,
         edges=args.edges,
+        candidates=args.candidates,
         elbows=args.elbows,
         face_detector=detector,
         max_persons=args.max_persons,

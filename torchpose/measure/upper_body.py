@@ -1,6 +1,7 @@
 """From a frame of video to measured head, neck and hands of everybody in it."""
 
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from torchpose.priors.upper_body import UpperBodyPrior
 __all__ = [
     "HAND_TRACKERS",
     "MEASURED",
+    "Candidates",
     "FrameMeasurements",
     "MeasurerState",
     "UpperBodyMeasurer",
@@ -39,6 +41,7 @@ HAND_TRACKERS = ("grid", "mean-shift")
 _LARGEST_SIDE = 960  # of the image in which faces are looked for, pixels
 _UNSEEN = 1.0  # seconds over which a face that is not detected counts as measured
 _LEVEL = math.sqrt(2.0)
+_MOVES = 0.15  # sizes of the face that a hand moves in a frame
 _TORSO_FACE = 24.0  # size of a face in the image in which elbows are looked for, pixels
 
 
@@ -56,6 +59,13 @@ class FrameMeasurements(NamedTuple):
     covariance: Float[Tensor, "N J 2 2"]
     faces: Float[Tensor, "N 3"]
     hands: HandMeasurements
+
+
+class Candidates(NamedTuple):
+    """Hands, left and right, as a pose filter has them: mean [..., 2, 2] and covariance, pixels."""
+
+    mean: Tensor
+    covariance: Tensor
 
 
 class MeasurerState(NamedTuple):
@@ -142,16 +152,21 @@ class UpperBodyMeasurer(nn.Module):
         return self.face_tracker.step(tracks, np.asarray(grey, dtype=np.uint8))
 
     def step(
-        self, state: MeasurerState, image: Image, tracks: FaceTracks | None = None
+        self,
+        state: MeasurerState,
+        image: Image,
+        tracks: FaceTracks | None = None,
+        candidates: Mapping[int, Candidates] | None = None,
     ) -> tuple[MeasurerState, FrameMeasurements]:
         """Measure the next frame.
 
         Args:
             state: from `init` or the step before. image: RGB, uint8 [H, W, 3].
             tracks: faces of this frame by `follow_faces`, if that was done already.
+            candidates: where a pose filter believes the hands of these persons; only for "grid".
 
         Raises:
-            InputError: another kind of image.
+            InputError: another kind of image; candidates for a tracker that takes none.
         """
         if tracks is None:
             tracks = self.follow_faces(state.faces, image)
@@ -161,7 +176,14 @@ class UpperBodyMeasurer(nn.Module):
             state.persons, image, faces, identity, state.frame, detected
         )
         foreground = None if self.background is None else self.background.step(image, faces)
-        hand_state, hands = self.hand_tracker.step(state.hands, image, faces, number, foreground)
+        arguments = (state.hands, image, faces, number, foreground)
+        if candidates is None:
+            hand_state, hands = self.hand_tracker.step(*arguments)
+        elif isinstance(self.hand_tracker, HandTracker):
+            expected = _expected(candidates, number, faces[:, 2])
+            hand_state, hands = self.hand_tracker.step(*arguments, expected)
+        else:
+            raise InputError("candidates need hands='grid': mean shift takes none")
         parts = [self.head_neck(faces, face_cov), (_where_seen(hands), hands.covariance)]
         if len(self.names) > len(MEASURED):
             found = self._elbows(image, faces, hand_state.skin)
@@ -202,6 +224,18 @@ class UpperBodyMeasurer(nn.Module):
         faces = torch.cat([(faces[:, :2] + 0.5) / scale - 0.5, faces[:, 2:] / scale], 1)
         cov = tracks.cov[rows, :3, :3] / scale**2
         return faces, cov, tracks.identity[rows], tracks.unseen[rows]
+
+
+def _expected(
+    candidates: Mapping[int, Candidates], number: Int[Tensor, " N"], size: Float[Tensor, " N"]
+) -> Candidates:
+    """Candidates of the persons of a frame, NaN without any, widened by what a hand moves in it."""
+    nothing = Candidates(torch.full((2, 2), torch.nan), torch.full((2, 2, 2), torch.nan))
+    found = [candidates.get(n, nothing) for n in number.tolist()]
+    mean = torch.stack([each.mean.to(size) for each in found]) if found else size.new_zeros(0, 2, 2)
+    cov = [each.covariance.to(size) for each in found]
+    moved = (_MOVES * size).square()[:, None, None, None] * torch.eye(2).to(size)
+    return Candidates(mean, torch.stack(cov) + moved if cov else size.new_zeros(0, 2, 2, 2))
 
 
 def _where_seen(found: HandMeasurements | TorsoElbows) -> Float[Tensor, "N 2 2"]:
