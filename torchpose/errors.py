@@ -4,6 +4,7 @@ Every message says what was expected, what came, and what to do about it.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,6 +24,8 @@ __all__ = [
     "TorchposeError",
     "check_covariance",
     "check_finite",
+    "check_grey",
+    "check_rgb",
     "check_shape",
     "check_weights",
 ]
@@ -112,6 +115,24 @@ def check_finite(name: str, tensor: Tensor, where: Tensor | None = None, hint: s
         count = int(bad.sum())
         message = f"{name} must be finite, got {value} at index {index} ({count} such values)"
         raise InputError(f"{message}; {hint}" if hint else message)
+
+
+def check_rgb(name: str, image: Any, empty: bool = True) -> None:
+    """Raise `InputError` unless `image` is an array [H, W, 3] of uint8; `empty` ones may pass."""
+    _check_image(name, image, "RGB, [H, W, 3]", 3, empty)
+
+
+def check_grey(name: str, image: Any) -> None:
+    """Raise `InputError` unless `image` is an array [H, W] of uint8."""
+    _check_image(name, image, "grey, [H, W]", None, True)
+
+
+def _check_image(name: str, image: Any, kind: str, channels: int | None, empty: bool) -> None:
+    shape = tuple(getattr(image, "shape", ()))
+    dtype = getattr(image, "dtype", type(image))
+    fits = len(shape) == (2 if channels is None else 3) and channels in (None, shape[-1])
+    if not fits or str(dtype) != "uint8" or (not empty and 0 in shape):
+        raise InputError(f"{name} must be {kind} of uint8, got {list(shape)} of {dtype}")
 
 
 def check_weights(name: str, weights: Tensor) -> None:

@@ -12,13 +12,11 @@ from torch import Tensor, nn
 from torchpose.measure.association import AssociationState, HandAssociation
 from torchpose.measure.face import Image
 from torchpose.measure.upper_body import FrameMeasurements
-from torchpose.pose_track import PoseTrack
+from torchpose.pose_track import FRAME_FIELDS, PoseTrack
 from torchpose.streaming import StreamState
 from torchpose.tracking import UpperBodyTracker
 
-__all__ = ["Measured", "PersonStream", "PersonStreamState", "measured_of"]
-
-_POSES = ("joints2d", "joints3d", "covariance2d", "covariance3d", "observed", "log_evidence")
+__all__ = ["Measured", "PersonStream", "PersonStreamState", "measured_of", "unmeasured"]
 
 
 class Measured(NamedTuple):
@@ -40,15 +38,22 @@ class Measured(NamedTuple):
 
 def measured_of(block: Sequence[FrameMeasurements], number: int, n_joints: int) -> Measured:
     """What was measured of one person in each frame of a block."""
-    keypoints = torch.full((len(block), n_joints, 2), torch.nan, dtype=torch.float64)
-    cov = torch.eye(2, dtype=torch.float64).repeat(len(block), n_joints, 1, 1)
-    size = torch.full((len(block),), torch.nan, dtype=torch.float64)
+    keypoints, cov, size = found = unmeasured(len(block), n_joints)
     for t, frame in enumerate(block):
         row = torch.nonzero(frame.person == number).flatten()
         if len(row):
             keypoints[t], cov[t] = frame.keypoints[row[0]], frame.covariance[row[0]]
             size[t] = frame.faces[row[0], 2]
-    return Measured(keypoints, cov, size)
+    return found
+
+
+def unmeasured(n_frames: int, n_joints: int) -> Measured:
+    """Frames in which nothing is measured."""
+    return Measured(
+        torch.full((n_frames, n_joints, 2), torch.nan, dtype=torch.float64),
+        torch.eye(2, dtype=torch.float64).repeat(n_frames, n_joints, 1, 1),
+        torch.full((n_frames,), torch.nan, dtype=torch.float64),
+    )
 
 
 class PersonStreamState(NamedTuple):
@@ -156,7 +161,7 @@ def _vote(
 def _choose(poses: PoseTrack, which: Tensor) -> PoseTrack:
     """One sequence of two, frame by frame."""
     frames = torch.arange(len(which))
-    fields = {name: getattr(poses, name)[which, frames][None] for name in _POSES}
+    fields = {name: getattr(poses, name)[which, frames][None] for name in FRAME_FIELDS}
     failed = poses.failed_at[which]
     lost = (failed >= 0) & (frames >= failed)
     first = int(lost.long().argmax()) if bool(lost.any()) else -1

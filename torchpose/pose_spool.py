@@ -11,18 +11,9 @@ import torch
 from torch import Tensor
 
 from torchpose.errors import InputError, OutputError
-from torchpose.pose_track import PoseTrack
+from torchpose.pose_track import FRAME_FIELDS, PoseTrack
 
 __all__ = ["PoseSpool"]
-
-_FIELDS = (
-    "joints2d",
-    "joints3d",
-    "covariance2d",
-    "covariance3d",
-    "observed",
-    "log_evidence",
-)
 
 
 class PoseSpool:
@@ -61,7 +52,7 @@ class PoseSpool:
         if len(block) != 1:
             raise InputError(f"a spool holds one sequence, got a block of {len(block)}")
         try:
-            for name in _FIELDS:
+            for name in FRAME_FIELDS:
                 with self._path(name).open("ab") as file:
                     file.write(_array(getattr(block, name)).tobytes())
         except OSError as error:
@@ -83,7 +74,7 @@ class PoseSpool:
         if like is None or not 0 < count <= self._n_frames:
             raise InputError(f"expected 1 to {self._n_frames} poses, got {count}")
         fields: dict[str, Any] = {}
-        for name in _FIELDS:
+        for name in FRAME_FIELDS:
             sample = _array(getattr(like, name))
             shape = (self._n_frames, *sample.shape[1:])
             stored = np.memmap(self._path(name), sample.dtype, mode="c", shape=shape)

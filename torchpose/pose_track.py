@@ -12,7 +12,17 @@ from torchpose.errors import FileFormatError
 from torchpose.io.files import read_npz, write_npz
 from torchpose.skeleton import UPPER_BODY
 
-__all__ = ["PoseTrack"]
+__all__ = ["FRAME_FIELDS", "PoseTrack"]
+
+FRAME_FIELDS = (
+    "joints2d",
+    "joints3d",
+    "covariance2d",
+    "covariance3d",
+    "observed",
+    "log_evidence",
+)
+"""What a `PoseTrack` holds for every frame."""
 
 _KEYS = ("joints2d", "joints3d", "covariance3d", "observed", "log_evidence", "names")
 
@@ -60,14 +70,9 @@ class PoseTrack:
         """One sequence, cut to its own length, as a batch of one."""
         n = int(self.lengths[index])
         rows = slice(index, index + 1) if index != -1 else slice(-1, None)
-        cut = {
-            name: getattr(self, name)[rows, :n]
-            for name in ("joints2d", "joints3d", "covariance2d", "covariance3d")
-        }
+        cut: dict[str, Any] = {name: getattr(self, name)[rows, :n] for name in FRAME_FIELDS}
         return PoseTrack(
             **cut,
-            observed=self.observed[rows, :n],
-            log_evidence=self.log_evidence[rows, :n],
             lengths=self.lengths[rows],
             matrix=self.matrix,
             failed_at=self.failed_at[rows],

@@ -10,12 +10,18 @@ from torch import Tensor
 
 from torchpose.measure.face import Image
 from torchpose.measure.upper_body import FrameMeasurements
-from torchpose.person_stream import Measured, PersonStream, PersonStreamState, measured_of
+from torchpose.person_stream import (
+    Measured,
+    PersonStream,
+    PersonStreamState,
+    measured_of,
+    unmeasured,
+)
 from torchpose.pose_spool import PoseSpool
 from torchpose.pose_track import PoseTrack
 from torchpose.tracking import UpperBodyTracker
 
-__all__ = ["Recording", "TrackedPerson"]
+__all__ = ["Recording", "TrackedPerson", "smoothed"]
 
 _LEAST_SECONDS = 0.5  # for which somebody has to be seen to be reported
 
@@ -43,7 +49,11 @@ class TrackedPerson:
 
 @dataclass
 class _Person:
-    """One person while a recording is read; `state` is None while nobody is there."""
+    """One person while a recording is read.
+
+    `state` is None while nobody is there; the frames of that time are counted in `absent`, and
+    written only if the person returns.
+    """
 
     number: int
     first_frame: int
@@ -51,6 +61,7 @@ class _Person:
     state: PersonStreamState | None = None
     measured: list[Measured] = field(default_factory=list)
     n_frames: int = 0
+    absent: int = 0
     last_seen: int = 0
     n_seen: int = 0
 
@@ -107,11 +118,13 @@ class Recording:
         start = 0
         if person.state is None:
             start = int(frames[0]) if len(frames) else count
-        if start:
-            person.measured.append(measured.frames(slice(start)))
-            person.poses.append(_nobody(start, self.stream.tracker))
+        person.absent += start
         if start == count:
             return _nobody(count, self.stream.tracker)
+        if person.absent:
+            person.measured.append(unmeasured(person.absent, len(self.stream.names)))
+            person.poses.append(_nobody(person.absent, self.stream.tracker))
+            person.absent = 0
         state = person.state or self.stream.init(person.number)
         unseen, rows = state.unseen, slice(start, None)
         state, poses, chosen = self.stream.advance(state, measured.frames(rows), images[rows])
@@ -138,13 +151,26 @@ class Recording:
         keypoints = torch.cat([part.keypoints for part in person.measured])[:count]
         cov = torch.cat([part.covariance for part in person.measured])[:count]
         track = person.poses.track(count)
-        if smoother is not None:
-            with torch.no_grad():
-                smooth = smoother(keypoints[None], names=self.stream.names, covariance=cov[None])
-            seen = keypoints.isfinite().flatten(1).any(1)
-            track = _without_long_gaps(smooth, seen, 0, self.gap)
         track = replace(track, first_frame=person.first_frame)
-        return TrackedPerson(person.number, person.first_frame, track, keypoints, cov)
+        found = TrackedPerson(person.number, person.first_frame, track, keypoints, cov)
+        if smoother is None:
+            return found
+        return replace(found, track=smoothed(found, smoother, self.stream.names, self.gap))
+
+
+def smoothed(
+    person: TrackedPerson, smoother: UpperBodyTracker, names: Sequence[str], gap: int
+) -> PoseTrack:
+    """The poses of a person anew, from all measurements together.
+
+    Args:
+        names: of the measured joints. gap: frames after which there is no pose.
+    """
+    with torch.no_grad():
+        track = smoother(person.keypoints[None], names=names, covariance=person.covariance[None])
+    seen = person.keypoints.isfinite().flatten(1).any(1)
+    track = _without_long_gaps(track, seen, 0, gap)
+    return replace(track, first_frame=person.first_frame)
 
 
 def _seen(measured: Measured) -> Bool[Tensor, " T"]:

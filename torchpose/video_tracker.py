@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from torchpose.camera import PinholeCamera
-from torchpose.errors import InputError
+from torchpose.errors import InputError, check_rgb
 from torchpose.measure.association import HandAssociation
 from torchpose.measure.face import FaceDetector, FaceTracks, Image
 from torchpose.measure.head_neck import HeadNeck
@@ -20,7 +20,6 @@ from torchpose.measure.upper_body import (
     FrameMeasurements,
     MeasurerState,
     UpperBodyMeasurer,
-    check_image,
 )
 from torchpose.person_stream import Measured, PersonStream, PersonStreamState, measured_of
 from torchpose.pose_track import PoseTrack
@@ -238,7 +237,8 @@ def as_image(image: Any) -> Image:
                 f"{list(image.shape)} of {image.dtype}"
             )
         return np.ascontiguousarray(image.permute(1, 2, 0).cpu().numpy())
-    return check_image(image)
+    check_rgb("a frame", image)
+    return np.asarray(image)
 
 
 def _candidates(poses: dict[int, PoseTrack]) -> dict[int, Candidates]:

@@ -77,17 +77,13 @@ def _render(clip: Path, performance: "Performance", seed: int) -> None:
 
 def _smoothed(tracker: "VideoTracker", person: "TrackedPerson") -> "PoseTrack":
     """The poses from the same measurements, all frames together."""
-    import torch
-
     from torchpose import UpperBodyTracker
+    from torchpose.recording import smoothed
 
     smoother = UpperBodyTracker(
         tracker.tracker.prior, tracker.tracker.camera, fps=_FPS, smoothing="full", max_gap=None
     )
-    with torch.no_grad():
-        return smoother(
-            person.keypoints[None], names=tracker.measurer.names, covariance=person.covariance[None]
-        )
+    return smoothed(person, smoother, tracker.measurer.names, tracker.gap)
 
 
 def _seen(person: "TrackedPerson") -> str:

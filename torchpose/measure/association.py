@@ -10,6 +10,7 @@ from torchpose.errors import InputError, check_shape
 from torchpose.measure.edges import ARM_LIMBS, Segments, limb_votes, segments_of_arms
 from torchpose.measure.face import Image
 from torchpose.measure.hand_prior import HandPrior
+from torchpose.measure.persons import match_rows
 from torchpose.skeleton import UPPER_BODY
 
 __all__ = ["AssociationState", "HandAssociation", "arm_hypotheses"]
@@ -153,9 +154,7 @@ class HandAssociation(nn.Module):
 
 def _matched(state: AssociationState, identity: Tensor) -> AssociationState:
     """The state's rows in the order of `identity`; newcomers have no votes."""
-    place = torch.arange(len(state.identity))
-    same = torch.where(identity[:, None] == state.identity, place, len(place))
-    rows = nn.functional.pad(same, (0, 1), value=len(place)).amin(1)
+    rows = match_rows(state.identity, identity)
     votes = torch.cat([state.votes, state.votes.new_zeros(1, 2)])[rows]
     swapped = torch.cat([state.swapped, state.swapped.new_zeros(1)])[rows]
     return AssociationState(votes, swapped, identity.to(state.identity))

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import InputError, check_rgb, check_shape
 
 __all__ = ["BackgroundModel", "person_region"]
 
@@ -194,10 +194,7 @@ class BackgroundModel:
         self._mixture.apply(shown, None, rate)
 
     def _check(self, frame: Image, faces: Tensor) -> None:
-        if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8 or not frame.size:
-            raise InputError(
-                f"frame must be RGB, [H, W, 3] of uint8, got {list(frame.shape)} of {frame.dtype}"
-            )
+        check_rgb("frame", frame, empty=False)
         check_shape("faces", faces, ["N", 3])
         if self._shape not in (None, frame.shape):
             raise InputError(

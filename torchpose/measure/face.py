@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from torchpose.errors import InputError, check_finite, check_shape
+from torchpose.errors import InputError, check_finite, check_grey, check_shape
 from torchpose.gaussian import kalman_predict, kalman_update
 
 __all__ = ["FaceDetector", "FaceTracker", "FaceTracks", "HaarFaceDetector", "Region"]
@@ -21,6 +21,17 @@ Image = NDArray[np.uint8]
 _ROI = 1.1  # half the side of the region searched about a known face, in its sizes
 _SMALLER, _LARGER = 0.75, 1.4  # sizes searched for there
 _SAME_SIZE = 1.25  # a face that differs by less from the size wanted is taken as it is
+
+
+def check_faces(faces: Float[Tensor, "N 3"], count: int | None = None) -> None:
+    """Raise unless these are faces (x, y, size), `count` of them, that have a size.
+
+    Raises:
+        ShapeError: another shape. InputError: a size that is not positive.
+    """
+    check_shape("faces", faces, ["N" if count is None else count, 3])
+    if not bool((faces[:, 2] > 0).all()):
+        raise InputError(f"faces must have a positive size, got {faces[:, 2].tolist()}")
 
 
 class Region(NamedTuple):
@@ -86,10 +97,7 @@ class HaarFaceDetector:
 
     def __call__(self, image: Image, region: Region | None = None) -> Float[Tensor, "N 3"]:
         """See `FaceDetector`."""
-        if image.ndim != 2 or image.dtype != np.uint8:
-            raise InputError(
-                f"image must be grey, [H, W] of uint8, got {list(image.shape)} of {image.dtype}"
-            )
+        check_grey("image", image)
         left, top, sizes = 0, 0, {"minSize": (self.min_size, self.min_size)}
         if region is not None:
             left, top = region.left, region.top

@@ -1,11 +1,14 @@
-"""What trackers of hands say of a frame."""
+"""What trackers of hands take, and what they say of a frame."""
 
 from typing import NamedTuple
 
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-__all__ = ["HandMeasurements"]
+from torchpose.errors import check_finite, check_rgb, check_shape
+from torchpose.measure.face import Image, check_faces
+
+__all__ = ["HandMeasurements", "check_frame"]
 
 
 class HandMeasurements(NamedTuple):
@@ -22,3 +25,15 @@ class HandMeasurements(NamedTuple):
     covariance: Float[Tensor, "N 2 2 2"]
     mass: Float[Tensor, "N 2"]
     seen: Bool[Tensor, "N 2"]
+
+
+def check_frame(frame: Image, faces: Float[Tensor, "N 3"], identity: Int[Tensor, " N"]) -> None:
+    """Raise unless these are a frame, faces with a size, and who they are.
+
+    Raises:
+        ShapeError, InputError: see above.
+    """
+    check_rgb("frame", frame)
+    check_finite("faces", faces, hint="leave out persons without a face")
+    check_faces(faces)
+    check_shape("identity", identity, [len(faces)])

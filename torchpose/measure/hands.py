@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from torchpose.errors import InputError, check_finite, check_shape
+from torchpose.errors import InputError
 from torchpose.measure.body_window import (
     CELL,
     CELLS,
@@ -30,10 +30,11 @@ from torchpose.measure.body_window import (
 from torchpose.measure.face_memory import FaceMemory, FaceMemoryState, head_part
 from torchpose.measure.grid_filter import exclude, gaussian_bump, predict, read_out
 from torchpose.measure.hand_likelihood import HandLikelihood
-from torchpose.measure.hand_measurements import HandMeasurements
+from torchpose.measure.hand_measurements import HandMeasurements, check_frame
 from torchpose.measure.hand_prior import HandPrior
 from torchpose.measure.hand_settings import HandSettings
 from torchpose.measure.motion import Motion, MotionState
+from torchpose.measure.persons import match_rows
 from torchpose.measure.skin import SkinModel, SkinState
 
 __all__ = ["HandState", "HandTracker"]
@@ -176,8 +177,7 @@ class HandTracker(nn.Module):
     ) -> tuple[HandState, Tensor]:
         """Rows for the persons of this frame, and which of them are new."""
         if not torch.equal(state.identity, identity):
-            same = torch.nn.functional.pad(identity[:, None] == state.identity, (0, 1), value=True)
-            row = same.int().argmax(1)  # the first that is the same, or the fresh one behind all
+            row = match_rows(state.identity, identity)  # the fresh one is behind all
             new = row == len(state.identity)
             anchors = place_windows(faces)
             state = _map(
@@ -329,15 +329,7 @@ class HandTracker(nn.Module):
 
 
 def _check(frame: Image, faces: Tensor, identity: Tensor, foreground: Image | None) -> None:
-    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
-        raise InputError(
-            f"frame must be RGB, [H, W, 3] of uint8, got {list(frame.shape)} of {frame.dtype}"
-        )
-    check_shape("faces", faces, ["N", 3])
-    check_shape("identity", identity, [len(faces)])
-    check_finite("faces", faces, hint="leave out persons without a face")
-    if len(faces) and not bool((faces[:, 2] > 0).all()):
-        raise InputError(f"faces must have a positive size, got {faces[:, 2].tolist()}")
+    check_frame(frame, faces, identity)
     if foreground is not None and (
         foreground.shape != frame.shape[:2] or foreground.dtype != np.uint8
     ):

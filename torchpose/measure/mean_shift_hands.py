@@ -11,11 +11,12 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from torchpose.errors import InputError, check_finite, check_shape
+from torchpose.errors import InputError
 from torchpose.gaussian import kalman_predict, kalman_update
-from torchpose.measure.hand_measurements import HandMeasurements
+from torchpose.measure.hand_measurements import HandMeasurements, check_frame
 from torchpose.measure.hand_prior import HandPrior
 from torchpose.measure.mean_shift import mean_shift
+from torchpose.measure.persons import match_rows
 from torchpose.measure.skin import SkinModel, SkinState
 
 __all__ = ["MeanShiftHandState", "MeanShiftHandTracker"]
@@ -198,9 +199,7 @@ class MeanShiftHandTracker(nn.Module):
     def _matched(self, state: MeanShiftHandState, identity: Tensor) -> MeanShiftHandState:
         """The state's rows in the order of `identity`; who is new has neither hands nor colours."""
         identity = identity.to(state.identity)
-        place = torch.arange(len(state.identity))
-        same = torch.where(identity[:, None] == state.identity, place, len(place))
-        rows = torch.nn.functional.pad(same, (0, 1), value=len(place)).amin(1)
+        rows = match_rows(state.identity, identity)
         new = state.mean.new_zeros(1)
 
         def chosen(x: Tensor, other: Tensor = new) -> Tensor:
@@ -373,15 +372,7 @@ def _area_inside(centre: Tensor, size: Tensor, shape: Any) -> Tensor:
 
 
 def _check(frame: Image, faces: Tensor, identity: Tensor, foreground: Image | None) -> None:
-    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
-        raise InputError(
-            f"frame must be RGB, [H, W, 3] of uint8, got {list(frame.shape)} of {frame.dtype}"
-        )
-    check_shape("faces", faces, ["N", 3])
-    check_shape("identity", identity, [len(faces)])
-    check_finite("faces", faces)
-    if not bool((faces[:, 2] > 0).all()):
-        raise InputError(f"faces must have a positive size, got {faces[:, 2].tolist()}")
+    check_frame(frame, faces, identity)
     if foreground is not None and foreground.shape != frame.shape[:2]:
         raise InputError(
             f"foreground must be [H, W] like the frame, {list(frame.shape[:2])}, "

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpose.errors import InputError, MissingDependencyError
+from torchpose.errors import InputError, MissingDependencyError, check_grey, check_rgb
 from torchpose.io.landmarks import DERIVED_JOINTS, LANDMARKS, derive_joints
 from torchpose.measure.face import Region
 
@@ -101,10 +101,7 @@ class MediaPipeFaceDetector(_Task):
 
     def __call__(self, image: Image, region: Region | None = None) -> Float[Tensor, "N 3"]:
         """See `torchpose.measure.FaceDetector`."""
-        if image.ndim != 2 or image.dtype != np.uint8:
-            raise InputError(
-                f"image must be grey, [H, W] of uint8, got {list(image.shape)} of {image.dtype}"
-            )
+        check_grey("image", image)
         height, width = image.shape
         if region is None:
             views = [(0, 0, width, height), *_squares(width, height, self.tiles)]
@@ -227,10 +224,7 @@ class MediaPipePose(_Task):
         Raises:
             InputError: another kind of image, or a time that is not later.
         """
-        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            raise InputError(
-                f"image must be RGB, [H, W, 3] of uint8, got {list(image.shape)} of {image.dtype}"
-            )
+        check_rgb("image", image)
         if not (time > self._time and math.isfinite(time)):
             raise InputError(
                 f"time must be finite and later than that of the frame before ({self._time} s), "

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchpose.errors import InputError
 from torchpose.measure.face import Image
 
-__all__ = ["PersonRegister", "Persons", "clothes_colours"]
+__all__ = ["PersonRegister", "Persons", "clothes_colours", "match_rows"]
 
 _BINS = 8
 _CLOTHES = (0.8, 1.3, 2.6)  # half the width, top and bottom below the face, in its sizes
@@ -28,6 +28,16 @@ class Persons(NamedTuple):
     face: Int[Tensor, " P"]
     colours: Float[Tensor, "P 512"]
     last_seen: Int[Tensor, " P"]
+
+
+def match_rows(known: Int[Tensor, " K"], wanted: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
+    """The row of each wanted person among the known ones, K for a newcomer.
+
+    >>> match_rows(torch.tensor([7, 4]), torch.tensor([4, 9])).tolist()
+    [1, 2]
+    """
+    same = torch.nn.functional.pad(wanted[:, None] == known, (0, 1), value=True)
+    return same.int().argmax(1)  # the first that is the same, or the one behind all
 
 
 def clothes_colours(image: Image, faces: Float[Tensor, "N 3"]) -> Float[Tensor, "N 512"]:

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from torchpose.errors import InputError, check_shape
+from torchpose.measure.face import check_faces
 
 __all__ = ["SkinModel", "SkinState", "rgb_to_lab"]
 
@@ -145,9 +146,7 @@ class SkinModel(nn.Module):
             ShapeError: wrong shapes. InputError: faces without a size.
         """
         check_shape("lab", lab, [len(state.face), 3, "H", "W"])
-        check_shape("faces", faces, [len(state.face), 3])
-        if not bool((faces[:, 2] > 0).all()):
-            raise InputError(f"faces must have a positive size, got {faces[:, 2].tolist()}")
+        check_faces(faces, len(state.face))
         bins = self.bins(lab)
         state = self.learn(state, bins, faces.to(self.lowest), hands)
         return state, self.find(state, bins)

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchpose.errors import InputError, check_shape
+from torchpose.measure.face import check_faces
 from torchpose.priors.em import MixtureParameters, natural_parameters
 
 __all__ = ["SkinMixtureModel", "SkinMixtureState"]
@@ -135,9 +136,7 @@ class SkinMixtureModel(nn.Module):
             ShapeError: wrong shapes. InputError: faces without a size.
         """
         check_shape("lab", lab, [len(state.weights), 3, "H", "W"])
-        check_shape("faces", faces, [len(state.weights), 3])
-        if not bool((faces[:, 2] > 0).all()):
-            raise InputError(f"faces must have a positive size, got {faces[:, 2].tolist()}")
+        check_faces(faces, len(state.weights))
         due = state.frames % self.every == 0
         known = state.frames > 0
         if bool(due.any()):

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from torchpose.errors import InputError
+from torchpose.errors import InputError, check_rgb
 from torchpose.measure.background import BackgroundModel
 from torchpose.measure.face import FaceDetector, FaceTracker, FaceTracks, Image
 from torchpose.measure.hand_measurements import HandMeasurements
@@ -29,7 +29,6 @@ __all__ = [
     "FrameMeasurements",
     "MeasurerState",
     "UpperBodyMeasurer",
-    "check_image",
     "rounded_covariance",
 ]
 
@@ -145,7 +144,8 @@ class UpperBodyMeasurer(nn.Module):
         """
         import cv2
 
-        grey = cv2.cvtColor(check_image(image), cv2.COLOR_RGB2GRAY)
+        check_rgb("a frame", image)
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         scale = _face_scale(image)
         if scale < 1:
             grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -250,19 +250,6 @@ def rounded_covariance(cov: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batc
     variance = cov.diagonal(dim1=-2, dim2=-1).mean(-1)
     std = _LEVEL ** (0.5 * variance.log() / math.log(_LEVEL)).round()
     return std.square()[..., None, None] * torch.eye(2, dtype=cov.dtype, device=cov.device)
-
-
-def check_image(image: Any) -> Image:
-    """The image, if it is one.
-
-    Raises:
-        InputError: not RGB, [H, W, 3] of uint8.
-    """
-    shape: tuple[int, ...] = tuple(getattr(image, "shape", ()))
-    kind = getattr(image, "dtype", type(image))
-    if len(shape) != 3 or shape[2] != 3 or kind != np.uint8:
-        raise InputError(f"a frame must be RGB, [H, W, 3] of uint8, got {list(shape)} of {kind}")
-    return np.asarray(image)
 
 
 def _face_scale(image: Image) -> float:

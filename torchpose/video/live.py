@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpose.errors import InputError, OutputError
+from torchpose.errors import InputError, OutputError, check_rgb
 
 __all__ = ["LiveView"]
 
@@ -143,10 +143,7 @@ class LiveView:
         Raises:
             InputError: another kind of picture.
         """
-        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
-            raise InputError(
-                f"image must be RGB, [H, W, 3] of uint8, got {list(image.shape)} of {image.dtype}"
-            )
+        check_rgb("image", image, empty=False)
         with self._news:
             self._image = image.copy()  # the caller may draw into the same memory again
             self._number += 1

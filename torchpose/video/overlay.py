@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpose.calibration import chi2_quantile
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import InputError, check_rgb, check_shape
 from torchpose.joint_sets import UPPER_BODY
 from torchpose.skeleton import LIMBS
 from torchpose.viz.style import LEFT, RIGHT
@@ -264,10 +264,7 @@ def _check(
     tints: Sequence[int] | None,
     level: float,
 ) -> None:
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
-        raise InputError(
-            f"image must be RGB, [H, W, 3] of uint8, got {list(image.shape)} of {image.dtype}"
-        )
+    check_rgb("image", image, empty=False)
     check_shape("poses2d", poses2d, [None, len(UPPER_BODY), 2])
     n = len(poses2d)
     check_shape("observed", observed, [n, len(UPPER_BODY)])
