@@ -31,6 +31,7 @@ from _asl import BURN_IN, CLIPS, FPS, Clip, read_clip
 from _timing import Report, limit_threads, machine_line
 from torch import Tensor
 
+from torchpose.measure.edges import edge_map
 from torchpose.measure.face import FaceTracker
 from torchpose.measure.hand_prior import HandPrior
 from torchpose.measure.hand_settings import HandSettings
@@ -356,7 +357,7 @@ def draw_failures(
     for kind, places in kinds.items():
         some = places[:: max(1, -(-len(places) // 8))][:8]
         views = [_view(clip, t, materials[clip], found[clip].points[t]) for clip, t in some]
-        views += [np.zeros_like(views[0])] * (-len(views) % 4)
+        views += [np.full_like(views[0], 255)] * (-len(views) % 4)
         sheet = np.vstack([np.hstack(views[i : i + 4]) for i in range(0, len(views), 4)])
         name = f"{kind.replace(' ', '-')}.jpg"
         quality = [cv2.IMWRITE_JPEG_QUALITY, 80]
@@ -384,10 +385,13 @@ def failures(points: Tensor, material: Material) -> Iterator[tuple[int, str]]:
 
 
 def _view(clip: str, t: int, material: Material, points: Tensor) -> np.ndarray:
+    """Edges of a frame with true and found hands: a drawing, as the recordings are not ours to copy."""
     import cv2
 
-    image = material.frames[t].copy()
-    for k, colour in enumerate(((0, 255, 0), (255, 0, 0))):
+    grey = cv2.cvtColor(material.frames[t], cv2.COLOR_RGB2GRAY)
+    lines = np.where(edge_map(np.asarray(grey, np.uint8)).numpy(), 60, 255).astype(np.uint8)
+    image = cv2.cvtColor(lines, cv2.COLOR_GRAY2RGB)
+    for k, colour in enumerate(((0, 160, 0), (220, 0, 0))):
         if not bool(material.truth[t, k].isnan().any()):
             x, y = (int(v) for v in material.truth[t, k])
             cv2.circle(image, (x, y), round(material.tolerance), colour, 2)
