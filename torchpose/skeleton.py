@@ -12,6 +12,7 @@ told apart here:
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -108,6 +109,11 @@ def upper_body_indices(names: Sequence[str], nose_as_head: bool = False) -> Uppe
     ((1, -1, -1, 0, -1, -1, -1, 2), ('elbow_left', 'shoulder_left', 'neck', 'shoulder_right', \
 'elbow_right'))
     """
+    return _find_upper_body(tuple(str(name) for name in names), nose_as_head)
+
+
+@lru_cache(maxsize=1024)
+def _find_upper_body(names: tuple[str, ...], nose_as_head: bool) -> UpperBodyMap:
     canonical = canonical_names(names)
     where = {name: i for i, name in enumerate(canonical)}
     hand = _hand_kind(canonical)

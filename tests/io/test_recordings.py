@@ -104,6 +104,14 @@ def test_a_joint_with_one_coordinate_missing_is_missing(tmp_path):
     assert recording.joints[1, 2].isnan().all()
 
 
+@pytest.mark.parametrize(("factor", "word"), [(1000, "millimetres"), (100, "centimetres")])
+def test_other_units_are_converted_and_said(tmp_path, factor, word):
+    [recording] = read_recording(write(tmp_path / "a.npz", joints=pose() * factor))
+    np.testing.assert_allclose(recording.joints, pose(), atol=1e-12)
+    assert any(word in note for note in recording.notes)
+    assert read_recording(write(tmp_path / "b.npz"))[0].notes == ()
+
+
 @pytest.mark.parametrize(
     ("changes", "error", "word"),
     [
@@ -117,7 +125,9 @@ def test_a_joint_with_one_coordinate_missing_is_missing(tmp_path):
         ({"joints": pose(0)}, InputError, "empty"),
         ({"joints": pose() * np.nan}, InputError, "every joint is NaN"),
         ({"joints": np.where(pose() > 0.49, np.inf, pose())}, FileFormatError, "infinite"),
-        ({"joints": pose() * 1000}, FileFormatError, "millimetres"),
+        ({"joints": pose() * 30}, FileFormatError, "no person in metres"),
+        ({"joints": pose() / 20}, FileFormatError, "no person in metres"),
+        ({"joints": pose() * 0}, InputError, "zero or NaN"),
         ({"names": np.array(["tail", *UPPER_BODY[1:]])}, SkeletonError, "tail.*known are"),
         ({"names": np.array(["head", *UPPER_BODY[1:]])}, SkeletonError, "both head"),
         ({"names": np.array(UPPER_BODY[:7])}, FileFormatError, "7 names"),
@@ -140,9 +150,9 @@ def test_what_is_no_recording(tmp_path, changes, error, word):
 def test_other_files(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_recording(tmp_path / "none.npz")
-    (tmp_path / "a.txt").write_text("joints")
-    with pytest.raises(FileFormatError, match=r"a.txt.*\.npz"):
-        read_recording(tmp_path / "a.txt")
+    (tmp_path / "a.doc").write_text("joints")
+    with pytest.raises(FileFormatError, match=r"a.doc.*\.npz"):
+        read_recording(tmp_path / "a.doc")
     (tmp_path / "a.npz").write_bytes(write(tmp_path / "b.npz").read_bytes()[:700])
     with pytest.raises(FileFormatError, match="truncated"):
         read_recording(tmp_path / "a.npz")
@@ -312,6 +322,12 @@ def test_every_set_reads(folder):
         assert recording.fps is not None
         assert 29 < recording.fps < 121
     assert facing >= 0.9 * len(recordings)  # someone who throws stands sideways
+
+
+@pytest.mark.data
+def test_frames_that_a_kinect_dropped_are_said():
+    [wave] = read_recording(data_dir_or_skip("kinect_laban") / "Ges01_wavehand.csv")
+    assert wave.notes == ("2 frames are not in the file, by its time stamps: after 88, 95",)
 
 
 @pytest.mark.data

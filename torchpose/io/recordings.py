@@ -1,12 +1,12 @@
-"""Recordings of 3D joints: the common .npz, the authors' OpenCV file, Kinect v2 CSV.
+"""Recordings of 3D joints, whatever sensor or software wrote them.
 
-Joints come back in camera axes and metres; see `torchpose.io.axes` for how.
+Joints come back in camera axes and metres; see `torchpose.io.axes` and `torchpose.io.units` for how.
+One file per format reads what a file holds; here it is checked and converted.
 """
 
-import math
 import re
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,22 +14,38 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpose.errors import (
-    FileFormatError,
-    InputError,
-    MissingDependencyError,
-    SkeletonError,
-)
+from torchpose.errors import FileFormatError, InputError, SkeletonError
 from torchpose.io.axes import axes_rotation, check_upright, default_axes
-from torchpose.io.files import read_npz, require_file
-from torchpose.joint_sets import SKELETONS, UPPER_BODY, canonical_names, identify_skeleton
+from torchpose.io.azure_json import read_azure_json
+from torchpose.io.bvh_recordings import read_bvh
+from torchpose.io.c3d_recordings import read_c3d
+from torchpose.io.files import require_file
+from torchpose.io.kinect_csv import ROW_LENGTHS, header_joints, read_kinect_csv, split_row
+from torchpose.io.kinect_v1 import read_kinect_v1
+from torchpose.io.npz_recordings import read_npz_recording, read_opencv_recording
+from torchpose.io.ntu_skeleton import read_ntu_skeleton
+from torchpose.io.raw_recording import RawRecording, frame_ranges
+from torchpose.io.units import body_unit
+from torchpose.joint_sets import canonical_names, identify_skeleton
 from torchpose.skeleton import UpperBody, to_upper_body
 
 __all__ = ["Recording", "find_recordings", "read_recording", "read_recordings"]
 
-_SUFFIXES = (".npz", ".yaml", ".yml", ".csv")
-_TRACKING_WEIGHTS = (0.0, 0.5, 1.0)  # Kinect v2: not tracked, inferred, tracked
-_KINECT_TICK = 1e-7  # its time stamps count 100 ns
+_READERS: dict[str, Callable[[Path], list[RawRecording]]] = {
+    ".npz": read_npz_recording,
+    ".yaml": read_opencv_recording,
+    ".yml": read_opencv_recording,
+    ".csv": read_kinect_csv,
+    ".txt": read_kinect_v1,
+    ".skeleton": read_ntu_skeleton,
+    ".json": read_azure_json,
+    ".bvh": read_bvh,
+    ".c3d": read_c3d,
+}
+_SUFFIXES = tuple(_READERS)
+_SNIFFED = 65536  # bytes from the start of a file that tell whether it is a recording
+_BESIDE_BODY = 0.3  # of its size: how far outside its other joints a centred body's origin may be
+_SHOWN_JOINTS = 3
 
 
 @dataclass
@@ -42,9 +58,13 @@ class Recording:
         fps: frames per second, None if unknown.
         person, action, source: from the file, empty if it does not say.
         path: the file.
-        weights: [T, J] in [0, 1], how far to trust each joint, or None for all alike.
+        weights: [T, J] in [0, 1], how far to trust each joint, 0 where it is missing; or None for all
+            alike.
         skeleton: name of the joint set, empty if it is no known one.
         rotation: M [3, 3] with x_camera = M x_file, to go back to the axes of the file.
+        notes: what reading assumed, converted or left out, for people.
+        companion: 0 for the person whose file it is, else which of the others in it.
+        first_frame: number of the first frame in the file.
     """
 
     joints: Tensor
@@ -57,6 +77,9 @@ class Recording:
     weights: Tensor | None = None
     skeleton: str = ""
     rotation: Tensor = field(default_factory=lambda: torch.eye(3, dtype=torch.float64))
+    notes: tuple[str, ...] = ()
+    companion: int = 0
+    first_frame: int = 0
 
     def __len__(self) -> int:
         return len(self.joints)
@@ -66,11 +89,13 @@ class Recording:
         """The person, told apart from persons of the same name in other data sets.
 
         ``origin#person``: the origin is the repository that `source` names, else the folder. Files
-        that were made from one repository share it, whatever folder they are in.
+        that were made from one repository share it, whatever folder they are in. Where a file names
+        no person, its folder therefore stands for one. ``+1`` and so on are other people in the file.
         """
-        folder = self.path.resolve().parent.name if self.path is not None else ""
+        folder = self.path.parent.resolve().name if self.path is not None else ""
         origin = re.split(r"[@\s]", self.source.strip(), maxsplit=1)[0] or folder
-        return f"{origin}#{self.person}"
+        other = f"+{self.companion}" if self.companion else ""
+        return f"{origin}#{self.person}{other}"
 
     def upper_body(self, nose_as_head: bool = False) -> UpperBody:
         """The eight joints [T, 8, 3] with the kinds of neck, hand and head."""
@@ -78,12 +103,17 @@ class Recording:
 
 
 def read_recording(path: str | Path, axes: str | None = None) -> list[Recording]:
-    """Read the recordings of one file.
+    """Read the recordings of one file: one for each person in it.
 
-    ``.npz``: `joints` [T, J, 3] in metres and `names` [J]; optionally `fps`, `subject`, `action`,
-    `source`, `axes`, `weights` [T, J]. ``.yaml``: the authors' OpenCV matrix of T x 24, joints in
-    the order of `UPPER_BODY`. ``.csv``: Kinect v2 as in LabanotationSuite, 25 joints with tracking
-    state (inferred joints weigh 0.5, those not tracked are missing) and time stamps in 100 ns.
+    ``.npz``: `joints` [T, J, 3] and `names` [J]; optionally `fps`, `subject`, `action`, `source`,
+    `axes`, `weights` [T, J]. ``.yaml``: the authors' OpenCV matrix. ``.csv``: rows of Kinect v1 or v2,
+    or any joint set with a header (`torchpose.io.kinect_csv`). ``.txt``: Kinect v1
+    (`torchpose.io.kinect_v1`). ``.skeleton``: NTU RGB+D. ``.json``: Azure Kinect. ``.bvh``, ``.c3d``:
+    motion capture, with the extra ``mocap``.
+
+    Millimetres and centimetres are recognised by the size of the body and converted; joints exactly
+    at (0, 0, 0), with which sensors fill up, become missing. Other bodies in a file that are no
+    people are left out. `Recording.notes` says so.
 
     Args:
         path: the file.
@@ -91,21 +121,32 @@ def read_recording(path: str | Path, axes: str | None = None) -> list[Recording]
             what its joint set usually has.
 
     Returns:
-        One `Recording` per sequence in the file (one, for these formats), in camera axes.
+        A `Recording` per person, in camera axes; the one whose file it is first.
 
     Raises:
         InputError: no such file, an empty sequence, no joint anywhere. FileFormatError: truncated,
-            another kind of file, wrong shapes, infinite values, upside down.
-        SkeletonError: unknown joint names. MissingDependencyError: OpenCV is needed for ``.yaml``.
+            another kind of file, wrong shapes, infinite values, no size of a body, upside down.
+        SkeletonError: unknown joint names. MissingDependencyError: a library is needed.
     """
     path = require_file(path)
-    readers = {".npz": _read_npz, ".yaml": _read_yaml, ".yml": _read_yaml, ".csv": _read_kinect_csv}
-    reader = readers.get(path.suffix.lower())
+    reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise FileFormatError(
             f"{path}: expected one of {', '.join(_SUFFIXES)}, got {path.suffix or 'no suffix'}"
         )
-    return [_finish(reader(path), axes)]
+    found = reader(path)
+    if not found:
+        raise InputError(f"{path}: nobody is in any frame; expected a body in some")
+    first, *others = found
+    recordings, ghosts = [_finish(first, axes)], []
+    for raw in others:
+        try:
+            recordings.append(_finish(raw, axes))
+        except (FileFormatError, InputError) as error:  # sensors take furniture for people
+            reason = str(error).removeprefix(f"{raw.where()}: ").split(";")[0]
+            ghosts.append(f"other body {raw.companion} is left out: {reason}")
+    recordings[0].notes += tuple(ghosts)
+    return recordings
 
 
 def read_recordings(
@@ -118,9 +159,10 @@ def read_recordings(
 def find_recordings(paths: str | Path | Iterable[str | Path]) -> list[Path]:
     """Files with recordings among files and folders.
 
-    Folders are searched with their subfolders. A folder's `.yaml` and `.csv` files are passed over
-    where it holds recordings as `.npz`, because they are those in another form. So are files of
-    other content; files that cannot be opened are listed, so that reading them says what is wrong.
+    Folders are searched with their subfolders. A folder's other files are passed over where it holds
+    recordings as `.npz`, because they are those in another form. So are files of other content, and
+    what `torchpose track` wrote; files that cannot be opened are listed, so that reading them says
+    what is wrong.
 
     Args:
         paths: one path or several. A file is taken as it is.
@@ -170,180 +212,127 @@ def _may_hold_joints(path: Path) -> bool:
 
 def _looks_recorded(path: Path) -> bool:
     with path.open("rb") as stream:
-        start = stream.read(4096).decode("utf-8", "replace")
-    if path.suffix.lower() == ".csv":
-        return len(start.split("\n", 1)[0].rstrip().rstrip(",").split(",")) == 1 + 25 * 4
-    return start.startswith("%YAML") and "opencv-matrix" in start
-
-
-# --- readers --------------------------------------------------------------------------------------
-
-
-@dataclass
-class _Raw:
-    """What a file holds, before conversion."""
-
-    path: Path
-    joints: np.ndarray
-    names: tuple[str, ...]
-    fps: float | None
-    axes: str | None = None
-    person: str = ""
-    action: str = ""
-    source: str = ""
-    weights: np.ndarray | None = None
-
-
-def _read_npz(path: Path) -> _Raw:
-    arrays = read_npz(
-        path,
-        required=("joints", "names"),
-        optional=("fps", "subject", "action", "source", "axes", "weights"),
-    )
-    joints = _numbers(f"{path}: joints", arrays["joints"])
-    names = tuple(str(n) for n in np.atleast_1d(arrays["names"]).ravel())
-    weights = arrays.get("weights")
-    text = {key: str(arrays[key].item()) if key in arrays and arrays[key].size == 1 else ""
-            for key in ("subject", "action", "source", "axes")}  # fmt: skip
-    fps = None
-    if "fps" in arrays:
-        value = _numbers(f"{path}: fps", arrays["fps"])
-        if value.size != 1 or not 0 < float(value.item()) < math.inf:
-            raise FileFormatError(f"{path}: fps must be one positive number, got {value.tolist()}")
-        fps = float(value.item())
-    return _Raw(
-        path, joints, names, fps, text["axes"] or None, text["subject"], text["action"],
-        text["source"], None if weights is None else _numbers(f"{path}: weights", weights),
-    )  # fmt: skip
-
-
-def _read_yaml(path: Path) -> _Raw:
-    try:
-        import cv2
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"{path}: reading OpenCV files needs OpenCV; install opencv-python-headless"
-        ) from error
-    expected = f"an OpenCV FileStorage with one matrix of T x {3 * len(UPPER_BODY)}"
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path}: expected {expected}, got another kind of file") from error
-    if "opencv-matrix" not in text:  # OpenCV prints its own complaint about foreign files
-        raise FileFormatError(f"{path}: expected {expected}, found no matrix")
-    try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        nodes = [storage.getNode(key) for key in storage.root().keys()]  # noqa: SIM118
-        matrices = [node.mat() for node in nodes if node.isMap()]
-        storage.release()
-    except (cv2.error, SystemError) as error:
-        raise FileFormatError(
-            f"{path}: expected {expected}; it is truncated or damaged ({_first_line(error)})"
-        ) from error
-    if len(matrices) != 1 or matrices[0] is None or matrices[0].shape[1:] != (3 * len(UPPER_BODY),):
-        shapes = [None if m is None else m.shape for m in matrices]
-        raise FileFormatError(f"{path}: expected {expected}, got matrices of {shapes}")
-    joints = matrices[0].reshape(-1, len(UPPER_BODY), 3)
-    # the source states no rate; Kinect v1 records 30 frames per second
-    return _Raw(path, joints, UPPER_BODY, 30.0, "camera")
-
-
-def _read_kinect_csv(path: Path) -> _Raw:
-    names = SKELETONS["kinect-v2-25"].joints
-    width = 1 + 4 * len(names)
-    rows: list[list[float]] = []
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path}: expected Kinect v2 rows of numbers, got bytes") from error
-    for number, line in enumerate(lines, start=1):
-        if not line.strip():
-            continue
-        fields = line.strip().removesuffix(",").split(",")
-        try:
-            row = [float(value) for value in fields]
-        except ValueError as error:
-            raise FileFormatError(f"{path}, line {number}: expected numbers ({error})") from error
-        if len(row) != width:
-            raise FileFormatError(
-                f"{path}, line {number}: expected {width} numbers (time stamp, then x, y, z and "
-                f"tracking state of {len(names)} joints), got {len(row)}"
-            )
-        if not set(row[4::4]) <= {0.0, 1.0, 2.0}:
-            raise FileFormatError(f"{path}, line {number}: tracking states must be 0, 1 or 2")
-        if rows and row[0] <= rows[-1][0]:
-            raise FileFormatError(
-                f"{path}, line {number}: time stamps must increase, got {row[0]:.0f} after "
-                f"{rows[-1][0]:.0f}"
-            )
-        rows.append(row)
-    table = np.array(rows).reshape(-1, width)
-    values = table[:, 1:].reshape(-1, len(names), 4)
-    weights = np.array(_TRACKING_WEIGHTS)[values[..., 3].astype(int)]
-    joints = np.where(weights[..., None] > 0, values[..., :3], np.nan)
-    steps = np.diff(table[:, 0]) * _KINECT_TICK
-    fps = float(1 / np.median(steps)) if len(steps) else None
-    return _Raw(path, joints, names, fps, "kinect", action=path.stem, weights=weights)
+        start = stream.read(_SNIFFED).decode("utf-8-sig", "replace")
+    suffix = path.suffix.lower()
+    if suffix in (".csv", ".txt"):
+        lines = [line for line in start.splitlines() if line.strip() and not line.startswith("#")]
+        first = split_row(lines[0]) if lines else []
+        daily = suffix == ".txt" and first[1:] == ["20"]
+        return len(first) in ROW_LENGTHS or daily or (bool(lines) and bool(header_joints(lines[0])))
+    if suffix == ".json":
+        return '"joint_positions"' in start or '"bone_list"' in start
+    if suffix == ".bvh":
+        return not ("ROOT neck" in start and "JOINT head_base" in start)  # a result, no recording
+    if suffix in (".yaml", ".yml"):
+        return start.startswith("%YAML") and "opencv-matrix" in start
+    return True
 
 
 # --- checks and conversion ------------------------------------------------------------------------
 
 
-def _numbers(name: str, array: np.ndarray) -> np.ndarray:
-    if array.dtype.kind not in "fiub":
-        raise FileFormatError(f"{name} must be numbers, got {array.dtype}")
-    return array.astype(np.float64)
-
-
-def _first_line(error: BaseException) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[0] if lines else type(error).__name__
-
-
-def _finish(raw: _Raw, axes: str | None) -> Recording:
-    """Check what was read and turn it into camera axes."""
-    path, joints = raw.path, raw.joints
-    if joints.ndim != 3 or joints.shape[1:] != (len(raw.names), 3):
-        raise FileFormatError(
-            f"{path}: joints must have shape [T, {len(raw.names)}, 3] for {len(raw.names)} names, "
-            f"got {list(joints.shape)}"
-        )
-    if len(joints) == 0:
-        raise InputError(f"{path}: the sequence is empty; expected one frame or more")
-    if np.isinf(joints).any():
-        frame = int(np.argwhere(np.isinf(joints))[0, 0])
-        raise FileFormatError(f"{path}: joints must not be infinite, frame {frame} is; use NaN")
-    if np.isnan(joints).all():
-        raise InputError(f"{path}: every joint is NaN; expected some that are measured")
-    _check_weights(path, raw.weights, joints)
+def _finish(raw: RawRecording, axes: str | None) -> Recording:
+    """Check what was read and turn it into metres and camera axes."""
+    where = raw.where()
+    _check_shapes(raw)
     try:
         canonical_names(raw.names)
     except SkeletonError as error:
-        raise SkeletonError(f"{path}: {error}") from error
-    # a joint with one coordinate missing is missing
-    joints = np.where(np.isnan(joints).any(-1, keepdims=True), np.nan, joints)
+        raise SkeletonError(f"{where}: {error}") from error
+    notes = list(raw.notes)
+    joints = _missing(raw, notes)
     tensor = torch.from_numpy(joints)
-    skeleton = identify_skeleton(raw.names)
-    axes = axes or raw.axes or default_axes(str(path), raw.names)
+    tensor = tensor * (1.0 if raw.unit is None else raw.unit)
+    unit = body_unit(where, tensor, raw.names)
+    if raw.unit is not None and unit.note:
+        raise FileFormatError(
+            f"{where}: the file states its unit ({raw.unit:g} m), but in it the body is no person's "
+            f"size ({unit.note}); correct the unit"
+        )
+    notes += [unit.note] if unit.note else []
+    tensor = tensor * unit.metres
+    axes = axes or raw.axes or default_axes(where, raw.names)
     try:
         rotation = axes_rotation(tensor, raw.names, axes)
     except InputError as error:
-        raise type(error)(f"{path}: {error}") from error
+        raise type(error)(f"{where}: {error}") from error
     tensor = tensor @ rotation.mT
-    check_upright(str(path), tensor, raw.names)
+    check_upright(where, tensor, raw.names)
+    skeleton = identify_skeleton(raw.names)
+    weights = None
+    if raw.weights is not None:
+        weights = torch.from_numpy(np.where(np.isnan(joints).any(-1), 0.0, raw.weights))
     return Recording(
-        tensor, raw.names, raw.fps, raw.person, raw.action, raw.source, path,
-        None if raw.weights is None else torch.from_numpy(raw.weights),
-        "" if skeleton is None else skeleton.name, rotation,
+        tensor, raw.names, raw.fps, raw.person, raw.action, raw.source, raw.path, weights,
+        "" if skeleton is None else skeleton.name, rotation, tuple(notes), raw.companion,
+        raw.first_frame,
     )  # fmt: skip
 
 
-def _check_weights(path: Path, weights: np.ndarray | None, joints: np.ndarray) -> None:
+def _check_shapes(raw: RawRecording) -> None:
+    where, joints, weights = raw.where(), raw.joints, raw.weights
+    if joints.ndim != 3 or joints.shape[1:] != (len(raw.names), 3):
+        raise FileFormatError(
+            f"{where}: joints must have shape [T, {len(raw.names)}, 3] for {len(raw.names)} names, "
+            f"got {list(joints.shape)}"
+        )
+    if len(joints) == 0:
+        raise InputError(f"{where}: the sequence is empty; expected one frame or more")
+    if np.isinf(joints).any():
+        frame, joint = np.argwhere(np.isinf(joints))[0, :2]
+        raise FileFormatError(
+            f"{where}: joints must not be infinite, frame {raw.first_frame + frame} is "
+            f"({raw.names[joint]}); use NaN for what is missing"
+        )
+    if np.isnan(joints).all():
+        raise InputError(f"{where}: every joint is NaN; expected some that are measured")
     if weights is None:
         return
     if weights.shape != joints.shape[:2]:
         raise FileFormatError(
-            f"{path}: weights must have shape {list(joints.shape[:2])}, got {list(weights.shape)}"
+            f"{where}: weights must have shape {list(joints.shape[:2])}, got {list(weights.shape)}"
         )
     if not (np.isfinite(weights).all() and (weights >= 0).all() and (weights <= 1).all()):
-        raise FileFormatError(f"{path}: weights must lie in [0, 1]")
+        raise FileFormatError(f"{where}: weights must lie in [0, 1]")
+
+
+def _missing(raw: RawRecording, notes: list[str]) -> np.ndarray:
+    """Joints with NaN where one coordinate is missing and where they are exactly zero; says so."""
+    joints = np.where(np.isnan(raw.joints).any(-1, keepdims=True), np.nan, raw.joints)
+    zero = (joints == 0).all(-1)
+    always = np.flatnonzero(zero[~np.isnan(joints).all((1, 2))].all(0))
+    if len(always) == 1 and _is_origin(np.delete(joints, always, 1)):
+        zero[:, always] = False
+        notes.append(f"centred on {raw.names[always[0]]}, which is always at zero")
+    if not zero.any():
+        return joints
+    joints = np.where(zero[..., None], np.nan, joints)
+    if np.isnan(joints).all():
+        raise InputError(f"{raw.where()}: every joint is zero or NaN; expected some measured ones")
+    empty = zero.all(1)
+    if empty.any():
+        frames = frame_ranges(np.flatnonzero(empty).tolist(), raw.first_frame)
+        notes.append(f"no body (all joints at zero) in frames {frames}")
+    notes += _zero_notes(zero & ~empty[:, None], raw)
+    return joints
+
+
+def _is_origin(others: np.ndarray) -> bool:
+    """Whether zero lies within the body that the other joints make, so that it is centred there."""
+    measured = ~np.isnan(others).all((1, 2))
+    low = np.where(np.isnan(others), np.inf, others)[measured].min(1)
+    high = np.where(np.isnan(others), -np.inf, others)[measured].max(1)
+    beside = _BESIDE_BODY * (high - low).max(-1, keepdims=True)
+    inside = ((low - beside <= 0) & (high + beside >= 0)).all(-1)
+    return bool(inside.mean() > 0.5) if len(inside) else False
+
+
+def _zero_notes(zero: np.ndarray, raw: RawRecording) -> list[str]:
+    found = np.flatnonzero(zero.any(0))
+    notes = [
+        f"{raw.names[j]} is exactly (0, 0, 0), so missing, in frames "
+        f"{frame_ranges(np.flatnonzero(zero[:, j]).tolist(), raw.first_frame)}"
+        for j in found[:_SHOWN_JOINTS]
+    ]
+    rest = [raw.names[j] for j in found[_SHOWN_JOINTS:]]
+    return notes + [f"so are, in some frames, {', '.join(rest)}"] * bool(rest)
