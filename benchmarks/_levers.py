@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose import recipes
 from torchpose.camera import PinholeCamera, ViewRange
 from torchpose.filters import MixtureKalmanFilter
 from torchpose.io.files import atomic_path
@@ -29,6 +28,7 @@ from torchpose.protocols.common import (
     score,
     settings_hash,
 )
+from torchpose.recipes import VERSION, UpperBodyRecipe
 from torchpose.skeleton import ARM_JOINTS
 from torchpose.tracking import UpperBodyTracker
 
@@ -46,7 +46,7 @@ class Size(NamedTuple):
     pose_components: int = 30
     pose_samples: int = 100_000
     shrink: int = 1  # of components and samples of windows
-    em_steps: int = recipes._EM_STEPS
+    em_steps: int = UpperBodyRecipe.window_steps
     noise_steps: int = 40
     noise_sequences: int = 32
     thin_fit: int = 1  # every so many recordings are fitted
@@ -175,7 +175,7 @@ class Bench:
             temporary.write_text(json.dumps(results, indent=1), encoding="utf-8")
 
     def _hash(self, *facts: Any) -> str:
-        return settings_hash([recipes.VERSION, self.size, self.persons.digest, *facts])
+        return settings_hash([VERSION, self.size, self.persons.digest, *facts])
 
     def _tracker(self, prior: UpperBodyPrior, lever: Lever, mode: str) -> UpperBodyTracker:
         options = {"window": lever.windows is not None, "max_gap": None} | MODES[mode]
@@ -190,10 +190,11 @@ class Bench:
         path = self.out / f"poses-{self._hash('poses', seed)}.safetensors"
         if not path.is_file():
             start = time.process_time()
-            sizes = recipes._Size(self.size.pose_components, 0, 0, self.size.em_steps)
-            prior = recipes._fit(
-                self.persons.fitted, sizes, seed, TRAINING_VIEWS, n_samples=self.size.pose_samples
-            )
+            recipe = UpperBodyRecipe(
+                self.size.pose_components, self.size.pose_samples, window_components=0,
+                calibration_folds=0, seed=seed,
+            )  # fmt: skip
+            prior = recipe.fit(self.persons.fitted)
             _save(prior, path, fit_seconds=time.process_time() - start)
         prior = UpperBodyPrior.load(path)
         seconds = float(prior.info.extra["fit_seconds"])
@@ -223,23 +224,32 @@ class Bench:
     def _window(
         self, base: UpperBodyPrior, spec: Windows, mode: str, seed: int
     ) -> tuple[WindowPrior, float]:
-        layout = (spec.layouts or recipes.LAYOUTS)[mode]
+        recipe = self._window_recipe(spec, seed)
         facts = spec._replace(layouts=None, seeds=1)
+        layout = recipe.layouts[mode]
         path = self.out / f"window-{self._hash(facts, layout, mode, seed)}.safetensors"
         if not path.is_file():
-            components, samples = (n // self.size.shrink for n in (spec.components, spec.samples))
-            sizes = recipes._Size(0, components, samples, self.size.em_steps)
-            sequences = recipes._sequences(self.persons.fitted, base)
-            settings = recipes._window_settings(mode)
             start = time.process_time()
-            window = recipes._fit_window(
-                sequences, layout, base, sizes, seed, spec.views, settings, **dict(spec.bodies)
-            )
+            tasks = recipe.tasks(self.persons.fitted)
+            fitted = {key: task.fit() for key, task in tasks.items() if key.startswith(mode)}
+            window = recipe.window(mode, fitted)
             seconds = time.process_time() - start
             prior = UpperBodyPrior(base.left, base.right, base.info, base.noise, {mode: window})
             _save(prior, path, fit_seconds=seconds)
         prior = UpperBodyPrior.load(path)
         return prior.windows[mode], float(prior.info.extra["fit_seconds"])
+
+    def _window_recipe(self, spec: Windows, seed: int) -> UpperBodyRecipe:
+        """The recipe with what a lever turns of its windows."""
+        return UpperBodyRecipe(
+            window_components=spec.components // self.size.shrink,
+            window_samples=spec.samples // self.size.shrink,
+            window_steps=self.size.em_steps,
+            views=spec.views,
+            seed=seed,
+            **dict(spec.layouts or {}),
+            **dict(spec.bodies),
+        )
 
 
 def _save(prior: UpperBodyPrior, path: Path, **extra: Any) -> None:

@@ -20,7 +20,7 @@ GAP = 20
 def tracker():
     people = [recording(performer(120, seed=1).body, person="p", fps=30.0)]
     prior = fit_kinect_prior(
-        people, 3, window_components=4, window_samples=1000, n_samples=2000, max_iter=5
+        people, 3, window_components=4, window_samples=1000, n_samples=2000, pose_steps=5
     )
     return UpperBodyTracker(prior, demo_camera(), fps=30.0, max_gap=None)
 

@@ -18,7 +18,7 @@ def prior():
     """As small as it may be: only the arithmetic is of interest."""
     people = [recording(performer(120, seed=1).body, person="p", fps=30.0)]
     return fit_kinect_prior(
-        people, 3, window_components=4, window_samples=1000, n_samples=2000, max_iter=5
+        people, 3, window_components=4, window_samples=1000, n_samples=2000, pose_steps=5
     )
 
 

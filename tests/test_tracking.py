@@ -39,7 +39,7 @@ def prior():
     """A small prior with windows, fitted on two performers of other sizes."""
     recordings = [recording(performer(400, seed=s).body, person=f"p{s}", fps=30.0) for s in (1, 2)]
     return fit_kinect_prior(
-        recordings, 6, window_components=8, window_samples=4000, n_samples=8000, max_iter=20
+        recordings, 6, window_components=8, window_samples=4000, n_samples=8000, pose_steps=20
     )
 
 
@@ -406,7 +406,7 @@ def test_the_recipe_is_repeatable_and_saved(prior, tmp_path):
     torch.testing.assert_close(back.windows["full"].left.means, prior.windows["full"].left.means)
     recordings = [recording(performer(400, seed=s).body, person=f"p{s}") for s in (1, 2)]
     again = fit_kinect_prior(
-        recordings, 6, window_components=8, window_samples=4000, n_samples=8000, max_iter=20
+        recordings, 6, window_components=8, window_samples=4000, n_samples=8000, pose_steps=20
     )
     again.save(tmp_path / "again.safetensors")
     assert (tmp_path / "again.safetensors").read_bytes() == (
@@ -417,7 +417,7 @@ def test_the_recipe_is_repeatable_and_saved(prior, tmp_path):
 def test_one_person_gives_a_prior_without_calibration():
     single = fit_kinect_prior(
         [recording(performer(120, seed=1).body)], 3, window_components=3, window_samples=1000,
-        n_samples=1000, max_iter=5,
+        n_samples=1000, pose_steps=5,
     )  # fmt: skip
     assert not any(name.startswith("calibration") for name in single.noise)
 

@@ -40,6 +40,7 @@ __all__ = [
     "window_inputs",
 ]
 
+_BIMODAL = 2  # hand and elbow, which may be before or behind the body
 _HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
 _HANDS = [UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")]
 
@@ -149,19 +150,20 @@ def window_filter(
         window: whose mixture is taken. side: "left" or "right". joints: of `ARM_JOINTS`.
         measurement_cov: R of the eight joints, the prior's pixels. options: of the caller.
     """
-    arm, dim = ARMS[side], window.layout.dim
+    arm, layout = ARMS[side], window.layout
     blocks = [measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
-    blocks += [_hand_cov(window, side, measurement_cov)] * ((dim - STATE_DIM) // 2)
+    blocks += [_hand_cov(window, side, measurement_cov)] * layout.n_hands
     settings = {"likelihood_power": window.settings["likelihood_power"]}
     # Poses of consecutive frames are tied by the window itself: no memory beyond it.
     return MixtureKalmanFilter(
         getattr(window, side),
-        torch.ones(dim, dtype=torch.float64),
+        torch.ones(layout.dim, dtype=torch.float64),
         torch.block_diag(*blocks),
-        pixel_indices(joints) + list(range(STATE_DIM, dim)),
+        pixel_indices(joints) + list(layout.hands),
         transition="ou",
         gamma=0.0,
         weighting="frame",
+        medians=layout.in_torso[: 3 * _BIMODAL : 3] if joints else (),
         **(settings | options),
     )
 
@@ -195,9 +197,15 @@ def window_inputs(
 
 
 def pose_of_window(
-    out: FilterOutput, context: FilterOutput, seen: SeenInView, arm: tuple[int, ...]
+    out: FilterOutput,
+    context: FilterOutput,
+    seen: SeenInView,
+    arm: tuple[int, ...],
+    layout: WindowLayout,
 ) -> FilterOutput:
     """The arm's part of a window's estimate, and its evidence beyond that of the window's hands.
+
+    The arm's joints in the axes of the torso follow, where the window has them.
 
     The evidence is a density over pixels of the prior's camera, not of the virtual one.
     """
@@ -205,5 +213,6 @@ def pose_of_window(
     evidence = out.log_evidence - context.log_evidence
     evidence = evidence + (seen.log_scale[:, :, list(arm)] * measured).sum(-1)
     evidence = torch.where(measured.any(-1), evidence, torch.zeros_like(evidence))
-    cov = require_cov(out)[..., :STATE_DIM, :STATE_DIM]
-    return out._replace(mean=out.mean[..., :STATE_DIM], cov=cov, log_evidence=evidence)
+    kept = torch.tensor([*range(STATE_DIM), *layout.in_torso], device=out.mean.device)
+    cov = require_cov(out)[..., kept[:, None], kept]
+    return out._replace(mean=out.mean[..., kept], cov=cov, log_evidence=evidence)

@@ -16,7 +16,10 @@ from torchpose.body_view import BodyView, from_view, view_jacobian
 from torchpose.filters.base import FilterOutput
 from torchpose.filters.constant_velocity import ConstantVelocityFilter, ConstantVelocityState
 from torchpose.lifting import arm_in_body_frame, join_arms, pixel_covariances
+from torchpose.priors.arm_state import STATE_DIM
+from torchpose.projection import lift
 from torchpose.rotations import RotationOrder, euler_to_matrix, matrix_to_euler
+from torchpose.torso import onto_torso
 
 __all__ = ["MotionStage", "MotionState", "ReadOut", "read_out", "recalibrated"]
 
@@ -52,14 +55,19 @@ def read_out(
         left, right: outputs of the arms' filters, with covariances. matrix: K of the states' pixels.
         order: of roll, pitch and yaw. view: the virtual camera that the states are seen by, if any.
     """
-    covs = require_cov(left), require_cov(right)
-    means = left.mean, right.mean
-    lifted = [
-        arm_in_body_frame(mean, cov, matrix, order) for mean, cov in zip(means, covs, strict=True)
-    ]
-    joints = join_arms(*(joints for joints, _ in lifted))
-    joint_covs = join_arms(*(cov for _, cov in lifted))
-    camera = (left.mean[..., 15:] + right.mean[..., 15:]) / 2
+    outputs = left, right
+    means = [out.mean[..., :STATE_DIM] for out in outputs]
+    covs = [require_cov(out)[..., :STATE_DIM, :STATE_DIM] for out in outputs]
+    if left.mean.shape[-1] > STATE_DIM:
+        joints, joint_covs = _on_torso(left, right, matrix, order)
+    else:
+        lifted = [
+            arm_in_body_frame(mean, cov, matrix, order)
+            for mean, cov in zip(means, covs, strict=True)
+        ]
+        joints = join_arms(*(joints for joints, _ in lifted))
+        joint_covs = join_arms(*(cov for _, cov in lifted))
+    camera = (means[0][..., 15:] + means[1][..., 15:]) / 2
     angles, place = camera[..., :3], camera[..., 3:]
     uv = join_arms(*(mean[..., :15].unflatten(-1, (5, 3))[..., :2] for mean in means))
     uv_covs = join_arms(*(pixel_covariances(cov) for cov in covs))
@@ -70,6 +78,25 @@ def read_out(
         slopes = view_jacobian(uv, view, matrix)
         uv, uv_covs = from_view(uv, view, matrix), slopes @ uv_covs @ slopes.mT
     return ReadOut(joints, joint_covs, angles, place, uv, uv_covs)
+
+
+def _on_torso(
+    left: FilterOutput, right: FilterOutput, matrix: Tensor, order: RotationOrder
+) -> tuple[Float[Tensor, "B T 8 3"], Float[Tensor, "B T 8 3 3"]]:
+    """Joints that were estimated in the axes of the torso, in those of the body.
+
+    The states say where head, neck and shoulders are there (BL 5), which takes no covariances.
+    """
+    lifted, pose, covs = [], [], []
+    for out in (left, right):
+        rotation = euler_to_matrix(out.mean[..., 15:18], order)
+        joints = out.mean[..., :15].unflatten(-1, (5, 3))
+        lifted.append(lift(joints, matrix, rotation, out.mean[..., 18:STATE_DIM]))
+        pose.append(out.mean[..., STATE_DIM:].unflatten(-1, (5, 3)))
+        blocks = require_cov(out)[..., STATE_DIM:, STATE_DIM:].unflatten(-1, (5, 3))
+        blocks = blocks.unflatten(-3, (5, 3))
+        covs.append(blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3))
+    return onto_torso(join_arms(*pose), join_arms(*covs), join_arms(*lifted))
 
 
 def recalibrated(

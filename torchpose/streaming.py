@@ -226,7 +226,7 @@ def _advance_arm(
     both, noise, hands = window_inputs(seen, window, side, joints, tracker.measurement_cov)
     after, out = _advance(models[0], states[0], *both, noise, None)
     after_hands, context = _advance(models[1], states[1], *hands, None, None)
-    return (after, after_hands), pose_of_window(out, context, seen, ARMS[side])
+    return (after, after_hands), pose_of_window(out, context, seen, ARMS[side], window.layout)
 
 
 def _advance(

@@ -358,7 +358,7 @@ class UpperBodyTracker(nn.Module):
         model = self._window_filter(side, seen.window, joints)
         out = model(*both, noise, lengths, return_cov=True, progress=progress)
         context = self._window_filter(side, seen.window, ())(*hands, None, lengths)
-        return pose_of_window(out, context, seen, ARMS[side])
+        return pose_of_window(out, context, seen, ARMS[side], window.layout)
 
     def _window_filter(self, side: str, name: str, joints: tuple[str, ...]) -> MixtureKalmanFilter:
         """Fixed tracks over window states that measure these joints and all hands of the window."""

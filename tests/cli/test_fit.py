@@ -1,16 +1,16 @@
 """`torchpose fit`: the prior, its card and its picture, and what it refuses."""
 
-import sys
-from dataclasses import replace
-from types import ModuleType
+import shutil
 
 import numpy as np
 import pytest
 import torch
 
 from torchpose.cli.fit import build, command_line
+from torchpose.curation import curate
 from torchpose.io import read_recordings
 from torchpose.priors import fit_upper_body_prior, load_prior
+from torchpose.recipes import UpperBodyRecipe
 
 QUICK = ("--components", 2, "--samples", 500, "--noise", "none", "--pictures", "false")
 
@@ -27,7 +27,7 @@ def test_prior_is_that_of_the_library(torchpose, files, tmp_path):
     assert prior.info.name == "mine" and prior.info.licence == "CC0"
     assert prior.info.persons == ("recordings#p1", "recordings#p2")
     assert prior.info.command.startswith(f"torchpose fit {folder} --out {out} --components 2")
-    assert "read     2 recordings of 2 persons, 900 frames" in done.out
+    assert "kept     2 recordings of 2 persons, 900 frames" in done.out
     assert out.with_suffix(".md").read_text().startswith("# mine")
     assert {p.name for p in out.parent.iterdir()} == {"mine.safetensors", "mine.md"}
 
@@ -42,30 +42,59 @@ def test_picture_and_name(torchpose, files, tmp_path):
     assert load_prior(out).info.name == "both"
 
 
-def test_learnt_noise_comes_from_the_recipe(torchpose, files, tmp_path, monkeypatch):
-    """A stand-in for the recipe, which takes minutes: what it is given, and that its prior is kept."""
-    called = {}
+RECIPE = ("--components", 2, "--samples", 500, "--window-components", 0, "--pictures", "false")
 
-    def fit_kinect_prior(recordings, n_components=30, seed=0, progress=False, name=""):
-        called.update(persons=len(recordings), K=n_components, seed=seed, name=name)
-        prior = load_prior(files / "prior.safetensors")
-        prior.set_noise("measurement_std", torch.ones(5, dtype=torch.float64))
-        prior.info = replace(prior.info, name=name)
-        return prior
 
-    recipes = ModuleType("torchpose.recipes")
-    recipes.fit_kinect_prior = fit_kinect_prior
-    monkeypatch.setitem(sys.modules, "torchpose.recipes", recipes)
+def test_the_recipe_holds_persons_out_and_says_what_to_expect(torchpose, files, tmp_path):
     out = tmp_path / "p.safetensors"
-    line = ("fit", files / "recordings", "--out", out, "--components", 5, "--seed", 2)
-    done = torchpose(*line, "--pictures", "false", "--licence", "CC0")
+    line = ("fit", files / "recordings", "--out", out, *RECIPE, "--seed", 2, "--licence", "CC0")
+    done = torchpose(*line)
     assert done.code == 0, done.err
-    assert called == {"persons": 2, "K": 5, "seed": 2, "name": "p"}
-    assert "measurement_std" in load_prior(out).noise
-    assert load_prior(out).info.licence == "CC0"
-    assert "noise    measurement_std" in done.out
-    refused = torchpose(*line, "--samples", 100)
-    assert refused.code == 2 and "only with --noise none" in refused.err
+    prior = load_prior(out)
+    recipe = UpperBodyRecipe(2, 500, window_components=0, seed=2)
+    wanted = recipe.fit(curate(read_recordings(files / "recordings")).recordings)
+    torch.testing.assert_close(prior.left.means, wanted.left.means, rtol=0, atol=0)
+    assert set(prior.info.extra["held_out"]["pose"]) == {"recordings#p1", "recordings#p2"}
+    assert prior.info.licence == "CC0" and "measurement_std" in prior.noise
+    assert "kept     2 recordings of 2 persons, 900 frames" in done.out
+    card = out.with_suffix(".md").read_text()
+    assert "On persons that it was not fitted on" in card and "| recordings#p2 |" in card
+    assert prior.info.extra["curation"]["after"]["frames"] == 900
+
+
+def test_persons_are_left_out_by_name(torchpose, files, tmp_path):
+    out = tmp_path / "p.safetensors"
+    line = ("fit", files / "recordings", "--out", out, *RECIPE, "--without", "p2")
+    done = torchpose(*line)
+    assert done.code == 0, done.err
+    prior = load_prior(out)
+    assert prior.info.persons == ("recordings#p1",)
+    assert "--without p2" in prior.info.command
+    assert not any(name.startswith("calibration") for name in prior.noise)
+    assert "no person was held out" in out.with_suffix(".md").read_text()
+    refused = torchpose(*line[:-1], "p9")
+    assert refused.code == 2 and "recordings#p1, recordings#p2" in refused.err
+
+
+def test_what_jumps_is_left_out_and_said(torchpose, files, tmp_path):
+    folder = tmp_path / "recordings"
+    shutil.copytree(files / "recordings", folder)
+    with np.load(folder / "p1.npz") as archive:
+        arrays = dict(archive)
+    arrays["joints"] = arrays["joints"].copy()
+    arrays["joints"][100, 0] += 1.5  # a hand that is somewhere else for one frame
+    np.savez(folder / "p1.npz", **arrays)
+    quick = (*RECIPE, "--noise", "none")[2:]
+    quick = tuple(q for q in quick if q not in ("--window-components", 0))
+    done = torchpose("fit", folder, "--out", tmp_path / "p.safetensors", *quick)
+    assert done.code == 0, done.err
+    assert "jump:" in done.out and "hand_left in 1 frame 100" in done.out
+    left_out = load_prior(tmp_path / "p.safetensors").info.extra["frames_left_out"]
+    assert left_out == {"left": 1, "right": 0}
+    plain = torchpose(
+        "fit", folder, "--out", tmp_path / "q.safetensors", *quick, "--curate", "false"
+    )
+    assert plain.code == 0 and "jump:" not in plain.out
 
 
 def test_many_paths_are_cut_short():

@@ -1,6 +1,7 @@
 """Training states: which frames are used, how often, from where, with which neck."""
 
 import math
+from collections import namedtuple
 
 import pytest
 import torch
@@ -9,15 +10,18 @@ from tests.priors.poses import lowered_neck, poses, recording
 from torchpose.camera import ViewRange, lift
 from torchpose.camera import euler_to_matrix as rotate
 from torchpose.errors import InputError, PriorError
-from torchpose.priors import TRAINING_VIEWS, collect_poses, training_states
+from torchpose.priors import TRAINING_VIEWS, arm_sources, collect_poses
+from torchpose.priors.samplers import all_samples
 from torchpose.skeleton import UPPER_BODY
 
+Fitted = namedtuple("Fitted", "left right facts")
 MATRIX = torch.tensor([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]], dtype=torch.float64)
 
 
 def states(*recordings, seed=0, **options):
-    g = torch.Generator().manual_seed(seed)
-    return training_states(collect_poses(recordings), MATRIX, g, **options)
+    sources = arm_sources(collect_poses(recordings), MATRIX, seed, **options)
+    right = None if sources.right is None else all_samples(sources.right).states
+    return Fitted(all_samples(sources.left).states, right, sources.facts)
 
 
 def body_of(state):

@@ -23,14 +23,16 @@ from torchpose.priors import (
     GaussianMixture,
     PriorInfo,
     UpperBodyPrior,
+    arm_sources,
+    collect_poses,
     fit_upper_body_prior,
     known_priors,
     load_prior,
     model_card,
-    training_states,
     write_model_card,
 )
 from torchpose.priors import upper_body as module
+from torchpose.priors.samplers import all_samples
 
 
 @pytest.fixture(scope="module")
@@ -89,13 +91,8 @@ def test_fit_follows_its_seed_and_fits_arms_apart():
 
 
 def test_prior_explains_new_poses_better_than_shifted_ones(prior):
-    from torchpose.priors import collect_poses
-
-    fresh = training_states(
-        collect_poses([recording(poses(200, 9))]), prior.info.matrix, torch.Generator(),
-        n_samples=500,
-    )  # fmt: skip
-    x = fresh.left
+    fresh = collect_poses([recording(poses(200, 9))])
+    x = all_samples(arm_sources(fresh, prior.info.matrix, n_samples=500).left).states
     shifted = x + 5 * torch.eye(21, dtype=x.dtype)[0]  # the hand five pixels to one side
     moved = x.clone()
     moved[:, 14] += 0.05  # the neck 5 cm away from where the camera is said to be

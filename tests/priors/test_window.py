@@ -6,15 +6,15 @@ import torch
 from tests.priors.poses import poses
 from torchpose.body_view import BodyPath
 from torchpose.camera import ViewRange
-from torchpose.errors import InputError, PriorError
+from torchpose.errors import PriorError
 from torchpose.priors import GaussianMixture
 from torchpose.priors.arm_state import mirror_arm_state
+from torchpose.priors.samplers import PoseFrames, WindowSource, all_samples
 from torchpose.priors.window import (
     WindowLayout,
     WindowPrior,
     augment_bodies,
     window_measurements,
-    window_states,
 )
 
 MATRIX = torch.tensor([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]], dtype=torch.float64)
@@ -27,10 +27,18 @@ def sequence(n=12):
     return moving - moving[:, 4:5]
 
 
-def states(layout=LAYOUT, **options):
-    g = torch.Generator().manual_seed(0)
-    settings = {"n_samples": 12, "size": 0.0, "bones": 0.0} | options
-    return window_states([sequence()], [30.0], layout, MATRIX, FRONT, "zxy", g, **settings)
+def states(layout=LAYOUT, n_samples=12, views=FRONT, **bodies):
+    """Window states of both arms, the first of every frame in the order of the frames."""
+    frames = PoseFrames.join([sequence()], [30.0])
+    centres, found = frames.complete(layout), {}
+    for side in ("left", "right"):
+        source = WindowSource(
+            MATRIX, views, "zxy", n_samples, 0, False, frames, centres, layout, side, **bodies
+        )
+        found[side] = all_samples(source).states
+    return {
+        side: values[source._poses(0, len(centres)).argsort()] for side, values in found.items()
+    }
 
 
 def pixels(point):
@@ -162,10 +170,3 @@ def test_bad_windows_are_refused():
     good = prior()
     with pytest.raises(PriorError, match="27 dimensions"):
         WindowPrior(good.left.marginal(range(21)), good.right, LAYOUT, {})
-    g = torch.Generator()
-    with pytest.raises(InputError, match="at least one"):
-        window_states([], [], LAYOUT, MATRIX, FRONT, "zxy", g, n_samples=3)
-    broken = sequence()
-    broken[3, 2] = torch.nan
-    with pytest.raises(InputError, match="complete"):
-        window_states([broken], [30.0], LAYOUT, MATRIX, FRONT, "zxy", g, n_samples=3)

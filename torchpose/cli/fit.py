@@ -1,11 +1,10 @@
 """`torchpose fit`: a prior from recordings of 3D joints."""
 
-import inspect
 import shlex
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from statistics import fmean, stdev
+from typing import TYPE_CHECKING, Any
 
 from jsonargparse import ArgumentParser, Namespace
 
@@ -25,14 +24,12 @@ if TYPE_CHECKING:
 _EXAMPLES = """
 torchpose fit recordings/ --out prior.safetensors
 torchpose fit recordings/ more/ clip.npz --out prior.safetensors --components 30 --seed 0 --name mine
+torchpose fit recordings/ --out prior.safetensors --without bob carol
 torchpose fit recordings/ --out prior.safetensors --noise none --samples 20000
-torchpose fit room/ --out prior.safetensors --axes z-up"""
+torchpose fit room/ --out prior.safetensors --axes z-up --harmonise true"""
 
-_SHOWN_PATHS = 8
-_RECIPES = {
-    "learnt": ("torchpose.recipes", "fit_kinect_prior"),
-    "none": ("torchpose.priors", "fit_upper_body_prior"),
-}
+_SHOWN_PATHS, _SHOWN_DROPS = 8, 5
+_NOISE = ("learnt", "none")
 
 
 def main(arguments: list[str]) -> int:
@@ -45,8 +42,8 @@ def build() -> ArgumentParser:
     parser = new_parser(
         "fit",
         "Fit a prior of the upper body to recorded 3D poses seen from random viewpoints, and learn "
-        "the noise of its filters. Writes the prior, a model card beside it (.md) and a picture of "
-        "its mean poses (.png).",
+        "from persons held out in turn how good it is on somebody new. Writes the prior, a model "
+        "card beside it (.md) and a picture of its mean poses (.png).",
         _EXAMPLES,
     )
     add = parser.add_argument
@@ -55,10 +52,14 @@ def build() -> ArgumentParser:
         nargs="+",
         type=str,
         metavar="DIR",
-        help="folders (with their subfolders) or files: .npz, OpenCV .yaml, Kinect v2 .csv",
+        help="folders (with their subfolders) or files; a folder is a person where a file does not "
+        "say whose it is. Kinect v1, v2 (.csv, .skeleton) and Azure, .npz, .bvh, .c3d, OpenCV .yaml",
     )
     add("--out", type=str, required=True, metavar="FILE", help="the prior, NAME.safetensors")
     add("--components", type=int, default=30, metavar="K", help="Gaussians per arm (default 30)")
+    add("--window-components", type=int, metavar="K",
+        help="Gaussians per arm over windows of motion; 0 for none (default 8 times as many as over "
+        "poses, fewer for short recordings)")  # fmt: skip
     add_seed(parser, "viewpoints and start")
     add(
         "--axes",
@@ -67,6 +68,12 @@ def build() -> ArgumentParser:
         help="axes of all recordings: camera, kinect, y-up, z-up; by default what each file says, "
         "else what its joint set usually has",
     )
+    add("--without", type=str, nargs="+", metavar="PERSON",
+        help="persons to leave out, to test on later")  # fmt: skip
+    add("--curate", type=bool, default=True, metavar="true|false",
+        help="leave out what jumps or is no body, and say so (default true)")  # fmt: skip
+    add("--harmonise", type=bool, default=False, metavar="true|false",
+        help="give everybody the bones of the mean person (default false)")  # fmt: skip
     add(
         "--name",
         type=str,
@@ -80,9 +87,11 @@ def build() -> ArgumentParser:
         type=str,
         default="learnt",
         metavar="learnt|none",
-        help="learn process and measurement noise and calibrate the covariances (default), or leave "
-        "them to the tracker's defaults",
+        help="the whole recipe with its noise, windows and calibration (default), or mixtures over "
+        "single poses alone",
     )
+    add("--folds", type=int, default=6, metavar="N",
+        help="groups of persons that are held out in turn (default 6; 0 for none)")  # fmt: skip
     add(
         "--neck",
         type=str,
@@ -96,29 +105,19 @@ def build() -> ArgumentParser:
 
 
 def run(args: Namespace) -> int:
-    """Read, fit, write and report; every check comes before any work."""
-    from torchpose.io import AXES, check_output_folder, find_recordings, read_recordings
+    """Read, curate, fit, write and report; every check of an option comes before any work."""
+    from torchpose.io import check_output_folder, find_recordings, read_recordings
     from torchpose.priors import write_model_card
-    from torchpose.skeleton import NECK_KINDS
 
-    for option, value, known in (
-        ("--axes", args.axes, AXES),
-        ("--neck", args.neck, NECK_KINDS),
-        ("--noise", args.noise, tuple(_RECIPES)),
-    ):
-        if value is not None and value not in known:
-            raise InputError(f"{option} must be one of {', '.join(known)}, got {value!r}")
-    for option, count in (("--components", args.components), ("--samples", args.samples)):
-        if count is not None and count < 1:
-            raise InputError(f"{option} must be at least 1, got {count}")
+    _check_options(args)
     out = _output_file(args.out)
-    files = find_recordings(args.recordings)
-    recordings = read_recordings(files, args.axes)
+    recordings = read_recordings(find_recordings(args.recordings), args.axes)
     pictures = pictures_possible(args.pictures)
+    recordings, curation = _curated(_without(recordings, args.without or []), args)
     check_output_folder(out.parent)
-    print(f"read     {_count(recordings)}", flush=True)
+    print(curation["said"], flush=True)
     prior = _fit(recordings, args, args.name or out.stem)
-    prior.info = replace(prior.info, command=prior.info.command or command_line(args))
+    prior.info = replace(prior.info, extra=prior.info.extra | curation["facts"])
     prior.save(out)
     write_model_card(prior, out.with_suffix(".md"))
     written = [out, out.with_suffix(".md")]
@@ -133,10 +132,12 @@ def run(args: Namespace) -> int:
 
 
 def summary(prior: "UpperBodyPrior", written: list[Path]) -> str:
-    """A few lines for people: what was fitted, on what, which files."""
+    """A few lines for people: what was fitted, on what, how well it will do, which files."""
     info = prior.info
+    windows = [w.left.n_components for w in prior.windows.values()]
+    over = f" and {max(windows)} over windows" if windows else ""
     lines = [
-        f"prior    {info.name}, {prior.n_components} components per arm, neck: {info.neck}, "
+        f"prior    {info.name}, {prior.n_components} components per arm{over}, neck: {info.neck}, "
         f"hand: {info.hand}",
         f"persons  {len(info.persons)}",
         f"states   {info.n_samples} per arm from {info.n_frames} recorded frames",
@@ -149,35 +150,94 @@ def summary(prior: "UpperBodyPrior", written: list[Path]) -> str:
             f"iterations{end}"
         )
     lines.append(f"noise    {', '.join(prior.noise) or 'not learnt'}")
+    lines += [f"expect   {line}" for line in _expected(info.extra.get("held_out", {}))]
     return "\n".join([*lines, *(f"wrote    {path}" for path in written)])
 
 
+def _expected(held_out: dict[str, dict[str, float]]) -> list[str]:
+    """What somebody new can expect, from the errors of the persons that were held out."""
+    names = {"causal": "filtered", "full": "smoothed"}
+    lines = []
+    for mode, name in names.items():
+        errors = [100 * error for error in held_out.get(mode, {}).values()]
+        if errors:
+            spread = f" +- {stdev(errors):.1f}" if len(errors) > 1 else ""
+            lines.append(f"{fmean(errors):.1f}{spread} cm {name} on somebody new")
+    return lines
+
+
 def _fit(recordings: list["Recording"], args: Namespace, name: str) -> "UpperBodyPrior":
-    home, function = _RECIPES[args.noise]
-    fit = getattr(import_module(home), function)
-    options = {"neck": args.neck, "n_samples": args.samples, "licence": args.licence or None}
-    given = {key: value for key, value in options.items() if value is not None}
-    parameters = inspect.signature(fit).parameters
-    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
-    refused = [key for key in given if key not in parameters and not takes_any]
-    if refused == ["licence"]:
-        del given["licence"]
-    elif refused:
-        raise InputError(
-            f"--{refused[0].removeprefix('n_')} applies only with --noise none: the recipe that "
-            "learns the noise sets it itself"
-        )
-    prior = fit(
-        recordings,
+    facts = {"name": name, "licence": args.licence, "command": command_line(args)}
+    own = {"neck": args.neck} | ({"n_samples": args.samples} if args.samples else {})
+    if args.noise == "none":
+        from torchpose.priors import fit_upper_body_prior
+
+        settings: dict[str, Any] = facts | own | {"progress": show_progress()}
+        return fit_upper_body_prior(recordings, args.components, args.seed, **settings)
+    from torchpose.recipes import UpperBodyRecipe
+
+    recipe = UpperBodyRecipe(
         n_components=args.components,
+        window_components=args.window_components,
+        calibration_folds=args.folds,
         seed=args.seed,
-        name=name,
-        progress=show_progress(),
-        **given,
+        **own,
     )
-    if args.licence:
-        prior.info = replace(prior.info, licence=args.licence)
-    return prior
+    return recipe.fit(recordings, progress=show_progress(), **facts)
+
+
+def _curated(
+    recordings: list["Recording"], args: Namespace
+) -> tuple[list["Recording"], dict[str, Any]]:
+    """Recordings without what is no body, what was dropped in words, and as facts for the card."""
+    if not args.curate:
+        return recordings, {"said": f"read     {_count(recordings)}", "facts": {}}
+    from torchpose.curation import CurationSettings, curate
+
+    curated = curate(recordings, CurationSettings(harmonise=args.harmonise))
+    report = curated.report
+    kept = ("before", "after", "dropped", "by_person", "notes")
+    facts = {key: value for key, value in report.facts().items() if key in kept}
+    return curated.recordings, {"said": report.text(_SHOWN_DROPS), "facts": {"curation": facts}}
+
+
+def _without(recordings: list["Recording"], persons: list[str]) -> list["Recording"]:
+    """Recordings of everybody else; a person is named by id or by the part after #."""
+    known = {r.person_id for r in recordings} | {r.person_id.partition("#")[2] for r in recordings}
+    known |= {r.person_id.rstrip("#") for r in recordings}
+    unknown = sorted(set(persons) - known)
+    if unknown:
+        names = ", ".join(sorted({r.person_id for r in recordings}))
+        raise InputError(f"--without must name persons among {names}, got {', '.join(unknown)}")
+    out = set(persons)
+    return [
+        r
+        for r in recordings
+        if not out & {r.person_id, r.person_id.partition("#")[2], r.person_id.rstrip("#")}
+    ]
+
+
+def _check_options(args: Namespace) -> None:
+    from torchpose.io import AXES
+    from torchpose.skeleton import NECK_KINDS
+
+    for option, value, known in (
+        ("--axes", args.axes, AXES),
+        ("--neck", args.neck, NECK_KINDS),
+        ("--noise", args.noise, _NOISE),
+    ):
+        if value is not None and value not in known:
+            raise InputError(f"{option} must be one of {', '.join(known)}, got {value!r}")
+    for option, count, least in (
+        ("--components", args.components, 1),
+        ("--samples", args.samples, 1),
+        ("--window-components", args.window_components, 0),
+        ("--folds", args.folds, 0),
+    ):
+        if count is not None and count < least:
+            raise InputError(f"{option} must be at least {least}, got {count}")
+    if args.noise == "none" and args.window_components:
+        raise InputError("--window-components applies only with --noise learnt")
 
 
 def _output_file(name: str) -> Path:
@@ -199,7 +259,9 @@ def command_line(args: Namespace) -> str:
     for key, value in vars(args).items():
         if key in ("recordings", "out", "config", "pictures") or value == defaults.get(key):
             continue
-        parts += [f"--{key.replace('_', '-')}", str(value)]
+        option = f"--{key.replace('_', '-')}"
+        for one in value if isinstance(value, list) else [value]:
+            parts += [option, str(one).lower() if isinstance(one, bool) else str(one)]
     return shlex.join(parts)
 
 

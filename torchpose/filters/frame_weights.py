@@ -15,6 +15,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchpose.filters.base import FilterOutput, Measurements, StepOutput, finish_output
+from torchpose.filters.geometric_median import median_estimate
 from torchpose.filters.tracks import MKFState, estimate_of
 from torchpose.filters.weights import normalise
 from torchpose.gaussian import Gain, kalman_gain
@@ -78,6 +79,8 @@ def run_memoryless(
         measured = frames.mask.flatten(0, 1)[group.rows].any(-1)
         evidence = torch.where(measured, evidence, torch.zeros_like(evidence))
         mean, total = estimate_of(log_weights, means, cov if return_cov else None)
+        if len(model.medians):
+            mean, total = median_estimate(log_weights, means, cov, mean, total, model.medians)
         for part, value in zip(parts, (mean, log_weights, evidence, total), strict=True):
             if value is not None:
                 part.append((group.rows, value))

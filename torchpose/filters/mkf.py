@@ -68,6 +68,8 @@ class MixtureKalmanFilter(RecursiveFilter):
             holds the past already; epsilon and `reset_below` then play no part.
         reset_below: fixed tracks only; see `step_weights`.
         dtype: of means and measurements; covariances are always float64.
+        medians: first of three dimensions each, points whose estimate is the geometric median of the
+            mixture instead of its mean (BL 48); only where frames do not depend on each other.
 
     Raises:
         InputError, ShapeError, CovarianceError: for what does not fit, before any work.
@@ -110,6 +112,7 @@ class MixtureKalmanFilter(RecursiveFilter):
         weighting: str = "sequence",
         reset_below: float | None = None,
         dtype: torch.dtype = torch.float64,
+        medians: Sequence[int] = (),
     ) -> None:
         super().__init__(measurement_cov, observed, gmm.means.shape[-1], dtype)
         n_components = gmm.means.shape[0]
@@ -128,6 +131,8 @@ class MixtureKalmanFilter(RecursiveFilter):
         self.likelihood_power = float(likelihood_power)
         self.weighting = weighting
         self.reset_below = reset_below
+        points = torch.tensor(list(medians), dtype=torch.long)
+        self.register_buffer("medians", points, persistent=False)
         self._graph: GainGraph | None = None
         self.frame_gains = FrameGains()
         if gamma is not None:
@@ -155,6 +160,7 @@ class MixtureKalmanFilter(RecursiveFilter):
         for name, value in zip(model._fields, model, strict=True):
             self.register_buffer(f"transition_{name}", value, persistent=False)
 
+    medians: Tensor
     log_prior: Tensor
     means: Tensor
     covariances: Tensor

@@ -20,7 +20,7 @@ from torchpose.priors.neck import (
     place_neck,
 )
 from torchpose.priors.prior_file import PriorInfo
-from torchpose.priors.training import TRAINING_VIEWS, collect_poses, training_states
+from torchpose.priors.training import TRAINING_VIEWS, arm_sources, collect_poses
 from torchpose.priors.upper_body import (
     UpperBodyPrior,
     fit_upper_body_prior,
@@ -40,6 +40,7 @@ __all__ = [
     "PriorInfo",
     "SufficientStatistics",
     "UpperBodyPrior",
+    "arm_sources",
     "arm_state",
     "arm_states",
     "collect_poses",
@@ -55,6 +56,5 @@ __all__ = [
     "mirror_mixture",
     "model_card",
     "place_neck",
-    "training_states",
     "write_model_card",
 ]

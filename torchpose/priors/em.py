@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -22,12 +22,15 @@ from torchpose.priors.features import CyclicFeatures, cyclic_order
 
 __all__ = [
     "FitReport",
+    "IterationBar",
     "MixtureParameters",
     "SufficientStatistics",
     "e_step",
     "expectation_maximisation",
     "m_step",
+    "map_mixture",
     "natural_parameters",
+    "whitening",
 ]
 
 POINTS = 1008  # at a time and core: 253 features are 2 MB; a power of two is 10 % slower
@@ -62,6 +65,22 @@ class SufficientStatistics(NamedTuple):
             pairs = zip(total, other, strict=True)
             total = SufficientStatistics(*(a + b for a, b in pairs))
         return total
+
+    @classmethod
+    def zeros(cls, n_components: int, dim: int, device: Any = None) -> SufficientStatistics:
+        """Statistics of no points."""
+        n_features = 1 + dim + dim * (dim + 1) // 2
+        table = torch.zeros(n_components, n_features, dtype=torch.float64, device=device)
+        return cls(table, table.new_zeros(()), table.new_zeros(()))
+
+    def pack(self) -> Float[Tensor, " P"]:
+        """Everything in one vector, which processes can sum up in a single exchange."""
+        return torch.cat([self.table.flatten(), self.log_likelihood[None], self.weight[None]])
+
+    @classmethod
+    def unpack(cls, packed: Float[Tensor, " P"], n_components: int) -> SufficientStatistics:
+        """What `pack` was given."""
+        return cls(packed[:-2].reshape(n_components, -1), packed[-2], packed[-1])
 
 
 @dataclass(frozen=True)
@@ -281,16 +300,16 @@ def expectation_maximisation(
     if sample_weight is not None:
         sample_weight = sample_weight.detach().double()
     diagonal = torch.zeros_like(x[0]) if floor is None else floor.to(x)
-    mean, centred, factor = _scale_of(x, sample_weight, diagonal)
+    mean, centred, factor = whitening(x, sample_weight, diagonal)
     inverse = torch.linalg.solve_triangular(factor, torch.eye(len(mean)).to(x), upper=False)
     white = (inverse @ centred).to(dtype)  # [D, N] in memory, as `e_step` wants it
     weights, means, covariances = (p.detach().double() for p in start)
-    state = _map_mixture(MixtureParameters(weights, means - mean, covariances), inverse)
+    state = map_mixture(MixtureParameters(weights, means - mean, covariances), inverse)
     state, report = _iterate(
         white.T, state, sample_weight, max_iter, tol, (inverse * diagonal) @ inverse.T, progress,
         offset=float(factor.diagonal().log().sum()),
     )  # fmt: skip
-    state = _map_mixture(state, factor)
+    state = map_mixture(state, factor)
     return state._replace(means=state.means + mean), report
 
 
@@ -306,7 +325,7 @@ def _iterate(
 ) -> tuple[MixtureParameters, FitReport]:
     history: list[float] = []
     moved_before, reseeded, converged = 0, 0, False
-    with _Bar(max_iter, progress) as bar:
+    with IterationBar(max_iter, progress) as bar:
         for iteration in range(max_iter + 1):
             statistics = e_step(points, state, sample_weight)
             history.append(float(statistics.log_likelihood / statistics.weight) - offset)
@@ -325,7 +344,7 @@ def _iterate(
     return state, FitReport(len(history) - 1, tuple(history), converged, reseeded)
 
 
-class _Bar:
+class IterationBar:
     """Progress bar over iterations that shows the log-likelihood; nothing unless asked for."""
 
     def __init__(self, total: int, show: bool) -> None:
@@ -335,7 +354,7 @@ class _Bar:
 
             self.bar = tqdm(total=total, desc="EM", unit="it")
 
-    def __enter__(self) -> _Bar:
+    def __enter__(self) -> IterationBar:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -348,13 +367,13 @@ class _Bar:
             self.bar.update()
 
 
-def _map_mixture(state: MixtureParameters, matrix: Tensor) -> MixtureParameters:
-    """Mixture of A x."""
+def map_mixture(state: MixtureParameters, matrix: Float[Tensor, "D D"]) -> MixtureParameters:
+    """Mixture of A x, where `state` is that of x."""
     covariances = symmetrise(matrix @ state.covariances @ matrix.T)
     return MixtureParameters(state.weights, state.means @ matrix.T, covariances)
 
 
-def _scale_of(
+def whitening(
     x: Tensor, sample_weight: Tensor | None, diagonal: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Mean [D], x less it [D, N], and the factor [D, D] of the covariance of x, made regular."""

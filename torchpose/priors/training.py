@@ -1,23 +1,29 @@
-"""From recorded poses to training states: which frames, which neck, which viewpoints."""
+"""From recorded poses to sources of training states: which frames, which neck, which viewpoints."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.camera import ViewRange, sample_viewpoints
+from torchpose.camera import ViewRange
 from torchpose.errors import InputError, PriorError
-from torchpose.priors.arm_state import arm_state
 from torchpose.priors.neck import learn_neck_offset, place_neck
-from torchpose.skeleton import LEFT_ARM, NECK_KINDS, RIGHT_ARM, UPPER_BODY
+from torchpose.priors.samplers import ArmSource, PoseFrames, derived_seed
+from torchpose.skeleton import LEFT_ARM, NECK_KINDS, RIGHT_ARM, UPPER_BODY, upper_body_indices
 
-__all__ = ["TRAINING_VIEWS", "PoseSet", "RecordingLike", "collect_poses", "training_states"]
+__all__ = [
+    "TRAINING_VIEWS",
+    "ArmSources",
+    "PoseSet",
+    "RecordingLike",
+    "arm_sources",
+    "collect_poses",
+]
 
 TRAINING_VIEWS = ViewRange(
     roll=math.radians(15),
@@ -30,6 +36,7 @@ TRAINING_VIEWS = ViewRange(
 """Viewpoints of the shipped priors: a person about 2 m in front of the camera."""
 
 DEFAULT_SAMPLES = 100_000
+DEFAULT_RATE = 30.0  # of recordings that do not say
 _HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
 
 
@@ -37,6 +44,7 @@ _HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
 class RecordingLike(Protocol):
     """What is used of a `torchpose.io.Recording`."""
 
+    names: tuple[str, ...]
     fps: float | None
     source: str
 
@@ -52,15 +60,25 @@ class PoseSet(NamedTuple):
     Attributes:
         joints: [N, 8, 3], metres, camera axes; NaN where a joint is missing.
         facts: what `PriorInfo` has to say about them, by the names of its fields.
+        weight: how far to trust each joint, [N, 8] in [0, 1]; one where a recording does not say.
+        lengths: frames of each recording. rates: their frames per second. persons: their ids.
     """
 
     joints: Float[Tensor, "N 8 3"]
     facts: dict[str, Any]
+    weight: Float[Tensor, "N 8"]
+    lengths: list[int]
+    rates: list[float]
+    persons: list[str]
+
+    def frames(self) -> PoseFrames:
+        """The frames with where each recording begins and ends."""
+        joints, weight = (values.split(self.lengths) for values in (self.joints, self.weight))
+        return PoseFrames.join(joints, self.rates, weight)
 
 
-@dataclass(frozen=True)
-class TrainingStates:
-    """States that the mixtures are fitted to.
+class ArmSources(NamedTuple):
+    """Sources of the states that the mixtures over poses are fitted to.
 
     Attributes:
         left: states of the left arm, with those of the mirrored right arm among them if `mirror`.
@@ -68,8 +86,8 @@ class TrainingStates:
         facts: as in `PoseSet`, with counts of frames that were used and left out.
     """
 
-    left: Float[Tensor, "N 21"]
-    right: Float[Tensor, "M 21"] | None
+    left: ArmSource
+    right: ArmSource | None
     facts: dict[str, Any]
 
 
@@ -119,36 +137,45 @@ def collect_poses(
         extra["frames_with_converted_neck"] = sum(
             len(j) for j, kind in zip(joints, kinds, strict=True) if kind != wanted
         )
+    rate = _frame_rate(recordings, joints)
     facts = {
         "neck": wanted,
         "hand": hand,
         "centre": centre,
-        "fps": _frame_rate(recordings, joints),
+        "fps": rate,
         "persons": tuple(sorted({r.person_id for r in recordings})),
         "sources": tuple(sorted({_origin(r) for r in recordings})),
         "extra": extra | {"recordings": len(recordings)},
     }
-    return PoseSet(torch.cat([_centred(j, centre) for j in joints]), facts)
+    return PoseSet(
+        torch.cat([_centred(j, centre) for j in joints]),
+        facts,
+        torch.cat([_weights(r, nose_as_head) for r in recordings]),
+        [len(j) for j in joints],
+        [float(r.fps or rate or DEFAULT_RATE) for r in recordings],
+        [r.person_id for r in recordings],
+    )
 
 
-def training_states(
+def arm_sources(
     poses: PoseSet,
     matrix: Float[Tensor, "3 3"],
-    generator: torch.Generator,
+    seed: int = 0,
     view_range: ViewRange = TRAINING_VIEWS,
     rotation_order: str = "zxy",
     mirror: bool = True,
     n_samples: int | None = None,
     views_per_pose: int | None = None,
-) -> TrainingStates:
+) -> ArmSources:
     """States of both arms from random viewpoints, every pose as often as any other.
 
     An arm leaves out the frames in which one of its five joints is missing; `facts` says how many.
+    A state weighs as much as the least trusted joint of its pose.
 
     Args:
         poses: from `collect_poses`.
         matrix: K, pixels.
-        generator: source of randomness, on the CPU.
+        seed: of the viewpoints.
         view_range: limits of the viewpoints.
         rotation_order: "zxy" (paper) or "zyx" (released priors).
         mirror: pool left arms and mirrored right arms; the right mixture is then to be the mirror
@@ -166,30 +193,61 @@ def training_states(
             f"mirrored arms need views with tx the same to both sides, got {view_range.tx}; "
             "make it symmetric or use mirror=False"
         )
-    left, right = poses.joints[:, list(LEFT_ARM)], poses.joints[:, list(RIGHT_ARM)]
-    arms = {"left": _complete(left), "right": _complete(right)}
-    used = torch.isfinite(left).all(-1).all(-1) | torch.isfinite(right).all(-1).all(-1)
-    dropped = {side: len(poses.joints) - len(arm) for side, arm in arms.items()}
+    left, right = (_arm(poses, arm) for arm in (LEFT_ARM, RIGHT_ARM))
+    dropped = {"left": int((~left.known).sum()), "right": int((~right.known).sum())}
+    arms = {"left": left.usable(), "right": right.usable()}
     if mirror:
         flip = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
-        arms = {"left": torch.cat([arms["left"], arms["right"] * flip])}
-    states = {}
-    for side, arm in arms.items():
-        if not len(arm):
+        (own, trust), (other, also) = arms["left"], arms["right"]
+        arms = {"left": (torch.cat([own, other * flip]), torch.cat([trust, also]))}
+    sources = {}
+    for side, (points, weight) in arms.items():
+        if not len(points):
             raise InputError(
                 f"no frame has all five joints of the {side} arm (hand, elbow, shoulder, head, "
                 "neck); the prior needs recordings that do"
             )
-        arm = arm[_spread(len(arm), _count(len(arm), n_samples, views_per_pose), generator)]
-        views = sample_viewpoints(len(arm), view_range, generator)
-        states[side] = arm_state(arm, views, matrix, rotation_order)
+        count = _count(len(points), n_samples, views_per_pose)
+        own_seed = derived_seed(seed, f"poses {side}")
+        sources[side] = ArmSource(
+            matrix, view_range, rotation_order, count, own_seed, False, points, weight
+        )
     facts = poses.facts | {
-        "n_frames": int(used.sum()),
-        "n_samples": len(states["left"]),
+        "n_frames": int((left.known | right.known).sum()),
+        "n_samples": sources["left"].n_samples,
         "mirrored": mirror,
         "extra": poses.facts["extra"] | {"frames_left_out": dropped},
     }
-    return TrainingStates(states["left"], states.get("right"), facts)
+    return ArmSources(sources["left"], sources.get("right"), facts)
+
+
+class _Arm(NamedTuple):
+    """Poses [N, 5, 3] of an arm, which of them are complete and trusted at all, and weights [N]."""
+
+    points: Tensor
+    known: Tensor
+    weight: Tensor
+
+    def usable(self) -> tuple[Tensor, Tensor]:
+        return self.points[self.known], self.weight[self.known]
+
+
+def _arm(poses: PoseSet, arm: tuple[int, ...]) -> _Arm:
+    points, weight = poses.joints[:, list(arm)], poses.weight[:, list(arm)].amin(1)
+    return _Arm(points, torch.isfinite(points).flatten(1).all(1) & (weight > 0), weight)
+
+
+def _weights(recording: RecordingLike, nose_as_head: bool) -> Float[Tensor, "T 8"]:
+    """Trust in the eight joints; a joint that the recording does not have needs none."""
+    given = getattr(recording, "weights", None)
+    frames = len(recording.upper_body(nose_as_head).joints)
+    weight = torch.ones(frames, len(UPPER_BODY), dtype=torch.float64)
+    if given is None:
+        return weight
+    indices = upper_body_indices(recording.names, nose_as_head).indices
+    there = [i for i, index in enumerate(indices) if index >= 0]
+    weight[:, there] = given[:, [indices[i] for i in there]].to(weight)
+    return weight
 
 
 def _one_kind(joint: str, kinds: Sequence[str | None]) -> str | None:
@@ -229,20 +287,10 @@ def _centred(joints: Tensor, centre: str) -> Tensor:
     return joints - joints[:, joint : joint + 1]
 
 
-def _complete(arm: Tensor) -> Tensor:
-    return arm[torch.isfinite(arm).all(-1).all(-1)]
-
-
 def _count(n: int, n_samples: int | None, views_per_pose: int | None) -> int:
     if views_per_pose is not None:
-        return n * views_per_pose
-    return DEFAULT_SAMPLES if n_samples is None else n_samples
-
-
-def _spread(n: int, count: int, generator: torch.Generator) -> Tensor:
-    """`count` indices below n, each as often as any other up to one."""
+        n_samples = n * views_per_pose
+    count = DEFAULT_SAMPLES if n_samples is None else n_samples
     if count < 1:
         raise InputError(f"the number of samples must be at least 1, got {count}")
-    rounds, rest = divmod(count, n)
-    whole = torch.arange(n).repeat(rounds)
-    return torch.cat([whole, torch.randperm(n, generator=generator)[:rest]])
+    return count

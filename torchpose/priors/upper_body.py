@@ -29,12 +29,8 @@ from torchpose.priors.arm_state import (
 )
 from torchpose.priors.gmm import GaussianMixture
 from torchpose.priors.prior_file import PriorInfo, read_prior, require_tensor, write_prior
-from torchpose.priors.training import (
-    TRAINING_VIEWS,
-    RecordingLike,
-    collect_poses,
-    training_states,
-)
+from torchpose.priors.samplers import ArmSource, all_samples
+from torchpose.priors.training import TRAINING_VIEWS, RecordingLike, arm_sources, collect_poses
 from torchpose.priors.window import WindowPrior
 
 __all__ = [
@@ -271,7 +267,7 @@ def fit_upper_body_prior(
         centre: "neck", "head" or "sequence" (`PriorInfo`).
         neck: kind of neck; the highest among the recordings if None. Others are converted.
         mirror: fit one mixture to left arms and mirrored right arms, and mirror it.
-        n_samples, views_per_pose: how many training states (`training_states`).
+        n_samples, views_per_pose: how many training states (`arm_sources`).
         nose_as_head: take the nose where a joint set has no head.
         name, licence, command: for `info`.
         progress: show bars.
@@ -286,24 +282,37 @@ def fit_upper_body_prior(
     (fx, skew, cx), (_, fy, cy), _ = camera.matrix.tolist()
     if skew:
         raise PriorError(f"the camera of a prior must have no skew, got {skew:g} pixels")
-    generator = torch.Generator().manual_seed(seed)
     poses = collect_poses(recordings, neck, centre, nose_as_head)
-    states = training_states(
-        poses, camera.matrix, generator, views, rotation_order, mirror, n_samples, views_per_pose
+    sources = arm_sources(
+        poses, camera.matrix, seed, views, rotation_order, mirror, n_samples, views_per_pose
     )
-    options: dict[str, Any] = {"n_components": n_components, "seed": generator}
+    options: dict[str, Any] = {"n_components": n_components, "seed": seed}
     options |= {"progress": progress} | fit_options
-    left = GaussianMixture.fit(states.left, **options)
-    right = (
-        mirror_mixture(left, cx)
-        if states.right is None
-        else GaussianMixture.fit(states.right, **options)
-    )
+    left = _fit_arm(sources.left, options)
+    right = None if sources.right is None else _fit_arm(sources.right, options)
     info = PriorInfo(
         name=name, rotation_order=rotation_order, fx=fx, fy=fy, cx=cx, cy=cy, licence=licence,
-        command=command, views=asdict(views), **states.facts,
+        command=command, views=asdict(views), **sources.facts,
     )  # fmt: skip
-    return UpperBodyPrior(left, right, replace(info, extra=info.extra | _fit_facts(left, seed)))
+    return prior_of_arms(left, right, info, seed)
+
+
+def _fit_arm(source: ArmSource, options: dict[str, Any]) -> GaussianMixture:
+    states, weight = all_samples(source)
+    return GaussianMixture.fit(states, sample_weight=weight, **options)
+
+
+def prior_of_arms(
+    left: GaussianMixture, right: GaussianMixture | None, info: PriorInfo, seed: int
+) -> UpperBodyPrior:
+    """Prior of fitted mixtures over poses; a right arm of None is the left one's mirror image.
+
+    Args:
+        left, right: mixtures with their `fit_report`, if they were fitted. info: what they were
+            fitted on. seed: of the fit.
+    """
+    info = replace(info, extra=info.extra | _fit_facts(left, seed))
+    return UpperBodyPrior(left, mirror_mixture(left, info.cx) if right is None else right, info)
 
 
 def known_priors() -> list[str]:

@@ -5,47 +5,86 @@ some frames earlier (or later), and of the other hand. A mixture over windows ca
 other arm into the estimate, which a mixture over single poses cannot.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose.body_view import BodyPath
-from torchpose.camera import ViewRange, sample_viewpoints
-from torchpose.errors import InputError, PriorError
+from torchpose.camera import Viewpoints
+from torchpose.errors import PriorError
 from torchpose.priors.arm_state import STATE_DIM, mirror_arm_state
 from torchpose.priors.gmm import GaussianMixture
 from torchpose.projection import project
 from torchpose.rotations import euler_to_matrix
 from torchpose.skeleton import LEFT_ARM, RIGHT_ARM
+from torchpose.torso import in_torso_axes
 
-__all__ = ["WindowLayout", "WindowPrior", "augment_bodies", "window_measurements", "window_states"]
+__all__ = [
+    "WindowLayout",
+    "WindowPrior",
+    "augment_bodies",
+    "mirror_bodies",
+    "window_measurements",
+    "window_state",
+]
 
 _HANDS = {"left": (0, 7), "right": (7, 0)}  # own hand, other hand
+_TORSO_DIM = 15
+_SEEN = (0, 1, 9, 10, 12, 13)  # pixels of hand, head and neck
 _ARMS = {"left": LEFT_ARM, "right": RIGHT_ARM}
 _BONES = ((4, 3), (4, 2), (2, 1), (1, 0), (4, 5), (5, 6), (6, 7))  # parent first, from the neck
 _SAME_BONE = (0, 1, 2, 3, 1, 2, 3)  # left and right limbs are of one length
 _MIRROR = (7, 6, 5, 3, 4, 2, 1, 0)  # left and right change places, head and neck stay
 
 
-class WindowLayout(NamedTuple):
+@dataclass(frozen=True)
+class WindowLayout:
     """Which hands a window holds.
 
     Attributes:
         own: lags of the arm's own hand, frames; positive is the past. other: lags of the other hand.
         fps: the frame rate that the lags count at.
+        torso: whether the joints of the arm in the axes of the torso follow (`torchpose.torso`).
     """
 
     own: tuple[int, ...]
     other: tuple[int, ...]
     fps: float = 30.0
+    torso: bool = False
 
     @property
     def dim(self) -> int:
         """Number of dimensions of a window state."""
-        return STATE_DIM + 2 * (len(self.own) + len(self.other))
+        return STATE_DIM + 2 * self.n_hands + (_TORSO_DIM if self.torso else 0)
+
+    @property
+    def n_hands(self) -> int:
+        """Number of hands of other frames and of the other arm."""
+        return len(self.own) + len(self.other)
+
+    @property
+    def hands(self) -> range:
+        """Dimensions of a window state that are pixels of hands."""
+        return range(STATE_DIM, STATE_DIM + 2 * self.n_hands)
+
+    @property
+    def deciding(self) -> list[int]:
+        """Dimensions that decide which component a window belongs to (`torchpose.priors.completion`).
+
+        What is measured, and with `torso` what is wanted of it; without, all of them.
+        """
+        if not self.torso:
+            return list(range(self.dim))
+        return [*_SEEN, *self.hands, *self.in_torso]
+
+    @property
+    def in_torso(self) -> range:
+        """Dimensions of a window state that are joints in the axes of the torso."""
+        return range(self.hands.stop, self.dim)
 
     @property
     def lags(self) -> tuple[int, ...]:
@@ -61,7 +100,8 @@ class WindowLayout(NamedTuple):
         """The lags in frames at another frame rate."""
         ratio = fps / self.fps
         own = tuple(round(lag * ratio) for lag in self.own)
-        return WindowLayout(own, tuple(round(lag * ratio) for lag in self.other), fps)
+        other = tuple(round(lag * ratio) for lag in self.other)
+        return WindowLayout(own, other, fps, self.torso)
 
 
 class WindowPrior(nn.Module):
@@ -96,8 +136,9 @@ class WindowPrior(nn.Module):
 
     def facts(self) -> dict[str, Any]:
         """What a prior file says about it, as JSON can hold it."""
-        layout = {"own": list(self.layout.own), "other": list(self.layout.other)}
-        return layout | {"fps": self.layout.fps, "settings": self.settings}
+        layout: dict[str, Any] = {"own": list(self.layout.own), "other": list(self.layout.other)}
+        layout |= {"fps": self.layout.fps, "torso": self.layout.torso}
+        return layout | {"settings": self.settings}
 
     @classmethod
     def from_facts(
@@ -105,19 +146,22 @@ class WindowPrior(nn.Module):
     ) -> "WindowPrior":
         """From mixtures and `facts`."""
         own, other = tuple(facts["own"]), tuple(facts["other"])
-        return cls(left, right, WindowLayout(own, other, facts["fps"]), facts["settings"])
+        layout = WindowLayout(own, other, facts["fps"], bool(facts.get("torso", False)))
+        return cls(left, right, layout, facts["settings"])
 
     def mirrored(self, cx: float) -> "WindowPrior":
         """Windows of the mirrored person: each arm is the mirror image of the other one."""
-        left, right = (_mirror(mixture, cx) for mixture in (self.right, self.left))
+        left, right = (_mirror(mixture, cx, self.layout) for mixture in (self.right, self.left))
         return WindowPrior(left, right, self.layout, self.settings)
 
 
-def _mirror(mixture: GaussianMixture, cx: float) -> GaussianMixture:
-    extra = mixture.dim - STATE_DIM
+def _mirror(mixture: GaussianMixture, cx: float, layout: WindowLayout) -> GaussianMixture:
+    extra, joints = 2 * layout.n_hands, len(layout.in_torso) // 3
     base = mirror_arm_state(mixture.means[:, :STATE_DIM], cx)
     flip = mixture.means.new_tensor([-1.0, 1.0]).repeat(extra // 2)
     shift = mixture.means.new_tensor([2 * cx, 0.0]).repeat(extra // 2)
+    flip = torch.cat([flip, flip.new_tensor([-1.0, 1.0, 1.0]).repeat(joints)])
+    shift = torch.cat([shift, shift.new_zeros(3 * joints)])
     means = torch.cat([base, mixture.means[:, STATE_DIM:] * flip + shift], 1)
     sign = torch.cat([mirror_arm_state(torch.ones_like(base[0]), 0.0), flip])
     return GaussianMixture(mixture.weights, means, mixture.covariances * sign * sign[:, None])
@@ -148,71 +192,43 @@ def augment_bodies(
     return out
 
 
-def window_states(
-    sequences: Sequence[Float[Tensor, "T 8 3"]],
-    rates: Sequence[float],
-    layout: WindowLayout,
-    matrix: Float[Tensor, "3 3"],
-    views: ViewRange,
-    rotation_order: str,
-    generator: torch.Generator,
-    *,
-    n_samples: int,
-    size: float = 0.0,
-    bones: float = 0.0,
-    mirror_share: float = 0.0,
-) -> dict[str, Float[Tensor, "N W"]]:
-    """Window states of both arms from recorded sequences, each from a viewpoint and body of its own.
+def mirror_bodies(
+    joints: Float[Tensor, "N W 8 3"], generator: torch.Generator, share: float
+) -> Float[Tensor, "N W 8 3"]:
+    """Windows of which a share, drawn at random, is mirrored: left and right change places."""
+    mirrored = torch.rand(len(joints), generator=generator) < share
+    flip = joints.new_tensor([-1.0, 1.0, 1.0])
+    return torch.where(mirrored[:, None, None, None], joints[:, :, list(_MIRROR)] * flip, joints)
 
-    Beyond the ends of a sequence its first and last poses are held.
+
+def window_state(
+    joints: Float[Tensor, "N W 8 3"],
+    views: Viewpoints,
+    layout: WindowLayout,
+    side: str,
+    matrix: Float[Tensor, "3 3"],
+    rotation_order: str,
+) -> Float[Tensor, "N D"]:
+    """Window states of one arm: the arm now, the camera, hands at their lags, the arm on its torso.
 
     Args:
-        sequences: poses centred on the neck, metres, complete. rates: their frames per second.
-        layout: the hands of a window. matrix: K, without skew. views, rotation_order: of the random
-            viewpoints (BL section 3.1). n_samples: windows, spread evenly over all frames.
-        size, bones: see `augment_bodies`. mirror_share: share of windows that are mirrored.
-
-    Raises:
-        InputError: no sequences, or joints missing.
+        joints: poses at `layout.lags`, centred on the neck, metres. views: a camera pose for each
+            window. layout: the hands of a window. side: "left" or "right". matrix: K, without skew.
+        rotation_order: "zxy" (paper) or "zyx" (released priors).
     """
-    if not sequences:
-        raise InputError("window states need at least one sequence, got none")
-    lags = layout.lags
-    windows = torch.cat(
-        [
-            _windows(sequence, [round(lag * rate / layout.fps) for lag in lags])
-            for sequence, rate in zip(sequences, rates, strict=True)
-        ]
-    ).double()
-    if not bool(torch.isfinite(windows).all()):
-        raise InputError("window states need complete poses; leave out frames with missing joints")
-    rounds, rest = divmod(n_samples, len(windows))
-    order = [torch.arange(len(windows))] * rounds
-    order += [torch.randperm(len(windows), generator=generator)[:rest]]
-    windows = augment_bodies(windows[torch.cat(order)], generator, size, bones)
-    mirrored = torch.rand(len(windows), generator=generator) < mirror_share
-    flip = windows.new_tensor([-1.0, 1.0, 1.0])
-    windows = torch.where(
-        mirrored[:, None, None, None], windows[:, :, list(_MIRROR)] * flip, windows
-    )
-    view = sample_viewpoints(len(windows), views, generator)
-    rotation = euler_to_matrix(view.angles, rotation_order)  # type: ignore[arg-type]
-    uvl = project(windows, matrix, rotation[:, None], view.translation[:, None])
-    at = {lag: i for i, lag in enumerate(lags)}
-    states = {}
-    for side, arm in _ARMS.items():
-        own, other = _HANDS[side]
-        parts = [uvl[:, at[0], list(arm)].flatten(1), view.angles, view.translation]
-        parts += [uvl[:, at[lag], own, :2] for lag in layout.own]
-        parts += [uvl[:, at[lag], other, :2] for lag in layout.other]
-        states[side] = torch.cat(parts, 1)
-    return states
-
-
-def _windows(sequence: Tensor, lags: Sequence[int]) -> Tensor:
-    frames = torch.arange(len(sequence))
-    taken = [sequence[(frames - lag).clamp(0, len(sequence) - 1)] for lag in lags]
-    return torch.stack(taken, 1)
+    rotation = euler_to_matrix(views.angles, rotation_order)[:, None]  # type: ignore[arg-type]
+    place = views.translation[:, None]
+    at = {lag: i for i, lag in enumerate(layout.lags)}
+    own, other = _HANDS[side]
+    arm = project(joints[:, at[0] : at[0] + 1, list(_ARMS[side])], matrix, rotation, place)
+    parts = [arm.flatten(1), views.angles, views.translation]
+    for joint, lags in ((own, layout.own), (other, layout.other)):
+        if lags:
+            hands = joints[:, [at[lag] for lag in lags], joint]
+            parts.append(project(hands, matrix, rotation[:, 0], place[:, 0])[..., :2].flatten(1))
+    if layout.torso:
+        parts.append(in_torso_axes(joints[:, at[0]])[:, list(_ARMS[side])].flatten(1))
+    return torch.cat(parts, 1)
 
 
 def window_measurements(
