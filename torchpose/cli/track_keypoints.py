@@ -39,7 +39,7 @@ def track_keypoints(args: Namespace) -> int:
     camera, notes = resolve_camera(
         args.camera, args.camera_name, keypoints.image_size, keypoints.K, keypoints.path
     )
-    names, more = _names(keypoints, args.nose_as_head)
+    names, more = joint_names(keypoints, args.nose_as_head)
     fps = args.fps or keypoints.fps
     if fps is None:
         more += (f"the keypoint file states no frame rate: {prior.info.fps or 30:g} fps assumed",)
@@ -54,7 +54,7 @@ def track_keypoints(args: Namespace) -> int:
         static_camera=args.static_camera,
         window=args.window,
         steady=args.steady,
-        neck=_neck(args.neck, keypoints),
+        neck=kind_of_neck(args.neck, keypoints),
         max_gap=args.max_gap,
         **filter_options(args),
     )
@@ -80,7 +80,9 @@ def track_keypoints(args: Namespace) -> int:
     return report_failure(track)
 
 
-def _names(keypoints: "Keypoints", nose_as_head: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def joint_names(
+    keypoints: "Keypoints", nose_as_head: bool
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names for the tracker, with the nose as head if asked for, and notes."""
     from torchpose.skeleton import canonical_names
 
@@ -98,7 +100,7 @@ def _names(keypoints: "Keypoints", nose_as_head: bool) -> tuple[tuple[str, ...],
     return names, ("the nose stands for the head",)
 
 
-def _neck(given: str | None, keypoints: "Keypoints") -> str | None:
+def kind_of_neck(given: str | None, keypoints: "Keypoints") -> str | None:
     from torchpose.skeleton import NECK_KINDS
 
     if given is not None and given not in NECK_KINDS:

@@ -13,6 +13,11 @@ from torchpose.viz.charts import (
     plot_pcp,
     plot_reliability,
 )
+from torchpose.viz.prior_pictures import (
+    plot_log_likelihood,
+    plot_prior_components,
+    plot_prior_samples,
+)
 from torchpose.viz.skeletons import (
     draw_skeleton,
     plot_pose,
@@ -27,11 +32,14 @@ __all__ = [
     "plot_error_bars",
     "plot_errors_over_time",
     "plot_joint_curves",
+    "plot_log_likelihood",
     "plot_pcp",
     "plot_pose",
     "plot_pose_3d",
     "plot_pose_strip",
+    "plot_prior_components",
     "plot_prior_means",
+    "plot_prior_samples",
     "plot_reliability",
     "save_figure",
 ]

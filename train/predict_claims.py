@@ -1,0 +1,147 @@
+"""Who is at work on which recording: claims that vanish with the process that holds them.
+
+A claim is a lock (`flock`) on a small file, which the system releases when the process ends, however
+it ends; so there is no time after which a claim expires, and no clock to be agreed on. What happened
+to a recording is appended to the same file, a line of JSON for each event.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import socket
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+from torchpose.errors import InputError, OutputError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+__all__ = ["Claim", "Claims", "Event", "Run"]
+
+Event = dict[str, Any]
+"""What happened to a recording: `event` ("started", "finished" or "failed"), by whom, and facts."""
+
+
+class Claim(NamedTuple):
+    """The right to work on a recording, and what happened to it before."""
+
+    stream: IO[bytes]
+    history: list[Event]
+
+    @property
+    def deaths(self) -> int:
+        """How many processes in a row have started to work on it and did not come to an end."""
+        events = [event["event"] for event in reversed(self.history)]
+        return next((i for i, event in enumerate(events) if event != "started"), len(events))
+
+    def record(self, event: str, **facts: Any) -> None:
+        """Append an event; it is on the disk when this returns."""
+        line = {"event": event, "host": socket.gethostname(), "pid": os.getpid()} | facts
+        self.stream.seek(0, os.SEEK_END)
+        self.stream.write(b"\n" + json.dumps(line, sort_keys=True).encode() + b"\n")
+        self.stream.flush()
+        os.fsync(self.stream.fileno())
+        self.history.append(line)
+
+
+class Run(NamedTuple):
+    """The run that all processes at work in a folder belong to."""
+
+    id: str
+    task: str
+
+
+class Claims:
+    """The claims of the results in a folder.
+
+    Args:
+        folder: of the claims' files; made if need be.
+        alone: whether there is only one process, which needs no locks where the file system has
+            none.
+
+    Raises:
+        OutputError: several processes, but no locks.
+    """
+
+    def __init__(self, folder: Path, alone: bool = True) -> None:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot be made ({error.strerror or error})") from error
+        self._folder, self._alone = folder, alone
+
+    def path(self, name: str) -> Path:
+        """File of a recording's claim."""
+        return self._folder / f"{hashlib.sha256(name.encode()).hexdigest()[:20]}.jsonl"
+
+    @contextlib.contextmanager
+    def claim(self, name: str, wait: bool = False) -> Iterator[Claim | None]:
+        """Hold the claim of a recording; None if another process has it and `wait` is False."""
+        with self.path(name).open("a+b") as stream:
+            if not self._lock(stream, exclusive=True, wait=wait):
+                yield None
+                return
+            yield Claim(stream, _events(stream))
+
+    @contextlib.contextmanager
+    def run(self, task: str) -> Iterator[Run]:
+        """Belong to the run that is going on in the folder, or begin one.
+
+        Args:
+            task: what the run does; processes of one run have to have the same.
+
+        Raises:
+            InputError: a run with another task is going on.
+        """
+        with (self._folder / "run.json").open("a+b") as stream:
+            if self._lock(stream, exclusive=True, wait=False):
+                begun = json.dumps({"run": uuid.uuid4().hex, "task": task})
+                stream.truncate(0)
+                stream.write(begun.encode())
+                stream.flush()
+            self._lock(stream, exclusive=False, wait=True)
+            stream.seek(0)  # another one may have begun while the lock was made a shared one
+            current = json.loads(stream.read())
+            if current["task"] != task:
+                raise InputError(
+                    f"{self._folder.parent}: another run with other recordings or settings is writing "
+                    "into this folder; wait until it ends, or choose another --out"
+                )
+            yield Run(current["run"], task)
+
+    def _lock(self, stream: IO[bytes], exclusive: bool, wait: bool) -> bool:
+        """Lock an open file until it is closed; whether it was to be had."""
+        if fcntl is None:
+            return self._without_locks("this system has none")
+        kind = fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH
+        try:
+            fcntl.flock(stream, kind if wait else kind | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError as error:
+            return self._without_locks(error.strerror or str(error))
+        return True
+
+    def _without_locks(self, reason: str) -> bool:
+        if self._alone:
+            return True
+        raise OutputError(
+            f"{self._folder}: several processes need a folder whose files can be locked ({reason}); "
+            "choose another --out, or run one process"
+        )
+
+
+def _events(stream: IO[bytes]) -> list[Event]:
+    """Events in a file; a line that a killed process did not finish is passed over."""
+    stream.seek(0)
+    events = []
+    for line in stream.read().splitlines():
+        with contextlib.suppress(ValueError):
+            events.append(json.loads(line))
+    return events

@@ -1,0 +1,151 @@
+"""Which recordings of 2D keypoints there are, what their results are called, how long they are."""
+
+import hashlib
+import zipfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import numpy as np
+
+from torchpose.errors import InputError
+
+__all__ = ["Recording", "content_of", "find_keypoints", "share"]
+
+_SUFFIXES = (".npz", ".csv")
+_POINTS = ("keypoints.npy", "joints2d.npy")
+_OPENPOSE = "*_keypoints.json"
+_BLOCK = 1 << 20
+
+
+class Recording(NamedTuple):
+    """A file or folder of keypoints, the name of its result (without suffix), and its length."""
+
+    name: str
+    path: Path
+    n_frames: int
+
+
+def find_keypoints(
+    paths: Sequence[str | Path], leave_out: str | Path | None = None
+) -> list[Recording]:
+    """Recordings of keypoints among files and folders, the longest first.
+
+    Folders are searched with their subfolders; files of other content are passed over there, but
+    those that cannot be opened are listed, so that reading them says what is wrong. A folder of
+    OpenPose's JSON files is one recording.
+
+    Args:
+        paths: files and folders. leave_out: a folder that is not searched: that of the results.
+
+    Raises:
+        InputError: no such path, a file of another kind, no recordings, or two whose results would
+            have one name.
+    """
+    found: dict[str, Path] = {}
+    skipped = None if leave_out is None else Path(leave_out).resolve()
+    for given in map(Path, paths):
+        for name, path in _recordings_in(given, skipped):
+            if found.setdefault(name, path).resolve() != path.resolve():
+                raise InputError(
+                    f"{found[name]} and {path}: both results would be called {name}.npz; rename one, "
+                    "or give the folder above both"
+                )
+    if not found:
+        raise InputError(
+            f"expected recordings of 2D keypoints ({', '.join(_SUFFIXES)} or folders of {_OPENPOSE}), "
+            f"found none in {', '.join(map(str, paths)) or 'no paths at all'}"
+        )
+    recordings = [Recording(name, path, _length(path)) for name, path in found.items()]
+    return sorted(recordings, key=lambda r: (-r.n_frames, r.name))
+
+
+def share(recordings: Sequence[Recording], rank: int, world: int) -> list[Recording]:
+    """The recordings of one process, rank, rank + world, ..., and then those of the others.
+
+    Args:
+        recordings: the longest first. rank, world: which process of how many.
+    """
+    own = list(recordings[rank::world])
+    mine = {recording.name for recording in own}
+    return own + [recording for recording in recordings if recording.name not in mine]
+
+
+def content_of(path: Path) -> str:
+    """SHA-256 of a file, or of the names and contents of the files in a folder of OpenPose's."""
+    digest = hashlib.sha256()
+    for file in sorted(path.glob(_OPENPOSE)) if path.is_dir() else [path]:
+        if path.is_dir():
+            digest.update(f"{file.name}\0{file.stat().st_size}\0".encode())
+        with file.open("rb") as stream:
+            while block := stream.read(_BLOCK):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+def _recordings_in(given: Path, leave_out: Path | None) -> Iterable[tuple[str, Path]]:
+    if given.is_file():
+        if given.suffix.lower() not in _SUFFIXES:
+            raise InputError(
+                f"{given}: expected keypoints as {', '.join(_SUFFIXES)} or a folder of {_OPENPOSE}; "
+                "`torchpose track` takes videos"
+            )
+        yield given.stem, given
+        return
+    if not given.is_dir():
+        raise InputError(f"{given}: no such file or folder")
+    if _is_openpose(given):
+        yield given.resolve().name, given
+        return
+    for path in sorted(given.rglob("*")):
+        if path.name.startswith(".") or (leave_out and leave_out in path.resolve().parents):
+            continue
+        relative = path.relative_to(given)
+        if path.is_dir() and _is_openpose(path):
+            yield relative.as_posix(), path
+        elif path.is_file() and _may_hold_keypoints(path):
+            yield relative.with_suffix("").as_posix(), path
+
+
+def _is_openpose(folder: Path) -> bool:
+    return next(folder.glob(_OPENPOSE), None) is not None
+
+
+def _may_hold_keypoints(path: Path) -> bool:
+    suffix = path.suffix.lower()
+    if suffix not in _SUFFIXES:
+        return False
+    try:
+        if suffix == ".npz":
+            with zipfile.ZipFile(path) as archive:
+                return any(member in _POINTS for member in archive.namelist())
+        with path.open("rb") as stream:
+            lines = stream.read(4096).decode("utf-8-sig", "replace").splitlines()
+    except (zipfile.BadZipFile, OSError):
+        return True  # reading it gives the error
+    header = next((line for line in lines if line.strip() and not line.startswith("#")), "frame")
+    return header.split(",")[0].strip().lower() == "frame"
+
+
+def _length(path: Path) -> int:
+    """Frames, or about so many; 0 if that cannot be told."""
+    if path.is_dir():
+        return sum(1 for _ in path.glob(_OPENPOSE))
+    try:
+        if path.suffix.lower() != ".npz":
+            with path.open("rb") as stream:
+                return sum(1 for _ in stream)
+        with zipfile.ZipFile(path) as archive:
+            member = next(m for m in archive.namelist() if m in _POINTS)
+            with archive.open(member) as stream:
+                return _rows(stream)
+    except Exception:  # it only serves the order; reading the file will say what is wrong with it
+        return 0
+
+
+def _rows(stream: IO[bytes]) -> int:
+    """First number of the shape in the header of an .npy."""
+    version = np.lib.format.read_magic(stream)
+    first = version == (1, 0)
+    read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+    return int(read(stream)[0][0])

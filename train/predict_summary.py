@@ -1,0 +1,79 @@
+"""The table of all recordings of a batch, and what became of each."""
+
+import csv
+import io
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from torchpose.io.files import atomic_path
+
+__all__ = ["COLUMNS", "Outcome", "count_outcomes", "write_summary"]
+
+COLUMNS = ("recording", "state", "frames", "fps", "seconds", "log_evidence",
+           "log_evidence_per_frame", "missing", "failed_at", "took_seconds", "error")  # fmt: skip
+_WORDS = {"made": "made", "found": "made before or by others", "failed": "failed"}
+
+
+class Outcome(NamedTuple):
+    """What became of a recording.
+
+    Attributes:
+        recording: its name. state: "made" now, "found" from before, or "failed".
+        facts: of its result, see `train.predict_tracking.facts_of`. error: why there is none.
+    """
+
+    recording: str
+    state: str
+    facts: Mapping[str, Any] | None = None
+    error: str = ""
+
+    @property
+    def good(self) -> bool:
+        """Whether there are poses for all frames."""
+        return self.facts is not None and self.facts["failed_at"] < 0
+
+    def row(self) -> dict[str, Any]:
+        """Its line in the summary, the same whoever writes it."""
+        if self.facts is None:
+            return {"recording": self.recording, "state": "failed", "error": self.error}
+        facts = dict(self.facts)
+        facts["log_evidence_per_frame"] = facts["log_evidence"] / facts["frames"]
+        numbers = {key: _text(facts[key]) for key in COLUMNS if key in facts}
+        state = "done" if self.good else "degenerate"
+        return numbers | {"recording": self.recording, "state": state, "error": self.error}
+
+
+def write_summary(path: Path, outcomes: Mapping[str, Outcome]) -> None:
+    """Write a row for every recording, by name; nothing is done if that is there already.
+
+    Every process that gets to the end does this, so that it does not matter which one is the last.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    table = io.StringIO()
+    writer = csv.DictWriter(table, COLUMNS, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(outcomes[name].row() for name in sorted(outcomes))
+    if path.is_file() and path.read_text(encoding="utf-8") == table.getvalue():
+        return
+    with atomic_path(path) as temporary:
+        temporary.write_text(table.getvalue(), encoding="utf-8")
+
+
+def count_outcomes(outcomes: Mapping[str, Outcome]) -> str:
+    """How many recordings were made, found and failed, in words."""
+    states = Counter(outcome.state for outcome in outcomes.values())
+    parts = [f"{states[state]} {word}" for state, word in _WORDS.items() if states[state]]
+    broken = sum(o.facts is not None and not o.good for o in outcomes.values())
+    if broken:
+        parts.append(f"in {broken} the filter degenerated (failed_at in the summary)")
+    return f"{len(outcomes)} recordings: {', '.join(parts)}"
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return ""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
