@@ -101,6 +101,24 @@ def test_prior_explains_new_poses_better_than_shifted_ones(prior):
     assert float(own) > float(prior.left.log_prob(moved).mean()) + 10
 
 
+def test_files_hold_triangles_and_older_ones_with_whole_covariances_are_read(saved, prior):
+    triangles = load_file(saved)["left.covariances"]
+    assert triangles.shape == (3, 21 * 22 // 2)
+    whole = load_file(saved) | {"left.covariances": prior.left.covariances}
+    from safetensors import safe_open
+
+    with safe_open(saved, framework="pt") as file:
+        header = json.loads(file.metadata()["torchpose"])
+    save_file(whole, saved, metadata={"torchpose": json.dumps(header | {"version": 1})})
+    assert torch.equal(UpperBodyPrior.load(saved).left.covariances, prior.left.covariances)
+    save_file(
+        whole | {"left.covariances": triangles[:, 1:].clone()}, saved,
+        metadata={"torchpose": json.dumps(header)},
+    )  # fmt: skip
+    with pytest.raises(FileFormatError, match="triangles"):
+        UpperBodyPrior.load(saved)
+
+
 def test_round_trip(saved, prior):
     loaded = UpperBodyPrior.load(saved)
     assert loaded.info == prior.info
@@ -154,7 +172,7 @@ def test_foreign_files_are_refused(saved, tmp_path):
 @pytest.mark.parametrize(
     ("change", "error", "match"),
     [
-        (lambda h: h.update(version=2), FileFormatError, "version 1"),
+        (lambda h: h.update(version=3), FileFormatError, "version 2"),
         (lambda h: h.update(format="other"), FileFormatError, "another kind"),
         (lambda h: h.update(info="[]"), FileFormatError, "JSON"),
         (change_info(colour="red"), FileFormatError, "colour"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -21,7 +22,8 @@ from torchpose.priors.arm_state import check_rotation_order
 __all__ = ["FILE_FORMAT", "FILE_VERSION", "SKELETON", "PriorInfo", "read_prior", "write_prior"]
 
 FILE_FORMAT = "torchpose-prior"
-FILE_VERSION = 1
+FILE_VERSION = 2
+_READABLE = (1, 2)  # version 1 holds whole covariances
 SKELETON = "upper-body-8"
 CENTRES = ("neck", "head", "sequence")
 _HEADER = "torchpose"  # one key: the order of several is not reproducible in safetensors
@@ -148,9 +150,31 @@ def write_prior(path: str | Path, info: PriorInfo, tensors: Mapping[str, Tensor]
         header = {"format": FILE_FORMAT, "version": FILE_VERSION, "info": info.to_json()}
     except (TypeError, ValueError) as error:
         raise PriorError(f"info.extra must hold only what JSON can hold: {error}") from error
-    plain = {k: _compact(t.detach().cpu()).contiguous().clone() for k, t in tensors.items()}
+    packed = {key: _pack(key, value.detach().cpu()) for key, value in tensors.items()}
+    plain = {key: _compact(value).contiguous().clone() for key, value in packed.items()}
     with atomic_path(path) as temporary:
         save_file(plain, temporary, metadata={_HEADER: json.dumps(header, sort_keys=True)})
+
+
+def _pack(key: str, tensor: Tensor) -> Tensor:
+    """Covariances [K, D, D] as their lower triangles [K, D (D + 1) / 2], row by row."""
+    if not key.endswith(".covariances") or not torch.equal(tensor, tensor.mT):
+        return tensor
+    rows, columns = torch.tril_indices(*tensor.shape[-2:])
+    return tensor[:, rows, columns]
+
+
+def _unpack(key: str, tensor: Tensor) -> Tensor:
+    if not key.endswith(".covariances") or tensor.ndim != 2:
+        return tensor
+    dim = round(math.sqrt(2 * tensor.shape[1] + 0.25) - 0.5)
+    if dim * (dim + 1) // 2 != tensor.shape[1]:
+        raise ValueError(f"{key} with {tensor.shape[1]} columns is no list of triangles")
+    rows, columns = torch.tril_indices(dim, dim)
+    whole = tensor.new_empty(len(tensor), dim, dim)
+    whole[:, rows, columns] = tensor
+    whole[:, columns, rows] = tensor
+    return whole
 
 
 def _compact(tensor: Tensor) -> Tensor:
@@ -171,7 +195,10 @@ def read_prior(path: str | Path) -> tuple[PriorInfo, dict[str, Tensor]]:
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            tensors: dict[str, Tensor] = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+            tensors: dict[str, Tensor] = {
+                key: _unpack(key, file.get_tensor(key))
+                for key in file.keys()  # noqa: SIM118
+            }
     except (SafetensorError, OSError, ValueError, RuntimeError) as error:
         raise FileFormatError(
             f"{path}: expected a prior as safetensors; the file is truncated or of another kind "
@@ -185,9 +212,9 @@ def read_prior(path: str | Path) -> tuple[PriorInfo, dict[str, Tensor]]:
         raise FileFormatError(
             f"{path}: expected a prior written by torchpose, got a safetensors file of another kind"
         )
-    if header.get("version") != FILE_VERSION:
+    if header.get("version") not in _READABLE:
         raise FileFormatError(
-            f"{path}: expected version {FILE_VERSION} of the prior format, got "
+            f"{path}: expected version {FILE_VERSION} of the prior format or an older one, got "
             f"{header.get('version')!r}; use a torchpose that fits, or fit the prior again"
         )
     try:
