@@ -46,6 +46,11 @@ class ColumnsSource:
         return self.source.n_blocks
 
     @property
+    def n_poses(self) -> int:
+        """Number of distinct poses."""
+        return int(getattr(self.source, "n_poses", self.source.n_samples))
+
+    @property
     def fresh(self) -> bool:
         """Whether every epoch draws states of its own."""
         return bool(getattr(self.source, "fresh", False))

@@ -146,6 +146,7 @@ class CachedSource(_Blocks):
     def __init__(self, source: SampleSource) -> None:
         self.source = source
         self.n_samples, self.dim = source.n_samples, source.dim
+        self.n_poses = getattr(source, "n_poses", source.n_samples)
         self._kept: dict[int, Samples] = {}
 
     def block(self, index: int, epoch: int = 0) -> Samples:
@@ -218,6 +219,11 @@ class ArmSource(_Drawn):
     arms: Float[Tensor, "N 5 3"]
     weight: Float[Tensor, " N"]
     dim: int = field(default=21, init=False)
+
+    @property
+    def n_poses(self) -> int:
+        """Number of distinct poses."""
+        return len(self.arms)
 
     def block(self, index: int, epoch: int = 0) -> Samples:
         """The states of a block."""
@@ -304,6 +310,11 @@ class WindowSource(_Drawn):
     def dim(self) -> int:
         """Dimensions of a window state."""
         return self.layout.dim
+
+    @property
+    def n_poses(self) -> int:
+        """Number of distinct poses."""
+        return len(self.centres)
 
     def block(self, index: int, epoch: int = 0) -> Samples:
         """The states of a block."""
