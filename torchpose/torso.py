@@ -5,7 +5,6 @@ It is what the 3D error compares (BL section 6), and what a person does apart fr
 towards the camera, so that estimates from different views and postures may be averaged in it.
 """
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 

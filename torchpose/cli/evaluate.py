@@ -18,7 +18,25 @@ PROTOCOLS = {
     "ub-people": ("ub_people", "persons whom the prior never saw (kinect_utd_mhad)"),
     "ub-one": ("ub_one", "the paper's trackers on the authors' own recording (burke_kinect)"),
     "signer": ("signer", "the authors' released sign-language tracker"),
+    "leave-one-person-out": (
+        "leave_one_person_out",
+        "each person of some recordings under a prior of the others",
+    ),
+    "learning-curve": (
+        "learning_curve",
+        "error over the number of training persons (kinect_utd_mhad and more)",
+    ),
+    "cross-dataset": (
+        "cross_dataset",
+        "a prior of one data set on another one's persons, and what motion capture adds",
+    ),
+    "uncommon-poses": (
+        "uncommon_poses",
+        "training recordings of raised arms left out (kinect_utd_mhad)",
+    ),
 }
+_SEVERAL = ("leave-one-person-out",)
+"""Protocols on recordings from any folders; the others know theirs by name."""
 _COMMON = ("data", "out", "seed", "progress")
 _PLAIN = (int, float, bool, str, type(None))
 
@@ -42,10 +60,17 @@ def build(name: str | None) -> ArgumentParser:
         f"evaluate {name or 'PROTOCOL'}",
         "Run an evaluation protocol on recordings, print its tables, and write them with pictures "
         f"into a folder. Protocols are {known}.",
-        "\n".join(f"torchpose evaluate {p} --data data/ --out result" for p in PROTOCOLS),
+        "\n".join(
+            f"torchpose evaluate {p} {'mine/ more/' if p in _SEVERAL else '--data data/'} --out result"
+            for p in PROTOCOLS
+        ),
     )
     add = parser.add_argument
-    add("--data", type=str, required=True, metavar="DIR", help="folder with the recordings")
+    if name in _SEVERAL:
+        add("recordings", nargs="*", type=str, metavar="DIR", help="folders or files of recordings")
+        add("--data", type=str, metavar="DIR", help="one folder, instead of or beside these")
+    else:
+        add("--data", type=str, required=True, metavar="DIR", help="folder with the recordings")
     add("--out", type=str, required=True, metavar="DIR", help="folder of the results")
     add_seed(parser, "noise, viewpoints and fits")
     if name is not None:
@@ -57,8 +82,8 @@ def run(name: str, args: Namespace) -> int:
     """Run a protocol after checking its folders, and print its summary."""
     from torchpose.io import check_output_folder
 
-    data = Path(args.data)
-    if not data.is_dir():
+    data: Any = _folders(args) if name in _SEVERAL else Path(args.data)
+    if isinstance(data, Path) and not data.is_dir():
         raise InputError(f"--data {data}: no such folder; expected the one with the recordings")
     function = _runner(name)
     own = {key: getattr(args, key) for key in _own_options(function)}
@@ -70,6 +95,14 @@ def run(name: str, args: Namespace) -> int:
     report = function(data, out, seed=args.seed, progress=show_progress(), **own)
     print(report.summary())
     return 0
+
+
+def _folders(args: Namespace) -> list[Path]:
+    """Where the recordings are, given one by one or by --data."""
+    given = [*(args.recordings or ()), *([args.data] if args.data else ())]
+    if not given:
+        raise InputError("expected folders or files of recordings, got none; see --help")
+    return [Path(path) for path in given]
 
 
 def _protocol_name(arguments: list[str]) -> str | None:

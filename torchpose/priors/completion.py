@@ -8,6 +8,7 @@ maximisation step with the components' responsibilities for the others.
 from collections.abc import Sequence
 
 import torch
+
 from torchpose.errors import InputError
 from torchpose.gaussian import symmetrise
 from torchpose.priors.gmm import GaussianMixture
@@ -44,11 +45,6 @@ class ColumnsSource:
     def n_blocks(self) -> int:
         """Number of blocks."""
         return self.source.n_blocks
-
-    @property
-    def n_poses(self) -> int:
-        """Number of distinct poses."""
-        return int(getattr(self.source, "n_poses", self.source.n_samples))
 
     @property
     def fresh(self) -> bool:

@@ -3,13 +3,25 @@
 - `ub_people`: persons whom the prior never saw (UTD-MHAD).
 - `ub_one`: the paper's comparison of trackers on the authors' own recording.
 - `signer`: the released sign-language tracker, and how well hand positions are predicted.
+- `leave_one_person_out`: each person of any recordings under a prior of the others.
+- `learning_curve`: error over the number of training persons; one person's prior against many.
+- `cross_dataset`: a prior of one data set on another one's persons, and what motion capture adds.
+- `uncommon_poses`: training recordings of raised arms left out.
 """
 
 from torchpose.protocols.report import Report, Table
 
 __all__ = ["PROTOCOLS", "Report", "Table", "run_protocol"]
 
-PROTOCOLS = ("ub-people", "ub-one", "signer")
+PROTOCOLS = (
+    "ub-people",
+    "ub-one",
+    "signer",
+    "leave-one-person-out",
+    "learning-curve",
+    "cross-dataset",
+    "uncommon-poses",
+)
 
 
 def run_protocol(name: str, data: str, out: str, **options: object) -> Report:

@@ -8,7 +8,9 @@ from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.priors.window import WindowLayout
 from torchpose.recipes.upper_body import fit_kinect_prior
 
-__all__ = ["fit_recipe_2"]
+__all__ = ["VERSION", "fit_recipe_2"]
+
+VERSION = "2"
 
 
 def fit_recipe_2(recordings: Sequence[RecordingLike], **settings: Any) -> UpperBodyPrior:
