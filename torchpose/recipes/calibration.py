@@ -29,6 +29,7 @@ MODES: dict[str, dict[str, Any]] = {
 
 _VIEWS = 0.5  # of the training views' width: cameras are mostly in front of a person
 _FRAMES, _SEQUENCES = 8000, 48  # in all, and of each group of persons
+_PIECE = 300  # frames at most, so that one long recording does not pad all others
 _NOISE = 3.0  # pixels
 
 
@@ -75,14 +76,18 @@ def track_held_out(
         prior: fitted without these persons. poses: of everybody, centred as the prior's are.
         persons: whose recordings are tracked. seed: of viewpoints and noise.
     """
-    sequences = poses.joints.split(poses.lengths)
-    rows = [i for i, person in enumerate(poses.persons) if person in persons]
-    rows = rows[:: max(1, len(rows) // _SEQUENCES)]
-    if not rows:
+    pieces = [
+        (piece, person)
+        for sequence, person in zip(poses.joints.split(poses.lengths), poses.persons, strict=True)
+        if person in persons
+        for piece in sequence.split(_PIECE)
+    ]
+    pieces = pieces[:: max(1, len(pieces) // _SEQUENCES)]
+    if not pieces:
         return {}
-    keypoints, truth, inside = _seen(prior, [sequences[row] for row in rows], seed)
+    keypoints, truth, inside = _seen(prior, [piece for piece, _ in pieces], seed)
     scored = inside & torch.isfinite(truth).flatten(2).all(2)
-    who = [poses.persons[rows[i]] for i in scored.nonzero()[:, 0].tolist()]
+    who = [pieces[i][1] for i in scored.nonzero()[:, 0].tolist()]
     if not who:
         return {}
     found = {}
