@@ -1,0 +1,89 @@
+"""Real processes: killed in the middle of a step, resumed, two of them, by Lightning and by torchrun."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("lightning", reason="training needs it: pip install torchpose[train]")
+pytest.importorskip("tensorboard", reason="training needs it: pip install torchpose[train]")
+
+from tests.train.people import settings, write_recordings, write_settings
+from tests.train.test_fit import assert_same
+from torchpose.priors import load_prior
+from train.cli import main
+
+ROOT = Path(__file__).parents[2]
+LOCAL = {"OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1", "GLOO_SOCKET_IFNAME": "lo"}
+STRICT = {"PYTHONWARNINGS": "error,ignore::DeprecationWarning"}
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory):
+    return write_recordings(tmp_path_factory.mktemp("people"))
+
+
+def start(arguments, *launcher):
+    """`python -m train fit ...` in a process of its own; torchrun warns, so only without it strictly."""
+    command = [sys.executable, "-m", *launcher, "train", "fit", *map(str, arguments)]
+    return subprocess.Popen(
+        command, cwd=ROOT, env={**os.environ, **LOCAL, **({} if launcher else STRICT)},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def end(process):
+    """What it wrote as errors, once it is over."""
+    return process.communicate(timeout=300)[1]
+
+
+def node(port):
+    """torchrun as on one of two nodes with a process each."""
+    where = ("--rdzv-backend", "c10d", "--rdzv-id", "fit", "--rdzv-endpoint", f"127.0.0.1:{port}")
+    here = ("--nnodes", "2", "--nproc-per-node", "1", "--local-addr", "127.0.0.1")
+    return ("torch.distributed.run", *here, *where, "-m")
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="SIGKILL, and the loopback's name, are Linux's")
+def test_killed_and_resumed_on_one_and_two_processes(recordings, tmp_path):
+    """One process dies in its third step, one of two in the fifth; two that torchrun starts finish."""
+    values = settings(recordings, tmp_path / "one")
+    assert main(["fit", "--config", str(write_settings(tmp_path / "one", values))]) == 0
+    wanted = load_prior(tmp_path / "one" / "p.safetensors")
+
+    values = settings(recordings, tmp_path)
+    out, last = tmp_path / "p.safetensors", tmp_path / "runs" / "checkpoints" / "last.ckpt"
+    config = write_settings(tmp_path / "final", values)
+    kill = {"class_path": "tests.train.people.Kill", "init_args": {"step": 2}}
+    values["trainer"]["callbacks"] = [kill]
+    dying = write_settings(tmp_path / "dying", values)
+    killed = start(["--config", dying, "--ckpt_path", "auto"])
+    assert end(killed) == "" and killed.returncode == -signal.SIGKILL
+    assert last.is_file() and not out.exists()
+
+    kill["init_args"] = {"step": 4, "rank": 1}
+    write_settings(tmp_path / "dying", values)
+    lost = start(["--config", dying, "--ckpt_path", "last", "--trainer.devices", "2"])
+    message = end(lost)
+    assert lost.returncode != 0, message
+    assert not out.exists()
+
+    port = free_port()
+    nodes = [start(["--config", config, "--ckpt_path", "last"], *node(port)) for _ in range(2)]
+    messages = [end(process) for process in nodes]
+    assert [process.returncode for process in nodes] == [0, 0], messages
+    prior = load_prior(out)
+    assert_same(prior, wanted, 1e-8)
+    assert prior.info.persons == wanted.info.persons
+    logs = sorted(p.name for p in (tmp_path / "runs").iterdir())
+    assert logs == ["checkpoints", "version_0", "version_1", "version_2"]

@@ -1,0 +1,6 @@
+"""`python -m train`: fit, predict."""
+
+from train.cli import main
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,211 @@
+"""What happens beside the steps of a fit: the bar, the checkpoint, the pictures, the prior's file."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import Checkpoint, ProgressBar
+from lightning.pytorch.loggers import TensorBoardLogger
+from tqdm.auto import tqdm
+
+from torchpose.cli.common import show_progress
+from torchpose.cli.fit import summary
+from torchpose.errors import OutputError
+from torchpose.io.files import check_output_folder
+from torchpose.priors import UpperBodyPrior, write_model_card
+from train.blocks import Sweep
+from train.mixture_em import MixtureEM
+
+__all__ = ["FitPictures", "FitProgress", "LastCheckpoint", "PriorWriter", "checkpoint_file"]
+
+
+def checkpoint_file(folder: str | Path) -> Path:
+    """The last checkpoint of the fit whose logs are in a folder."""
+    return Path(folder) / "checkpoints" / "last.ckpt"
+
+
+class LastCheckpoint(Checkpoint):
+    """After every step, the whole state of the fit in `checkpoints/last.ckpt`."""
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write it."""
+        trainer.save_checkpoint(checkpoint_file(trainer.default_root_dir))
+
+
+class FitProgress(ProgressBar):
+    """Bars over the steps of EM, with the mean log-likelihoods, and over the blocks of a step."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._shown = show_progress()
+        self._steps: Any = None
+        self._blocks: Any = None
+
+    def disable(self) -> None:
+        """Show nothing."""
+        self._shown = False
+
+    def enable(self) -> None:
+        """Show the bars."""
+        self._shown = True
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Begin."""
+        off = not self._shown
+        self._steps = tqdm(desc="EM", unit="step", initial=trainer.current_epoch, disable=off)
+        self._blocks = tqdm(desc="step", unit="block", leave=False, disable=off)
+
+    def on_train_batch_start(
+        self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
+    ) -> None:
+        """Count the blocks of this step."""
+        if isinstance(batch, Sweep):
+            self._blocks.reset(total=len(batch))
+            batch.watchers.append(self._blocks.update)
+
+    def on_train_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        """Show where the fit stands."""
+        shown = {
+            kind.replace("_", " "): f"{float(trainer.callback_metrics[kind]):.4f}"
+            for kind in ("log_likelihood", "held_out")
+            if kind in trainer.callback_metrics
+        }
+        self._steps.set_postfix(shown, refresh=False)
+        self._steps.update()
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """End."""
+        for bar in (self._blocks, self._steps):
+            if bar is not None:
+                bar.close()
+
+
+class FitPictures(Callback):
+    """The components as skeletons, samples, and likelihoods, as files and in TensorBoard.
+
+    Args:
+        every: steps between two sets of pictures; 0 draws none but at the end.
+        at_end: draw them at the end. n_shown: components at most.
+    """
+
+    def __init__(self, every: int = 10, at_end: bool = True, n_shown: int = 30) -> None:
+        self._every, self._at_end, self._n_shown = every, at_end, n_shown
+        self._drawn_at = -1
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw if it is time."""
+        if self._every and (trainer.current_epoch + 1) % self._every == 0:
+            self._draw(trainer, pl_module)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw what has come of it."""
+        if self._at_end:
+            self._draw(trainer, pl_module)
+
+    def _draw(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not trainer.is_global_zero or not isinstance(pl_module, MixtureEM):
+            return
+        step = max(len(history) for history in pl_module.histories.values())
+        folder = trainer.log_dir
+        if folder is None or step == self._drawn_at:
+            return
+        self._drawn_at = step
+        pictures = Path(folder) / "pictures"
+        pictures.mkdir(parents=True, exist_ok=True)
+        prior = pl_module.assembled(name=Path(trainer.default_root_dir).name)
+        for name, draw in _pictures(pl_module, prior, self._n_shown).items():
+            _keep(draw(), pictures / f"{name}.png", trainer, step)
+
+
+def _pictures(
+    module: MixtureEM, prior: UpperBodyPrior, n_shown: int
+) -> dict[str, Callable[[], Any]]:
+    from torchpose.viz.prior_pictures import (
+        plot_log_likelihood,
+        plot_prior_components,
+        plot_prior_samples,
+    )
+
+    found: dict[str, Callable[[], Any]] = {
+        "likelihood": lambda: plot_log_likelihood(module.histories, module.held_out_history),
+        "samples": lambda: plot_prior_samples(prior),
+    }
+    for mixture in ("pose", *prior.windows):
+
+        def draw(mixture: str = mixture) -> Any:
+            return plot_prior_components(prior, mixture, n_shown)
+
+        found[f"components-{mixture}"] = draw
+    return found
+
+
+def _keep(figure: Any, path: Path, trainer: Trainer, step: int) -> None:
+    """A picture as a file, and in TensorBoard."""
+    import numpy as np
+
+    from torchpose.viz import save_figure
+
+    save_figure(figure, path, dpi=100)
+    for logger in trainer.loggers:
+        if isinstance(logger, TensorBoardLogger):
+            figure.set_dpi(100)
+            figure.canvas.draw()
+            pixels = np.asarray(figure.canvas.buffer_rgba())[..., :3]
+            logger.experiment.add_image(path.stem, pixels, step, dataformats="HWC")
+
+
+class PriorWriter(Callback):
+    """When a fit is done: calibrate, and write the prior, its model card and its picture.
+
+    Args:
+        out: the prior, NAME.safetensors. name: in its metadata, that of the file by default.
+        licence: of the recordings. command: that makes it. pictures: draw its mean poses.
+
+    Raises:
+        OutputError: a name that is none of a prior, a folder that cannot be written to.
+    """
+
+    def __init__(
+        self,
+        out: str,
+        name: str = "",
+        licence: str = "",
+        command: str = "",
+        pictures: bool = True,
+    ) -> None:
+        self.out = Path(out)
+        if self.out.suffix != ".safetensors":
+            raise OutputError(f"{out}: expected a name that ends in .safetensors")
+        if self.out.is_dir():
+            raise OutputError(f"{out}: is a folder; give the name of a file")
+        self._facts = {"name": name or self.out.stem, "licence": licence, "command": command}
+        self._pictures = pictures
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """See that the prior can be written, before any work."""
+        if trainer.is_global_zero and stage == "fit":
+            check_output_folder(self.out.parent)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write everything, from the first process."""
+        finish = getattr(pl_module, "finished_prior", None)
+        prior = finish(**self._facts) if finish else None
+        if prior is None:
+            return
+        prior.save(self.out)
+        write_model_card(prior, self.out.with_suffix(".md"))
+        written = [self.out, self.out.with_suffix(".md")]
+        if self._pictures:
+            from torchpose.viz import plot_prior_means, save_figure
+
+            arms = {"left arm": prior.left, "right arm": prior.right}
+            written.append(save_figure(plot_prior_means(arms), self.out.with_suffix(".png")))
+        print(summary(prior, written), flush=True)

@@ -1,0 +1,77 @@
+"""`python -m train`: which command, and what becomes of its errors."""
+
+import os
+import sys
+from collections.abc import Sequence
+
+__all__ = ["main"]
+
+_HELP = """\
+usage: python -m train COMMAND ...
+
+commands:
+  fit      fit a prior with Lightning: resumable, in one process or many
+  select   choose its number of components by the likelihood of held-out persons
+  predict  track many recordings, in one process or many
+
+`python -m train COMMAND --help` lists the options of a command, --print_config writes them as YAML,
+--config FILE reads them, --debug shows the traceback of an error.
+
+examples:
+  python -m train fit --config configs/kinect-upper-body.yaml
+  python -m train fit --data.paths '[recordings/]' --prior.out prior.safetensors --ckpt_path auto
+  torchrun --nproc-per-node 2 -m train fit --config configs/many-machines.yaml
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit code: 0 done, 1 done but not all is good, 2 refused.
+
+    Args:
+        argv: what stands after `python -m train`; `sys.argv[1:]` if None.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    command = arguments[0] if arguments else ""
+    if command in ("", "-h", "--help"):
+        print(_HELP, end="", file=sys.stdout if command else sys.stderr)
+        return 0 if command else 2
+    if command == "predict":
+        from train.predict import main as predict
+
+        return predict(arguments[1:])
+    if command in ("fit", "select"):
+        return _fit(arguments)
+    return _refuse(f"unknown command {command!r}; known are fit, select and predict")
+
+
+def _fit(arguments: list[str]) -> int:
+    debug = "--debug" in arguments or os.environ.get("TORCHPOSE_DEBUG", "0") not in ("", "0")
+    arguments = [a for a in arguments if a != "--debug"]
+    try:
+        from train.command import run
+    except ModuleNotFoundError as error:
+        if debug or (error.name or "").partition(".")[0] not in ("lightning", "tensorboard"):
+            raise
+        return _refuse(f"training needs {error.name}; run `pip install torchpose[train]`")
+    from train.refusals import reason
+
+    try:
+        run(arguments)
+    except SystemExit as stop:  # --help and --print_config
+        return stop.code if isinstance(stop.code, int) else 0
+    except KeyboardInterrupt:
+        print("train: interrupted; go on with --ckpt_path last", file=sys.stderr)
+        return 130
+    except Exception as error:
+        text = None if debug else reason(error, arguments)
+        if text is None:
+            raise
+        return _refuse(text)
+    return 0
+
+
+def _refuse(text: str) -> int:
+    rank = os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0"))
+    of = "" if rank == "0" else f" (process {rank})"
+    print(f"train: error{of}: {text}", file=sys.stderr)
+    return 2

@@ -1,0 +1,192 @@
+"""`python -m train fit` and `select`: their arguments, and what is set where they say nothing."""
+
+import logging
+import os
+import shlex
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import LightningDataModule, LightningModule, Trainer
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
+
+from torchpose.errors import InputError
+from train import strategy
+from train.callbacks import FitPictures, FitProgress, LastCheckpoint, PriorWriter, checkpoint_file
+from train.selection import SelectingTrainer
+
+__all__ = ["run"]
+
+_MODEL = {"class_path": "train.mixture_em.MixtureEM"}
+_DATA = {"class_path": "train.data.RecordingsDataModule"}
+_SHOWN_DROPS = 5
+_DEFAULTS = {
+    "max_epochs": -1,  # the recipe says how many steps there are
+    "log_every_n_steps": 1,
+    "enable_model_summary": False,
+}
+# how and where a fit runs, not what it makes
+_HOW = (
+    "--trainer",
+    "--ckpt_path",
+    "--pictures",
+    "--prior.pictures",
+    "--data.num_workers",
+    "--data.init_args.num_workers",
+)
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run `fit` or `select`.
+
+    Args:
+        arguments: the command and what stands after it.
+    """
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    # Lightning and the versions of torch and jsonargparse that it is used with here; nothing to change
+    warnings.filterwarnings("ignore", r".*LeafSpec", FutureWarning)
+    warnings.filterwarnings("ignore", category=DeprecationWarning, module="lightning|jsonargparse")
+    strategy.register()
+    _Command.arguments = list(arguments)
+    quiet: dict[str, Any] = {"exit_on_error": False}
+    _Command(
+        LightningModule,
+        LightningDataModule,
+        subclass_mode_model=True,
+        subclass_mode_data=True,
+        trainer_class=SelectingTrainer,
+        trainer_defaults=_DEFAULTS,
+        seed_everything_default=0,
+        auto_configure_optimizers=False,
+        load_from_checkpoint_support=False,
+        parser_kwargs={**quiet, "prog": "python -m train", "fit": quiet, "select": quiet},
+        args=_Command.arguments,
+    )
+
+
+class _Command(LightningCLI):
+    arguments: list[str]
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        return {
+            "fit": LightningCLI.subcommands()["fit"] | {"weights_only"},
+            "select": {"model", "datamodule"},
+        }
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        parser.add_lightning_class_args(PriorWriter, "prior")
+        parser.add_lightning_class_args(FitPictures, "pictures")
+        parser.set_defaults({"model": _MODEL, "data": _DATA})
+        parser.link_arguments("seed_everything", "data.init_args.recipe.seed")
+
+    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
+        self.config = parser.parse_args(args)
+
+    def _parse_ckpt_path(self) -> None:
+        """Settings come from the configuration only; a checkpoint is compared with them."""
+
+    def before_instantiate_classes(self) -> None:
+        settings = self.config[self.subcommand]
+        if not settings["prior"]["command"]:
+            settings["prior"]["command"] = command_line(self.arguments)
+        if not settings["trainer"]["default_root_dir"]:
+            name = Path(settings["prior"]["out"]).stem
+            settings["trainer"]["default_root_dir"] = str(Path("runs") / name)
+        _follow_torchrun(settings["trainer"])
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        given = self.config_init[self.subcommand]["trainer"]
+        callbacks = list(given["callbacks"] or [])
+        own = [
+            kind() for kind in (LastCheckpoint, FitProgress) if given[_SWITCHES[kind]] is not False
+        ]
+        given["callbacks"] = callbacks + own
+        if given["logger"] in (None, True):
+            given["logger"] = _loggers(given["default_root_dir"])
+        given["plugins"] = [*(given["plugins"] or []), strategy.AtomicCheckpoints()]
+        return super().instantiate_trainer(**kwargs)
+
+    def before_fit(self) -> None:
+        """Read and check all recordings before other processes are started."""
+        self.datamodule.setup("fit")
+        report = getattr(self.datamodule, "report", None)
+        if report is not None:
+            rank_zero_only(print)(report.text(_SHOWN_DROPS), flush=True)
+
+    def _prepare_subcommand_kwargs(self, subcommand: str) -> dict[str, Any]:
+        given = super()._prepare_subcommand_kwargs(subcommand)
+        if subcommand == "fit":
+            given["ckpt_path"] = _checkpoint(given["ckpt_path"], self.trainer.default_root_dir)
+        return given
+
+
+_SWITCHES = {LastCheckpoint: "enable_checkpointing", FitProgress: "enable_progress_bar"}
+
+
+def command_line(arguments: Sequence[str]) -> str:
+    """The command that makes the same prior: without how and where it was run.
+
+    >>> command_line(["fit", "--config", "a.yaml", "--trainer.devices", "2", "--ckpt_path=last"])
+    'python -m train fit --config a.yaml'
+    """
+    kept, skipping = [], False
+    for argument in arguments:
+        if argument.startswith("--"):
+            skipping = argument.startswith(_HOW) and "=" not in argument
+            if argument.startswith(_HOW):
+                continue
+        elif skipping:
+            continue
+        kept.append(argument)
+    return shlex.join(["python", "-m", "train", *kept])
+
+
+def _follow_torchrun(trainer: Any) -> None:
+    """As many devices and nodes as torchrun has started processes for.
+
+    Lightning would take one device and fit the same prior in every process.
+    """
+    if "TORCHELASTIC_RUN_ID" not in os.environ:
+        return
+    here, everywhere = int(os.environ["LOCAL_WORLD_SIZE"]), int(os.environ["WORLD_SIZE"])
+    for name, count in (("devices", here), ("num_nodes", everywhere // here)):
+        given = trainer[name]
+        if given not in ("auto", 1, "1", -1, "-1") and str(given) != str(count):
+            raise InputError(
+                f"--trainer.{name} is {given}, but torchrun has started {here} processes on each of "
+                f"{everywhere // here} nodes; leave it out"
+            )
+        trainer[name] = count
+    if everywhere > 1 and trainer["strategy"] == "auto":
+        trainer["strategy"] = "ddp"
+
+
+def _loggers(folder: str | Path) -> list[Logger]:
+    """Tables and TensorBoard, side by side in a folder of their own for each run."""
+    versions = [p.name.partition("_")[2] for p in Path(folder).glob("version_*")]
+    version = max((int(v) for v in versions if v.isdigit()), default=-1) + 1
+    return [
+        CSVLogger(folder, name="", version=version, flush_logs_every_n_steps=1),
+        TensorBoardLogger(folder, name="", version=version),
+    ]
+
+
+def _checkpoint(given: str | None, folder: str | Path) -> str | None:
+    """Path of the checkpoint to go on from: `last`, `auto` (the last one, if there is one) or a file.
+
+    Raises:
+        InputError: there is none.
+    """
+    if given is None:
+        return None
+    path = checkpoint_file(folder) if given in ("last", "auto") else Path(given)
+    if path.is_file():
+        return str(path)
+    if given == "auto":
+        return None
+    raise InputError(f"{path}: no such checkpoint; leave out --ckpt_path to start anew")

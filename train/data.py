@@ -1,0 +1,222 @@
+"""Recordings for training: which files, which persons, and the mixtures to fit to them."""
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+from lightning.pytorch import LightningDataModule
+
+from torchpose.curation import CurationReport, CurationSettings, curate, refuse_leaks
+from torchpose.errors import InputError, OverlapError
+from torchpose.io import Recording, find_recordings, read_recordings
+from torchpose.priors.samplers import SampleSource, cached
+from torchpose.recipes import VERSION, MixtureTask, UpperBodyRecipe
+from train.blocks import Key, SweepLoader
+
+__all__ = ["RecordingsDataModule", "expand_path", "fingerprint", "pick_persons"]
+
+_RECIPE, _CURATION = UpperBodyRecipe(), CurationSettings()
+_TOLD = ("before", "after", "dropped", "by_person", "notes")
+_HELD_OUT_SHARE = 5  # held-out states: one for so many training states
+
+
+class RecordingsDataModule(LightningDataModule):
+    """Recordings of 3D joints, split by person, and the blocks of states that they give.
+
+    Args:
+        paths: folders (with their subfolders) or files; `$NAME` stands for a variable of the
+            environment.
+        recipe: what is fitted.
+        curation: what is left out of the recordings; None takes them as they are.
+        axes: of all recordings: camera, kinect, y-up, z-up; by default what each file says.
+        persons: whom to fit to, as `origin#person` or just the person; everybody not held out if
+            None.
+        held_out: whose likelihood is watched; they are never fitted to.
+        num_workers: processes that draw states ahead; 0 draws them in the process that uses them.
+
+    Raises:
+        InputError: a variable of the environment that is not set, unknown persons, nobody left.
+        OverlapError: a person, or a recording, is both fitted to and held out.
+    """
+
+    def __init__(
+        self,
+        paths: list[str],
+        recipe: UpperBodyRecipe = _RECIPE,
+        curation: CurationSettings | None = _CURATION,
+        axes: str | None = None,
+        persons: list[str] | None = None,
+        held_out: list[str] | None = None,
+        num_workers: int = 0,
+    ) -> None:
+        super().__init__()
+        self.recipe = recipe
+        self.report: CurationReport | None = None
+        self.train: list[Recording] = []
+        self.watched: list[Recording] = []
+        self.tasks: dict[str, MixtureTask] = {}
+        self._curation = curation
+        self._paths, self._axes, self._num_workers = paths, axes, num_workers
+        self._persons, self._held_out = persons, held_out or []
+        self.sources: dict[Key, SampleSource] = {}
+
+    def setup(self, stage: str) -> None:
+        """Read, split, and draw up the mixtures; the second call does nothing."""
+        if self.tasks:
+            return
+        files = find_recordings([expand_path(path) for path in self._paths])
+        recordings = read_recordings(files, self._axes)
+        # apart, so that nothing of the held-out persons gets into what is fitted
+        train, watched = split(recordings, self._persons, self._held_out)
+        self.train, self.report = self._curated(train)
+        self.watched, _ = self._curated(watched)
+        self.tasks = self.recipe.tasks(self.train)
+        self.sources = {Key(name): cached(task.source) for name, task in self.tasks.items()}
+        if self.watched:
+            for name, task in self._watched_recipe().tasks(self.watched).items():
+                if name in self.tasks:
+                    self.sources[Key(name, held_out=True)] = cached(task.source)
+
+    def train_dataloader(self) -> SweepLoader:
+        """This process' share of all blocks, one sweep each epoch."""
+        trainer: Any = self.trainer
+        if trainer is None:
+            return SweepLoader(self.sources, num_workers=self._num_workers)
+        return SweepLoader(
+            self.sources,
+            trainer.global_rank,
+            trainer.world_size,
+            trainer.lightning_module.epoch_of,
+            self._num_workers,
+        )
+
+    def identity(self) -> dict[str, Any]:
+        """What makes a fit the same fit: the recipe, and the recordings on either side."""
+        return {
+            "recipe": json.loads(json.dumps({"version": VERSION} | asdict(self.recipe))),
+            "recordings": fingerprint(self.train),
+            "held-out recordings": fingerprint(self.watched),
+        }
+
+    def facts(self) -> dict[str, Any]:
+        """What a prior's file says about the curation, as that of `torchpose fit` does."""
+        if self.report is None:
+            return {}
+        told = self.report.facts()
+        return {"curation": {name: told[name] for name in _TOLD if name in told}}
+
+    def sources_by_person(self) -> list[SampleSource]:
+        """States over poses of each held-out person."""
+        recipe, people = self._watched_recipe(), sorted({r.person_id for r in self.watched})
+        each = ([r for r in self.watched if r.person_id == person] for person in people)
+        return [cached(recipe.tasks(recordings)["pose"].source) for recordings in each]
+
+    def _curated(
+        self, recordings: list[Recording]
+    ) -> tuple[list[Recording], CurationReport | None]:
+        if self._curation is None or not recordings:
+            return recordings, None
+        return curate(recordings, self._curation)
+
+    def _watched_recipe(self) -> UpperBodyRecipe:
+        """The recipe with fewer states, and with the kind of neck that is fitted to."""
+        recipe, n_samples = self.recipe, self.tasks["pose"].source.n_samples
+        windows = [task.source.n_samples for name, task in self.tasks.items() if "." in name]
+        return replace(
+            recipe,
+            neck=self.recipe.poses(self.train).facts["neck"],
+            n_samples=-(-n_samples // _HELD_OUT_SHARE),
+            window_samples=-(-max(windows, default=0) // _HELD_OUT_SHARE),
+        )
+
+
+def expand_path(path: str) -> str:
+    """A path with its `$NAME` and `~` filled in.
+
+    Raises:
+        InputError: a variable that is not set.
+    """
+    for braced, plain in re.findall(r"\$(?:\{(\w+)\}|(\w+))", path):
+        name = braced or plain
+        if not os.environ.get(name):
+            raise InputError(
+                f"{path}: the environment variable {name} is not set; set it to the folder of the "
+                "recordings, or give the path itself with --data.paths"
+            )
+    return os.path.expanduser(os.path.expandvars(path))
+
+
+def split(
+    recordings: Sequence[Recording], persons: Sequence[str] | None, held_out: Sequence[str]
+) -> tuple[list[Recording], list[Recording]]:
+    """Recordings to fit to, and those of held-out persons.
+
+    Args:
+        recordings: of everybody. persons: to fit to; all others than those held out if None.
+        held_out: persons that are not fitted to.
+
+    Raises:
+        InputError: unknown persons, or nobody is left. OverlapError: a leak between both sides.
+    """
+    known = sorted({r.person_id for r in recordings})
+    out = pick_persons(held_out, known)
+    fitted = set(known) - out if persons is None else pick_persons(persons, known)
+    both = sorted(fitted & out)
+    if both:
+        raise OverlapError(
+            f"{', '.join(both)}: held out, but to be fitted to as well; name each person on one side"
+        )
+    if not fitted:
+        raise InputError(
+            f"nobody is left to fit to: all of {', '.join(known)} are held out; hold fewer out"
+        )
+    train = [r for r in recordings if r.person_id in fitted]
+    watched = [r for r in recordings if r.person_id in out]
+    refuse_leaks(train, watched)
+    return train, watched
+
+
+def pick_persons(names: Sequence[str], known: Sequence[str]) -> set[str]:
+    """Ids of the persons that are meant by names, which may leave out their origin.
+
+    Raises:
+        InputError: nobody, or several persons, of that name.
+
+    >>> sorted(pick_persons(["s1", "b#s2"], ["a#s1", "a#s2", "b#s2"]))
+    ['a#s1', 'b#s2']
+    """
+    found = set()
+    for name in names:
+        fitting = [person for person in known if name in (person, person.partition("#")[2])]
+        if len(fitting) != 1:
+            which = f"could be {' or '.join(fitting)}" if fitting else "is nobody's name"
+            raise InputError(
+                f"{name!r} {which}; the recordings are of {', '.join(known) or 'nobody'}"
+            )
+        found.add(fitting[0])
+    return found
+
+
+def fingerprint(recordings: Sequence[Recording]) -> dict[str, Any]:
+    """How many recordings, frames and persons there are, and a digest of all of it."""
+    return {
+        "count": len(recordings),
+        "frames": sum(len(r) for r in recordings),
+        "persons": sorted({r.person_id for r in recordings}),
+        "sha256": _digest(recordings),
+    }
+
+
+def _digest(recordings: Sequence[Recording]) -> str:
+    digest = hashlib.sha256()
+    for recording in recordings:
+        facts = (recording.person_id, recording.fps, recording.names, recording.joints.shape)
+        digest.update(repr(facts).encode())
+        digest.update(recording.joints.numpy().tobytes())
+        if recording.weights is not None:
+            digest.update(recording.weights.numpy().tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,271 @@
+"""Exact expectation-maximisation of all mixtures of a recipe at once, by one process or by many.
+
+An epoch is one EM step. Each process sums up the sufficient statistics of its share of the blocks,
+one exchange at the end of the epoch adds up the sums of all processes, and each of them makes the
+same maximisation step. There are no gradients and no optimisers.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, cast
+
+import torch
+from lightning.pytorch import LightningModule
+from torch import nn
+from torch.optim import Optimizer
+
+from torchpose.errors import InputError, TorchposeError
+from torchpose.priors import GaussianMixture, SufficientStatistics, UpperBodyPrior
+from torchpose.priors.stepwise_em import stepwise_pass
+from torchpose.priors.streamed_em import Share, StreamedEM
+from torchpose.recipes import MixtureTask
+from torchpose.recipes.calibration import folds
+from train.blocks import Key, Sweep
+from train.data import RecordingsDataModule
+from train.identity import check_identity, differences
+from train.processes import broadcast_state, first_failure, from_all, total
+
+__all__ = ["MixtureEM"]
+
+_IDENTITY = "torchpose"
+
+
+class MixtureEM(LightningModule):
+    """Fits the mixtures of `RecordingsDataModule.tasks` by exact EM.
+
+    After the same number of steps the mixtures are the same, up to the rounding of sums, from any
+    number of processes, with or without an interruption, and from `torchpose fit`.
+
+    Logged in each step, all of the mixtures as they were before it: `log_likelihood/NAME` and
+    `held_out/NAME`, means over the states in nats, and `log_likelihood` and `held_out`, their means
+    over the mixtures.
+
+    Args:
+        first_pass: go once over the states by stepwise (online) EM before the first exact step,
+            which is worth several exact ones where there are very many states.
+    """
+
+    def __init__(self, first_pass: bool = False) -> None:
+        super().__init__()
+        self._first_pass = first_pass
+        self.automatic_optimization = False
+        self.mixtures = nn.ModuleDict()
+        self.held_out_history: dict[str, list[float]] = {}
+        self._tasks: dict[str, MixtureTask] = {}
+        self._identity: dict[str, Any] = {}
+        self._resumed, self._stopped = False, False
+
+    # --- what Lightning calls
+
+    def setup(self, stage: str) -> None:
+        """A blank mixture for every task; what is in them comes from their start, or a checkpoint."""
+        device, precision = self.trainer.strategy.root_device, self.trainer.precision
+        if device.type == "mps":
+            raise InputError(
+                "a fit needs double precision, which MPS does not have; add --trainer.accelerator cpu"
+            )
+        if precision not in ("32-true", "64-true"):
+            raise InputError(
+                f"a fit runs in double precision, got --trainer.precision {precision}; leave it out"
+            )
+        data = self._data
+        data.setup(stage)
+        self._tasks, self._identity = data.tasks, data.identity()
+        self._identity |= {"model": type(self).__name__, "first pass": self._first_pass}
+        self.mixtures = nn.ModuleDict(
+            {
+                _module_name(name): StreamedEM.blank(task.n_components, task.source.dim)
+                for name, task in self._tasks.items()
+            }
+        )
+
+    def on_fit_start(self) -> None:
+        """The same recordings everywhere, and a start for every mixture."""
+        self._check_processes()
+        if not self._resumed:
+            self._start()
+
+    def on_train_start(self) -> None:
+        """Nothing is left to do if the fit was resumed after its last step."""
+        if self._stopped or self.finished:
+            self.trainer.should_stop = True
+
+    def configure_optimizers(self) -> Sequence[Optimizer]:
+        """None: the maximisation step is in closed form."""
+        return []
+
+    def training_step(self, batch: Sweep, batch_idx: int) -> None:
+        """One EM step."""
+        totals = self._exchange(batch)
+        for name, task in self._tasks.items():
+            em = self.em(name)
+            if Key(name, held_out=True) in totals:
+                value = em.mean_log_likelihood(totals[Key(name, held_out=True)])
+                self.held_out_history.setdefault(name, []).append(value)
+            if Key(name) not in totals:
+                continue
+            if int(em.steps) >= task.max_iter:
+                em.record(totals[Key(name)], task.tol)
+            else:
+                em.maximise(totals[Key(name)], task.tol)
+        self._log_likelihoods()
+        if self.finished:
+            self.trainer.should_stop = True
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Say what the checkpoint is of."""
+        checkpoint[_IDENTITY] = {
+            "identity": self._identity,
+            "held_out": self.held_out_history,
+            "stopped": self.trainer.should_stop,
+        }
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse a checkpoint of anything else."""
+        kept = check_identity(checkpoint.get(_IDENTITY), self._identity, self.trainer.ckpt_path)
+        self.held_out_history = {name: list(v) for name, v in kept["held_out"].items()}
+        self._stopped = bool(kept["stopped"])
+        self._resumed = True
+
+    # --- where the fit stands
+
+    def em(self, name: str) -> StreamedEM:
+        """The fit of one mixture."""
+        return cast(StreamedEM, self.mixtures[_module_name(name)])
+
+    @property
+    def histories(self) -> dict[str, list[float]]:
+        """Mean log-likelihood of each mixture before every step, and at its end."""
+        return {name: self.em(name).history.tolist() for name in self._tasks}
+
+    @property
+    def finished(self) -> bool:
+        """Whether every mixture has converged or taken all of its steps."""
+        return all(self._is_finished(name) for name in self._tasks)
+
+    def epoch_of(self, key: Key) -> int | None:
+        """How many steps the mixture of a source has taken; None if it needs no more."""
+        return None if self._is_finished(key.name) else int(self.em(key.name).steps)
+
+    def fitted(self) -> dict[str, GaussianMixture]:
+        """The mixtures as they are, on the CPU."""
+        return {name: self.em(name).mixture().cpu() for name in self._tasks}
+
+    def assembled(self, **facts: str) -> UpperBodyPrior:
+        """Prior of the mixtures as they are, not calibrated; facts are name, licence, command."""
+        return self._data.recipe.assemble(self._data.train, self.fitted(), **facts)
+
+    def finished_prior(self, **facts: str) -> UpperBodyPrior | None:
+        """The calibrated prior in the first process, None in the others; all have to call it.
+
+        The groups of persons that are held out in turn are shared among the processes.
+        """
+        data, trainer = self._data, self.trainer
+        groups = folds([r.person_id for r in data.train], data.recipe.calibration_folds)
+        mine = range(trainer.global_rank, len(groups), trainer.world_size)
+        done, failure = {}, ""
+        try:
+            done = {i: data.recipe.hold_out(data.train, groups[i]) for i in mine}
+        except TorchposeError as error:
+            failure = str(error)
+        parts: dict[int, Any] = {}
+        for share in first_failure(from_all((done, failure))):
+            parts |= share
+        if not trainer.is_global_zero:
+            return None
+        prior = data.recipe.finish(self.assembled(**facts), [parts[i] for i in range(len(groups))])
+        prior.info = replace(prior.info, extra=prior.info.extra | data.facts())
+        return prior
+
+    # --- one step
+
+    def _is_finished(self, name: str) -> bool:
+        em, task = self.em(name), self._tasks[name]
+        recorded = len(em.history) > int(em.steps)
+        return bool(em.converged) or (int(em.steps) >= task.max_iter and recorded)
+
+    def _sweep(self, sweep: Sweep) -> dict[Key, SufficientStatistics]:
+        """Sums over this process' share."""
+        sums: dict[Key, SufficientStatistics] = {}
+        for key, samples in sweep:
+            found = self.em(key.name).expect(samples)
+            sums[key] = sums[key].merge(found) if key in sums else found
+        return sums
+
+    def _exchange(self, sweep: Sweep) -> dict[Key, SufficientStatistics]:
+        """Sums over all processes, in a single exchange."""
+        wanted = [key for key in self._data.sources if self.epoch_of(key) is not None]
+        blank = {
+            key: SufficientStatistics.zeros(
+                self._tasks[key.name].n_components, self.em(key.name).means.shape[1], self.device
+            )
+            for key in wanted
+        }
+        try:
+            mine = blank | self._sweep(sweep)
+        except Exception:
+            # or the others would wait for this process for ever
+            total(torch.cat([blank[key].pack() for key in wanted]).fill_(torch.nan))
+            raise
+        packed = [mine[key].pack() for key in wanted]
+        sums = total(torch.cat(packed)).split([len(p) for p in packed])
+        return {
+            key: SufficientStatistics.unpack(part, self._tasks[key.name].n_components)
+            for key, part in zip(wanted, sums, strict=True)
+        }
+
+    def _log_likelihoods(self) -> None:
+        """Log the last value of every mixture; a finished one keeps its last."""
+        step = max((len(history) for history in self.histories.values()), default=0)
+        found = {"log_likelihood": self.histories, "held_out": self.held_out_history}
+        values = {"step": float(step)}
+        for kind, histories in found.items():
+            last = {name: history[-1] for name, history in histories.items() if history}
+            values |= {f"{kind}/{name}": value for name, value in last.items()}
+            if last:
+                values[kind] = sum(last.values()) / len(last)
+        self.log_dict({k: torch.tensor(v).double() for k, v in values.items()}, on_step=True)
+
+    # --- before the first step
+
+    @property
+    def _data(self) -> RecordingsDataModule:
+        data = getattr(self.trainer, "datamodule", None)
+        if not isinstance(data, RecordingsDataModule):
+            raise InputError(
+                f"{type(self).__name__} fits the mixtures of RecordingsDataModule, got "
+                f"{type(data).__name__}; set data.class_path to train.data.RecordingsDataModule"
+            )
+        return data
+
+    def _check_processes(self) -> None:
+        """Raise unless all processes have read the same recordings, and run the same recipe."""
+        for rank, theirs in enumerate(from_all(self._identity)):
+            found = differences(theirs, self._identity)
+            if found:
+                raise InputError(
+                    f"process {rank} differs from process {self.trainer.global_rank}: "
+                    f"{'; '.join(found)}; give all of them the same recordings and settings"
+                )
+
+    def _start(self) -> None:
+        """A start for every mixture, shared among the processes."""
+        rank, world, failure = self.trainer.global_rank, self.trainer.world_size, ""
+        for number, (name, task) in enumerate(self._tasks.items()):
+            if number % world == rank and not failure:
+                source = self._data.sources[Key(name)]
+                try:
+                    em = StreamedEM.start(source, task.n_components, task.seed)
+                    self.em(name).load_state_dict(em.state_dict())
+                except TorchposeError as error:
+                    failure = f"mixture {name!r}: {error}"
+        first_failure(from_all((None, failure)))
+        for number, (name, task) in enumerate(self._tasks.items()):
+            broadcast_state(self.em(name), number % world)
+            if self._first_pass:
+                source, share = self._data.sources[Key(name)], Share.of_processes()
+                stepwise_pass(self.em(name), source, task.seed, share=share)
+
+
+def _module_name(name: str) -> str:
+    return name.replace(".", "_")  # torch has dots between the names of modules
