@@ -109,7 +109,7 @@ class UpperBodyRecipe:
     window_components: int | None = None
     window_samples: int | None = None
     window_steps: int = 20
-    causal: WindowLayout = field(default=WindowLayout((4, 10, 20), (0, 10), torso=True))
+    causal: WindowLayout = field(default=WindowLayout((3, 7, 12, 20), (0, 7, 16), torso=True))
     full: WindowLayout = field(
         default=WindowLayout((4, 8, 16, -4, -8, -16), (0, 8, -8), torso=True)
     )
