@@ -53,6 +53,7 @@ class MixtureEM(LightningModule):
         self.held_out_history: dict[str, list[float]] = {}
         self._tasks: dict[str, MixtureTask] = {}
         self._identity: dict[str, Any] = {}
+        self._whole: dict[str, tuple[int, GaussianMixture]] = {}  # and the steps that it had taken
         self._resumed, self._stopped = False, False
 
     # --- what Lightning calls
@@ -153,7 +154,12 @@ class MixtureEM(LightningModule):
 
     def assembled(self, **facts: str) -> UpperBodyPrior:
         """Prior of the mixtures as they are, not calibrated; facts are name, licence, command."""
-        return self._data.recipe.assemble(self._data.train, self.fitted(), **facts)
+        for name, task in self._tasks.items():
+            steps = int(self.em(name).steps)
+            if self._whole.get(name, (-1, None))[0] != steps:
+                self._whole[name] = steps, task.whole(self.em(name).mixture().cpu())
+        whole = {name: mixture for name, (_, mixture) in self._whole.items()}
+        return self._data.recipe.assemble(self._data.train, whole, **facts)
 
     def finished_prior(self, **facts: str) -> UpperBodyPrior | None:
         """The calibrated prior in the first process, None in the others; all have to call it.

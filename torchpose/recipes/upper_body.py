@@ -70,6 +70,13 @@ class MixtureTask(NamedTuple):
             cached(self.source), self.n_components, self.seed, max_iter=self.max_iter, tol=self.tol
         )
 
+    def whole(self, mixture: GaussianMixture) -> GaussianMixture:
+        """The mixture over all dimensions of its states, if it was fitted to some of them only."""
+        source = self.source
+        if not isinstance(source, ColumnsSource) or mixture.dim == source.source.dim:
+            return mixture
+        return complete_mixture(mixture, source.source, source.columns)
+
 
 @dataclass(frozen=True)
 class UpperBodyRecipe:
@@ -258,7 +265,7 @@ class UpperBodyRecipe:
             "measurement_std": torch.full((5,), _MEASUREMENT_STD, dtype=torch.float64),
         }
         tasks = self._window_tasks(poses)
-        whole = {key: _whole(mixtures[key], task) for key, task in tasks.items() if key in mixtures}
+        whole = {key: task.whole(mixtures[key]) for key, task in tasks.items() if key in mixtures}
         windows = {
             mode: self.window(mode, whole) for mode in self.layouts if f"{mode}.left" in whole
         }
@@ -359,13 +366,6 @@ def fit_kinect_prior(
     """
     recipe = UpperBodyRecipe(n_components=n_components, seed=seed, views=views, **settings)
     return recipe.fit(recordings, name=name, licence=licence, command=command, progress=progress)
-
-
-def _whole(mixture: GaussianMixture, task: MixtureTask) -> GaussianMixture:
-    """The mixture over all dimensions of its states, if it was fitted to some of them."""
-    if not isinstance(task.source, ColumnsSource) or mixture.dim == task.source.source.dim:
-        return mixture
-    return complete_mixture(mixture, task.source.source, task.source.columns)
 
 
 def _compact(mixture: GaussianMixture) -> GaussianMixture:
