@@ -232,3 +232,24 @@ def test_bad_arguments_are_refused():
         mixture.condition([3], torch.zeros(1))
     with pytest.raises(ShapeError):
         mixture.condition([0, 1], torch.zeros(1))
+
+
+def test_rounded_mixtures_stay_positive_definite_and_change_no_more_than_rounding_does():
+    g = torch.Generator().manual_seed(0)
+    factor = torch.randn(5, 40, 40, generator=g, dtype=torch.float64)
+    factor[1:, 20:] = factor[1:, :20] @ torch.eye(40, dtype=torch.float64)  # twenty free dimensions
+    scale = torch.logspace(-3, 2, 40, dtype=torch.float64)
+    cov = (factor @ factor.mT + 3e-8 * torch.eye(40, dtype=torch.float64)) * scale * scale[:, None]
+    mixture = GaussianMixture(
+        torch.full((5,), 0.2, dtype=torch.float64), torch.zeros(5, 40, dtype=torch.float64),
+        (cov + cov.mT) / 2,
+    )  # fmt: skip
+    plain = mixture.covariances.float().double()
+    assert int((torch.linalg.cholesky_ex(plain).info != 0).sum()) == 4  # what it is there for
+    rounded = mixture.rounded()
+    assert torch.equal(rounded.covariances.float().double(), rounded.covariances)
+    assert torch.equal(rounded.covariances[0], plain[0])
+    relative = (rounded.covariances - mixture.covariances).abs() / (
+        scale * scale[:, None] * mixture.covariances.diagonal(dim1=-2, dim2=-1).amax()
+    )
+    assert float(relative.max()) < 1e-4

@@ -134,6 +134,24 @@ class GaussianMixture(nn.Module):
     def extra_repr(self) -> str:
         return f"n_components={self.n_components}, dim={self.dim}, dtype={self.means.dtype}"
 
+    def rounded(self) -> GaussianMixture:
+        """The mixture in numbers that single precision holds, its covariances still positive definite.
+
+        Rounding may push the least eigenvalue of a covariance below zero. There, a share of each
+        variance is added before: the least of 0, 1e-6, ... 1e-3 with which a tenth of a millionth
+        could be taken away again.
+        """
+        scale = self.covariances.diagonal(dim1=-2, dim2=-1).sqrt()
+        eye = torch.eye(self.dim, dtype=self.covariances.dtype, device=self.covariances.device)
+        units = scale[:, :, None] * scale[:, None]
+        best = self.covariances.float().to(self.covariances)
+        for share in (0.0, 1e-6, 1e-5, 1e-4, 1e-3):
+            tried = (self.covariances + share * units * eye).float().to(self.covariances)
+            unsafe = torch.linalg.cholesky_ex(best / units - 1e-7 * eye).info != 0
+            best = torch.where(unsafe[:, None, None], tried, best)
+        weights, means = (x.float().to(x) for x in (self.weights, self.means))
+        return GaussianMixture(weights, means, best)
+
     def parameters_tuple(self) -> MixtureParameters:
         """Weights, means and covariances as one value."""
         return MixtureParameters(self.weights, self.means, self.covariances)

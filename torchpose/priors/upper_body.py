@@ -17,6 +17,7 @@ from torchpose.errors import (
     OverlapError,
     PriorError,
     TorchposeError,
+    check_covariance,
     check_finite,
 )
 from torchpose.io.files import read_npz
@@ -154,8 +155,12 @@ class UpperBodyPrior(nn.Module):
         """Write the prior as safetensors; the file appears whole or not at all.
 
         Raises:
-            OutputError: the file cannot be written.
+            OutputError: the file cannot be written. CovarianceError: a mixture that `load` would
+                refuse.
         """
+        for mixture in self.modules():
+            if isinstance(mixture, GaussianMixture):
+                check_covariance("covariances", mixture.covariances)
         tensors = {
             f"{side}.{part}": getattr(getattr(self, side), part)
             for side in _SIDES
