@@ -231,7 +231,8 @@ class Bench:
         if not path.is_file():
             start = time.process_time()
             tasks = recipe.tasks(self.persons.fitted)
-            fitted = {key: task.fit() for key, task in tasks.items() if key.startswith(mode)}
+            chosen = {key: task for key, task in tasks.items() if key.startswith(mode)}
+            fitted = {key: task.whole(task.fit()) for key, task in chosen.items()}
             window = recipe.window(mode, fitted)
             seconds = time.process_time() - start
             prior = UpperBodyPrior(base.left, base.right, base.info, base.noise, {mode: window})

@@ -354,9 +354,11 @@ def _add_classes(
 def _add_findings(report: Report, curves: Mapping[str, Mapping[str, Curve]]) -> None:
     for recipe, curve in curves["filtered"].items():
         smooth = curves["smoothed"][recipe]
+        if len(curve.counts) < 2:
+            continue
         report.findings.append(
             f"{recipe}: from {curve.counts[0]} to {curve.counts[-1]} training persons the error "
-            f"falls from {curve.mean[0]:.2f} to {curve.mean[-1]:.2f} cm filtered and from "
+            f"goes from {curve.mean[0]:.2f} to {curve.mean[-1]:.2f} cm filtered and from "
             f"{smooth.mean[0]:.2f} to {smooth.mean[-1]:.2f} cm smoothed."
         )
     names = list(curves["filtered"])
