@@ -232,7 +232,7 @@ class Bench:
             start = time.process_time()
             tasks = recipe.tasks(self.persons.fitted)
             chosen = {key: task for key, task in tasks.items() if key.startswith(mode)}
-            fitted = {key: task.whole(task.fit()) for key, task in chosen.items()}
+            fitted = {key: task.fit() for key, task in chosen.items()}
             window = recipe.window(mode, fitted)
             seconds = time.process_time() - start
             prior = UpperBodyPrior(base.left, base.right, base.info, base.noise, {mode: window})

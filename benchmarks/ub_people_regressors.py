@@ -37,14 +37,13 @@ from torchpose.protocols.common import (
     Trials,
     centred_on_neck,
     make_test_set,
-    mirror_pose,
     score,
 )
 from torchpose.protocols.people_tables import SHORT_NAMES
 from torchpose.protocols.report import Report
 from torchpose.protocols.ub_people import people, sway
 from torchpose.rotations import euler_to_matrix
-from torchpose.skeleton import UPPER_BODY
+from torchpose.skeleton import UPPER_BODY, mirror_pose
 
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 COLUMNS = [UPPER_BODY.index(name) for name in MEASURED]

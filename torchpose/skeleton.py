@@ -31,9 +31,11 @@ from torchpose.joint_sets import (
 
 __all__ = [
     "ARM_JOINTS",
+    "BONES",
     "LEFT_ARM",
     "LIMBS",
     "NECK_KINDS",
+    "OTHER_SIDE",
     "RIGHT_ARM",
     "SKELETONS",
     "UPPER_BODY",
@@ -44,6 +46,8 @@ __all__ = [
     "canonical_names",
     "identify_skeleton",
     "measure_neck_kind",
+    "mirror_pose",
+    "scale_bones",
     "to_upper_body",
     "upper_body_indices",
 ]
@@ -59,6 +63,13 @@ RIGHT_ARM = (7, 6, 5, 3, 4)
 
 LIMBS = ((0, 1), (1, 2), (2, 4), (3, 4), (4, 5), (5, 6), (6, 7))
 """Pairs of `UPPER_BODY` indices to join by a line."""
+
+BONES = ((4, 3), (4, 2), (2, 1), (1, 0), (4, 5), (5, 6), (6, 7))
+"""Bones between joints of `UPPER_BODY`, from the neck outwards: the nearer joint, the farther one."""
+
+_BONE_LEVELS = ((0, 1, 4), (2, 5), (3, 6))  # of BONES, from the neck outwards
+OTHER_SIDE = (7, 6, 5, 3, 4, 2, 1, 0)
+"""Indices into `UPPER_BODY` of the joints of the other side; head and neck stay."""
 
 NECK_KINDS = ("neck", "low-neck", "mid-shoulder")
 """Kinds of neck, from the highest to the lowest."""
@@ -194,3 +205,35 @@ def to_upper_body(
     if neck is None and "neck" not in found.missing and upper.shape[-1] == 3:
         neck = measure_neck_kind(upper)
     return UpperBody(upper, neck, found.hand, found.head)
+
+
+def mirror_pose(joints: Float[Tensor, "... 8 3"]) -> Float[Tensor, "... 8 3"]:
+    """The mirrored person: x changes sign and left becomes right.
+
+    Args:
+        joints: the eight joints, camera axes.
+    """
+    return joints[..., list(OTHER_SIDE), :] * joints.new_tensor([-1.0, 1.0, 1.0])
+
+
+def scale_bones(
+    joints: Float[Tensor, "... 8 3"], factors: Float[Tensor, "... 7"]
+) -> Float[Tensor, "... 8 3"]:
+    """Bones of other lengths in the same directions, rebuilt from the neck outwards.
+
+        x'_neck = x_neck,   x'_b = x'_a + f_ab (x_b - x_a)
+
+    Args:
+        joints: of `UPPER_BODY`. factors: f of each of `BONES`; leading dimensions broadcast.
+
+    Returns:
+        Joints; those beyond a missing one are missing, because nothing tells where they would be.
+    """
+    check_shape("joints", joints, ["...", len(UPPER_BODY), 3])
+    check_shape("factors", factors, ["...", len(BONES)])
+    built = joints.clone()
+    for level in _BONE_LEVELS:
+        near, far = ([BONES[bone][end] for bone in level] for end in (0, 1))
+        bones = joints[..., far, :] - joints[..., near, :]
+        built[..., far, :] = built[..., near, :] + factors[..., list(level), None] * bones
+    return built

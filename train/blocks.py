@@ -10,16 +10,13 @@ of its blocks.
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from torchpose.errors import InputError
-from torchpose.priors.samplers import BLOCK, Samples, SampleSource
+from torchpose.priors.samplers import PRODUCT, Samples, SampleSource, join_samples
 from torchpose.priors.usable_samples import usable_block
 
-__all__ = ["PRODUCT", "Block", "Key", "Part", "ShareSampler", "Sweep", "SweepLoader", "list_blocks"]
-
-PRODUCT = 8 * BLOCK
+__all__ = ["Block", "Key", "Part", "ShareSampler", "Sweep", "SweepLoader", "list_blocks"]
 
 
 class Key(NamedTuple):
@@ -129,8 +126,7 @@ class Sweep:
 
 
 def _join(parts: list[Part]) -> Part:
-    values = zip(*(part.samples for part in parts), strict=True)
-    return Part(parts[0].key, Samples(*(torch.cat(v) for v in values)))
+    return Part(parts[0].key, join_samples([part.samples for part in parts]))
 
 
 class SweepLoader:

@@ -10,17 +10,22 @@ from typing import Any
 
 from lightning.pytorch import LightningDataModule
 
-from torchpose.curation import CurationReport, CurationSettings, curate, refuse_leaks
+from torchpose.curation import (
+    CurationReport,
+    CurationSettings,
+    curate,
+    pick_persons,
+    refuse_leaks,
+)
 from torchpose.errors import InputError, OverlapError
 from torchpose.io import Recording, find_recordings, read_recordings
 from torchpose.priors.samplers import SampleSource, cached
 from torchpose.recipes import VERSION, MixtureTask, UpperBodyRecipe
 from train.blocks import Key, SweepLoader
 
-__all__ = ["RecordingsDataModule", "expand_path", "fingerprint", "pick_persons"]
+__all__ = ["RecordingsDataModule", "expand_path", "fingerprint", "read_sides", "split"]
 
 _RECIPE, _CURATION = UpperBodyRecipe(), CurationSettings()
-_TOLD = ("before", "after", "dropped", "by_person", "notes")
 _HELD_OUT_SHARE = 5  # held-out states: one for so many training states
 
 
@@ -68,12 +73,9 @@ class RecordingsDataModule(LightningDataModule):
         """Read, split, and draw up the mixtures; the second call does nothing."""
         if self.tasks:
             return
-        files = find_recordings([expand_path(path) for path in self._paths])
-        recordings = read_recordings(files, self._axes)
-        # apart, so that nothing of the held-out persons gets into what is fitted
-        train, watched = split(recordings, self._persons, self._held_out)
-        self.train, self.report = self._curated(train)
-        self.watched, _ = self._curated(watched)
+        self.train, self.watched, self.report = read_sides(
+            self._paths, self._axes, self._persons, self._held_out, self._curation
+        )
         self.tasks = self.recipe.tasks(self.train)
         self.sources = {Key(name): cached(task.source) for name, task in self.tasks.items()}
         if self.watched:
@@ -104,23 +106,13 @@ class RecordingsDataModule(LightningDataModule):
 
     def facts(self) -> dict[str, Any]:
         """What a prior's file says about the curation, as that of `torchpose fit` does."""
-        if self.report is None:
-            return {}
-        told = self.report.facts()
-        return {"curation": {name: told[name] for name in _TOLD if name in told}}
+        return {} if self.report is None else self.report.for_prior()
 
     def sources_by_person(self) -> list[SampleSource]:
         """States over poses of each held-out person."""
         recipe, people = self._watched_recipe(), sorted({r.person_id for r in self.watched})
         each = ([r for r in self.watched if r.person_id == person] for person in people)
         return [cached(recipe.tasks(recordings)["pose"].source) for recordings in each]
-
-    def _curated(
-        self, recordings: list[Recording]
-    ) -> tuple[list[Recording], CurationReport | None]:
-        if self._curation is None or not recordings:
-            return recordings, None
-        return curate(recordings, self._curation)
 
     def _watched_recipe(self) -> UpperBodyRecipe:
         """The recipe with fewer states, and with the kind of neck that is fitted to."""
@@ -148,6 +140,29 @@ def expand_path(path: str) -> str:
                 "recordings, or give the path itself with --data.paths"
             )
     return os.path.expanduser(os.path.expandvars(path))
+
+
+def read_sides(
+    paths: Sequence[str],
+    axes: str | None,
+    persons: Sequence[str] | None,
+    held_out: Sequence[str],
+    curation: CurationSettings | None,
+) -> tuple[list[Recording], list[Recording], CurationReport | None]:
+    """Recordings to fit to, those of held-out persons, and what was left out of the former.
+
+    Both sides are curated apart, so that nothing of the held-out persons gets into what is fitted.
+
+    Args:
+        paths: folders or files, see `expand_path`. axes: of all recordings, or None.
+        persons, held_out: see `split`. curation: None takes recordings as they are.
+    """
+    files = find_recordings([expand_path(path) for path in paths])
+    train, watched = split(read_recordings(files, axes), persons, held_out)
+    if curation is None:
+        return train, watched, None
+    kept, report = curate(train, curation)
+    return kept, curate(watched, curation).recordings if watched else [], report
 
 
 def split(
@@ -178,27 +193,6 @@ def split(
     watched = [r for r in recordings if r.person_id in out]
     refuse_leaks(train, watched)
     return train, watched
-
-
-def pick_persons(names: Sequence[str], known: Sequence[str]) -> set[str]:
-    """Ids of the persons that are meant by names, which may leave out their origin.
-
-    Raises:
-        InputError: nobody, or several persons, of that name.
-
-    >>> sorted(pick_persons(["s1", "b#s2"], ["a#s1", "a#s2", "b#s2"]))
-    ['a#s1', 'b#s2']
-    """
-    found = set()
-    for name in names:
-        fitting = [person for person in known if name in (person, person.partition("#")[2])]
-        if len(fitting) != 1:
-            which = f"could be {' or '.join(fitting)}" if fitting else "is nobody's name"
-            raise InputError(
-                f"{name!r} {which}; the recordings are of {', '.join(known) or 'nobody'}"
-            )
-        found.add(fitting[0])
-    return found
 
 
 def fingerprint(recordings: Sequence[Recording]) -> dict[str, Any]:

@@ -17,14 +17,14 @@ from torch import Tensor, nn
 from torch.optim import Adam
 from torch.optim.lr_scheduler import LambdaLR
 
-from torchpose.curation import CurationSettings, curate
+from torchpose.curation import CurationSettings
 from torchpose.errors import InputError
-from torchpose.io import Recording, find_recordings, read_recordings
+from torchpose.io import Recording
 from torchpose.priors import UpperBodyPrior, load_prior
 from torchpose.priors.fine_tuning import TunableKalman, TunableWindow, parameter_groups
 from torchpose.priors.training import collect_poses
 from torchpose.recipes.calibration import HeldOut, calibration_noise, track_held_out
-from train.data import expand_path, fingerprint, split
+from train.data import fingerprint, read_sides
 from train.fine_tuning_batches import batches_of
 from train.identity import check_identity, differences
 from train.predict_tracking import digest_of_prior
@@ -95,11 +95,9 @@ class FineTuningData(LightningDataModule):
                 "fine-tuning stops when persons who are not tuned to are tracked best: name at least "
                 "one with --data.init_args.held_out"
             )
-        files = find_recordings([expand_path(path) for path in self._paths])
-        recordings = read_recordings(files, self._axes)
-        if self._curation is not None:
-            recordings, _ = curate(recordings, self._curation)
-        self.train, self.watched = split(recordings, self._persons, self._held_out)
+        self.train, self.watched, _ = read_sides(
+            self._paths, self._axes, self._persons, self._held_out, self._curation
+        )
 
     def train_dataloader(self) -> _Numbers:
         """The steps of an epoch."""

@@ -23,7 +23,7 @@ from torchpose.recipes.calibration import folds
 from train.blocks import Key, Sweep
 from train.data import RecordingsDataModule
 from train.identity import check_identity, differences
-from train.processes import broadcast_state, first_failure, from_all, total
+from train.processes import broadcast_state, first_failure, from_all
 
 __all__ = ["MixtureEM"]
 
@@ -207,14 +207,11 @@ class MixtureEM(LightningModule):
             )
             for key in wanted
         }
-        try:
+        share = Share.of_processes()
+        with share.failing_together(torch.cat([blank[key].pack() for key in wanted])):
             mine = blank | self._sweep(sweep)
-        except Exception:
-            # or the others would wait for this process for ever
-            total(torch.cat([blank[key].pack() for key in wanted]).fill_(torch.nan))
-            raise
         packed = [mine[key].pack() for key in wanted]
-        sums = total(torch.cat(packed)).split([len(p) for p in packed])
+        sums = share.total(torch.cat(packed)).split([len(p) for p in packed])
         return {
             key: SufficientStatistics.unpack(part, self._tasks[key.name].n_components)
             for key, part in zip(wanted, sums, strict=True)

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from torchpose.errors import InputError
 
-__all__ = ["broadcast_state", "first_failure", "from_all", "total"]
+__all__ = ["broadcast_state", "first_failure", "from_all"]
 
 T = TypeVar("T")
 
@@ -20,13 +20,6 @@ def _several() -> bool:
         and distributed.is_initialized()
         and distributed.get_world_size() > 1
     )
-
-
-def total(values: Tensor) -> Tensor:
-    """The sum over all processes, in each of them."""
-    if _several():
-        torch.distributed.all_reduce(values)
-    return values
 
 
 def from_all(value: T) -> list[T]:

@@ -16,12 +16,12 @@ from torchpose.protocols.common import (
     cached_prior,
     centred_on_neck,
     make_test_set,
-    mirror_pose,
     score,
     track,
 )
 from torchpose.protocols.gaps import back_and_forth
 from torchpose.protocols.ub_people import mean_pose, nearest_neighbour, people, sway
+from torchpose.skeleton import mirror_pose
 
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5)
 

@@ -196,25 +196,15 @@ def _curated(
 
     curated = curate(recordings, CurationSettings(harmonise=args.harmonise))
     report = curated.report
-    kept = ("before", "after", "dropped", "by_person", "notes")
-    facts = {key: value for key, value in report.facts().items() if key in kept}
-    return curated.recordings, {"said": report.text(_SHOWN_DROPS), "facts": {"curation": facts}}
+    return curated.recordings, {"said": report.text(_SHOWN_DROPS), "facts": report.for_prior()}
 
 
 def _without(recordings: list["Recording"], persons: list[str]) -> list["Recording"]:
-    """Recordings of everybody else; a person is named by id or by the part after #."""
-    known = {r.person_id for r in recordings} | {r.person_id.partition("#")[2] for r in recordings}
-    known |= {r.person_id.rstrip("#") for r in recordings}
-    unknown = sorted(set(persons) - known)
-    if unknown:
-        names = ", ".join(sorted({r.person_id for r in recordings}))
-        raise InputError(f"--without must name persons among {names}, got {', '.join(unknown)}")
-    out = set(persons)
-    return [
-        r
-        for r in recordings
-        if not out & {r.person_id, r.person_id.partition("#")[2], r.person_id.rstrip("#")}
-    ]
+    """Recordings of everybody else."""
+    from torchpose.curation import pick_persons
+
+    out = pick_persons(persons, sorted({r.person_id for r in recordings}))
+    return [r for r in recordings if r.person_id not in out]
 
 
 def _check_options(args: Namespace) -> None:

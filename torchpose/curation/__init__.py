@@ -3,7 +3,7 @@
 from torchpose.curation.bones import BONE_RATIOS, bone_lengths, find_wrong_joints, person_bones
 from torchpose.curation.curate import Curated, CurationSettings, complete_runs, curate
 from torchpose.curation.duplicates import Duplicate, find_duplicates
-from torchpose.curation.harmonise import harmonise_bones, scale_bones
+from torchpose.curation.harmonise import harmonise_bones
 from torchpose.curation.jumps import JUMP_SPEEDS, find_jumps
 from torchpose.curation.kinds import check_kinds
 from torchpose.curation.mirror import mirrored
@@ -13,9 +13,11 @@ from torchpose.curation.splits import (
     PersonSplit,
     leave_one_person_out,
     persons_of,
+    pick_persons,
     refuse_leaks,
     split_persons,
 )
+from torchpose.skeleton import scale_bones
 
 __all__ = [
     "BONE_RATIOS",
@@ -39,6 +41,7 @@ __all__ = [
     "mirrored",
     "person_bones",
     "persons_of",
+    "pick_persons",
     "refuse_leaks",
     "scale_bones",
     "split_persons",

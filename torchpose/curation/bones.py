@@ -8,10 +8,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.curation.upper import BONES
 from torchpose.errors import check_shape
 from torchpose.io.recordings import Recording
-from torchpose.skeleton import UPPER_BODY
+from torchpose.skeleton import BONES, UPPER_BODY
 
 __all__ = [
     "BONE_RATIOS",

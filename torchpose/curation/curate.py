@@ -21,7 +21,7 @@ from torchpose.curation.kinds import check_kinds, skeleton_counts
 from torchpose.curation.mirror import mirrored
 from torchpose.curation.normalise import face_camera
 from torchpose.curation.report import CurationReport, Drop, Size, drop_frames
-from torchpose.curation.upper import label, measured, with_missing
+from torchpose.curation.upper import label, measured, runs, with_missing
 from torchpose.errors import InputError
 from torchpose.io.recordings import Recording
 from torchpose.skeleton import LEFT_ARM, RIGHT_ARM, UPPER_BODY
@@ -129,17 +129,14 @@ def complete_runs(recording: Recording, least: int = 15) -> list[Recording]:
     joints = recording.upper_body().joints
     there = measured(joints)
     whole = (there | ~there.any(0)).all(1) & there.any()
-    steps = torch.diff(torch.cat([whole.new_zeros(1), whole, whole.new_zeros(1)]).long())
-    starts, ends = (torch.nonzero(steps == sign).flatten().tolist() for sign in (1, -1))
     return [
         replace(
             recording,
-            joints=recording.joints[start:end],
-            weights=None if recording.weights is None else recording.weights[start:end],
-            first_frame=recording.first_frame + start,
+            joints=recording.joints[frames],
+            weights=None if recording.weights is None else recording.weights[frames],
+            first_frame=recording.first_frame + frames.start,
         )
-        for start, end in zip(starts, ends, strict=True)
-        if end - start >= least
+        for frames in runs(whole, least)
     ]
 
 

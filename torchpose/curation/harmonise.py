@@ -4,41 +4,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from torchpose.curation.bones import person_bones
-from torchpose.curation.upper import BONES, with_upper_joints
-from torchpose.errors import InputError, check_shape
+from torchpose.curation.upper import with_upper_joints
+from torchpose.errors import InputError
 from torchpose.io.recordings import Recording
-from torchpose.skeleton import UPPER_BODY
+from torchpose.skeleton import scale_bones
 
-__all__ = ["harmonise_bones", "scale_bones"]
-
-_LEVELS = ((0, 1, 4), (2, 5), (3, 6))  # of BONES, from the neck outwards
-
-
-def scale_bones(
-    joints: Float[Tensor, "... 8 3"], factors: Float[Tensor, " 7"]
-) -> Float[Tensor, "... 8 3"]:
-    """Bones of other lengths in the same directions, rebuilt from the neck outwards.
-
-        x'_neck = x_neck,   x'_b = x'_a + f_ab (x_b - x_a)
-
-    Args:
-        joints: of `UPPER_BODY`. factors: f of each of `BONES`.
-
-    Returns:
-        Joints; those beyond a missing one are missing, because nothing tells where they would be.
-    """
-    check_shape("joints", joints, ["...", len(UPPER_BODY), 3])
-    check_shape("factors", factors, [len(BONES)])
-    built = joints.clone()
-    for level in _LEVELS:
-        near, far = ([BONES[bone][end] for bone in level] for end in (0, 1))
-        bones = joints[..., far, :] - joints[..., near, :]
-        built[..., far, :] = built[..., near, :] + factors[list(level), None] * bones
-    return built
+__all__ = ["harmonise_bones"]
 
 
 def harmonise_bones(recordings: Sequence[Recording]) -> list[Recording]:

@@ -102,6 +102,12 @@ class CurationReport(NamedTuple):
             "settings": self.settings,
         }
 
+    def for_prior(self) -> dict[str, Any]:
+        """What the file of a prior says: counts, reasons and notes, without single drops."""
+        told = ("before", "after", "dropped", "by_person", "notes")
+        facts = self.facts()
+        return {"curation": {name: facts[name] for name in told}}
+
     def _by_person(self) -> dict[str, dict[str, int]]:
         found: dict[str, dict[str, int]] = {}
         for drop in self.drops:

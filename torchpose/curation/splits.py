@@ -11,7 +11,14 @@ from torchpose.curation.upper import label
 from torchpose.errors import InputError, OverlapError
 from torchpose.io.recordings import Recording
 
-__all__ = ["PersonSplit", "leave_one_person_out", "persons_of", "refuse_leaks", "split_persons"]
+__all__ = [
+    "PersonSplit",
+    "leave_one_person_out",
+    "persons_of",
+    "pick_persons",
+    "refuse_leaks",
+    "split_persons",
+]
 
 
 class PersonSplit(NamedTuple):
@@ -25,6 +32,33 @@ class PersonSplit(NamedTuple):
 def persons_of(recordings: Iterable[Recording]) -> list[str]:
     """The persons (`Recording.person_id`) in order, each once; companions are none of them."""
     return sorted({r.person_id for r in recordings if not r.companion})
+
+
+def pick_persons(names: Iterable[str], known: Sequence[str]) -> set[str]:
+    """Ids of the persons that are meant by names, which may leave out their origin.
+
+    Where a folder stands for a person, its name is the person's.
+
+    Args:
+        names: ids (`Recording.person_id`), or what stands on one side of their ``#``.
+        known: ids of everybody.
+
+    Raises:
+        InputError: nobody, or several persons, of that name.
+
+    >>> sorted(pick_persons(["s1", "b#s2", "bob"], ["a#s1", "a#s2", "b#s2", "bob#"]))
+    ['a#s1', 'b#s2', 'bob#']
+    """
+    found = set()
+    for name in names:
+        fitting = [p for p in known if name in (p, p.partition("#")[2], p.removesuffix("#"))]
+        if len(fitting) != 1:
+            which = f"could be {' or '.join(fitting)}" if fitting else "is nobody's name"
+            raise InputError(
+                f"{name!r} {which}; the recordings are of {', '.join(known) or 'nobody'}"
+            )
+        found.add(fitting[0])
+    return found
 
 
 def split_persons(recordings: Sequence[Recording], test_persons: Iterable[str]) -> PersonSplit:

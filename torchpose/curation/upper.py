@@ -10,10 +10,7 @@ from torchpose.errors import check_shape
 from torchpose.io.recordings import Recording
 from torchpose.skeleton import UPPER_BODY, upper_body_indices
 
-__all__ = ["BONES", "label", "measured", "with_missing", "with_upper_joints"]
-
-BONES = ((4, 3), (4, 2), (2, 1), (1, 0), (4, 5), (5, 6), (6, 7))
-"""Bones between joints of `UPPER_BODY`, from the neck outwards: the nearer joint, the farther one."""
+__all__ = ["label", "measured", "runs", "with_missing", "with_upper_joints"]
 
 
 def label(recording: Recording) -> str:
@@ -24,6 +21,14 @@ def label(recording: Recording) -> str:
 def measured(joints: Float[Tensor, "... J 3"]) -> Bool[Tensor, "... J"]:
     """Which joints are there."""
     return torch.isfinite(joints).all(-1)
+
+
+def runs(there: Bool[Tensor, " T"], least: int) -> list[slice]:
+    """The stretches of at least so many frames in which something is there."""
+    edge = there.new_zeros(1)
+    steps = torch.cat([edge, there, edge]).long().diff()
+    starts, ends = (torch.nonzero(steps == sign).flatten().tolist() for sign in (1, -1))
+    return [slice(a, b) for a, b in zip(starts, ends, strict=True) if b - a >= least]
 
 
 def with_upper_joints(recording: Recording, joints: Float[Tensor, "T 8 3"]) -> Recording:

@@ -22,6 +22,7 @@ from torchpose.priors.window import WindowLayout, augment_bodies, mirror_bodies,
 
 __all__ = [
     "BLOCK",
+    "PRODUCT",
     "ArmSource",
     "CachedSource",
     "PoseFrames",
@@ -33,9 +34,11 @@ __all__ = [
     "block_sizes",
     "cached",
     "derived_seed",
+    "join_samples",
 ]
 
 BLOCK = 4096
+PRODUCT = 8 * BLOCK  # states per product: single blocks take a third more time
 _CACHE_BYTES = 1 << 30
 _GOLDEN = (math.sqrt(5) - 1) / 2
 
@@ -49,6 +52,11 @@ class Samples(NamedTuple):
 
     states: Float[Tensor, "N D"]
     weight: Float[Tensor, " N"]
+
+
+def join_samples(parts: Sequence[Samples]) -> Samples:
+    """All samples of all parts."""
+    return Samples(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 @runtime_checkable
@@ -273,12 +281,21 @@ class PoseFrames:
 
     def at_lags(self, frames: Int[Tensor, " N"], layout: WindowLayout) -> Int[Tensor, "N W"]:
         """Indices of the frames of each window; beyond the ends of a recording its ends are held."""
-        ratio = (self.fps[frames] / layout.fps)[:, None]
-        lags = torch.round(torch.tensor(layout.lags, dtype=torch.float64) * ratio).long()
-        wanted = frames[:, None] - lags
+        wanted = self.wanted(frames, layout.lags, layout.fps)
         return torch.minimum(
             torch.maximum(wanted, self.first[frames, None]), self.last[frames, None]
         )
+
+    def wanted(
+        self, frames: Int[Tensor, " N"], lags: Sequence[int], fps: float
+    ) -> Int[Tensor, "N L"]:
+        """Where the frames at some lags would be, also beyond the ends of a recording.
+
+        Args:
+            frames: indices. lags: in frames at the rate `fps`; positive is the past.
+        """
+        ratio = (self.fps[frames] / fps)[:, None]
+        return frames[:, None] - torch.round(torch.tensor(lags).double() * ratio).long()
 
     def complete(self, layout: WindowLayout) -> Int[Tensor, " N"]:
         """Frames whose whole window has all joints."""
@@ -316,10 +333,14 @@ class WindowSource(_Drawn):
         """Number of distinct poses."""
         return len(self.centres)
 
+    def centres_of(self, index: int) -> Int[Tensor, " n"]:
+        """The frames that the windows of a block are about."""
+        return self.centres[self._poses(index, len(self.centres))]
+
     def block(self, index: int, epoch: int = 0) -> Samples:
         """The states of a block."""
         generator = self._generator(index, epoch)
-        centres = self.centres[self._poses(index, len(self.centres))]
+        centres = self.centres_of(index)
         taken = self.frames.at_lags(centres, self.layout)
         bodies = augment_bodies(
             self.frames.joints[taken], generator, self.body_size, self.bone_lengths

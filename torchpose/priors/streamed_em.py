@@ -28,7 +28,7 @@ from torchpose.priors.em import (
     whitening,
 )
 from torchpose.priors.gmm import GaussianMixture
-from torchpose.priors.samplers import BLOCK, Samples, SampleSource
+from torchpose.priors.samplers import PRODUCT, Samples, SampleSource, join_samples
 from torchpose.priors.share import ALONE, Share
 from torchpose.priors.start import STARTS, floor_variances, start_mixture
 from torchpose.priors.usable_samples import spread_samples, usable_block, usable_samples
@@ -43,7 +43,6 @@ __all__ = [
 ]
 
 START_SAMPLES = 100_000
-_PRODUCT = 8 * BLOCK  # states per product: single blocks take a third more time
 
 
 class StreamedEM(nn.Module):
@@ -368,15 +367,11 @@ def _products(source: SampleSource, share: Share, epoch: int) -> Iterator[Sample
     for index in share.blocks(source.n_blocks):
         parts.append(usable_block(source, index, epoch))
         count += len(parts[-1].states)
-        if count >= _PRODUCT:
-            yield _join(parts)
+        if count >= PRODUCT:
+            yield join_samples(parts)
             parts, count = [], 0
     if parts:
-        yield _join(parts)
-
-
-def _join(parts: list[Samples]) -> Samples:
-    return Samples(*(torch.cat(values) for values in zip(*parts, strict=True)))
+        yield join_samples(parts)
 
 
 def _inverse(factor: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ from torchpose.priors.arm_state import STATE_DIM, mirror_arm_state
 from torchpose.priors.gmm import GaussianMixture
 from torchpose.projection import project
 from torchpose.rotations import euler_to_matrix
-from torchpose.skeleton import LEFT_ARM, RIGHT_ARM
+from torchpose.skeleton import LEFT_ARM, RIGHT_ARM, mirror_pose, scale_bones
 from torchpose.torso import in_torso_axes
 
 __all__ = [
@@ -36,9 +36,7 @@ _HANDS = {"left": (0, 7), "right": (7, 0)}  # own hand, other hand
 _TORSO_DIM = 15
 _SEEN = (0, 1, 9, 10, 12, 13)  # pixels of hand, head and neck
 _ARMS = {"left": LEFT_ARM, "right": RIGHT_ARM}
-_BONES = ((4, 3), (4, 2), (2, 1), (1, 0), (4, 5), (5, 6), (6, 7))  # parent first, from the neck
 _SAME_BONE = (0, 1, 2, 3, 1, 2, 3)  # left and right limbs are of one length
-_MIRROR = (7, 6, 5, 3, 4, 2, 1, 0)  # left and right change places, head and neck stay
 
 
 @dataclass(frozen=True)
@@ -185,11 +183,7 @@ def augment_bodies(
         return 1 + limit * (2 * torch.rand(n, count, generator=generator, dtype=joints.dtype) - 1)
 
     factors = draw(4, bones)[:, list(_SAME_BONE)] * draw(1, size)
-    out = joints.clone()
-    for bone, (parent, child) in enumerate(_BONES):
-        offset = joints[:, :, child] - joints[:, :, parent]
-        out[:, :, child] = out[:, :, parent] + factors[:, bone, None, None] * offset
-    return out
+    return scale_bones(joints, factors[:, None])
 
 
 def mirror_bodies(
@@ -197,8 +191,7 @@ def mirror_bodies(
 ) -> Float[Tensor, "N W 8 3"]:
     """Windows of which a share, drawn at random, is mirrored: left and right change places."""
     mirrored = torch.rand(len(joints), generator=generator) < share
-    flip = joints.new_tensor([-1.0, 1.0, 1.0])
-    return torch.where(mirrored[:, None, None, None], joints[:, :, list(_MIRROR)] * flip, joints)
+    return torch.where(mirrored[:, None, None, None], mirror_pose(joints), joints)
 
 
 def window_state(

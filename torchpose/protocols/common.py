@@ -36,7 +36,7 @@ from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.projection import project
 from torchpose.protocols.report import Report
 from torchpose.rotations import euler_to_matrix
-from torchpose.skeleton import UPPER_BODY
+from torchpose.skeleton import UPPER_BODY, mirror_pose
 from torchpose.tracking import UpperBodyTracker
 
 __all__ = [
@@ -53,7 +53,6 @@ __all__ = [
     "centred_on_neck",
     "data_folder",
     "make_test_set",
-    "mirror_pose",
     "plain_prior",
     "projected_training_poses",
     "score",
@@ -71,8 +70,6 @@ MEASURED = ("head", "neck", "hand_left", "hand_right")
 HANDS = (UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right"))
 _MEASURED_AT = tuple(UPPER_BODY.index(name) for name in MEASURED)
 _NECK = UPPER_BODY.index("neck")
-# Reversed, the joints are those of the other side; head and neck have to be put back.
-_MIRRORED = [0, 1, 2, 4, 3, 5, 6, 7]
 
 Recipe = Callable[..., UpperBodyPrior]
 """recordings, n_components, seed, progress, name -> prior with its noise and calibration."""
@@ -147,11 +144,6 @@ def projected_training_poses(
     views = sample_viewpoints(n, TRAINING_VIEWS, generator)
     rotation = euler_to_matrix(views.angles, "zxy")
     return joints, project(joints, camera.matrix, rotation, views.translation)[..., :2]
-
-
-def mirror_pose(joints: Float[Tensor, "... 8 3"]) -> Float[Tensor, "... 8 3"]:
-    """The mirrored person: x changes sign and left becomes right."""
-    return joints.flip(-2)[..., _MIRRORED, :] * joints.new_tensor([-1.0, 1.0, 1.0])
 
 
 class Trials(NamedTuple):

@@ -24,7 +24,7 @@ from torchpose.protocols.common import (
     track,
 )
 from torchpose.protocols.report import Report
-from torchpose.skeleton import LEFT_ARM, RIGHT_ARM
+from torchpose.skeleton import LEFT_ARM, OTHER_SIDE, RIGHT_ARM
 
 __all__ = ["add_gap_tables", "back_and_forth"]
 
@@ -174,7 +174,7 @@ def _one_gap(
     changes.append(100 * float(steps.amax(-1).median()))
     over_time = errors.nanmean(0)
     if side == "right":
-        over_time = over_time.flip(-1)[:, [0, 1, 2, 4, 3, 5, 6, 7]]
+        over_time = over_time[:, list(OTHER_SIDE)]
     return means, changes, over_time
 
 

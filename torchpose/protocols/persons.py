@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose.curation.upper import measured, runs
 from torchpose.io.recordings import Recording
 
 __all__ = [
@@ -34,11 +35,7 @@ _NEAR = 0.2  # metres
 
 def complete_pieces(joints: Float[Tensor, "T 8 3"]) -> list[Float[Tensor, "S 8 3"]]:
     """Runs of at least ten frames in which no joint is missing."""
-    whole = torch.isfinite(joints).flatten(1).all(1)
-    runs = torch.cat([torch.zeros(1, dtype=torch.bool), whole, torch.zeros(1, dtype=torch.bool)])
-    edges = torch.nonzero(runs.int().diff()).flatten().tolist()
-    spans = zip(edges[::2], edges[1::2], strict=True)
-    return [joints[start:stop] for start, stop in spans if stop - start >= LEAST_FRAMES]
+    return [joints[frames] for frames in runs(measured(joints).all(1), LEAST_FRAMES)]
 
 
 def pose_classes(poses: Float[Tensor, "N 8 3"]) -> Int[Tensor, "N 2"]:

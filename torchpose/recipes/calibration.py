@@ -9,13 +9,11 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from torchpose.calibration import chi2_quantile
-from torchpose.camera import ViewRange, sample_viewpoints
 from torchpose.errors import InputError
 from torchpose.metrics import align
+from torchpose.priors.seen_keypoints import seen_keypoints
 from torchpose.priors.training import PoseSet
 from torchpose.priors.upper_body import UpperBodyPrior
-from torchpose.projection import project
-from torchpose.rotations import euler_to_matrix
 from torchpose.tracking import UpperBodyTracker
 
 __all__ = ["MODES", "HeldOut", "calibration_noise", "fit_calibration", "folds", "track_held_out"]
@@ -112,14 +110,7 @@ def _seen(
     lengths = torch.tensor([len(sequence) for sequence in sequences])
     poses = pad_sequence(sequences, batch_first=True).double()
     inside = torch.arange(poses.shape[1]) < lengths[:, None]
-    views = ViewRange(**prior.info.views).scaled(_VIEWS)
-    view = sample_viewpoints(len(sequences), views, generator)
-    rotation = euler_to_matrix(view.angles, prior.info.rotation_order)  # type: ignore[arg-type]
-    place = view.translation[:, None]
-    uvl = project(poses, prior.info.matrix, rotation[:, None], place)
-    noise = torch.randn(uvl[..., :2].shape, generator=generator, dtype=torch.float64)
-    keypoints = uvl[..., :2] + _NOISE * noise
-    keypoints[:, :, [1, 2, 5, 6]] = torch.nan
+    keypoints = seen_keypoints(poses, prior.info, generator, view_share=_VIEWS, noise_std=_NOISE)
     keypoints[~inside] = torch.nan
     return keypoints, poses, inside
 

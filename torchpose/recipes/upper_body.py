@@ -23,6 +23,7 @@ from torchpose.priors.samplers import SampleSource, WindowSource, cached, derive
 from torchpose.priors.streamed_em import fit_streamed
 from torchpose.priors.training import (
     TRAINING_VIEWS,
+    ArmSources,
     PoseSet,
     RecordingLike,
     arm_sources,
@@ -65,10 +66,12 @@ class MixtureTask(NamedTuple):
     seed: int
 
     def fit(self) -> GaussianMixture:
-        """The mixture, fitted in this process."""
-        return fit_streamed(
-            cached(self.source), self.n_components, self.seed, max_iter=self.max_iter, tol=self.tol
+        """The whole mixture, fitted in this process."""
+        source = cached(self.source)
+        fitted = fit_streamed(
+            source, self.n_components, self.seed, max_iter=self.max_iter, tol=self.tol
         )
+        return self.whole(fitted)
 
     def whole(self, mixture: GaussianMixture) -> GaussianMixture:
         """The mixture over all dimensions of its states, if it was fitted to some of them only."""
@@ -184,10 +187,7 @@ class UpperBodyRecipe:
             InputError: no usable frames. PriorError: kinds of joints that cannot be mixed.
         """
         poses = self.poses(recordings)
-        arms = arm_sources(
-            poses, self.matrix, self.seed, self.views, self.rotation_order, self.mirror,
-            self.n_samples,
-        )  # fmt: skip
+        arms = self._arms(poses)
         tasks = {}
         for name, source in (("pose", arms.left), ("pose.right", arms.right)):
             if source is not None:
@@ -196,6 +196,12 @@ class UpperBodyRecipe:
                     source, self.n_components, self.pose_steps, self.pose_tol, seed
                 )
         return tasks | self._window_tasks(poses)
+
+    def _arms(self, poses: PoseSet) -> ArmSources:
+        return arm_sources(
+            poses, self.matrix, self.seed, self.views, self.rotation_order, self.mirror,
+            self.n_samples,
+        )  # fmt: skip
 
     def _window_tasks(self, poses: PoseSet) -> dict[str, MixtureTask]:
         frames = poses.frames()
@@ -240,7 +246,8 @@ class UpperBodyRecipe:
         """Prior of fitted mixtures, with noise and windows; not calibrated.
 
         Args:
-            recordings: what `tasks` was given. mixtures: by the names of the tasks.
+            recordings: what `tasks` was given. mixtures: whole ones (`MixtureTask.whole`), by the
+                names of the tasks.
             name, licence, command: for `PriorInfo`.
 
         Raises:
@@ -248,13 +255,9 @@ class UpperBodyRecipe:
         """
         if "pose" not in mixtures:
             raise PriorError(f"expected the mixture 'pose', got {', '.join(mixtures) or 'none'}")
-        poses = self.poses(recordings)
-        arms = arm_sources(
-            poses, self.matrix, self.seed, self.views, self.rotation_order, self.mirror,
-            self.n_samples,
-        )  # fmt: skip
+        facts = self._arms(self.poses(recordings)).facts
+        facts = facts | {"extra": facts["extra"] | {"recipe": VERSION}}
         fx, fy, cx, cy = self.camera_matrix
-        facts = arms.facts | {"extra": arms.facts["extra"] | {"recipe": VERSION}}
         info = PriorInfo(
             name=name, rotation_order=self.rotation_order, fx=fx, fy=fy, cx=cx, cy=cy,
             licence=licence, command=command, views=asdict(self.views), **facts,
@@ -264,10 +267,8 @@ class UpperBodyRecipe:
             "process_cov": released_process_cov(),
             "measurement_std": torch.full((5,), _MEASUREMENT_STD, dtype=torch.float64),
         }
-        tasks = self._window_tasks(poses)
-        whole = {key: task.whole(mixtures[key]) for key, task in tasks.items() if key in mixtures}
         windows = {
-            mode: self.window(mode, whole) for mode in self.layouts if f"{mode}.left" in whole
+            mode: self.window(mode, mixtures) for mode in self.layouts if f"{mode}.left" in mixtures
         }
         return UpperBodyPrior(base.left, base.right, base.info, noise, windows)
 

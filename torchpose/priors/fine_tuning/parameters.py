@@ -19,8 +19,8 @@ from torchpose.rotations import euler_to_matrix
 
 __all__ = [
     "MEASURED",
+    "Fraction",
     "Positive",
-    "Share",
     "TunableMixture",
     "arm_in_body_axes",
     "departure_of",
@@ -121,7 +121,7 @@ class Positive(nn.Module):
         return self.start * self.log_ratio.exp()
 
 
-class Share(nn.Module):
+class Fraction(nn.Module):
     """Numbers in (0, 1) near others, by their logits."""
 
     def __init__(self, start: Tensor) -> None:

@@ -11,15 +11,14 @@ from torch.nn.utils.rnn import pad_sequence
 
 from torchpose.arm_filters import noise_options
 from torchpose.arms import ARMS
-from torchpose.camera import ViewRange, sample_viewpoints
 from torchpose.errors import InputError, PriorError
 from torchpose.filters import MixtureKalmanFilter
 from torchpose.lifting import join_arms
 from torchpose.measurements import pixel_indices
 from torchpose.priors.fine_tuning.parameters import (
     MEASURED,
+    Fraction,
     Positive,
-    Share,
     TunableMixture,
     arm_in_body_axes,
     departure_of,
@@ -28,10 +27,9 @@ from torchpose.priors.fine_tuning.parameters import (
     tuned_mixtures,
 )
 from torchpose.priors.gmm import GaussianMixture
+from torchpose.priors.seen_keypoints import seen_keypoints
 from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.priors.window import augment_bodies
-from torchpose.projection import project
-from torchpose.rotations import euler_to_matrix
 from torchpose.skeleton import ARM_JOINTS
 
 __all__ = ["SequenceBatch", "TunableKalman", "draw_sequences"]
@@ -98,12 +96,9 @@ def draw_sequences(
     ]
     poses = pad_sequence(pieces, batch_first=True, padding_value=math.nan)
     poses = augment_bodies(poses, generator, body_size, bone_lengths)
-    views = sample_viewpoints(n, ViewRange(**prior.info.views).scaled(view_share), generator)
-    rotation = euler_to_matrix(views.angles, prior.info.rotation_order)  # type: ignore[arg-type]
-    uvl = project(poses, prior.info.matrix, rotation[:, None], views.translation[:, None])
-    noise = torch.randn(uvl[..., :2].shape, generator=generator, dtype=torch.float64)
-    keypoints = uvl[..., :2] + noise_std * noise
-    keypoints[:, :, [1, 2, 5, 6]] = math.nan
+    keypoints = seen_keypoints(
+        poses, prior.info, generator, view_share=view_share, noise_std=noise_std
+    )
     return SequenceBatch(keypoints, poses, torch.tensor([len(piece) for piece in pieces]))
 
 
@@ -140,7 +135,7 @@ class TunableKalman(nn.Module):
         self.measurement = Positive(std[_ROWS].square())
         gamma = options.get("gamma")
         is_ou = prior.info.transition == "ou"
-        self.gamma = Share(torch.as_tensor(0.5 if gamma is None else gamma)) if is_ou else None
+        self.gamma = Fraction(torch.as_tensor(0.5 if gamma is None else gamma)) if is_ou else None
         self.process.requires_grad_(not is_ou)  # that transition has no Q
         self.epsilon = float(options.get("uniform_weight", 1e-3))
         self.mixtures = nn.ModuleDict(

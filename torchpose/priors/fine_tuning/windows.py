@@ -17,8 +17,8 @@ from torchpose.priors.arm_state import STATE_DIM
 from torchpose.priors.em import MixtureParameters
 from torchpose.priors.fine_tuning.parameters import (
     MEASURED,
+    Fraction,
     Positive,
-    Share,
     TunableMixture,
     arm_in_body_axes,
     departure_of,
@@ -62,12 +62,9 @@ def draw_windows(
     if (left.seed, left.layout, left.n_samples) != (right.seed, right.layout, right.n_samples):
         raise InputError("windows of both arms must come from one seed, layout and size")
     states = {side: sources[side].block(index, epoch).states for side in ARMS}
-    centres = left.centres[left._poses(index, len(left.centres))]
-    lags = torch.tensor([*left.layout.own, *left.layout.other], dtype=torch.float64)
-    ratio = (left.frames.fps[centres] / left.layout.fps)[:, None]
-    wanted = centres[:, None] - torch.round(lags * ratio).long()
-    first, last = left.frames.first[centres, None], left.frames.last[centres, None]
-    hands = (wanted >= first) & (wanted <= last)
+    layout, frames, centres = left.layout, left.frames, left.centres_of(index)
+    wanted = frames.wanted(centres, (*layout.own, *layout.other), layout.fps)
+    hands = (wanted >= frames.first[centres, None]) & (wanted <= frames.last[centres, None])
     step = 1 if n is None else max(1, len(hands) // n)
     return WindowBatch({side: value[::step] for side, value in states.items()}, hands[::step])
 
@@ -113,7 +110,7 @@ class TunableWindow(nn.Module):
         variance = [cov[arm[ARM_JOINTS.index(joint)], 0, 0] for joint in MEASURED]
         self.register_buffer("measured_cov", torch.stack(variance).repeat_interleave(2))
         self.hand_variance = Positive(torch.tensor(window.settings["hand_std"] ** 2))
-        self.power = Share(torch.tensor(window.settings["likelihood_power"]))
+        self.power = Fraction(torch.tensor(window.settings["likelihood_power"]))
         self.mixtures = nn.ModuleDict(
             {side: TunableMixture(getattr(window, side)) for side in ARMS} if mixtures else {}
         )
@@ -127,25 +124,16 @@ class TunableWindow(nn.Module):
 
     def _measured(self) -> list[int]:
         """Dimensions of a state that are measured: hand, head and neck, and the window's hands."""
-        hands = range(STATE_DIM, STATE_DIM + 2 * self._n_hands)
-        return [*pixel_indices(MEASURED), *hands]
-
-    def _in_torso(self) -> range:
-        """Dimensions of a state that are joints in the axes of the torso; none in some layouts."""
-        return range(STATE_DIM + 2 * self._n_hands, self.layout.dim)
+        return [*pixel_indices(MEASURED), *self.layout.hands]
 
     def _wanted(self) -> list[int]:
         """Dimensions of a state that the pose is read from."""
-        return list(self._in_torso() or range(STATE_DIM))
-
-    @property
-    def _n_hands(self) -> int:
-        return len(self.layout.own) + len(self.layout.other)
+        return list(self.layout.in_torso or range(STATE_DIM))
 
     def _noise(self) -> Float[Tensor, " Z"]:
         """Variances of all measured pixels: of this frame, then of the window's hands."""
         hand = self.measured_cov[:1] + self.hand_variance()
-        return torch.cat([self.measured_cov, hand.expand(2 * self._n_hands)])
+        return torch.cat([self.measured_cov, hand.expand(2 * self.layout.n_hands)])
 
     def _condition(
         self, side: str, z: Float[Tensor, "N Z"], known: Bool[Tensor, "N Z"]
@@ -199,10 +187,9 @@ class TunableWindow(nn.Module):
                 if self.weights_of_loss[1]:
                     arm = state[own][:, self._wanted()]
                     density = density + _log_density(log_weights, estimates, rest, arm).sum()
-            in_torso = self._in_torso()
             arms[side] = (
                 mean.unflatten(-1, (-1, 3))
-                if in_torso
+                if self.layout.torso
                 else arm_in_body_axes(mean, info.matrix, info.rotation_order)
             )
         joints = join_arms(*(arms[side][None] for side in ARMS))[0]
