@@ -1,7 +1,8 @@
-"""Measurements from images: faces, skin, hands, edges, background."""
+"""Measurements from images: faces, skin, hands, edges, background, silhouettes."""
 
 from torchpose.measure.association import AssociationState, HandAssociation
 from torchpose.measure.background import BackgroundModel
+from torchpose.measure.brightness_background import BrightnessBackground, PixelKind
 from torchpose.measure.edges import Segments, edge_map, find_segments, limb_votes
 from torchpose.measure.face import (
     FaceDetector,
@@ -19,6 +20,7 @@ from torchpose.measure.mean_shift import MeanShift, mean_shift
 from torchpose.measure.mean_shift_hands import MeanShiftHandState, MeanShiftHandTracker
 from torchpose.measure.mediapipe import MediaPipeFaceDetector, MediaPipePose, PoseLandmarks
 from torchpose.measure.persons import PersonRegister, Persons
+from torchpose.measure.silhouettes import SilhouetteMeasurer, fit_view, read_silhouettes
 from torchpose.measure.skin import SkinModel, SkinState, rgb_to_lab
 from torchpose.measure.skin_mixture import SkinMixtureModel, SkinMixtureState
 from torchpose.measure.torso import TorsoElbows, clothes_likelihood, elbows_from_torso
@@ -34,6 +36,7 @@ __all__ = [
     "MEASURED",
     "AssociationState",
     "BackgroundModel",
+    "BrightnessBackground",
     "FaceDetector",
     "FaceOffsets",
     "FaceTracker",
@@ -55,9 +58,11 @@ __all__ = [
     "MediaPipePose",
     "PersonRegister",
     "Persons",
+    "PixelKind",
     "PoseLandmarks",
     "Region",
     "Segments",
+    "SilhouetteMeasurer",
     "SkinMixtureModel",
     "SkinMixtureState",
     "SkinModel",
@@ -68,7 +73,9 @@ __all__ = [
     "edge_map",
     "elbows_from_torso",
     "find_segments",
+    "fit_view",
     "limb_votes",
     "mean_shift",
+    "read_silhouettes",
     "rgb_to_lab",
 ]
