@@ -5,7 +5,6 @@ joint was measured, a ring was inferred and comes with the ellipse that holds it
 neither arm (head, neck, collar bones, face box, label) has the tint of the person.
 """
 
-import math
 from collections.abc import Sequence
 from functools import lru_cache
 
@@ -19,19 +18,16 @@ from torchpose.calibration import chi2_quantile
 from torchpose.errors import InputError, check_rgb, check_shape
 from torchpose.joint_sets import UPPER_BODY
 from torchpose.skeleton import LIMBS
+from torchpose.video.pen import Color, Pen, rgb
 from torchpose.viz.style import LEFT, RIGHT
 
 __all__ = ["PERSON_TINTS", "draw_overlay"]
 
 Image = NDArray[np.uint8]
-Color = tuple[int, int, int]
 
 PERSON_TINTS = ("#F2F2F2", "#009E73", "#CC79A7", "#F0E442", "#56B4E9")
 """Of one person after the other, from the colours of Okabe & Ito; they come round again."""
 
-_LIGHT, _DARK = (255, 255, 255), (20, 20, 20)
-_SHIFT = 3  # cv2 takes coordinates in eighths of a pixel
-_REACH = 8  # what lies further out than so many image sizes is nonsense, and is left out
 _HAND_SIDES = (LEFT, RIGHT)
 _HEAD = UPPER_BODY.index("head")
 
@@ -82,13 +78,13 @@ def draw_overlay(
     """
     _check(image, poses2d, covariance2d, observed, labels, tints, level)
     canvas = np.array(image, order="C")
-    pen = _Pen(canvas)
+    pen = Pen(canvas)
     numbers = range(len(poses2d)) if tints is None else tints
-    own = [_rgb(PERSON_TINTS[n % len(PERSON_TINTS)]) for n in numbers]
+    own = [rgb(PERSON_TINTS[n % len(PERSON_TINTS)]) for n in numbers]
     if faces is not None:
         check_shape("faces", faces, [None, 3])
         for i, face in enumerate(faces.tolist()):
-            pen.box(face, own[i] if i < len(own) else _rgb(PERSON_TINTS[0]))
+            pen.box(face, own[i] if i < len(own) else rgb(PERSON_TINTS[0]))
     if hands is not None:
         _draw_hands(pen, hands, hand_covariance, level)
     points = poses2d.tolist()
@@ -104,11 +100,11 @@ def draw_overlay(
         for joint, filled in enumerate(seen):
             pen.joint(points[person][joint], colors[joint], filled)
         if labels is not None:
-            pen.label(labels[person], points[person], own[person])
+            pen.label(labels[person], points[person], _HEAD, own[person])
     return canvas
 
 
-def _draw_hands(pen: "_Pen", hands: Tensor, covariance: Tensor | None, level: float) -> None:
+def _draw_hands(pen: Pen, hands: Tensor, covariance: Tensor | None, level: float) -> None:
     check_shape("hands", hands, [None, 2, 2])
     points = hands.tolist()
     ellipses = None
@@ -117,7 +113,7 @@ def _draw_hands(pen: "_Pen", hands: Tensor, covariance: Tensor | None, level: fl
         ellipses = _ellipses(covariance, level, 2)
     for person, pair in enumerate(points):
         for side, point in enumerate(pair):
-            color = _rgb(_HAND_SIDES[side])
+            color = rgb(_HAND_SIDES[side])
             if ellipses is not None:
                 pen.ellipse(point, ellipses[person][side], color, outlined=True)
             pen.cross(point, color)
@@ -143,116 +139,10 @@ def _chi2(level: float, dof: int) -> float:
     return float(chi2_quantile(torch.tensor(level, dtype=torch.float64), dof))
 
 
-class _Pen:
-    """cv2 with outlines, in widths that fit the image; skips what cannot be drawn."""
-
-    def __init__(self, canvas: Image) -> None:
-        height, width = canvas.shape[:2]
-        self.canvas = canvas
-        self.scale = math.sqrt(height * width / (640 * 480))
-        self.limit = _REACH * max(height, width)
-        self.bone_width = max(1, round(3 * self.scale))
-        self.edge = max(1, round(self.scale))
-        self.thin = max(1, round(0.6 * self.scale))
-        self.radius = max(1.5, 4.5 * self.scale)
-
-    def drawable(self, *numbers: float) -> bool:
-        return all(math.isfinite(n) and abs(n) <= self.limit for n in numbers)
-
-    def bone(self, a: list[float], b: list[float], color: Color) -> None:
-        if self.drawable(*a, *b):
-            self.line(a, b, _outline(color), self.bone_width + 2 * self.edge)
-            self.line(a, b, color, self.bone_width)
-
-    def line(self, a: list[float], b: list[float], color: Color, width: int) -> None:
-        import cv2
-
-        cv2.line(self.canvas, _fixed(a), _fixed(b), color, width, cv2.LINE_AA, _SHIFT)
-
-    def joint(self, point: list[float], color: Color, filled: bool) -> None:
-        import cv2
-
-        if not self.drawable(*point):
-            return
-        around, inner = _outline(color), self.radius - 1.5 * self.edge
-        rings = [(self.radius + self.edge, around), (self.radius, color)]
-        for radius, paint in rings if filled else [*rings, (max(inner, 0.0), around)]:
-            size = max(1, round(radius * (1 << _SHIFT)))
-            cv2.circle(self.canvas, _fixed(point), size, paint, -1, cv2.LINE_AA, _SHIFT)
-
-    def ellipse(
-        self, point: list[float], shape: list[float], color: Color, outlined: bool = False
-    ) -> None:
-        import cv2
-
-        if not (self.drawable(*point, *shape[:2]) and math.isfinite(shape[2])):
-            return
-        strokes = [(_outline(color), 2 * self.edge + self.thin)] if outlined else []
-        for paint, width in [*strokes, (color, self.thin)]:
-            cv2.ellipse(
-                self.canvas, _fixed(point), _fixed(shape[:2]), shape[2], 0, 360, paint, width,
-                cv2.LINE_AA, _SHIFT,
-            )  # fmt: skip
-
-    def box(self, face: list[float], color: Color) -> None:
-        import cv2
-
-        if self.drawable(*face):
-            x, y, half = face[0], face[1], face[2] / 2
-            corners = _fixed([x - half, y - half]), _fixed([x + half, y + half])
-            for paint, width in ((_outline(color), self.edge + 2), (color, self.edge)):
-                cv2.rectangle(self.canvas, *corners, paint, width, cv2.LINE_AA, _SHIFT)
-
-    def cross(self, point: list[float], color: Color) -> None:
-        if self.drawable(*point):
-            arm = 1.6 * self.radius
-            for paint, width in ((_outline(color), 3 * self.edge), (color, self.edge)):
-                for dx, dy in ((arm, arm), (arm, -arm)):
-                    ends = [point[0] - dx, point[1] - dy], [point[0] + dx, point[1] + dy]
-                    self.line(*ends, paint, width)
-
-    def label(self, text: str, joints: list[list[float]], color: Color) -> None:
-        """Over the head, else over the highest joint that is there, and inside the image."""
-        import cv2
-
-        there = [joint for joint in joints if self.drawable(*joint)]
-        if not text or not there:
-            return
-        text = text.encode("ascii", "replace").decode()  # all that cv2's letters have
-        size = max(0.35, 0.5 * self.scale)
-        (width, height), base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, self.edge)
-        head = joints[_HEAD]
-        x, y = head if head in there else min(there, key=lambda joint: joint[1])
-        rows, columns = self.canvas.shape[:2]
-        left = round(min(max(x - width / 2, 2), max(2, columns - width - 2)))
-        top = y - 10 * self.radius - base
-        bottom = round(min(max(top, height + 2), max(height + 2, rows - base - 2)))
-        for paint, stroke in ((_outline(color), 3 * self.edge), (color, self.edge)):
-            cv2.putText(
-                self.canvas, text, (left, bottom), cv2.FONT_HERSHEY_SIMPLEX, size, paint, stroke,
-                cv2.LINE_AA,
-            )  # fmt: skip
-
-
-def _fixed(point: list[float]) -> tuple[int, int]:
-    return round(point[0] * (1 << _SHIFT)), round(point[1] * (1 << _SHIFT))
-
-
 @lru_cache(maxsize=32)
 def _joint_colors(own: Color) -> list[Color]:
-    sides = {"left": _rgb(LEFT), "right": _rgb(RIGHT)}
+    sides = {"left": rgb(LEFT), "right": rgb(RIGHT)}
     return [sides.get(name.rsplit("_", 1)[-1], own) for name in UPPER_BODY]
-
-
-@lru_cache(maxsize=32)
-def _rgb(text: str) -> Color:
-    return int(text[1:3], 16), int(text[3:5], 16), int(text[5:7], 16)
-
-
-@lru_cache(maxsize=32)
-def _outline(color: Color) -> Color:
-    """Black around light colours, white around dark ones, so that both show on any picture."""
-    return _DARK if 0.3 * color[0] + 0.59 * color[1] + 0.11 * color[2] > 140 else _LIGHT
 
 
 def _check(
