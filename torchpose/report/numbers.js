@@ -7,6 +7,7 @@ const RADIUS_2D = 1.6449; // 90 % of a Gaussian in one dimension
 const RADIUS_3D = 2.5003; // and in three
 const ARRAYS = { float32: Float32Array, uint8: Uint8Array };
 const JOINTS = data.names.length;
+const OBSERVED_BYTES = Math.ceil(JOINTS / 8); // of a frame, one bit per joint
 const NECK = data.names.indexOf("neck");
 const AXES = data.frame === "camera"
   ? ["x, right", "y, down", "z, away"] : ["x, left", "y, down", "z, back"];
@@ -36,7 +37,8 @@ function unpackPerson(p) {
 }
 
 const isThere = (p, i) => !p.there || p.there[i] === 1;
-const isMeasured = (p, i, joint) => ((p.observed[i] >> joint) & 1) === 1;
+const isMeasured = (p, i, joint) =>
+  ((p.observed[i * OBSERVED_BYTES + (joint >> 3)] >> (joint & 7)) & 1) === 1;
 
 /** Numbers of a person at a frame of the video, evenly between kept poses; null where none is. */
 function at(p, values, width, frame) {

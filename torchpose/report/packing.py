@@ -2,7 +2,7 @@
 
 import base64
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -10,9 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.calibration import chi2_quantile
-from torchpose.pose_track import PoseTrack
 
-__all__ = ["CURVE_POINTS", "MAX_POSES", "Thinned", "pack_array", "pack_person"]
+__all__ = ["CURVE_POINTS", "MAX_POSES", "ReportedTrack", "Thinned", "pack_array", "pack_person"]
 
 CURVE_POINTS = 4000
 """Points of a curve in the page, at most."""
@@ -22,6 +21,28 @@ MAX_POSES = 10_000
 
 _LEVEL = 0.9
 _TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # what a symmetric matrix consists of
+
+
+@runtime_checkable
+class ReportedTrack(Protocol):
+    """What the page needs of one person: a `PoseTrack`, or a body with other joints.
+
+    Attributes:
+        joints3d: [1, T, J, 3], metres, in `frame`. covariance3d: [1, T, J, 3, 3].
+        observed: [1, T, J], True where the joint was measured.
+        failed_at: [1], the first frame without a pose, -1 if there is none.
+        names: of the joints. fps: frames per second, or None. frame: "camera" or "body".
+    """
+
+    joints3d: Tensor
+    covariance3d: Tensor
+    observed: Tensor
+    failed_at: Tensor
+    names: tuple[str, ...]
+    fps: float | None
+    frame: str
+
+    def __len__(self) -> int: ...
 
 
 class Thinned(NamedTuple):
@@ -43,10 +64,10 @@ def pack_array(array: np.ndarray) -> dict[str, Any]:
 
 
 def pack_person(
-    track: PoseTrack,
+    track: ReportedTrack,
     label: str,
     first_frame: int = 0,
-    truth: Float[Tensor, "T 8 3"] | None = None,
+    truth: Float[Tensor, "T J 3"] | None = None,
     max_poses: int = MAX_POSES,
 ) -> tuple[dict[str, Any], Thinned]:
     """Everything that the page holds of one person.
@@ -59,7 +80,7 @@ def pack_person(
     Args:
         track: one sequence of T frames. label: its name in the page.
         first_frame: frame of the video with which it begins.
-        truth: true joints [T, 8, 3], metres, in the axes of the track.
+        truth: true joints [T, J, 3], metres, in the axes of the track.
         max_poses: see above.
 
     Returns:
@@ -82,7 +103,7 @@ def pack_person(
         "bucket": thinned.bucket,
         "joints": pack_array(_float32(joints[:: thinned.stride])),
         "covariance": pack_array(_float32(covariance[:: thinned.stride][..., rows, columns])),
-        "observed": pack_array(np.packbits(observed, axis=1, bitorder="little")[:, 0]),
+        "observed": pack_array(np.packbits(observed, axis=1, bitorder="little").reshape(-1)),
         "there": None if there.all() else pack_array(there.astype(np.uint8)),
         "measured": _shares(observed, there),
         "truth": None,
@@ -103,7 +124,7 @@ def _shares(observed: np.ndarray, there: np.ndarray) -> list[float]:
 
 
 def _curves(joints: np.ndarray, covariance: np.ndarray, bucket: int) -> np.ndarray:
-    """Lowest and highest value, lower and upper end of the band, for each bucket [4, 8, 3, N]."""
+    """Lowest and highest value, lower and upper end of the band, for each bucket [4, J, 3, N]."""
     quantile = chi2_quantile(torch.tensor(_LEVEL, dtype=torch.float64), 1)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore"):  # NaN stays NaN, whatever its sign bit

@@ -17,8 +17,13 @@ from torch import Tensor
 from torchpose.errors import InputError, check_shape
 from torchpose.io.files import atomic_path, require_file
 from torchpose.joint_sets import UPPER_BODY
-from torchpose.pose_track import PoseTrack
-from torchpose.report.packing import CURVE_POINTS, MAX_POSES, Thinned, pack_person
+from torchpose.report.packing import (
+    CURVE_POINTS,
+    MAX_POSES,
+    ReportedTrack,
+    Thinned,
+    pack_person,
+)
 from torchpose.skeleton import LIMBS
 from torchpose.viz.style import readable
 
@@ -34,7 +39,7 @@ _CHUNK = 3 * 2**18  # of three bytes, so that the pieces of base64 join without 
 
 def write_report(
     path: str | Path,
-    people: Sequence[PoseTrack],
+    people: Sequence[ReportedTrack],
     *,
     overlay: str | Path | None = None,
     title: str = "Tracked poses",
@@ -44,6 +49,7 @@ def write_report(
     n_frames: int | None = None,
     labels: Sequence[str] | None = None,
     truth: Tensor | None = None,
+    limbs: Sequence[tuple[int, int]] = LIMBS,
 ) -> Path:
     """Write what was tracked as one HTML page that any browser shows, without a network.
 
@@ -54,8 +60,8 @@ def write_report(
 
     Args:
         path: the page; it appears whole or not at all.
-        people: one `PoseTrack` of one sequence for each person; an empty list gives a page that says
-            that nobody was tracked. NaN poses are drawn as nothing.
+        people: one `PoseTrack` of one sequence for each person, or the like with other joints; an
+            empty list gives a page that says that nobody was tracked. NaN poses are drawn as nothing.
         overlay: video for the page, H.264; up to 64 MB it is put into the page, a larger one is
             linked. Without it the page plays the skeleton alone.
         title: of the page. facts: rows of a table, such as video, camera, method.
@@ -63,7 +69,8 @@ def write_report(
         first_frames: frame of the video with which each track begins; by default 0.
         n_frames: frames of the video; by default up to the end of the last track.
         labels: name of each person; by default "person 1" and so on.
-        truth: true joints of the first person [T, 8, 3], metres, in the axes of its track.
+        truth: true joints of the first person [T, J, 3], metres, in the axes of its track.
+        limbs: pairs of joints that a line joins.
 
     Returns:
         `path`.
@@ -88,12 +95,13 @@ def write_report(
     video = None if overlay is None else _Overlay(require_file(overlay), path)
     more += _thinning_notes([thinned for _, thinned in packed], fps)
     more += _failures(people, names) + ([] if video is None else video.notes)
+    joints = people[0].names if people else UPPER_BODY
     data = {
         "fps": fps,
         "frames": n_frames,
-        "names": [readable(name) for name in UPPER_BODY],
-        "sides": [_side(name) for name in UPPER_BODY],
-        "limbs": LIMBS,
+        "names": [readable(name) for name in joints],
+        "sides": [_side(name) for name in joints],
+        "limbs": [list(pair) for pair in limbs],
         "frame": people[0].frame if people else "camera",
         "video": None if video is None else video.source,
         "people": [person for person, _ in packed],
@@ -159,7 +167,7 @@ def _template(name: str) -> str:
 
 
 def _summary(
-    people: Sequence[PoseTrack],
+    people: Sequence[ReportedTrack],
     packed: Sequence[tuple[dict[str, Any], Thinned]],
     n: int,
     fps: float,
@@ -170,7 +178,7 @@ def _summary(
     if len(people) > 1:
         return f"{length}, {len(people)} persons."
     shares = packed[0][0]["measured"]
-    hidden = [readable(name) for name, s in zip(UPPER_BODY, shares, strict=True) if s == 0]
+    hidden = [readable(name) for name, s in zip(people[0].names, shares, strict=True) if s == 0]
     if not hidden:
         return f"{length}."
     return f"{length}. Never measured, so inferred throughout: {', '.join(hidden)}."
@@ -211,7 +219,7 @@ def _ordinal(n: int) -> str:
     return f"{n}{ending}"
 
 
-def _failures(people: Sequence[PoseTrack], names: Sequence[str]) -> list[str]:
+def _failures(people: Sequence[ReportedTrack], names: Sequence[str]) -> list[str]:
     return [
         f"The filter of {name} degenerated at its frame {int(track.failed_at[0])}: there is no pose "
         "from there on."
@@ -220,7 +228,7 @@ def _failures(people: Sequence[PoseTrack], names: Sequence[str]) -> list[str]:
     ]
 
 
-def _frame_rate(people: Sequence[PoseTrack]) -> tuple[float, list[str]]:
+def _frame_rate(people: Sequence[ReportedTrack]) -> tuple[float, list[str]]:
     rates = {track.fps for track in people}
     if len(rates) > 1:
         raise InputError(
@@ -247,12 +255,14 @@ def _list(notes: Sequence[str]) -> str:
 
 
 def _side(name: str) -> str:
-    side = name.rsplit("_", 1)[-1]
-    return side if side in ("left", "right") else "middle"
+    return next((side for side in ("left", "right") if side in name.split("_")), "middle")
 
 
 def _check(
-    people: Sequence[PoseTrack], starts: Sequence[int], names: Sequence[str], truth: Tensor | None
+    people: Sequence[ReportedTrack],
+    starts: Sequence[int],
+    names: Sequence[str],
+    truth: Tensor | None,
 ) -> None:
     for i, track in enumerate(people):
         if len(track) != 1 or track.joints3d.shape[1] == 0:
@@ -270,6 +280,6 @@ def _check(
     if truth is not None:
         if not people:
             raise InputError("expected a tracked person to go with truth, got none")
-        check_shape("truth", truth, [people[0].joints3d.shape[1], len(UPPER_BODY), 3])
+        check_shape("truth", truth, [*people[0].joints3d.shape[1:3], 3])
         if not torch.is_floating_point(truth):
             raise InputError(f"truth must be floating point, got {truth.dtype}")

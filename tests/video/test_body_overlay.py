@@ -1,0 +1,49 @@
+import numpy as np
+import pytest
+import torch
+
+from torchpose.body.skeleton import BODY_15
+from torchpose.errors import InputError, ShapeError
+from torchpose.video.body_overlay import draw_body
+
+
+def joints():
+    """A body that stands in the middle of 160 x 120 pixels."""
+    x = {"left": 100.0, "right": 60.0}
+    y = {"shoulder": 40, "elbow": 55, "wrist": 70, "hip": 70, "knee": 90, "ankle": 110}
+    middle = {"pelvis": (80, 70), "neck": (80, 35), "head": (80, 20)}
+    points = [
+        middle[n] if n in middle else (x[n.split("_")[0]], y[n.split("_")[1]])
+        for n in BODY_15.names
+    ]
+    return torch.tensor(points, dtype=torch.float64)
+
+
+def test_sides_have_their_colours_and_the_frame_stays():
+    frame = np.full((120, 160, 3), 90, np.uint8)
+    drawn = draw_body(frame, joints(), label="one")
+    assert (frame == 90).all()
+    left, right = drawn[100, 100].astype(int), drawn[100, 60].astype(int)
+    assert left[2] > left[0] + 80  # blue
+    assert right[0] > right[2] + 80  # orange
+
+
+def test_silhouettes_of_another_scale_cover_their_place():
+    frame = np.full((120, 160, 3), 90, np.uint8)
+    mask = torch.zeros(60, 80, dtype=torch.bool)
+    mask[40:50, 50:60] = True  # pixels 80..100, 100..120 of the frame
+    nobody = torch.full((15, 2), torch.nan, dtype=torch.float64)
+    tinted = draw_body(frame, nobody, model=mask)
+    changed = (tinted != frame).any(-1)
+    assert changed[80:100, 100:120].all()
+    assert changed.sum() == 400
+    outlined = (draw_body(frame, nobody, silhouette=mask) != frame).any(-1)
+    assert outlined[80, 110]
+    assert not outlined[90, 110]
+
+
+def test_bad_input_is_refused():
+    with pytest.raises(InputError):
+        draw_body(np.zeros((4, 4), np.uint8), joints())
+    with pytest.raises(ShapeError, match="joints2d"):
+        draw_body(np.zeros((4, 4, 3), np.uint8), joints()[:3])
