@@ -85,6 +85,18 @@ def test_a_person_is_found_and_their_shadow_is_not(from_empty):
     assert not measurer(background).any()
 
 
+def test_what_was_moved_since_the_scene_was_empty_is_no_person():
+    empty = scene()
+    moved = empty.copy()
+    cv2.rectangle(moved, (20, 150), (90, 220), (20, 60, 220), -1)
+    view = fit_view(PinholeCamera(300, 300, 159.5, 119.5, 320, 240), (320, 240), 240, 320)
+    frames = [with_person(moved, x)[0] for x in range(60, 300, 6)]
+    frame, truth = with_person(moved, 75)
+    assert overlap(SilhouetteMeasurer(view, empty=[empty])(frame), truth) < 0.75
+    measurer = SilhouetteMeasurer(view, empty=[empty], frames=frames)
+    assert overlap(measurer(frame), truth) > 0.93
+
+
 def test_distortion_is_undone():
     camera = PinholeCamera(300, 300, 159.5, 119.5, 320, 240, distortions=(-0.3, 0.1, 0.001, -0.002))
     straight, truth = with_person(scene(), 60)
@@ -153,7 +165,7 @@ def test_cameras_are_read_together():
 def test_bad_input_is_refused():
     background = scene()
     view = fit_view(PinholeCamera(300, 300, 159.5, 119.5, 320, 240, "left"), (320, 240), 120, 160)
-    with pytest.raises(InputError, match="either"):
+    with pytest.raises(InputError, match="empty scene"):
         SilhouetteMeasurer(view)
     measurer = SilhouetteMeasurer(view, empty=[background])
     with pytest.raises(InputError, match="'left' must have 320 x 240"):

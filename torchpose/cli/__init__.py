@@ -15,6 +15,7 @@ __all__ = ["main"]
 
 COMMANDS = {
     "track": "2D keypoints to 2D and 3D poses",
+    "track-body": "videos of calibrated cameras to the poses of a whole body",
     "fit": "fit a prior to recorded 3D poses",
     "evaluate": "run an evaluation protocol: ub-people, ub-one, signer",
     "demo": "track an animated performer; needs no data",
@@ -81,11 +82,11 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     if first not in COMMANDS:
         raise ArgumentError(None, f"unknown command {first!r}; known are {', '.join(COMMANDS)}")
-    return import_module(f"torchpose.cli.{first}").main(arguments[1:])
+    return import_module(f"torchpose.cli.{first.replace('-', '_')}").main(arguments[1:])
 
 
 def _help() -> str:
-    commands = "\n".join(f"  {name:<10} {text}" for name, text in COMMANDS.items())
+    commands = "\n".join(f"  {name:<11} {text}" for name, text in COMMANDS.items())
     return (
         "usage: torchpose COMMAND ...\n\n"
         "Bayesian human-pose tracking: from 2D keypoints, gaps and all, to 3D poses.\n\n"

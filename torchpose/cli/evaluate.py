@@ -34,9 +34,15 @@ PROTOCOLS = {
         "uncommon_poses",
         "training recordings of raised arms left out (kinect_utd_mhad)",
     ),
+    "silhouette": (
+        "silhouette",
+        "whole bodies tracked from silhouettes of several cameras by three particle filters",
+    ),
 }
 _SEVERAL = ("leave-one-person-out",)
 """Protocols on recordings from any folders; the others know theirs by name."""
+_MOCAP = ("silhouette",)
+"""Protocols on any one folder of motion capture."""
 _COMMON = ("data", "out", "seed", "progress")
 _PLAIN = (int, float, bool, str, type(None))
 
@@ -60,15 +66,15 @@ def build(name: str | None) -> ArgumentParser:
         f"evaluate {name or 'PROTOCOL'}",
         "Run an evaluation protocol on recordings, print its tables, and write them with pictures "
         f"into a folder. Protocols are {known}.",
-        "\n".join(
-            f"torchpose evaluate {p} {'mine/ more/' if p in _SEVERAL else '--data data/'} --out result"
-            for p in PROTOCOLS
-        ),
+        "\n".join(f"torchpose evaluate {p} {_example(p)} --out result" for p in PROTOCOLS),
     )
     add = parser.add_argument
     if name in _SEVERAL:
         add("recordings", nargs="*", type=str, metavar="DIR", help="folders or files of recordings")
         add("--data", type=str, metavar="DIR", help="one folder, instead of or beside these")
+    elif name in _MOCAP:
+        text = "folder or file of recordings of whole bodies, such as .npz of 3D joints"
+        add("--data", "--mocap", type=str, required=True, metavar="DIR", help=text)
     else:
         add("--data", type=str, required=True, metavar="DIR", help="folder with the recordings")
     add("--out", type=str, required=True, metavar="DIR", help="folder of the results")
@@ -83,7 +89,9 @@ def run(name: str, args: Namespace) -> int:
     from torchpose.io import check_output_folder
 
     data: Any = _folders(args) if name in _SEVERAL else Path(args.data)
-    if isinstance(data, Path) and not data.is_dir():
+    if name in _MOCAP and not data.exists():
+        raise InputError(f"--mocap {data}: no such folder or file of motion capture")
+    if isinstance(data, Path) and name not in _MOCAP and not data.is_dir():
         raise InputError(f"--data {data}: no such folder; expected the one with the recordings")
     function = _runner(name)
     own = {key: getattr(args, key) for key in _own_options(function)}
@@ -103,6 +111,12 @@ def _folders(args: Namespace) -> list[Path]:
     if not given:
         raise InputError("expected folders or files of recordings, got none; see --help")
     return [Path(path) for path in given]
+
+
+def _example(name: str) -> str:
+    if name in _SEVERAL:
+        return "mine/ more/"
+    return "--mocap data/mocap_cmu_walk/" if name in _MOCAP else "--data data/"
 
 
 def _protocol_name(arguments: list[str]) -> str | None:
@@ -126,7 +140,14 @@ def _add_own_options(parser: ArgumentParser, function: Callable[..., Any]) -> No
     own, parameters = _own_options(function), inspect.signature(function).parameters
     texts = _documented(function)
     hints = typing.get_type_hints(function)
+    spaced = getattr(import_module(function.__module__), "SPACED", ())
     for key in own:
+        if key in spaced:  # words with blanks between them, for those who type
+            parser.add_argument(
+                f"--{key.replace('_', '-')}", type=str, nargs="+", metavar=key.upper(),
+                default=list(parameters[key].default), help=texts.get(key),
+            )  # fmt: skip
+            continue
         numbers = {int, float} & {hints[key], *typing.get_args(hints[key])}
         kind = "true|false" if hints[key] is bool else "N" if numbers else key.upper()
         parser.add_argument(

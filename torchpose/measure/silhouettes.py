@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -26,6 +26,7 @@ Image = NDArray[np.uint8]
 _BLOCK = 16  # pixels: codecs store multiples of it, and some calibrations are of what is stored
 _PART = 0.03  # of the largest piece: a smaller one is not a part of the person that was cut off
 _HOLE = 0.02  # of the silhouette: a larger hole is what one sees between arm and body
+_STILL, _SAME = 0.9, 18  # share of the frames, and grey levels, for what always looks the same
 _LEARNING_FRAMES = 120  # of a video without an empty scene, spread over all of it
 
 
@@ -134,11 +135,12 @@ class SilhouetteMeasurer:
         view: from `fit_view`.
         empty: RGB frames of the empty scene [N, H, W, 3], uint8, with or without the padding; then
             the background is a `BrightnessBackground`, which knows shadows. None takes `frames`.
-        frames: RGB frames spread over the video itself, from which OpenCV's MOG2 learns what stays;
-            whoever does not move in all of them becomes background.
+        frames: RGB frames spread over the video itself. With `empty`, what looks the same in nine of
+            ten of them is something that was moved since the scene was empty, and no person; without
+            `empty`, OpenCV's MOG2 learns what stays, and whoever does not move becomes background.
 
     Raises:
-        InputError: neither or both. ShapeError, InputError: frames of another size or kind.
+        InputError: neither. ShapeError, InputError: frames of another size or kind.
     """
 
     def __init__(
@@ -147,16 +149,19 @@ class SilhouetteMeasurer:
         empty: Sequence[Image] | None = None,
         frames: Sequence[Image] | None = None,
     ) -> None:
-        if bool(empty is not None and len(empty)) == bool(frames is not None and len(frames)):
-            raise InputError("give either frames of the empty scene or frames of the video itself")
+        empty, frames = list(empty or ()), list(frames or ())
+        if not empty and not frames:
+            raise InputError("give frames of the empty scene, or frames of the video itself")
         self.view = view
         self._maps = _undistortion(view)
         self._background: BrightnessBackground | None = None
-        if empty is not None and len(empty):
-            stack = torch.stack([self._tensor(self._prepare(frame)) for frame in empty])
-            self._background = BrightnessBackground().fit(stack)
+        self._moved: _Moved | None = None
+        if empty:
+            self._background = BrightnessBackground().fit(self._stack(empty))
+            if frames:
+                self._moved = _find_moved(self._stack(frames))
         else:
-            self._mixture = self._learn(frames or ())
+            self._mixture = self._learn(frames)
 
     def __call__(self, frame: Image) -> NDArray[np.bool_]:
         """The silhouette in a frame: bool, of the size of the view's camera [height, width].
@@ -172,8 +177,11 @@ class SilhouetteMeasurer:
 
     def _foreground(self, small: Image) -> NDArray[np.bool_]:
         if self._background is not None:
-            kinds = self._background(self._tensor(small))
-            return (kinds == PixelKind.FOREGROUND).numpy()
+            image = self._tensor(small)
+            found = self._background(image) == PixelKind.FOREGROUND
+            if self._moved is not None:
+                found &= ~(self._moved.still & _alike(image, self._moved.colour))
+            return found.numpy()
         return np.asarray(self._mixture.apply(small, None, 0.0) == 255)
 
     def _learn(self, frames: Sequence[Image]):  # type: ignore[no-untyped-def]  # cv2 has no types
@@ -201,9 +209,28 @@ class SilhouetteMeasurer:
             frame = cv2.remap(frame, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(cv2.resize(frame, self.view.inner, interpolation=cv2.INTER_AREA))
 
+    def _stack(self, frames: Sequence[Image]) -> UInt8[Tensor, "N 3 H W"]:
+        return torch.stack([self._tensor(self._prepare(frame)) for frame in frames])
+
     @staticmethod
     def _tensor(image: Image) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)
+
+
+class _Moved(NamedTuple):
+    """What a video shows nearly all the time: its colour [3, H, W], and where [H, W]."""
+
+    colour: Tensor
+    still: Tensor
+
+
+def _find_moved(frames: UInt8[Tensor, "N 3 H W"]) -> _Moved:
+    colour = frames.median(0).values
+    return _Moved(colour, _alike(frames, colour).double().mean(0) >= _STILL)
+
+
+def _alike(images: Tensor, colour: Tensor) -> Tensor:
+    return (images.int() - colour.int()).abs().amax(-3) <= _SAME
 
 
 def _undistortion(view: SilhouetteView) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:

@@ -1,0 +1,73 @@
+"""Track a whole body through silhouettes that come frame by frame."""
+
+from collections.abc import Iterable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from torchpose.body.kinematics import Body
+from torchpose.body_poses import BodyPoses
+from torchpose.camera_rig import Cameras
+from torchpose.errors import InputError
+from torchpose.filters.base import Generators
+from torchpose.filters.silhouette_filter import BodyFilterState, SilhouetteParticleFilter
+
+__all__ = ["joint_covariance", "track_body"]
+
+
+@torch.no_grad()
+def track_body(
+    model: SilhouetteParticleFilter,
+    frames: Iterable[Bool[Tensor, "C H W"]],
+    cameras: Cameras,
+    initial_state: Float[Tensor, " D"],
+    generator: Generators = None,
+    *,
+    initial_std: Float[Tensor, " D"] | None = None,
+    fps: float | None = None,
+    n_frames: int | None = None,
+    progress: bool = False,
+) -> BodyPoses:
+    """Track one person; memory holds the poses and a single frame.
+
+    Args:
+        model: a filter over silhouettes, whose body is a `torchpose.body.Body`.
+        frames: silhouettes of the C cameras, frame after frame. cameras: theirs.
+        initial_state: the pose before the first frame [D], recorded or from `find_pose`.
+        generator: for what is drawn. initial_std: spread of the first particles [D]; none if None.
+        fps: of the frames, for the result. n_frames: how many to expect, for the progress bar.
+        progress: whether to show it.
+
+    Returns:
+        `BodyPoses` of as many frames as came.
+
+    Raises:
+        InputError: no frame, or a filter without a body. CameraError, ShapeError: as the filter.
+    """
+    if not isinstance(model.body, Body):
+        raise InputError(f"the filter must track a Body, got {type(model.body).__name__}")
+    state, steps, covs = model.init(initial_state[None], generator, initial_std), [], []
+    for silhouettes in tqdm(frames, total=n_frames, disable=not progress, unit="frame"):
+        state, out = model.step(state, silhouettes[None], cameras, generator)
+        steps.append(out)
+        covs.append(joint_covariance(model.body, state, out.mean)[0])
+    if not steps:
+        raise InputError("there must be at least one frame of silhouettes, got none")
+    mean, evidence, std, size, coasting, respread = (
+        torch.cat(part) for part in zip(*steps, strict=True)
+    )
+    return BodyPoses(
+        model.body, mean, std, model.body.joints(mean), torch.stack(covs), evidence, size,
+        coasting, respread, fps,
+    )  # fmt: skip
+
+
+def joint_covariance(
+    body: Body, state: BodyFilterState, mean: Float[Tensor, "B D"]
+) -> Float[Tensor, "B J 3 3"]:
+    """Second moment of the particles' joints about those of an estimate, metres squared."""
+    away = body.joints(state.particles) - body.joints(mean)[:, None]
+    weights = state.log_weights.exp().to(away)
+    return torch.einsum("bn,bnji,bnjk->bjik", weights, away, away)

@@ -1,0 +1,179 @@
+"""What `torchpose track-body` writes and prints."""
+
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jsonargparse import Namespace
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from torchpose.body_poses import BodyPoses
+    from torchpose.camera import PinholeCamera
+    from torchpose.cli.track_body_videos import Recordings
+    from torchpose.measure.silhouettes import SilhouetteView
+
+__all__ = ["draw", "facts_of", "project_joints", "summary", "write_csv", "write_page"]
+
+
+def write_csv(path: Path, poses: "BodyPoses") -> None:
+    """One row per frame: x, y, z of every joint in metres, and its standard deviation."""
+    from torchpose.io.files import atomic_path
+
+    columns = [f"{n}_{axis}" for n in poses.names for axis in ("x", "y", "z", "std")]
+    spread = poses.covariance3d.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True).div(3).sqrt()
+    rows = poses.joints3d.new_zeros(len(poses), len(poses.names), 4)
+    rows[..., :3], rows[..., 3:] = poses.joints3d, spread
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as stream:
+        stream.write(",".join(["frame", *columns, "coasting"]) + "\n")
+        for t, (row, coasting) in enumerate(zip(rows.flatten(1).tolist(), poses.coasting.tolist(),
+                                                strict=True)):  # fmt: skip
+            cells = [str(t + poses.first_frame), *(f"{v:.4f}" for v in row), str(int(coasting))]
+            stream.write(",".join(cells) + "\n")
+
+
+def draw(
+    recordings: "Recordings", poses: "BodyPoses", out: Path, videos: bool, picture: bool
+) -> list[Path]:
+    """The body drawn into the frames of every camera: videos, and some frames as one picture."""
+    from contextlib import ExitStack
+
+    from torchpose.video import VideoWriter
+
+    names = recordings.rig.names
+    files = [out / f"overlay_{name}.mp4" for name in names] if videos else []
+    chosen = {round(i * (len(poses) - 1) / 5) + poses.first_frame for i in range(6)}
+    strip: list[list[Any]] = []
+    with ExitStack() as stack:
+        writers = [
+            stack.enter_context(VideoWriter(file, recordings.fps, view.size))
+            for file, view in zip(files, recordings.views, strict=False)
+        ]
+        for t, images in enumerate(recordings.images()):
+            if t < poses.first_frame or t - poses.first_frame >= len(poses):
+                continue
+            if not videos and t not in chosen:
+                continue
+            drawn = _drawn(recordings, poses, t, images)
+            for writer, image in zip(writers, drawn, strict=False):
+                writer.write(image)
+            if t in chosen:
+                strip.append(drawn)
+    if picture and strip:
+        files.append(_write_strip(out / "overlay.png", strip))
+    return files
+
+
+def _drawn(
+    recordings: "Recordings", poses: "BodyPoses", t: int, images: Iterable[Any]
+) -> list[Any]:
+    from torchpose.body.silhouette import render
+    from torchpose.video.body_overlay import draw_body
+
+    k, rig = t - poses.first_frame, recordings.rig
+    height, width = rig.sizes[0]  # type: ignore[misc]  # views have sizes
+    model = render(poses.body, poses.state[k], rig, height, width)
+    measured = recordings.kept(t)
+    drawn = []
+    for c, (view, image) in enumerate(zip(recordings.views, images, strict=True)):
+        part = _inside(view)
+        drawn.append(
+            draw_body(image, project_joints(poses.joints3d[k], view.source), poses.body.skeleton,
+                      model=model[c][part], silhouette=measured[c][part])
+        )  # fmt: skip
+    return drawn
+
+
+def _inside(view: "SilhouetteView") -> tuple[slice, slice]:
+    """The part of a silhouette that the frame of the video shows."""
+    (w, h), (right, below), (inner_w, inner_h) = view.size, view.padding, view.inner
+    return slice(0, round(inner_h * h / (h + below))), slice(0, round(inner_w * w / (w + right)))
+
+
+def project_joints(joints: "Tensor", camera: "PinholeCamera") -> "Tensor":
+    """Pixels [J, 2] of world points [J, 3] in the images of a camera, its distortions applied."""
+    import cv2
+    import numpy as np
+    import torch
+
+    model = cv2.fisheye if camera.fisheye else cv2
+    distortions = camera.distortions.numpy()
+    pixels, _ = model.projectPoints(
+        np.ascontiguousarray(joints.detach().cpu().double().numpy())[:, None],
+        camera.rotation.numpy(), camera.translation.numpy(), camera.matrix.numpy(),
+        distortions if len(distortions) else np.zeros(4),
+    )  # fmt: skip
+    return torch.from_numpy(np.asarray(pixels).reshape(-1, 2))
+
+
+def _write_strip(path: Path, strip: list[list[Any]]) -> Path:
+    """Columns are frames, rows are cameras."""
+    import cv2
+    import numpy as np
+
+    from torchpose.io.files import atomic_path
+
+    height = 320
+
+    def small(image: Any) -> Any:
+        width = max(1, round(image.shape[1] * height / image.shape[0]))
+        return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+    rows = [np.hstack([small(frame[c]) for frame in strip]) for c in range(len(strip[0]))]
+    widest = max(row.shape[1] for row in rows)
+    rows = [np.pad(row, ((0, 4), (0, widest - row.shape[1]), (0, 0))) for row in rows]
+    with atomic_path(path) as temporary:
+        coded = cv2.imencode(".png", cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))[1]
+        temporary.write_bytes(coded.tobytes())
+    return path
+
+
+def facts_of(
+    args: Namespace, recordings: "Recordings", poses: "BodyPoses", seconds: float
+) -> dict[str, str]:
+    height, width = recordings.rig.sizes[0]  # type: ignore[misc]  # views have sizes
+    return {
+        "videos": f"{len(args.videos)} cameras, {recordings.fps:g} fps",
+        "silhouettes": f"{width} x {height} pixels, "
+        + ("against the empty scene" if args.background else "against what stays"),
+        "method": f"{args.method}, {args.n_particles} particles, sharpness {args.sharpness:g}",
+        "body": args.body or f"average proportions, {args.height:g} m",
+        "speed": f"{len(poses) / max(seconds, 1e-9):.1f} frames a second, without drawing",
+    }
+
+
+def write_page(
+    recordings: "Recordings", poses: "BodyPoses", facts: dict[str, str], out: Path
+) -> list[Path]:
+    from torchpose.report import write_report
+
+    camera = recordings.views[0].source
+    overlay = out / f"overlay_{recordings.rig.names[0]}.mp4"
+    bones = [(p, j) for j, p in enumerate(poses.body.skeleton.parents) if p >= 0]
+    page = write_report(
+        out / "report.html", [poses.seen_by(camera)], overlay=overlay if overlay.exists() else None,
+        title="Tracked body", facts=facts, notes=poses.notes,
+        n_frames=len(poses), limbs=bones,
+    )  # fmt: skip
+    return [page]
+
+
+def summary(poses: "BodyPoses", facts: dict[str, str], written: Sequence[Path]) -> int:
+    """Say what was found; 1 if the filter lost the person in more than half of the frames."""
+    for name, fact in facts.items():
+        print(f"{name:<12} {fact}")
+    print(f"{'frames':<12} {len(poses)} from frame {poses.first_frame}")
+    coasting, respread = int(poses.coasting.sum()), int(poses.respread.sum())
+    if coasting:
+        print(f"{'unseen':<12} {coasting} frames, in which the pose only diffused")
+    if respread:
+        print(f"{'lost':<12} {respread} frames, in which particles were spread anew")
+    for note in poses.notes:
+        print(f"{'note':<12} {note}")
+    print(f"{'written':<12} " + ", ".join(map(str, written)))
+    if 2 * (coasting + respread) <= len(poses):
+        return 0
+    print("torchpose: the person was lost in more than half of the frames", file=sys.stderr)
+    return 1

@@ -1,0 +1,132 @@
+"""The videos of a `torchpose track-body`: opened, turned to silhouettes, read once more to be drawn."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jsonargparse import Namespace
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from torchpose.camera import PinholeCamera
+    from torchpose.camera_rig import CameraRig
+    from torchpose.measure.silhouettes import SilhouetteMeasurer, SilhouetteView
+    from torchpose.video import VideoSource
+
+__all__ = ["Recordings"]
+
+
+class Recordings:
+    """The videos, how each becomes silhouettes, and the silhouettes that were seen so far."""
+
+    def __init__(self, args: Namespace, cameras: "Sequence[PinholeCamera]") -> None:
+        self._args = args
+        self.sources = self._open()
+        self.views = _views(cameras, [s.size for s in self.sources], args.rows)
+        self.packed: list[Any] = []
+        self.notes: list[str] = []
+
+    def __enter__(self) -> "Recordings":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for source in self.sources:
+            source.close()
+
+    @property
+    def rig(self) -> "CameraRig":
+        """The cameras of the silhouettes."""
+        from torchpose.camera_rig import CameraRig
+
+        return CameraRig([view.camera for view in self.views])
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return float(self.sources[0].fps)
+
+    @property
+    def n_frames(self) -> int | None:
+        """How many frames to expect."""
+        counts = [s.n_frames for s in self.sources if s.n_frames is not None]
+        return min(counts, default=None)
+
+    def silhouettes(self) -> "Iterator[Tensor]":
+        """Silhouettes [C, H, W] of one frame after the other, which are kept, a bit per pixel."""
+        import numpy as np
+
+        from torchpose.measure.silhouettes import read_silhouettes
+
+        measurers = self._measurers()
+        for masks in read_silhouettes(self.sources, measurers, self._args.delays):
+            self.packed.append(np.packbits(masks.numpy(), axis=-1))
+            yield masks
+
+    def kept(self, frame: int) -> "Tensor":
+        """The silhouettes of a frame that was read."""
+        import numpy as np
+        import torch
+
+        width = self.rig.sizes[0][1]  # type: ignore[index]  # views have sizes
+        bits = np.unpackbits(self.packed[frame], axis=-1)[..., :width]
+        return torch.from_numpy(bits.astype(bool))
+
+    def images(self) -> Iterator[tuple[Any, ...]]:
+        """The frames of all cameras once more."""
+        sources = self._open()
+        try:
+            for source, delay in zip(sources, self._args.delays or [0] * len(sources), strict=True):
+                for _ in range(delay):
+                    next(source, None)
+            for frames in zip(*sources, strict=False):
+                yield tuple(frame.image for frame in frames)
+        finally:
+            for source in sources:
+                source.close()
+
+    def _open(self) -> "list[VideoSource]":
+        from torchpose.video import open_video
+
+        return [open_video(path, fps=self._args.fps) for path in self._args.videos]
+
+    def _measurers(self) -> "list[SilhouetteMeasurer]":
+        from torchpose.measure.silhouettes import SilhouetteMeasurer, learning_frames
+
+        print("learning the background ...", flush=True)
+        empty = [_empty_scene(path) for path in self._args.background or []]
+        if not empty:
+            self.notes.append(
+                "without --background what stays in the videos is taken for their background; a part "
+                "of the person that never moves is taken for it, too"
+            )
+        measurers = []
+        for i, (view, video) in enumerate(zip(self.views, self._open(), strict=True)):
+            with video as source:
+                wanted = not empty or self._args.ignore_still
+                frames = learning_frames(source) if wanted else None
+            measurers.append(SilhouetteMeasurer(view, empty[i] if empty else None, frames))
+        return measurers
+
+
+def _views(
+    cameras: "Sequence[PinholeCamera]", sizes: Sequence[tuple[int, int]], rows: int
+) -> "list[SilhouetteView]":
+    from torchpose.measure.silhouettes import fit_view
+
+    shapes = [c.image_size or size for c, size in zip(cameras, sizes, strict=True)]
+    width = max(round(w * rows / h) for w, h in shapes)
+    return [fit_view(c, size, rows, width) for c, size in zip(cameras, sizes, strict=True)]
+
+
+def _empty_scene(path: str) -> list[Any]:
+    """Frames of a picture, a folder of pictures or a video."""
+    import cv2
+
+    from torchpose.measure.silhouettes import learning_frames
+    from torchpose.video import open_video
+
+    if Path(path).is_file() and (image := cv2.imread(path, cv2.IMREAD_COLOR)) is not None:
+        return [cv2.cvtColor(image, cv2.COLOR_BGR2RGB)]
+    with open_video(path) as source:
+        return learning_frames(source)
