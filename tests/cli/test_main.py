@@ -75,7 +75,7 @@ def console_lines() -> list[str]:
         text = page.read_text(encoding="utf-8").replace("\\\n", " ")
         found += re.findall(r"^\$ (torchpose .*)$", text, re.MULTILINE)
     for path in sorted((ROOT / "torchpose" / "cli").glob("*.py")):
-        found += re.findall(r"^ *(torchpose [a-z]+ .*?)\"*$", path.read_text(), re.MULTILINE)
+        found += re.findall(r"^ *(torchpose [a-z-]+ .*?)\"*$", path.read_text(), re.MULTILINE)
     return sorted({re.split(r" +[#>] ?", line)[0].strip() for line in found})
 
 
@@ -84,7 +84,8 @@ def test_written_command_lines_parse(line, monkeypatch, tmp_path):
     """The parser of each takes it; the work is not done."""
     parsed = []
     for name in COMMANDS:
-        monkeypatch.setattr(f"torchpose.cli.{name}.run", lambda *args: parsed.append(args) or 0)
+        module = f"torchpose.cli.{name.replace('-', '_')}"
+        monkeypatch.setattr(f"{module}.run", lambda *args: parsed.append(args) or 0)
     words = shlex.split(line)[1:]
     if "--config" in words:  # the file has to be there
         config = tmp_path / "config.yaml"

@@ -33,8 +33,7 @@ _EXAMPLES = """
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 cam3.mp4 --out result
 torchpose track-body cameras.toml cam*.mp4 --background empty*.png --height 1.82 --out result
 torchpose track-body cameras.toml cam*.mp4 --manifold walk.safetensors --out result
-torchpose track-body cameras.toml cam*.mp4 --initial-pose result/body.npz --body result/body.npz \\
-    --out again"""
+torchpose track-body cameras.toml cam*.mp4 --body result/body.npz --facing [1,0,0] --out again"""
 METHODS = ("mrpf", "apf", "sir")
 _LAYERS = 5  # of the annealed filter, each with its share of the particles
 _RATE = 60.0  # frames per second for which the default noise of the filters is
