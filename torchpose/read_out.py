@@ -8,20 +8,26 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchpose.arms import require_cov
 from torchpose.body_view import BodyView, from_view, view_jacobian
 from torchpose.filters.base import FilterOutput
 from torchpose.filters.constant_velocity import ConstantVelocityFilter, ConstantVelocityState
+from torchpose.joint_sets import UPPER_BODY
 from torchpose.lifting import arm_in_body_frame, join_arms, pixel_covariances
 from torchpose.priors.arm_state import STATE_DIM
-from torchpose.projection import lift
+from torchpose.projection import lift, project
 from torchpose.rotations import RotationOrder, euler_to_matrix, matrix_to_euler
 from torchpose.torso import onto_torso
 
-__all__ = ["MotionStage", "MotionState", "ReadOut", "read_out", "recalibrated"]
+__all__ = ["MotionStage", "MotionState", "ReadOut", "on_their_rays", "read_out", "recalibrated"]
+
+_LIMB_ENDS = tuple(
+    UPPER_BODY.index(f"{j}_{s}") for j in ("hand", "elbow") for s in ("left", "right")
+)
+_NEAREST = 0.1  # metres before the camera, from where a projection means something
 
 
 class ReadOut(NamedTuple):
@@ -97,6 +103,33 @@ def _on_torso(
         blocks = blocks.unflatten(-3, (5, 3))
         covs.append(blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3))
     return onto_torso(join_arms(*pose), join_arms(*covs), join_arms(*lifted))
+
+
+def on_their_rays(
+    reading: ReadOut,
+    matrix: Float[Tensor, "3 3"],
+    order: RotationOrder,
+    observed: Bool[Tensor, "B T 8"],
+) -> ReadOut:
+    """Hands and elbows that were measured on their rays, and all others' pixels where they project to.
+
+    Pixels and the joints in space are two readings of one mixture, linear each, and differ where a
+    camera is unlike those of the prior: on webcams that look up at somebody near, by 40 pixels for a
+    hand. A measured joint keeps its depth and goes to where it was seen; a joint that was inferred is
+    seen where it is in space. Head, neck and shoulders stay, since the body hangs on them.
+
+    Args:
+        reading: of windows. matrix: K of its pixels. order: of its angles. observed: what was measured.
+    """
+    rotation = euler_to_matrix(reading.angles, order)
+    seen = project(reading.joints, matrix, rotation, reading.place)
+    before = seen[..., 2:] > _NEAREST
+    uv = torch.where(observed[..., None] | ~before, reading.uv, seen[..., :2])
+    moved = lift(torch.cat([uv, seen[..., 2:]], -1), matrix, rotation, reading.place)
+    limb = torch.zeros(uv.shape[-2], 1, dtype=torch.bool, device=uv.device)
+    limb[list(_LIMB_ENDS)] = True
+    joints = torch.where(limb & observed[..., None] & before, moved, reading.joints)
+    return reading._replace(joints=joints, uv=uv)
 
 
 def recalibrated(

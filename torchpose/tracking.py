@@ -39,7 +39,7 @@ from torchpose.pose_track import PoseTrack
 from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.priors.window import WindowLayout
 from torchpose.projection import map_pixel_covariance, map_pixels
-from torchpose.read_out import MotionStage, ReadOut, read_out, recalibrated
+from torchpose.read_out import MotionStage, ReadOut, on_their_rays, read_out, recalibrated
 from torchpose.rotations import RotationOrder, euler_to_matrix
 from torchpose.streaming import LivePose, StreamState
 
@@ -382,6 +382,8 @@ class UpperBodyTracker(nn.Module):
         """The result in the frame and the pixels that were asked for."""
         info = self.prior.info
         order: RotationOrder = info.rotation_order  # type: ignore[assignment]
+        if self._window() is not None:
+            reading = on_their_rays(reading, info.matrix.to(reading.uv), order, observed)
         joints3d, covs3d = reading.joints, self._calibrated(reading.covs)
         if self.frame == "camera":
             rotation = euler_to_matrix(reading.angles, order)[..., None, :, :]
