@@ -1,0 +1,167 @@
+"""Rotations as vector parts of unit quaternions: v = sin(angle / 2) axis, w = sqrt(1 - |v|^2) >= 0.
+
+Every rotation is one such vector in the unit ball, except those by pi, which are two (v and -v). A
+vector longer than 1 is scaled back to the unit sphere. Quaternions [..., 4] are (x, y, z, w); the
+product of two rotations turns by the right one first. Gradients are finite everywhere.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.errors import check_shape
+
+__all__ = [
+    "compose",
+    "conjugate",
+    "matrix_to_quaternion_vector",
+    "mean_rotation",
+    "minimal_rotation",
+    "quaternion_to_vector",
+    "quaternion_vector_to_matrix",
+    "vector_to_quaternion",
+    "within_unit_ball",
+]
+
+
+def within_unit_ball(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Scale vectors longer than 1 back to the unit sphere; others stay as they are."""
+    return vector * vector.square().sum(-1, keepdim=True).clamp_min(1).rsqrt()
+
+
+def vector_to_quaternion(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
+    """The unit quaternion (x, y, z, w), w >= 0, of a quaternion vector.
+
+    w = sqrt(1 - |v|^2), whose slope is infinite at |v| = 1: within the rounding of the dtype w is 0
+    there and has no slope.
+    """
+    vector = within_unit_ball(vector)
+    squared = 1 - vector.square().sum(-1, keepdim=True)
+    on_sphere = squared <= 2 * torch.finfo(vector.dtype).eps
+    w = torch.where(on_sphere, torch.ones_like(squared), squared).sqrt()
+    return torch.cat([vector, torch.where(on_sphere, torch.zeros_like(w), w)], -1)
+
+
+def quaternion_to_vector(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
+    """The vector part of q or of -q, whichever has w >= 0; q and -q are the same rotation."""
+    vector, w = quaternion[..., :3], quaternion[..., 3:]
+    return torch.where(w < 0, -vector, vector)
+
+
+def quaternion_vector_to_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrix R = I + 2 w [v]x + 2 [v]x^2 of a quaternion vector.
+
+    >>> quaternion_vector_to_matrix(torch.tensor([0.0, 1.0, 0.0])).diagonal()  # by pi about y
+    tensor([-1.,  1., -1.])
+    """
+    check_shape("vector", vector, ["...", 3])
+    x, y, z, w = vector_to_quaternion(vector).unbind(-1)
+    xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
+    xy, xz, yz = 2 * x * y, 2 * x * z, 2 * y * z
+    wx, wy, wz = 2 * w * x, 2 * w * y, 2 * w * z
+    rows = [
+        1 - yy - zz, xy - wz, xz + wy,
+        xy + wz, 1 - xx - zz, yz - wx,
+        xz - wy, yz + wx, 1 - xx - yy,
+    ]  # fmt: skip
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def matrix_to_quaternion_vector(
+    rotation: Float[Tensor, "*batch 3 3"],
+) -> Float[Tensor, "*batch 3"]:
+    """Quaternion vector of a rotation matrix; the inverse of `quaternion_vector_to_matrix`.
+
+    R determines the matrix 4 q q^T; its row with the largest diagonal entry, at least 1, is q up to
+    its length, which is stable at every angle, 0 and pi included.
+
+    Args:
+        rotation: [..., 3, 3], orthonormal with determinant 1.
+    """
+    check_shape("rotation", rotation, ["...", 3, 3])
+    a, b, c, d, e, f, g, h, i = rotation.flatten(-2).unbind(-1)
+    xy, xz, yz, wx, wy, wz = b + d, c + g, f + h, h - f, c - g, d - b
+    rows = [
+        1 + a - e - i, xy, xz, wx,
+        xy, 1 - a + e - i, yz, wy,
+        xz, yz, 1 - a - e + i, wz,
+        wx, wy, wz, 1 + a + e + i,
+    ]  # fmt: skip
+    outer = torch.stack(rows, -1).unflatten(-1, (4, 4))
+    best = outer.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)
+    row = outer.gather(-2, best[..., None, None].expand(*best.shape, 1, 4)).squeeze(-2)
+    return quaternion_to_vector(row / row.norm(dim=-1, keepdim=True))
+
+
+def conjugate(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """The inverse rotation: -v."""
+    return -vector
+
+
+def compose(
+    first: Float[Tensor, "*#batch 3"], second: Float[Tensor, "*#batch 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """Quaternion vector of the product R(first) R(second).
+
+    v = w_1 v_2 + w_2 v_1 + v_1 x v_2, with the sign that makes w_1 w_2 - v_1 . v_2 >= 0.
+
+    >>> quarter = torch.tensor([0.0, 0.5**0.5, 0.0])
+    >>> compose(quarter, -quarter)
+    tensor([0., 0., 0.])
+    """
+    return quaternion_to_vector(_product(vector_to_quaternion(first), vector_to_quaternion(second)))
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    a, b = torch.broadcast_tensors(a, b)
+    (va, wa), (vb, wb) = (q.split([3, 1], -1) for q in (a, b))
+    vector = wa * vb + wb * va + torch.linalg.cross(va, vb)
+    return torch.cat([vector, wa * wb - (va * vb).sum(-1, keepdim=True)], -1)
+
+
+def minimal_rotation(
+    start: Float[Tensor, "*#batch 3"], end: Float[Tensor, "*#batch 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """The rotation by the smallest angle that turns one direction into another: swing, no twist.
+
+    v = a x h,   h = (a + b) / |a + b|, the direction half way.
+
+    Opposite directions have no single such rotation: one by pi about an axis across them is taken.
+
+    Args:
+        start, end: directions a and b, of any length but zero.
+    """
+    a = torch.nn.functional.normalize(start, dim=-1)
+    b = torch.nn.functional.normalize(end, dim=-1)
+    a, b = torch.broadcast_tensors(a, b)
+    middle = a + b
+    opposite = middle.square().sum(-1, keepdim=True) <= 16 * torch.finfo(a.dtype).eps ** 2
+    middle = torch.where(opposite, _across(a), middle)
+    return torch.linalg.cross(a, torch.nn.functional.normalize(middle, dim=-1))
+
+
+def _across(direction: Tensor) -> Tensor:
+    """A direction at right angles to another: across its smallest coordinate's axis."""
+    least = direction.detach().abs().argmin(-1, keepdim=True)
+    axis = torch.zeros_like(direction).scatter(-1, least, 1.0)
+    return torch.linalg.cross(direction, axis)
+
+
+def mean_rotation(
+    vectors: Float[Tensor, "*batch N 3"], weights: Float[Tensor, "*#batch N"] | None = None
+) -> Float[Tensor, "*batch 3"]:
+    """Mean of rotations: the quaternion q that maximises sum_n w_n (q . q_n)^2.
+
+    It is the leading eigenvector of sum_n w_n q_n q_n^T, so that q and -q count alike.
+
+    Args:
+        vectors: [..., N, 3].
+        weights: [..., N], not negative; equal ones by default.
+
+    Reference: Markley, Cheng, Crassidis & Oshman, Averaging quaternions, 2007, equation (12).
+    """
+    check_shape("vectors", vectors, ["...", None, 3])
+    quaternions = vector_to_quaternion(vectors)
+    weighted = quaternions if weights is None else quaternions * weights[..., None]
+    _, axes = torch.linalg.eigh(weighted.mT @ quaternions)
+    return quaternion_to_vector(axes[..., -1])
