@@ -21,8 +21,10 @@ if TYPE_CHECKING:
 
 _SUBMODULES = frozenset(
     {
+        "body",
         "calibration",
         "camera",
+        "camera_rig",
         "demo",
         "errors",
         "filters",

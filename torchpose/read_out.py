@@ -27,6 +27,9 @@ __all__ = ["MotionStage", "MotionState", "ReadOut", "on_their_rays", "read_out",
 _LIMB_ENDS = tuple(
     UPPER_BODY.index(f"{j}_{s}") for j in ("hand", "elbow") for s in ("left", "right")
 )
+_HAND_OF = tuple(
+    UPPER_BODY.index(f"hand_{'right' if 'right' in j else 'left'}") for j in UPPER_BODY
+)
 _NEAREST = 0.1  # metres before the camera, from where a projection means something
 
 
@@ -111,12 +114,13 @@ def on_their_rays(
     order: RotationOrder,
     observed: Bool[Tensor, "B T 8"],
 ) -> ReadOut:
-    """Hands and elbows that were measured on their rays, and all others' pixels where they project to.
+    """Measured hands and elbows on their rays, and the other joints' pixels where they project to.
 
     Pixels and the joints in space are two readings of one mixture, linear each, and differ where a
     camera is unlike those of the prior: on webcams that look up at somebody near, by 40 pixels for a
     hand. A measured joint keeps its depth and goes to where it was seen; a joint that was inferred is
-    seen where it is in space. Head, neck and shoulders stay, since the body hangs on them.
+    seen where it is in space, if the hand of its arm was measured: without, its pixels know better.
+    Head, neck and shoulders stay, since the body hangs on them.
 
     Args:
         reading: of windows. matrix: K of its pixels. order: of its angles. observed: what was measured.
@@ -124,7 +128,9 @@ def on_their_rays(
     rotation = euler_to_matrix(reading.angles, order)
     seen = project(reading.joints, matrix, rotation, reading.place)
     before = seen[..., 2:] > _NEAREST
-    uv = torch.where(observed[..., None] | ~before, reading.uv, seen[..., :2])
+    hand = observed[..., list(_HAND_OF)]
+    projected = (hand & ~observed)[..., None] & before
+    uv = torch.where(projected, seen[..., :2], reading.uv)
     moved = lift(torch.cat([uv, seen[..., 2:]], -1), matrix, rotation, reading.place)
     limb = torch.zeros(uv.shape[-2], 1, dtype=torch.bool, device=uv.device)
     limb[list(_LIMB_ENDS)] = True

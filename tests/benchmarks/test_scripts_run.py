@@ -16,6 +16,7 @@ SCRIPTS = (
     "expectation_maximisation",
     "batch_memory",
     "streamed_em",
+    "silhouettes",
 )
 
 

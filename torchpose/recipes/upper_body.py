@@ -35,7 +35,7 @@ from torchpose.recipes.calibration import HeldOut, calibration_noise, folds, tra
 
 __all__ = ["VERSION", "MixtureTask", "UpperBodyRecipe", "fit_kinect_prior"]
 
-VERSION = "3"
+VERSION = "4"
 """Changes whenever the recipe does, so that priors cached under an older one are not taken for it."""
 
 _SIDES = ("left", "right")
@@ -119,7 +119,7 @@ class UpperBodyRecipe:
     window_components: int | None = None
     window_samples: int | None = None
     window_steps: int = 20
-    causal: WindowLayout = field(default=WindowLayout((3, 7, 12, 20), (0, 7, 16), torso=True))
+    causal: WindowLayout = field(default=WindowLayout((4, 10, 20), (0, 10), torso=True))
     full: WindowLayout = field(
         default=WindowLayout((4, 8, 16, -4, -8, -16), (0, 8, -8), torso=True)
     )

@@ -1,0 +1,285 @@
+"""Real silhouettes: four cameras around a balancing man, and one depth camera before eight persons.
+
+The four views (`multicam_pose2sim`) are silhouettes of its videos against pictures of the empty room,
+made by `torchpose.measure.silhouettes`; the reference is the set's triangulated 3D, which no marker
+measured, so the table is a difference and not an error. The single view (`utd_mhad_silhouettes`) is
+segmented depth, paired with the Kinect's skeleton at the lag that the set gives; body, noise and
+manifold come from other recordings than the one that is tracked, sharpness from another person. A
+single view does not show how far away somebody is: errors are given with and without the place of
+the pelvis.
+
+    python benchmarks/real_silhouettes.py --data DIR --out DIR
+"""
+
+import argparse
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from torchpose.body import BODY_15, Body, body_joints, fit_body, fit_state
+from torchpose.body.shape import fit_radii
+from torchpose.camera import PinholeCamera, load_cameras
+from torchpose.camera_rig import CameraRig
+from torchpose.filters import AnnealedParticleFilter, ManifoldParticleFilter, SIRParticleFilter
+from torchpose.filters.pose_search import find_pose
+from torchpose.filters.silhouette_filter import SilhouetteParticleFilter, motion_std
+from torchpose.io import check_output_folder
+from torchpose.measure.silhouettes import SilhouetteMeasurer, fit_view, read_silhouettes
+from torchpose.priors.gplvm import BackConstrainedGPLVM
+from torchpose.priors.manifold_file import ManifoldInfo
+from torchpose.protocols.report import Report
+from torchpose.protocols.silhouette_tables import PARTS
+from torchpose.video import open_video
+
+ROWS = 160
+HEIGHT = 1.75  # metres, of the man in the four views: nobody wrote it down
+N_PARTICLES, LAYERS = 1000, 5
+SHARPNESS = (30.0, 100.0, 300.0)
+ACTIONS = ("wave", "arm_curl", "squat", "lunge")
+TEST, TUNING, OTHERS = ("s02", "s04", "s06"), "s08", ("s01", "s03", "s05", "s07")
+HEAD_TOP = 0.11  # metres: the Kinect's head is in the middle of the head
+PELVIS = BODY_15.joint("pelvis")
+Make = Callable[[float], SilhouetteParticleFilter]
+
+
+class Sequence1(NamedTuple):
+    """What is tracked: silhouettes [T, C, H, W] of a rig, and the reference [T, 15, 3]."""
+
+    silhouettes: Tensor
+    rig: CameraRig
+    joints: Tensor
+
+
+def part_means(found: Tensor, truth: Tensor, centred: bool) -> list[float]:
+    """Mean distance of all joints and of each part, mm; without the place of the pelvis if asked."""
+    if centred:
+        found, truth = found - found[:, [PELVIS]], truth - truth[:, [PELVIS]]
+    gap = 1000 * (found - truth).norm(dim=-1)
+    columns = [list(range(15)), *([BODY_15.joint(n) for n in names] for names in PARTS.values())]
+    return [float(gap[:, c].nanmean()) for c in columns]
+
+
+# --- four cameras
+
+
+def four_views(folder: Path) -> Sequence1:
+    """Silhouettes of the videos, and the set's triangulated 3D."""
+    raw = folder / "multicam_pose2sim" / "raw"
+    cameras = list(load_cameras(raw / "Calib_qualisys.toml").values())
+    sources = [open_video(raw / f"cam{i:02d}.mp4") for i in range(1, 5)]
+    width = max(round(c.image_size[0] * ROWS / c.image_size[1]) for c in cameras)  # type: ignore[index]
+    views = [fit_view(c, s.size, ROWS, width) for c, s in zip(cameras, sources, strict=True)]
+    measurers = []
+    for i, (view, source) in enumerate(zip(views, sources, strict=True), start=1):
+        with open_video(raw / f"cam{i:02d}_ext.png") as picture:
+            empty = [frame.image for frame in picture]
+        frames = [frame.image for frame in source.reopen() if frame.index % 4 == 0]
+        measurers.append(SilhouetteMeasurer(view, empty, frames))
+    silhouettes = torch.stack(list(read_silhouettes(sources, measurers)))
+    with np.load(folder / "multicam_pose2sim" / "balancing_4cam.npz") as z:
+        joints = body_joints(torch.from_numpy(z["joints"]).double(), list(z["names"]))
+    n = min(len(silhouettes), len(joints))
+    return Sequence1(silhouettes[:n], CameraRig([v.camera for v in views]), joints[:n])
+
+
+def facing(joints: Tensor) -> Tensor:
+    """Where the person of a frame looks, level, z up."""
+    left = joints[BODY_15.joint("left_shoulder")] - joints[BODY_15.joint("right_shoulder")]
+    return torch.linalg.cross(left, torch.tensor([0.0, 0.0, 1.0], dtype=left.dtype))
+
+
+def report_four(report: Report, folder: Path, seeds: int) -> None:
+    """Difference from the triangulated 3D, from a given first pose and from one that is found."""
+    data = four_views(folder)
+    table = report.table(
+        "four", "Four cameras: distance from the triangulated 3D (mm)", ["all", *PARTS],
+        note=f"{len(data.joints)} frames at 60 Hz, {N_PARTICLES} particles in all, untuned (sharpness "
+        f"100, survival rate 0.5), body of average proportions, {HEIGHT} m; mean of {seeds} seeds. "
+        "The set's head is the top of the head, this body's the middle.",
+    )  # fmt: skip
+    average = Body.of_height(BODY_15, HEIGHT)
+    own = fit_body(data.joints, head_top=0.0)
+    for body, shape in ((average, "average body"), (own, "own bone lengths")):
+        given = fit_state(body, data.joints[:1])[0]
+        for name, make in plain_filters(body, None).items():
+            found = [
+                body.joints(make(100.0)(data.silhouettes, data.rig, given, seeded(seed)).mean)
+                for seed in range(seeds)
+            ]
+            table.add(f"{name}, {shape}", mean_of(found, data.joints, False))
+    tracks = []
+    for seed in range(seeds):
+        generator = seeded(seed)
+        start = find_pose(
+            average, data.silhouettes[0], data.rig, None, generator, facing=facing(data.joints[0])
+        )
+        tracker = plain_filters(average, None)["APF"](100.0)
+        tracks.append(average.joints(tracker(data.silhouettes, data.rig, start, generator).mean))
+    table.add("APF, average body, first pose found", mean_of(tracks, data.joints, False))
+
+
+def seeded(seed: int) -> torch.Generator:
+    """A generator of its own."""
+    return torch.Generator().manual_seed(seed)
+
+
+def mean_of(found: Sequence[Tensor], truth: Tensor, centred: bool) -> list[float]:
+    """Mean over seeds of `part_means`."""
+    parts = torch.tensor([part_means(f, truth, centred) for f in found])
+    return [float(x) for x in parts.mean(0)]
+
+
+def plain_filters(body: Body, step_std: Tensor | None) -> dict[str, Make]:
+    """SIR and the annealed filter of as many likelihoods a frame."""
+    return {
+        "SIR": lambda s: SIRParticleFilter(body, N_PARTICLES, step_std=step_std, sharpness=s),
+        "APF": lambda s: AnnealedParticleFilter(
+            body, N_PARTICLES // LAYERS, n_layers=LAYERS, step_std=step_std
+        ),
+    }
+
+
+# --- one camera
+
+
+def kinect(folder: Path, person: str, action: str, trials: str) -> Iterator[Tensor]:
+    """Recorded joints [T, 15, 3] of a person's trials, the room's axes made right-handed, y up."""
+    for path in sorted((folder / "kinect_utd_mhad").glob(f"{person}_a*_{action}_t[{trials}].npz")):
+        with np.load(path) as z:
+            yield body_joints(torch.from_numpy(z["joints"]).double(), list(z["names"]))
+
+
+def one_view(folder: Path, person: str, action: str) -> Sequence1:
+    """Segmented depth of trial 1 and its skeleton, at the lag that the set gives."""
+    path = next((folder / "utd_mhad_silhouettes").glob(f"{person}_a*_{action}_t1.npz"))
+    with np.load(path) as z:
+        shape = z["sil_shape"]
+        masks = np.unpackbits(z["sil_packed"], axis=-1)[..., : shape[2]].astype(bool)
+        joints = body_joints(torch.from_numpy(z["joints"]).double(), list(z["names"]))
+        lag, K = int(z["mask_lag"]), z["K"].astype(float)
+    # the depth image is mirrored: turned over, it is that of a camera which stands on its head
+    camera = PinholeCamera(
+        K[0, 0], K[1, 1], 319 - K[0, 2], K[1, 2], 320, 240, "depth", rotation=(0.0, 0.0, np.pi)
+    )
+    silhouettes = torch.from_numpy(np.ascontiguousarray(masks[:, :, ::-1]))[:, None]
+    n = min(len(joints), len(silhouettes) - lag)
+    rig = CameraRig([camera]).scaled(120, 160)
+    small = silhouettes[lag : lag + n, :, ::2, ::2]
+    return Sequence1(small, rig, joints[:n])
+
+
+class Person(NamedTuple):
+    """Body, noise and manifold from other trials than the tracked one, and from other persons."""
+
+    body: Body
+    step_std: Tensor
+    manifold: BackConstrainedGPLVM
+
+
+def prepare(folder: Path, person: str, action: str, data: Sequence1) -> Person:
+    """Bone lengths from trials 2 to 4, radii from frames of another action's silhouettes."""
+    own = list(kinect(folder, person, action, "234"))
+    body = fit_body(torch.cat(own), head_top=HEAD_TOP)
+    other = one_view(folder, person, "clap" if action != "clap" else "wave")
+    rows = torch.linspace(0, len(other.joints) - 1, 6).round().long()
+    states = fit_state(body, other.joints[rows])
+    body = fit_radii(body, states, other.silhouettes[rows], other.rig, seed=0)
+    poses = [
+        body.relative(fit_state(body, joints))
+        for p in OTHERS
+        for joints in kinect(folder, p, action, "2")
+    ]
+    info = ManifoldInfo.of_body(body, name=f"{action} of {', '.join(OTHERS)}")
+    manifold = BackConstrainedGPLVM.fit(poses, seed=0, info=info)
+    validation = [
+        body.relative(fit_state(body, joints)) for joints in kinect(folder, TUNING, action, "23")
+    ]
+    manifold = manifold.fit_noise(validation, 30.0)
+    std = motion_std(body, [fit_state(body, joints) for joints in own], floor=1e-3)
+    return Person(body, std, manifold)
+
+
+def filters_of(person: Person) -> dict[str, Make]:
+    """The three filters, with the same noise."""
+    return plain_filters(person.body, person.step_std) | {
+        "MRPF": lambda s: ManifoldParticleFilter(
+            person.body, person.manifold, N_PARTICLES, step_std=person.step_std, sharpness=s
+        )
+    }
+
+
+def run(person: Person, make: Make, sharpness: float, data: Sequence1, seed: int) -> Tensor:
+    """Joints of the estimates [T, 15, 3]."""
+    start = fit_state(person.body, data.joints[:1])[0]
+    track = make(sharpness)(data.silhouettes, data.rig, start, seeded(seed))
+    return person.body.joints(track.mean)
+
+
+def report_one(report: Report, folder: Path, seeds: int, actions: Sequence[str]) -> None:
+    """Error of a single view, for each action."""
+    centred = report.table(
+        "one", "One depth camera: error without the place of the pelvis (mm)", ["all", *PARTS],
+        note=f"Persons {', '.join(TEST)}, trial 1, {N_PARTICLES} likelihoods a frame, {seeds} seeds; "
+        f"sharpness among {', '.join(f'{s:g}' for s in SHARPNESS)} by the error on {TUNING}, the "
+        f"annealed filter with a survival rate of 0.5. Manifold: {', '.join(OTHERS)}. \"Not moving\" "
+        "keeps the first pose, which is given to all.",
+    )  # fmt: skip
+    placed = report.table("one_placed", "The same with the place of the pelvis (mm)",
+                          ["all", *PARTS])  # fmt: skip
+    for action in tqdm(actions, desc="actions"):
+        tuning = one_view(folder, TUNING, action)
+        judge = prepare(folder, TUNING, action, tuning)
+        best = {
+            name: min(
+                SHARPNESS if name != "APF" else (1.0,),
+                key=lambda s, m=make: part_means(  # type: ignore[misc]
+                    run(judge, m, s, tuning, 0), tuning.joints, True
+                )[0],
+            )
+            for name, make in filters_of(judge).items()
+        }
+        rows: dict[str, list[tuple[Tensor, Tensor]]] = {"not moving": []}
+        for p in TEST:
+            data = one_view(folder, p, action)
+            person = prepare(folder, p, action, data)
+            rows["not moving"].append((data.joints[:1].expand_as(data.joints), data.joints))
+            for name, make in filters_of(person).items():
+                for seed in range(seeds):
+                    found = run(person, make, best[name], data, seed + zlib.crc32(p.encode()) % 97)
+                    rows.setdefault(name, []).append((found, data.joints))
+        for name, pairs in rows.items():
+            label = f"{action}, {name}" + (f" ({best[name]:g})" if best.get(name, 1) > 1 else "")
+            for table, without in ((centred, True), (placed, False)):
+                parts = torch.tensor([part_means(f, t, without) for f, t in pairs])
+                table.add(label, [float(x) for x in parts.mean(0)])
+
+
+def main() -> None:
+    """Print the tables and write them as Markdown."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--data", type=Path, required=True, help="folder of the data sets")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the results")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--only", choices=["four", "one"])
+    parser.add_argument("--actions", nargs="+", default=list(ACTIONS))
+    parser.add_argument("--threads", type=int, default=2)
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    out = check_output_folder(args.out)
+    report = Report("Real silhouettes", {"seeds": args.seeds, "particles": N_PARTICLES})
+    if args.only != "one":
+        report_four(report, args.data, args.seeds)
+    if args.only != "four":
+        report_one(report, args.data, args.seeds, args.actions)
+    print(report.summary())
+    (out / "real-silhouettes.md").write_text(report.to_markdown(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
