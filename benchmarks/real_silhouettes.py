@@ -30,7 +30,12 @@ from torchpose.filters import AnnealedParticleFilter, ManifoldParticleFilter, SI
 from torchpose.filters.pose_search import find_pose
 from torchpose.filters.silhouette_filter import SilhouetteParticleFilter, motion_std
 from torchpose.io import check_output_folder
-from torchpose.measure.silhouettes import SilhouetteMeasurer, fit_view, read_silhouettes
+from torchpose.measure.silhouettes import (
+    SilhouetteMeasurer,
+    fit_view,
+    read_empty_scene,
+    read_silhouettes,
+)
 from torchpose.priors.gplvm import BackConstrainedGPLVM
 from torchpose.priors.manifold_file import ManifoldInfo
 from torchpose.protocols.report import Report
@@ -77,8 +82,7 @@ def four_views(folder: Path) -> Sequence1:
     views = [fit_view(c, s.size, ROWS, width) for c, s in zip(cameras, sources, strict=True)]
     measurers = []
     for i, (view, source) in enumerate(zip(views, sources, strict=True), start=1):
-        with open_video(raw / f"cam{i:02d}_ext.png") as picture:
-            empty = [frame.image for frame in picture]
+        empty = read_empty_scene(raw / f"cam{i:02d}_ext.png")
         frames = [frame.image for frame in source.reopen() if frame.index % 4 == 0]
         measurers.append(SilhouetteMeasurer(view, empty, frames))
     silhouettes = torch.stack(list(read_silhouettes(sources, measurers)))

@@ -1,7 +1,6 @@
 """The videos of a `torchpose track-body`: opened, turned to silhouettes, read once more to be drawn."""
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jsonargparse import Namespace
@@ -91,10 +90,14 @@ class Recordings:
         return [open_video(path, fps=self._args.fps) for path in self._args.videos]
 
     def _measurers(self) -> "list[SilhouetteMeasurer]":
-        from torchpose.measure.silhouettes import SilhouetteMeasurer, learning_frames
+        from torchpose.measure.silhouettes import (
+            SilhouetteMeasurer,
+            learning_frames,
+            read_empty_scene,
+        )
 
         print("learning the background ...", flush=True)
-        empty = [_empty_scene(path) for path in self._args.background or []]
+        empty = [read_empty_scene(path) for path in self._args.background or []]
         if not empty:
             self.notes.append(
                 "without --background what stays in the videos is taken for their background; a part "
@@ -117,16 +120,3 @@ def _views(
     shapes = [c.image_size or size for c, size in zip(cameras, sizes, strict=True)]
     width = max(round(w * rows / h) for w, h in shapes)
     return [fit_view(c, size, rows, width) for c, size in zip(cameras, sizes, strict=True)]
-
-
-def _empty_scene(path: str) -> list[Any]:
-    """Frames of a picture, a folder of pictures or a video."""
-    import cv2
-
-    from torchpose.measure.silhouettes import learning_frames
-    from torchpose.video import open_video
-
-    if Path(path).is_file() and (image := cv2.imread(path, cv2.IMREAD_COLOR)) is not None:
-        return [cv2.cvtColor(image, cv2.COLOR_BGR2RGB)]
-    with open_video(path) as source:
-        return learning_frames(source)

@@ -1,7 +1,8 @@
 """One person's silhouettes in the synchronised videos of calibrated cameras."""
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -97,9 +98,9 @@ def clean_silhouette(mask: NDArray[np.bool_], largest_hole: float = _HOLE) -> ND
     """
     import cv2
 
-    found = cv2.medianBlur(mask.astype(np.uint8), 3)
-    found = cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    kept = _pieces(found, _PART)
+    smooth = cv2.medianBlur(mask.astype(np.uint8), 3)
+    closed = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    kept = _pieces(np.asarray(closed, np.uint8), _PART)
     area = int(kept.sum())
     holes = _areas(1 - kept)
     fill = np.flatnonzero(holes.areas < largest_hole * area)
@@ -184,7 +185,7 @@ class SilhouetteMeasurer:
             return found.numpy()
         return np.asarray(self._mixture.apply(small, None, 0.0) == 255)
 
-    def _learn(self, frames: Sequence[Image]):  # type: ignore[no-untyped-def]  # cv2 has no types
+    def _learn(self, frames: Sequence[Image]) -> Any:
         import cv2
 
         mixture = cv2.createBackgroundSubtractorMOG2(len(frames), 16.0, True)
@@ -198,16 +199,17 @@ class SilhouetteMeasurer:
 
         check_rgb("frame", frame, empty=False)
         (width, height), (right, below) = self.view.size, self.view.padding
+        whole: Any = frame
         if frame.shape[1::-1] == (width, height):
-            frame = cv2.copyMakeBorder(frame, 0, below, 0, right, cv2.BORDER_REPLICATE)
+            whole = cv2.copyMakeBorder(frame, 0, below, 0, right, cv2.BORDER_REPLICATE)
         elif frame.shape[1::-1] != (width + right, height + below):
             raise InputError(
                 f"frames of camera {self.view.camera.name!r} must have {width} x {height} pixels, "
                 f"got {frame.shape[1]} x {frame.shape[0]}"
             )
         if self._maps is not None:
-            frame = cv2.remap(frame, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(cv2.resize(frame, self.view.inner, interpolation=cv2.INTER_AREA))
+            whole = cv2.remap(whole, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(cv2.resize(whole, self.view.inner, interpolation=cv2.INTER_AREA))
 
     def _stack(self, frames: Sequence[Image]) -> UInt8[Tensor, "N 3 H W"]:
         return torch.stack([self._tensor(self._prepare(frame)) for frame in frames])
@@ -252,6 +254,24 @@ def learning_frames(source: VideoSource) -> list[Image]:
     count = source.n_frames or _LEARNING_FRAMES
     stride = max(1, count // _LEARNING_FRAMES)
     return [frame.image for frame in source if frame.index % stride == 0][: 2 * _LEARNING_FRAMES]
+
+
+def read_empty_scene(path: str | Path) -> list[Image]:
+    """Frames of the empty scene: of a picture, a folder of pictures or a video.
+
+    Raises:
+        InputError: no such file. FileFormatError: neither a picture nor a video.
+    """
+    import cv2
+
+    from torchpose.video.source import open_video
+
+    if Path(path).is_file():
+        picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if picture is not None:
+            return [np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)]
+    with open_video(str(path)) as source:
+        return learning_frames(source)
 
 
 def read_silhouettes(
