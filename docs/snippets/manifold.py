@@ -14,7 +14,7 @@ states = torch.zeros(90, body.dim, dtype=torch.float64)
 for side, sign in (("left", 1.0), ("right", -1.0)):
     states[:, 3 + 3 * BODY_15.part(f"{side}_thigh")] = sign * 0.25 * phase.sin()
     states[:, 3 + 3 * BODY_15.part(f"{side}_shank")] = 0.2 + 0.1 * sign * phase.cos()
-trials = [body.joints(states[i:]) for i in (0, 10, 20)]
+trials = [body.joints(scale * states) for scale in (1.0, 0.9, 1.1)]
 
 body = fit_body(torch.cat(trials))
 poses = [body.relative(fit_state(body, joints)) for joints in trials]
