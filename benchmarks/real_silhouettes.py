@@ -22,7 +22,15 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose.body import BODY_15, Body, body_joints, fit_body, fit_state
+from torchpose.body import (
+    BODY_15,
+    Body,
+    JointLimits,
+    body_joints,
+    fit_body,
+    fit_state,
+    render,
+)
 from torchpose.body.shape import fit_radii
 from torchpose.camera import PinholeCamera, load_cameras
 from torchpose.camera_rig import CameraRig
@@ -41,8 +49,10 @@ from torchpose.priors.manifold_file import ManifoldInfo
 from torchpose.protocols.report import Report
 from torchpose.protocols.silhouette_tables import PARTS
 from torchpose.video import open_video
+from torchpose.video.body_overlay import draw_body
 
 ROWS = 160
+_ENLARGED = 2  # pixels of the picture for one of a silhouette
 HEIGHT = 1.75  # metres, of the man in the four views: nobody wrote it down
 N_PARTICLES, LAYERS = 1000, 5
 SHARPNESS = (30.0, 100.0, 300.0)
@@ -92,13 +102,36 @@ def four_views(folder: Path) -> Sequence1:
     return Sequence1(silhouettes[:n], CameraRig([v.camera for v in views]), joints[:n])
 
 
+def draw(data: Sequence1, body: Body, states: Tensor, path: Path, columns: int = 6) -> None:
+    """Measured silhouettes in grey with the body over them: a row per camera, frames from left to right."""
+    import cv2
+
+    _, _, height, width = data.silhouettes.shape
+    chosen = torch.linspace(0, len(states) - 1, columns).round().long().tolist()
+    model = render(body, states, data.rig, height, width)
+    seen = data.rig(body.joints(states)).pixels
+    size = (_ENLARGED * width, _ENLARGED * height)
+    rows = []
+    for c in range(len(data.rig)):
+        cells = []
+        for t in chosen:
+            grey = np.where(data.silhouettes[t, c].numpy(), 150, 255).astype(np.uint8)
+            picture = cv2.resize(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB), size,
+                                 interpolation=cv2.INTER_NEAREST)  # fmt: skip
+            pixels = _ENLARGED * (seen[t, c] + 0.5) - 0.5
+            drawn = draw_body(picture, pixels, body.skeleton, model=model[t, c])
+            cells.append(np.pad(drawn, ((0, 2), (0, 2), (0, 0))))
+        rows.append(np.hstack(cells))
+    cv2.imwrite(str(path), cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))
+
+
 def facing(joints: Tensor) -> Tensor:
     """Where the person of a frame looks, level, z up."""
     left = joints[BODY_15.joint("left_shoulder")] - joints[BODY_15.joint("right_shoulder")]
     return torch.linalg.cross(left, torch.tensor([0.0, 0.0, 1.0], dtype=left.dtype))
 
 
-def report_four(report: Report, folder: Path, seeds: int) -> None:
+def report_four(report: Report, folder: Path, seeds: int, out: Path) -> None:
     """Difference from the triangulated 3D, from a given first pose and from one that is found."""
     data = four_views(folder)
     table = report.table(
@@ -117,6 +150,10 @@ def report_four(report: Report, folder: Path, seeds: int) -> None:
                 for seed in range(seeds)
             ]
             table.add(f"{name}, {shape}", mean_of(found, data.joints, False))
+    given = fit_state(average, data.joints[:1])[0]
+    track = plain_filters(average, None)["APF"](100.0)(data.silhouettes, data.rig, given, seeded(0))
+    draw(data, average, track.mean, out / "four-cameras.png")
+    report.pictures.append("four-cameras.png")
     tracks = []
     for seed in range(seeds):
         generator = seeded(seed)
@@ -139,12 +176,16 @@ def mean_of(found: Sequence[Tensor], truth: Tensor, centred: bool) -> list[float
     return [float(x) for x in parts.mean(0)]
 
 
-def plain_filters(body: Body, step_std: Tensor | None) -> dict[str, Make]:
+def plain_filters(
+    body: Body, step_std: Tensor | None, limits: JointLimits | None = None
+) -> dict[str, Make]:
     """SIR and the annealed filter of as many likelihoods a frame."""
     return {
-        "SIR": lambda s: SIRParticleFilter(body, N_PARTICLES, step_std=step_std, sharpness=s),
+        "SIR": lambda s: SIRParticleFilter(
+            body, N_PARTICLES, step_std=step_std, sharpness=s, limits=limits
+        ),
         "APF": lambda s: AnnealedParticleFilter(
-            body, N_PARTICLES // LAYERS, n_layers=LAYERS, step_std=step_std
+            body, N_PARTICLES // LAYERS, n_layers=LAYERS, step_std=step_std, limits=limits
         ),
     }
 
@@ -184,6 +225,7 @@ class Person(NamedTuple):
     body: Body
     step_std: Tensor
     manifold: BackConstrainedGPLVM
+    limits: JointLimits
 
 
 def prepare(folder: Path, person: str, action: str, data: Sequence1) -> Person:
@@ -206,15 +248,22 @@ def prepare(folder: Path, person: str, action: str, data: Sequence1) -> Person:
     ]
     manifold = manifold.fit_noise(validation, 30.0)
     std = motion_std(body, [fit_state(body, joints) for joints in own], floor=1e-3)
-    return Person(body, std, manifold)
+    seen = [fit_state(body, j) for p in OTHERS for a in ACTIONS for j in kinect(folder, p, a, "2")]
+    return Person(body, std, manifold, JointLimits.fit(torch.cat(seen)))
 
 
 def filters_of(person: Person) -> dict[str, Make]:
-    """The three filters, with the same noise."""
-    return plain_filters(person.body, person.step_std) | {
+    """The filters, with the same noise and the same joint limits."""
+    body, manifold = person.body, person.manifold
+    common = {"step_std": person.step_std, "limits": person.limits}
+    normalised = {"weights": "normalised", "proposal": "product"}
+    return plain_filters(body, person.step_std, person.limits) | {
         "MRPF": lambda s: ManifoldParticleFilter(
-            person.body, person.manifold, N_PARTICLES, step_std=person.step_std, sharpness=s
-        )
+            body, manifold, N_PARTICLES, sharpness=s, **common
+        ),
+        "MRPF, normalised, product": lambda s: ManifoldParticleFilter(
+            body, manifold, N_PARTICLES, sharpness=s, **common, **normalised
+        ),
     }
 
 
@@ -231,8 +280,8 @@ def report_one(report: Report, folder: Path, seeds: int, actions: Sequence[str])
         "one", "One depth camera: error without the place of the pelvis (mm)", ["all", *PARTS],
         note=f"Persons {', '.join(TEST)}, trial 1, {N_PARTICLES} likelihoods a frame, {seeds} seeds; "
         f"sharpness among {', '.join(f'{s:g}' for s in SHARPNESS)} by the error on {TUNING}, the "
-        f"annealed filter with a survival rate of 0.5. Manifold: {', '.join(OTHERS)}. \"Not moving\" "
-        "keeps the first pose, which is given to all.",
+        f"annealed filter with a survival rate of 0.5. Manifold and joint limits: {', '.join(OTHERS)}. "
+        "\"Not moving\" keeps the first pose, which is given to all.",
     )  # fmt: skip
     placed = report.table("one_placed", "The same with the place of the pelvis (mm)",
                           ["all", *PARTS])  # fmt: skip
@@ -278,7 +327,7 @@ def main() -> None:
     out = check_output_folder(args.out)
     report = Report("Real silhouettes", {"seeds": args.seeds, "particles": N_PARTICLES})
     if args.only != "one":
-        report_four(report, args.data, args.seeds)
+        report_four(report, args.data, args.seeds, out)
     if args.only != "four":
         report_one(report, args.data, args.seeds, args.actions)
     print(report.summary())

@@ -17,6 +17,7 @@ SCRIPTS = (
     "batch_memory",
     "streamed_em",
     "silhouettes",
+    "gplvm",
 )
 
 

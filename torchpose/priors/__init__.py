@@ -1,4 +1,4 @@
-"""Learned priors over body states: Gaussian mixtures, their fit, and the pair of both arms."""
+"""Learned priors over body states: Gaussian mixtures of both arms, manifolds of a whole body."""
 
 from torchpose.priors.arm_state import arm_state, arm_states, mirror_arm_state, mirror_mixture
 from torchpose.priors.density import FastMixtureDensity
@@ -11,6 +11,8 @@ from torchpose.priors.em import (
     m_step,
 )
 from torchpose.priors.gmm import ConditionedMixture, GaussianMixture
+from torchpose.priors.gplvm import BackConstrainedGPLVM
+from torchpose.priors.manifold_file import ManifoldInfo
 from torchpose.priors.model_card import model_card, write_model_card
 from torchpose.priors.neck import (
     NeckFraction,
@@ -30,10 +32,12 @@ from torchpose.priors.upper_body import (
 
 __all__ = [
     "TRAINING_VIEWS",
+    "BackConstrainedGPLVM",
     "ConditionedMixture",
     "FastMixtureDensity",
     "FitReport",
     "GaussianMixture",
+    "ManifoldInfo",
     "MixtureParameters",
     "NeckFraction",
     "NeckOffset",

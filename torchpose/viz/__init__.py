@@ -13,6 +13,7 @@ from torchpose.viz.charts import (
     plot_pcp,
     plot_reliability,
 )
+from torchpose.viz.manifold_picture import plot_manifold
 from torchpose.viz.prior_pictures import (
     plot_log_likelihood,
     plot_prior_components,
@@ -33,6 +34,7 @@ __all__ = [
     "plot_errors_over_time",
     "plot_joint_curves",
     "plot_log_likelihood",
+    "plot_manifold",
     "plot_pcp",
     "plot_pose",
     "plot_pose_3d",

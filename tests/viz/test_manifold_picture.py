@@ -1,0 +1,87 @@
+"""The picture of a latent space: trajectories where they are, grey where nothing is known."""
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("matplotlib", reason="matplotlib is not installed")
+
+from tests.priors.motions import motion
+from torchpose.body import BODY_15, Body
+from torchpose.errors import InputError, PriorError, ShapeError
+from torchpose.priors.gplvm import BackConstrainedGPLVM
+from torchpose.priors.manifold_file import ManifoldInfo
+from torchpose.viz import save_figure
+from torchpose.viz.manifold_picture import plot_manifold
+
+
+@pytest.fixture(scope="module")
+def body() -> Body:
+    return Body.of_height(BODY_15, 1.8)
+
+
+@pytest.fixture(scope="module")
+def manifold(body) -> BackConstrainedGPLVM:
+    info = ManifoldInfo.of_body(body, name="walk", sequences=("a", "b", "a"))
+    poses = [motion(80), motion(40, phase=2.0, seed=1), motion(40, phase=1.0, seed=2)]
+    return BackConstrainedGPLVM.fit(poses, steps=5, info=info)
+
+
+def lines(ax) -> list[np.ndarray]:
+    return [line.get_xydata() for line in ax.lines if len(line.get_xydata()) > 1]
+
+
+def test_trajectories_are_drawn_where_they_are(manifold) -> None:
+    figure = plot_manifold(manifold, resolution=30)
+    ax = figure.axes[0]
+    for drawn, path in zip(lines(ax), manifold.trajectories()[:1], strict=False):
+        np.testing.assert_allclose(drawn, path.numpy())
+    assert len(lines(ax)) == 3
+    colours = {line.get_color() for line in ax.lines}
+    assert len(colours) == 2  # sequences of one name share theirs
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["a", "b"]
+    assert "walk: 160 frames of 30 columns" in figure.get_suptitle()
+
+
+def test_it_is_light_where_poses_are_known(manifold) -> None:
+    ax = plot_manifold(manifold, resolution=60).axes[0]
+    image = ax.images[0]
+    grey = np.asarray(image.get_array())
+    left, right, bottom, top = image.get_extent()
+    at = manifold.latents.numpy()
+    columns = ((at[:, 0] - left) / (right - left) * 59).round().astype(int)
+    rows = ((at[:, 1] - bottom) / (top - bottom) * 59).round().astype(int)
+    corners = grey[[0, 0, -1, -1], [0, -1, 0, -1]]
+    assert grey[rows, columns].mean() < 0.5 * corners.mean()
+
+
+def test_other_poses_and_a_body_are_drawn_too(manifold, body, tmp_path) -> None:
+    others = {"held out": motion(50, phase=0.5, seed=7)}
+    figure = plot_manifold(manifold, others, body, n_poses=5, resolution=30)
+    path = save_figure(figure, tmp_path / "manifold.png", dpi=50)
+    assert path.stat().st_size > 5000
+    ax = figure.axes[0]
+    np.testing.assert_allclose(lines(ax)[-1], manifold.to_latent(others["held out"]).numpy())
+    numbers = {text.get_text() for text in ax.texts} & set("12345")
+    assert numbers == set("12345")
+    bones = figure.axes[1].lines
+    assert len(bones) == 5 * (len(BODY_15.names) - 1)
+
+
+def test_what_cannot_be_drawn_is_refused(manifold, body) -> None:
+    one = BackConstrainedGPLVM.fit(motion(30), latent_dim=1, steps=1)
+    with pytest.raises(InputError, match="needs two dimensions or more, got 1"):
+        plot_manifold(one)
+    with pytest.raises(InputError, match="resolution and n_poses must be at least 2"):
+        plot_manifold(manifold, resolution=1)
+    with pytest.raises(PriorError, match="frame"):
+        plot_manifold(manifold, body=body.altered(frame="body"))
+    with pytest.raises(ShapeError, match="x must have shape"):
+        plot_manifold(manifold, {"other": torch.zeros(5, 7)})
+
+
+def test_more_than_two_dimensions_show_the_first_two() -> None:
+    three = BackConstrainedGPLVM.fit(motion(40), latent_dim=3, steps=2)
+    ax = plot_manifold(three, resolution=20).axes[0]
+    np.testing.assert_allclose(lines(ax)[0], three.latents[:, :2].numpy())
