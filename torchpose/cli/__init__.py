@@ -17,7 +17,7 @@ COMMANDS = {
     "track": "2D keypoints to 2D and 3D poses",
     "track-body": "videos of calibrated cameras to the poses of a whole body",
     "fit": "fit a prior to recorded 3D poses",
-    "evaluate": "run an evaluation protocol: ub-people, ub-one, signer",
+    "evaluate": "run an evaluation protocol: ub-people, signer, silhouette, ...",
     "demo": "track an animated performer; needs no data",
     "info": "version, priors that are there, what a file holds",
 }

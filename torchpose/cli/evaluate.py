@@ -94,7 +94,8 @@ def run(name: str, args: Namespace) -> int:
     if isinstance(data, Path) and name not in _MOCAP and not data.is_dir():
         raise InputError(f"--data {data}: no such folder; expected the one with the recordings")
     function = _runner(name)
-    own = {key: getattr(args, key) for key in _own_options(function)}
+    given = {key: getattr(args, key) for key in _own_options(function)}
+    own = {key: tuple(v) if isinstance(v, list) else v for key, v in given.items()}
     if getattr(args, "prior", None) is not None:
         from torchpose.priors import load_prior
 

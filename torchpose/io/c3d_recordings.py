@@ -3,7 +3,7 @@
 import re
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,18 @@ from torchpose.io.raw_recording import RawRecording
 from torchpose.io.units import unit_from_text
 from torchpose.joint_sets import canonical_name
 
-__all__ = ["read_c3d"]
+__all__ = ["C3DPoints", "read_c3d", "read_c3d_points"]
+
+
+class C3DPoints(NamedTuple):
+    """Points of a file: their labels, [T, N, 3] as written, frames per second, unit, axis up."""
+
+    labels: list[str]
+    points: np.ndarray
+    rate: float
+    unit: str
+    up: str
+
 
 _UP = {"+Z": "z-up", "+Y": "y-up"}
 
@@ -26,6 +37,25 @@ def read_c3d(path: Path) -> list[RawRecording]:
     Raises:
         MissingDependencyError: c3d is not installed. SkeletonError: no point is named as a joint.
         FileFormatError: damaged or truncated.
+    """
+    found = read_c3d_points(path)
+    columns = _joint_columns(path, found.labels)
+    joints = found.points[:, list(columns.values())]
+    unused = [label.strip() for i, label in enumerate(found.labels) if i not in columns.values()]
+    notes = [f"points not used: {', '.join(unused[:8])}{' ...' * (len(unused) > 8)}"] * bool(unused)
+    return [
+        RawRecording(
+            path, joints, tuple(columns), found.rate if found.rate > 0 else None,
+            _UP.get(found.up.upper()), unit_from_text(found.unit), action=path.stem, notes=tuple(notes),
+        )
+    ]  # fmt: skip
+
+
+def read_c3d_points(path: Path) -> C3DPoints:
+    """Read every point of a file, whatever it is called; NaN where the residual is -1.
+
+    Raises:
+        MissingDependencyError: c3d is not installed. FileFormatError: damaged or truncated.
     """
     try:
         import c3d
@@ -48,17 +78,9 @@ def read_c3d(path: Path) -> list[RawRecording]:
         ) from error
     if len(frames) < expected or any("end of file" in str(note.message) for note in said):
         raise FileFormatError(f"{path}: expected {expected} frames, ends in frame {len(frames)}")
-    columns = _joint_columns(path, labels)
-    points = np.array(frames).reshape(-1, len(labels), 5)[:, list(columns.values())]
-    joints = np.where(points[..., 3:4] < 0, np.nan, points[..., :3]).astype(np.float64)
-    unused = [label.strip() for i, label in enumerate(labels) if i not in columns.values()]
-    notes = [f"points not used: {', '.join(unused[:8])}{' ...' * (len(unused) > 8)}"] * bool(unused)
-    return [
-        RawRecording(
-            path, joints, tuple(columns), rate if rate > 0 else None, _UP.get(up.upper()),
-            unit_from_text(unit), action=path.stem, notes=tuple(notes),
-        )
-    ]  # fmt: skip
+    points = np.array(frames).reshape(-1, len(labels), 5)
+    placed = np.where(points[..., 3:4] < 0, np.nan, points[..., :3]).astype(np.float64)
+    return C3DPoints(labels, placed, rate, unit, up)
 
 
 def _text(reader: Any, key: str) -> str:

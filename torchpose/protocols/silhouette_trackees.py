@@ -1,0 +1,288 @@
+"""What one person is tracked with: body, manifold, noise, and the silhouettes of every clip."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchpose.body.fitting import fit_body, fit_state
+from torchpose.body.kinematics import Body
+from torchpose.body.shape import fit_radii
+from torchpose.body.silhouette import count_pixels
+from torchpose.body.silhouette_likelihood import intersection_over_union
+from torchpose.camera_rig import CameraRig
+from torchpose.errors import InputError
+from torchpose.filters.annealed import AnnealedParticleFilter
+from torchpose.filters.manifold import ManifoldParticleFilter
+from torchpose.filters.silhouette_filter import SilhouetteParticleFilter, motion_std
+from torchpose.filters.sir import SIRParticleFilter
+from torchpose.io.mocap import MocapClip
+from torchpose.priors.gplvm import BackConstrainedGPLVM
+from torchpose.priors.manifold_file import ManifoldInfo
+from torchpose.protocols.common import settings_hash
+from torchpose.protocols.silhouette_data import Split, in_view, place_cameras
+from torchpose.protocols.silhouette_truth import TrueShape, true_silhouettes
+
+__all__ = [
+    "METHODS",
+    "SCALES",
+    "Conditions",
+    "Method",
+    "Setting",
+    "Trackee",
+    "View",
+    "make_filter",
+    "prepare",
+]
+
+LAYERS = 5
+_RADII_FRAMES = 8
+
+
+class Method(NamedTuple):
+    """A filter of the comparison.
+
+    Attributes:
+        label: in tables. tuned: what validation chooses, beside the scale of the diffusion.
+        first: the value with which the scale is chosen. values: what it then chooses among, the
+            published one among them. options: of the filter.
+    """
+
+    label: str
+    tuned: str
+    first: float
+    values: tuple[float, ...]
+    options: dict[str, Any]
+
+
+class Setting(NamedTuple):
+    """What validation chose: sharpness (or survival rate), and factor of the diffusion."""
+
+    value: float
+    scale: float = 1.0
+
+
+SCALES = (0.7, 1.0, 1.4, 2.0, 2.8)
+"""Factors of the diffusion that validation chooses among; 1 is the motion of the validation clips."""
+
+PUBLISHED_SURVIVAL = 0.5
+_SHARPNESS = ("sharpness", 100.0, (1.0, 30.0, 100.0, 300.0))
+
+METHODS = {
+    "sir": Method("SIR", *_SHARPNESS, {}),
+    "apf": Method("APF", "survival rate", PUBLISHED_SURVIVAL, (0.3, 0.5, 0.7, 0.85), {}),
+    "mrpf": Method("MRPF", *_SHARPNESS, {"weights": "normalised", "proposal": "product"}),
+    "mrpf-diffusion": Method(
+        "MRPF, diffusion", *_SHARPNESS, {"weights": "normalised", "proposal": "diffusion"}
+    ),
+    "mrpf-published": Method(
+        "MRPF as published", *_SHARPNESS, {"weights": "published", "proposal": "diffusion"}
+    ),
+    "mrpf-published-product": Method(
+        "MRPF as published, product", *_SHARPNESS, {"weights": "published", "proposal": "product"}
+    ),
+}
+"""The filters by the names that the command takes.
+
+``mrpf`` has the exact form of the weights (MR 28 normalised over x_t) and samples the product of
+both Gaussians; ``mrpf-published`` weighs by (MR 30) alone and samples the diffusion.
+"""
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What silhouettes are like.
+
+    Args:
+        size: (height, width), pixels. faults: severity. cameras_used: the first so many of the rig.
+        rig: the cameras, or None to place three around each clip. seed: of shapes and faults.
+    """
+
+    size: tuple[int, int] = (120, 160)
+    faults: float = 1.0
+    cameras_used: int = 3
+    rig: CameraRig | None = None
+    seed: int = 0
+
+
+class View(NamedTuple):
+    """A clip as the cameras see it.
+
+    Attributes:
+        clip: with the true joints. rig: cameras of the silhouettes' size.
+        silhouettes: [T, C, H, W]. initial_state: [D], that of the first frame.
+        floor: mean error of the nearest state, mm. overlap: intersection over union of the body at
+            that state with the silhouettes, mean. in_view: share of joints within the images.
+    """
+
+    clip: MocapClip
+    rig: CameraRig
+    silhouettes: Bool[Tensor, "T C H W"]
+    initial_state: Float[Tensor, " D"]
+    floor: float
+    overlap: float
+    in_view: float
+
+
+@dataclass(frozen=True)
+class Trackee:
+    """A person, ready to be tracked.
+
+    Args:
+        split: whose clips. body: with bone lengths and radii of training clips.
+        manifold: of the training clips. step_std: [D], of the validation clips.
+        tests: clips to track. validation: (body, view) of clips that choose the exponents.
+    """
+
+    split: Split
+    body: Body
+    manifold: BackConstrainedGPLVM
+    step_std: Float[Tensor, " D"]
+    tests: tuple[View, ...]
+    validation: tuple[tuple[Body, View], ...]
+
+
+def prepare(
+    split: Split,
+    conditions: Conditions,
+    test_frames: int,
+    validation_frames: int,
+    manifold_seed: int = 0,
+) -> Trackee:
+    """Fit body, manifold and noise to a person's training clips, and render what cameras see.
+
+    Args:
+        split: clips. conditions: of the silhouettes. test_frames: of each test trial, from its first.
+        validation_frames: for the exponents. manifold_seed: of the manifold's fit.
+    """
+    body = _body_of(split.body, conditions)
+    bodies = {split.person: body}
+    for clip in (*split.manifold, *split.validation):
+        if clip.person not in bodies:
+            theirs = [c for c in (*split.manifold, *split.validation) if c.person == clip.person]
+            bodies[clip.person] = _body_of(theirs, conditions)
+    manifold = _manifold(split, bodies, manifold_seed)
+    moved = [_states(bodies, clip) for clip in split.validation]
+    tests = tuple(_view(body, clip.cut(0, test_frames), conditions) for clip in split.test)
+    first = split.validation[0].cut(0, validation_frames)
+    owner = bodies[first.person]
+    validation = ((owner, _view(owner, first, conditions)),)
+    step_std = _any_heading(motion_std(body, moved), first.up)
+    return Trackee(split, body, manifold, step_std, tests, validation)
+
+
+def make_filter(
+    name: str,
+    trackee: Trackee,
+    setting: Setting,
+    n_particles: int = 500,
+    likelihood: str = "bidirectional",
+    body: Body | None = None,
+) -> SilhouetteParticleFilter:
+    """A filter that evaluates `n_particles` likelihoods a frame, whatever its method.
+
+    Args:
+        name: among `METHODS`. setting: sharpness or survival rate, and factor of the diffusion.
+        body: instead of the trackee's.
+
+    Raises:
+        InputError: an unknown method, or fewer particles than an annealed filter has layers.
+    """
+    if name not in METHODS:
+        raise InputError(f"method must be among {', '.join(METHODS)}, got {name!r}")
+    method, own = METHODS[name], trackee.body if body is None else body
+    common: dict[str, Any] = {
+        "step_std": setting.scale * trackee.step_std,
+        "likelihood": likelihood,
+    }
+    if name == "apf":
+        if n_particles < LAYERS:
+            raise InputError(f"{LAYERS} layers need {LAYERS} particles or more, got {n_particles}")
+        return AnnealedParticleFilter(
+            own, n_particles // LAYERS, n_layers=LAYERS, survival_rate=setting.value, **common
+        )
+    if name == "sir":
+        return SIRParticleFilter(own, n_particles, sharpness=setting.value, **common)
+    return ManifoldParticleFilter(
+        own, trackee.manifold, n_particles, sharpness=setting.value, **method.options, **common
+    )
+
+
+# --- fits -----------------------------------------------------------------------------------------
+
+
+def _any_heading(std: Float[Tensor, " D"], up: Float[Tensor, "3"]) -> Float[Tensor, " D"]:
+    """The root's steps the same in all horizontal directions: the next walk may go elsewhere."""
+    along = up.abs() > 0.9
+    level = ~along if bool(along.any()) else torch.ones_like(along)
+    std = std.clone()
+    std[:3] = torch.where(level, std[:3][level].square().mean().sqrt(), std[:3])
+    return std
+
+
+def person_seed(person: str, seed: int) -> int:
+    """Seed of a person's shape, the same in all conditions of a run."""
+    return int(settings_hash([person, seed])[:8], 16)
+
+
+def _body_of(clips: Sequence[MocapClip], conditions: Conditions) -> Body:
+    """Bone lengths of all frames, radii of a few frames of the first clip."""
+    body = fit_body(torch.cat([clip.joints for clip in clips]))
+    first = clips[0]
+    rig, silhouettes = _seen(first, conditions)
+    rows = torch.linspace(0, len(first) - 1, min(_RADII_FRAMES, len(first))).round().long()
+    states = fit_state(body, first.joints[rows])
+    return fit_radii(body, states, silhouettes[rows], rig, seed=conditions.seed)
+
+
+def _states(bodies: dict[str, Body], clip: MocapClip) -> Float[Tensor, "T D"]:
+    return fit_state(bodies[clip.person], clip.joints)
+
+
+def _manifold(split: Split, bodies: dict[str, Body], seed: int) -> BackConstrainedGPLVM:
+    body = bodies[split.person]
+    info = ManifoldInfo.of_body(
+        body,
+        name=f"{' '.join(dict.fromkeys(c.person for c in split.manifold))}",
+        persons=tuple(dict.fromkeys(c.person for c in split.manifold)),
+        actions=tuple(dict.fromkeys(c.action for c in split.manifold)),
+        sequences=tuple(c.trial for c in split.manifold),
+    )
+    poses = [body.relative(_states(bodies, clip)) for clip in split.manifold]
+    manifold = BackConstrainedGPLVM.fit(poses, seed=seed, info=info)
+    held_out = [body.relative(_states(bodies, clip)) for clip in split.validation]
+    return manifold.fit_noise(held_out, split.validation[0].fps)
+
+
+# --- views ----------------------------------------------------------------------------------------
+
+
+def _seen(clip: MocapClip, conditions: Conditions) -> tuple[CameraRig, Bool[Tensor, "T C H W"]]:
+    rig = place_cameras(clip) if conditions.rig is None else conditions.rig
+    if conditions.cameras_used > len(rig):
+        raise InputError(
+            f"{conditions.cameras_used} cameras are asked for, and there are {len(rig)}"
+        )
+    rig = rig.select(range(conditions.cameras_used)).scaled(*conditions.size)
+    if float(in_view(clip, rig).max()) == 0:
+        raise InputError(
+            f"{clip.trial}: no camera sees the person; cameras must be in the axes and metres of the "
+            "recordings"
+        )
+    shape = TrueShape.draw(person_seed(clip.person, conditions.seed))
+    generator = torch.Generator().manual_seed(person_seed(clip.trial, conditions.seed))
+    return rig, true_silhouettes(clip, shape, rig, conditions.faults, generator)
+
+
+def _view(body: Body, clip: MocapClip, conditions: Conditions) -> View:
+    rig, silhouettes = _seen(clip, conditions)
+    states = fit_state(body, clip.joints)
+    apart = (body.joints(states) - clip.joints).norm(dim=-1)
+    overlap = intersection_over_union(count_pixels(body, states[:, None], rig, silhouettes))
+    return View(
+        clip, rig, silhouettes, states[0], 1000 * float(apart.nanmean()),
+        float(overlap.mean()), float(in_view(clip, rig).min()),
+    )  # fmt: skip
