@@ -256,13 +256,13 @@ def filters_of(person: Person) -> dict[str, Make]:
     """The filters, with the same noise and the same joint limits."""
     body, manifold = person.body, person.manifold
     common = {"step_std": person.step_std, "limits": person.limits}
-    normalised = {"weights": "normalised", "proposal": "product"}
+    published = {"weights": "published", "proposal": "diffusion"}
     return plain_filters(body, person.step_std, person.limits) | {
         "MRPF": lambda s: ManifoldParticleFilter(
             body, manifold, N_PARTICLES, sharpness=s, **common
         ),
-        "MRPF, normalised, product": lambda s: ManifoldParticleFilter(
-            body, manifold, N_PARTICLES, sharpness=s, **common, **normalised
+        "MRPF, published": lambda s: ManifoldParticleFilter(
+            body, manifold, N_PARTICLES, sharpness=s, **common, **published
         ),
     }
 

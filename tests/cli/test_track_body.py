@@ -9,6 +9,7 @@ from torchpose.body_poses import BodyPoses
 from torchpose.camera import PinholeCamera, save_cameras
 from torchpose.camera_rig import CameraRig
 from torchpose.cli import main
+from torchpose.priors import BackConstrainedGPLVM, ManifoldInfo
 from torchpose.video import VideoWriter
 
 HEIGHT, WIDTH, N = 120, 160, 8
@@ -77,7 +78,7 @@ def arguments(folder, out, *more):
     return [
         "track-body", str(folder / "cameras.toml"), *(str(folder / f"{n}.mp4") for n in names),
         "--background", *(str(folder / f"{n}.png") for n in names),
-        "--n-particles", "100", "--rows", "60", "--out", str(out), *more,
+        "--n-particles", "300", "--rows", "60", "--out", str(out), *more,
     ]  # fmt: skip
 
 
@@ -136,3 +137,34 @@ def test_nobody_there_is_said(recorded, tmp_path, capsys):
 def test_bad_options_are_refused(recorded, tmp_path, capsys, more, said):
     assert main(arguments(recorded[0], tmp_path, *more)) == 2
     assert said in capsys.readouterr().err
+
+
+def rising_arms_manifold(body, fps=60.0):
+    """Of arms that rise and fall, and of others that were not fitted for the noise."""
+    phase = torch.linspace(0.1, 6.1, 60, dtype=torch.float64)
+    trials = []
+    for height in (0.15, 0.13):
+        states = arms_rise(body)[:1].expand(60, -1).clone()
+        for side, sign in (("left", 1.0), ("right", -1.0)):
+            part = body.skeleton.part(f"{side}_upper_arm")
+            states[:, 3 + 3 * part + 2] = sign * (0.2 + height * phase.sin())
+            states[:, 3 + 3 * part] = 0.1 * phase.cos()
+        trials.append(body.relative(states))
+    manifold = BackConstrainedGPLVM.fit(trials[0], info=ManifoldInfo.of_body(body, name="arms"))
+    return manifold.fit_noise(trials[1], fps)
+
+
+def test_a_manifold_of_the_motion(recorded, tmp_path, capsys):
+    folder, body, states = recorded
+    rising_arms_manifold(body).save(tmp_path / "arms.safetensors")
+    rising_arms_manifold(body, 30.0).save(tmp_path / "slow.safetensors")
+    given = ["--initial-pose", str(folder / "start.npz"), "--body", str(folder / "start.npz"),
+             "--overlay", "false", "--pictures", "false", "--manifold"]  # fmt: skip
+    out = tmp_path / "out"
+    assert main(arguments(folder, out, *given, str(tmp_path / "arms.safetensors"))) == 0
+    assert "mrpf" in capsys.readouterr().out
+    poses = BodyPoses.load(out / "body.npz")
+    errors = (poses.joints3d - body.joints(states)).norm(dim=-1)
+    assert float(errors.mean()) < 0.08
+    assert main(arguments(folder, out, *given, str(tmp_path / "slow.safetensors"))) == 2
+    assert "30 frames per second" in capsys.readouterr().err

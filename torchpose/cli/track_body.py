@@ -90,8 +90,8 @@ def build() -> ArgumentParser:
     )
     add("--n-particles", type=int, default=1000, metavar="N",
         help="particles, of all layers together (default 1000)")  # fmt: skip
-    add("--sharpness", type=float, default=60.0, metavar="X",
-        help="exponent of the likelihood (default 60; the papers have 1)")  # fmt: skip
+    add("--sharpness", type=float, default=100.0, metavar="X",
+        help="exponent of the likelihood (default 100; the papers have 1)")  # fmt: skip
     add("--fps", type=float, metavar="HZ", help="rate at which all videos are read")
     add("--delays", type=list[int] | None, default=None, metavar="[n,n,...]",
         help="frames by which each video began too early (default none)")  # fmt: skip
@@ -207,7 +207,10 @@ def make_filter(
         )
     if method == "sir":
         return SIRParticleFilter(body, n_particles, step_std=step, sharpness=sharpness)
-    return ManifoldParticleFilter(body, manifold, n_particles, sharpness=sharpness)
+    step[list(body.relative_columns)] = manifold.std_step.to(step)
+    return ManifoldParticleFilter(
+        body, manifold, n_particles, step_std=step, fps=fps, sharpness=sharpness
+    )
 
 
 def _track(
