@@ -58,6 +58,7 @@ N_PARTICLES, LAYERS = 1000, 5
 SHARPNESS = (30.0, 100.0, 300.0)
 ACTIONS = ("wave", "arm_curl", "squat", "lunge")
 TEST, TUNING, OTHERS = ("s02", "s04", "s06"), "s08", ("s01", "s03", "s05", "s07")
+DRAWN = ("squat", "s02", "MRPF")
 HEAD_TOP = 0.11  # metres: the Kinect's head is in the middle of the head
 PELVIS = BODY_15.joint("pelvis")
 Make = Callable[[float], SilhouetteParticleFilter]
@@ -274,7 +275,7 @@ def run(person: Person, make: Make, sharpness: float, data: Sequence1, seed: int
     return person.body.joints(track.mean)
 
 
-def report_one(report: Report, folder: Path, seeds: int, actions: Sequence[str]) -> None:
+def report_one(report: Report, folder: Path, seeds: int, actions: Sequence[str], out: Path) -> None:
     """Error of a single view, for each action."""
     centred = report.table(
         "one", "One depth camera: error without the place of the pelvis (mm)", ["all", *PARTS],
@@ -306,6 +307,10 @@ def report_one(report: Report, folder: Path, seeds: int, actions: Sequence[str])
                 for seed in range(seeds):
                     found = run(person, make, best[name], data, seed + zlib.crc32(p.encode()) % 97)
                     rows.setdefault(name, []).append((found, data.joints))
+                if (action, p, name) == DRAWN:
+                    states = fit_state(person.body, found)
+                    draw(data, person.body, states, out / "one-camera.png")
+                    report.pictures.append("one-camera.png")
         for name, pairs in rows.items():
             label = f"{action}, {name}" + (f" ({best[name]:g})" if best.get(name, 1) > 1 else "")
             for table, without in ((centred, True), (placed, False)):
@@ -329,7 +334,7 @@ def main() -> None:
     if args.only != "one":
         report_four(report, args.data, args.seeds, out)
     if args.only != "four":
-        report_one(report, args.data, args.seeds, args.actions)
+        report_one(report, args.data, args.seeds, args.actions, out)
     print(report.summary())
     (out / "real-silhouettes.md").write_text(report.to_markdown(), encoding="utf-8")
 

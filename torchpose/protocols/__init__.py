@@ -7,6 +7,7 @@
 - `learning_curve`: error over the number of training persons; one person's prior against many.
 - `cross_dataset`: a prior of one data set on another one's persons, and what motion capture adds.
 - `uncommon_poses`: training recordings of raised arms left out.
+- `silhouette`: whole bodies in silhouettes of several cameras, by three particle filters.
 """
 
 from torchpose.protocols.report import Report, Table
@@ -21,6 +22,7 @@ PROTOCOLS = (
     "learning-curve",
     "cross-dataset",
     "uncommon-poses",
+    "silhouette",
 )
 
 
