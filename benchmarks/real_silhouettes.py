@@ -40,7 +40,7 @@ from torchpose.filters.silhouette_filter import SilhouetteParticleFilter, motion
 from torchpose.io import check_output_folder
 from torchpose.measure.silhouettes import (
     SilhouetteMeasurer,
-    fit_view,
+    fit_views,
     read_empty_scene,
     read_silhouettes,
 )
@@ -89,8 +89,7 @@ def four_views(folder: Path) -> Sequence1:
     raw = folder / "multicam_pose2sim" / "raw"
     cameras = list(load_cameras(raw / "Calib_qualisys.toml").values())
     sources = [open_video(raw / f"cam{i:02d}.mp4") for i in range(1, 5)]
-    width = max(round(c.image_size[0] * ROWS / c.image_size[1]) for c in cameras)  # type: ignore[index]
-    views = [fit_view(c, s.size, ROWS, width) for c, s in zip(cameras, sources, strict=True)]
+    views = fit_views(cameras, [source.size for source in sources], ROWS)
     measurers = []
     for i, (view, source) in enumerate(zip(views, sources, strict=True), start=1):
         empty = read_empty_scene(raw / f"cam{i:02d}_ext.png")

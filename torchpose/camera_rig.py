@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchpose.camera import PinholeCamera, load_cameras
 from torchpose.errors import CameraError, InputError, check_shape
 
-__all__ = ["CameraRig", "Cameras", "RigView", "as_rig"]
+__all__ = ["CameraRig", "Cameras", "RigView", "as_rig", "scale_matrix", "undistortion_maps"]
 
 _OPENCV_DISTORTIONS = 14  # the longest list that OpenCV takes; zeros change nothing
 
@@ -147,11 +147,7 @@ class CameraRig(nn.Module):
             )
         old = torch.tensor([s for s in self.sizes if s is not None]).to(self.matrix)
         sx, sy = width / old[:, 1], height / old[:, 0]
-        matrix = self.matrix.clone()
-        matrix[:, 0] *= sx[:, None]
-        matrix[:, 1] *= sy[:, None]
-        matrix[:, 0, 2] += (sx - 1) / 2
-        matrix[:, 1, 2] += (sy - 1) / 2
+        matrix = scale_matrix(self.matrix, sx, sy)
         rig = copy.copy(self)
         rig._buffers = {**dict(self.named_buffers()), "matrix": matrix}
         rig.sizes = ((int(height), int(width)),) * len(self)
@@ -212,23 +208,61 @@ class CameraRig(nn.Module):
         """Images [T, H, W] or [T, H, W, 3] of one camera."""
         import cv2
 
-        d = self.distortions[camera].numpy(force=True)
-        if not d.any():
-            return images
-        K = self.matrix[camera].numpy(force=True)
         size = images.shape[2], images.shape[1]
-        if self.fisheye[camera]:
-            u, v = cv2.fisheye.initUndistortRectifyMap(K, d[:4], np.eye(3), K, size, cv2.CV_32FC1)
-        else:
-            u, v = cv2.initUndistortRectifyMap(K, d, np.eye(3), K, size, cv2.CV_32FC1)
-        if K[0, 1]:  # OpenCV leaves the skew of the distorted image out
-            u = u + np.float32(K[0, 1] / K[1, 1]) * (v - np.float32(K[1, 2]))
+        d, K = self.distortions[camera], self.matrix[camera]
+        maps = undistortion_maps(K, d, self.fisheye[camera], size)
+        if maps is None:
+            return images
         mask = images.dtype == bool
         source = images.astype(np.uint8) * 255 if mask else images
         out = np.empty_like(source)
         for image, straight in zip(source, out, strict=True):
-            straight[:] = cv2.remap(np.ascontiguousarray(image), u, v, cv2.INTER_LINEAR)
+            straight[:] = cv2.remap(np.ascontiguousarray(image), *maps, cv2.INTER_LINEAR)
         return out > 127 if mask else out
+
+
+def scale_matrix(
+    matrix: Float[Tensor, "*batch 3 3"], sx: Tensor | float, sy: Tensor | float
+) -> Float[Tensor, "*batch 3 3"]:
+    """K of images that are scaled by sx and sy, pixel centres at whole numbers.
+
+    Args:
+        matrix: K. sx, sy: new by old width and height, numbers or of the batch's shape.
+    """
+    scaled = matrix.clone()
+    sx, sy = (torch.as_tensor(s).to(matrix) for s in (sx, sy))
+    scaled[..., 0, :] *= sx[..., None]
+    scaled[..., 1, :] *= sy[..., None]
+    scaled[..., 0, 2] += (sx - 1) / 2
+    scaled[..., 1, 2] += (sy - 1) / 2
+    return scaled
+
+
+def undistortion_maps(
+    matrix: Float[Tensor, "3 3"], distortions: Float[Tensor, " n"], fisheye: bool,
+    size: tuple[int, int],
+) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
+    """Where each pixel of an image without distortion is to be looked up, for `cv2.remap`.
+
+    Args:
+        matrix: K, the same before and after. distortions: OpenCV's. size: (width, height).
+
+    Returns:
+        u and v [height, width], float32; None if nothing is distorted.
+    """
+    import cv2
+
+    d, K = distortions.numpy(force=True), matrix.numpy(force=True)
+    if not d.any():
+        return None
+    if fisheye:
+        u, v = cv2.fisheye.initUndistortRectifyMap(K, d[:4], np.eye(3), K, size, cv2.CV_32FC1)
+    else:
+        u, v = cv2.initUndistortRectifyMap(K, d, np.eye(3), K, size, cv2.CV_32FC1)
+    u, v = np.asarray(u), np.asarray(v)
+    if K[0, 1]:  # OpenCV leaves the skew of the distorted image out
+        u = u + np.float32(K[0, 1] / K[1, 1]) * (v - np.float32(K[1, 2]))
+    return u, v
 
 
 Cameras = CameraRig | PinholeCamera | Iterable[PinholeCamera] | Mapping[str, PinholeCamera]

@@ -1,6 +1,7 @@
 """The videos of a `torchpose track-body`: opened, turned to silhouettes, read once more to be drawn."""
 
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from jsonargparse import Namespace
@@ -10,7 +11,7 @@ if TYPE_CHECKING:
 
     from torchpose.camera import PinholeCamera
     from torchpose.camera_rig import CameraRig
-    from torchpose.measure.silhouettes import SilhouetteMeasurer, SilhouetteView
+    from torchpose.measure.silhouettes import SilhouetteMeasurer
     from torchpose.video import VideoSource
 
 __all__ = ["Recordings"]
@@ -20,9 +21,11 @@ class Recordings:
     """The videos, how each becomes silhouettes, and the silhouettes that were seen so far."""
 
     def __init__(self, args: Namespace, cameras: "Sequence[PinholeCamera]") -> None:
+        from torchpose.measure.silhouettes import fit_views
+
         self._args = args
         self.sources = self._open()
-        self.views = _views(cameras, [s.size for s in self.sources], args.rows)
+        self.views = fit_views(cameras, [s.size for s in self.sources], args.rows)
         self.packed: list[Any] = []
         self.notes: list[str] = []
 
@@ -33,7 +36,7 @@ class Recordings:
         for source in self.sources:
             source.close()
 
-    @property
+    @cached_property
     def rig(self) -> "CameraRig":
         """The cameras of the silhouettes."""
         from torchpose.camera_rig import CameraRig
@@ -73,12 +76,11 @@ class Recordings:
 
     def images(self) -> Iterator[tuple[Any, ...]]:
         """The frames of all cameras once more."""
+        from torchpose.measure.silhouettes import frames_in_step
+
         sources = self._open()
         try:
-            for source, delay in zip(sources, self._args.delays or [0] * len(sources), strict=True):
-                for _ in range(delay):
-                    next(source, None)
-            for frames in zip(*sources, strict=False):
+            for frames in frames_in_step(sources, self._args.delays or [0] * len(sources)):
                 yield tuple(frame.image for frame in frames)
         finally:
             for source in sources:
@@ -95,6 +97,7 @@ class Recordings:
             learning_frames,
             read_empty_scene,
         )
+        from torchpose.video import open_video
 
         print("learning the background ...", flush=True)
         empty = [read_empty_scene(path) for path in self._args.background or []]
@@ -104,19 +107,11 @@ class Recordings:
                 "of the person that never moves is taken for it, too"
             )
         measurers = []
-        for i, (view, video) in enumerate(zip(self.views, self._open(), strict=True)):
-            with video as source:
-                wanted = not empty or self._args.ignore_still
-                frames = learning_frames(source) if wanted else None
-            measurers.append(SilhouetteMeasurer(view, empty[i] if empty else None, frames))
+        for i, (view, path) in enumerate(zip(self.views, self._args.videos, strict=True)):
+            if empty and not self._args.ignore_still:
+                measurers.append(SilhouetteMeasurer(view, empty[i]))
+                continue
+            with open_video(path, fps=self._args.fps) as source:
+                frames = learning_frames(source)
+                measurers.append(SilhouetteMeasurer(view, empty[i] if empty else None, frames))
         return measurers
-
-
-def _views(
-    cameras: "Sequence[PinholeCamera]", sizes: Sequence[tuple[int, int]], rows: int
-) -> "list[SilhouetteView]":
-    from torchpose.measure.silhouettes import fit_view
-
-    shapes = [c.image_size or size for c, size in zip(cameras, sizes, strict=True)]
-    width = max(round(w * rows / h) for w, h in shapes)
-    return [fit_view(c, size, rows, width) for c, size in zip(cameras, sizes, strict=True)]

@@ -1,6 +1,7 @@
 """One person's silhouettes in the synchronised videos of calibrated cameras."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,15 +12,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpose.camera import PinholeCamera
+from torchpose.camera_rig import scale_matrix, undistortion_maps
 from torchpose.errors import CameraError, InputError, check_rgb
 from torchpose.measure.brightness_background import BrightnessBackground, PixelKind
-from torchpose.video.base import VideoSource
+from torchpose.projection import intrinsics
+from torchpose.video.base import VideoFrame, VideoSource
 
 __all__ = [
     "SilhouetteMeasurer",
     "SilhouetteView",
     "clean_silhouette",
     "fit_view",
+    "fit_views",
+    "frames_in_step",
     "read_silhouettes",
 ]
 
@@ -76,14 +81,23 @@ def fit_view(
     scale = min(width / calibrated[0], height / calibrated[1])
     inner = (min(width, round(calibrated[0] * scale)), min(height, round(calibrated[1] * scale)))
     x, y = inner[0] / calibrated[0], inner[1] / calibrated[1]
-    K = camera.matrix
+    fx, fy, skew, cx, cy = map(float, intrinsics(scale_matrix(camera.matrix, x, y)))
     scaled = PinholeCamera(
-        float(K[0, 0]) * x, float(K[1, 1]) * y,
-        (float(K[0, 2]) + 0.5) * x - 0.5, (float(K[1, 2]) + 0.5) * y - 0.5,
-        width, height, camera.name, skew=float(K[0, 1]) * x,
+        fx, fy, cx, cy, width, height, camera.name, skew=skew,
         rotation=camera.rotation.tolist(), translation=camera.translation.tolist(),
     )  # fmt: skip
     return SilhouetteView(scaled, size, padding, inner, camera)
+
+
+def fit_views(
+    cameras: Sequence[PinholeCamera], sizes: Sequence[tuple[int, int]], rows: int
+) -> list[SilhouetteView]:
+    """`fit_view` of each camera, in images of so many rows that are wide enough for all of them."""
+    shapes = [camera.image_size or size for camera, size in zip(cameras, sizes, strict=True)]
+    width = max(round(w * rows / h) for w, h in shapes)
+    return [
+        fit_view(camera, size, rows, width) for camera, size in zip(cameras, sizes, strict=True)
+    ]
 
 
 def clean_silhouette(mask: NDArray[np.bool_], largest_hole: float = _HOLE) -> NDArray[np.bool_]:
@@ -147,22 +161,24 @@ class SilhouetteMeasurer:
     def __init__(
         self,
         view: SilhouetteView,
-        empty: Sequence[Image] | None = None,
-        frames: Sequence[Image] | None = None,
+        empty: Iterable[Image] | None = None,
+        frames: Iterable[Image] | None = None,
     ) -> None:
-        empty, frames = list(empty or ()), list(frames or ())
-        if not empty and not frames:
-            raise InputError("give frames of the empty scene, or frames of the video itself")
         self.view = view
         self._maps = _undistortion(view)
+        # large frames pass one by one, what is kept of them is small
+        without = [self._prepare(frame) for frame in (() if empty is None else empty)]
+        shown = [self._prepare(frame) for frame in (() if frames is None else frames)]
+        if not without and not shown:
+            raise InputError("give frames of the empty scene, or frames of the video itself")
         self._background: BrightnessBackground | None = None
         self._moved: _Moved | None = None
-        if empty:
-            self._background = BrightnessBackground().fit(self._stack(empty))
-            if frames:
-                self._moved = _find_moved(self._stack(frames))
+        if without:
+            self._background = BrightnessBackground().fit(_stack(without))
+            if shown:
+                self._moved = _find_moved(_stack(shown))
         else:
-            self._mixture = self._learn(frames)
+            self._mixture = _learn(shown)
 
     def __call__(self, frame: Image) -> NDArray[np.bool_]:
         """The silhouette in a frame: bool, of the size of the view's camera [height, width].
@@ -178,20 +194,12 @@ class SilhouetteMeasurer:
 
     def _foreground(self, small: Image) -> NDArray[np.bool_]:
         if self._background is not None:
-            image = self._tensor(small)
+            image = _tensor(small)
             found = self._background(image) == PixelKind.FOREGROUND
             if self._moved is not None:
                 found &= ~(self._moved.still & _alike(image, self._moved.colour))
             return found.numpy()
         return np.asarray(self._mixture.apply(small, None, 0.0) == 255)
-
-    def _learn(self, frames: Sequence[Image]) -> Any:
-        import cv2
-
-        mixture = cv2.createBackgroundSubtractorMOG2(len(frames), 16.0, True)
-        for frame in frames:
-            mixture.apply(self._prepare(frame), None, 1 / len(frames))
-        return mixture
 
     def _prepare(self, frame: Image) -> Image:
         """Padded, undistorted and scaled in one go."""
@@ -211,12 +219,23 @@ class SilhouetteMeasurer:
             whole = cv2.remap(whole, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(cv2.resize(whole, self.view.inner, interpolation=cv2.INTER_AREA))
 
-    def _stack(self, frames: Sequence[Image]) -> UInt8[Tensor, "N 3 H W"]:
-        return torch.stack([self._tensor(self._prepare(frame)) for frame in frames])
 
-    @staticmethod
-    def _tensor(image: Image) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)
+def _tensor(image: Image) -> UInt8[Tensor, "3 H W"]:
+    return torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)
+
+
+def _stack(images: Sequence[Image]) -> UInt8[Tensor, "N 3 H W"]:
+    return torch.stack([_tensor(image) for image in images])
+
+
+def _learn(images: Sequence[Image]) -> Any:
+    """OpenCV's MOG2 of what stays in all of the images."""
+    import cv2
+
+    mixture = cv2.createBackgroundSubtractorMOG2(len(images), 16.0, True)
+    for image in images:
+        mixture.apply(image, None, 1 / len(images))
+    return mixture
 
 
 class _Moved(NamedTuple):
@@ -235,25 +254,19 @@ def _alike(images: Tensor, colour: Tensor) -> Tensor:
     return (images.int() - colour.int()).abs().amax(-3) <= _SAME
 
 
-def _undistortion(view: SilhouetteView) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-    """Where each pixel without distortion is to be looked up; None if nothing is distorted."""
-    import cv2
-
+def _undistortion(view: SilhouetteView) -> tuple[np.ndarray, np.ndarray] | None:
+    """`undistortion_maps` of the image with its padding."""
     camera = view.source
-    if not bool(camera.distortions.any()):
-        return None
-    K, d = camera.matrix.numpy(), camera.distortions.numpy()
     size = (view.size[0] + view.padding[0], view.size[1] + view.padding[1])
-    model = cv2.fisheye if camera.fisheye else cv2
-    maps = model.initUndistortRectifyMap(K, d, np.eye(3), K, size, cv2.CV_32FC1)
-    return np.asarray(maps[0]), np.asarray(maps[1])
+    return undistortion_maps(camera.matrix, camera.distortions, camera.fisheye, size)
 
 
-def learning_frames(source: VideoSource) -> list[Image]:
+def learning_frames(source: VideoSource) -> Iterator[Image]:
     """Some frames spread over a video, for what it shows all the time."""
     count = source.n_frames or _LEARNING_FRAMES
     stride = max(1, count // _LEARNING_FRAMES)
-    return [frame.image for frame in source if frame.index % stride == 0][: 2 * _LEARNING_FRAMES]
+    spread = (frame.image for frame in source if frame.index % stride == 0)
+    return islice(spread, 2 * _LEARNING_FRAMES)
 
 
 def read_empty_scene(path: str | Path) -> list[Image]:
@@ -271,7 +284,21 @@ def read_empty_scene(path: str | Path) -> list[Image]:
         if picture is not None:
             return [np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)]
     with open_video(str(path)) as source:
-        return learning_frames(source)
+        return list(learning_frames(source))
+
+
+def frames_in_step(
+    sources: Sequence[VideoSource], delays: Sequence[int]
+) -> Iterator[tuple[VideoFrame, ...]]:
+    """The frames of all videos side by side, until the first one ends.
+
+    Args:
+        delays: frames by which each video began too early, which are passed over.
+    """
+    for source, delay in zip(sources, delays, strict=True):
+        for _ in range(delay):
+            next(source, None)
+    yield from zip(*sources, strict=False)
 
 
 def read_silhouettes(
@@ -299,9 +326,6 @@ def read_silhouettes(
         raise InputError(
             f"videos must have one frame rate, got {sorted(rates)}; open them with a common fps"
         )
-    for source, start in zip(sources, starts, strict=True):
-        for _ in range(start):
-            next(source, None)
-    for frames in zip(*sources, strict=False):
+    for frames in frames_in_step(sources, starts):
         masks = [m(frame.image) for m, frame in zip(measurers, frames, strict=True)]
         yield torch.from_numpy(np.stack(masks))
