@@ -12,6 +12,7 @@ from torchpose.body_poses import BodyPoses
 from torchpose.camera_rig import Cameras
 from torchpose.errors import InputError
 from torchpose.filters.base import Generators
+from torchpose.filters.body_particles import stack_tracks
 from torchpose.filters.silhouette_filter import BodyFilterState, SilhouetteParticleFilter
 
 __all__ = ["joint_covariance", "track_body"]
@@ -55,12 +56,10 @@ def track_body(
         covs.append(joint_covariance(model.body, state, out.mean)[0])
     if not steps:
         raise InputError("there must be at least one frame of silhouettes, got none")
-    mean, evidence, std, size, coasting, respread = (
-        torch.cat(part) for part in zip(*steps, strict=True)
-    )
+    track = stack_tracks(steps).element(0)
     return BodyPoses(
-        model.body, mean, std, model.body.joints(mean), torch.stack(covs), evidence, size,
-        coasting, respread, fps,
+        model.body, track.mean, track.std, model.body.joints(track.mean), torch.stack(covs),
+        track.log_evidence, track.effective_sample_size, track.coasting, track.respread, fps,
     )  # fmt: skip
 
 

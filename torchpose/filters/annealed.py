@@ -12,6 +12,8 @@ from torchpose.errors import InputError
 from torchpose.filters.base import Generators
 from torchpose.filters.resampling import resample
 from torchpose.filters.silhouette_filter import (
+    BodyFilterState,
+    Frame,
     PoseSpace,
     Score,
     SilhouetteParticleFilter,
@@ -142,15 +144,10 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
         self.schedule, self.noise_decay = schedule, decay
 
     def move(
-        self,
-        particles: Float[Tensor, "B N D"],
-        log_weights: Float[Tensor, "B N"],
-        score: Score,
-        seen: Bool[Tensor, " B"],
-        generator: Generators,
+        self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
         """Anneal from the resampled particles of the last frame."""
-        run = self.anneal(particles, score, seen, generator)
+        run = self.anneal(state.particles, frame.score, frame.seen, generator)
         no_evidence = torch.full_like(run.log_weights[:, 0], torch.nan)
         return WeightedParticles(run.particles, run.log_weights, no_evidence)
 

@@ -4,10 +4,10 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor, nn
 
-from torchpose.body.silhouette import count_pixels, prepare_silhouettes
+from torchpose.body.silhouette import PreparedSilhouettes, count_pixels, prepare_silhouettes
 from torchpose.body.silhouette_likelihood import silhouette_log_likelihood
 from torchpose.errors import InputError, check_finite, check_shape
 
@@ -22,6 +22,7 @@ __all__ = [
     "motion_std",
     "reweight",
     "silhouette_score",
+    "stack_tracks",
     "take_particles",
 ]
 
@@ -62,6 +63,7 @@ class BodyTrack(NamedTuple):
         effective_sample_size: 1 / sum_n w_n^2 of the weights of the estimate.
         coasting: True where no camera saw the person: diffused, not weighted by an image.
         respread: True where all particles had died: drawn anew about the last mean.
+        details: what only some filters report, by name, each with the same leading dimensions.
     """
 
     mean: Tensor
@@ -70,6 +72,12 @@ class BodyTrack(NamedTuple):
     effective_sample_size: Tensor
     coasting: Tensor
     respread: Tensor
+    details: dict[str, Tensor]
+
+    def element(self, index: int) -> "BodyTrack":
+        """The track of one element of a batch."""
+        details = {name: value[index] for name, value in self.details.items()}
+        return BodyTrack(*(part[index] for part in self[:-1]), details)
 
 
 class BodyFilterState(NamedTuple):
@@ -78,12 +86,16 @@ class BodyFilterState(NamedTuple):
     Attributes:
         particles: [B, N, D]. log_weights: normalised, [B, N], float64. mean: last estimate [B, D].
         lost: number of frames in a row in which all particles died, [B].
+        memory: what a filter remembers of every particle beside its state, [B, N, ...]; resampled
+            with them. trend: what it remembers of every element, [B, ...].
     """
 
     particles: Tensor
     log_weights: Tensor
     mean: Tensor
     lost: Tensor
+    memory: Tensor | None = None
+    trend: Tensor | None = None
 
 
 class WeightedParticles(NamedTuple):
@@ -92,19 +104,34 @@ class WeightedParticles(NamedTuple):
     Attributes:
         particles: [B, N, D]. log_weights: normalised [B, N], float64; NaN in an element whose particles
             all died. log_evidence: of the frame, [B]; it counts where somebody is seen.
+        memory, trend: as in the state, of the new frame. details: as in `BodyTrack`, [B, ...].
     """
 
     particles: Tensor
     log_weights: Tensor
     log_evidence: Tensor
+    memory: Tensor | None = None
+    trend: Tensor | None = None
+    details: dict[str, Tensor] | None = None
 
 
-def silhouette_score(body: Any, frame: Tensor, cameras: Any, likelihood: str) -> Score:
+def stack_tracks(steps: Sequence[BodyTrack]) -> BodyTrack:
+    """Steps [B, ...] as one track [B, T, ...]."""
+    parts = zip(*(step[:-1] for step in steps), strict=True)
+    names = steps[0].details
+    details = {name: torch.stack([step.details[name] for step in steps], 1) for name in names}
+    return BodyTrack(*(torch.stack(part, 1) for part in parts), details)
+
+
+def silhouette_score(
+    body: Any, silhouettes: Tensor | PreparedSilhouettes, cameras: Any, likelihood: str
+) -> Score:
     """states [B, N, D] -> log-likelihood [B, N] of the silhouettes [B, C, H, W] of one frame."""
-    prepared = prepare_silhouettes(frame)
+    if not isinstance(silhouettes, PreparedSilhouettes):
+        silhouettes = prepare_silhouettes(silhouettes)
 
     def score(states: Tensor) -> Tensor:
-        counts = count_pixels(body, states, cameras, prepared)
+        counts = count_pixels(body, states, cameras, silhouettes)
         return silhouette_log_likelihood(counts, likelihood)
 
     return score
@@ -132,13 +159,13 @@ def reweight(
 
 
 def take_particles(
-    particles: Float[Tensor, "B N D"], ancestors: Int[Tensor, "B n"]
-) -> Float[Tensor, "B n D"]:
+    particles: Shaped[Tensor, "B N *rest"], ancestors: Int[Tensor, "B n"]
+) -> Shaped[Tensor, "B n *rest"]:
     """particles[b, ancestors[b, i]]."""
-    batch, n, dim = particles.shape
+    batch, n, *rest = particles.shape
     first = torch.arange(batch, device=ancestors.device)[:, None] * n
-    taken = particles.reshape(-1, dim).index_select(0, (ancestors + first).reshape(-1))
-    return taken.view(batch, ancestors.shape[1], dim)
+    taken = particles.flatten(0, 1).index_select(0, (ancestors + first).reshape(-1))
+    return taken.view(batch, ancestors.shape[1], *rest)
 
 
 def default_step_std(body: PoseSpace) -> Float[Tensor, " D"]:

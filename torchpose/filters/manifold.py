@@ -9,8 +9,9 @@ from torch import Tensor
 from torchpose.errors import InputError, PriorError, check_shape
 from torchpose.filters.base import Generators, standard_normal
 from torchpose.filters.silhouette_filter import (
+    BodyFilterState,
+    Frame,
     PoseSpace,
-    Score,
     SilhouetteParticleFilter,
     WeightedParticles,
     default_step_std,
@@ -122,14 +123,10 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
         self.columns: Tensor
 
     def move(
-        self,
-        particles: Float[Tensor, "B N D"],
-        log_weights: Float[Tensor, "B N"],
-        score: Score,
-        seen: Bool[Tensor, " B"],
-        generator: Generators,
+        self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
         """Steps 3 to 7 of Algorithm 1."""
+        particles, seen = state.particles, frame.seen
         before = particles.index_select(-1, self.columns)
         target = self.draw_targets(before, generator)
         # without an image to weigh by, weights would only thin the particles out
@@ -137,8 +134,8 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
         moved = self._propose(particles, target - before, exact, generator)
         after = moved.index_select(-1, self.columns)
         log_omega = self._log_omega(before, after, target).double()
-        log_prior = log_weights + torch.where(seen[:, None], log_omega, 0.0)
-        return reweight(moved, log_prior + self.log_limits(moved), score(moved))
+        log_prior = state.log_weights + torch.where(seen[:, None], log_omega, 0.0)
+        return reweight(moved, log_prior + self.log_limits(moved), frame.score(moved))
 
     def draw_targets(
         self, before: Float[Tensor, "B N Q"], generator: Generators

@@ -5,7 +5,6 @@ empty silhouettes, dead particles and the loop over time are handled here.
 """
 
 import math
-import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,15 +14,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
+from torchpose.body.silhouette import prepare_silhouettes
 from torchpose.body.silhouette_likelihood import LIKELIHOODS
-from torchpose.errors import (
-    DegenerateFilterWarning,
-    InputError,
-    ShapeError,
-    check_finite,
-    check_shape,
-)
+from torchpose.errors import InputError, check_finite, check_shape
 from torchpose.filters.base import Generators, effective_sample_size, standard_normal
+from torchpose.filters.body_frames import (
+    Frame,
+    check_frame,
+    check_sequences,
+    is_seen,
+    warn_if_respread,
+)
 from torchpose.filters.body_particles import (
     BodyFilterState,
     BodyTrack,
@@ -35,13 +36,16 @@ from torchpose.filters.body_particles import (
     motion_std,
     reweight,
     silhouette_score,
+    stack_tracks,
     take_particles,
 )
+from torchpose.filters.leg_swap import check_leg_swap, swap_legs
 from torchpose.filters.resampling import RESAMPLING, resample
 
 __all__ = [
     "BodyFilterState",
     "BodyTrack",
+    "Frame",
     "PoseSpace",
     "SilhouetteParticleFilter",
     "WeightedParticles",
@@ -75,6 +79,9 @@ class SilhouetteParticleFilter(nn.Module):
         resample_threshold: share of N below which the effective sample size leads to resampling;
             1 is in every frame, as published.
         estimate: "mean", weighted before resampling, or "map", the particle of the largest weight.
+        leg_swap: for a person whose legs may have been taken for each other: at resampling a particle
+            goes on with its legs exchanged with this probability times the angle between its upper
+            legs over pi (Daubney & Xie, section 8); 0 for never.
         respread_scale: particles that all died are drawn about the last mean with this many times
             `step_std`, twice that in the second such frame, and so on.
 
@@ -97,6 +104,7 @@ class SilhouetteParticleFilter(nn.Module):
         resampling: str = "systematic",
         resample_threshold: float = 1.0,
         estimate: str = "mean",
+        leg_swap: float = 0.0,
         respread_scale: float = 5.0,
     ) -> None:
         super().__init__()
@@ -108,6 +116,7 @@ class SilhouetteParticleFilter(nn.Module):
             raise InputError(f"n_particles must be at least 1, got {n_particles}")
         if not 0 <= resample_threshold <= 1:
             raise InputError(f"resample_threshold must be from 0 to 1, got {resample_threshold}")
+        check_leg_swap(body, leg_swap)
         for name, value in (("sharpness", sharpness), ("respread_scale", respread_scale)):
             if not 0 < value < math.inf:
                 raise InputError(f"{name} must be positive and finite, got {value}")
@@ -115,28 +124,45 @@ class SilhouetteParticleFilter(nn.Module):
         self.n_particles, self.sharpness = n_particles, float(sharpness)
         self.likelihood, self.estimate = likelihood, estimate
         self.resampling, self.resample_threshold = resampling, resample_threshold
-        self.respread_scale = respread_scale
+        self.leg_swap, self.respread_scale = leg_swap, respread_scale
         self.register_buffer("step_std", as_step_std(body, step_std))
 
     # --- what a subclass adds
 
     @abstractmethod
     def move(
-        self,
-        particles: Float[Tensor, "B N D"],
-        log_weights: Float[Tensor, "B N"],
-        score: Score,
-        seen: Bool[Tensor, " B"],
-        generator: Generators,
+        self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
         """Weighted particles of the next frame from those of the last.
 
         Args:
-            particles, log_weights: of the last frame, resampled if that was due; normalised.
-            score: states [B, N, D] -> sharpened log-likelihood of the frame [B, N], float64; 0 in
-                elements that nobody sees.
-            seen: [B], False where the frame is empty. generator: for what is drawn.
+            state: of the last frame, its particles resampled if that was due, with what was remembered
+                of them. frame: what is seen. generator: for what is drawn.
         """
+
+    def first_memory(self, particles: Float[Tensor, "B N D"]) -> Tensor | None:
+        """What is remembered of new particles, [B, N, ...]; nothing by default."""
+        return None
+
+    def first_trend(self, mean: Float[Tensor, "B D"]) -> Tensor | None:
+        """What is remembered of an element, [B, ...], before the first frame; nothing by default."""
+        return None
+
+    def swap_memory(self, memory: Tensor, swapped: Bool[Tensor, "B N"]) -> Tensor:
+        """What is remembered of particles whose legs have been exchanged; the same by default."""
+        return memory
+
+    def spread(
+        self,
+        particles: Float[Tensor, "B N D"],
+        log_weights: Float[Tensor, "B N"],
+        mean: Float[Tensor, "B D"],
+        memory: Tensor | None,
+    ) -> Float[Tensor, "B D"]:
+        """Standard deviation about the estimate, in the units of a step."""
+        gap = self.body.difference(particles, mean[:, None].expand_as(particles))
+        weights = log_weights.exp().to(gap.dtype)
+        return torch.einsum("bn,bnd->bd", weights, gap.square()).sqrt()
 
     # --- running
 
@@ -169,15 +195,21 @@ class SilhouetteParticleFilter(nn.Module):
             ShapeError: sizes that do not match. InputError: no frames, values that are not finite,
             silhouettes that are not bool. CameraError: as the likelihood.
         """
-        frames, start, batched = self._check(silhouettes, initial_state, generator)
+        frames, start, batched = check_sequences(
+            silhouettes,
+            initial_state,
+            generator,
+            self.body.dim,
+            plain=not callable(self.likelihood),
+        )
         state = self.init(start, generator, initial_std)
         steps = []
         for t in tqdm(range(frames.shape[1]), disable=not progress, unit="frame"):
             state, out = self._advance(state, frames[:, t], cameras, generator)
             steps.append(out)
-        track = BodyTrack(*(torch.stack(part, 1) for part in zip(*steps, strict=True)))
-        _warn_if_respread(track.respread)
-        return track if batched else BodyTrack(*(part[0] for part in track))
+        track = stack_tracks(steps)
+        warn_if_respread(track.respread)
+        return track if batched else track.element(0)
 
     @torch.no_grad()
     def init(
@@ -197,7 +229,8 @@ class SilhouetteParticleFilter(nn.Module):
         uniform = torch.full(particles.shape[:2], -math.log(self.n_particles))
         uniform = uniform.to(start.device, torch.float64)
         lost = torch.zeros(len(start), dtype=torch.long, device=start.device)
-        return BodyFilterState(particles, uniform, start, lost)
+        memory, trend = self.first_memory(particles), self.first_trend(start)
+        return BodyFilterState(particles, uniform, start, lost, memory, trend)
 
     @torch.no_grad()
     def step(
@@ -216,41 +249,35 @@ class SilhouetteParticleFilter(nn.Module):
         Returns:
             The next state, and a `BodyTrack` without the dimension of time.
         """
-        if len(silhouettes) != len(state.mean):
-            raise ShapeError(
-                f"silhouettes must hold one frame for each of the {len(state.mean)} elements of the "
-                f"state, [B, C, H, W]; got {list(silhouettes.shape)}"
-            )
-        self._check_silhouettes(silhouettes[:, None])
+        check_frame(silhouettes, len(state.mean), plain=not callable(self.likelihood))
         state, out = self._advance(state, silhouettes, cameras, generator)
-        _warn_if_respread(out.respread[:, None])
+        warn_if_respread(out.respread[:, None])
         return state, out
 
     def _advance(
-        self, state: BodyFilterState, frame: Tensor, cameras: Any, generator: Generators
+        self, state: BodyFilterState, silhouettes: Tensor, cameras: Any, generator: Generators
     ) -> tuple[BodyFilterState, BodyTrack]:
-        frame = frame.to(self.step_std.device)
-        seen = _is_seen(frame)
-        score = self._score(frame, cameras, seen)
-        particles, log_weights = self._resample(state, generator)
-        moved = self.move(particles, log_weights, score, seen, generator)
+        frame = self._frame(silhouettes.to(self.step_std.device), cameras)
+        moved = self.move(self._resample(state, generator), frame, generator)
         dead = ~torch.isfinite(moved.log_weights.amax(-1))
         lost = torch.where(dead, state.lost + 1, 0)
-        particles, log_weights = moved.particles, moved.log_weights
         if bool(dead.any()):
-            particles, log_weights = self._respread(moved, state.mean, lost, generator)
+            moved = self._respread(moved, state.mean, lost, generator)
+        particles, log_weights = moved.particles, moved.log_weights
         mean = self._estimate(particles, log_weights)
         mean = torch.where(dead[:, None], state.mean, mean)
-        evidence = torch.where(seen, moved.log_evidence, 0.0)  # exactly: without rounding
+        evidence = torch.where(frame.seen, moved.log_evidence, 0.0)  # exactly: without rounding
         out = BodyTrack(
             mean,
             torch.where(dead & ~evidence.isnan(), -torch.inf, evidence),
-            self._std(particles, log_weights, mean),
+            self.spread(particles, log_weights, mean, moved.memory),
             effective_sample_size(log_weights),
-            ~seen,
+            ~frame.seen,
             dead,
+            moved.details or {},
         )
-        return BodyFilterState(particles, log_weights, mean, lost), out
+        after = BodyFilterState(particles, log_weights, mean, lost, moved.memory, moved.trend)
+        return after, out
 
     # --- pieces that `move` uses
 
@@ -280,17 +307,23 @@ class SilhouetteParticleFilter(nn.Module):
 
     # --- helpers
 
-    def _score(self, frame: Tensor, cameras: Any, seen: Bool[Tensor, " B"]) -> Score:
-        raw: Score | None = None
-        if bool(seen.any()):
-            if callable(self.likelihood):
-                likelihood = self.likelihood
-                raw = lambda states: likelihood(states, frame)  # noqa: E731
-            else:
-                raw = silhouette_score(self.body, frame, cameras, self.likelihood)
+    def _frame(self, silhouettes: Tensor, cameras: Any) -> Frame:
+        seen = is_seen(silhouettes)
+        likelihood = self.likelihood
+        observed: Any = silhouettes
+        if callable(likelihood):
+            score: Score = lambda states: likelihood(states, silhouettes)  # noqa: E731
+        else:
+            observed = prepare_silhouettes(silhouettes)
+            score = silhouette_score(self.body, observed, cameras, likelihood)
+        return Frame(self._sharpened(score, seen), seen, observed, cameras)
+
+    def _sharpened(self, raw: Score, seen: Bool[Tensor, " B"]) -> Score:
+        """The exponent of the likelihood, and nothing from elements that nobody sees."""
+        nobody = not bool(seen.any())
 
         def score(states: Tensor) -> Tensor:
-            if raw is None:
+            if nobody:
                 return states.new_zeros(states.shape[:2], dtype=torch.float64)
             value = self.sharpness * raw(states).double()
             value = torch.where(torch.isfinite(value), value, -torch.inf)
@@ -298,15 +331,22 @@ class SilhouetteParticleFilter(nn.Module):
 
         return score
 
-    def _resample(self, state: BodyFilterState, generator: Generators) -> tuple[Tensor, Tensor]:
+    def _resample(self, state: BodyFilterState, generator: Generators) -> BodyFilterState:
         """Resample the elements whose effective sample size is low; the others stay."""
         n = self.n_particles
         due = effective_sample_size(state.log_weights) < self.resample_threshold * n
         # drawn for all: what an element draws must not depend on its neighbours
         ancestors = resample(state.log_weights, self.resampling, generator)
         ancestors = torch.where(due[:, None], ancestors, torch.arange(n, device=due.device))
-        particles = take_particles(state.particles, ancestors)
-        return particles, torch.where(due[:, None], -math.log(n), state.log_weights)
+        particles, memory = take_particles(state.particles, ancestors), state.memory
+        if memory is not None:
+            memory = take_particles(memory, ancestors)
+        if self.leg_swap > 0:
+            particles, swapped = swap_legs(self.body, particles, self.leg_swap, generator)
+            if memory is not None:
+                memory = self.swap_memory(memory, swapped)
+        log_weights = torch.where(due[:, None], -math.log(n), state.log_weights)
+        return state._replace(particles=particles, log_weights=log_weights, memory=memory)
 
     def _respread(
         self,
@@ -314,7 +354,7 @@ class SilhouetteParticleFilter(nn.Module):
         mean: Float[Tensor, "B D"],
         lost: Int[Tensor, " B"],
         generator: Generators,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> WeightedParticles:
         """New particles about the last mean in the elements whose particles died."""
         rows = torch.nonzero(lost > 0).reshape(-1)
         if isinstance(generator, Sequence):
@@ -325,69 +365,17 @@ class SilhouetteParticleFilter(nn.Module):
         std = self.respread_scale * growth * self.step_std
         particles[rows] = self.diffuse(start, std, generator)
         log_weights[rows] = -math.log(self.n_particles)
-        return particles, log_weights
+        memory = self.first_memory(particles)
+        if memory is not None and moved.memory is not None:
+            fresh, memory = memory, moved.memory.clone()
+            memory[rows] = fresh[rows]
+        return moved._replace(particles=particles, log_weights=log_weights, memory=memory)
 
     def _estimate(self, particles: Tensor, log_weights: Tensor) -> Float[Tensor, "B D"]:
         if self.estimate == "mean":
             return self.body.mean(particles, log_weights.to(particles.dtype))
         best = log_weights.argmax(-1, keepdim=True)
         return take_particles(particles, best)[:, 0]
-
-    def _std(self, particles: Tensor, log_weights: Tensor, mean: Tensor) -> Float[Tensor, "B D"]:
-        gap = self.body.difference(particles, mean[:, None].expand_as(particles))
-        weights = log_weights.exp().to(gap.dtype)
-        return torch.einsum("bn,bnd->bd", weights, gap.square()).sqrt()
-
-    def _check(
-        self, silhouettes: Tensor, initial_state: Tensor, generator: Generators
-    ) -> tuple[Tensor, Tensor, bool]:
-        """Observations [B, T, ...], initial states [B, D], and whether a batch was given."""
-        check_shape("initial_state", initial_state, ["...", self.body.dim])
-        if initial_state.ndim > 2:
-            raise ShapeError(
-                f"initial_state must be [D] or [B, D], got {list(initial_state.shape)}"
-            )
-        batched = initial_state.ndim == 2
-        if callable(self.likelihood):
-            frames = silhouettes if batched else silhouettes[None]
-        else:
-            if silhouettes.ndim not in (4, 5):
-                raise ShapeError(
-                    "silhouettes must have shape [T, C, H, W] or [B, T, C, H, W], "
-                    f"got {list(silhouettes.shape)}"
-                )
-            batched = batched or silhouettes.ndim == 5
-            frames = silhouettes if silhouettes.ndim == 5 else silhouettes[None]
-            self._check_silhouettes(frames)
-        start = initial_state if initial_state.ndim == 2 else initial_state[None]
-        sizes = {len(frames), len(start)} - {1}
-        if len(sizes) > 1 or 0 in sizes or 0 in frames.shape[:2]:
-            raise ShapeError(
-                "silhouettes and initial_state must hold the same number of sequences, at least one "
-                f"of one frame; got {list(silhouettes.shape)} and {list(initial_state.shape)}"
-            )
-        batch = max(len(frames), len(start))
-        if isinstance(generator, Sequence) and len(generator) != batch:
-            raise InputError(
-                f"a list of generators must hold one for each of the {batch} sequences, "
-                f"got {len(generator)}"
-            )
-        return frames.expand(batch, *frames.shape[1:]), start.expand(batch, -1), batched
-
-    def _check_silhouettes(self, frames: Tensor) -> None:
-        if callable(self.likelihood):
-            return
-        check_shape("silhouettes", frames, ["B", "T", "C", "H", "W"])
-        if frames.dtype != torch.bool:
-            raise InputError(
-                f"silhouettes must be bool (True = person), got {frames.dtype}; pass mask > 0"
-            )
-
-
-def _is_seen(frame: Tensor) -> Bool[Tensor, " B"]:
-    """Whether anything is observed: a True pixel, or a number that is not NaN."""
-    known = frame if frame.dtype == torch.bool else ~torch.isnan(frame)
-    return known.flatten(1).any(1)
 
 
 def _check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
@@ -396,18 +384,3 @@ def _check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
     if name == "likelihood" and callable(value):
         return
     raise InputError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
-
-
-def _warn_if_respread(respread: Bool[Tensor, "B T"]) -> None:
-    if not bool(respread.any()):
-        return
-    rows, frames = torch.nonzero(respread, as_tuple=True)
-    listed = [
-        f"element {b} at frame {t}" for b, t in zip(rows.tolist(), frames.tolist(), strict=True)
-    ]
-    warnings.warn(
-        f"all particles died {len(listed)} times ({', '.join(listed[:8])}) and were spread about the "
-        "last mean; use more particles, a larger step_std, a smaller sharpness or wider joint limits",
-        DegenerateFilterWarning,
-        stacklevel=3,
-    )

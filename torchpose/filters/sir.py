@@ -3,14 +3,13 @@
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
 
 from torchpose.errors import InputError
 from torchpose.filters.base import Generators
 from torchpose.filters.silhouette_filter import (
+    BodyFilterState,
+    Frame,
     PoseSpace,
-    Score,
     SilhouetteParticleFilter,
     WeightedParticles,
     reweight,
@@ -56,17 +55,12 @@ class SIRParticleFilter(SilhouetteParticleFilter):
         self.survival_rate = survival_rate
 
     def move(
-        self,
-        particles: Float[Tensor, "B N D"],
-        log_weights: Float[Tensor, "B N"],
-        score: Score,
-        seen: Bool[Tensor, " B"],
-        generator: Generators,
+        self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
         """Diffuse (MR 29) and weigh (MR 5)."""
-        particles = self.diffuse(particles, self.step_std, generator)
-        log_limits, log_likelihood = self.log_limits(particles), score(particles)
-        log_prior = log_weights + log_limits
+        particles = self.diffuse(state.particles, self.step_std, generator)
+        log_limits, log_likelihood = self.log_limits(particles), frame.score(particles)
+        log_prior = state.log_weights + log_limits
         if self.survival_rate is None:
             return reweight(particles, log_prior, log_likelihood)
         exponent = survival_exponent(log_likelihood + log_limits, self.survival_rate)[:, None]

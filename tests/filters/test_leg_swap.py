@@ -1,0 +1,86 @@
+"""Exchanged legs against joints that trade places, and how often they are exchanged."""
+
+import math
+
+import pytest
+import torch
+
+from tests.filters.walking_body import walk, walker
+from torchpose.body import BODY_15, Body
+from torchpose.body.kinematics import FRAMES, centres_of
+from torchpose.errors import InputError, SkeletonError
+from torchpose.filters.leg_swap import exchange_legs, leg_angle, leg_permutation, swap_legs
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_legs_trade_directions_whatever_the_centres(frame):
+    plain = walker()
+    states = walk(plain, 30)
+    body = plain.altered(frame=frame)
+    body = body.altered(centres=centres_of(body, plain.convert(states, body)))
+    states = plain.convert(states, body)
+    swapped = exchange_legs(body, states)
+    before, after = body.joints(states), body.joints(swapped)
+    for side, other in (("left", "right"), ("right", "left")):
+        for above, below in (("hip", "knee"), ("knee", "ankle")):
+            bone = [body.skeleton.joint(f"{side}_{joint}") for joint in (above, below)]
+            source = [body.skeleton.joint(f"{other}_{joint}") for joint in (above, below)]
+            new = after[:, bone[1]] - after[:, bone[0]]
+            old = before[:, source[1]] - before[:, source[0]]
+            torch.testing.assert_close(new, old, rtol=0, atol=1e-12)
+    rest = [i for i, n in enumerate(BODY_15.names) if not n.endswith(("knee", "ankle"))]
+    torch.testing.assert_close(after[:, rest], before[:, rest], rtol=0, atol=1e-12)
+    torch.testing.assert_close(exchange_legs(body, swapped), states, rtol=0, atol=1e-12)
+
+
+def test_the_angle_is_that_of_the_swings():
+    body = walker()
+    state = torch.zeros(2, body.dim, dtype=torch.float64)
+    thighs = [3 + 3 * BODY_15.part(f"{side}_thigh") for side in ("left", "right")]
+    state[0, thighs[0]], state[0, thighs[1]] = math.sin(0.2), -math.sin(0.15)
+    torch.testing.assert_close(leg_angle(body, state), torch.tensor([0.7, 0.0]).double())
+
+
+def test_swaps_come_as_often_as_said():
+    body = walker()
+    state = torch.zeros(body.dim, dtype=torch.float64)
+    thighs = [3 + 3 * BODY_15.part(f"{side}_thigh") for side in ("left", "right")]
+    state[thighs[0]], state[thighs[1]] = math.sin(0.25), -math.sin(0.25)  # an angle of 1
+    particles = state.expand(2, 20000, -1)
+    generator = torch.Generator().manual_seed(0)
+    moved, swapped = swap_legs(body, particles, 0.6, generator)
+    expected = 0.6 / math.pi
+    deviation = math.sqrt(expected * (1 - expected) / 40000)
+    assert abs(float(swapped.double().mean()) - expected) < 4 * deviation
+    torch.testing.assert_close(moved[swapped], exchange_legs(body, particles)[swapped])
+    assert torch.equal(moved[~swapped], particles[~swapped])
+
+
+def test_legs_that_hang_together_are_never_swapped_and_a_rate_of_zero_draws_nothing():
+    body, generator = walker(), torch.Generator().manual_seed(0)
+    particles = torch.zeros(1, 50, body.dim, dtype=torch.float64)
+    assert not bool(swap_legs(body, particles, 1.0, generator)[1].any())
+    before = generator.get_state()
+    same, swapped = swap_legs(body, particles, 0.0, generator)
+    assert same is particles and not bool(swapped.any())
+    assert torch.equal(generator.get_state(), before)
+
+
+def test_an_element_draws_from_its_own_generator():
+    body = walker()
+    particles = walk(body, 3)[:, None].expand(-1, 40, -1)
+    together = [torch.Generator().manual_seed(i) for i in range(3)]
+    moved, _ = swap_legs(body, particles, 1.0, together)
+    alone = swap_legs(body, particles[1:2], 1.0, [torch.Generator().manual_seed(1)])[0]
+    assert torch.equal(moved[1:2], alone)
+
+
+def test_what_cannot_be_swapped_is_refused():
+    body = walker()
+    particles = torch.zeros(1, 2, body.dim, dtype=torch.float64)
+    with pytest.raises(InputError, match="from 0 to 1"):
+        swap_legs(body, particles, 1.5)
+    with pytest.raises(SkeletonError, match="set leg_swap=0"):
+        swap_legs(torch.nn.Identity(), particles, 0.5)
+    assert leg_permutation(BODY_15)[BODY_15.part("left_shank")] == BODY_15.part("right_shank")
+    assert isinstance(body, Body)
