@@ -148,18 +148,3 @@ def test_moments_of_a_mixture_are_those_of_its_draws(rng):
     draws = means[chosen] + (np.linalg.cholesky(covs)[chosen] @ noise)[..., 0]
     np.testing.assert_allclose(mean, draws.mean(0), atol=5 * draws.std() / n**0.5)
     np.testing.assert_allclose(cov, np.cov(draws.T), atol=0.1)
-
-
-def test_the_unscented_transform_is_exact_for_linear_maps_and_means_of_squares(rng):
-    mean, cov, matrix = (
-        rng.standard_normal(4),
-        random_covariance(rng, 4),
-        rng.standard_normal((3, 4)),
-    )
-    new_mean, new_cov = gaussian.unscented_transform(
-        tensor(mean), tensor(cov), lambda x: x @ tensor(matrix).mT
-    )
-    np.testing.assert_allclose(new_mean, matrix @ mean, atol=1e-12)
-    np.testing.assert_allclose(new_cov, matrix @ cov @ matrix.T, atol=1e-12)
-    squares, _ = gaussian.unscented_transform(tensor(mean), tensor(cov), torch.square)
-    np.testing.assert_allclose(squares, mean**2 + np.diag(cov), atol=1e-12)

@@ -5,7 +5,6 @@ and what comes back is symmetric by construction.
 """
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -26,9 +25,7 @@ __all__ = [
     "mixture_moments",
     "product",
     "safe_cholesky",
-    "sigma_points",
     "symmetrise",
-    "unscented_transform",
 ]
 
 LOG_2PI = math.log(2 * math.pi)
@@ -317,42 +314,3 @@ def mixture_moments(
     mean = (weights[..., None] * means).sum(-2)
     spread = (means - mean[..., None, :]) * weights[..., None].sqrt()
     return mean, (weights[..., None, None] * covs).sum(-3) + spread.mT @ spread
-
-
-def sigma_points(
-    mean: Float[Tensor, "... D"], cov: Float[Tensor, "... D D"], kappa: float = 0.5
-) -> tuple[Float[Tensor, "... S D"], Float[Tensor, " S"]]:
-    """2 D + 1 symmetric sigma points at distance sqrt(D + kappa) and their weights (DX 2).
-
-    Args:
-        mean: [..., D]. cov: [..., D, D]. kappa: weight of the centre, kappa / (D + kappa).
-    """
-    dim = mean.shape[-1]
-    spread = math.sqrt(dim + kappa) * safe_cholesky(cov).mT
-    points = torch.cat(
-        [mean[..., None, :], mean[..., None, :] + spread, mean[..., None, :] - spread], -2
-    )
-    weights = torch.full((2 * dim + 1,), 0.5 / (dim + kappa), dtype=mean.dtype, device=mean.device)
-    weights[0] = kappa / (dim + kappa)
-    return points, weights
-
-
-def unscented_transform(
-    mean: Float[Tensor, "... D"],
-    cov: Float[Tensor, "... D D"],
-    function: Callable[[Tensor], Tensor],
-    kappa: float = 0.5,
-) -> tuple[Tensor, Tensor]:
-    """Mean and covariance of a function of a Gaussian variable, by sigma points (DX 2).
-
-    Args:
-        mean: [..., D]. cov: [..., D, D]. function: maps [..., S, D] to [..., S, E].
-
-    Returns:
-        Mean [..., E] and covariance [..., E, E].
-    """
-    points, weights = sigma_points(mean, cov, kappa)
-    values = function(points)
-    new_mean = (weights[:, None] * values).sum(-2)
-    spread = (values - new_mean[..., None, :]) * weights[:, None].sqrt()
-    return new_mean, spread.mT @ spread

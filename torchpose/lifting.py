@@ -1,12 +1,14 @@
 """From the state of an arm, in the image plane, to joints in metres with covariances (BL 5)."""
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.gaussian import unscented_transform
 from torchpose.projection import backproject, lift
 from torchpose.rotations import RotationOrder, euler_to_matrix
+from torchpose.unscented import unscented_transform
 
 __all__ = ["arm_in_body_frame", "arm_in_camera_frame", "join_arms", "pixel_covariances"]
 
@@ -32,7 +34,7 @@ def arm_in_camera_frame(
     joints = mean[..., :15].unflatten(-1, (5, 3))
     blocks = cov[..., :15, :15].unflatten(-1, (5, 3)).unflatten(-3, (5, 3))
     own = blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
-    return unscented_transform(joints, own, lambda points: backproject(points, matrix))
+    return _unscented(lambda points: backproject(points, matrix), joints, own)
 
 
 def arm_in_body_frame(
@@ -61,11 +63,17 @@ def arm_in_body_frame(
 
     flat_mean, flat_cov = mean.reshape(-1, 21), cov.reshape(-1, 21, 21)
     parts = [
-        _joint_blocks(*unscented_transform(m, c, to_body))
+        _joint_blocks(*_unscented(to_body, m, c))
         for m, c in zip(flat_mean.split(_CHUNK), flat_cov.split(_CHUNK), strict=True)
     ]
     joints, covs = (torch.cat(values) for values in zip(*parts, strict=True))
     return joints.view(*mean.shape[:-1], 5, 3), covs.view(*mean.shape[:-1], 5, 3, 3)
+
+
+def _unscented(
+    function: Callable[[Tensor], Tensor], mean: Tensor, cov: Tensor
+) -> tuple[Tensor, Tensor]:
+    return unscented_transform(function, mean, cov, centre=True, directions="cholesky")
 
 
 def _joint_blocks(mean: Tensor, cov: Tensor) -> tuple[Tensor, Tensor]:

@@ -143,7 +143,7 @@ def test_a_failed_save_keeps_the_old_file(saved, prior, monkeypatch):
     def full(*_args, **_options):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("torchpose.priors.prior_file.save_file", full)
+    monkeypatch.setattr("torchpose.priors.tensor_file.save_file", full)
     with pytest.raises(OutputError, match="No space left"):
         prior.save(saved)
     assert saved.read_bytes() == before

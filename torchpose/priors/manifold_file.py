@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
-from torchpose.errors import FileFormatError, PriorError
-from torchpose.io.files import atomic_path, require_file
+from torchpose.errors import PriorError
+from torchpose.priors.tensor_file import (
+    FileKind,
+    info_from_json,
+    info_to_json,
+    read_tensors,
+    write_tensors,
+)
 
-__all__ = ["FILE_FORMAT", "FILE_VERSION", "ManifoldInfo", "read_manifold", "write_manifold"]
+__all__ = ["TENSORS", "ManifoldInfo", "read_manifold", "write_manifold"]
 
-FILE_FORMAT, FILE_VERSION = "torchpose-manifold", 1
-_HEADER = "torchpose"  # one key: the order of several is not reproducible in safetensors
 _SAME_FRAME_RATE = 0.01  # of it
 _SAME_CENTRE = 1e-6  # of a quaternion vector
 
@@ -99,7 +100,7 @@ class ManifoldInfo:
 
     def to_json(self) -> str:
         """Text that `from_json` reads back."""
-        return json.dumps(asdict(self), sort_keys=True, allow_nan=False)
+        return info_to_json(self)
 
     @classmethod
     def from_json(cls, text: str) -> ManifoldInfo:
@@ -108,83 +109,39 @@ class ManifoldInfo:
         Raises:
             FileFormatError: not JSON, other fields, or values of another kind.
         """
-        try:
-            values = json.loads(text)
-        except ValueError as error:
-            raise FileFormatError(f"expected the JSON of a manifold: {error}") from error
-        if not isinstance(values, dict):
-            raise FileFormatError("expected the JSON of a manifold, got something else")
-        unknown = sorted(set(values) - {f.name for f in fields(cls)})
-        if unknown:
-            raise FileFormatError(f"unknown field {unknown[0]!r} in the JSON of a manifold")
-        for key, default in asdict(cls()).items():
-            allowed: Any = {tuple: list, str: str, dict: dict}.get(
-                type(default), float | int | None
-            )
-            if key in values and not isinstance(values[key], allowed):
-                raise FileFormatError(
-                    f"bad value of {key} in the JSON of a manifold: {values[key]!r:.60}"
-                )
-        return cls(**{key: _tuples(value) for key, value in values.items()})
+        return info_from_json(cls, text)
+
+
+_KIND = FileKind(
+    "torchpose-manifold",
+    1,
+    ManifoldInfo,
+    tensors={
+        "poses": "T Q", "scale": "Q", "weights": "T d", "bias": "d", "gamma_x": "",
+        "log_kernel": "4", "std_latent": "d", "std_pose": "Q", "std_step": "Q",
+    },
+    indices={"lengths": "S"},
+)  # fmt: skip
+TENSORS = (*_KIND.tensors, *_KIND.indices)  # names of those that a manifold's file holds
 
 
 def write_manifold(path: str | Path, info: ManifoldInfo, tensors: Mapping[str, Tensor]) -> None:
-    """Write tensors and info as safetensors; the file appears whole or not at all.
+    """Write info and `TENSORS` as safetensors; the file appears whole or not at all.
 
     Raises:
         OutputError: the file cannot be written. PriorError: `info` holds what is not JSON.
     """
-    try:
-        header = {"format": FILE_FORMAT, "version": FILE_VERSION, "info": info.to_json()}
-    except (TypeError, ValueError) as error:
-        raise PriorError(f"info must hold only what JSON can hold: {error}") from error
-    plain = {key: value.detach().cpu().contiguous().clone() for key, value in tensors.items()}
-    with atomic_path(path) as temporary:
-        save_file(plain, temporary, metadata={_HEADER: json.dumps(header, sort_keys=True)})
+    write_tensors(path, _KIND, info, tensors)
 
 
-def read_manifold(
-    path: str | Path, expected: Sequence[str]
-) -> tuple[ManifoldInfo, dict[str, Tensor]]:
+def read_manifold(path: str | Path) -> tuple[ManifoldInfo, dict[str, Tensor]]:
     """Info and tensors of a manifold's file.
 
-    Args:
-        path: the file. expected: names of the tensors.
-
     Raises:
-        InputError: no such file. FileFormatError: truncated, of another kind or version.
+        InputError: no such file. FileFormatError: truncated, of another kind or version, or tensors
+            are missing or of other sizes.
     """
-    path = require_file(path)
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors: dict[str, Tensor] = {
-                key: file.get_tensor(key)
-                for key in file.keys()  # noqa: SIM118
-            }
-        header = json.loads(metadata.get(_HEADER, "null"))
-    except (SafetensorError, OSError, ValueError, RuntimeError) as error:
-        raise FileFormatError(
-            f"{path}: expected a manifold as safetensors; the file is truncated or of another kind "
-            f"({error})"
-        ) from error
-    if not isinstance(header, dict) or header.get("format") != FILE_FORMAT:
-        kind = header.get("format") if isinstance(header, dict) else "another kind"
-        raise FileFormatError(f"{path}: expected a {FILE_FORMAT}, got a file of {kind}")
-    if header.get("version") != FILE_VERSION:
-        raise FileFormatError(
-            f"{path}: expected version {FILE_VERSION} of the manifold format, got "
-            f"{header.get('version')!r}; use a torchpose that fits, or fit the manifold again"
-        )
-    if set(tensors) != set(expected):
-        raise FileFormatError(
-            f"{path}: expected the tensors {', '.join(sorted(expected))}, found "
-            f"{', '.join(sorted(tensors)) or 'none'}"
-        )
-    try:
-        return ManifoldInfo.from_json(str(header.get("info"))), tensors
-    except FileFormatError as error:
-        raise FileFormatError(f"{path}: {error}") from error
+    return read_tensors(path, _KIND)
 
 
 def _centres(body: Any) -> tuple[tuple[float, ...], ...]:
@@ -200,10 +157,6 @@ def _same_centres(mine: Sequence[Sequence[float]], theirs: Sequence[Sequence[flo
     return len(a) == len(b) and all(
         math.isclose(x, y, rel_tol=0, abs_tol=_SAME_CENTRE) for x, y in zip(a, b, strict=True)
     )
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
 
 
 def _short(value: Any) -> str:

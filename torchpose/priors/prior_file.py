@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from torchpose.camera import PinholeCamera
-from torchpose.errors import FileFormatError, PriorError, TorchposeError
-from torchpose.io.files import atomic_path, require_file
+from torchpose.errors import FileFormatError, PriorError
 from torchpose.priors.arm_state import check_rotation_order
+from torchpose.priors.tensor_file import (
+    FileKind,
+    info_from_json,
+    info_to_json,
+    read_tensors,
+    write_tensors,
+)
 
-__all__ = ["FILE_FORMAT", "FILE_VERSION", "SKELETON", "PriorInfo", "read_prior", "write_prior"]
+__all__ = ["SKELETON", "PriorInfo", "read_prior", "write_prior"]
 
-FILE_FORMAT = "torchpose-prior"
-FILE_VERSION = 2
-_READABLE = (1, 2)  # version 1 holds whole covariances
 SKELETON = "upper-body-8"
 CENTRES = ("neck", "head", "sequence")
-_HEADER = "torchpose"  # one key: the order of several is not reproducible in safetensors
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,9 @@ class PriorInfo:
             )
         if self.centre not in CENTRES:
             raise PriorError(f"centre must be one of {', '.join(CENTRES)}, got {self.centre!r}")
-        object.__setattr__(self, "persons", tuple(self.persons))
+        views = {k: tuple(v) if isinstance(v, list) else v for k, v in self.views.items()}
+        for name, value in (("persons", tuple(self.persons)), ("views", views)):
+            object.__setattr__(self, name, value)
         object.__setattr__(self, "sources", tuple(self.sources))
         PinholeCamera(self.fx, self.fy, self.cx, self.cy)  # refuses what is no camera
 
@@ -101,7 +102,7 @@ class PriorInfo:
 
     def to_json(self) -> str:
         """Text that `from_json` reads back."""
-        return json.dumps(asdict(self), sort_keys=True, allow_nan=False)
+        return info_to_json(self)
 
     @classmethod
     def from_json(cls, text: str) -> PriorInfo:
@@ -110,34 +111,11 @@ class PriorInfo:
         Raises:
             FileFormatError: not JSON, or other fields. PriorError: other skeleton or conventions.
         """
-        try:
-            values = json.loads(text)
-            if not isinstance(values, dict):
-                raise TypeError("not an object")
-        except (TypeError, ValueError) as error:
-            raise FileFormatError(
-                f"expected the JSON of a prior, got something else: {error}"
-            ) from (error)
-        _check_fields(values)
-        listed = {key: tuple(v) for key, v in values.items() if isinstance(v, list)}
-        views = {
-            key: tuple(v) if isinstance(v, list) else v
-            for key, v in values.get("views", {}).items()
-        }
-        return cls(**(values | listed | {"views": views}))
+        return info_from_json(cls, text)
 
 
-def _check_fields(values: Mapping[str, Any]) -> None:
-    """Raise `FileFormatError` unless all are fields of `PriorInfo` with values of their kind."""
-    defaults = PriorInfo()
-    for key, value in values.items():
-        if key not in {f.name for f in fields(PriorInfo)}:
-            raise FileFormatError(f"unknown field {key!r} in the JSON of a prior")
-        kind: Any = type(getattr(defaults, key))
-        allowed: Any = {float: (float, int), tuple: list}.get(kind, kind)
-        optional = value is None and key in ("neck", "hand", "fps")
-        if not optional and not isinstance(value, allowed):
-            raise FileFormatError(f"bad value of {key} in the JSON of a prior: {value!r:.60}")
+# version 1 holds whole covariances; the tensors depend on the windows, so the prior looks for its own
+_KIND = FileKind("torchpose-prior", 2, PriorInfo, older=(1,))
 
 
 def write_prior(path: str | Path, info: PriorInfo, tensors: Mapping[str, Tensor]) -> None:
@@ -146,14 +124,8 @@ def write_prior(path: str | Path, info: PriorInfo, tensors: Mapping[str, Tensor]
     Raises:
         OutputError: the file cannot be written. PriorError: `info.extra` is not JSON.
     """
-    try:
-        header = {"format": FILE_FORMAT, "version": FILE_VERSION, "info": info.to_json()}
-    except (TypeError, ValueError) as error:
-        raise PriorError(f"info.extra must hold only what JSON can hold: {error}") from error
     packed = {key: _pack(key, value.detach().cpu()) for key, value in tensors.items()}
-    plain = {key: _compact(value).contiguous().clone() for key, value in packed.items()}
-    with atomic_path(path) as temporary:
-        save_file(plain, temporary, metadata={_HEADER: json.dumps(header, sort_keys=True)})
+    write_tensors(path, _KIND, info, {key: _compact(value) for key, value in packed.items()})
 
 
 def _pack(key: str, tensor: Tensor) -> Tensor:
@@ -191,41 +163,8 @@ def read_prior(path: str | Path) -> tuple[PriorInfo, dict[str, Tensor]]:
         InputError: no such file. FileFormatError: truncated, foreign, or of a newer version.
         PriorError: other skeleton, or a rotation order that is not known.
     """
-    path = require_file(path)
+    info, tensors = read_tensors(path, _KIND)
     try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors: dict[str, Tensor] = {
-                key: _unpack(key, file.get_tensor(key))
-                for key in file.keys()  # noqa: SIM118
-            }
-    except (SafetensorError, OSError, ValueError, RuntimeError) as error:
-        raise FileFormatError(
-            f"{path}: expected a prior as safetensors; the file is truncated or of another kind "
-            f"({error})"
-        ) from error
-    try:
-        header = json.loads(metadata.get(_HEADER, "null"))
+        return info, {key: _unpack(key, value) for key, value in tensors.items()}
     except ValueError as error:
-        raise FileFormatError(f"{path}: the header is not JSON ({error})") from error
-    if not isinstance(header, dict) or header.get("format") != FILE_FORMAT:
-        raise FileFormatError(
-            f"{path}: expected a prior written by torchpose, got a safetensors file of another kind"
-        )
-    if header.get("version") not in _READABLE:
-        raise FileFormatError(
-            f"{path}: expected version {FILE_VERSION} of the prior format or an older one, got "
-            f"{header.get('version')!r}; use a torchpose that fits, or fit the prior again"
-        )
-    try:
-        return PriorInfo.from_json(str(header.get("info"))), tensors
-    except TorchposeError as error:
-        raise type(error)(f"{path}: {error}") from error
-
-
-def require_tensor(path: str | Path, tensors: Mapping[str, Tensor], key: str) -> Tensor:
-    """A tensor of the file, or `FileFormatError`."""
-    if key not in tensors:
-        found = ", ".join(sorted(tensors)) or "none"
-        raise FileFormatError(f"{path}: expected a tensor {key}, found {found}")
-    return tensors[key].to(torch.float64)
+        raise FileFormatError(f"{path}: {error}; the file is damaged") from error

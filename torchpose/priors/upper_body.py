@@ -29,8 +29,9 @@ from torchpose.priors.arm_state import (
     mirror_mixture,
 )
 from torchpose.priors.gmm import GaussianMixture
-from torchpose.priors.prior_file import PriorInfo, read_prior, require_tensor, write_prior
+from torchpose.priors.prior_file import PriorInfo, read_prior, write_prior
 from torchpose.priors.samplers import ArmSource, all_samples
+from torchpose.priors.tensor_file import require_tensor
 from torchpose.priors.training import TRAINING_VIEWS, RecordingLike, arm_sources, collect_poses
 from torchpose.priors.window import WindowPrior
 
