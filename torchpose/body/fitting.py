@@ -23,7 +23,7 @@ from torchpose.body.quaternion_vectors import minimal_rotation, quaternion_vecto
 from torchpose.body.skeleton import BODY_15, BodySkeleton
 from torchpose.errors import InputError, SkeletonError, check_shape
 
-__all__ = ["fit_body", "fit_state", "joint_errors"]
+__all__ = ["fit_body", "fit_state", "joint_errors", "swing_parts"]
 
 _TILT = 0.5  # radians, standard deviation between the tilts of pelvis and torso
 _LEVER = 0.04  # metres, least distance of the pelvis joint from the hips that tells the tilt
@@ -188,13 +188,13 @@ def _tilt_of(body: Body, joints: Tensor) -> _Tilt:
 
 def _fit_chunk(body: Body, joints: Tensor, known: Tensor, tilt: _Tilt, steps: int) -> Tensor:
     rotations = _rigid_rotations(body, joints, tilt)
-    rotations = _swing(body, rotations, _bones(body.skeleton, joints), known)
+    rotations = swing_parts(body, rotations, _bones(body.skeleton, joints), known)
     fit = _Fit(joints[:, 0], rotations)
     if steps:
         fit = _gauss_newton(body, fit, joints, known, tilt, steps)
         axes = fit.rotations[:, list(body.skeleton.part_of)]
         bones = (axes @ body.offsets[..., None]).squeeze(-1)
-        rotations = _swing(body, fit.rotations, bones, known)  # steps may have left a twist
+        rotations = swing_parts(body, fit.rotations, bones, known)  # steps may have left a twist
         fit = fit._replace(rotations=rotations)
     return body.state_of(fit.position, fit.rotations)
 
@@ -222,11 +222,18 @@ def _rigid_rotations(body: Body, joints: Tensor, tilt: _Tilt) -> Tensor:
     return rotations
 
 
-def _swing(body: Body, rotations: Tensor, bones: Tensor, known: Tensor) -> Tensor:
-    """Rotations of the parts with one bone: from their centre to its direction, without twist.
+def swing_parts(
+    body: Body,
+    rotations: Float[Tensor, "T P 3 3"],
+    bones: Float[Tensor, "T J 3"],
+    known: Bool[Tensor, " J"],
+) -> Float[Tensor, "T P 3 3"]:
+    """World rotations of the parts with one bone: from their centre to its direction, without twist.
 
     Args:
-        rotations: [T, P, 3, 3], of the rigid parts. bones: [T, J, 3], world axes.
+        rotations: [T, P, 3, 3], of the rigid parts (pelvis and torso); what it holds for the others
+            counts for nothing. bones: [T, J, 3], from each joint's parent to it, world axes, of any
+            length. known: [J]; parts of other joints stay at rest.
     """
     skeleton, roles = body.skeleton, _roles(body.skeleton)
     done = rotations.clone()

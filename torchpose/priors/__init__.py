@@ -1,5 +1,7 @@
-"""Learned priors over body states: Gaussian mixtures of both arms, manifolds of a whole body."""
+"""Learned priors over body states: mixtures of both arms, manifolds, postures of actions."""
 
+from torchpose.priors.action_bank import ActionBank
+from torchpose.priors.action_space import ActionInfo, ActionSpace
 from torchpose.priors.arm_state import arm_state, arm_states, mirror_arm_state, mirror_mixture
 from torchpose.priors.density import FastMixtureDensity
 from torchpose.priors.em import (
@@ -32,6 +34,9 @@ from torchpose.priors.upper_body import (
 
 __all__ = [
     "TRAINING_VIEWS",
+    "ActionBank",
+    "ActionInfo",
+    "ActionSpace",
     "BackConstrainedGPLVM",
     "ConditionedMixture",
     "FastMixtureDensity",

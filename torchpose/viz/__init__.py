@@ -6,6 +6,7 @@ grey; a filled joint was measured, a hollow one was inferred. The colours are th
 which colour-blind readers can tell apart; lines differ in their dashes as well.
 """
 
+from torchpose.viz.action_picture import plot_action_space
 from torchpose.viz.charts import (
     plot_error_bars,
     plot_errors_over_time,
@@ -30,6 +31,7 @@ from torchpose.viz.style import save_figure
 
 __all__ = [
     "draw_skeleton",
+    "plot_action_space",
     "plot_error_bars",
     "plot_errors_over_time",
     "plot_joint_curves",
