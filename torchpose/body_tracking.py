@@ -36,7 +36,7 @@ def track_body(
     Args:
         model: a filter over silhouettes, whose body is a `torchpose.body.Body`.
         frames: silhouettes of the C cameras, frame after frame. cameras: theirs.
-        initial_state: the pose before the first frame [D], recorded or from `find_pose`.
+        initial_state: the pose before the first frame [D], recorded or from `find_first_pose`.
         generator: for what is drawn. initial_std: spread of the first particles [D]; none if None.
         fps: of the frames, for the result. n_frames: how many to expect, for the progress bar.
         progress: whether to show it.

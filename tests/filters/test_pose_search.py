@@ -9,7 +9,12 @@ from torchpose.body.silhouette import render, render_limbs
 from torchpose.camera import PinholeCamera
 from torchpose.camera_rig import CameraRig
 from torchpose.errors import CameraError, InputError, ShapeError
-from torchpose.filters.pose_search import find_pose, place_from_silhouettes, upward_direction
+from torchpose.filters.pose_search import (
+    find_candidates,
+    find_pose,
+    place_from_silhouettes,
+    upward_direction,
+)
 
 BODY, RIG = walker(), rig()
 
@@ -73,6 +78,15 @@ def test_a_pose_is_found_without_one():
     assert blind.shape == (36,)
     joints, expected = BODY.joints(blind), BODY.joints(truth[0])
     assert (joints[[0, 1, 2]] - expected[[0, 1, 2]]).norm(dim=-1).mean() < 0.12
+
+
+def test_the_pose_found_is_the_best_candidate():
+    silhouettes = render(BODY, walk(BODY, 2), RIG, HEIGHT, WIDTH)
+    few = {"n_particles": 60, "n_layers": 2, "n_headings": 3}
+    found = find_candidates(BODY, silhouettes, RIG, None, generator(), **few)
+    assert found.states.shape == (2, 3, 36) and found.log_likelihood.shape == (2, 3)
+    best = find_pose(BODY, silhouettes, RIG, None, generator(), **few)
+    assert torch.equal(best[1], found.states[1, found.log_likelihood[1].argmax()])
 
 
 def test_what_the_search_refuses():

@@ -120,10 +120,8 @@ def _frame(
     generator: torch.Generator,
 ) -> Tensor:
     """One frame [C, H, W]; it draws the same numbers whatever the kinds are."""
-    border, salt = (
-        _noise(clean.shape[1:], generator),
-        torch.rand(clean.shape[1:], generator=generator),
-    )
+    border = _noise(clean.shape[1:], generator)
+    salt = torch.rand(clean.shape[1:], generator=generator)
     mask = clean[t]
     if "holes" in kinds:
         mask = mask & ~_holes(scene, t, severity * worse)

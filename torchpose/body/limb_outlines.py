@@ -16,12 +16,13 @@ from torch import Tensor
 from torchpose.body.limbs import Limbs
 from torchpose.camera_rig import CameraRig
 
-__all__ = ["NEAR", "Outlines", "ProjectedLimbs", "outline", "project_limbs"]
+__all__ = ["LEVEL", "NEAR", "Outlines", "ProjectedLimbs", "outline", "project_limbs"]
 
 NEAR = 0.1
 """Metres in front of a camera; nearer parts of a limb are cut off."""
 
-_LEVEL = 1e-9  # a tangent with less rise than this times its run lies within one row
+LEVEL = 1e-9
+"""An edge with less rise than this times its run lies within one row."""
 
 
 class ProjectedLimbs(NamedTuple):
@@ -42,15 +43,16 @@ class Outlines(NamedTuple):
     """What a row needs of each limb, M = C N L limbs in this order.
 
     Attributes:
-        discs: [2, 3, M]: x, y and squared radius of both discs.
-        tangents: [2, 4, M]: middle y, half the height, middle x, and dx/dy of both outer tangents
-            between the points where they touch. Half the height is -1 where there is none.
+        discs: [2, 3, M]: x, y and squared radius of both discs; [0, 3, M] for limbs without round ends.
+        edges: [E, 4, M]: middle y, half the height, middle x, and dx/dy of the straight edges: both
+            outer tangents between the points where they touch, or the four sides of a rectangle. Half
+            the height is -1 where there is none.
         first_row: [M], first row of the image that the limb covers.
         n_rows: [M], how many; 0 for a limb out of sight.
     """
 
-    discs: Float[Tensor, "2 3 M"]
-    tangents: Float[Tensor, "2 4 M"]
+    discs: Float[Tensor, "K 3 M"]
+    edges: Float[Tensor, "E 4 M"]
     first_row: Float[Tensor, " M"]
     n_rows: Int[Tensor, " M"]
 
@@ -103,7 +105,7 @@ def outline(limbs: ProjectedLimbs, height: int, width: int) -> Outlines:
         nx = dx * along - side * (dy * across)
         ny = dy * along + side * (dx * across)
         rise, run = dy - dr * ny, dx - dr * nx
-        level = rise.abs() <= _LEVEL * run.abs()
+        level = rise.abs() <= LEVEL * run.abs()
         half = (rise.abs() * 0.5).masked_fill_(level | ~exists, -1.0)
         slope = run / rise.masked_fill(level, math.inf)
         sum_r = ra + rb

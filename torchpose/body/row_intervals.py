@@ -108,7 +108,7 @@ def _block_rows(
 def _row_ends(outlines: Outlines, limb: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """Leftmost and rightmost x [rows, n] of hulls in rows y [rows, n]; left > right if there is none.
 
-    A hull's boundary in a row is that of a disc or of a tangent, whichever is outermost. Those that
+    A hull's boundary in a row is that of a disc or of an edge, whichever is outermost. Those that
     the row misses are pushed far inwards; to select by a mask takes three times as long.
     """
     left, right = torch.full_like(y, _FAR), torch.full_like(y, -_FAR)
@@ -121,7 +121,7 @@ def _row_ends(outlines: Outlines, limb: Tensor, y: Tensor) -> tuple[Tensor, Tens
         half = _sqrt_(inside.clamp_(min=0)).add_(outside, alpha=_FAR)
         torch.minimum(left, torch.sub(x_middle, half, out=offset), out=left)
         torch.maximum(right, half.add_(x_middle), out=right)
-    for middle, half_height, x_middle, slope in _of_limbs(outlines.tangents, limb):
+    for middle, half_height, x_middle, slope in _of_limbs(outlines.edges, limb):
         torch.sub(y, middle, out=offset)
         torch.addcmul(x_middle, offset, slope, out=x)
         outside = torch.sub(half_height, offset.abs_(), out=offset).clamp_(max=0).mul_(_FAR)
@@ -131,7 +131,7 @@ def _row_ends(outlines: Outlines, limb: Tensor, y: Tensor) -> tuple[Tensor, Tens
 
 
 def _of_limbs(table: Tensor, limb: Tensor) -> Tensor:
-    """Columns `limb` of a table [2, k, M]; gather takes a sixth of the time of index_select."""
+    """Columns `limb` of a table [n, k, M]; gather takes a sixth of the time of index_select."""
     return table.gather(2, limb.expand(*table.shape[:2], -1))
 
 

@@ -5,9 +5,6 @@ particles, cameras or limbs. Counting never forms an image.
 """
 
 import math
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from threading import Lock
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -15,10 +12,19 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchpose.body.limb_outlines import NEAR, outline, project_limbs
-from torchpose.body.limbs import Limbs, check_limbs
-from torchpose.body.row_intervals import RowIntervals, Strip, limb_intervals
-from torchpose.camera_rig import CameraRig, Cameras, as_rig
+from torchpose.body.limb_batches import (
+    checked_limbs,
+    count_intervals,
+    flatten_limbs,
+    in_chunks,
+    intervals_of,
+    which_silhouette,
+)
+from torchpose.body.limb_outlines import NEAR
+from torchpose.body.limbs import Limbs
+from torchpose.body.rectangles import check_limb_shape
+from torchpose.body.row_intervals import RowIntervals, Strip
+from torchpose.camera_rig import Cameras, as_rig
 from torchpose.errors import InputError, ShapeError
 
 __all__ = [
@@ -31,12 +37,7 @@ __all__ = [
     "render_limbs",
 ]
 
-# Intervals in one chunk: with fewer the overhead of calls shows, with more only the memory grows.
-_INTERVALS, _INTERVALS_GPU = 2**17, 2**22
-_KEPT = 2**25 - 2**16  # bytes; glibc adapts to freed blocks of at most 32 MB
 _PIXELS = 2**22  # rendered in one chunk
-_POOL = Lock()
-_COVERED_ROWS = 0.15  # of an image's height, by a limb on average; a guess that sizes chunks
 
 
 @runtime_checkable
@@ -104,12 +105,13 @@ def count_pixels(
     *,
     chunk: int | None = None,
     near: float = NEAR,
+    limb_shape: str = "cylinders",
 ) -> SilhouetteCounts:
     """Pixels of the projected body, of the silhouette, and of both, for every particle and camera.
 
     Pixel (i, j) belongs to the body if (x, y) = (j, i) lies in the projection of one of its limbs,
-    the convex hull of two discs. A limb is cut off where it comes nearer than `near`; a body wholly
-    behind a camera is an empty model there.
+    the convex hull of two discs or a rectangle. A limb is cut off where it comes nearer than `near`; a
+    body wholly behind a camera is an empty model there.
 
     Args:
         body: with `limbs(state)`, or `Limbs` [*B, ..., L] themselves, whose radii may differ from
@@ -120,6 +122,7 @@ def count_pixels(
             leading dimensions they are shared by all states.
         chunk: particles at a time; chosen by the size of the images if None (some 10 MB).
         near: metres.
+        limb_shape: "cylinders", tapered and with round ends, or "rectangles" (AS, section 3.2).
 
     Returns:
         `SilhouetteCounts`, each [*B, ..., C].
@@ -127,8 +130,9 @@ def count_pixels(
     Raises:
         CameraError: the silhouettes are of another number of cameras, or of another size.
         ShapeError: their leading dimensions do not fit those of the states.
-        InputError: `chunk` or `near` is not positive.
+        InputError: `chunk` or `near` is not positive, or another `limb_shape`.
     """
+    check_limb_shape(limb_shape)
     rig, limbs = as_rig(cameras), _limbs_of(body, state, near)
     if not isinstance(silhouettes, PreparedSilhouettes):
         silhouettes = prepare_silhouettes(silhouettes)
@@ -140,18 +144,18 @@ def count_pixels(
             f"silhouettes must have the leading dimensions of the states, [{list(batch)}] or the "
             f"first of them, got {list(shared)} before [C, H, W]"
         )
-    flat = _flattened(limbs)
+    flat = flatten_limbs(limbs)
     n, strip = len(flat.start), Strip(*silhouettes.shape)
     before = silhouettes.before.to(flat.start.device)
-    which = _which_silhouette(n, math.prod(shared), before)
+    which = which_silhouette(n, math.prod(shared), before)
     counts = torch.zeros(2, n, strip.cameras, dtype=torch.int64, device=flat.start.device)
 
     def count(items: slice) -> None:
-        intervals = _intervals(flat, items, rig, strip, near)
+        intervals = intervals_of(flat, items, rig, strip, near, limb_shape)
         offset = None if which is None else which[items]
-        counts[:, items] = _sums(intervals, before.view(-1), offset, strip)
+        counts[:, items] = count_intervals(intervals, before.view(-1), offset, strip)
 
-    _in_chunks(count, flat, strip, chunk)
+    in_chunks(count, flat, strip, chunk)
     model, overlap = counts.view(2, *batch, strip.cameras)
     area = silhouettes.area.to(model.device)
     area = area.view(*shared, *[1] * (len(batch) - len(shared)), -1).expand_as(model)
@@ -166,6 +170,7 @@ def render(
     width: int,
     *,
     near: float = NEAR,
+    limb_shape: str = "cylinders",
 ) -> Bool[Tensor, "*batch C H W"]:
     """Silhouettes of bodies in every camera, exactly the pixels that `count_pixels` counts.
 
@@ -174,20 +179,27 @@ def render(
         state: [..., D].
         cameras: C of them, with images of this size.
         height, width: pixels.
-        near: metres; nearer parts of a limb are cut off.
+        near: metres; nearer parts of a limb are cut off. limb_shape: as `count_pixels`.
 
     Returns:
         [..., C, H, W], True on the body.
 
     Raises:
         CameraError: the cameras have images of another size.
-        InputError: a side or `near` is not positive.
+        InputError: a side or `near` is not positive, or another `limb_shape`.
     """
-    return render_limbs(_limbs_of(body, state, near), cameras, height, width, near=near)
+    limbs = _limbs_of(body, state, near)
+    return render_limbs(limbs, cameras, height, width, near=near, limb_shape=limb_shape)
 
 
 def render_limbs(
-    limbs: Limbs, cameras: Cameras, height: int, width: int, *, near: float = NEAR
+    limbs: Limbs,
+    cameras: Cameras,
+    height: int,
+    width: int,
+    *,
+    near: float = NEAR,
+    limb_shape: str = "cylinders",
 ) -> Bool[Tensor, "*batch C H W"]:
     """Silhouettes of limbs [..., L] in every camera, as `render`.
 
@@ -201,18 +213,20 @@ def render_limbs(
             [0, 1, 1, 1, 0],
             [0, 0, 1, 0, 0]], dtype=torch.int32)
     """
-    rig, limbs = as_rig(cameras), _limbs_of(limbs, None, near)
+    check_limb_shape(limb_shape)
+    rig, limbs = as_rig(cameras), checked_limbs(limbs, near)
     if height < 1 or width < 1:
         raise InputError(f"an image needs positive sides in pixels, got {height} x {width}")
     rig.check_images("silhouettes", (len(rig), height, width))
-    flat, strip = _flattened(limbs), Strip(len(rig), int(height), int(width))
+    flat, strip = flatten_limbs(limbs), Strip(len(rig), int(height), int(width))
     device = flat.start.device
     images = torch.empty(len(flat.start), strip.pixels, dtype=torch.bool, device=device)
 
     def paint(items: slice) -> None:
-        images[items] = _painted(_intervals(flat, items, rig, strip, near), strip)
+        intervals = intervals_of(flat, items, rig, strip, near, limb_shape)
+        images[items] = _painted(intervals, strip)
 
-    _in_chunks(paint, flat, strip, max(_PIXELS // strip.pixels, 1))
+    in_chunks(paint, flat, strip, max(_PIXELS // strip.pixels, 1))
     return images.view(*limbs.start.shape[:-2], *strip)
 
 
@@ -220,56 +234,10 @@ def render_limbs(
 
 
 def _limbs_of(body: HasLimbs | Limbs, state: Tensor | None, near: float) -> Limbs:
-    if not 0 < near < math.inf:
-        raise InputError(f"near must be a positive number of metres, got {near}")
     if isinstance(body, Limbs) != (state is None):
         raise InputError("state must be given with a body, and be None with Limbs")
     limbs = body if isinstance(body, Limbs) else body.limbs(state)  # type: ignore[arg-type]
-    check_limbs(limbs)
-    return Limbs(*(part.detach() for part in limbs))
-
-
-def _flattened(limbs: Limbs) -> Limbs:
-    """Limbs [N, L] with radii [L, 2] or [N, L, 2]."""
-    start, end, radii = limbs
-    shape = math.prod(start.shape[:-2]), start.shape[-2]
-    if radii.ndim > 2:
-        radii = radii.expand(*start.shape[:-1], 2).reshape(*shape, 2)
-    return Limbs(start.reshape(*shape, 3), end.reshape(*shape, 3), radii)
-
-
-def _which_silhouette(n_items: int, n_silhouettes: int, before: Tensor) -> Tensor | None:
-    """Where each item's running sums begin [N]; None if all share one silhouette."""
-    if n_silhouettes <= 1:
-        return None
-    begin = torch.arange(n_silhouettes, device=before.device) * before.shape[-1]
-    return begin.repeat_interleave(n_items // n_silhouettes)
-
-
-def _intervals(
-    limbs: Limbs, items: slice, rig: CameraRig, strip: Strip, near: float
-) -> RowIntervals:
-    radii = limbs.radii if limbs.radii.ndim == 2 else limbs.radii[items]
-    some = Limbs(limbs.start[items], limbs.end[items], radii)
-    outlines = outline(project_limbs(some, rig, near), strip.height, strip.width)
-    return limb_intervals(outlines, len(some.start), strip)
-
-
-def _sums(
-    intervals: RowIntervals, before: Tensor, begin: Tensor | None, strip: Strip
-) -> Int[Tensor, "2 N C"]:
-    """Covered pixels, and those of them in the silhouette, of each item and camera."""
-    place = (1 << strip.bits) - 1
-    start, stop = intervals.start & place, intervals.stop & place
-    model = stop - start
-    if begin is not None:
-        shift = begin.index_select(0, intervals.start >> strip.bits)
-        start, stop = start + shift, stop + shift
-    overlap = before.index_select(0, stop).sub_(before.index_select(0, start))
-    ends = intervals.per_image.flatten().cumsum(0)
-    sums = torch.stack([x.cumsum(0, dtype=torch.int64) for x in (model, overlap)])
-    totals = pad(sums, (1, 0))[:, pad(ends, (1, 0))].diff(dim=-1)
-    return totals.view(2, *intervals.per_image.shape)
+    return checked_limbs(limbs, near)
 
 
 def _painted(intervals: RowIntervals, strip: Strip) -> Bool[Tensor, "N P"]:
@@ -284,48 +252,3 @@ def _painted(intervals: RowIntervals, strip: Strip) -> Bool[Tensor, "N P"]:
     edges[start] = 1
     edges[stop] -= 1  # an interval may start where another one stops
     return (edges.view(n, size).cumsum(-1, dtype=torch.int8) > 0)[:, :-1]
-
-
-def _in_chunks(
-    work: Callable[[slice], None], limbs: Limbs, strip: Strip, chunk: int | None
-) -> None:
-    """Call `work` on slices of the items, by as many threads as torch may use."""
-    n, n_limbs = limbs.start.shape[:2]
-    on_cpu = limbs.start.device.type == "cpu"
-    threads = torch.get_num_threads() if on_cpu else 1
-    if chunk is None:
-        intervals = _INTERVALS if on_cpu else _INTERVALS_GPU
-        per_item = strip.cameras * max(n_limbs, 1) * (_COVERED_ROWS * strip.height + 4)
-        chunk = max(min(round(intervals / per_item), -(-n // threads)), 1)
-    if chunk < 1:
-        raise InputError(f"chunk must be 1 or more, got {chunk}")
-    slices = [slice(i, min(i + chunk, n)) for i in range(0, n, chunk)]
-    _keep_freed_memory()
-
-    def run(items: slice) -> None:
-        with torch.inference_mode():  # it holds for one thread only
-            work(items)
-
-    threads = min(threads, len(slices))
-    if threads < 2 or not _POOL.acquire(blocking=False):  # another thread has the cores already
-        for items in slices:
-            run(items)
-        return
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(1)  # so that the workers' operations do not ask for more threads
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(run, slices))
-    finally:
-        torch.set_num_threads(before)
-        _POOL.release()
-
-
-def _keep_freed_memory() -> None:
-    """Have glibc keep the temporaries of a chunk for the next one.
-
-    By default it returns blocks of 128 KB and more to the system, and the pages of every temporary
-    are faulted in anew, which can take more time than the arithmetic. Once a block of 32 MB has been
-    freed (never touched, so it costs nothing) up to 64 MB are kept. Other allocators do not mind.
-    """
-    torch.empty(_KEPT, dtype=torch.uint8)

@@ -3,7 +3,7 @@
 import sys
 import time
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
 
 from jsonargparse import ArgumentParser, Namespace
@@ -37,6 +37,7 @@ torchpose track-body cameras.toml cam*.mp4 --body result/body.npz --facing [1,0,
 METHODS = ("mrpf", "apf", "sir")
 _LAYERS = 5  # of the annealed filter, each with its share of the particles
 _RATE = 60.0  # frames per second for which the default noise of the filters is
+_LOOK_AHEAD = 0.5  # seconds that decide where the person looks at first
 _SEEN = 0.002  # of the image: fewer pixels are nobody
 
 
@@ -84,7 +85,8 @@ def build() -> ArgumentParser:
     add("--initial-pose", type=str, metavar="FILE",
         help="a body.npz whose first pose the person begins with; without, it is found")  # fmt: skip
     add("--facing", type=list[float] | None, default=None, metavar="[x,y,z]",
-        help="where the person looks at first, in world axes; silhouettes hardly tell")  # fmt: skip
+        help="where the person looks at first, in world axes; without, the first steps and the bend of "
+        "the knees tell, which one who walks backwards or stands straight gets wrong")  # fmt: skip
     add(
         "--rows", type=int, default=160, metavar="N", help="height of the silhouettes (default 160)"
     )
@@ -228,13 +230,15 @@ def _track(
     begun = len(recordings.packed) - 1
     generator = torch.Generator().manual_seed(args.seed)
     rig = recordings.rig
-    start = _initial_state(args, body, first, rig, manifold, generator)
+    looked_at = 1 if args.initial_pose else max(1, round(_LOOK_AHEAD * recordings.fps))
+    begin = [first, *islice(frames, looked_at - 1)]
+    start = _initial_state(args, body, begin, rig, manifold, recordings.fps, generator)
     model = make_filter(
         args.method, body, manifold, args.n_particles, args.sharpness, recordings.fps
     )
     expected = recordings.n_frames
     poses = track_body(
-        model, chain([first], frames), rig, start, generator, initial_std=2 * model.step_std,
+        model, chain(begin, frames), rig, start, generator, initial_std=2 * model.step_std,
         fps=recordings.fps, n_frames=None if expected is None else max(1, expected - begun),
         progress=show_progress(),
     )  # fmt: skip
@@ -249,17 +253,20 @@ def _all_see(masks: "Tensor") -> bool:
 
 
 def _initial_state(
-    args: Namespace, body: "Body", first: "Tensor", rig: "CameraRig", manifold: Any, generator: Any
-) -> "Tensor":
+    args: Namespace, body: "Body", begin: "list[Tensor]", rig: "CameraRig", manifold: Any, fps: float,
+    generator: Any,
+) -> "Tensor":  # fmt: skip
     import torch
 
     from torchpose.body.fitting import fit_state
     from torchpose.body_poses import BodyPoses
-    from torchpose.filters.pose_search import find_pose
+    from torchpose.filters.first_pose import find_first_pose
 
     if args.initial_pose:
         recorded = BodyPoses.load(args.initial_pose)
         return fit_state(body, recorded.joints3d[:1])[0]
     print("finding the pose of the first frame ...", flush=True)
     facing = None if args.facing is None else torch.tensor(args.facing, dtype=torch.float64)
-    return find_pose(body, first, rig, manifold, generator, facing=facing)
+    return find_first_pose(
+        body, torch.stack(begin), rig, manifold, generator, fps=fps, facing=facing
+    ).state

@@ -76,8 +76,8 @@ class BodyTrack(NamedTuple):
 
     def element(self, index: int) -> "BodyTrack":
         """The track of one element of a batch."""
-        details = {name: value[index] for name, value in self.details.items()}
-        return BodyTrack(*(part[index] for part in self[:-1]), details)
+        parts: dict[str, Any] = {name: getattr(self, name)[index] for name in self._fields[:-1]}
+        return BodyTrack(**parts, details={n: value[index] for n, value in self.details.items()})
 
 
 class BodyFilterState(NamedTuple):
@@ -117,21 +117,28 @@ class WeightedParticles(NamedTuple):
 
 def stack_tracks(steps: Sequence[BodyTrack]) -> BodyTrack:
     """Steps [B, ...] as one track [B, T, ...]."""
-    parts = zip(*(step[:-1] for step in steps), strict=True)
+    parts: dict[str, Any] = {
+        name: torch.stack([getattr(step, name) for step in steps], 1)
+        for name in BodyTrack._fields[:-1]
+    }
     names = steps[0].details
     details = {name: torch.stack([step.details[name] for step in steps], 1) for name in names}
-    return BodyTrack(*(torch.stack(part, 1) for part in parts), details)
+    return BodyTrack(**parts, details=details)
 
 
 def silhouette_score(
-    body: Any, silhouettes: Tensor | PreparedSilhouettes, cameras: Any, likelihood: str
+    body: Any,
+    silhouettes: Tensor | PreparedSilhouettes,
+    cameras: Any,
+    likelihood: str,
+    limb_shape: str = "cylinders",
 ) -> Score:
     """states [B, N, D] -> log-likelihood [B, N] of the silhouettes [B, C, H, W] of one frame."""
     if not isinstance(silhouettes, PreparedSilhouettes):
         silhouettes = prepare_silhouettes(silhouettes)
 
     def score(states: Tensor) -> Tensor:
-        counts = count_pixels(body, states, cameras, silhouettes)
+        counts = count_pixels(body, states, cameras, silhouettes, limb_shape=limb_shape)
         return silhouette_log_likelihood(counts, likelihood)
 
     return score

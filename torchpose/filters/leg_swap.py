@@ -70,7 +70,7 @@ def exchange_legs(body: Body, states: Float[Tensor, "*batch D"]) -> Float[Tensor
 
 
 def swap_legs(
-    body: Body, particles: Float[Tensor, "B N D"], rate: float, generator: Generators = None
+    body: Any, particles: Float[Tensor, "B N D"], rate: float, generator: Generators = None
 ) -> tuple[Float[Tensor, "B N D"], Bool[Tensor, "B N"]]:
     """Exchange the legs of some particles, the more often the wider they are apart.
 

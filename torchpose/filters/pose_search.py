@@ -20,7 +20,15 @@ from torchpose.filters.annealed import anneal
 from torchpose.filters.base import Generators, standard_normal, uniform
 from torchpose.filters.silhouette_filter import silhouette_score
 
-__all__ = ["SilhouettePlace", "find_pose", "place_from_silhouettes", "upward_direction"]
+__all__ = [
+    "PoseCandidates",
+    "SilhouettePlace",
+    "find_candidates",
+    "find_pose",
+    "place_from_silhouettes",
+    "upward_direction",
+    "world_up",
+]
 
 _ACROSS = 0.1  # metres: how far the middle of a silhouette lies from that of the body
 _DEPTH_SHARE = 0.1  # of a ray's information across it that its length has, from the person's height
@@ -57,6 +65,15 @@ def upward_direction(rig: CameraRig) -> Float[Tensor, "3"]:
             f"their mean is {[round(float(x), 2) for x in up]}"
         )
     return torch.eye(3).to(up)[axis] * up[axis].sign()
+
+
+def world_up(rig: CameraRig, up: Tensor | None) -> Float[Tensor, "3"]:
+    """The direction that was given as up, of length one, or `upward_direction` if it is None.
+
+    Raises:
+        InputError: not a direction, or none can be told. ShapeError: not [3].
+    """
+    return _unit("up", upward_direction(rig) if up is None else up)
 
 
 def place_from_silhouettes(
@@ -105,8 +122,53 @@ def place_from_silhouettes(
     return SilhouettePlace(position, _ACROSS**2 * torch.linalg.inv(information))
 
 
-@torch.no_grad()
+class PoseCandidates(NamedTuple):
+    """The best pose of every sector of headings.
+
+    Attributes:
+        states: [B, S, D]. log_likelihood: of each [B, S].
+    """
+
+    states: Tensor
+    log_likelihood: Tensor
+
+
 def find_pose(
+    body: Any,
+    silhouettes: Tensor,
+    cameras: Cameras,
+    prior: Any = None,
+    generator: Generators = None,
+    **options: Any,
+) -> Float[Tensor, "*B D"]:
+    """Find the pose in one frame by annealing: all headings, poses of the prior, the rays' position.
+
+    Every sector of headings is searched by itself, lest the first layers settle on one, and the pose
+    of the sector that fits best is returned (`find_candidates`).
+
+    One frame hardly tells front from back, and left leg from right: without `facing` the person may
+    come out turned by half a turn. `find_first_pose` lets several frames decide.
+
+    Args:
+        silhouettes: bool [C, H, W], or [B, C, H, W] for several persons' frames.
+        body, cameras, prior, generator, options: as `find_candidates`.
+
+    Returns:
+        State [D] or [B, D].
+
+    Raises:
+        InputError, ShapeError, CameraError, PriorError: as `find_candidates`.
+    """
+    batched = silhouettes.ndim == 4
+    silhouettes = silhouettes if batched else silhouettes[None]
+    found = find_candidates(body, silhouettes, cameras, prior, generator, **options)
+    best = found.log_likelihood.argmax(1)
+    states = found.states[torch.arange(len(best), device=best.device), best]
+    return states if batched else states[0]
+
+
+@torch.no_grad()
+def find_candidates(
     body: Any,
     silhouettes: Tensor,
     cameras: Cameras,
@@ -121,33 +183,26 @@ def find_pose(
     limits: Any = None,
     up: Tensor | None = None,
     facing: Tensor | None = None,
-) -> Float[Tensor, "*B D"]:
-    """Find the pose in one frame by annealing: all headings, poses of the prior, the rays' position.
+) -> PoseCandidates:
+    """Find a pose in one frame for every sector of headings, by annealing.
 
-    The particles start where the rays of the silhouettes meet, upright with headings all around, with
-    poses of the prior. In layers of diffusion that shrinks, weights and resampling they gather where the
-    likelihood is high. Every sector of headings is searched by itself, lest the first layers settle on
-    one, and the mean of the best particles of the sector that fits best is returned.
-
-    Silhouettes hardly tell front from back, and left leg from right: without `facing` the person may
-    still come out turned by half a turn.
+    The particles start where the rays of the silhouettes meet, upright with headings within the
+    sector, with poses of the prior. In layers of diffusion that shrinks, weights and resampling they
+    gather where the likelihood is high; the mean of the best ones is the sector's pose.
 
     Args:
         body: a `torchpose.body.Body`.
-        silhouettes: bool [C, H, W], or [B, C, H, W] for several persons' frames. cameras: the C cameras.
+        silhouettes: bool [B, C, H, W], a frame of each of B persons. cameras: the C cameras.
         prior: poses to start from: relative columns [M, Q], states [M, D], a fitted
             `BackConstrainedGPLVM`, or None for the rest pose.
         generator: one generator, or a list of one for each of B.
         n_particles: N, of all sectors together. n_layers: M; the search evaluates M N likelihoods.
-        n_headings: sectors of the circle; one of 120 degrees with `facing`.
+        n_headings: S, sectors of the circle; one of 120 degrees with `facing`.
         survival_rate: of a layer.
         likelihood: "bidirectional" or "overlap"; its exponents are solved from the survival rate.
         limits: joint limits with `clamp(states)`, or None.
         up: [3], direction of the world's vertical; by `upward_direction` if None.
         facing: [3], the world direction that the person faces to within 60 degrees, if it is known.
-
-    Returns:
-        State [D] or [B, D].
 
     Raises:
         InputError: no camera sees the person, or a bad setting. ShapeError, CameraError: silhouettes,
@@ -160,14 +215,12 @@ def find_pose(
             "a search needs at least 1 heading, 1 particle for each and 2 layers, got "
             f"{n_headings}, {n_particles} and {n_layers}"
         )
-    batched = silhouettes.ndim == 4
-    silhouettes = silhouettes if batched else silhouettes[None]
     check_shape("silhouettes", silhouettes, ["B", "C", "H", "W"])
     if silhouettes.dtype != torch.bool:
         raise InputError(f"silhouettes must be bool (True = person), got {silhouettes.dtype}")
     rig = as_rig(cameras)
     rig.check_images("silhouettes", silhouettes.shape[1:])
-    up = _unit("up", upward_direction(rig) if up is None else up).to(body.offsets)
+    up = world_up(rig, up).to(body.offsets)
     sectors = _sectors(up, n_headings, facing)
     batch, count = len(silhouettes), len(sectors.middle)
     # every sector is an element of the batch
@@ -188,9 +241,8 @@ def find_pose(
 
     run = anneal(particles, score, diffuse, n_layers, survival_rate, generator=generator)
     found = _mean_of_best_mode(body, run.particles, run.log_weights)
-    fit = score(found[:, None]).view(batch, count)
-    best = found.view(batch, count, -1)[torch.arange(batch, device=fit.device), fit.argmax(1)]
-    return best if batched else best[0]
+    fit = score(found[:, None])
+    return PoseCandidates(found.view(batch, count, -1), fit.view(batch, count))
 
 
 class _Sectors(NamedTuple):

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
+from torchpose.body.rectangles import check_limb_shape
 from torchpose.body.silhouette import prepare_silhouettes
 from torchpose.body.silhouette_likelihood import LIKELIHOODS
 from torchpose.errors import InputError, check_finite, check_shape
@@ -82,6 +83,7 @@ class SilhouetteParticleFilter(nn.Module):
         leg_swap: for a person whose legs may have been taken for each other: at resampling a particle
             goes on with its legs exchanged with this probability times the angle between its upper
             legs over pi (Daubney & Xie, section 8); 0 for never.
+        limb_shape: of the body in silhouettes, "cylinders" or "rectangles" (AS, section 3.2).
         respread_scale: particles that all died are drawn about the last mean with this many times
             `step_std`, twice that in the second such frame, and so on.
 
@@ -105,6 +107,7 @@ class SilhouetteParticleFilter(nn.Module):
         resample_threshold: float = 1.0,
         estimate: str = "mean",
         leg_swap: float = 0.0,
+        limb_shape: str = "cylinders",
         respread_scale: float = 5.0,
     ) -> None:
         super().__init__()
@@ -117,12 +120,13 @@ class SilhouetteParticleFilter(nn.Module):
         if not 0 <= resample_threshold <= 1:
             raise InputError(f"resample_threshold must be from 0 to 1, got {resample_threshold}")
         check_leg_swap(body, leg_swap)
+        check_limb_shape(limb_shape)
         for name, value in (("sharpness", sharpness), ("respread_scale", respread_scale)):
             if not 0 < value < math.inf:
                 raise InputError(f"{name} must be positive and finite, got {value}")
         self.body, self.limits, self.limit_mode = body, limits, limit_mode
         self.n_particles, self.sharpness = n_particles, float(sharpness)
-        self.likelihood, self.estimate = likelihood, estimate
+        self.likelihood, self.limb_shape, self.estimate = likelihood, limb_shape, estimate
         self.resampling, self.resample_threshold = resampling, resample_threshold
         self.leg_swap, self.respread_scale = leg_swap, respread_scale
         self.register_buffer("step_std", as_step_std(body, step_std))
@@ -315,7 +319,7 @@ class SilhouetteParticleFilter(nn.Module):
             score: Score = lambda states: likelihood(states, silhouettes)  # noqa: E731
         else:
             observed = prepare_silhouettes(silhouettes)
-            score = silhouette_score(self.body, observed, cameras, likelihood)
+            score = silhouette_score(self.body, observed, cameras, likelihood, self.limb_shape)
         return Frame(self._sharpened(score, seen), seen, observed, cameras)
 
     def _sharpened(self, raw: Score, seen: Bool[Tensor, " B"]) -> Score:

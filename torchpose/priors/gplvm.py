@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,31 +17,18 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from torchpose.errors import (
-    FileFormatError,
-    InputError,
-    ShapeError,
-    check_finite,
-    check_shape,
-)
-from torchpose.gaussian import safe_cholesky
-from torchpose.priors.gplvm_fit import GPLVMFit, median_gamma, run_fit
-from torchpose.priors.gplvm_kernel import KernelParameters, covariance, rbf_rows, rbf_with_rows
-from torchpose.priors.manifold_file import ManifoldInfo, read_manifold, write_manifold
-from torchpose.priors.pose_sequences import (
-    column_scale,
-    join_sequences,
-    principal_axes,
-    steps_within,
-)
+from torchpose.errors import FileFormatError, InputError, ShapeError, check_finite, check_shape
+from torchpose.priors import gplvm_prediction
+from torchpose.priors.gplvm_fit import GPLVMFit, best_fit, median_gamma
+from torchpose.priors.gplvm_kernel import KernelParameters
+from torchpose.priors.gplvm_noise import MotionNoise, check_unseen, motion_noise, no_noise
+from torchpose.priors.gplvm_prediction import Fitted, Prepared
+from torchpose.priors.manifold_file import TENSORS, ManifoldInfo, read_manifold, write_manifold
+from torchpose.priors.pose_sequences import column_scale, join_sequences, principal_axes
 
 __all__ = ["BackConstrainedGPLVM"]
 
-_CHUNK = 512  # particles per product, so that their kernel values stay in the cache
 _WATCHED, _ALONE = {"steps": 40, "n_init": 4}, {"steps": 3, "n_init": 1}
-_LEAST_SHARE = 0.05  # of the root mean square over all columns: a deviation that is not nothing
-_NOISE = ("std_latent", "std_pose", "std_step")
-_KEPT = ("poses", "lengths", "scale", "weights", "bias", "gamma_x", "log_kernel", *_NOISE)
 
 
 class BackConstrainedGPLVM(nn.Module):
@@ -86,7 +72,6 @@ class BackConstrainedGPLVM(nn.Module):
 
     poses: Tensor
     lengths: Tensor
-    mean: Tensor
     scale: Tensor
     weights: Tensor
     bias: Tensor
@@ -96,12 +81,6 @@ class BackConstrainedGPLVM(nn.Module):
     std_pose: Tensor
     std_step: Tensor
     latents: Tensor
-    _mean: Tensor
-    _pose_rows: Tensor
-    _latent_rows: Tensor
-    _factor: Tensor
-    _alpha: Tensor
-    _offset: Tensor
 
     def __init__(
         self,
@@ -135,8 +114,8 @@ class BackConstrainedGPLVM(nn.Module):
             check_finite(name, value)
             self.register_buffer(name, value.detach().to(poses.device, torch.float64).clone())
         self.register_buffer("lengths", lengths.detach().clone())
-        for name, size in zip(_NOISE, (latent_dim, columns, columns), strict=True):
-            self.register_buffer(name, torch.full_like(self.bias[:1], math.nan).repeat(size))
+        for name, value in no_noise(latent_dim, columns, self.poses)._asdict().items():
+            self.register_buffer(name, value)
         self.register_load_state_dict_post_hook(_prepare_again)
         self._prepare()
 
@@ -201,19 +180,18 @@ class BackConstrainedGPLVM(nn.Module):
         defaults = _ALONE if validation is None else _WATCHED
         steps = defaults["steps"] if steps is None else steps
         n_init = defaults["n_init"] if n_init is None else n_init
-        if n_init < 1 or steps < 1:
-            raise InputError(f"n_init and steps must be at least 1, got {n_init} and {steps}")
-        fits = []
-        for start in range(n_init):
-            one = GPLVMFit(
-                target, latent_dim, gamma, optimiser, learning_rate, smoothness, start=start
+        error = None
+        if validation is not None:
+            watched, _ = join_sequences(validation, info.columns, joined.shape[1])
+            error = lambda fit: (  # noqa: E731
+                cls.from_fit(fit, joined, lengths, scale).reconstruction_error(watched)
             )
-            error = None
-            if validation is not None:
-                watched, _ = join_sequences(validation, info.columns, joined.shape[1])
-                error = partial(_held_out_error, one, joined, lengths, scale, watched)
-            fits.append(run_fit(one, steps, tolerance, progress, error, patience))
-        best = max(fits, key=lambda one: -min(one.scores) if one.scores else one.history[-1])
+        best = best_fit(
+            lambda start: GPLVMFit(
+                target, latent_dim, gamma, optimiser, learning_rate, smoothness, start=start
+            ),
+            n_init, steps, tolerance, progress, error, patience,
+        )  # fmt: skip
         return cls.from_fit(best, joined, lengths, scale, info)
 
     @classmethod
@@ -245,9 +223,7 @@ class BackConstrainedGPLVM(nn.Module):
         """Set the three standard deviations from validation poses; returns the manifold itself.
 
         sigma x->z: root mean square of g(x_t) - g(x_t-1) (MR 27); sigma z->x: of x_t - f(g(x_t))
-        (MR 30); sigma x->x: of x_t - x_t-1 (MR 29), each dimension apart, and never across the end
-        of a sequence. A column that stands still, such as the twist of an arm, gets a twentieth of
-        the root mean square over all columns.
+        (MR 30); sigma x->x: of x_t - x_t-1 (MR 29), each dimension apart; see `motion_noise`.
 
         Args:
             poses: one sequence or several that were not fitted to; on those that were, sigma z->x
@@ -261,19 +237,11 @@ class BackConstrainedGPLVM(nn.Module):
             raise InputError(f"fps must be positive, got {fps:g}")
         joined, lengths = join_sequences(poses, self.info.columns, self.dim)
         joined = joined.to(self.poses)
-        starts = torch.tensor([0, *lengths[:-1]]).cumsum(0)
-        if bool((joined[starts, None] == self.poses).all(-1).any()):
-            raise InputError(
-                "the standard deviations need poses that were not fitted to, got some that were; "
-                "take another trial of the same person"
-            )
+        check_unseen(joined, lengths, self.poses)
         latents = self.to_latent(joined)
-        residual = joined - self.pose_mean(latents)
-        found = (steps_within(latents, lengths), residual, steps_within(joined, lengths))
-        for name, values in zip(_NOISE, found, strict=True):
-            squared = values.square().mean(0)
-            least = _LEAST_SHARE * squared.mean().sqrt()
-            getattr(self, name).copy_(squared.sqrt().maximum(least))
+        noise = motion_noise(joined, latents, self.pose_mean(latents), lengths)
+        for name, value in noise._asdict().items():
+            getattr(self, name).copy_(value)
         self.info = replace(self.info, fps=float(fps))
         return self
 
@@ -286,12 +254,9 @@ class BackConstrainedGPLVM(nn.Module):
             ShapeError: another number of columns.
         """
         check_shape("x", x, ("...", self.dim))
-        flat = (x.reshape(-1, self.dim).to(self.poses.dtype) - self._mean) / self.scale
-        chunks = [
-            rbf_with_rows(part, self._pose_rows, self.gamma_x) @ self.weights + self.bias
-            for part in flat.split(_CHUNK)
-        ]
-        return torch.cat(chunks).reshape(*x.shape[:-1], self.latent_dim)
+        flat = x.reshape(-1, self.dim).to(self.poses.dtype)
+        found = gplvm_prediction.to_latent(flat, self._fitted, self._prepared)
+        return found.reshape(*x.shape[:-1], self.latent_dim)
 
     def pose_mean(self, z: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch Q"]:
         """Mean pose of latent points, f(z) = X^T K^-1 k   (MR 25).
@@ -300,8 +265,8 @@ class BackConstrainedGPLVM(nn.Module):
             ShapeError: another number of latent dimensions.
         """
         check_shape("z", z, ("...", self.latent_dim))
-        chunks = [self._smooth(part) @ self._alpha + self._offset for part in self._rows_of(z)]
-        return torch.cat(chunks).reshape(*z.shape[:-1], self.dim)
+        found = gplvm_prediction.to_pose_mean(self._flat(z), self._fitted, self._prepared)
+        return found.reshape(*z.shape[:-1], self.dim)
 
     def to_pose(
         self, z: Float[Tensor, "*batch d"]
@@ -321,19 +286,8 @@ class BackConstrainedGPLVM(nn.Module):
             ShapeError: another number of latent dimensions.
         """
         check_shape("z", z, ("...", self.latent_dim))
-        kernel = self.kernel
-        means, variances = [], []
-        for part in self._rows_of(z):
-            smooth = self._smooth(part)
-            means.append(smooth @ self._alpha + self._offset)
-            cross = smooth + kernel.log_beta0.exp()
-            white = torch.linalg.solve_triangular(self._factor.mT, cross, upper=True, left=False)
-            variances.append((kernel.variance - white.square().sum(-1)).clamp_min(0))
-        variance = torch.cat(variances) + kernel.noise
-        return (
-            torch.cat(means).reshape(*z.shape[:-1], self.dim),
-            variance.reshape(z.shape[:-1]),
-        )
+        mean, variance = gplvm_prediction.to_pose(self._flat(z), self._fitted, self._prepared)
+        return mean.reshape(*z.shape[:-1], self.dim), variance.reshape(z.shape[:-1])
 
     def reconstruct(self, x: Float[Tensor, "*batch Q"]) -> Float[Tensor, "*batch Q"]:
         """The pose on the manifold that a pose leads to, f(g(x))."""
@@ -397,7 +351,7 @@ class BackConstrainedGPLVM(nn.Module):
         Raises:
             OutputError: the file cannot be written. PriorError: `info.extra` is not JSON.
         """
-        write_manifold(path, self.info, {name: getattr(self, name) for name in _KEPT})
+        write_manifold(path, self.info, {name: getattr(self, name) for name in TENSORS})
 
     @classmethod
     def load(cls, path: str | Path) -> BackConstrainedGPLVM:
@@ -406,61 +360,38 @@ class BackConstrainedGPLVM(nn.Module):
         Raises:
             InputError: no such file. FileFormatError: truncated, or of another kind.
         """
-        info, tensors = read_manifold(path, _KEPT)
-        kernel = tensors["log_kernel"]
+        info, kept = read_manifold(path)
+        kernel = KernelParameters(*kept["log_kernel"].unbind())
         try:
-            check_shape("log_kernel", kernel, (4,))
             manifold = cls(
-                tensors["poses"], tensors["lengths"], tensors["weights"], tensors["bias"],
-                tensors["gamma_x"], KernelParameters(*kernel.unbind()), scale=tensors["scale"],
-                info=info,
+                kept["poses"], kept["lengths"], kept["weights"], kept["bias"], kept["gamma_x"],
+                kernel, scale=kept["scale"], info=info,
             )  # fmt: skip
-            for name in _NOISE:
-                check_shape(name, tensors[name], getattr(manifold, name).shape)
-                getattr(manifold, name).copy_(tensors[name])
         except (InputError, ShapeError) as error:
             raise FileFormatError(f"{path}: {error}") from error
+        for name in MotionNoise._fields:
+            getattr(manifold, name).copy_(kept[name])
         return manifold
 
     # --- inside
 
+    @property
+    def _fitted(self) -> Fitted:
+        return Fitted(self.scale, self.weights, self.bias, self.gamma_x, self.kernel)
+
+    @property
+    def _prepared(self) -> Prepared:
+        return Prepared(self.latents, *(getattr(self, f"_{name}") for name in Prepared._fields[1:]))
+
     def _prepare(self) -> None:
-        """What prediction needs and follows from the rest, in double precision."""
-        poses, scale, weights, bias, gamma, logs = (
-            getattr(self, name).double() for name in _KEPT[:1] + _KEPT[2:7]
-        )
-        kernel, mean = KernelParameters(*logs.unbind()), poses.mean(0)
-        target, zero = (poses - mean) / scale, torch.zeros_like(gamma)
-        pose_rows = rbf_rows(target, gamma, zero)
-        latents = rbf_with_rows(target, pose_rows, gamma) @ weights + bias
-        factor = safe_cholesky(covariance(latents, kernel))
-        alpha = torch.cholesky_solve(target, factor) * scale
-        derived = {
-            "latents": latents,
-            "_mean": mean,
-            "_pose_rows": pose_rows,
-            "_latent_rows": rbf_rows(latents, kernel.log_gamma.exp(), kernel.log_beta),
-            "_factor": factor,
-            "_alpha": alpha,
-            "_offset": mean + kernel.log_beta0.exp() * alpha.sum(0),
-        }
-        for name, value in derived.items():
-            self.register_buffer(name, value.to(self.poses.dtype), persistent=False)
+        """What prediction needs and follows from the rest."""
+        for name, value in gplvm_prediction.prepare(self.poses, self._fitted)._asdict().items():
+            own = name if name == "latents" else f"_{name}"
+            self.register_buffer(own, value.to(self.poses.dtype), persistent=False)
 
-    def _rows_of(self, z: Tensor) -> tuple[Tensor, ...]:
-        return z.reshape(-1, self.latent_dim).to(self.poses.dtype).split(_CHUNK)
-
-    def _smooth(self, z: Tensor) -> Tensor:
-        """beta exp(...) of latent points and those of the training poses; beta_0 is in the offset."""
-        return rbf_with_rows(z, self._latent_rows, self.kernel.log_gamma.exp())
+    def _flat(self, z: Tensor) -> Float[Tensor, "N d"]:
+        return z.reshape(-1, self.latent_dim).to(self.poses.dtype)
 
 
 def _prepare_again(manifold: BackConstrainedGPLVM, _: Any) -> None:
     manifold._prepare()
-
-
-def _held_out_error(
-    fit: GPLVMFit, poses: Tensor, lengths: Sequence[int], scale: Tensor, watched: Tensor
-) -> float:
-    found = BackConstrainedGPLVM.from_fit(fit, poses, lengths, scale)
-    return found.reconstruction_error(watched)

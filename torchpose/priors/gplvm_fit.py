@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import combinations
 from typing import Any
 
@@ -16,6 +17,7 @@ from torchpose.priors.gplvm_kernel import KernelParameters, covariance, rbf
 __all__ = [
     "OPTIMISERS",
     "GPLVMFit",
+    "best_fit",
     "log_likelihood",
     "median_gamma",
     "objective",
@@ -294,6 +296,34 @@ def run_fit(
     if error is not None:
         fit.restore_best()
     return fit
+
+
+def best_fit(
+    make: Callable[[int], GPLVMFit],
+    n_init: int,
+    steps: int,
+    tolerance: float = 1e-5,
+    progress: bool = False,
+    error: Callable[[GPLVMFit], float] | None = None,
+    patience: int = 3,
+) -> GPLVMFit:
+    """The best fit of several starts: with the lowest error, or else the highest objective.
+
+    Args:
+        make: a fit at start 0, 1, ... n_init: how many. error: on poses that are not fitted to, of a
+            fit as it stands. Others: as `run_fit`.
+
+    Raises:
+        InputError: no start or no step.
+    """
+    if n_init < 1 or steps < 1:
+        raise InputError(f"n_init and steps must be at least 1, got {n_init} and {steps}")
+    fits = []
+    for start in range(n_init):
+        fit = make(start)
+        own = None if error is None else partial(error, fit)
+        fits.append(run_fit(fit, steps, tolerance, progress, own, patience))
+    return max(fits, key=lambda fit: -min(fit.scores) if fit.scores else fit.history[-1])
 
 
 def _make(name: str, parameters: Iterator[nn.Parameter], rate: float | None) -> Any:

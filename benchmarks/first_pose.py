@@ -1,0 +1,114 @@
+"""Does a first pose that is found in silhouettes face the right way: one frame against half a second.
+
+Walks of four persons (`mocap_cmu_walk`) are rendered as in the protocol Silhouette; where the data has
+them, the four views of a balancing man (`multicam_pose2sim`) are searched from several of their frames.
+
+    python benchmarks/first_pose.py --data DIR [--seeds 3] [--cameras 3] [--manifold]
+"""
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from real_silhouettes import HEIGHT, four_views
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from torchpose.body import BODY_15, Body, fit_state
+from torchpose.camera_rig import CameraRig
+from torchpose.filters import find_first_pose, find_pose
+from torchpose.io.mocap import read_mocap
+from torchpose.priors import BackConstrainedGPLVM
+from torchpose.protocols.silhouette import FPS, WALKERS
+from torchpose.protocols.silhouette_data import split_clips
+from torchpose.protocols.silhouette_trackees import Conditions, prepare
+
+LOOK_AHEAD = 30  # frames at 60 Hz
+TRIALS, CLIP = 3, 45  # of each person, and frames that the cameras stand around
+STARTS = range(0, 70, 15)  # frames of the four views to start from
+
+
+class Start(NamedTuple):
+    """What a search is given, and the joints [15, 3] of the first frame."""
+
+    body: Body
+    silhouettes: Tensor
+    rig: CameraRig
+    manifold: BackConstrainedGPLVM | None
+    up: Tensor | None
+    joints: Tensor
+
+
+def walks(folder: Path, cameras: int, with_manifold: bool) -> Iterator[Start]:
+    """The first frames of three trials of each person."""
+    clips = read_mocap(folder, FPS)
+    for split in split_clips(clips, WALKERS, WALKERS, TRIALS):
+        trackee = prepare(split, Conditions(cameras_used=cameras), CLIP, LOOK_AHEAD)
+        manifold = trackee.manifold if with_manifold else None
+        for view in trackee.tests:
+            yield Start(
+                trackee.body, view.silhouettes[:LOOK_AHEAD], view.rig, manifold, view.clip.up,
+                view.clip.joints[0],
+            )  # fmt: skip
+
+
+def balancing(folder: Path) -> Iterator[Start]:
+    """Several frames of the four views, a body of average proportions."""
+    data, body = four_views(folder), Body.of_height(BODY_15, HEIGHT)
+    for t in STARTS:
+        frames = data.silhouettes[t : t + LOOK_AHEAD]
+        yield Start(body, frames, data.rig, None, None, data.joints[t])
+
+
+def one_frame(start: Start, generator: torch.Generator) -> Tensor:
+    """The pose that fits the first frame best."""
+    return find_pose(
+        start.body, start.silhouettes[0], start.rig, start.manifold, generator, up=start.up
+    )
+
+
+def half_a_second(start: Start, generator: torch.Generator) -> Tensor:
+    """The pose whose track tells best where it faces."""
+    return find_first_pose(
+        start.body, start.silhouettes, start.rig, start.manifold, generator, fps=FPS, up=start.up
+    ).state
+
+
+def row(
+    name: str, starts: Sequence[Start], seeds: int, find: Callable[[Start, torch.Generator], Tensor]
+) -> str:
+    """How many face the right way, mean and largest error (mm)."""
+    right, errors = 0, []
+    for start in tqdm(starts, desc=name, disable=None):
+        truth = fit_state(start.body, start.joints[None])[0]
+        for seed in range(seeds):
+            found = find(start, torch.Generator().manual_seed(seed))
+            ahead = start.body.part_rotations(torch.stack([found, truth]))[:, 0, :, 2]
+            right += int(float(ahead[0] @ ahead[1]) > 0)
+            gap = (start.body.joints(found) - start.joints).norm(dim=-1)
+            errors.append(1000 * float(gap.nanmean()))
+    count = len(errors)
+    return f"| {name} | {right} of {count} | {sum(errors) / count:.0f} | {max(errors):.0f} |"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--cameras", type=int, default=3)
+    parser.add_argument("--manifold", action="store_true")
+    args = parser.parse_args()
+    groups = {"walks": list(walks(args.data / "mocap_cmu_walk", args.cameras, args.manifold))}
+    if (args.data / "multicam_pose2sim").is_dir() and not args.manifold:
+        groups["balancing man"] = list(balancing(args.data))
+    print("| | faces the right way | error (mm) | largest (mm) |\n| --- | ---: | ---: | ---: |")
+    for name, starts in groups.items():
+        print(row(f"{name}, one frame", starts, args.seeds, one_frame))
+        print(row(f"{name}, half a second", starts, args.seeds, half_a_second))
+
+
+if __name__ == "__main__":
+    main()
