@@ -8,17 +8,30 @@ manifold come from other recordings than the one that is tracked, sharpness from
 single view does not show how far away somebody is: errors are given with and without the place of
 the pelvis.
 
+It writes real-silhouettes.md and the folder real-silhouettes of its pictures into the folder of the
+results.
+
     python benchmarks/real_silhouettes.py --data DIR --out DIR
 """
 
 import argparse
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from _depth_silhouettes import (
+    HEAD_TOP,
+    Filmed,
+    draw,
+    kinect,
+    mean_of,
+    one_view,
+    part_means,
+    seeded,
+)
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -29,15 +42,14 @@ from torchpose.body import (
     body_joints,
     fit_body,
     fit_state,
-    render,
 )
 from torchpose.body.shape import fit_radii
-from torchpose.camera import PinholeCamera, load_cameras
+from torchpose.camera import load_cameras
 from torchpose.camera_rig import CameraRig
 from torchpose.filters import AnnealedParticleFilter, ManifoldParticleFilter, SIRParticleFilter
 from torchpose.filters.pose_search import find_pose
 from torchpose.filters.silhouette_filter import SilhouetteParticleFilter, motion_std
-from torchpose.io import check_output_folder
+from torchpose.io.files import atomic_path, check_output_folder
 from torchpose.measure.silhouettes import (
     SilhouetteMeasurer,
     fit_views,
@@ -48,43 +60,24 @@ from torchpose.priors.gplvm import BackConstrainedGPLVM
 from torchpose.priors.manifold_file import ManifoldInfo
 from torchpose.protocols.report import Report
 from torchpose.protocols.silhouette_tables import PARTS
+from torchpose.protocols.silhouette_trackees import METHODS
 from torchpose.video import open_video
-from torchpose.video.body_overlay import draw_body
 
 ROWS = 160
-_ENLARGED = 2  # pixels of the picture for one of a silhouette
 HEIGHT = 1.75  # metres, of the man in the four views: nobody wrote it down
 N_PARTICLES, LAYERS = 1000, 5
 SHARPNESS = (30.0, 100.0, 300.0)
 ACTIONS = ("wave", "arm_curl", "squat", "lunge")
 TEST, TUNING, OTHERS = ("s02", "s04", "s06"), "s08", ("s01", "s03", "s05", "s07")
-DRAWN = ("squat", "s02", "MRPF")
-HEAD_TOP = 0.11  # metres: the Kinect's head is in the middle of the head
-PELVIS = BODY_15.joint("pelvis")
+DRAWN = ("squat", "s02", METHODS["mrpf"].label)
+PICTURES = "real-silhouettes"
 Make = Callable[[float], SilhouetteParticleFilter]
-
-
-class Sequence1(NamedTuple):
-    """What is tracked: silhouettes [T, C, H, W] of a rig, and the reference [T, 15, 3]."""
-
-    silhouettes: Tensor
-    rig: CameraRig
-    joints: Tensor
-
-
-def part_means(found: Tensor, truth: Tensor, centred: bool) -> list[float]:
-    """Mean distance of all joints and of each part, mm; without the place of the pelvis if asked."""
-    if centred:
-        found, truth = found - found[:, [PELVIS]], truth - truth[:, [PELVIS]]
-    gap = 1000 * (found - truth).norm(dim=-1)
-    columns = [list(range(15)), *([BODY_15.joint(n) for n in names] for names in PARTS.values())]
-    return [float(gap[:, c].nanmean()) for c in columns]
 
 
 # --- four cameras
 
 
-def four_views(folder: Path) -> Sequence1:
+def four_views(folder: Path) -> Filmed:
     """Silhouettes of the videos, and the set's triangulated 3D."""
     raw = folder / "multicam_pose2sim" / "raw"
     cameras = list(load_cameras(raw / "Calib_qualisys.toml").values())
@@ -96,33 +89,12 @@ def four_views(folder: Path) -> Sequence1:
         frames = [frame.image for frame in source.reopen() if frame.index % 4 == 0]
         measurers.append(SilhouetteMeasurer(view, empty, frames))
     silhouettes = torch.stack(list(read_silhouettes(sources, measurers)))
+    for source in sources:
+        source.close()
     with np.load(folder / "multicam_pose2sim" / "balancing_4cam.npz") as z:
         joints = body_joints(torch.from_numpy(z["joints"]).double(), list(z["names"]))
     n = min(len(silhouettes), len(joints))
-    return Sequence1(silhouettes[:n], CameraRig([v.camera for v in views]), joints[:n])
-
-
-def draw(data: Sequence1, body: Body, states: Tensor, path: Path, columns: int = 6) -> None:
-    """Measured silhouettes in grey with the body over them: a row per camera, frames from left to right."""
-    import cv2
-
-    _, _, height, width = data.silhouettes.shape
-    chosen = torch.linspace(0, len(states) - 1, columns).round().long().tolist()
-    model = render(body, states, data.rig, height, width)
-    seen = data.rig(body.joints(states)).pixels
-    size = (_ENLARGED * width, _ENLARGED * height)
-    rows = []
-    for c in range(len(data.rig)):
-        cells = []
-        for t in chosen:
-            grey = np.where(data.silhouettes[t, c].numpy(), 150, 255).astype(np.uint8)
-            picture = cv2.resize(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB), size,
-                                 interpolation=cv2.INTER_NEAREST)  # fmt: skip
-            pixels = _ENLARGED * (seen[t, c] + 0.5) - 0.5
-            drawn = draw_body(picture, pixels, body.skeleton, model=model[t, c])
-            cells.append(np.pad(drawn, ((0, 2), (0, 2), (0, 0))))
-        rows.append(np.hstack(cells))
-    cv2.imwrite(str(path), cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))
+    return Filmed(silhouettes[:n], CameraRig([v.camera for v in views]), joints[:n])
 
 
 def facing(joints: Tensor) -> Tensor:
@@ -152,8 +124,7 @@ def report_four(report: Report, folder: Path, seeds: int, out: Path) -> None:
             table.add(f"{name}, {shape}", mean_of(found, data.joints, False))
     given = fit_state(average, data.joints[:1])[0]
     track = plain_filters(average, None)["APF"](100.0)(data.silhouettes, data.rig, given, seeded(0))
-    draw(data, average, track.mean, out / "four-cameras.png")
-    report.pictures.append("four-cameras.png")
+    draw(report, data, average, track.mean, out, f"{PICTURES}/four-cameras.png")
     tracks = []
     for seed in range(seeds):
         generator = seeded(seed)
@@ -163,17 +134,6 @@ def report_four(report: Report, folder: Path, seeds: int, out: Path) -> None:
         tracker = plain_filters(average, None)["APF"](100.0)
         tracks.append(average.joints(tracker(data.silhouettes, data.rig, start, generator).mean))
     table.add("APF, average body, first pose found", mean_of(tracks, data.joints, False))
-
-
-def seeded(seed: int) -> torch.Generator:
-    """A generator of its own."""
-    return torch.Generator().manual_seed(seed)
-
-
-def mean_of(found: Sequence[Tensor], truth: Tensor, centred: bool) -> list[float]:
-    """Mean over seeds of `part_means`."""
-    parts = torch.tensor([part_means(f, truth, centred) for f in found])
-    return [float(x) for x in parts.mean(0)]
 
 
 def plain_filters(
@@ -193,32 +153,6 @@ def plain_filters(
 # --- one camera
 
 
-def kinect(folder: Path, person: str, action: str, trials: str) -> Iterator[Tensor]:
-    """Recorded joints [T, 15, 3] of a person's trials, the room's axes made right-handed, y up."""
-    for path in sorted((folder / "kinect_utd_mhad").glob(f"{person}_a*_{action}_t[{trials}].npz")):
-        with np.load(path) as z:
-            yield body_joints(torch.from_numpy(z["joints"]).double(), list(z["names"]))
-
-
-def one_view(folder: Path, person: str, action: str) -> Sequence1:
-    """Segmented depth of trial 1 and its skeleton, at the lag that the set gives."""
-    path = next((folder / "utd_mhad_silhouettes").glob(f"{person}_a*_{action}_t1.npz"))
-    with np.load(path) as z:
-        shape = z["sil_shape"]
-        masks = np.unpackbits(z["sil_packed"], axis=-1)[..., : shape[2]].astype(bool)
-        joints = body_joints(torch.from_numpy(z["joints"]).double(), list(z["names"]))
-        lag, K = int(z["mask_lag"]), z["K"].astype(float)
-    # the depth image is mirrored: turned over, it is that of a camera which stands on its head
-    camera = PinholeCamera(
-        K[0, 0], K[1, 1], 319 - K[0, 2], K[1, 2], 320, 240, "depth", rotation=(0.0, 0.0, np.pi)
-    )
-    silhouettes = torch.from_numpy(np.ascontiguousarray(masks[:, :, ::-1]))[:, None]
-    n = min(len(joints), len(silhouettes) - lag)
-    rig = CameraRig([camera]).scaled(120, 160)
-    small = silhouettes[lag : lag + n, :, ::2, ::2]
-    return Sequence1(small, rig, joints[:n])
-
-
 class Person(NamedTuple):
     """Body, noise and manifold from other trials than the tracked one, and from other persons."""
 
@@ -228,7 +162,7 @@ class Person(NamedTuple):
     limits: JointLimits
 
 
-def prepare(folder: Path, person: str, action: str, data: Sequence1) -> Person:
+def prepare(folder: Path, person: str, action: str) -> Person:
     """Bone lengths from trials 2 to 4, radii from frames of another action's silhouettes."""
     own = list(kinect(folder, person, action, "234"))
     body = fit_body(torch.cat(own), head_top=HEAD_TOP)
@@ -253,21 +187,21 @@ def prepare(folder: Path, person: str, action: str, data: Sequence1) -> Person:
 
 
 def filters_of(person: Person) -> dict[str, Make]:
-    """The filters, with the same noise and the same joint limits."""
-    body, manifold = person.body, person.manifold
+    """The filters, the manifold's in its exact and its published form, with the same noise and limits."""
     common = {"step_std": person.step_std, "limits": person.limits}
-    published = {"weights": "published", "proposal": "diffusion"}
-    return plain_filters(body, person.step_std, person.limits) | {
-        "MRPF": lambda s: ManifoldParticleFilter(
-            body, manifold, N_PARTICLES, sharpness=s, **common
-        ),
-        "MRPF, published": lambda s: ManifoldParticleFilter(
-            body, manifold, N_PARTICLES, sharpness=s, **common, **published
-        ),
+
+    def with_manifold(options: dict[str, str]) -> Make:
+        return lambda s: ManifoldParticleFilter(
+            person.body, person.manifold, N_PARTICLES, sharpness=s, **common, **options
+        )
+
+    return plain_filters(person.body, person.step_std, person.limits) | {
+        METHODS[name].label: with_manifold(METHODS[name].options)
+        for name in ("mrpf", "mrpf-published")
     }
 
 
-def run(person: Person, make: Make, sharpness: float, data: Sequence1, seed: int) -> Tensor:
+def run(person: Person, make: Make, sharpness: float, data: Filmed, seed: int) -> Tensor:
     """Joints of the estimates [T, 15, 3]."""
     start = fit_state(person.body, data.joints[:1])[0]
     track = make(sharpness)(data.silhouettes, data.rig, start, seeded(seed))
@@ -286,21 +220,10 @@ def report_one(report: Report, folder: Path, seeds: int, actions: Sequence[str],
     placed = report.table("one_placed", "The same with the place of the pelvis (mm)",
                           ["all", *PARTS])  # fmt: skip
     for action in tqdm(actions, desc="actions"):
-        tuning = one_view(folder, TUNING, action)
-        judge = prepare(folder, TUNING, action, tuning)
-        best = {
-            name: min(
-                SHARPNESS if name != "APF" else (1.0,),
-                key=lambda s, m=make: part_means(  # type: ignore[misc]
-                    run(judge, m, s, tuning, 0), tuning.joints, True
-                )[0],
-            )
-            for name, make in filters_of(judge).items()
-        }
+        best = best_sharpness(folder, action)
         rows: dict[str, list[tuple[Tensor, Tensor]]] = {"not moving": []}
         for p in TEST:
-            data = one_view(folder, p, action)
-            person = prepare(folder, p, action, data)
+            data, person = one_view(folder, p, action), prepare(folder, p, action)
             rows["not moving"].append((data.joints[:1].expand_as(data.joints), data.joints))
             for name, make in filters_of(person).items():
                 for seed in range(seeds):
@@ -308,13 +231,25 @@ def report_one(report: Report, folder: Path, seeds: int, actions: Sequence[str],
                     rows.setdefault(name, []).append((found, data.joints))
                 if (action, p, name) == DRAWN:
                     states = fit_state(person.body, found)
-                    draw(data, person.body, states, out / "one-camera.png")
-                    report.pictures.append("one-camera.png")
+                    draw(report, data, person.body, states, out, f"{PICTURES}/one-camera.png")
         for name, pairs in rows.items():
             label = f"{action}, {name}" + (f" ({best[name]:g})" if best.get(name, 1) > 1 else "")
             for table, without in ((centred, True), (placed, False)):
                 parts = torch.tensor([part_means(f, t, without) for f, t in pairs])
                 table.add(label, [float(x) for x in parts.mean(0)])
+
+
+def best_sharpness(folder: Path, action: str) -> dict[str, float]:
+    """The exponent of each filter with the smallest error on a person who is not tracked."""
+    data, person = one_view(folder, TUNING, action), prepare(folder, TUNING, action)
+
+    def error(make: Make, sharpness: float) -> float:
+        return part_means(run(person, make, sharpness, data, 0), data.joints, True)[0]
+
+    return {
+        name: 1.0 if name == "APF" else min(SHARPNESS, key=lambda s, m=make: error(m, s))  # type: ignore[misc]
+        for name, make in filters_of(person).items()
+    }
 
 
 def main() -> None:
@@ -329,13 +264,16 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     out = check_output_folder(args.out)
-    report = Report("Real silhouettes", {"seeds": args.seeds, "particles": N_PARTICLES})
+    report = Report("Real silhouettes", {
+        "seeds": args.seeds, "particles": N_PARTICLES, "actions": args.actions, "threads": args.threads
+    })  # fmt: skip
     if args.only != "one":
         report_four(report, args.data, args.seeds, out)
     if args.only != "four":
         report_one(report, args.data, args.seeds, args.actions, out)
     print(report.summary())
-    (out / "real-silhouettes.md").write_text(report.to_markdown(), encoding="utf-8")
+    with atomic_path(out / "real-silhouettes.md") as path:
+        path.write_text(report.to_markdown(), encoding="utf-8")
 
 
 if __name__ == "__main__":

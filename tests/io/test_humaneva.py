@@ -1,11 +1,11 @@
 """HumanEva-I: a folder written in its layout, its joint centres, its clock, and damaged files."""
 
-import warnings
-
 import numpy as np
 import pytest
 import torch
 
+from tests.io import humaneva_files
+from tests.io.humaneva_files import write_c3d
 from torchpose.errors import FileFormatError, InputError
 from torchpose.io import humaneva
 from torchpose.io.humaneva_joints import joint_centres
@@ -38,32 +38,11 @@ def body_points(n_frames, step=10.0):
     return {name: place + moved for name, place in points.items()}
 
 
-def write_c3d(path, points, lost=()):
-    """Points by label; `lost`: pairs of frame and label."""
-    c3d = pytest.importorskip("c3d")
-    labels = list(points)
-    writer = c3d.Writer(point_rate=120.0, point_units="mm  ")
-    writer.set_point_labels([f"S1:{name}" for name in labels])
-    writer.set_screen_axis("+X", "+Z")
-    for t in range(len(next(iter(points.values())))):
-        frame = np.zeros((len(labels), 5), np.float32)
-        frame[:, :3] = [points[name][t] for name in labels]
-        for when, label in lost:
-            if when == t:
-                frame[labels.index(label)] = (0, 0, 0, -1, 0)
-        writer.add_frames([(frame, np.empty((0, 0)))])
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with warnings.catch_warnings(), path.open("wb") as stream:
-        warnings.simplefilter("ignore")
-        writer.write(stream)
-
-
-def write_calibration(path, rotvec=(0.3, -1.2, 0.5), skew=0.0):
-    R = rotvec_to_matrix(torch.tensor(rotvec, dtype=torch.float64)).numpy()
-    numbers = [765.0, 764.0, 330.5, 240.25, skew, -0.2, 0.1, 0.001, -0.002, 0.0]
-    numbers += [*R.ravel(), 120.0, -80.0, 3500.0]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("\r\n".join(f"{v:.8f}" for v in numbers))
+def write_calibration(path):
+    R = rotvec_to_matrix(torch.tensor((0.3, -1.2, 0.5), dtype=torch.float64)).numpy()
+    K = [[765.0, 0, 330.5], [0, 764.0, 240.25], [0, 0, 1]]
+    distortions = (-0.2, 0.1, 0.001, -0.002, 0.0)
+    humaneva_files.write_calibration(path, K, R, (120.0, -80.0, 3500.0), distortions)
     return R
 
 

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import torch
 from tests.protocols.walkers import write_walkers
 from torchpose.body.skeleton import BODY_15
 from torchpose.camera import save_cameras
-from torchpose.errors import InputError
+from torchpose.errors import FileFormatError, InputError
 from torchpose.filters.annealed import AnnealedParticleFilter
 from torchpose.filters.sharpness import SharpnessFit
 from torchpose.filters.sir import SIRParticleFilter
@@ -28,8 +29,8 @@ from torchpose.protocols.silhouette_trackees import (
 from torchpose.protocols.silhouette_truth import TrueShape, true_limbs, true_silhouettes
 
 SMALL = {
-    "progress": False, "frames": 8, "particles": 20, "seeds": 2, "size": "64x48", "faults": 0.5,
-    "setting": 100.0,
+    "progress": False, "frames": 8, "particles": (20,), "seeds": 2, "size": ("64x48",), "faults": 0.5,
+    "sharpness": 100.0,
 }  # fmt: skip
 
 
@@ -74,6 +75,30 @@ def test_others_train_for_someone_unseen(clips):
 def test_too_few_trials_are_refused(clips):
     with pytest.raises(InputError, match="person p1: expected two trials or more"):
         silhouette_data.split_clips(clips, ["p1"], ["p1"], n_clips=3)
+
+
+def renamed(clips, action):
+    """The same motion under another action's name."""
+    return [
+        replace(clip, action=action, trial=clip.trial.replace("_", f"_{action}_")) for clip in clips
+    ]
+
+
+def test_an_unseen_action_is_tracked_with_a_manifold_of_another(clips):
+    (split,) = silhouette_data.split_clips(
+        clips, ["p1"], ["p1"], manifold_frames=60, tracked=renamed(clips, "run")
+    )
+    assert split.seen and [c.trial for c in split.test] == ["p1_run_0"]
+    for part in (split.manifold, split.validation):
+        assert {(c.person, c.action) for c in part} == {("p1", "walk")}
+    assert split.body[0].action == "walk"
+    assert "p1_run_0" not in {c.trial for c in split.body}
+    (split,) = silhouette_data.split_clips(
+        [c for c in clips if c.person == "p1"], ["p1"], ["p2"], tracked=renamed(clips, "run")
+    )
+    assert not split.seen and {c.person for c in split.manifold} == {"p1"}
+    assert {(c.person, c.action) for c in split.body} == {("p2", "run")}
+    assert not {c.trial for c in split.body} & {c.trial for c in split.test}
 
 
 # --- cameras and truth ----------------------------------------------------------------------------
@@ -234,7 +259,7 @@ def made_up(seed, n_frames=(30, 40), n_seeds=4, offset=50.0):
 
 def test_statistics_are_numpy_s():
     runs = {"sir": made_up(0), "mrpf": made_up(1, offset=40.0)}
-    every = [[run.errors.numpy() for run in seeds] for seeds in runs["sir"].values()]
+    every = [[run.errors.numpy().copy() for run in seeds] for seeds in runs["sir"].values()]
     whole = silhouette_tables.part_errors(runs, "sir")
     expected = [[np.nanmean(e) for e in seeds] for seeds in every]
     np.testing.assert_allclose(whole.numpy(), expected)
@@ -249,6 +274,10 @@ def test_statistics_are_numpy_s():
         for seeds in every
     ]
     np.testing.assert_allclose(silhouette_tables.drift(runs, "sir", 60.0).numpy(), slopes)
+    runs["sir"]["sequence 0"][0].errors[5:8] = torch.nan  # the truth was lost for three frames
+    kept = np.delete(every[0][0], slice(5, 8), 0)
+    slope = np.polyfit(np.delete(np.arange(30), slice(5, 8)) / 60, np.nanmean(kept, 1), 1)[0]
+    assert float(silhouette_tables.drift(runs, "sir", 60.0)[0, 0]) == pytest.approx(slope)
     spread = math.sqrt(np.mean([np.var(row, ddof=1) for row in expected]))
     assert float(silhouette_tables.pooled_std(whole)) == pytest.approx(spread)
     joints = [name for names in silhouette_tables.PARTS.values() for name in names]
@@ -338,7 +367,7 @@ def test_other_conditions(folder, tmp_path, clips):
     report = silhouette.run(
         folder, tmp_path / "out", cameras=str(tmp_path / "cameras.toml"), cameras_used=1,
         train_persons=("p1",), test_persons=("p2",), method=("sir",),
-        **{**SMALL, "seeds": 1, "faults": 0.0, "setting": 1.0},
+        **{**SMALL, "seeds": 1, "faults": 0.0, "sharpness": 1.0},
     )  # fmt: skip
     assert report["sequences"]["p2 p2_0", "own manifold"] == "no"
     assert report["sequences"]["p2 p2_0", "in view (%)"] > 99
@@ -348,6 +377,78 @@ def test_other_conditions(folder, tmp_path, clips):
         method=("mrpf",), initial="found", **{**SMALL, "seeds": 1},
     )  # fmt: skip
     assert report["sequences"].rows["p1 p1_0 looped 1 times"][0] > 50
+
+
+def test_several_conditions_with_the_settings_of_an_earlier_run(done, folder, tmp_path):
+    """One table over particles and sizes; a row of it is the run of that condition alone."""
+    earlier, _, _ = done
+    options = {"train_persons": ("p1",), "test_persons": ("p1",), "method": ("sir", "mrpf")}
+    options |= {**SMALL, "sharpness": None, "settings": str(earlier), "faults": 0.0, "frames": 3}
+    several = {**options, "particles": (20, 40), "size": ("64x48", "80x60")}
+    report = silhouette.run(folder, tmp_path / "out", **several)
+    names = [f"{n} likelihoods, {size}" for size in ("64x48", "80x60") for n in (20, 40)]
+    assert list(report["conditions"].rows) == names
+    assert report["tuning"]["MRPF", "chosen"] == 100 and len(report["tuning"].rows) == 2
+    assert {f"errors, {name}" for name in names} | {"sequences, 80x60"} <= set(report)
+    assert (tmp_path / "out" / "runs-40-80x60.csv").is_file()
+    alone = silhouette.run(folder, tmp_path / "one", **{**options, "particles": (40,)})
+    row = report["conditions"].rows["40 likelihoods, 64x48"]
+    assert row[0] == alone["errors"]["all", "SIR"] and row[5] == alone["errors"]["all", "± MRPF"]
+    expected = alone["differences"].rows["MRPF - SIR"]
+    assert report["differences"].rows["40 likelihoods, 64x48: MRPF - SIR"] == expected
+    settings = json.loads((tmp_path / "out" / "report.json").read_text())["settings"]
+    assert settings["settings"] == {m: {"value": 100.0, "scale": 1.0} for m in ("sir", "mrpf")}
+    assert settings["particles"] == [20, 40]
+    with pytest.raises(InputError, match="none of apf, only of sir, mrpf"):
+        silhouette_runs.read_settings(tmp_path / "out", ["sir", "apf"])
+
+
+def test_settings_are_those_of_the_report(tmp_path):
+    path = tmp_path / "report.json"
+    with pytest.raises(InputError, match="no such file"):
+        silhouette_runs.read_settings(path, ["sir"])
+    chosen = {"sir": {"value": 30.0, "scale": 1.4}, "apf": {"value": 0.7, "scale": 2.0}}
+    path.write_text(json.dumps({"settings": {"settings": chosen}}))
+    for given in (path, tmp_path, str(tmp_path)):
+        assert silhouette_runs.read_settings(given, ["apf"]) == {"apf": Setting(0.7, 2.0)}
+    for damaged in ("no json", "[]", '{"settings": {"settings": {"500 at 160x120": {"sir": 1}}}}'):
+        path.write_text(damaged)
+        with pytest.raises(FileFormatError, match=r"expected the report\.json"):
+            silhouette_runs.read_settings(tmp_path, ["sir"])
+
+
+def test_the_settings_of_each_condition_where_validation_chose_them(folder, tmp_path, monkeypatch):
+    """Sharpness 30 is put in place of what validation chooses with 20 particles, else 300."""
+
+    def tune(trackees, method, n, likelihood, out):
+        found = Setting(30.0 if n == 20 else 300.0, 1.4)
+        return silhouette_runs.Tuning(found, (found,), (50.0,))
+
+    monkeypatch.setattr(silhouette, "tune", tune)
+    report = silhouette.run(
+        folder, tmp_path, train_persons=("p1",), test_persons=("p1",), method=("sir",),
+        **{**SMALL, "sharpness": None, "particles": (20, 25), "seeds": 1, "frames": 3},
+    )  # fmt: skip
+    assert report["tuning"]["20 likelihoods: SIR", "chosen"] == 30.0
+    assert report["tuning"]["25 likelihoods: SIR", "chosen"] == 300.0
+    assert report.settings["settings"]["25 at 64x48"]["sir"]["value"] == 300.0
+    assert "differences" not in report  # nothing to compare with
+
+
+def test_an_unseen_action_by_name(tmp_path):
+    folder = write_walkers(tmp_path / "mocap", ("p1",), 4, 30)
+    path = folder / "p1_3.npz"
+    with np.load(path) as archive:
+        content = dict(archive)
+    np.savez(path, **{**content, "action": "run"})
+    options = {**SMALL, "seeds": 1, "frames": 4, "method": ("mrpf",), "actions": ("walk",)}
+    options |= {"train_persons": ("p1",)}
+    report = silhouette.run(folder, tmp_path / "out", test_actions=("run",), **options)
+    assert report["sequences"]["p1 p1_3", "own manifold"] == "yes, of walk"
+    assert report.settings["tracked actions"] == ["run"] and report.settings["actions"] == ["walk"]
+    assert "one seed" in report.findings[0]
+    with pytest.raises(InputError, match="the manifold is of this action as well"):
+        silhouette.run(folder, tmp_path / "out", test_actions=("walk",), **options)
 
 
 def _rotvec(R):
@@ -361,11 +462,14 @@ def _rotvec(R):
     [
         ({"method": ("kalman",)}, "--method takes sir, apf, mrpf"),
         ({"seeds": 0}, "--seeds must be at least 1"),
-        ({"size": "large"}, "--size must be width x height"),
+        ({"size": ("large",)}, "--size must be width x height"),
         ({"initial": "guessed"}, "--initial must be given or found"),
         ({"test_persons": ("p9",)}, "expected recordings of person p9"),
         ({"actions": ("run",)}, "there are walk"),
         ({"cameras_used": 4}, "4 cameras are asked for"),
+        ({"settings": "x"}, "leave --sharpness out"),
+        ({"particles": (20, 0)}, "--particles must be 1 or more"),
+        ({"particles": (20, 20)}, "--particles takes each value once"),
     ],
 )
 def test_refusals(folder, tmp_path, options, message):
@@ -394,9 +498,9 @@ def test_several_actions_are_refused(tmp_path):
 def test_the_command(torchpose_command, folder, tmp_path):
     line = ["evaluate", "silhouette", "--mocap", str(folder), "--out", str(tmp_path / "out")]
     line += ["--method", "sir", "mrpf", "--test-persons", "p1", "--train-persons", "p1"]
-    line += ["--size", "64x48", "--setting", "100", "--frames", "5"]
+    line += ["--size", "64x48", "--particles", "10", "20", "--sharpness", "100", "--frames", "5"]
     code, text = torchpose_command([*line, "--quick", "true"])
-    assert code == 0 and "MRPF - SIR" in text
+    assert code == 0 and "20 likelihoods: MRPF - SIR" in text
     code, text = torchpose_command(["evaluate", "silhouette", "--mocap", "none", "--out", "o"])
     assert code == 2 and "--mocap none: no such folder" in text
 

@@ -6,8 +6,9 @@
     ROOT/S1/Image_Data/Walking_1_(C1).avi ...
     ROOT/Background/Background_1_(C1).avi ...
 
-Millimetres become metres; the axes are those of the room, z up. Frames of a trial are numbered from
-one, at the rate of the videos, as in the lists of the data set.
+A video may also be a folder of its frames, without the ``.avi``. Millimetres become metres; the axes
+are those of the room, z up. Frames of a trial are numbered from one, at the rate of the videos, as in
+the lists of the data set.
 """
 
 import re
@@ -36,6 +37,7 @@ __all__ = [
     "HumanEvaTrial",
     "StreamOffset",
     "find_humaneva",
+    "is_humaneva",
     "read_calibration",
     "read_humaneva",
     "read_stream_offset",
@@ -81,7 +83,7 @@ class HumanEvaTrial:
         person, action, trial: such as S1, Walking, 1.
         joints: [T, 15, 3] of the joint set humaneva-15, metres, z up; NaN in frames in which markers
             were lost. names: of those.
-        cameras: the rig of the cameras that were asked for.
+        calibrations: of the cameras that were asked for.
         videos: their videos, for those that are there.
         first_frames: of each camera, which image of its video (from zero) belongs to `joints[0]`.
         backgrounds: videos of the empty room of each camera.
@@ -93,7 +95,7 @@ class HumanEvaTrial:
     trial: str
     joints: Tensor
     names: tuple[str, ...]
-    cameras: CameraRig
+    calibrations: tuple[PinholeCamera, ...]
     videos: dict[str, Path]
     first_frames: dict[str, int]
     backgrounds: dict[str, tuple[Path, ...]]
@@ -101,6 +103,11 @@ class HumanEvaTrial:
 
     def __len__(self) -> int:
         return len(self.joints)
+
+    @property
+    def cameras(self) -> CameraRig:
+        """The rig of the cameras, at the size of their videos."""
+        return CameraRig(self.calibrations)
 
     def clip(self, start: int | None = None, stop: int | None = None) -> MocapClip:
         """Frames `start` to `stop`, numbered from one, both included, as a clip of fifteen joints."""
@@ -111,6 +118,15 @@ class HumanEvaTrial:
             body_joints(joints, self.names), joints, self.names, up, FPS, self.person, self.action,
             f"{self.action}_{self.trial}",
         )  # fmt: skip
+
+
+def is_humaneva(root: str | Path) -> bool:
+    """Whether a folder is laid out as HumanEva-I.
+
+    >>> is_humaneva("nowhere")
+    False
+    """
+    return any(Path(root).glob("S*/Mocap_Data"))
 
 
 def find_humaneva(root: str | Path) -> list[tuple[str, str, str]]:
@@ -150,7 +166,7 @@ def read_humaneva(
     """
     folder = Path(root) / person
     name = f"{action}_{trial}"
-    rig = CameraRig([read_calibration(folder / "Calibration_Data" / f"{c}.cal") for c in cameras])
+    calibrated = [read_calibration(folder / "Calibration_Data" / f"{c}.cal") for c in cameras]
     offsets = _offsets(folder / "Sync_Data", name)
     common, firsts = _common_clock(offsets)
     notes = [] if offsets else ["no .ofs file: the videos start with the motion capture"]
@@ -159,15 +175,12 @@ def read_humaneva(
     notes += missing
     joints = joint_centres(points, measures)
     at_video = _interpolated(joints, common)
-    videos = {c: folder / "Image_Data" / f"{name}_({c}).avi" for c in cameras}
-    backgrounds = {
-        c: tuple(sorted((Path(root) / "Background").glob(f"Background_*_({c}).avi")))
-        for c in cameras
-    }
+    videos = {c: _videos(folder / "Image_Data", f"{name}_({c})") for c in cameras}
+    backgrounds = {c: _videos(Path(root) / "Background", f"Background_*_({c})") for c in cameras}
     return HumanEvaTrial(
         person, action, str(trial), torch.from_numpy(at_video * _MM),
-        SKELETONS["humaneva-15"].joints, rig,
-        {c: path for c, path in videos.items() if path.is_file()},
+        SKELETONS["humaneva-15"].joints, tuple(calibrated),
+        {c: paths[0] for c, paths in videos.items() if paths},
         {c: firsts.get(c, 0) for c in cameras}, backgrounds, tuple(notes),
     )  # fmt: skip
 
@@ -209,6 +222,12 @@ def read_stream_offset(path: str | Path) -> StreamOffset:
     if not offset.scale > 0:
         raise FileFormatError(f"{path}: the scale must be positive, got {offset.scale:g}")
     return offset
+
+
+def _videos(folder: Path, name: str) -> tuple[Path, ...]:
+    """Videos of a name, or folders of their frames."""
+    files = [path for path in folder.glob(f"{name}.avi") if path.is_file()]
+    return tuple(sorted(files or [path for path in folder.glob(name) if path.is_dir()]))
 
 
 def _numbers(path: Path, count: int) -> list[float]:

@@ -1,6 +1,6 @@
 """One person's silhouettes in the synchronised videos of calibrated cameras."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -303,13 +303,14 @@ def frames_in_step(
 
 def read_silhouettes(
     sources: Sequence[VideoSource],
-    measurers: Sequence[SilhouetteMeasurer],
+    measurers: Sequence[Callable[[Image], NDArray[np.bool_]]],
     delays: Sequence[int] | None = None,
 ) -> Iterator[Bool[Tensor, "C H W"]]:
     """The silhouettes of all cameras, frame by frame, until the first video ends.
 
     Args:
-        sources: one video per camera, of one frame rate. measurers: one per camera.
+        sources: one video per camera, of one frame rate.
+        measurers: one per camera, such as a `SilhouetteMeasurer`.
         delays: frames by which each video began too early, which are passed over.
 
     Raises:

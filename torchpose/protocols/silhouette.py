@@ -16,38 +16,30 @@ from tqdm.auto import tqdm
 from torchpose.camera_rig import CameraRig
 from torchpose.errors import InputError
 from torchpose.io.files import check_output_folder
+from torchpose.io.humaneva import is_humaneva
 from torchpose.io.mocap import MocapClip, read_mocap
-from torchpose.protocols.common import add_picture
 from torchpose.protocols.report import Report
 from torchpose.protocols.silhouette_data import Split, looped, split_clips
-from torchpose.protocols.silhouette_runs import Run, Runs, Tuning, run_all, sequence_name, tune
-from torchpose.protocols.silhouette_tables import (
-    add_differences,
-    add_errors,
-    add_parts,
-    add_pooled,
-    add_setup,
-    add_tuning,
-    mean_of,
-    part_errors,
-    write_csv,
-)
+from torchpose.protocols.silhouette_humaneva import HumanEvaFootage, humaneva_splits
+from torchpose.protocols.silhouette_report import Cell, fill_one, fill_several
+from torchpose.protocols.silhouette_runs import Tuning, read_settings, run_all, tune
 from torchpose.protocols.silhouette_trackees import (
     METHODS,
     PUBLISHED_SURVIVAL,
     Conditions,
     Setting,
-    Trackee,
     prepare,
 )
 
-__all__ = ["WALKERS", "run"]
+__all__ = ["WALKERS", "image_size", "run"]
 
 FPS = 60.0
 WALKERS = ("07", "08", "35", "39")
 """The persons of CMU's walks who have enough trials; tracked if nobody is named."""
 
-SPACED = ("method", "train_persons", "test_persons", "actions")
+SPACED = (
+    "method", "train_persons", "test_persons", "actions", "test_actions", "particles", "size",
+)  # fmt: skip
 """Options that a command line takes as words with blanks between them."""
 
 _VALIDATION_FRAMES = 60
@@ -66,15 +58,17 @@ def run(
     train_persons: tuple[str, ...] = (),
     test_persons: tuple[str, ...] = (),
     actions: tuple[str, ...] = (),
+    test_actions: tuple[str, ...] = (),
     clips: int = 1,
     frames: int = 150,
-    particles: int = 500,
+    particles: tuple[int, ...] = (500,),
     cameras_used: int = 3,
     faults: float = 1.0,
-    size: str = "160x120",
+    size: tuple[str, ...] = ("160x120",),
     likelihood: str = "bidirectional",
     initial: str = "given",
-    setting: float | None = None,
+    sharpness: float | None = None,
+    settings: str | None = None,
     loop: int = 0,
 ) -> Report:
     """Run the protocol; writes report.json, report.md, runs.csv and pictures to `out`.
@@ -82,7 +76,9 @@ def run(
     Runs are kept in `out`, one file each, so that a killed run goes on where it stopped.
 
     Args:
-        data: folder or file of motion capture. out: folder for the results.
+        data: folder or file of motion capture, or the folder of HumanEva-I: then its own videos are
+            tracked, by its own partitions (``--frames 200`` as in the paper), without rendering.
+        out: folder for the results.
         seed: of shapes, faults and the first run. progress: whether to show bars.
         quick: few frames and particles, two runs, to see that all of it works.
         method: filters, among sir, apf, mrpf (exact weights, samples of the product),
@@ -90,129 +86,158 @@ def run(
         seeds: runs of every filter on every clip.
         cameras: TOML file with K, R, t of cameras in the axes of the recordings; without one, three
             of 640 x 480 pixels stand 3.8 m around the middle of every clip.
-        train_persons: whose trials make manifolds; all persons if none is named.
-        test_persons: who is tracked; with a manifold of their own other trials if they train as well,
-            else of the others.
-        actions: only recordings of these.
+        train_persons: whose trials make manifolds. test_persons: who is tracked; with a manifold of
+            their own other trials if they train as well, else of the others. Where none is named,
+            CMU's four walkers, else everybody with trials enough.
+        actions: only recordings of these, one action; of HumanEva several, each with manifolds of its
+            own, Walking and Jog if none is named.
+        test_actions: tracked instead of those, which still make the manifold and choose noise and
+            exponents; so the manifold never saw what is tracked.
         clips: trials tracked of each person. frames: of each trial, from its first.
-        particles: likelihoods a frame; the annealed filter has a fifth of them in each of its layers.
+        particles: likelihoods a frame, one number or several for a table over them; the annealed
+            filter has a fifth of them in each of its layers.
         cameras_used: the first 1, 2 or 3 of the cameras.
         faults: severity of holes, ragged edges, shadows and missing limbs; 0 for none.
-        size: of the silhouettes, width x height.
+        size: of the silhouettes, width x height, one or several for a table over them.
         likelihood: bidirectional (MR 12) or overlap (AS 7).
         initial: given, or found in the first silhouettes.
-        setting: sharpness of the likelihood (1 as published) instead of what validation chooses;
+        sharpness: of the likelihood (1 as published) instead of what validation chooses;
             the annealed filter then has its published survival rate, and all the plain diffusion.
+        settings: folder or report.json of an earlier run; exponents and diffusion are those that it
+            chose, for all particles and sizes. Without it validation chooses for each of them.
         loop: walk one cycle of every test trial so many times on the spot; 0 for the trial itself.
 
     Raises:
         InputError: unknown methods, persons or actions, too few trials, cameras that do not fit.
-        OutputError: `out` cannot be written.
+        FileFormatError: `settings` is no report. OutputError: `out` cannot be written.
     """
     out = check_output_folder(out)
-    _check(method, seeds, initial)
+    _check(method, seeds, initial, particles, size)
+    given = _given_settings(method, sharpness, settings)
     if quick:
-        frames, particles, seeds, clips = min(frames, 20), min(particles, 50), min(seeds, 2), 1
-    recorded = read_mocap(data, FPS, actions)
-    _one_action(recorded)
-    persons = _default_persons(recorded)
-    splits = split_clips(recorded, train_persons or persons, test_persons or persons, clips)
+        frames, seeds, clips = min(frames, 20), min(seeds, 2), 1
+        particles = tuple(dict.fromkeys(min(n, 50) for n in particles))
+    named = (actions, test_actions, train_persons, test_persons)
+    footage = None
+    if is_humaneva(data):
+        _check_footage(cameras, loop, clips)
+        footage = HumanEvaFootage(out, progress)
+        splits = humaneva_splits(data, footage, *named)
+    else:
+        splits = _splits(data, *named, clips)
     if loop:
         splits = [_looped(split, loop) for split in splits]
         frames = max(len(clip) for split in splits for clip in split.test)
     rig = None if cameras is None else CameraRig.load(cameras)
-    conditions = Conditions(_size(size), faults, cameras_used, rig, seed)
-    validation = 15 if quick else _VALIDATION_FRAMES
-    trackees = [
-        prepare(split, conditions, frames, validation, seed)
-        for split in tqdm(splits, disable=not progress, desc="bodies and manifolds")
-    ]
-    tunings = _tunings(trackees, method, particles, likelihood, out, setting, progress)
-    runs = run_all(
-        trackees, {name: tuning.setting for name, tuning in tunings.items()}, out, seeds=seeds,
-        seed=seed, n_particles=particles, likelihood=likelihood, initial=initial,
-        progress=progress,
-    )  # fmt: skip
+    cells = []
+    for text in size:
+        conditions = Conditions(image_size(text), faults, cameras_used, rig, seed, footage=footage)
+        trackees = [
+            prepare(split, conditions, frames, 15 if quick else _VALIDATION_FRAMES, seed)
+            for split in tqdm(splits, disable=not progress, desc="bodies and manifolds")
+        ]
+        for n in particles:
+            tunings = given or {
+                name: tune(trackees, name, n, likelihood, out)
+                for name in tqdm(method, disable=not progress, desc="exponents")
+            }
+            runs = run_all(
+                trackees, {name: tuning.setting for name, tuning in tunings.items()}, out,
+                seeds=seeds, seed=seed, n_particles=n, likelihood=likelihood, initial=initial,
+                progress=progress,
+            )  # fmt: skip
+            cells.append(Cell(n, text, trackees, tunings, runs))
     report = Report("Silhouettes: three filters over body poses", {
         "quick": quick, "seed": seed, "seeds": seeds, "methods": list(method),
-        "persons": [t.split.person for t in trackees], "frames": frames, "particles": particles,
-        "cameras": cameras or "three around each clip, 3.8 m from its middle",
-        "cameras used": cameras_used, "faults": faults, "size": size, "likelihood": likelihood,
-        "initial pose": initial, "looped": loop, "threads": torch.get_num_threads(),
-        "settings": {name: tuning.setting._asdict() for name, tuning in tunings.items()},
+        "persons": list(dict.fromkeys(split.person for split in splits)),
+        "actions": _actions(splits, "manifold"), "tracked actions": _actions(splits, "test"),
+        "frames": frames, "particles": _one_or_all(particles),
+        "cameras": _cameras(cameras, footage),
+        "cameras used": cameras_used, "faults": faults if footage is None else "real",
+        "size": _one_or_all(size),
+        "likelihood": likelihood, "initial pose": initial, "looped": loop,
+        "threads": torch.get_num_threads(), "settings": _chosen(cells),
     })  # fmt: skip
-    _fill(report, runs, tunings, trackees, out, seed)
+    if len(cells) == 1:
+        fill_one(report, cells[0], out, FPS, seed)
+    else:
+        fill_several(report, cells, out, FPS, seed)
     report.save(out)
     return report
 
 
-def _fill(
-    report: Report, runs: Runs, tunings: dict[str, Tuning], trackees: Sequence[Trackee], out: Path,
-    seed: int,
-) -> None:  # fmt: skip
-    add_errors(report, runs)
-    add_parts(report, runs)
-    add_pooled(report, runs, FPS)
-    if any(name.startswith("mrpf") for name in runs) and {"sir", "apf"} & runs.keys():
-        add_differences(report, runs)
-        _add_order(report, runs)
-    add_tuning(report, tunings)
-    add_setup(report, trackees)
-    write_csv(out / "runs.csv", runs, FPS, seed)
-    _add_pictures(report, runs, trackees, out)
-
-
-def _add_order(report: Report, runs: Runs) -> None:
-    """Whether the order of the paper's tables appears, in words."""
-    if not {"sir", "apf", "mrpf"} <= runs.keys():
-        return
-    for part in ("", "arms"):
-        mean = {name: float(mean_of(part_errors(runs, name, part))) for name in runs}
-        best = mean["mrpf"] < min(mean["sir"], mean["apf"])
-        what = "arms" if part else "the whole body"
-        report.findings.append(
-            f"The paper's order {'appears' if best else 'does NOT appear'} for {what}: MRPF "
-            f"{mean['mrpf']:.1f} mm, SIR {mean['sir']:.1f} mm, APF {mean['apf']:.1f} mm."
+def _splits(
+    data: str | Path, actions: tuple[str, ...], test_actions: tuple[str, ...],
+    train_persons: tuple[str, ...], test_persons: tuple[str, ...], clips: int,
+) -> list[Split]:  # fmt: skip
+    """Who is tracked with what, everybody and every action by the names that were given."""
+    recorded = read_mocap(data, FPS, actions)
+    _one_action(recorded)
+    if not test_actions:
+        if not (train_persons and test_persons):
+            persons = _default_persons(recorded)
+            train_persons, test_persons = train_persons or persons, test_persons or persons
+        return split_clips(recorded, train_persons, test_persons, clips)
+    tracked = read_mocap(data, FPS, test_actions)
+    if {clip.action for clip in tracked} & {clip.action for clip in recorded}:
+        raise InputError(
+            f"--test-actions {' '.join(test_actions)}: the manifold is of this action as well; name "
+            "other ones, or leave the option out to track other trials of the same action"
         )
+    return split_clips(recorded, train_persons, test_persons, clips, tracked=tracked)
 
 
-def _add_pictures(report: Report, runs: Runs, trackees: Sequence[Trackee], out: Path) -> None:
-    from torchpose.protocols.silhouette_pictures import (
-        plot_errors_by_part,
-        plot_errors_by_time,
-        plot_silhouettes,
-    )
-
-    add_picture(report, out, "error-over-time.png", plot_errors_by_time(runs, FPS))
-    add_picture(report, out, "error-by-part.png", plot_errors_by_part(runs))
-    trackee = trackees[0]
-    view = trackee.tests[0]
-    name = sequence_name(trackee, view)
-    last = list(runs)[-1]
-    shown: list[tuple[str, Run]] = [(METHODS[last].label, runs[last][name][0])]
-    title = f"{name}: silhouettes and estimates"
-    figure = plot_silhouettes(trackee, view, shown, n_frames=6, title=title)
-    add_picture(report, out, "silhouettes.png", figure)
+def _given_settings(
+    methods: Sequence[str], sharpness: float | None, settings: str | None
+) -> dict[str, Tuning]:
+    """What stands instead of a validation; nothing if that shall choose."""
+    if settings is not None:
+        if sharpness is not None:
+            raise InputError("--settings holds a sharpness already: leave --sharpness out")
+        return {name: Tuning(found) for name, found in read_settings(settings, methods).items()}
+    if sharpness is None:
+        return {}
+    return {
+        name: Tuning(Setting(PUBLISHED_SURVIVAL if name == "apf" else sharpness))
+        for name in methods
+    }
 
 
-def _tunings(
-    trackees: Sequence[Trackee], methods: Sequence[str], particles: int, likelihood: str, out: Path,
-    setting: float | None, progress: bool,
-) -> dict[str, Tuning]:  # fmt: skip
-    found = {}
-    for name in tqdm(methods, disable=not progress, desc="exponents"):
-        if setting is None:
-            found[name] = tune(trackees, name, particles, likelihood, out)
-        else:
-            value = PUBLISHED_SURVIVAL if name == "apf" else setting
-            found[name] = Tuning(Setting(value))
-    return found
+# --- what a report says ---------------------------------------------------------------------------
+
+
+def _chosen(cells: Sequence[Cell]) -> dict[str, object]:
+    """Settings by method; by condition and method where they differ."""
+    by_cell = {
+        f"{cell.n_particles} at {cell.size}": {
+            name: tuning.setting._asdict() for name, tuning in cell.tunings.items()
+        }
+        for cell in cells
+    }
+    first, *others = by_cell.values()
+    return dict(first) if all(other == first for other in others) else dict(by_cell)
+
+
+def _cameras(path: str | None, footage: HumanEvaFootage | None) -> str:
+    if footage is not None:
+        return "HumanEva's own, with its videos"
+    return path or "three around each clip, 3.8 m from its middle"
+
+
+def _actions(splits: Sequence[Split], part: str) -> list[str]:
+    return sorted({clip.action for split in splits for clip in getattr(split, part)})
+
+
+def _one_or_all(values: Sequence[object]) -> object:
+    return values[0] if len(values) == 1 else list(values)
 
 
 # --- what the arguments mean ----------------------------------------------------------------------
 
 
-def _check(methods: Sequence[str], seeds: int, initial: str) -> None:
+def _check(
+    methods: Sequence[str], seeds: int, initial: str, particles: Sequence[int], sizes: Sequence[str]
+) -> None:
     unknown = [name for name in methods if name not in METHODS]
     if unknown or not methods:
         raise InputError(f"--method takes {', '.join(METHODS)}; got {', '.join(unknown) or 'none'}")
@@ -220,6 +245,24 @@ def _check(methods: Sequence[str], seeds: int, initial: str) -> None:
         raise InputError(f"--seeds must be at least 1, got {seeds}")
     if initial not in ("given", "found"):
         raise InputError(f"--initial must be given or found, got {initial!r}")
+    if not particles or min(particles) < 1:
+        raise InputError(f"--particles must be 1 or more, got {' '.join(map(str, particles))!r}")
+    for name, values in (("particles", particles), ("size", sizes)):
+        if len(set(values)) < max(len(values), 1):
+            raise InputError(f"--{name} takes each value once, got {' '.join(map(str, values))!r}")
+    for size in sizes:
+        image_size(size)
+
+
+def _check_footage(cameras: str | None, loop: int, clips: int) -> None:
+    """What cannot be had from videos that are there."""
+    if cameras is not None:
+        raise InputError("--cameras: HumanEva has its own calibration; leave the option out")
+    if loop or clips != 1:
+        raise InputError(
+            "--loop and --clips have no meaning for the videos of HumanEva: each person has one filmed "
+            "trial of an action; leave them out"
+        )
 
 
 def _one_action(clips: Sequence[MocapClip]) -> None:
@@ -247,7 +290,7 @@ def _default_persons(clips: Sequence[MocapClip]) -> tuple[str, ...]:
     return enough
 
 
-def _size(text: str) -> tuple[int, int]:
+def image_size(text: str) -> tuple[int, int]:
     """(height, width) of ``160x120``."""
     match = re.fullmatch(r"\s*(\d+)\s*[x×]\s*(\d+)\s*", text)
     if match is None or 0 in (int(match[1]), int(match[2])):

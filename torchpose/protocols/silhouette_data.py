@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -16,7 +16,15 @@ from torchpose.camera_rig import CameraRig
 from torchpose.errors import InputError
 from torchpose.io.mocap import MocapClip, select_persons
 
-__all__ = ["Split", "in_view", "looped", "place_cameras", "split_clips", "take_frames"]
+__all__ = [
+    "Split",
+    "in_view",
+    "looped",
+    "place_cameras",
+    "split_clips",
+    "take_frames",
+    "whole_frames",
+]
 
 AZIMUTHS = (30.0, 150.0, 270.0)
 """Where the cameras stand, degrees from the direction of the walk, to the walker's left."""
@@ -32,8 +40,9 @@ class Split(NamedTuple):
 
     Attributes:
         person: who. test: trials to track. manifold: clips for the manifold.
-        validation: clips for noise and sharpness. body: clips for bone lengths and radii, never of a
-            test trial. seen: whether the manifold is made of other trials of the same person.
+        validation: clips for noise and sharpness, of the manifold's action. body: clips for bone
+            lengths and radii, never of a test trial.
+        seen: whether the manifold is made of other trials of the same person.
     """
 
     person: str
@@ -51,6 +60,7 @@ def split_clips(
     n_clips: int = 1,
     manifold_frames: int = 350,
     validation_frames: int = 300,
+    tracked: Sequence[MocapClip] = (),
 ) -> list[Split]:
     """Who is tracked with what.
 
@@ -61,26 +71,30 @@ def split_clips(
     Args:
         clips: of one action. train_persons, test_persons: names; all persons if empty.
         n_clips: trials tracked of each person. manifold_frames, validation_frames: at most so many.
+        tracked: clips of another action, to be tracked instead of `clips`, which still make the
+            manifold and choose noise and sharpness.
 
     Raises:
         InputError: no such person, or one with too few trials.
     """
-    testers = select_persons(clips, test_persons)
+    testers = select_persons(tracked or clips, test_persons)
     trainers = select_persons(clips, train_persons)
     found = []
     for person, group in testers.items():
         test = _test_trials(group, n_clips)
         tested = {clip.trial for clip in test}
-        own = [clip for clip in group if clip.trial not in tested]
+        # of the manifold's action first, then other trials of the tracked one
+        own = [c for c in (*clips, *tracked) if c.person == person and c.trial not in tested]
         seen = person in trainers
         if seen:
-            pool, least = own, 2
+            pool = [clip for clip in trainers[person] if clip.trial not in tested]
         else:
-            pool, least = [c for g in trainers.values() for c in g], 2
-        if len(pool) < least or not own:
+            pool = [clip for group in trainers.values() for clip in group]
+        if len(pool) < 2 or not own:
             raise InputError(
                 f"person {person}: expected two trials or more beside the {len(test)} tracked ones "
-                f"for manifold and validation, got {len(pool)}; give --clips fewer or other persons"
+                f"for manifold and validation, and one of their own for the body, got {len(pool)} "
+                f"and {len(own)}; give --clips fewer or other persons"
             )
         manifold, rest = _share(pool, manifold_frames, seen)
         validation = take_frames(rest, validation_frames)
@@ -98,6 +112,12 @@ def take_frames(clips: Sequence[MocapClip], n_frames: int) -> tuple[MocapClip, .
         taken.append(clip.cut(0, left))
         left -= len(taken[-1])
     return tuple(taken)
+
+
+def whole_frames(clip: MocapClip) -> Bool[Tensor, " T"]:
+    """Frames in which no joint was lost; one that the joint set lacks altogether does not count."""
+    missing = clip.joints.isnan().any(-1)
+    return ~(missing & ~missing.all(0)).any(-1) & ~missing.all(-1)
 
 
 def _test_trials(group: Sequence[MocapClip], n_clips: int) -> tuple[MocapClip, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 from torchpose.body.silhouette import render
 from torchpose.protocols.silhouette_runs import Run, Runs
 from torchpose.protocols.silhouette_tables import PARTS, part_errors, pooled_std
-from torchpose.protocols.silhouette_trackees import METHODS, Trackee, View
+from torchpose.protocols.silhouette_trackees import Tracked, View, label_of
 from torchpose.viz.style import (
     INK,
     NORMAL,
@@ -29,7 +29,12 @@ if TYPE_CHECKING:
 else:
     Figure = Any
 
-__all__ = ["plot_errors_by_part", "plot_errors_by_time", "plot_silhouettes"]
+__all__ = [
+    "plot_errors_by_condition",
+    "plot_errors_by_part",
+    "plot_errors_by_time",
+    "plot_silhouettes",
+]
 
 _SEEN, _BOTH, _MODEL = (0.62, 0.72, 0.83), (0.16, 0.20, 0.28), (0.90, 0.45, 0.10)
 
@@ -42,7 +47,7 @@ def plot_errors_by_time(runs: Runs, fps: float, title: str = "Error over time") 
     require_matplotlib()
     from matplotlib.lines import Line2D
 
-    labels = {method: METHODS[method].label for method in runs}
+    labels = {method: label_of(method) for method in runs}
     styles = method_styles(list(labels.values()))
     names = list(next(iter(runs.values())))
     columns = min(2, len(names))
@@ -79,7 +84,7 @@ def plot_errors_by_part(runs: Runs, title: str = "Error by part of the body") ->
     require_matplotlib()
     from matplotlib.patches import Patch
 
-    labels = {method: METHODS[method].label for method in runs}
+    labels = {method: label_of(method) for method in runs}
     styles = method_styles(list(labels.values()))
     parts = ("", *PARTS)
     figure = new_figure(7.6, 3.8, title)
@@ -100,8 +105,43 @@ def plot_errors_by_part(runs: Runs, title: str = "Error by part of the body") ->
     return figure
 
 
+def plot_errors_by_condition(
+    conditions: Mapping[str, Runs], title: str = "Error by condition"
+) -> Figure:
+    """Mean error under each condition, in their order, one line a method, with the spread over seeds.
+
+    Args:
+        conditions: runs of the same methods by what they differ in, such as the number of particles.
+        title: above.
+    """
+    require_matplotlib()
+    from matplotlib.lines import Line2D
+
+    first = next(iter(conditions.values()))
+    labels = {method: label_of(method) for method in first}
+    styles = method_styles(list(labels.values()))
+    figure = new_figure(7.6, 3.8, title)
+    ax = style_axes(figure.add_subplot(), y="error (mm)")
+    for method, label in labels.items():
+        found = [part_errors(runs, method) for runs in conditions.values()]
+        middle = torch.stack([f.mean() for f in found])
+        place = torch.arange(len(found)).numpy()
+        if found[0].shape[1] > 1:
+            spread = torch.stack([pooled_std(f) for f in found])
+            ax.fill_between(
+                place, to_numpy(middle - spread), to_numpy(middle + spread),
+                color=styles[label]["color"], alpha=0.15, linewidth=0,
+            )  # fmt: skip
+        ax.plot(place, to_numpy(middle), linewidth=1.6, marker="o", markersize=4, **styles[label])
+    ax.set_ylim(bottom=0)
+    ax.set_xticks(range(len(conditions)), [name.replace(", ", "\n") for name in conditions])
+    ax.tick_params(axis="x", length=0, labelsize=NORMAL, labelcolor=INK)
+    add_legend(figure, [Line2D([], [], linewidth=1.8, label=n, **s) for n, s in styles.items()])
+    return figure
+
+
 def plot_silhouettes(
-    trackee: Trackee,
+    trackee: Tracked,
     view: View,
     runs: Sequence[tuple[str, Run]],
     n_frames: int = 4,

@@ -4,37 +4,51 @@ A run is one method on one clip with one seed. Runs that are missing are filtere
 with random numbers of its own, so a run does not depend on which others were missing.
 """
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from math import inf, isfinite
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchpose.body.kinematics import Body
-from torchpose.errors import TorchposeError
-from torchpose.filters.pose_search import find_pose
+from torchpose.errors import FileFormatError, InputError
+from torchpose.filters.first_pose import find_first_pose
 from torchpose.filters.sharpness import ValidationSequence, fit_sharpness
 from torchpose.filters.silhouette_filter import BodyTrack, SilhouetteParticleFilter
-from torchpose.io.files import read_npz, write_npz
+from torchpose.io.files import require_file
 from torchpose.protocols.common import settings_hash
+from torchpose.protocols.kept_runs import keep, kept, read_kept
 from torchpose.protocols.silhouette_trackees import (
     METHODS,
     SCALES,
     Setting,
+    Tracked,
     Trackee,
     View,
     make_filter,
 )
 
-__all__ = ["Run", "Runs", "Tuning", "run_all", "tune"]
+__all__ = [
+    "Run",
+    "Runs",
+    "Tuning",
+    "choose_setting",
+    "generators_of",
+    "run_all",
+    "sequence_name",
+    "track_view",
+    "tune",
+    "view_errors",
+]
 
 _VERSION = 1
+_LOOK_AHEAD = 30  # frames that decide where somebody faces, if the first pose is found
 
 
 class Run(NamedTuple):
@@ -72,7 +86,7 @@ class Tuning(NamedTuple):
         return found[0] if found else float("nan")
 
 
-def sequence_name(trackee: Trackee, view: View) -> str:
+def sequence_name(trackee: Tracked, view: View) -> str:
     """What a sequence is called in tables."""
     return f"{trackee.split.person} {view.clip.trial}"
 
@@ -90,27 +104,71 @@ def tune(
     First the scale of the diffusion, then the sharpness (or survival rate) at that scale. Every
     method has the same clips, seeds and number of settings to choose among.
     """
-    known = METHODS[method]
+
+    def error(setting: Setting) -> float:
+        found = [
+            _kept_error(t, body, view, method, setting, n_particles, likelihood, folder, seeds)
+            for t in trackees
+            for body, view in t.validation
+        ]
+        return sum(found) / len(found)
+
+    return choose_setting(error, METHODS[method].first, METHODS[method].values)
+
+
+def choose_setting(
+    error: Callable[[Setting], float],
+    first: float,
+    values: Sequence[float],
+    scales: Sequence[float] = SCALES,
+) -> Tuning:
+    """The setting with the smallest error: first the scale at the value `first`, then the value.
+
+    Args:
+        error: of a setting; one that is not finite is never chosen.
+        first: value with which the scale is chosen. values, scales: what is tried.
+    """
     tried: dict[Setting, float] = {}
 
     def best() -> Setting:
         return min(tried, key=lambda s: tried[s] if isfinite(tried[s]) else inf)
 
-    def attempt(setting: Setting) -> None:
-        if setting not in tried:
-            found = [
-                _kept_error(t, body, view, method, setting, n_particles, likelihood, folder, seeds)
-                for t in trackees
-                for body, view in t.validation
-            ]
-            tried[setting] = sum(found) / len(found)
-
-    for scale in SCALES:
-        attempt(Setting(known.first, scale))
+    for scale in scales:
+        tried[Setting(first, scale)] = error(Setting(first, scale))
     scale = best().scale
-    for value in known.values:
-        attempt(Setting(value, scale))
+    for value in values:
+        if Setting(value, scale) not in tried:
+            tried[Setting(value, scale)] = error(Setting(value, scale))
     return Tuning(best(), tuple(tried), tuple(tried.values()))
+
+
+def read_settings(path: str | Path, methods: Sequence[str]) -> dict[str, Setting]:
+    """What an earlier run chose for these methods.
+
+    Args:
+        path: report.json of the run, or its folder. methods: by name.
+
+    Raises:
+        InputError: no such file, or a method that the run did not have.
+        FileFormatError: no report of one choice for each method.
+    """
+    path = require_file(Path(path) / "report.json" if Path(path).is_dir() else path)
+    try:
+        chosen = json.loads(path.read_text(encoding="utf-8"))["settings"]["settings"]
+        known = {name: Setting(float(s["value"]), float(s["scale"])) for name, s in chosen.items()}
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise FileFormatError(
+            f"{path}: expected the report.json of a run of this protocol with one number of particles "
+            f"and one size, whose settings hold a value and a scale for each method ({error!r})"
+        ) from error
+    missing = [name for name in methods if name not in known]
+    if missing:
+        raise InputError(
+            f"{path}: expected settings of {', '.join(methods)}; there are none of "
+            f"{', '.join(missing)}, only of {', '.join(known)}: run without --settings, or choose "
+            "with --method"
+        )
+    return {name: known[name] for name in methods}
 
 
 def _kept_error(
@@ -120,11 +178,6 @@ def _kept_error(
     """Mean error on a validation clip, mm, read from the folder if it is there."""
     facts = ["tuning", _VERSION, method, list(setting), n_particles, likelihood, seeds]
     path = folder / f"tuning-{settings_hash([*facts, *_facts(trackee, body, view, method)])}.npz"
-    if path.is_file():
-        try:
-            return float(read_npz(path, ("error",))["error"])
-        except TorchposeError:
-            path.unlink()  # damaged: try again
     sequence = ValidationSequence(
         view.silhouettes, view.rig, None, view.initial_state, view.clip.joints
     )
@@ -134,10 +187,11 @@ def _kept_error(
             method, trackee, Setting(value, setting.scale), n_particles, likelihood, body
         )
 
-    fit = fit_sharpness(tracker, [sequence], values=[setting.value], seeds=seeds)
-    error = 1000 * fit.errors[0]
-    write_npz(path, {"error": np.array(error)})
-    return error
+    def error() -> float:
+        fit = fit_sharpness(tracker, [sequence], values=[setting.value], seeds=seeds)
+        return 1000 * fit.errors[0]
+
+    return kept(path, error)
 
 
 def run_all(
@@ -157,7 +211,7 @@ def run_all(
     Args:
         trackees: who is tracked. settings: of each method.
         folder: where runs are kept. seeds: how many runs, numbered from `seed`.
-        n_particles: likelihoods per frame. initial: "given", or "found" from the first frame.
+        n_particles: likelihoods per frame. initial: "given", or "found" in the first frames.
         progress: whether to show a bar.
     """
     runs: Runs = {method: {} for method in settings}
@@ -168,7 +222,8 @@ def run_all(
                 name = sequence_name(trackee, view)
                 for method, setting in settings.items():
                     bar.set_postfix_str(f"{name} {method}")
-                    facts = [_VERSION, method, list(setting), n_particles, likelihood, initial]
+                    facts = [_VERSION, method, list(setting), n_particles, likelihood]
+                    facts += [initial if initial == "given" else f"{initial} in {_LOOK_AHEAD}"]
                     facts += _facts(trackee, trackee.body, view, method)
                     paths = {
                         s: folder / f"run-{settings_hash([*facts, s])}.npz"
@@ -179,8 +234,7 @@ def run_all(
                         track = (trackee, view, method, setting, n_particles, likelihood)
                         found = _filtered(*track, initial, missing)
                         for s, run in zip(missing, found, strict=True):
-                            arrays = {key: value.numpy() for key, value in run._asdict().items()}
-                            write_npz(paths[s], arrays)
+                            keep(paths[s], run)
                     # read back, so that a run that goes on works with the same bits
                     runs[method][name] = [r for r in map(_read, paths.values()) if r is not None]
                     bar.update(seeds * len(view.clip))
@@ -188,14 +242,8 @@ def run_all(
 
 
 def _read(path: Path) -> Run | None:
-    if not path.is_file():
-        return None
-    try:
-        arrays = read_npz(path, Run._fields)
-    except TorchposeError:
-        path.unlink()  # damaged: run again
-        return None
-    return Run(*(torch.from_numpy(arrays[key]) for key in Run._fields))
+    run: Run | None = read_kept(path, Run, Run._fields)
+    return run
 
 
 def _filtered(
@@ -204,36 +252,53 @@ def _filtered(
 ) -> list[Run]:  # fmt: skip
     """Runs of some seeds on one clip, as one batch."""
     tracker = make_filter(method, trackee, setting, n_particles, likelihood)
-    generators = [torch.Generator().manual_seed(7919 * s + 1) for s in seeds]
+    generators = generators_of(seeds)
     start = view.initial_state.expand(len(seeds), -1)
     if initial == "found":
         start = torch.stack([_found_pose(trackee, view, g) for g in generators])
+    return track_view(tracker, trackee.body, view, start, generators)
+
+
+def generators_of(seeds: Sequence[int]) -> list[torch.Generator]:
+    """A stream of random numbers for every run."""
+    return [torch.Generator().manual_seed(7919 * s + 1) for s in seeds]
+
+
+def track_view(
+    tracker: SilhouetteParticleFilter,
+    body: Body,
+    view: View,
+    start: Float[Tensor, "S D"],
+    generators: list[torch.Generator],
+) -> list[Run]:
+    """One run for each generator, as one batch, each from its own initial state."""
     began = perf_counter()
     out: BodyTrack = tracker(view.silhouettes, view.rig, start, generator=generators)
-    seconds = (perf_counter() - began) / len(view.clip) / len(seeds)
-    errors = joint_errors(trackee, view, out.mean)
+    seconds = (perf_counter() - began) / len(view.clip) / len(generators)
+    errors = view_errors(body, view, out.mean)
     return [
         Run(
             errors[i].float(), out.mean[i].float(), out.std[i].float(), out.coasting[i],
             out.respread[i], torch.tensor([seconds], dtype=torch.float64),
         )
-        for i in range(len(seeds))
+        for i in range(len(generators))
     ]  # fmt: skip
 
 
-def joint_errors(
-    trackee: Trackee, view: View, states: Float[Tensor, "*batch T D"]
+def view_errors(
+    body: Body, view: View, states: Float[Tensor, "*batch T D"]
 ) -> Float[Tensor, "*batch T 15"]:
     """Distance of the estimated joints from the recorded ones, mm (MR 31)."""
-    return 1000 * (trackee.body.joints(states) - view.clip.joints).norm(dim=-1)
+    return 1000 * (body.joints(states) - view.clip.joints).norm(dim=-1)
 
 
 def _found_pose(trackee: Trackee, view: View, generator: torch.Generator) -> Float[Tensor, " D"]:
     """The first pose from the first silhouettes alone, about the poses of the manifold."""
-    found = find_pose(
-        trackee.body, view.silhouettes[0], view.rig, trackee.manifold, generator, up=view.clip.up
-    )
-    return found.to(view.initial_state)
+    found = find_first_pose(
+        trackee.body, view.silhouettes[:_LOOK_AHEAD], view.rig, trackee.manifold, generator,
+        fps=view.clip.fps, up=view.clip.up,
+    )  # fmt: skip
+    return found.state.to(view.initial_state)
 
 
 def _facts(trackee: Trackee, body: Body, view: View, method: str) -> list[Any]:

@@ -11,12 +11,14 @@ from torch import Tensor
 from torchpose.body.skeleton import BODY_15
 from torchpose.io.files import atomic_path
 from torchpose.protocols.report import Report
+from torchpose.protocols.silhouette_data import Split
 from torchpose.protocols.silhouette_runs import Runs, Tuning, sequence_name
 from torchpose.protocols.silhouette_trackees import (
     METHODS,
     PUBLISHED_SURVIVAL,
     Setting,
-    Trackee,
+    Tracked,
+    label_of,
 )
 
 __all__ = [
@@ -70,6 +72,8 @@ def drift(runs: Runs, method: str, fps: float) -> Float[Tensor, "Q S"]:
         settled = _SETTLED if len(errors) >= 3 * _SETTLED else 0
         value = errors[settled:].double().nanmean(1)
         t = torch.arange(len(value), dtype=torch.float64) / fps
+        known = value.isfinite()  # not where the truth was lost
+        t, value = t[known], value[known]
         t = t - t.mean()
         return (t * value).sum() / (t * t).sum()
 
@@ -121,15 +125,21 @@ def bootstrap(
 
 
 def _labels(runs: Runs) -> dict[str, str]:
-    return {method: METHODS[method].label for method in runs}
+    return {method: label_of(method) for method in runs}
 
 
-def add_errors(report: Report, runs: Runs) -> None:
-    """Table 1: mean error of every sequence, and its standard deviation over seeds."""
+def add_errors(report: Report, runs: Runs, condition: str = "") -> None:
+    """Table 1: mean error of every sequence, and its standard deviation over seeds.
+
+    Args:
+        condition: of the runs, where a report has several; a part of the table's name and title.
+    """
     labels = _labels(runs)
     columns = [c for label in labels.values() for c in (label, f"± {label}")]
+    title = "Error (mm) of the joints, mean over joints, frames and seeds"
     table = report.table(
-        "errors", "Error (mm) of the joints, mean over joints, frames and seeds", columns,
+        f"errors, {condition}" if condition else "errors",
+        f"{condition}: {title[0].lower()}{title[1:]}" if condition else title, columns,
         note="±: standard deviation over seeds; in the last row pooled over sequences.",
     )  # fmt: skip
     found = {method: part_errors(runs, method) for method in labels}
@@ -177,16 +187,23 @@ def add_pooled(report: Report, runs: Runs, fps: float) -> None:
         seconds = float(torch.cat([run.seconds for run in every]).mean())
         cells = [float(mean_of(errors)), _pooled(errors), *slope, *flags, 1000 * seconds]
         table.add(label, cells)
+        spread = f"standard deviation over seeds {cells[1]:.1f} mm"
+        if errors.shape[1] == 1:
+            spread = "one seed"
         report.findings.append(
-            f"{label}: {cells[0]:.1f} mm, standard deviation over seeds {cells[1]:.1f} mm; the "
-            f"error changes by {slope[0]:+.1f} mm per second ({slope[1]:+.1f} to {slope[2]:+.1f})."
+            f"{label}: {cells[0]:.1f} mm, {spread}; the error changes by {slope[0]:+.1f} mm per second "
+            f"({slope[1]:+.1f} to {slope[2]:+.1f})."
         )
 
 
-def add_differences(report: Report, runs: Runs) -> None:
-    """What the first methods have over the others, with intervals."""
+def add_differences(report: Report, runs: Runs, condition: str = "") -> None:
+    """What the manifold's methods have over the others, with intervals.
+
+    Args:
+        condition: of the runs, where a report has several; before the names of the rows.
+    """
     labels = _labels(runs)
-    table = report.table(
+    table = report.get("differences") or report.table(
         "differences", "Differences (mm) with the 95 % intervals of a bootstrap",
         ["mean", "from", "to", "arms", "from ", "to ", "± seeds", "from  ", "to  "],
         note="Below zero is for the first. Drawn again are sequences and seeds.",
@@ -200,13 +217,20 @@ def add_differences(report: Report, runs: Runs) -> None:
             n_seeds = whole[0].shape[1]
             spread = bootstrap(pooled_std, *whole) if n_seeds > 1 else (float("nan"),) * 3
             cells = [*bootstrap(mean_of, *whole), *bootstrap(mean_of, *arms), *spread]
-            table.add(f"{labels[method]} - {labels[other]}", cells)
+            name = f"{labels[method]} - {labels[other]}"
+            table.add(f"{condition}: {name}" if condition else name, cells)
 
 
-def add_tuning(report: Report, tunings: Mapping[str, Tuning]) -> None:
-    """What validation chose for every method."""
-    table = report.table(
-        "tuning", "What validation clips chose: the setting with the smallest error",
+def add_tuning(report: Report, tunings: Mapping[str, Tuning], condition: str = "") -> None:
+    """What validation chose for every method, or what was given.
+
+    Args:
+        condition: of the runs, where a report has several; before the names of the rows.
+    """
+    given = not any(found.tried for found in tunings.values())
+    title = "What validation clips chose: the setting with the smallest error"
+    table = report.get("tuning") or report.table(
+        "tuning", "Settings as given, without validation" if given else title,
         ["chosen", "diffusion", "error (mm)", "as published (mm)", "tried: value x diffusion, error"],
         digits=(2, 1, 1, 1, 0),
         note="Chosen: the sharpness of the likelihood for SIR and MRPF, 1 as published; the survival "
@@ -219,16 +243,22 @@ def add_tuning(report: Report, tunings: Mapping[str, Tuning]) -> None:
         errors = dict(zip(found.tried, found.errors, strict=True))
         published = PUBLISHED_SURVIVAL if method == "apf" else 1.0
         text = "; ".join(f"{s.value:g} x {s.scale:g}, {e:.0f}" for s, e in errors.items())
-        table.add(METHODS[method].label, [
+        label = METHODS[method].label
+        table.add(f"{condition}: {label}" if condition else label, [
             *found.setting, found.error, errors.get(Setting(published, found.setting.scale)),
             text or "-",
         ])  # fmt: skip
 
 
-def add_setup(report: Report, trackees: Sequence[Trackee]) -> None:
-    """The sequences, and how near the tracker's body can come to what the cameras see."""
+def add_setup(report: Report, trackees: Sequence[Tracked], condition: str = "") -> None:
+    """The sequences, and how near the tracker's body can come to what the cameras see.
+
+    Args:
+        condition: of the silhouettes, where a report has several; a part of the table's name.
+    """
+    name = f"sequences, {condition}" if condition else "sequences"
     table = report.table(
-        "sequences", "Sequences",
+        name, name.capitalize(),
         ["frames", "manifold frames", "validation frames", "own manifold", "nearest state (mm)",
          "overlap", "in view (%)"],
         digits=(0, 0, 0, 0, 1, 2, 1),
@@ -241,8 +271,15 @@ def add_setup(report: Report, trackees: Sequence[Trackee]) -> None:
         for view in trackee.tests:
             table.add(sequence_name(trackee, view), [
                 len(view.clip), sum(map(len, split.manifold)), sum(map(len, split.validation)),
-                "yes" if split.seen else "no", view.floor, view.overlap, 100 * view.in_view,
+                _manifold_of(split), view.floor, view.overlap, 100 * view.in_view,
             ])  # fmt: skip
+
+
+def _manifold_of(split: Split) -> str:
+    """Whether the manifold is the person's own, and of which action if of another one."""
+    actions = " ".join(dict.fromkeys(clip.action for clip in split.manifold))
+    other = actions not in {clip.action for clip in split.test}
+    return ("yes" if split.seen else "no") + (f", of {actions}" if other else "")
 
 
 def write_csv(path: Path, runs: Runs, fps: float, first_seed: int = 0) -> None:

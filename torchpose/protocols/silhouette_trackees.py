@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -23,19 +23,31 @@ from torchpose.io.mocap import MocapClip
 from torchpose.priors.gplvm import BackConstrainedGPLVM
 from torchpose.priors.manifold_file import ManifoldInfo
 from torchpose.protocols.common import settings_hash
-from torchpose.protocols.silhouette_data import Split, in_view, place_cameras
+from torchpose.protocols.silhouette_data import (
+    AZIMUTHS,
+    Split,
+    in_view,
+    place_cameras,
+    whole_frames,
+)
 from torchpose.protocols.silhouette_truth import TrueShape, true_silhouettes
 
 __all__ = [
     "METHODS",
     "SCALES",
     "Conditions",
+    "Footage",
     "Method",
     "Setting",
+    "Tracked",
     "Trackee",
     "View",
+    "any_heading",
+    "body_of",
+    "label_of",
     "make_filter",
     "prepare",
+    "view_of",
 ]
 
 LAYERS = 5
@@ -92,6 +104,24 @@ both Gaussians; ``mrpf-published`` weighs by (MR 30) alone and samples the diffu
 """
 
 
+def label_of(method: str) -> str:
+    """What a method is called in tables and pictures; its name, if it is none of `METHODS`."""
+    return METHODS[method].label if method in METHODS else method
+
+
+@runtime_checkable
+class Footage(Protocol):
+    """Silhouettes of videos, in place of rendered ones."""
+
+    def sees(self, clip: MocapClip) -> bool:
+        """Whether there are videos of a clip."""
+
+    def __call__(
+        self, clip: MocapClip, size: tuple[int, int], n_cameras: int
+    ) -> tuple[CameraRig, Bool[Tensor, "T C H W"]]:
+        """The first `n_cameras` cameras, scaled to (height, width), and what they see of a clip."""
+
+
 @dataclass(frozen=True)
 class Conditions:
     """What silhouettes are like.
@@ -99,6 +129,9 @@ class Conditions:
     Args:
         size: (height, width), pixels. faults: severity. cameras_used: the first so many of the rig.
         rig: the cameras, or None to place three around each clip. seed: of shapes and faults.
+        azimuths: where cameras are placed, degrees from the direction of the walk or of the chest,
+            to the person's left.
+        footage: silhouettes that were filmed; with it, faults, rig, seed and azimuths have no part.
     """
 
     size: tuple[int, int] = (120, 160)
@@ -106,6 +139,8 @@ class Conditions:
     cameras_used: int = 3
     rig: CameraRig | None = None
     seed: int = 0
+    azimuths: tuple[float, ...] = AZIMUTHS
+    footage: Footage | None = None
 
 
 class View(NamedTuple):
@@ -128,21 +163,31 @@ class View(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Trackee:
+class Tracked:
     """A person, ready to be tracked.
 
     Args:
         split: whose clips. body: with bone lengths and radii of training clips.
-        manifold: of the training clips. step_std: [D], of the validation clips.
-        tests: clips to track. validation: (body, view) of clips that choose the exponents.
+        step_std: [D], of clips that are not tracked.
+        tests: clips to track. validation: (body, view) of clips that choose the settings.
     """
 
     split: Split
     body: Body
-    manifold: BackConstrainedGPLVM
     step_std: Float[Tensor, " D"]
     tests: tuple[View, ...]
     validation: tuple[tuple[Body, View], ...]
+
+
+@dataclass(frozen=True)
+class Trackee(Tracked):
+    """A person with a manifold.
+
+    Args:
+        manifold: of the training clips.
+    """
+
+    manifold: BackConstrainedGPLVM
 
 
 def prepare(
@@ -158,20 +203,20 @@ def prepare(
         split: clips. conditions: of the silhouettes. test_frames: of each test trial, from its first.
         validation_frames: for the exponents. manifold_seed: of the manifold's fit.
     """
-    body = _body_of(split.body, conditions)
+    body = body_of(split.body, conditions)
     bodies = {split.person: body}
     for clip in (*split.manifold, *split.validation):
         if clip.person not in bodies:
             theirs = [c for c in (*split.manifold, *split.validation) if c.person == clip.person]
-            bodies[clip.person] = _body_of(theirs, conditions)
+            bodies[clip.person] = body_of(theirs, conditions)
     manifold = _manifold(split, bodies, manifold_seed)
     moved = [_states(bodies, clip) for clip in split.validation]
-    tests = tuple(_view(body, clip.cut(0, test_frames), conditions) for clip in split.test)
+    tests = tuple(view_of(body, clip.cut(0, test_frames), conditions) for clip in split.test)
     first = split.validation[0].cut(0, validation_frames)
     owner = bodies[first.person]
-    validation = ((owner, _view(owner, first, conditions)),)
-    step_std = _any_heading(motion_std(body, moved), first.up)
-    return Trackee(split, body, manifold, step_std, tests, validation)
+    validation = ((owner, view_of(owner, first, conditions)),)
+    step_std = any_heading(motion_std(body, moved), first.up)
+    return Trackee(split, body, step_std, tests, validation, manifold)
 
 
 def make_filter(
@@ -214,7 +259,7 @@ def make_filter(
 # --- fits -----------------------------------------------------------------------------------------
 
 
-def _any_heading(std: Float[Tensor, " D"], up: Float[Tensor, "3"]) -> Float[Tensor, " D"]:
+def any_heading(std: Float[Tensor, " D"], up: Float[Tensor, "3"]) -> Float[Tensor, " D"]:
     """The root's steps the same in all horizontal directions: the next walk may go elsewhere."""
     along = up.abs() > 0.9
     level = ~along if bool(along.any()) else torch.ones_like(along)
@@ -228,10 +273,16 @@ def person_seed(person: str, seed: int) -> int:
     return int(settings_hash([person, seed])[:8], 16)
 
 
-def _body_of(clips: Sequence[MocapClip], conditions: Conditions) -> Body:
-    """Bone lengths of all frames, radii of a few frames of the first clip."""
+def body_of(clips: Sequence[MocapClip], conditions: Conditions) -> Body:
+    """Bone lengths of all frames, radii of a few frames of the first clip that cameras see.
+
+    Where they see none, radii are those of an average person of these lengths: enough for states.
+    """
     body = fit_body(torch.cat([clip.joints for clip in clips]))
-    first = clips[0]
+    footage = conditions.footage
+    first = next((clip for clip in clips if footage is None or footage.sees(clip)), None)
+    if first is None:
+        return body
     rig, silhouettes = _seen(first, conditions)
     rows = torch.linspace(0, len(first) - 1, min(_RADII_FRAMES, len(first))).round().long()
     states = fit_state(body, first.joints[rows])
@@ -261,7 +312,9 @@ def _manifold(split: Split, bodies: dict[str, Body], seed: int) -> BackConstrain
 
 
 def _seen(clip: MocapClip, conditions: Conditions) -> tuple[CameraRig, Bool[Tensor, "T C H W"]]:
-    rig = place_cameras(clip) if conditions.rig is None else conditions.rig
+    if conditions.footage is not None:
+        return conditions.footage(clip, conditions.size, conditions.cameras_used)
+    rig = place_cameras(clip, conditions.azimuths) if conditions.rig is None else conditions.rig
     if conditions.cameras_used > len(rig):
         raise InputError(
             f"{conditions.cameras_used} cameras are asked for, and there are {len(rig)}"
@@ -277,11 +330,20 @@ def _seen(clip: MocapClip, conditions: Conditions) -> tuple[CameraRig, Bool[Tens
     return rig, true_silhouettes(clip, shape, rig, conditions.faults, generator)
 
 
-def _view(body: Body, clip: MocapClip, conditions: Conditions) -> View:
+def view_of(body: Body, clip: MocapClip, conditions: Conditions) -> View:
+    """A clip as the cameras see it, with its first state for this body.
+
+    Frames in which joints were lost count for nothing; the first one must be whole.
+    """
     rig, silhouettes = _seen(clip, conditions)
-    states = fit_state(body, clip.joints)
-    apart = (body.joints(states) - clip.joints).norm(dim=-1)
-    overlap = intersection_over_union(count_pixels(body, states[:, None], rig, silhouettes))
+    whole = whole_frames(clip)
+    if not bool(whole[0]):
+        raise InputError(f"{clip.person} {clip.trial}: joints are missing in the first frame")
+    joints = clip.joints[whole]
+    states = fit_state(body, joints)
+    apart = (body.joints(states) - joints).norm(dim=-1)
+    counts = count_pixels(body, states[:, None], rig, silhouettes[whole])
+    overlap = intersection_over_union(counts)
     return View(
         clip, rig, silhouettes, states[0], 1000 * float(apart.nanmean()),
         float(overlap.mean()), float(in_view(clip, rig).min()),
