@@ -17,7 +17,9 @@ SCRIPTS = (
     "batch_memory",
     "streamed_em",
     "silhouettes",
+    "root_uncertainty",
     "gplvm",
+    "tree_messages",
 )
 
 

@@ -38,10 +38,18 @@ PROTOCOLS = {
         "silhouette",
         "whole bodies tracked from silhouettes of several cameras by three particle filters",
     ),
+    "root-uncertainty": (
+        "root_uncertainty",
+        "whole bodies by many hypotheses of the root, over cameras, frame rates, displacements",
+    ),
+    "bend": (
+        "bend",
+        "an action tracked from one camera, with and without the constraints of its action model",
+    ),
 }
 _SEVERAL = ("leave-one-person-out",)
 """Protocols on recordings from any folders; the others know theirs by name."""
-_MOCAP = ("silhouette",)
+_MOCAP = ("silhouette", "root-uncertainty", "bend")
 """Protocols on any one folder of motion capture."""
 _COMMON = ("data", "out", "seed", "progress")
 _PLAIN = (int, float, bool, str, type(None))
@@ -73,7 +81,9 @@ def build(name: str | None) -> ArgumentParser:
         add("recordings", nargs="*", type=str, metavar="DIR", help="folders or files of recordings")
         add("--data", type=str, metavar="DIR", help="one folder, instead of or beside these")
     elif name in _MOCAP:
-        text = "folder or file of recordings of whole bodies, such as .npz of 3D joints"
+        text = (
+            "folder or file of recordings of whole bodies, such as .npz of 3D joints; or HumanEva-I"
+        )
         add("--data", "--mocap", type=str, required=True, metavar="DIR", help=text)
     else:
         add("--data", type=str, required=True, metavar="DIR", help="folder with the recordings")
@@ -145,7 +155,8 @@ def _add_own_options(parser: ArgumentParser, function: Callable[..., Any]) -> No
     for key in own:
         if key in spaced:  # words with blanks between them, for those who type
             parser.add_argument(
-                f"--{key.replace('_', '-')}", type=str, nargs="+", metavar=key.upper(),
+                f"--{key.replace('_', '-')}", type=typing.get_args(hints[key])[0], nargs="+",
+                metavar="N" if int in typing.get_args(hints[key]) else key.upper(),
                 default=list(parameters[key].default), help=texts.get(key),
             )  # fmt: skip
             continue

@@ -8,6 +8,8 @@
 - `cross_dataset`: a prior of one data set on another one's persons, and what motion capture adds.
 - `uncommon_poses`: training recordings of raised arms left out.
 - `silhouette`: whole bodies in silhouettes of several cameras, by three particle filters.
+- `root_uncertainty`: the same with many hypotheses of the root, over cameras and frame rates.
+- `bend`: an action in one camera, with and without the constraints of its action model.
 """
 
 from torchpose.protocols.report import Report, Table
@@ -23,6 +25,8 @@ PROTOCOLS = (
     "cross-dataset",
     "uncommon-poses",
     "silhouette",
+    "root-uncertainty",
+    "bend",
 )
 
 
