@@ -76,6 +76,7 @@ class ActionData(LightningDataModule):
         self.fps, self.actions = fps, tuple(actions)
         self.train: list[Performed] = []
         self.watched: list[Performed] = []
+        self.left_out = 0  # repetitions that are too short
         self._paths, self._persons, self._held_out = paths, persons, held_out or []
         self._repeated, self._postures, self._axes = repeated, postures, axes
         self._recordings: list[Recording] = []
@@ -91,7 +92,8 @@ class ActionData(LightningDataModule):
         for action in self.actions:
             if not any(p.action == action for p in self.train):
                 raise InputError(
-                    f"{action}: everybody who did it is held out; nobody is left to learn from"
+                    f"{action}: there is no performance to learn from; everybody who did it is held "
+                    f"out or not among the persons, or no repetition lasts {LEAST_FRAMES} frames"
                 )
 
     def train_dataloader(self) -> range:
@@ -108,9 +110,8 @@ class ActionData(LightningDataModule):
 
     def facts(self, action: str) -> ActionInfo:
         """What is known of an action before it is fitted."""
-        mine = [r for r in self._recordings if r.action == action]
         learnt = {p.person for p in self.train if p.action == action}
-        mine = [r for r in mine if r.person_id in learnt]
+        mine = [r for r in self._recordings if r.action == action and r.person_id in learnt]
         return ActionInfo(
             name=action,
             fps=self.fps,
@@ -139,15 +140,21 @@ class ActionData(LightningDataModule):
         found = []
         for action in self.actions:
             mine = [i for i, r in enumerate(self._recordings) if r.action == action]
-            axis = repetition_axis([told[i] for i in mine])
-            for i in mine:
-                whole = [slice(0, len(told[i]))]
-                parts = split_repetitions(told[i], self.fps, axis) if self._repeated else whole
+            for i, parts in zip(mine, self._parts([told[i] for i in mine]), strict=True):
                 person = self._recordings[i].person_id
                 found += [Performed(person, action, told[i][part]) for part in parts]
         if not self._repeated:  # then every recording counts, and a short one is refused
             return found
-        return [p for p in found if len(p.postures) >= LEAST_FRAMES]
+        kept = [p for p in found if len(p.postures) >= LEAST_FRAMES]
+        self.left_out = len(found) - len(kept)
+        return kept
+
+    def _parts(self, told: Sequence[Tensor]) -> list[list[slice]]:
+        """Frames of the single performances in each recording of an action."""
+        if not told or not self._repeated:
+            return [[slice(0, len(postures))] for postures in told]
+        axis = repetition_axis(told)
+        return [split_repetitions(postures, self.fps, axis) for postures in told]
 
     def _joints(self, recording: Recording) -> Tensor:
         if recording.fps is None:
@@ -204,6 +211,7 @@ class ActionFit(LightningModule):
         self.save_hyperparameters()
         self.automatic_optimization = False
         self.fitted: dict[str, tuple[ActionSpace, Synchronised]] = {}
+        self._accepted: dict[str, float] = {}
         self._identity: dict[str, Any] = {}
 
     def setup(self, stage: str) -> None:
@@ -252,7 +260,7 @@ class ActionFit(LightningModule):
     # --- what comes of it
 
     def fit(self) -> None:
-        """Fit every action."""
+        """Fit every action, and try its gate on who is held out."""
         given, data = self._given, self._data
         for action in data.actions:
             self.fitted[action] = ActionSpace.fit_synchronised(
@@ -261,8 +269,13 @@ class ActionFit(LightningModule):
                 prominence=given.prominence, info=data.facts(action),
             )  # fmt: skip
 
+        self._accepted = self._tried()
+
     def accepted(self) -> dict[str, float]:
-        """Share of the held-out postures that pass the gate, by action."""
+        """Share of the held-out postures that pass the gate, by action, of the last fit."""
+        return dict(self._accepted)
+
+    def _tried(self) -> dict[str, float]:
         found = {}
         for action, (space, _) in self.fitted.items():
             watched = [p.postures for p in self._data.watched if p.action == action]
@@ -328,6 +341,10 @@ class ActionFit(LightningModule):
             if action in accepted:
                 line += f"; {100 * accepted[action]:.0f} % of held-out postures pass the gate"
             lines.append(line)
+        if self._data.left_out:
+            lines.append(
+                f"left out {self._data.left_out} repetitions shorter than {LEAST_FRAMES} frames"
+            )
         return "\n".join([*lines, f"wrote {', '.join(map(str, written))}"])
 
     @property

@@ -5,7 +5,7 @@ import warnings
 import pytest
 import torch
 
-from tests.filters.bending_body import BODY, FPS, performance, performances, space
+from tests.filters.bending_body import BODY, performance, performances, space
 from tests.filters.linear_poses import LinearBody, assert_within_error
 from tests.filters.walking_body import HEIGHT, WIDTH, rig
 from torchpose.body.limits import JointLimits
@@ -17,6 +17,7 @@ from torchpose.filters.posture_gate import PostureGate
 from torchpose.filters.redraw import Rows
 from torchpose.filters.sir import SIRParticleFilter
 from torchpose.priors.action_bank import ActionBank
+from torchpose.priors.action_space import ActionInfo, ActionSpace
 from torchpose.priors.postures import state_postures
 
 BEND, WAVE = space("bend"), space("wave")
@@ -72,25 +73,30 @@ def test_the_gate_is_that_of_the_action():
     assert 0.1 < found.double().mean() < 0.9
 
 
-@pytest.mark.parametrize("weights", ["published", "normalised"])
-def test_one_frame_is_the_model_sampled_by_brute_force(weights):
-    """From 16 ancestors that differ in how many draws are accepted.
+@pytest.fixture(scope="module")
+def brute_force():
+    """Sixteen ancestors that differ in how many of their draws belong to the action.
 
-    The oracle draws 2,500 per ancestor without any bound, with the probability of acceptance summed
-    over all postures j instead of a drawn one, and divides by its mean per ancestor, or does not.
+    2,500 draws of each without any bound, with the probability of acceptance summed over all postures
+    j instead of a drawn one.
     """
     before = performance("bend", 3)[12]
     g = generator(7)
     spread = torch.zeros(36, dtype=torch.float64).index_fill(0, torch.tensor([6, 9, 12, 21]), 0.03)
     ancestors = before + spread * torch.randn(16, 36, generator=g, dtype=torch.float64)
-    target = ancestors[:4].mean(0)
     drawn = ancestors[:, None] + STD * torch.randn(16, 2500, 36, generator=g, dtype=torch.float64)
     drawn = drawn.flatten(0, 1)
     z = BEND.project(state_postures(BODY, drawn))
-    inside = torch.stack(
-        [BEND.inside(z, torch.full((len(z),), j)) for j in range(BEND.n_postures)], 1
-    )
+    inside = ((z[:, None] - BEND.performance).abs() < 2 * BEND.std).all(-1)
     accepted = (BEND.log_match(z).softmax(-1) * inside).sum(-1).view(16, -1)
+    return before, ancestors, drawn, accepted
+
+
+@pytest.mark.parametrize("weights", ["published", "normalised"])
+def test_one_frame_is_the_model_sampled_by_brute_force(brute_force, weights):
+    """Redrawing divides by every ancestor's share of accepted draws; normalised weights put it back."""
+    before, ancestors, drawn, accepted = brute_force
+    target = ancestors[:4].mean(0)
     share = accepted.mean(1, keepdim=True)
     assert share.min() < 0.5 * share.max() and share.min() > 0.01
     weight = accepted * near(target)(drawn, None).view(16, -1).exp()
@@ -205,9 +211,9 @@ def test_frame_by_frame_and_alone_it_is_the_same(sequence):
     bank = ActionBank([BEND, WAVE])
     for action in (BEND, bank):
         tracker = ConstrainedParticleFilter(
-            BODY, action, 40, step_std=STD, likelihood="overlap", sharpness=30.0, max_redraws=10
+            BODY, action, 20, step_std=STD, likelihood="overlap", sharpness=30.0, max_redraws=10
         )
-        both = torch.stack([silhouettes[:4], silhouettes[4:8]])
+        both = torch.stack([silhouettes[:3], silhouettes[4:7]])
         start = torch.stack([states[0], states[4]])
         track = tracker(both, RIG, start, [generator(1), generator(2)])
         alone = tracker(both[1], RIG, start[1], [generator(2)])
@@ -216,7 +222,7 @@ def test_frame_by_frame_and_alone_it_is_the_same(sequence):
             assert torch.allclose(track.details[name][1].double(), value.double())
         state = tracker.init(start[1])
         g = [generator(2)]
-        for t in range(4):
+        for t in range(3):
             state, out = tracker.step(state, both[1, t][None], RIG, g)
             assert torch.allclose(out.mean[0], alone.mean[t])
 
@@ -248,60 +254,62 @@ def test_joint_limits_hold_too(sequence):
 # --- several actions
 
 
+def follow(action, states, n_particles, n_seeds):
+    """Details [B, T, ...] of tracks by joints that are seen with noise, each with its own seed."""
+    seen = []
+
+    def log_likelihood(particles, frame):
+        return near(seen[-1])(particles, frame)
+
+    tracker = ConstrainedParticleFilter(
+        BODY, action, n_particles, step_std=motion_noise(), likelihood=log_likelihood,
+        max_redraws=10,
+    )  # fmt: skip
+    generators = [generator(seed) for seed in range(n_seeds)]
+    state, details = tracker.init(states[0].expand(n_seeds, -1), generators), []
+    for seen_now in states[1:]:
+        seen.append(seen_now)
+        state, out = tracker.step(state, FRAME.expand(n_seeds, 1), None, generators)
+        details.append(out.details)
+    return {name: torch.stack([d[name] for d in details], 1) for name in details[0]}
+
+
 @pytest.mark.parametrize("action", ["bend", "wave"])
 def test_a_bank_tells_the_action(action):
-    states = performance(action, 11, 40)[4:22]
-    silhouettes = render(BODY, states[1:], RIG, HEIGHT, WIDTH)
     bank = ActionBank([BEND, WAVE])
-    tracker = ConstrainedParticleFilter(
-        BODY,
-        bank,
-        150,
-        step_std=motion_noise(),
-        likelihood="overlap",
-        sharpness=60.0,
-        max_redraws=10,
-        fps=FPS,
-    )
-    out = tracker(silhouettes, RIG, states[0], generator())
-    posterior = out.details["actions"]
-    assert posterior.shape == (17, 3)
-    assert torch.allclose(posterior.sum(-1), torch.ones(17, dtype=torch.float64))
-    index = bank.names.index(action)
-    assert posterior[8:, index].mean() > 0.5
-    assert out.details["released"][8:].double().mean() < 0.2
+    posterior = follow(bank, performance(action, 11, 40)[4:19], 150, 6)["actions"]
+    assert posterior.shape == (6, 14, 3)
+    assert torch.allclose(posterior.sum(-1), torch.ones(6, 14, dtype=torch.float64))
+    right, wrong = bank.names.index(action), 1 - bank.names.index(action)
+    assert posterior[:, 8:, right].mean() > 0.5 and posterior[:, 8:, wrong].max() < 0.01
 
 
 def test_what_is_none_of_the_actions_is_released():
-    """A bank of waves sees somebody bend."""
-    states = performance("bend", 11, 40)[4:22]
-    silhouettes = render(BODY, states[1:], RIG, HEIGHT, WIDTH)
-    bank = ActionBank([WAVE])
-    tracker = ConstrainedParticleFilter(
-        BODY,
-        bank,
-        150,
-        step_std=motion_noise(),
-        likelihood="overlap",
-        sharpness=60.0,
-        max_redraws=10,
-        fps=FPS,
-    )
-    out = tracker(silhouettes, RIG, states[0], generator())
-    assert out.details["released"][8:].double().mean() > 0.9
-    tracker = ConstrainedParticleFilter(
-        BODY,
-        WAVE,
-        100,
-        step_std=motion_noise(),
-        likelihood="overlap",
-        sharpness=60.0,
-        max_redraws=10,
-    )
+    """Somebody bends, and a bank knows waves only; beside it the gate of waves alone."""
+    states = performance("bend", 11, 40)[6:18]
+    free = follow(ActionBank([WAVE]), states, 40, 4)
+    assert (free["released"][:, 6:].double().mean(1) > 0.9).all()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DegenerateFilterWarning)
-        held = tracker(silhouettes, RIG, states[0], generator())
-    assert out.details["clamped"][8:].mean() < 0.1 < held.details["clamped"][8:].mean()
+        held = follow(WAVE, states, 30, 4)
+    assert free["clamped"][:, 6:].mean() < 0.1 < held["clamped"][:, 6:].mean(1).min()
+
+
+def test_transitions_are_rescaled_to_the_frames_and_repr_says_so():
+    bank = ActionBank([BEND, WAVE])
+    apart = {}
+    for fps in (None, 15.0):
+        tracker = ConstrainedParticleFilter(BODY, bank, 10, fps=fps)
+        actions = torch.zeros(1, 20_000, dtype=torch.long)
+        moved = tracker.gate.next_actions(actions, fps, generator())
+        left = (moved != 0).double().mean()
+        expected = 1 - bank.transition(fps)[0, 0]
+        assert abs(left - expected) < 4 * (expected / 20_000) ** 0.5
+        apart[fps] = left
+    assert apart[15.0] > 1.5 * apart[None]
+    assert "transitions at 15 frames per second, rescaled from 30" in repr(tracker)
+    assert "rescaled" not in repr(ConstrainedParticleFilter(BODY, bank, 10, fps=30.0))
+    assert "transitions" not in repr(ConstrainedParticleFilter(BODY, BEND, 10, fps=15.0))
 
 
 # --- bad input
@@ -335,6 +343,7 @@ def test_a_gate_that_rejects_everything_is_reported():
         ({"weights": "none"}, "weights must be one of published, normalised"),
         ({"velocity_rate": 1.0}, "velocity_rate must be from 0 to below 1"),
         ({"max_redraws": -1}, "max_redraws must be 0 or more"),
+        ({"fps": 0.0}, "fps must be positive"),
         ({"gate_width": 0.0}, "width must be positive"),
         ({"limb_shape": "cones"}, "limb_shape must be one of cylinders, rectangles"),
     ],
@@ -349,6 +358,9 @@ def test_actions_and_bodies_that_do_not_fit():
         ConstrainedParticleFilter(BODY, "bend", 10)
     with pytest.raises(InputError, match="a bank compares motions"):
         ConstrainedParticleFilter(BODY, ActionBank([BEND]), 10, weights="normalised")
+    with pytest.raises(InputError, match="without a frame rate; give fps"):
+        timeless = ActionSpace(**dict(BEND.named_buffers()), info=ActionInfo(name="bend"))
+        ConstrainedParticleFilter(BODY, ActionBank([timeless]), 10)
     with pytest.raises(SkeletonError, match="posture_body of skeleton"):
         other = type("Other", (), {"skeleton": type("S", (), {"name": "stick"})()})()
         PostureGate(BODY, BEND, other)

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -188,6 +189,12 @@ def test_files(bank, spaces, tmp_path):
     postures = some_postures(10)
     assert back.info == bank.info and back.names == bank.names
     assert torch.equal(back.recognise(postures), bank.recognise(postures))
+    bank = ActionBank(spaces)
+    for change, message in (({"names": ("one",)}, "a name for each of 3"), ({"stay": 0.1}, "stay")):
+        bank.info = replace(back.info, **change)
+        bank.save(path)
+        with pytest.raises((FileFormatError, InputError), match=message):
+            ActionBank.load(path)
     spaces[0].save(path)
     with pytest.raises(FileFormatError, match="torchpose-action-bank"):
         ActionBank.load(path)
@@ -217,6 +224,8 @@ def test_bad_input(bank, spaces):
                         ("evidence_rate", math.inf), ("gate_dimensions", 0)):  # fmt: skip
         with pytest.raises(InputError, match=name):
             ActionBank(spaces, **{name: value})
+    with pytest.raises(InputError, match="width must be positive"):
+        bank.inside(torch.zeros(36).double(), torch.tensor(0), torch.tensor(0), width=0.0)
     with pytest.raises(ShapeError, match="36"):
         bank.recognise(torch.zeros(3, 35).double())
     with pytest.raises(InputError, match="at least one frame"):

@@ -193,8 +193,10 @@ def test_bad_input(space):
         (good[:1], "expected two or more, got 1"),
         ([], "expected two or more, got 0"),
         ([good[0][:3], good[1]], "performance 0 has 3 frames, and key frames need at least 8"),
-        ([good[0], good[1] * torch.nan], "postures must be finite"),
-        ([good[0], good[0].clone()], "one and the same"),
+        ([good[0], good[1] * torch.nan], "performance 1 must be finite"),
+        ([good[0], good[0].clone()], "all performances are one and the same"),
+        ([0 * good[0] + 3, 0 * good[1] + 3], "all postures are one and the same"),
+        ([good[0][:3], good[1][:3]], "performance 0 has 3 frames"),  # not that D is reduced
     ):
         with pytest.raises(InputError, match=message):
             ActionSpace.fit(bad)
@@ -203,6 +205,9 @@ def test_bad_input(space):
     for count in (0, -2):
         with pytest.raises(InputError, match=f"n_dimensions must be at least 1, got {count}"):
             ActionSpace.fit(good, count)
+    for fps in (0.0, math.inf):
+        with pytest.raises(InputError, match="fps must be positive"):
+            ActionSpace.fit(good, fps=fps)
     for count in (0, 7):
         with pytest.raises(InputError, match="from 1 to 6 dimensions"):
             space.with_dimensions(count)
@@ -210,11 +215,16 @@ def test_bad_input(space):
         space.project(torch.zeros(2, 35).double())
     with pytest.raises(InputError, match="width"):
         space.inside(torch.zeros(6).double(), torch.tensor(0), width=0.0)
+    with pytest.raises(InputError, match="rounds must be 0 or more"):
+        space.clamp_postures(good[0], torch.zeros(len(good[0])).long(), rounds=-1)
     with pytest.raises(InputError, match="at least one posture"):
         space.acceptance(torch.zeros(0, 36).double())
     buffers = dict(space.named_buffers())
     with pytest.raises(InputError, match="std must be positive"):
         ActionSpace(**{**buffers, "std": 0 * buffers["std"]})
+    with pytest.raises(InputError, match="a performance of none"):
+        none = {name: buffers[name][:0] for name in ("performance", "std")}
+        ActionSpace(**{**buffers, **none})
     with pytest.raises(ShapeError, match="match_std"):
         ActionSpace(**{**buffers, "match_std": buffers["match_std"][:2]})
 

@@ -47,6 +47,7 @@ def test_key_frames_are_the_extrema_that_stand_out():
     assert find_key_frames(torch.arange(9.0)) == (0, 8)
     assert find_key_frames(torch.zeros(9)) == (0, 8)
     assert find_key_frames(torch.tensor([0.0, 1, 0, 1, 0]), prominence=0) == (0, 1, 2, 3, 4)
+    assert find_key_frames(torch.tensor([0.0, 1, 1, 1, 0, 0, 1])) == (0, 3, 5, 6)  # it rests there
 
 
 def test_the_same_motion_at_other_speeds_comes_into_step():
@@ -126,3 +127,8 @@ def test_bad_input():
         split_repetitions(good[0], 0.0)
     with pytest.raises(InputError, match="finite"):
         split_repetitions(good[0] * torch.nan, 30.0)
+    for none in ([], [good[0], good[1][:0]]):
+        with pytest.raises(InputError, match="at least one frame each"):
+            repetition_axis(none)
+    with pytest.raises(ShapeError, match="recording 1"):
+        repetition_axis([good[0], good[1][:, :5]])

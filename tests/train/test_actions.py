@@ -174,7 +174,7 @@ def test_bad_input_is_refused_in_one_line(scene, capsys) -> None:
         (["--data.init_args.persons", "[p9]"], "'p9' is nobody's name"),
         (["--data.init_args.actions", "[hop]"], "no recording of hop; there are action0, action1"),
         (["--data.init_args.actions", "[]"], "actions must be names"),
-        (["--data.init_args.held_out", "[p0, p1, p2, p3]"], "everybody who did it is held out"),
+        (["--data.init_args.held_out", "[p0, p1, p2, p3]"], "there is no performance to learn from"),
         (["--data.init_args.fps", "0"], "fps must be positive"),
         (["--model.init_args.n_dimensions", "0"], "n_dimensions must be at least 1, got 0"),
         (["--data", "train.data.RecordingsDataModule"], "train.actions.ActionData"),
@@ -182,6 +182,7 @@ def test_bad_input_is_refused_in_one_line(scene, capsys) -> None:
         ([*nobody, "--data.init_args.paths", f"['{timeless}']"], "does not say its frame rate"),
         ([*nobody, "--data.init_args.paths", f"['{short}']", "--data.init_args.repeated", "false"],
          "has 3 frames, and key frames need at least 8"),
+        ([*nobody, "--data.init_args.paths", f"['{short}']"], "or no repetition lasts 8 frames"),
         ([*nobody, "--data.init_args.persons", "[p0]", "--data.init_args.repeated", "false"],
          "expected two or more, got 1"),
     ):  # fmt: skip

@@ -24,7 +24,8 @@ from torchpose.filters.silhouette_filter import (
     reweight,
 )
 from torchpose.priors.action_bank import ActionBank
-from torchpose.priors.action_space import GATE_WIDTH, ActionSpace
+from torchpose.priors.action_gate import GATE_WIDTH
+from torchpose.priors.action_space import ActionSpace
 
 __all__ = ["CONSTRAINED_WEIGHTS", "ConstrainedParticleFilter"]
 
@@ -72,7 +73,8 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         weights: "published" or "normalised".
         gate_width: deviations to either side in (AS 6), 2 as published.
         posture_body: see `PostureGate`.
-        fps: of the frames to be tracked, for the bank's transitions; that of its performances if None.
+        fps: of the frames to be tracked, to which a bank's transitions are rescaled (`repr` says from
+            which); that of its performances if None. One action is the same at any frame rate.
         options: as `SilhouetteParticleFilter`; its `likelihood="overlap"` is the published one.
 
     Raises:
@@ -111,6 +113,10 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
                 "a bank compares motions that are normalised under every action, as redrawing does; "
                 "expected weights='published', got 'normalised'"
             )
+        if fps is not None and not 0 < fps < float("inf"):
+            raise InputError(f"fps must be positive and finite, got {fps}")
+        if isinstance(action, ActionBank):
+            action.frame_rate(fps)  # there is one
         self.velocity_rate, self.max_redraws, self.weights = velocity_rate, max_redraws, weights
         self.fps = fps
         self.gate: PostureGate | None = None
@@ -170,6 +176,14 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         state, track = super().step(*args, **options)
         warn_if_rejected(track.details["clamped"][:, None])
         return state, track
+
+    def extra_repr(self) -> str:
+        said = f"{self.n_particles} particles"
+        if self.gate is None or not self.gate.several:
+            return said
+        fitted, fps = self.gate.action.info.fps, self.gate.action.frame_rate(self.fps)
+        rescaled = "" if fitted in (None, fps) else f", rescaled from {fitted:g}"
+        return f"{said}, transitions at {fps:g} frames per second{rescaled}"
 
     # --- helpers
 

@@ -12,7 +12,8 @@ from torchpose.errors import InputError, SkeletonError
 from torchpose.filters.base import Generators, uniform
 from torchpose.filters.redraw import Rows
 from torchpose.priors.action_bank import ActionBank
-from torchpose.priors.action_space import GATE_WIDTH, ActionSpace, match_postures
+from torchpose.priors.action_gate import GATE_WIDTH, check_gate_width, match_postures
+from torchpose.priors.action_space import ActionSpace
 from torchpose.priors.part_postures import PartPostures
 from torchpose.priors.postures import posture_to_state
 
@@ -56,8 +57,7 @@ class PostureGate(nn.Module):
             raise InputError(
                 f"action must be an ActionSpace, an ActionBank or None, got {type(action).__name__}"
             )
-        if not 0 < width < float("inf"):
-            raise InputError(f"the gate's width must be positive, in deviations, got {width}")
+        check_gate_width(width)
         if posture_body is None:
             posture_body = body
         elif posture_body.skeleton != body.skeleton:
@@ -97,8 +97,7 @@ class PostureGate(nn.Module):
         """
         log = self.action.log_likelihood(self.postures(states.flatten(0, 1)))
         log = log.gather(-1, actions.flatten()[:, None]).view(actions.shape).double()
-        rate = self.action.info.fps if fps is None else fps
-        return log * min(1.0, self.action.info.evidence_rate / (rate or 1.0))
+        return log * self.action.evidence_share(fps)
 
     # --- the gate
 

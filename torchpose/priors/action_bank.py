@@ -2,76 +2,29 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from torchpose.errors import InputError, check_finite, check_shape
-from torchpose.priors.action_space import (
+from torchpose.errors import FileFormatError, InputError, check_finite, check_shape
+from torchpose.priors.action_chain import chain_step, chain_transition, check_chain, evidence_share
+from torchpose.priors.action_file import BANK_FILE, BankInfo
+from torchpose.priors.action_gate import (
     CLAMP_ROUNDS,
     GATE_WIDTH,
-    ActionSpace,
+    check_gate_width,
     clamp_in_rounds,
+    clamp_offset,
     match_postures,
 )
-from torchpose.priors.postures import LIMBS_12, POSTURE_DIM, check_limbs
-from torchpose.priors.tensor_file import FileKind, read_tensors, write_tensors
+from torchpose.priors.action_space import ActionSpace
+from torchpose.priors.action_stack import NONE, common_frame_rate, names_of, stack_spaces
+from torchpose.priors.polar_limbs import POSTURE_DIM, check_limbs
+from torchpose.priors.tensor_file import read_tensors, write_tensors
 
 __all__ = ["NONE", "ActionBank", "BankInfo"]
-
-NONE = "none"
-"""Name of the last state: none of the known actions."""
-
-_LEAST_RESIDUAL = 2.0  # degrees, of every direction outside of an action's subspace
-
-
-@dataclass(frozen=True)
-class BankInfo:
-    """What a bank holds, and how sure it is.
-
-    Attributes:
-        names: of the A actions. fps: of their performances. limbs: that the postures are of.
-        persons: ids of all persons. stay: probability of doing the same thing a second later.
-        spread: factor on the deviations of the training persons, for others. background: factor on
-            the deviation of all training postures, for none of the actions. evidence_rate: frames
-            per second that count as independent of each other. gate_dimensions: of the D that the gates
-        look at; None for all.
-        licence: of the data. command: that made it.
-    """
-
-    names: tuple[str, ...] = ()
-    fps: float | None = None
-    limbs: tuple[str, ...] = tuple(limb.name for limb in LIMBS_12)
-    persons: tuple[str, ...] = ()
-    stay: float = 0.8
-    spread: float = 1.0
-    background: float = 1.0
-    evidence_rate: float = 1.0
-    gate_dimensions: int | None = None
-    licence: str = ""
-    command: str = ""
-
-
-_FILE = FileKind(
-    "torchpose-action-bank",
-    1,
-    BankInfo,
-    tensors={
-        "mean": "A 36",
-        "basis": "A 36 D",
-        "performance": "A K D",
-        "std": "A K D",
-        "match_std": "A D",
-        "residual_std": "",
-        "background_mean": "36",
-        "background_axes": "36 36",
-        "background_std": "36",
-    },
-    indices={"n_postures": "A", "n_dimensions": "A"},
-)
 
 
 class ActionBank(nn.Module):
@@ -87,19 +40,14 @@ class ActionBank(nn.Module):
     that the subspaces leave over in a direction, at least (2 degrees)^2, the same for all actions.
     m_0 and C_0 are mean and covariance of the postures of all actions (the mean performances with
     their deviations, each action alike), its deviations multiplied by `background` and none below s:
-    none of the actions is whoever moves as much, but otherwise. Postures of frames that follow each
-    other are no independent evidence: the log-likelihood of a frame is multiplied by
-    min(1, evidence_rate / fps). Actions change as a chain that goes from each state to every other
-    one at the same rate,
-
-        p(A_t = A_{t-1}) = 1/n + (1 - 1/n) e^(-r dt),  n = A + 1,  r such that it is `stay` in a second,
-
-    so that two frames of 1/60 s are as one of 1/30 s.
+    none of the actions is whoever moves as much, but otherwise. Actions change as a chain
+    (`chain_transition`). Postures of frames that follow each other are no independent evidence: the
+    log-likelihood of a frame is multiplied by min(1, evidence_rate / fps).
 
     Args:
         spaces: at least one. stay: above 1/n and below 1. spread, background, evidence_rate: positive.
-        gate_dimensions: of the first so many dimensions the gates are made, all by default. More
-            dimensions than a gate should have tell actions apart better.
+        gate_dimensions: how many of the first dimensions the gates look at; all by default, or if
+            there are fewer. More dimensions than a gate should have tell actions apart better.
 
     Attributes:
         info: names, frame rate and settings.
@@ -139,17 +87,15 @@ class ActionBank(nn.Module):
         gate_dimensions: int | None = None,
     ) -> None:
         super().__init__()
-        names = _names(spaces)
-        if gate_dimensions is not None and gate_dimensions < 1:
-            raise InputError(f"gate_dimensions must be at least 1, got {gate_dimensions}")
-        _check_settings(stay, spread, background, evidence_rate, len(names) + 1)
+        names = names_of(spaces)
         self.info = BankInfo(
-            names, _frame_rate(spaces), spaces[0].info.limbs,
+            names, common_frame_rate(spaces), spaces[0].info.limbs,
             tuple(sorted({p for space in spaces for p in space.info.persons})),
             stay, spread, background, evidence_rate, gate_dimensions,
             "; ".join(dict.fromkeys(s.info.licence for s in spaces if s.info.licence)),
         )  # fmt: skip
-        for name, value in {**_stacked(spaces), **_densities(spaces, background)}.items():
+        _check_settings(self.info)
+        for name, value in stack_spaces(spaces, background).items():
             self.register_buffer(name, value)
 
     @property
@@ -204,6 +150,7 @@ class ActionBank(nn.Module):
         width: float = GATE_WIDTH,
     ) -> Bool[Tensor, "*batch"]:
         """Whether postures lie in the gates of their own actions (AS 6); always for none."""
+        check_gate_width(width)
         z, own = self._own(postures, actions)
         within = (z - self.performance[own, j]).abs() < width * self.std[own, j]
         return within[..., : self._gated].all(-1) | (actions == self.none)
@@ -226,8 +173,7 @@ class ActionBank(nn.Module):
 
         def clamp(angles: Tensor, width: float) -> Tensor:
             z, _ = self._own(angles, actions)
-            reach = (1 - 1e-6) * width * std
-            step = gated * ((z - centre).clamp(-reach, reach) - (z - centre))
+            step = gated * (clamp_offset(z - centre, std, width) - (z - centre))
             return angles + (basis @ step[..., None]).squeeze(-1)
 
         inside = self.inside(postures, actions, j, width)
@@ -256,11 +202,28 @@ class ActionBank(nn.Module):
         Args:
             fps: frames per second; by default that of the performances.
         """
-        n = len(self.names)
-        lasting = (self.info.stay - 1 / n) / (1 - 1 / n)  # e^-r
-        lasting = lasting ** (1 / self._rate(fps))
-        eye = torch.eye(n, dtype=self.mean.dtype, device=self.mean.device)
-        return lasting * eye + (1 - lasting) / n
+        return chain_transition(len(self.names), self.info.stay, self.frame_rate(fps), self.mean)
+
+    def evidence_share(self, fps: float | None = None) -> float:
+        """min(1, evidence_rate / fps), the power to which the likelihood of a frame counts.
+
+        Args:
+            fps: frames per second; by default that of the performances.
+        """
+        return evidence_share(self.info.evidence_rate, self.frame_rate(fps))
+
+    def frame_rate(self, fps: float | None = None) -> float:
+        """The given frame rate, or that of the performances.
+
+        Raises:
+            InputError: not positive, or there is none.
+        """
+        rate = self.info.fps if fps is None else fps
+        if rate is None:
+            raise InputError("the actions were fitted without a frame rate; give fps")
+        if not 0 < rate < math.inf:
+            raise InputError(f"fps must be positive, got {rate:g}")
+        return rate
 
     def start(self) -> Float[Tensor, " S"]:
         """Log-probabilities [A + 1] of the states before the first frame: all alike."""
@@ -272,15 +235,15 @@ class ActionBank(nn.Module):
         postures: Float[Tensor, "*batch 36"],
         fps: float | None = None,
     ) -> Float[Tensor, "*batch S"]:
-        """One frame of the recursion over actions.
-
-            log p(A_t | phi_1:t) = e log p(phi_t | A_t) + log sum p(A_t | A_{t-1}) p(A_{t-1} | ...) + const
+        """One frame of the recursion over actions, see `chain_step`.
 
         Args:
             log_posterior: [..., A + 1], of the frame before. postures: [..., 36], of this frame.
             fps: frames per second; by default that of the performances.
         """
-        return self._step(log_posterior, self.log_likelihood(postures), self._rate(fps))
+        log_likelihood = self.log_likelihood(postures)
+        log_transition = self.transition(fps).log()
+        return chain_step(log_posterior, log_likelihood, log_transition, self.evidence_share(fps))
 
     def recognise(
         self, postures: Float[Tensor, "*batch T 36"], fps: float | None = None
@@ -302,35 +265,36 @@ class ActionBank(nn.Module):
         check_finite("postures", postures, hint="cut out the frames with missing joints")
         if postures.shape[-2] == 0:
             raise InputError("expected at least one frame of postures, got none")
-        rate = self._rate(fps)
+        log_transition, share = self.transition(fps).log(), self.evidence_share(fps)
         log, found = self.start(), []
         for frame in self.log_likelihood(postures).unbind(-2):
-            log = self._step(log, frame, rate)
+            log = chain_step(log, frame, log_transition, share)
             found.append(log)
         return torch.stack(found, -2).exp()
-
-    def _step(self, log: Tensor, log_likelihood: Tensor, rate: float) -> Tensor:
-        moved = (log.unsqueeze(-1) + self.transition(rate).log()).logsumexp(-2)
-        share = min(1.0, self.info.evidence_rate / rate)
-        return (moved + share * log_likelihood).log_softmax(-1)
 
     # --- files ------------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> None:
         """Write it as safetensors; the file appears whole or not at all."""
-        tensors = {n: getattr(self, n) for n in (*_FILE.tensors, *_FILE.indices)}
-        write_tensors(path, _FILE, self.info, tensors)
+        tensors = {n: getattr(self, n) for n in (*BANK_FILE.tensors, *BANK_FILE.indices)}
+        write_tensors(path, BANK_FILE, self.info, tensors)
 
     @classmethod
     def load(cls, path: str | Path) -> "ActionBank":
         """Read what `save` has written.
 
         Raises:
-            InputError: no such file. FileFormatError: damaged, or a file of another kind.
-            SkeletonError: limbs of other names.
+            InputError: no such file, or settings out of range. FileFormatError: damaged, or a file
+                of another kind. SkeletonError: limbs of other names.
         """
-        info, tensors = read_tensors(path, _FILE)
+        info, tensors = read_tensors(path, BANK_FILE)
         check_limbs(info.limbs)
+        if len(info.names) != len(tensors["mean"]):
+            raise FileFormatError(
+                f"{path}: expected a name for each of {len(tensors['mean'])} actions, got "
+                f"{len(info.names)}; fit the bank again"
+            )
+        _check_settings(info)
         bank = cls.__new__(cls)
         nn.Module.__init__(bank)
         bank.info = info
@@ -370,84 +334,14 @@ class ActionBank(nn.Module):
         k = torch.arange(self.performance.shape[1], device=self.performance.device)
         return k < self.n_postures[:, None]
 
-    def _rate(self, fps: float | None) -> float:
-        rate = self.info.fps if fps is None else fps
-        if rate is None:
-            raise InputError("the actions were fitted without a frame rate; give fps")
-        if not 0 < rate < math.inf:
-            raise InputError(f"fps must be positive, got {rate:g}")
-        return rate
-
     def extra_repr(self) -> str:
         return ", ".join(self.names)
 
 
-def _stacked(spaces: Sequence[ActionSpace]) -> dict[str, Tensor]:
-    """The tensors of all actions, padded to the same D and K."""
-    dims = torch.tensor([s.n_dimensions for s in spaces])
-    counts = torch.tensor([s.n_postures for s in spaces])
-    d, k = int(dims.max()), int(counts.max())
-
-    def padded(name: str, fill: float) -> Tensor:
-        parts = []
-        for space in spaces:
-            value = getattr(space, name)
-            missing = [0, d - value.shape[-1]]
-            if name in ("performance", "std"):
-                missing += [0, k - len(value)]
-            parts.append(torch.nn.functional.pad(value, missing, value=fill))
-        return torch.stack(parts)
-
-    device = spaces[0].mean.device
-    return {
-        "mean": torch.stack([s.mean for s in spaces]), "basis": padded("basis", 0.0),
-        "performance": padded("performance", 0.0), "std": padded("std", 1.0),
-        "match_std": padded("match_std", 1.0), "n_postures": counts.to(device),
-        "n_dimensions": dims.to(device),
-    }  # fmt: skip
-
-
-def _densities(spaces: Sequence[ActionSpace], background: float) -> dict[str, Tensor]:
-    """Deviation outside of the subspaces, and the Gaussian of none of the actions."""
-    left = [s.lost_variance / max(POSTURE_DIM - s.n_dimensions, 1) for s in spaces]
-    residual = torch.stack(left).mean().sqrt().clamp_min(_LEAST_RESIDUAL)
-    means = torch.stack([s.mean for s in spaces])
-    centre = means.mean(0)
-    within = torch.stack([(s.basis * s.variances) @ s.basis.mT for s in spaces]).mean(0)
-    between = (means - centre).mT @ (means - centre) / len(spaces)
-    variances, axes = torch.linalg.eigh(within + between)
-    std = torch.maximum(background * variances.clamp_min(0).sqrt(), residual)
-    return {
-        "residual_std": residual, "background_mean": centre, "background_axes": axes.contiguous(),
-        "background_std": std,
-    }  # fmt: skip
-
-
-def _names(spaces: Sequence[ActionSpace]) -> tuple[str, ...]:
-    names = tuple(space.info.name for space in spaces)
-    if not names:
-        raise InputError("a bank needs at least one action space, got none")
-    if len(set(names)) < len(names) or "" in names or NONE in names:
-        raise InputError(
-            f"the actions of a bank need names of their own other than {NONE!r}, got "
-            f"{', '.join(map(repr, names))}; fit each with `name`"
-        )
-    return names
-
-
-def _frame_rate(spaces: Sequence[ActionSpace]) -> float | None:
-    rates = {space.info.fps for space in spaces if space.info.fps is not None}
-    if len(rates) > 1:
-        raise InputError(
-            "the actions of a bank must be fitted at one frame rate, got "
-            f"{', '.join(f'{r:g}' for r in sorted(rates))}; resample the performances"
-        )
-    return next(iter(rates), None)
-
-
-def _check_settings(stay: float, spread: float, background: float, rate: float, n: int) -> None:
-    if not 1 / n < stay < 1:
-        raise InputError(f"stay must lie between 1/{n}, where nothing lasts, and 1, got {stay:g}")
-    for name, value in (("spread", spread), ("background", background), ("evidence_rate", rate)):
-        if not 0 < value < math.inf:
-            raise InputError(f"{name} must be positive, got {value:g}")
+def _check_settings(info: BankInfo) -> None:
+    check_chain(len(info.names) + 1, info.stay, info.evidence_rate)
+    for name in ("spread", "background"):
+        if not 0 < getattr(info, name) < math.inf:
+            raise InputError(f"{name} must be positive, got {getattr(info, name):g}")
+    if info.gate_dimensions is not None and info.gate_dimensions < 1:
+        raise InputError(f"gate_dimensions must be at least 1, got {info.gate_dimensions}")

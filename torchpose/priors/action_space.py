@@ -1,19 +1,29 @@
 """The postures of one action: a principal subspace, a mean performance in it and a tube around it."""
 
-import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchpose.errors import InputError, PriorError, check_finite, check_shape
-from torchpose.priors.postures import LIMBS_12, POSTURE_DIM, check_limbs, normalise_postures
-from torchpose.priors.synchronisation import Synchronised, synchronise
-from torchpose.priors.tensor_file import FileKind, read_tensors, write_tensors
+from torchpose.priors.action_file import SPACE_FILE, ActionInfo
+from torchpose.priors.action_fit import fit_action
+from torchpose.priors.action_gate import (
+    CLAMP_ROUNDS,
+    GATE_WIDTH,
+    Acceptance,
+    check_gate_width,
+    clamp_in_rounds,
+    clamp_offset,
+    match_postures,
+    passes_any_gate,
+)
+from torchpose.priors.polar_limbs import POSTURE_DIM, check_limbs
+from torchpose.priors.synchronisation import Synchronised
+from torchpose.priors.tensor_file import read_tensors, write_tensors
 
 __all__ = [
     "CLAMP_ROUNDS",
@@ -24,72 +34,6 @@ __all__ = [
     "clamp_in_rounds",
     "match_postures",
 ]
-
-GATE_WIDTH = 2.0
-"""Deviations on either side of the matched posture that (AS 6) allows."""
-
-CLAMP_ROUNDS = 10
-"""In which postures are moved into a gate."""
-
-_MARGIN = 0.9  # of the gate, to which postures are clamped in rounds
-_STD_FLOOR = 0.1  # of a dimension's deviation over the whole performance
-_LEAST_STD = 0.1  # degrees
-_SMALLEST_VARIANCE = 1e-10  # of the largest; below it a direction is rounding
-_INSIDE = 1 - 1e-6  # of the gate, to which postures are clamped
-_CHUNK = 4_000_000  # entries of a table of distances
-
-
-@dataclass(frozen=True)
-class ActionInfo:
-    """What an action space was fitted on; fields that are not known are empty.
-
-    Attributes:
-        name: of the action. fps: of the performances. limbs: that the postures are of.
-        performances: how many there were. key_frames: indices of the key postures.
-        explained: share of the variance of the postures that the D dimensions hold.
-        persons: ids. sources: recordings or data sets. licence: of the data. command: that made it.
-        extra: anything else that JSON can hold.
-    """
-
-    name: str = ""
-    fps: float | None = None
-    limbs: tuple[str, ...] = tuple(limb.name for limb in LIMBS_12)
-    performances: int = 0
-    key_frames: tuple[int, ...] = ()
-    explained: float | None = None
-    persons: tuple[str, ...] = ()
-    sources: tuple[str, ...] = ()
-    licence: str = ""
-    command: str = ""
-    extra: dict[str, Any] = field(default_factory=dict)
-
-
-_FILE = FileKind(
-    "torchpose-action-space",
-    1,
-    ActionInfo,
-    tensors={
-        "mean": "36",
-        "basis": "36 D",
-        "performance": "K D",
-        "std": "K D",
-        "match_std": "D",
-        "variances": "D",
-        "lost_variance": "",
-    },
-)
-
-
-class Acceptance(NamedTuple):
-    """Share of postures that the gate lets through, by how j is chosen.
-
-    Attributes:
-        drawn: j drawn from its Gaussian, as in the filter. best: the most likely j. any: any j at all.
-    """
-
-    drawn: float
-    best: float
-    any: float
 
 
 class ActionSpace(nn.Module):
@@ -160,6 +104,10 @@ class ActionSpace(nn.Module):
             raise InputError("an action space needs at least one dimension, got a basis of none")
         check_shape("performance", performance, ["K", d])
         count = len(performance)
+        if count < 1:
+            raise InputError(
+                "an action space needs at least one posture, got a performance of none"
+            )
         given = {
             "mean": (mean, [POSTURE_DIM]), "basis": (basis, [POSTURE_DIM, d]),
             "performance": (performance, [count, d]), "std": (std, [count, d]),
@@ -199,14 +147,14 @@ class ActionSpace(nn.Module):
             info: more facts; name, fps and what the fit finds are filled in.
 
         Raises:
-            InputError: one performance only, one with too few frames, NaN, D not positive.
-            ShapeError: postures of other than 36 angles.
+            InputError: one performance only, one with too few frames, NaN, D or fps not positive,
+                nothing moves. ShapeError: postures of other than 36 angles.
         """
-        space, _ = cls.fit_synchronised(
+        found = fit_action(
             performances, n_dimensions, name=name, fps=fps, n_postures=n_postures,
             prominence=prominence, info=info,
         )  # fmt: skip
-        return space
+        return cls(**found.tensors, info=found.info)
 
     @classmethod
     def fit_synchronised(
@@ -220,37 +168,12 @@ class ActionSpace(nn.Module):
         prominence: float = 0.15,
         info: ActionInfo | None = None,
     ) -> tuple["ActionSpace", Synchronised]:
-        """The same as `fit`, and the performances in the D dimensions before and after being put in
-        step, for pictures."""
-        _check_fit(performances, n_dimensions)
-        postures = torch.cat([p.detach().double() for p in performances])
-        check_finite("postures", postures, hint="cut out the frames with missing joints")
-        mean = postures.mean(0)
-        variances, axes = _principal_axes(postures - mean)
-        rank = int((variances > _SMALLEST_VARIANCE * variances[0]).sum())
-        if n_dimensions > rank:
-            warnings.warn(
-                f"the postures of {name or 'the action'} span {rank} dimensions, fewer than the "
-                f"{n_dimensions} that were asked for: the action space has {rank}",
-                stacklevel=3,
-            )
-        d = min(n_dimensions, rank)
-        axes = axes[:, :rank]
-        projected = [(p.detach().double() - mean) @ axes for p in performances]
-        found = synchronise(projected, n_postures, prominence)
-        found = found._replace(before=found.before[..., :d], after=found.after[..., :d])
-        performance, std = found.after.mean(0), found.after.std(0)
-        match_std = (found.after - performance).square().mean((0, 1)).sqrt().clamp_min(_LEAST_STD)
-        facts = replace(
-            info or ActionInfo(), performances=len(performances), key_frames=found.key_frames,
-            explained=float(variances[:d].sum() / variances.sum()),
+        """The same as `fit`, and the performances before and after being put in step, for pictures."""
+        found = fit_action(
+            performances, n_dimensions, name=name, fps=fps, n_postures=n_postures,
+            prominence=prominence, info=info,
         )  # fmt: skip
-        facts = replace(facts, name=name or facts.name, fps=facts.fps if fps is None else fps)
-        space = cls(
-            mean, axes[:, :d].contiguous(), performance, torch.maximum(std, _STD_FLOOR * match_std),
-            match_std, variances[:d].clone(), variances[d:].sum(), facts,
-        )  # fmt: skip
-        return space, found
+        return cls(**found.tensors, info=found.info), found.synchronised
 
     # --- sizes ------------------------------------------------------------------------------------
 
@@ -327,16 +250,16 @@ class ActionSpace(nn.Module):
         Args:
             z: [..., D]. j: [...]. width: of the gate, in sigma to either side; 2 as published.
         """
-        _check_width(width)
+        check_gate_width(width)
         return ((z - self.performance[j]).abs() < width * self.std[j]).all(-1)
 
     def clamp(
         self, z: Float[Tensor, "*batch D"], j: Int[Tensor, "*batch"], width: float = GATE_WIDTH
     ) -> Float[Tensor, "*batch D"]:
         """The nearest point of the gate of posture j; z itself where it is inside."""
-        _check_width(width)
-        reach = _INSIDE * width * self.std[j]
-        return self.performance[j] + (z - self.performance[j]).clamp(-reach, reach)
+        check_gate_width(width)
+        centre = self.performance[j]
+        return centre + clamp_offset(z - centre, self.std[j], width)
 
     def clamp_postures(
         self,
@@ -381,19 +304,12 @@ class ActionSpace(nn.Module):
         z = self.project(postures)
         if len(z) == 0:
             raise InputError("an acceptance needs at least one posture, got none")
-        somewhere = [
-            self._anywhere(part, width)
-            for part in z.split(max(1, _CHUNK // self.performance.numel()))
-        ]
+        somewhere = passes_any_gate(z, self.performance, self.std, width)
         return Acceptance(
             float(self.inside(z, self.match(z, generator), width).double().mean()),
             float(self.inside(z, self.best_match(z), width).double().mean()),
-            float(torch.cat(somewhere).double().mean()),
+            float(somewhere.double().mean()),
         )
-
-    def _anywhere(self, z: Tensor, width: float) -> Tensor:
-        off = (z[:, None] - self.performance).abs()
-        return (off < width * self.std).all(-1).any(-1)
 
     # --- files ------------------------------------------------------------------------------------
 
@@ -403,7 +319,8 @@ class ActionSpace(nn.Module):
         Raises:
             OutputError: the file cannot be written.
         """
-        write_tensors(path, _FILE, self.info, {name: getattr(self, name) for name in _FILE.tensors})
+        tensors = {name: getattr(self, name) for name in SPACE_FILE.tensors}
+        write_tensors(path, SPACE_FILE, self.info, tensors)
 
     @classmethod
     def load(cls, path: str | Path) -> "ActionSpace":
@@ -413,7 +330,7 @@ class ActionSpace(nn.Module):
             InputError: no such file. FileFormatError: damaged, or a file of another kind.
             SkeletonError: limbs of other names.
         """
-        info, tensors = read_tensors(path, _FILE)
+        info, tensors = read_tensors(path, SPACE_FILE)
         return cls(**tensors, info=info)
 
     def check_for(self, limbs: Sequence[str]) -> None:
@@ -429,66 +346,3 @@ class ActionSpace(nn.Module):
             f"{self.info.name!r}, n_dimensions={self.n_dimensions}, n_postures={self.n_postures}, "
             f"performances={self.info.performances}"
         )
-
-
-def clamp_in_rounds(
-    postures: Float[Tensor, "*batch 36"],
-    inside: Bool[Tensor, "*batch"],
-    clamp: Callable[[Tensor, float], Tensor],
-    width: float,
-    rounds: int,
-) -> Float[Tensor, "*batch 36"]:
-    """Clamp and normalise postures in turn, see `ActionSpace.clamp_postures`.
-
-    Args:
-        postures: [..., 36]. inside: [...], those that stay. clamp: postures to the gate of a width.
-        width: of the gate. rounds: 0 clamps once.
-    """
-    moved = clamp(postures, width) if rounds == 0 else postures
-    for _ in range(rounds):
-        moved = normalise_postures(clamp(moved, _MARGIN * width))
-    return torch.where(inside[..., None], postures, moved)
-
-
-def match_postures(
-    log_weights: Float[Tensor, "*batch K"], uniform: Float[Tensor, "*batch"]
-) -> Int[Tensor, "*batch"]:
-    """An index for every row, drawn by the inverse of its distribution function.
-
-    Args:
-        log_weights: [..., K], of any common factor. uniform: [...], in [0, 1).
-
-    >>> match_postures(torch.tensor([[0.0, 0.0], [0.0, -99.0]]), torch.tensor([0.6, 0.9]))
-    tensor([1, 0])
-    """
-    share = log_weights.softmax(-1).cumsum(-1)
-    place = torch.searchsorted(share, (uniform * share[..., -1])[..., None])
-    return place.squeeze(-1).clamp_max(log_weights.shape[-1] - 1)
-
-
-def _principal_axes(moves: Tensor) -> tuple[Tensor, Tensor]:
-    """Variances [36], falling, and axes [36, 36] with their largest entry positive."""
-    variances, axes = torch.linalg.eigh(moves.mT @ moves / len(moves))
-    variances, axes = variances.flip(0).clamp_min(0), axes.flip(1)
-    largest = axes.gather(0, axes.abs().argmax(0, keepdim=True))
-    return variances, axes * largest.sign()
-
-
-def _check_fit(performances: Sequence[Tensor], n_dimensions: int) -> None:
-    if n_dimensions < 1:
-        raise InputError(f"n_dimensions must be at least 1, got {n_dimensions}")
-    if len(performances) < 2:
-        raise InputError(
-            f"an action space needs the deviation between performances: expected two or more, got "
-            f"{len(performances)}; add recordings, or cut one with `split_repetitions`"
-        )
-    for number, performance in enumerate(performances):
-        check_shape(f"performance {number}", performance, ["T", POSTURE_DIM])
-    first = performances[0].detach().double()
-    if all(torch.equal(first, p.detach().double()) for p in performances[1:]):
-        raise InputError("all performances are one and the same: there is no deviation to learn")
-
-
-def _check_width(width: float) -> None:
-    if not 0 < width < float("inf"):
-        raise InputError(f"the width of the gate must be positive, in sigma, got {width}")

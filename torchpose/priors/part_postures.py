@@ -14,7 +14,8 @@ from torch.nn.functional import normalize
 from torchpose.body.kinematics import Body
 from torchpose.body.skeleton import tree_levels
 from torchpose.errors import check_shape
-from torchpose.priors.postures import LIMBS_12, POSTURE_DIM, state_postures
+from torchpose.priors.polar_limbs import LIMB_PARENTS, LIMBS_12, POSTURE_DIM
+from torchpose.priors.postures import check_body
 
 __all__ = ["PartPostures"]
 
@@ -54,7 +55,7 @@ class PartPostures(nn.Module):
 
     def __init__(self, body: Body, dtype: torch.dtype = torch.float32) -> None:
         super().__init__()
-        state_postures(body, torch.zeros(1, body.dim).to(body.offsets))  # checks the joints
+        check_body(body)
         skeleton = body.skeleton
         ends = [skeleton.joint(limb.end) for limb in LIMBS_12]
         parts = [skeleton.part_of[joint] for joint in ends]
@@ -133,21 +134,19 @@ def _turns(parts: list[int], above: tuple[int, ...]) -> list[_Turn]:
 
 def _carries() -> list[_Turn]:
     """From the root outwards: which limbs each level of limbs carries."""
-    names = [limb.name for limb in LIMBS_12]
-    parents = [names.index(limb.parent) if limb.parent else -1 for limb in LIMBS_12]
     carries = []
-    for level in tree_levels(parents, names):
-        pairs = [(i, a) for i in range(len(names)) for a in _ancestors(i, parents) if a in level]
+    for level in tree_levels(LIMB_PARENTS, [limb.name for limb in LIMBS_12]):
+        pairs = [(i, a) for i in range(len(LIMBS_12)) for a in _ancestors(i) if a in level]
         if pairs:
             carries.append(_Turn([i for i, _ in pairs], [a for _, a in pairs]))
     return carries
 
 
-def _ancestors(i: int, parents: list[int]) -> list[int]:
+def _ancestors(limb: int) -> list[int]:
     found = []
-    while parents[i] >= 0:
-        i = parents[i]
-        found.append(i)
+    while LIMB_PARENTS[limb] >= 0:
+        limb = LIMB_PARENTS[limb]
+        found.append(limb)
     return found
 
 

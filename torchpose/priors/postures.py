@@ -26,12 +26,21 @@ from torchpose.body.kinematics import Body
 from torchpose.body.quaternion_vectors import minimal_rotation, quaternion_vector_to_matrix
 from torchpose.body.skeleton import BODY_15, body_joints, tree_levels
 from torchpose.errors import InputError, ShapeError, SkeletonError, check_finite, check_shape
+from torchpose.priors.polar_limbs import (
+    ANGLE_NAMES,
+    LIMB_PARENTS,
+    LIMBS_12,
+    POSTURE_DIM,
+    PolarLimb,
+    check_limbs,
+)
 
 __all__ = [
     "ANGLE_NAMES",
     "LIMBS_12",
     "POSTURE_DIM",
     "PolarLimb",
+    "check_body",
     "check_limbs",
     "normalise_postures",
     "posture_angles",
@@ -41,58 +50,6 @@ __all__ = [
     "recorded_postures",
     "state_postures",
 ]
-
-Axis = tuple[float, float, float]
-
-
-class PolarLimb(NamedTuple):
-    """A bone whose direction is told in the axes of the limb that it hangs on.
-
-    Attributes:
-        name: of the limb. parent: name of the limb that it hangs on, "" for the root.
-        start, end: names of the joints of `BODY_15` it runs between.
-        straight: direction in the parent's axes at which the axes are carried on unturned.
-        rest: direction in the parent's axes that stands for a joint that is not known.
-    """
-
-    name: str
-    parent: str
-    start: str
-    end: str
-    straight: Axis
-    rest: Axis
-
-
-def _limbs() -> list[tuple[str, str, str, str, Axis, Axis]]:
-    up, down = (0.0, 1.0, 0.0), (0.0, -1.0, 0.0)
-    limbs = [
-        ("torso", "", "pelvis", "neck", up, up),
-        ("head", "torso", "neck", "head", up, up),
-    ]
-    for side, x in (("left", 1.0), ("right", -1.0)):
-        out = (x, 0.0, 0.0)
-        clavicle, arm, forearm = (f"{side}_{kind}" for kind in ("clavicle", "upper_arm", "forearm"))
-        thigh, shank = f"{side}_thigh", f"{side}_shank"
-        shoulder, elbow, wrist = (f"{side}_{kind}" for kind in ("shoulder", "elbow", "wrist"))
-        hip, knee, ankle = (f"{side}_{kind}" for kind in ("hip", "knee", "ankle"))
-        limbs += [
-            (clavicle, "torso", "neck", shoulder, out, out),
-            (arm, clavicle, shoulder, elbow, out, down),
-            (forearm, arm, elbow, wrist, out, out),
-            (thigh, "", hip, knee, down, down),
-            (shank, thigh, knee, ankle, down, down),
-        ]
-    return limbs
-
-
-LIMBS_12 = tuple(PolarLimb(*row) for row in _limbs())
-"""Torso, head, and of either side clavicle (neck to shoulder), upper arm, forearm, thigh, shank."""
-
-POSTURE_DIM = 3 * len(LIMBS_12)
-"""36 angles: those of a limb stand together, about x (left), y (up), z (forward)."""
-
-ANGLE_NAMES = tuple(f"{limb.name} {axis}" for limb in LIMBS_12 for axis in "xyz")
-"""Names of the 36 angles."""
 
 _TINY = 1e-6  # metres or sines: nothing shorter has a direction
 
@@ -185,7 +142,7 @@ def state_postures(body: Body, state: Float[Tensor, "*batch D"]) -> Float[Tensor
     Raises:
         SkeletonError: a body of other joints than those of `BODY_15`.
     """
-    _check_body(body)
+    check_body(body)
     return posture_angles(body.joints(state))
 
 
@@ -251,9 +208,10 @@ def posture_to_state(
     Raises:
         SkeletonError: a body of other joints. ShapeError: other sizes. InputError: not finite.
     """
-    _check_body(body)
+    check_body(body)
     check_shape("postures", postures, ["...", POSTURE_DIM])
-    lead = torch.broadcast_shapes(postures.shape[:-1], root_state.shape[:-1])
+    # not by torch.broadcast_shapes, whose first call imports sympy: a second in the middle of a track
+    lead = torch.broadcast_tensors(postures[..., 0], root_state[..., 0])[0].shape
     states = root_state.expand(*lead, root_state.shape[-1]).reshape(-1, root_state.shape[-1])
     angles = postures.expand(*lead, POSTURE_DIM).reshape(-1, POSTURE_DIM).to(states)
     rotations = body.part_rotations(states)
@@ -267,13 +225,12 @@ def posture_to_state(
     return body.state_of(states[:, :3], rotations).reshape(*lead, body.dim)
 
 
-def check_limbs(names: Sequence[str]) -> None:
-    """Raise `SkeletonError` unless these are the names of `LIMBS_12`, in their order."""
-    expected = [limb.name for limb in LIMBS_12]
-    if list(names) != expected:
+def check_body(body: Body) -> None:
+    """Raise `SkeletonError` unless a body has the joints and parts of `BODY_15`."""
+    if body.skeleton.names != BODY_15.names or body.skeleton.parts != BODY_15.parts:
         raise SkeletonError(
-            f"postures are of the limbs {', '.join(expected)}, in this order; got "
-            f"{', '.join(map(str, names)) or 'none'}"
+            f"postures are of the joints of {BODY_15.name!r}, got a body of "
+            f"{body.skeleton.name!r} with {', '.join(body.skeleton.names)}"
         )
 
 
@@ -345,16 +302,19 @@ class _Level(NamedTuple):
 
 def _level(limbs: Sequence[int], carriers: Sequence[int]) -> _Level:
     """A level, by the carriers of the level before (-1: the root)."""
-    above = [carriers.index(_PARENTS[limb]) for limb in limbs]
-    return _Level(list(limbs), above, [i for i, limb in enumerate(limbs) if limb in _PARENTS])
+    above = [carriers.index(LIMB_PARENTS[limb]) for limb in limbs]
+    return _Level(list(limbs), above, [i for i, limb in enumerate(limbs) if limb in LIMB_PARENTS])
 
 
-_NAMES = [limb.name for limb in LIMBS_12]
-_PARENTS = [_NAMES.index(limb.parent) if limb.parent else -1 for limb in LIMBS_12]
-_LEVELS: list[_Level] = []
-for _depth in tree_levels(_PARENTS, _NAMES):
-    _before = [_LEVELS[-1].limbs[i] for i in _LEVELS[-1].carriers] if _LEVELS else [-1]
-    _LEVELS.append(_level(_depth, _before))
+def _levels() -> list[_Level]:
+    found: list[_Level] = []
+    for limbs in tree_levels(LIMB_PARENTS, [limb.name for limb in LIMBS_12]):
+        before = [found[-1].limbs[i] for i in found[-1].carriers] if found else [-1]
+        found.append(_level(limbs, before))
+    return found
+
+
+_LEVELS = _levels()
 
 
 def _joints(*names: str) -> list[int]:
@@ -387,11 +347,3 @@ def _known(joints: Tensor) -> Tensor:
         )
     all_there = there.all(0)
     return all_there[_STARTS] & all_there[_ENDS]
-
-
-def _check_body(body: Body) -> None:
-    if body.skeleton.names != BODY_15.names or body.skeleton.parts != BODY_15.parts:
-        raise SkeletonError(
-            f"postures are of the joints of {BODY_15.name!r}, got a body of "
-            f"{body.skeleton.name!r} with {', '.join(body.skeleton.names)}"
-        )

@@ -23,10 +23,9 @@ def split_repetitions(
     """Frames of every repetition, from where the motion is nearest to its start to where it is again.
 
     The motion is s, the recording along an axis, smoothed, with its two ends (the 10 and 90 %
-    quantiles) at 0 and 1. It is away once s passes 0.75 and back
-    once it falls below 0.6. A performance begins and ends where s is least between two times away; the
-    first begins, and the last ends, as long from its middle as it takes on its other side, so that
-    getting ready is left out.
+    quantiles) at 0 and 1. It is away once s passes 0.75 and back once it falls below 0.6. A performance
+    begins and ends where s is least between two times away; the first begins, and the last ends, as long
+    from its middle as it takes on its other side, so that getting ready is left out.
 
     Args:
         postures: [T, Q], or any other columns that show the motion, finite.
@@ -71,8 +70,16 @@ def repetition_axis(recordings: Sequence[Float[Tensor, "_ Q"]]) -> Float[Tensor,
     """The first principal axis of recordings, pointing away from where they start.
 
     Args:
-        recordings: [T_r, Q] each, of one action.
+        recordings: [T_r, Q] each, of one action, finite.
+
+    Raises:
+        InputError: no recording, one without frames, or not finite. ShapeError: other columns.
     """
+    if not recordings or not all(map(len, recordings)):
+        raise InputError("an axis needs recordings with at least one frame each, got one of none")
+    for number, recording in enumerate(recordings):
+        check_shape(f"recording {number}", recording, ["T", recordings[0].shape[-1]])
+        check_finite(f"recording {number}", recording)
     postures = torch.cat([r.double() for r in recordings])
     middle = postures.mean(0)
     axis = torch.linalg.eigh((postures - middle).mT @ (postures - middle))[1][:, -1]

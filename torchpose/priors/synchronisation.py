@@ -18,6 +18,7 @@ from torchpose.errors import InputError, check_finite, check_shape
 __all__ = [
     "LEAST_FRAMES",
     "Synchronised",
+    "checked_performances",
     "find_key_frames",
     "match_key_frames",
     "natural_spline",
@@ -63,7 +64,7 @@ def synchronise(
     Raises:
         InputError: no performance, one that is too short, NaN. ShapeError: other columns.
     """
-    parts = _checked(performances)
+    parts = checked_performances(performances)
     if n_postures is None:
         n_postures = int(torch.tensor([len(p) for p in parts]).median())
     if n_postures < LEAST_FRAMES:
@@ -79,8 +80,29 @@ def synchronise(
                 f"at least {len(keys)}; leave it out, or raise `prominence` for fewer key frames"
             )
     times = torch.stack([_times(match_key_frames(p, mean[list(keys)]), keys) for p in parts])
+    times = times.to(mean)
     after = torch.stack([natural_spline(p, t) for p, t in zip(parts, times, strict=True)])
     return Synchronised(before, after, keys, times)
+
+
+def checked_performances(performances: Sequence[Float[Tensor, "_ R"]]) -> list[Tensor]:
+    """Performances in double precision, if they can be put in step.
+
+    Raises:
+        InputError: none at all, one that is too short, NaN. ShapeError: other columns than the first.
+    """
+    if not len(performances):
+        raise InputError("expected performances of an action, got none")
+    columns = performances[0].shape[-1] if performances[0].ndim else 0
+    for number, part in enumerate(performances):
+        check_shape(f"performance {number}", part, ["T", columns])
+        if len(part) < LEAST_FRAMES:
+            raise InputError(
+                f"performance {number} has {len(part)} frames, and key frames need at least "
+                f"{LEAST_FRAMES}; leave it out, or record at a higher frame rate"
+            )
+        check_finite(f"performance {number}", part, hint="cut out the frames with gaps")
+    return [part.detach().double() for part in performances]
 
 
 def natural_spline(
@@ -125,7 +147,8 @@ def find_key_frames(distance: Float[Tensor, " K"], prominence: float = 0.15) -> 
     if not 0 <= prominence <= 1:
         raise InputError(f"prominence must lie between 0 and 1, got {prominence:g}")
     slope = distance.diff().sign()
-    turns = torch.nonzero(slope[1:] * slope[:-1] < 0).flatten() + 1
+    moving = torch.nonzero(slope).flatten()  # where it rests, it turns when it moves on
+    turns = moving[1:][slope[moving].diff() != 0]
     keys = [0, *turns.tolist(), len(distance) - 1]
     least = prominence * float(distance.max() - distance.min())
     heights = distance.tolist()
@@ -203,18 +226,3 @@ def _times(matched: Sequence[int], keys: Sequence[int]) -> Tensor:
     after = torch.searchsorted(place, k).clamp_min(1)
     share = (k - place[after - 1]) / (place[after] - place[after - 1])
     return frames[after - 1] + share * (frames[after] - frames[after - 1])
-
-
-def _checked(performances: Sequence[Tensor]) -> list[Tensor]:
-    if not len(performances):
-        raise InputError("expected performances of an action, got none")
-    columns = performances[0].shape[-1] if performances[0].ndim else 0
-    for number, part in enumerate(performances):
-        check_shape(f"performance {number}", part, ["T", columns])
-        if len(part) < LEAST_FRAMES:
-            raise InputError(
-                f"performance {number} has {len(part)} frames, and key frames need at least "
-                f"{LEAST_FRAMES}; leave it out, or record at a higher frame rate"
-            )
-        check_finite(f"performance {number}", part, hint="cut out the frames with gaps")
-    return [part.detach().double() for part in performances]

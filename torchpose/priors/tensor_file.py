@@ -23,6 +23,7 @@ from torchpose.io.files import atomic_path, require_file
 
 __all__ = [
     "FileKind",
+    "format_of",
     "info_from_json",
     "info_to_json",
     "read_tensors",
@@ -118,6 +119,21 @@ def read_tensors(path: str | Path, kind: FileKind[Info]) -> tuple[Info, dict[str
     except TorchposeError as error:
         raise type(error)(f"{path}: {error}") from error
     return info, tensors
+
+
+def format_of(path: str | Path) -> str | None:
+    """Name of a file's kind, `FileKind.format`, or None if `write_tensors` did not make it.
+
+    Raises:
+        InputError: no such file.
+    """
+    try:
+        with safe_open(require_file(path), framework="pt") as file:
+            header = json.loads((file.metadata() or {}).get(_HEADER, "null"))
+    except (SafetensorError, OSError, ValueError, RuntimeError):
+        return None
+    found = header.get("format") if isinstance(header, dict) else None
+    return found if isinstance(found, str) else None
 
 
 def require_tensor(path: str | Path, tensors: Mapping[str, Tensor], key: str) -> Tensor:

@@ -55,7 +55,7 @@ def plot_particles(runs: BendRuns, title: str = "Error over the number of partic
     styles = method_styles(list(LABELS.values()))
     numbers = sorted({variant.particles for variant in runs})
     panels = (
-        ("mean squared error of the angles (degrees²)", mean_squared),
+        ("MSE of the angles (degrees²)", mean_squared),
         ("error of the root (mm)", root_error),
         ("error of the joints (mm)", joint_error),
     )
