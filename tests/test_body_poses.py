@@ -42,6 +42,28 @@ def test_what_is_saved_is_loaded(tmp_path, frame):
     assert after.body.frame == frame
 
 
+def test_details_are_saved_by_their_names(tmp_path):
+    before = poses()
+    before.details = {"actions": torch.rand(4, 3), "released": torch.tensor([True, False] * 2)}
+    before.action_names = ("bend", "wave", "none")
+    before.save(tmp_path / "body.npz")
+    with np.load(tmp_path / "body.npz") as file:
+        assert file["detail_released"].tolist() == [True, False, True, False]
+        arrays = dict(file)
+    after = BodyPoses.load(tmp_path / "body.npz")
+    assert after.action_names == before.action_names
+    assert after.details.keys() == before.details.keys()
+    for name, value in before.details.items():
+        assert torch.equal(after.details[name], value)
+    np.savez(tmp_path / "short.npz", **(arrays | {"detail_released": np.zeros(3, dtype=bool)}))
+    with pytest.raises(FileFormatError, match="detail_released of 4 frames"):
+        BodyPoses.load(tmp_path / "short.npz")
+    # files of before there were details
+    old = {k: v for k, v in arrays.items() if not k.startswith(("detail_", "action_names"))}
+    np.savez(tmp_path / "old.npz", **old)
+    assert BodyPoses.load(tmp_path / "old.npz").details == {}
+
+
 def test_joints_in_the_axes_of_a_camera():
     before = poses()
     camera = PinholeCamera(

@@ -8,9 +8,16 @@ from torchpose.body import BODY_15, Body, render
 from torchpose.body_tracking import joint_covariance, track_body
 from torchpose.camera import PinholeCamera
 from torchpose.camera_rig import CameraRig
-from torchpose.errors import InputError
-from torchpose.filters import AnnealedParticleFilter, SIRParticleFilter
+from torchpose.errors import InputError, ShapeError
+from torchpose.filters import (
+    AnnealedParticleFilter,
+    RootUncertaintyTracker,
+    SilhouetteParticleFilter,
+    SIRParticleFilter,
+)
+from torchpose.filters.joint_spread import joint_covariance_with_parts
 from torchpose.filters.silhouette_filter import BodyFilterState
+from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +70,82 @@ def test_covariance_of_joints_is_that_of_the_particles(scene):
             away = body.joints(particles[b, n])[j].numpy() - centre
             expected += math.exp(float(log_weights[b, n])) * np.outer(away, away)
         np.testing.assert_allclose(found[b, j], expected, atol=1e-12)
+
+
+def uncertain_parts():
+    """Two persons' hypotheses with a Gaussian per part, in a body of odd centres."""
+    g = torch.Generator().manual_seed(4)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    centres = 0.3 * normal(11, 3)
+    centres[0] = 0
+    body = Body.of_height(BODY_15, 1.75).altered(frame="body", centres=centres)
+    particles = 0.1 * normal(2, 4, body.dim)
+    log_weights = normal(2, 4).log_softmax(-1)
+    factor = 0.04 * normal(2, 4, 10, 3, 3)
+    mean = particles[:, 1]
+    state = BodyFilterState(
+        particles, log_weights, mean, torch.zeros(2, dtype=torch.long), factor @ factor.mT
+    )
+    return body, state, factor, mean
+
+
+def test_covariance_of_joints_has_that_within_hypotheses():
+    body, state, factor, mean = uncertain_parts()
+    found = joint_covariance_with_parts(body, state, state.memory, mean)
+    assert torch.equal(found, found.mT)
+    # by Monte Carlo: every part of every hypothesis drawn many times
+    g, draws = torch.Generator().manual_seed(5), 6000
+    noise = torch.randn(draws, 4, 10, 3, 1, generator=g, dtype=torch.float64)
+    for b in range(2):
+        drawn = state.particles[b].expand(draws, -1, -1).clone()
+        drawn[..., 6:] += (factor[b] @ noise).flatten(-3)
+        away = (body.joints(drawn) - body.joints(mean[b])).numpy()
+        weights = state.log_weights[b].exp().numpy() / draws
+        expected = np.einsum("n,snji,snjk->jik", weights, away, away)
+        scale = np.trace(expected, axis1=1, axis2=2)[:, None, None]
+        np.testing.assert_allclose(found[b].numpy() / scale, expected / scale, atol=0.03)
+    between = joint_covariance(body, state, mean)
+    more = (found - between).diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+    wrist = BODY_15.joint("left_wrist")
+    assert bool((more[:, wrist] > 0.02).all())  # metres: limbs are as uncertain as that
+    assert float(more[:, BODY_15.joint("pelvis")].max()) < 1e-9
+
+
+def test_without_spread_within_they_are_the_particles_alone():
+    body, state, _, mean = uncertain_parts()
+    nothing = torch.zeros_like(state.memory)
+    torch.testing.assert_close(
+        joint_covariance_with_parts(body, state, nothing, mean), joint_covariance(body, state, mean)
+    )
+    upright = body.altered(frame="parent")
+    with pytest.raises(InputError, match="frame='body', got 'parent'"):
+        joint_covariance_with_parts(upright, state, nothing, mean)
+    with pytest.raises(ShapeError, match="covariances"):
+        joint_covariance_with_parts(body, state, nothing[:, :, :9], mean)
+
+
+def test_the_root_tracker_tells_the_covariance_of_both(scene, monkeypatch):
+    upright, rig, states, silhouettes = scene
+    g = torch.Generator().manual_seed(0)
+    moves = 0.1 * torch.randn(40, upright.dim, generator=g, dtype=torch.float64)
+    body, recorded = in_body_frame([(upright, [moves])])
+    model = RootUncertaintyTracker(body, LimbConditionals.fit(body, recorded, 60.0), 8, fps=60.0)
+    start = upright.convert(states[0], body)
+
+    def covariance():
+        seed = torch.Generator().manual_seed(1)
+        return track_body(model, iter(silhouettes[:2]), rig, start, seed).covariance3d
+
+    both = covariance()
+    monkeypatch.setattr(
+        RootUncertaintyTracker, "joint_covariance", SilhouetteParticleFilter.joint_covariance
+    )
+    more = (both - covariance()).diagonal(dim1=-2, dim2=-1).sum(-1)
+    assert bool((more[:, BODY_15.joint("right_ankle")] > 1e-5).all())
+    assert bool((torch.linalg.eigvalsh(both) > -1e-12).all())
 
 
 def test_bad_input_is_refused(scene):

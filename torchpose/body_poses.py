@@ -26,6 +26,7 @@ _FRAMES = (
     "coasting",
     "respread",
 )
+_DETAIL = "detail_"  # of the keys of what only some filters report
 _BODY = ("bone_lengths", "offsets", "tips", "radii", "centres")
 
 
@@ -37,11 +38,15 @@ class BodyPoses:
         body: whose states they are.
         state: [T, D], the estimates. state_std: [T, D], in the units of a step (`Body.difference`).
         joints3d: [T, J, 3], joints of the estimates, metres, world axes.
-        covariance3d: [T, J, 3, 3], second moment of the particles' joints about them, metres squared.
+        covariance3d: [T, J, 3, 3], second moment of the particles' joints about them, metres squared;
+            with the Gaussians within particles, of a filter that has them.
         log_evidence, effective_sample_size: [T]. coasting: [T], True where no camera saw the person.
         respread: [T], True where all particles had died and were spread about the last estimate.
         fps: frames per second, or None. notes: what was assumed, in plain words.
         first_frame: of the videos, that of the first pose.
+        details: what only some filters report, by name, [T, ...] each (`BodyTrack.details`): of
+            `ConstrainedParticleFilter` "acceptance", "clamped", "actions" and so on.
+        action_names: of the columns of ``details["actions"]``.
     """
 
     body: Body
@@ -56,6 +61,8 @@ class BodyPoses:
     fps: float | None = None
     notes: tuple[str, ...] = field(default_factory=tuple)
     first_frame: int = 0
+    details: dict[str, Tensor] = field(default_factory=dict)
+    action_names: tuple[str, ...] = field(default_factory=tuple)
 
     def __len__(self) -> int:
         return len(self.state)
@@ -67,7 +74,8 @@ class BodyPoses:
 
     def save(self, path: str | Path) -> None:
         """Write an .npz: what holds for each frame, `names`, `fps` (NaN if unknown), `notes`,
-        `first_frame`, and the body as `body_bone_lengths`, `body_radii` and so on.
+        `first_frame`, `action_names`, details as `detail_acceptance` and so on, and the body as
+        `body_bone_lengths`, `body_radii` and so on.
 
         Raises:
             OutputError: the file cannot be written.
@@ -76,6 +84,9 @@ class BodyPoses:
             name: getattr(self, name).detach().cpu().numpy() for name in _FRAMES
         }
         arrays |= {f"body_{n}": getattr(self.body, n).detach().cpu().numpy() for n in _BODY}
+        for name, value in self.details.items():
+            arrays[_DETAIL + name] = value.detach().cpu().numpy()
+        arrays["action_names"] = np.array(self.action_names, dtype=str)
         arrays["body_skeleton"] = np.array(self.body.skeleton.name)
         arrays["body_frame"] = np.array(self.body.frame)
         arrays["names"] = np.array(self.names)
@@ -89,9 +100,21 @@ class BodyPoses:
         """Read what `save` wrote.
 
         Raises:
-            InputError: no such file. FileFormatError: not such poses. SkeletonError: another skeleton.
+            InputError: no such file. FileFormatError: not such poses, or details of other frames.
+            SkeletonError: another skeleton.
         """
         arrays = read_npz(path, (*_FRAMES, "fps", "notes", "first_frame"))
+        details = {
+            key.removeprefix(_DETAIL): torch.from_numpy(value)
+            for key, value in arrays.items()
+            if key.startswith(_DETAIL)
+        }
+        for name, value in details.items():
+            if value.ndim < 1 or len(value) != len(arrays["state"]):
+                raise FileFormatError(
+                    f"{path}: expected {_DETAIL}{name} of {len(arrays['state'])} frames, got the "
+                    f"sizes {list(value.shape)}"
+                )
         fps = float(arrays["fps"])
         return cls(
             load_body(path),
@@ -99,6 +122,8 @@ class BodyPoses:
             fps=None if np.isnan(fps) else fps,
             notes=tuple(str(n) for n in arrays["notes"]),
             first_frame=int(arrays["first_frame"]),
+            details=details,
+            action_names=tuple(str(n) for n in arrays.get("action_names", ())),
         )
 
     def seen_by(self, camera: PinholeCamera) -> "CameraPoses":

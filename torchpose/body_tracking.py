@@ -13,7 +13,8 @@ from torchpose.camera_rig import Cameras
 from torchpose.errors import InputError
 from torchpose.filters.base import Generators
 from torchpose.filters.body_particles import stack_tracks
-from torchpose.filters.silhouette_filter import BodyFilterState, SilhouetteParticleFilter
+from torchpose.filters.joint_spread import joint_covariance
+from torchpose.filters.silhouette_filter import SilhouetteParticleFilter
 
 __all__ = ["joint_covariance", "track_body"]
 
@@ -42,7 +43,8 @@ def track_body(
         progress: whether to show it.
 
     Returns:
-        `BodyPoses` of as many frames as came.
+        `BodyPoses` of as many frames as came, with the covariances that the filter gives their joints
+        (`SilhouetteParticleFilter.joint_covariance`).
 
     Raises:
         InputError: no frame, or a filter without a body. CameraError, ShapeError: as the filter.
@@ -53,20 +55,12 @@ def track_body(
     for silhouettes in tqdm(frames, total=n_frames, disable=not progress, unit="frame"):
         state, out = model.step(state, silhouettes[None], cameras, generator)
         steps.append(out)
-        covs.append(joint_covariance(model.body, state, out.mean)[0])
+        covs.append(model.joint_covariance(state, out.mean)[0])
     if not steps:
         raise InputError("there must be at least one frame of silhouettes, got none")
     track = stack_tracks(steps).element(0)
     return BodyPoses(
         model.body, track.mean, track.std, model.body.joints(track.mean), torch.stack(covs),
         track.log_evidence, track.effective_sample_size, track.coasting, track.respread, fps,
+        details=track.details,
     )  # fmt: skip
-
-
-def joint_covariance(
-    body: Body, state: BodyFilterState, mean: Float[Tensor, "B D"]
-) -> Float[Tensor, "B J 3 3"]:
-    """Second moment of the particles' joints about those of an estimate, metres squared."""
-    away = body.joints(state.particles) - body.joints(mean)[:, None]
-    weights = state.log_weights.exp().to(away)
-    return torch.einsum("bn,bnji,bnjk->bjik", weights, away, away)

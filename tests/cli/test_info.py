@@ -1,11 +1,24 @@
 """`torchpose info`: every kind of file, and what is none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 
 from tests.cli.conftest import keypoints
+from torchpose.body import BODY_15, Body
+from torchpose.body_poses import BodyPoses
 from torchpose.camera import PinholeCamera
 from torchpose.io import write_keypoints
+from torchpose.priors import (
+    ActionBank,
+    ActionInfo,
+    ActionSpace,
+    BackConstrainedGPLVM,
+    ManifoldInfo,
+)
+from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
 
 
 def test_installation(torchpose):
@@ -51,6 +64,59 @@ def test_recordings_and_cameras(torchpose, files, tmp_path):
     PinholeCamera(600, 610, 330, 250, name="door").save(tmp_path / "cameras.toml")
     done = torchpose("info", tmp_path / "cameras.toml")
     assert done.out == "door  f = (600, 610), centre (330, 250) pixels\n"
+
+
+def test_what_body_trackers_learn(torchpose, tmp_path):
+    g = torch.Generator().manual_seed(0)
+    body = Body.of_height(BODY_15, 1.75)
+    states = 0.1 * torch.randn(60, body.dim, generator=g, dtype=torch.float64)
+    about = {"name": "walk", "persons": ("set#p1", "set#p2"), "licence": "free"}
+    own, moved = in_body_frame([(body, [states])])
+    limbs = LimbConditionals.fit(own, moved, 60.0, **about).at_rate(30.0)
+    held_out = {"frames": 7, "deviation": 1.25, "speed": 2.0}
+    limbs.info = replace(limbs.info, extra={"held_out": held_out})
+    limbs.save(tmp_path / "limbs.safetensors")
+    wave = torch.linspace(0, 6, 40, dtype=torch.float64)[:, None].sin()
+    turns = 30 * torch.rand(5, 1, 36, generator=g, dtype=torch.float64)
+    spaces = [
+        ActionSpace.fit([wave * k * turn for turn in turns], 3, name=name, fps=30.0,
+                        info=ActionInfo(persons=("set#p1",), extra={"accepted": 0.5}))
+        for name, k in (("bend", 1.0), ("wave", -0.5))
+    ]  # fmt: skip
+    spaces[0].save(tmp_path / "bend.safetensors")
+    ActionBank(spaces, gate_dimensions=2).save(tmp_path / "bank.safetensors")
+    manifold = BackConstrainedGPLVM.fit(
+        body.relative(states), steps=1, info=ManifoldInfo.of_body(body, **about)
+    )
+    manifold.save(tmp_path / "manifold.safetensors")
+    expected = {
+        "limbs": ("walk", "30, learnt at 60", "left_shank on left_thigh:", "2: set#p1, set#p2",
+                  "7 frames, whose limbs deviate 1.25 times", "--method root"),
+        "bend": ("bend", "3, ", "5", "lets 50 % of held-out postures through", "1: set#p1"),
+        "bank": ("2 actions", "bend: 3 dimensions", "wave: 3 dimensions", "first 2 dimensions", "30"),
+        "manifold": ("walk", "2 dimensions", "60 frames of 30 columns", "not fitted yet", "free"),
+    }  # fmt: skip
+    for name, parts in expected.items():
+        done = torchpose("info", tmp_path / f"{name}.safetensors")
+        assert done.code == 0, done.err
+        for part in parts:
+            assert part in done.out, (name, part)
+
+
+def test_poses_of_a_whole_body(torchpose, tmp_path):
+    body = Body.of_height(BODY_15, 1.7, "body")
+    states = torch.zeros(4, body.dim, dtype=torch.float64)
+    nothing = torch.zeros(4)
+    BodyPoses(
+        body, states, states, body.joints(states), 0.01 * torch.eye(3).expand(4, 15, 3, 3),
+        nothing, nothing, nothing > 0, nothing > 0, 25.0, ("a note",), 3,
+        {"actions": torch.eye(2)[[0, 0, 0, 1]]}, ("bend", "none"),
+    ).save(tmp_path / "body.npz")  # fmt: skip
+    done = torchpose("info", tmp_path / "body.npz")
+    assert done.code == 0, done.err
+    for part in ("4 (0.2 s at 25 fps) from frame 3", "1.70 m, rotations against the root",
+                 "bend 3-5, none 6-6", "left_wrist 17.3", "a note"):  # fmt: skip
+        assert part in done.out, part
 
 
 def test_config(torchpose, files, tmp_path):

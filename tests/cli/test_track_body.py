@@ -1,3 +1,6 @@
+from dataclasses import replace
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +12,12 @@ from torchpose.body_poses import BodyPoses
 from torchpose.camera import PinholeCamera, save_cameras
 from torchpose.camera_rig import CameraRig
 from torchpose.cli import main
-from torchpose.priors import BackConstrainedGPLVM, ManifoldInfo
+from torchpose.cli.track_body import _initial_state, build
+from torchpose.cli.track_body_models import check_method, load_model
+from torchpose.cli.track_body_output import action_text, gate_notes
+from torchpose.priors import ActionBank, ActionSpace, BackConstrainedGPLVM, ManifoldInfo
+from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
+from torchpose.priors.postures import state_postures
 from torchpose.video import VideoWriter
 
 HEIGHT, WIDTH, N = 120, 160, 8
@@ -127,7 +135,16 @@ def test_nobody_there_is_said(recorded, tmp_path, capsys):
     ("more", "said"),
     [
         (["--method", "mrpf"], "needs --manifold"),
-        (["--method", "ekf"], "mrpf, apf, sir"),
+        (["--method", "ekf"], "mrpf, apf, sir, root, constrained"),
+        (["--method", "root"], "--method root needs --conditionals FILE, limb conditionals"),
+        (["--method", "constrained"], "needs --action FILE, an action space"),
+        (["--method", "sir", "--action", "a"], "leave it out or take --method constrained"),
+        (["--method", "constrained", "--action", "a", "--conditionals", "b"], "take --method root"),
+        (["--manifold", "a", "--conditionals", "b"], "choose by --method mrpf|root"),
+        (["--conditionals", "a", "--sharpness", "9"], "--sharpness does nothing for --method root"),
+        (["--conditionals", "a", "--n-particles", "6"], "at least 7"),
+        (["--conditionals", "nowhere.safetensors"], "nowhere.safetensors: no such file"),
+        (["--action", "nowhere.safetensors"], "nowhere.safetensors: no such file"),
         (["--delays", "[1,2]"], "one entry for each"),
         (["--height", "-1"], "--height"),
         (["--camera-names", "[front,left]"], "a camera for each of the 3 videos"),
@@ -168,3 +185,151 @@ def test_a_manifold_of_the_motion(recorded, tmp_path, capsys):
     assert float(errors.mean()) < 0.08
     assert main(arguments(folder, out, *given, str(tmp_path / "slow.safetensors"))) == 2
     assert "30 frames per second" in capsys.readouterr().err
+
+
+def limbs_of_rising_arms(body, fps=60.0):
+    """Conditionals of arms that rise faster or slower, with legs that move a little."""
+    g = torch.Generator().manual_seed(0)
+    recorded = []
+    for pace in (1.0, 0.7):
+        states = arms_rise(body)
+        states[:, 6:] = pace * states[:, 6:] + 0.05 * torch.randn(
+            N, body.dim - 6, generator=g, dtype=torch.float64
+        )
+        recorded.append(states)
+    body, states = in_body_frame([(body, recorded)])
+    return LimbConditionals.fit(body, states, fps, name="arms")
+
+
+def bank_of_arms(body):
+    """Arms that rise, and arms that swing forwards."""
+    spaces = []
+    for name, column, sway in (("rise", 2, 6), ("swing", 0, 7)):
+        performances = []
+        for person in range(4):
+            phase = torch.linspace(0, np.pi, 30, dtype=torch.float64).sin()
+            states = arms_rise(body)[:1].expand(30, -1).clone()
+            states[:, sway] = 0.02 * (-1) ** person * phase.square()
+            for side, sign in (("left", 1.0), ("right", -1.0)):
+                part = 3 + 3 * body.skeleton.part(f"{side}_upper_arm")
+                states[:, part : part + 3] = 0.0
+                states[:, part + column] = (sign if column == 2 else -1.0) * (
+                    0.05 + (0.4 + 0.02 * person) * phase
+                )
+            performances.append(state_postures(body, states))
+        spaces.append(ActionSpace.fit(performances, 2, name=name, fps=30.0))
+    return ActionBank(spaces)
+
+
+def test_hypotheses_of_the_root(recorded, tmp_path, capsys):
+    folder, body, states = recorded
+    conditionals = limbs_of_rising_arms(body, 30.0)
+    conditionals.save(tmp_path / "limbs.safetensors")
+    given = ["--initial-pose", str(folder / "start.npz"), "--body", str(folder / "start.npz"),
+             "--overlay", "false", "--n-particles", "140",
+             "--conditionals", str(tmp_path / "limbs.safetensors")]  # fmt: skip
+    assert main(arguments(folder, tmp_path / "out", *given)) == 0
+    said = capsys.readouterr().out
+    assert "root, 140 particles\n" in said
+    assert "learnt at 30 frames per second and rescaled to 60" in said
+    poses = BodyPoses.load(tmp_path / "out" / "body.npz")
+    assert poses.body.frame == "body"
+    assert torch.equal(poses.body.centres, conditionals.centres)
+    torch.testing.assert_close(poses.body.joints(poses.state), poses.joints3d)
+    errors = (poses.joints3d - body.joints(states)).norm(dim=-1)
+    assert float(errors.mean()) < 0.08
+    assert poses.notes[-1].endswith("rescaled to 60")
+    assert (tmp_path / "out" / "overlay.png").exists()
+    # a person whose body is in this frame is tracked by others in theirs
+    args = build().parse_args(
+        arguments(folder, tmp_path, "--body", str(tmp_path / "out" / "body.npz"))[1:]
+    )
+    check_method(args)
+    plain = load_model(args)
+    assert plain.body.frame == "parent"
+    assert not bool(plain.body.centres.any())
+
+
+def test_the_constraint_of_actions_is_reported(recorded, tmp_path, capsys):
+    folder, body, states = recorded
+    bank_of_arms(body).save(tmp_path / "arms.safetensors")
+    given = ["--initial-pose", str(folder / "start.npz"), "--body", str(folder / "start.npz"),
+             "--overlay", "false", "--pictures", "false", "--action",
+             str(tmp_path / "arms.safetensors")]  # fmt: skip
+    assert main(arguments(folder, tmp_path / "out", *given)) == 0
+    said = capsys.readouterr().out
+    assert "constrained, 300 particles, sharpness 30" in said
+    assert "rescaled to 60" in said and "of the first draws through" in said
+    poses = BodyPoses.load(tmp_path / "out" / "body.npz")
+    assert poses.body.frame == "parent"
+    assert poses.action_names == ("rise", "swing", "none")
+    assert poses.details["actions"].shape == (N, 3)
+    torch.testing.assert_close(poses.details["actions"].sum(-1), torch.ones(N).double())
+    assert {"acceptance", "clamped", "released"} <= poses.details.keys()
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "first draws" in page
+    errors = (poses.joints3d - body.joints(states)).norm(dim=-1)
+    assert float(errors.mean()) < 0.08
+
+
+def test_what_is_said_of_the_gate():
+    states, T = torch.zeros(6, 36).double(), 6
+    posterior = torch.eye(3).double()[[0, 0, 1, 1, 1, 2]]
+    poses = BodyPoses(
+        Body.of_height(BODY_15, 1.7), states, states, *(torch.zeros(T) for _ in range(6)),
+        first_frame=10, action_names=("bend", "wave", "none"),
+        details={"actions": posterior, "released": posterior.argmax(-1) == 2,
+                 "clamped": torch.tensor([0, 0, 0, 1.0, 0.2, 0]),
+                 "acceptance": torch.full((T,), 0.25)},
+    )  # fmt: skip
+    assert action_text(poses) == "bend 10-11, wave 12-14, none 15-15"
+    share, shut, released = gate_notes(poses)
+    assert "let 25 % of the first draws through; 20 % of" in share
+    assert "in 1 frames, the first of them 13" in shut
+    assert released.startswith("in 1 frames none of the actions")
+    poses.details["actions"] = torch.eye(3).double()[[0, 1] * 5]
+    assert action_text(poses).startswith("bend 50 % of the frames, wave 50 %")
+    poses.details.clear()
+    assert (action_text(poses), gate_notes(poses)) == ("", ())
+
+
+def test_a_pose_is_found_on_an_upright_body(recorded, tmp_path, monkeypatch):
+    folder, body, states = recorded
+    limbs_of_rising_arms(body).save(tmp_path / "limbs.safetensors")
+    asked = []
+
+    def find(upright, *_, **__):
+        asked.append(upright)
+        return SimpleNamespace(state=states[0])
+
+    monkeypatch.setattr("torchpose.filters.first_pose.find_first_pose", find)
+    line = [
+        "--conditionals",
+        str(tmp_path / "limbs.safetensors"),
+        "--body",
+        str(folder / "start.npz"),
+    ]
+    args = build().parse_args(arguments(folder, tmp_path, *line)[1:])
+    check_method(args)
+    model = load_model(args)
+    start = _initial_state(args, model, [torch.ones(3, 4, 4)], None, 60.0, None)
+    assert asked[0].frame == "parent"
+    assert model.body.frame == "body"
+    torch.testing.assert_close(model.body.joints(start), body.joints(states[0]))
+
+
+def test_files_of_something_else_are_refused(recorded, tmp_path, capsys):
+    folder, body, _ = recorded
+    limbs, arms = limbs_of_rising_arms(body), tmp_path / "arms.safetensors"
+    bank_of_arms(body).save(arms)
+    assert main(arguments(folder, tmp_path, "--conditionals", str(arms))) == 2
+    assert "torchpose-limb-conditionals" in capsys.readouterr().err
+    limbs.info = replace(limbs.info, parts=("root", *limbs.info.parts[1:]))
+    limbs.save(tmp_path / "limbs.safetensors")
+    assert (
+        main(arguments(folder, tmp_path, "--conditionals", str(tmp_path / "limbs.safetensors")))
+        == 2
+    )
+    assert "expected limb conditionals of the parts pelvis" in capsys.readouterr().err
+    assert main(arguments(folder, tmp_path, "--action", str(tmp_path / "limbs.safetensors"))) == 2
+    assert "torchpose-action-space" in capsys.readouterr().err

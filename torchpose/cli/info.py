@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 _EXAMPLES = """
 torchpose info
 torchpose info kinect-upper-body
+torchpose info limbs.safetensors
 torchpose info result/poses.npz
 torchpose info keypoints.csv"""
 
@@ -32,8 +33,8 @@ def build() -> ArgumentParser:
     """Parser of the command."""
     parser = new_parser(
         "info",
-        "Say which version and priors are there, or what a prior, a file of poses, keypoints or "
-        "recordings, or a camera file holds.",
+        "Say which version and priors are there, or what a prior, a manifold, limb conditionals, an action "
+        "space or bank, a file of poses, keypoints or recordings, or a camera file holds.",
         _EXAMPLES,
     )
     parser.add_argument(
@@ -74,6 +75,13 @@ def _describe(what: str) -> str:
     from torchpose.priors import known_priors, load_prior
 
     path = Path(what)
+    if path.suffix == ".safetensors" and path.is_file():
+        from torchpose.cli.info_models import DESCRIBED
+        from torchpose.priors.tensor_file import format_of
+
+        describe = DESCRIBED.get(format_of(path) or "")
+        if describe is not None:
+            return _table(describe(path))
     if what in known_priors() or path.suffix == ".safetensors" or not path.exists():
         return describe_prior(load_prior(what))
     if path.suffix == ".toml":
@@ -96,6 +104,10 @@ def _describe_npz(path: Path) -> str:
     from torchpose.io import read_keypoints, read_npz
 
     keys = set(read_npz(path, optional=None))
+    if {"state", "body_frame"} <= keys:
+        from torchpose.cli.info_models import describe_body_poses
+
+        return _table(describe_body_poses(path))
     if {"joints3d", "covariance3d"} <= keys:
         return describe_poses(path)
     if "joints" in keys:
@@ -234,7 +246,8 @@ def _length(n_frames: int, fps: float | None) -> str:
 
 
 def _table(facts: dict[str, str]) -> str:
-    """Lines of a name and a value; empty values are left out."""
+    """Lines of a name and a value, further lines of which are indented; empty ones are left out."""
     rows = {name: value for name, value in facts.items() if value}
     width = max(len(name) for name in rows) + 2
+    rows = {name: value.replace("\n", "\n" + " " * width) for name, value in rows.items()}
     return "\n".join(f"{name:<{width}}{value}" for name, value in rows.items())

@@ -2,6 +2,7 @@
 
 import sys
 import time
+import warnings
 from dataclasses import replace
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
@@ -16,27 +17,32 @@ from torchpose.cli.common import (
     share_cores,
     show_progress,
 )
-from torchpose.cli.track_body_output import draw, facts_of, summary, write_csv, write_page
+from torchpose.cli.track_body_models import METHODS, BodyModel, check_method, load_model
+from torchpose.cli.track_body_output import (
+    draw,
+    facts_of,
+    gate_notes,
+    summary,
+    write_csv,
+    write_page,
+)
 from torchpose.cli.track_body_videos import Recordings
-from torchpose.errors import CameraError, InputError
+from torchpose.errors import CameraError, DegenerateFilterWarning, InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchpose.body.kinematics import Body
     from torchpose.body_poses import BodyPoses
     from torchpose.camera import PinholeCamera
     from torchpose.camera_rig import CameraRig
-    from torchpose.filters.silhouette_filter import SilhouetteParticleFilter
 
 _EXAMPLES = """
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 cam3.mp4 --out result
 torchpose track-body cameras.toml cam*.mp4 --background empty*.png --height 1.82 --out result
 torchpose track-body cameras.toml cam*.mp4 --manifold walk.safetensors --out result
+torchpose track-body cameras.toml cam*.mp4 --method root --conditionals limbs.safetensors --out result
+torchpose track-body cameras.toml cam1.mp4 --method constrained --action bend.safetensors --out result
 torchpose track-body cameras.toml cam*.mp4 --body result/body.npz --facing [1,0,0] --out again"""
-METHODS = ("mrpf", "apf", "sir")
-_LAYERS = 5  # of the annealed filter, each with its share of the particles
-_RATE = 60.0  # frames per second for which the default noise of the filters is
 _LOOK_AHEAD = 0.5  # seconds that decide where the person looks at first
 _SEEN = 0.002  # of the image: fewer pixels are nobody
 
@@ -69,15 +75,16 @@ def build() -> ArgumentParser:
     add("--ignore-still", type=bool, default=False, metavar="true|false",
         help="with --background: what always looks the same in a video was moved since the scene was "
         "empty, and is no person; not for somebody who stands still (default false)")  # fmt: skip
-    add("--method", type=str, metavar="mrpf|apf|sir",
-        help="manifold-regularised (needs --manifold), annealed or plain particle filter (default mrpf "
-        "with a manifold, else apf)")  # fmt: skip
-    add(
-        "--manifold",
-        type=str,
-        metavar="FILE",
-        help="poses of an action, from `python -m train fit`",
-    )
+    add("--method", type=str, metavar="|".join(METHODS),
+        help="manifold-regularised (needs --manifold), annealed, plain, root hypotheses with Gaussian "
+        "limbs (needs --conditionals), or constrained to an action (needs --action) particle filter "
+        "(default what the file given is for, else apf)")  # fmt: skip
+    add("--manifold", type=str, metavar="FILE",
+        help="poses of an action, from `python -m train fit`")  # fmt: skip
+    add("--conditionals", type=str, metavar="FILE",
+        help="how limbs stand to each other and turn, from `python -m train fit`")  # fmt: skip
+    add("--action", type=str, metavar="FILE",
+        help="postures of an action, or of several, from `python -m train fit`")  # fmt: skip
     add("--height", type=float, default=1.75, metavar="M",
         help="height of the person, metres (default 1.75)")  # fmt: skip
     add("--body", type=str, metavar="FILE",
@@ -91,9 +98,10 @@ def build() -> ArgumentParser:
         "--rows", type=int, default=160, metavar="N", help="height of the silhouettes (default 160)"
     )
     add("--n-particles", type=int, default=1000, metavar="N",
-        help="particles, of all layers together (default 1000)")  # fmt: skip
-    add("--sharpness", type=float, default=100.0, metavar="X",
-        help="exponent of the likelihood (default 100; the papers have 1)")  # fmt: skip
+        help="particles, of all layers together; a root hypothesis counts seven (default 1000)")  # fmt: skip
+    add("--sharpness", type=float, metavar="X",
+        help="exponent of the likelihood; not for root (default 100, of the overlap that constrained "
+        "goes by 30; the papers have 1)")  # fmt: skip
     add("--fps", type=float, metavar="HZ", help="rate at which all videos are read")
     add("--delays", type=list[int] | None, default=None, metavar="[n,n,...]",
         help="frames by which each video began too early (default none)")  # fmt: skip
@@ -112,12 +120,12 @@ def run(args: Namespace) -> int:
     _check(args)
     share_cores()
     cameras = _cameras(args)
-    body, manifold = _body(args), _manifold(args)
+    model = load_model(args)
     out = check_output_folder(args.out)
     pictures = pictures_possible(args.pictures)
     with Recordings(args, cameras) as recordings:
         start = time.perf_counter()
-        poses = _track(args, recordings, body, manifold)
+        poses = _track(args, recordings, model)
         seconds = time.perf_counter() - start
         if poses is None:
             print(
@@ -139,13 +147,7 @@ def _check(args: Namespace) -> None:
                           ("--rows", args.rows), ("--n-particles", args.n_particles),
                           ("--fps", args.fps)):  # fmt: skip
         positive(option, value)
-    args.method = args.method or ("mrpf" if args.manifold else "apf")
-    if args.method not in METHODS:
-        raise InputError(f"--method must be one of {', '.join(METHODS)}, got {args.method!r}")
-    if args.method == "mrpf" and not args.manifold:
-        raise InputError("--method mrpf needs --manifold FILE, a manifold of the action's poses")
-    if args.method != "mrpf" and args.manifold and args.initial_pose:
-        raise InputError(f"--manifold does nothing for --method {args.method} with an initial pose")
+    check_method(args)
     if args.facing is not None and len(args.facing) != 3:
         raise InputError(f"--facing must be three numbers, got {args.facing}")
     if args.ignore_still and not args.background:
@@ -172,52 +174,7 @@ def _cameras(args: Namespace) -> "list[PinholeCamera]":
     return [found[name] for name in names]
 
 
-def _body(args: Namespace) -> "Body":
-    from torchpose.body import BODY_15, Body
-    from torchpose.body_poses import load_body
-
-    return load_body(args.body) if args.body else Body.of_height(BODY_15, args.height)
-
-
-def _manifold(args: Namespace) -> Any:
-    if args.manifold is None:
-        return None
-    from torchpose.priors.gplvm import BackConstrainedGPLVM
-
-    return BackConstrainedGPLVM.load(args.manifold)
-
-
-def make_filter(
-    method: str, body: "Body", manifold: Any, n_particles: int, sharpness: float, fps: float
-) -> "SilhouetteParticleFilter":
-    """The filter of a method; its diffusion grows with the time between frames."""
-    from torchpose.filters import (
-        AnnealedParticleFilter,
-        ManifoldParticleFilter,
-        SIRParticleFilter,
-    )
-    from torchpose.filters.silhouette_filter import default_step_std
-
-    step = default_step_std(body) * (_RATE / fps) ** 0.5
-    if method == "apf":
-        return AnnealedParticleFilter(
-            body,
-            max(1, n_particles // _LAYERS),
-            n_layers=_LAYERS,
-            step_std=step,
-            sharpness=sharpness,
-        )
-    if method == "sir":
-        return SIRParticleFilter(body, n_particles, step_std=step, sharpness=sharpness)
-    step[list(body.relative_columns)] = manifold.std_step.to(step)
-    return ManifoldParticleFilter(
-        body, manifold, n_particles, step_std=step, fps=fps, sharpness=sharpness
-    )
-
-
-def _track(
-    args: Namespace, recordings: "Recordings", body: "Body", manifold: Any
-) -> "BodyPoses | None":
+def _track(args: Namespace, recordings: "Recordings", model: BodyModel) -> "BodyPoses | None":
     """Find the person, then track; None if there is nobody."""
     import torch
 
@@ -232,20 +189,24 @@ def _track(
     rig = recordings.rig
     looked_at = 1 if args.initial_pose else max(1, round(_LOOK_AHEAD * recordings.fps))
     begin = [first, *islice(frames, looked_at - 1)]
-    start = _initial_state(args, body, begin, rig, manifold, recordings.fps, generator)
-    model = make_filter(
-        args.method, body, manifold, args.n_particles, args.sharpness, recordings.fps
-    )
+    start = _initial_state(args, model, begin, rig, recordings.fps, generator)
+    tracker = model.make_filter(args.n_particles, args.sharpness, recordings.fps)
     expected = recordings.n_frames
-    poses = track_body(
-        model, chain(begin, frames), rig, start, generator, initial_std=2 * model.step_std,
-        fps=recordings.fps, n_frames=None if expected is None else max(1, expected - begun),
-        progress=show_progress(),
-    )  # fmt: skip
+    with warnings.catch_warnings():
+        # said in a note, with the numbers of the frames
+        warnings.filterwarnings("ignore", "the gate rejected", DegenerateFilterWarning)
+        poses = track_body(
+            tracker, chain(begin, frames), rig, start, generator,
+            initial_std=model.first_std(tracker), fps=recordings.fps,
+            n_frames=None if expected is None else max(1, expected - begun),
+            progress=show_progress(),
+        )  # fmt: skip
+    poses = replace(poses, first_frame=begun, action_names=model.action_names)
     notes = (*recordings.notes, *(n for s in recordings.sources for n in s.notes))
+    notes += (*model.notes(recordings.fps), *gate_notes(poses))
     if begun:
         notes += (f"the first {begun} frames, in which not all cameras saw somebody, have no pose",)
-    return replace(poses, first_frame=begun, notes=notes)
+    return replace(poses, notes=notes)
 
 
 def _all_see(masks: "Tensor") -> bool:
@@ -253,9 +214,10 @@ def _all_see(masks: "Tensor") -> bool:
 
 
 def _initial_state(
-    args: Namespace, body: "Body", begin: "list[Tensor]", rig: "CameraRig", manifold: Any, fps: float,
+    args: Namespace, model: BodyModel, begin: "list[Tensor]", rig: "CameraRig", fps: float,
     generator: Any,
 ) -> "Tensor":  # fmt: skip
+    """The pose before the first frame, as a state of the body that is tracked."""
     import torch
 
     from torchpose.body.fitting import fit_state
@@ -264,9 +226,10 @@ def _initial_state(
 
     if args.initial_pose:
         recorded = BodyPoses.load(args.initial_pose)
-        return fit_state(body, recorded.joints3d[:1])[0]
+        return fit_state(model.body, recorded.joints3d[:1])[0]
     print("finding the pose of the first frame ...", flush=True)
     facing = None if args.facing is None else torch.tensor(args.facing, dtype=torch.float64)
-    return find_first_pose(
-        body, torch.stack(begin), rig, manifold, generator, fps=fps, facing=facing
+    found = find_first_pose(
+        model.upright, torch.stack(begin), rig, model.manifold, generator, fps=fps, facing=facing
     ).state
+    return found if model.body is model.upright else model.upright.convert(found, model.body)

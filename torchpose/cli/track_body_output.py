@@ -15,7 +15,18 @@ if TYPE_CHECKING:
     from torchpose.cli.track_body_videos import Recordings
     from torchpose.measure.silhouettes import SilhouetteView
 
-__all__ = ["draw", "facts_of", "project_joints", "summary", "write_csv", "write_page"]
+__all__ = [
+    "action_text",
+    "draw",
+    "facts_of",
+    "gate_notes",
+    "project_joints",
+    "summary",
+    "write_csv",
+    "write_page",
+]
+
+_MOST_RUNS = 8  # of actions that are listed by their frames
 
 
 def write_csv(path: Path, poses: "BodyPoses") -> None:
@@ -134,14 +145,63 @@ def facts_of(
     args: Namespace, recordings: "Recordings", poses: "BodyPoses", seconds: float
 ) -> dict[str, str]:
     height, width = recordings.rig.sizes[0]  # type: ignore[misc]  # views have sizes
-    return {
+    sharpness = "" if args.sharpness is None else f", sharpness {args.sharpness:g}"
+    facts = {
         "videos": f"{len(args.videos)} cameras, {recordings.fps:g} fps",
         "silhouettes": f"{width} x {height} pixels, "
         + ("against the empty scene" if args.background else "against what stays"),
-        "method": f"{args.method}, {args.n_particles} particles, sharpness {args.sharpness:g}",
+        "method": f"{args.method}, {args.n_particles} particles{sharpness}",
+        "learnt": ", ".join(filter(None, (args.manifold, args.conditionals, args.action))),
         "body": args.body or f"average proportions, {args.height:g} m",
+        "actions": action_text(poses),
         "speed": f"{len(poses) / max(seconds, 1e-9):.1f} frames a second, without drawing",
     }
+    return {name: fact for name, fact in facts.items() if fact}
+
+
+def action_text(poses: "BodyPoses") -> str:
+    """The likeliest action frame by frame, as runs of frames, or as shares if there are many runs."""
+    import torch
+
+    if "actions" not in poses.details or not poses.action_names:
+        return ""
+    likeliest = poses.details["actions"].argmax(-1)
+    action, length = torch.unique_consecutive(likeliest, return_counts=True)
+    if len(action) > _MOST_RUNS:
+        shares = torch.bincount(likeliest, minlength=len(poses.action_names)) / len(likeliest)
+        pairs = zip(poses.action_names, shares.tolist(), strict=True)
+        return ", ".join(f"{name} {100 * share:.0f} % of the frames" for name, share in pairs)
+    last = length.cumsum(0) + poses.first_frame - 1
+    first = last - length + 1
+    return ", ".join(
+        f"{poses.action_names[k]} {a}-{b}"
+        for k, a, b in zip(action.tolist(), first.tolist(), last.tolist(), strict=True)
+    )
+
+
+def gate_notes(poses: "BodyPoses") -> tuple[str, ...]:
+    """What the gate of an action let through, and when it was released, in plain words."""
+    if "clamped" not in poses.details:
+        return ()
+    accepted, clamped = poses.details["acceptance"], poses.details["clamped"]
+    found = [
+        f"the gate let {100 * float(accepted.mean()):.0f} % of the first draws through; "
+        f"{100 * float(clamped.mean()):.0f} % of the particles were moved to its border"
+    ]
+    shut = (clamped == 1).nonzero().flatten() + poses.first_frame
+    if len(shut):
+        found.append(
+            f"in {len(shut)} frames, the first of them {int(shut[0])}, the gate rejected every draw: "
+            "the person did something else, or the body is not theirs; a bank of several actions "
+            "lets go there"
+        )
+    released = poses.details.get("released")
+    if released is not None and bool(released.any()):
+        found.append(
+            f"in {int(released.sum())} frames none of the actions was likeliest, and the constraint "
+            "was released"
+        )
+    return tuple(found)
 
 
 def write_page(

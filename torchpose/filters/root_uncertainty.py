@@ -18,6 +18,7 @@ from torchpose.errors import InputError
 from torchpose.filters.base import Generators, standard_normal
 from torchpose.filters.body_frames import Frame
 from torchpose.filters.body_particles import BodyFilterState, WeightedParticles, reweight
+from torchpose.filters.joint_spread import joint_covariance_with_parts
 from torchpose.filters.leg_swap import leg_permutation
 from torchpose.filters.limb_observations import (
     check_rules,
@@ -185,6 +186,12 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         variance = memory.diagonal(dim1=-2, dim2=-1).flatten(-2)
         within = torch.einsum("bn,bnd->bd", weights, variance)
         return (between.square() + pad(within, (_ROOT, 0))).sqrt()
+
+    def joint_covariance(
+        self, state: BodyFilterState, mean: Float[Tensor, "B D"]
+    ) -> Float[Tensor, "B J 3 3"]:
+        """Second moment of the joints about the estimate's: of the hypotheses, and within each."""
+        return joint_covariance_with_parts(self.body, state, self._memory(state), mean)
 
     # --- one frame
 

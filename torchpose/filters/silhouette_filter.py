@@ -40,6 +40,7 @@ from torchpose.filters.body_particles import (
     stack_tracks,
     take_particles,
 )
+from torchpose.filters.joint_spread import joint_covariance
 from torchpose.filters.leg_swap import check_leg_swap, swap_legs
 from torchpose.filters.resampling import RESAMPLING, resample
 
@@ -167,6 +168,12 @@ class SilhouetteParticleFilter(nn.Module):
         gap = self.body.difference(particles, mean[:, None].expand_as(particles))
         weights = log_weights.exp().to(gap.dtype)
         return torch.einsum("bn,bnd->bd", weights, gap.square()).sqrt()
+
+    def joint_covariance(
+        self, state: BodyFilterState, mean: Float[Tensor, "B D"]
+    ) -> Float[Tensor, "B J 3 3"]:
+        """Second moment of the joints of a `Body` about those of an estimate, metres squared."""
+        return joint_covariance(self.body, state, mean)  # type: ignore[arg-type]
 
     # --- running
 

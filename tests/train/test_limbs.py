@@ -1,0 +1,154 @@
+"""Limb conditionals fitted with Lightning: what they are of, who is held out, bad input."""
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("lightning", reason="lightning is not installed; training needs it")
+
+from torchpose.body import BODY_15, Body
+from torchpose.priors.limb_conditionals import LimbConditionals
+from train.cli import main
+from train.limbs import LimbData, held_out_spread
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIG = ROOT / "configs" / "limbs.yaml"
+SWING = {"left_thigh": (0.3, 0.0), "left_shank": (0.2, 0.35), "right_thigh": (0.3, 0.0),
+         "right_shank": (0.2, 0.35), "left_upper_arm": (0.2, 0.0), "right_forearm": (0.1, -0.4)}  # fmt: skip
+HERTZ = 1.0
+
+
+def write_trial(
+    folder: Path, person: str, trial: int, fps: float = 120.0, scale: float = 1.0, **change
+):
+    """Somebody whose limbs swing forwards and backwards, each by a radian of its own."""
+    frames = int(2 * fps)
+    body = Body.of_height(BODY_15, 1.65 + 0.05 * int(person[-1]))
+    phase = 2 * math.pi * HERTZ * torch.arange(frames, dtype=torch.float64) / fps + trial
+    states = torch.zeros(frames, body.dim, dtype=torch.float64)
+    states[:, 1] = 0.9
+    for i, (part, (size, rest)) in enumerate(SWING.items()):
+        angle = rest + scale * size * (phase + i).sin()
+        states[:, 3 + 3 * BODY_15.part(part)] = (angle / 2).sin()
+    arrays = {
+        "joints": body.joints(states).numpy(), "names": np.array(BODY_15.names), "fps": fps,
+        "subject": person, "action": f"walk{trial}", "source": "set", "axes": "y-up",
+    }  # fmt: skip
+    path = folder / f"{person}_{trial}.npz"
+    np.savez(path, **arrays)
+    return path
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> SimpleNamespace:
+    home = tmp_path_factory.mktemp("limbs")
+    folder = home / "recordings"
+    folder.mkdir()
+    for person in ("p0", "p1"):
+        for trial in (0, 1):
+            write_trial(folder, person, trial, fps=(120.0, 60.0)[trial])
+    write_trial(folder, "p2", 0, scale=1.5)
+    options = {
+        "--data.init_args.paths": f"['{folder}']",
+        "--data.init_args.held_out": "[p2]",
+    }
+    arguments = ["fit", "--config", str(CONFIG)]
+    arguments += [str(part) for pair in options.items() for part in pair]
+    return SimpleNamespace(home=home, folder=folder, arguments=arguments)
+
+
+def run(scene, name: str, *more: str) -> int:
+    out = ["--prior.out", str(scene.home / f"{name}.safetensors")]
+    folder = ["--trainer.default_root_dir", str(scene.home / "runs" / name)]
+    return main([*scene.arguments, *out, *folder, *more])
+
+
+def of_edge(conditionals: LimbConditionals, below: str) -> int:
+    parts = [conditionals.info.parts[j] for j in conditionals.edges[:, 1].tolist()]
+    return parts.index(below)
+
+
+def test_limbs_come_back_as_they_were_moved(scene, capsys) -> None:
+    assert run(scene, "walk") == 0
+    said = capsys.readouterr().out
+    assert "9 limbs from 480 frames of 2 persons at 60 frames per second" in said
+    found = LimbConditionals.load(scene.home / "walk.safetensors")
+    for part in ("left_shank", "right_shank", "right_forearm"):
+        covariance = found.covariance[of_edge(found, part)]
+        expected = SWING[part][0] / math.sqrt(2)  # root mean square of the angle
+        angle = 2 * float(torch.linalg.eigvalsh(covariance)[-1].sqrt())
+        assert angle == pytest.approx(expected, rel=0.03)
+        assert float(torch.linalg.eigvalsh(covariance)[:2].max()) < 2e-4
+    # a thigh turns against the root, which stands still, by so many radians from frame to frame
+    speed = SWING["left_thigh"][0] / math.sqrt(2) * 2 * math.pi * HERTZ / 60
+    step = found.diffusion[BODY_15.part("left_thigh")].trace().sqrt()
+    assert 2 * float(step) == pytest.approx(speed, rel=0.03)
+    info = found.info
+    assert info.name == "walk" and info.fps == 60.0 and info.sources == ("set",)
+    assert info.persons == ("set#p0", "set#p1") and info.actions == ("walk0", "walk1")
+    assert "configs/limbs.yaml" in info.command and "CMU" in info.licence
+    told = info.extra["held_out"]
+    assert told["frames"] == 120 and 1.1 < told["deviation"] < 1.6 and 1.3 < told["speed"] < 1.6
+    log = (scene.home / "runs" / "walk" / "version_0" / "metrics.csv").read_text().splitlines()
+    assert "deviation" in log[0] and "speed" in log[0] and len(log) == 2
+
+
+def test_it_is_the_fit_of_the_library_on_one_body(scene) -> None:
+    data = LimbData([str(scene.folder)], held_out=["p2"], actions=["walk0"])
+    data.setup("fit")
+    assert data.body.frame == "body" and len(data.train) == 2 and len(data.watched) == 1
+    one = LimbConditionals.fit(data.body, data.train, 60.0)
+    one.check_for(data.body)
+    same = held_out_spread(one, data.body, data.train)
+    assert same.deviation == pytest.approx(1, abs=0.15)  # the floor of the twist counts as spread
+    assert same.speed == pytest.approx(1) and same.frames == 240
+    assert run(scene, "one", "--data.init_args.actions", "[walk0]") == 0
+    found = LimbConditionals.load(scene.home / "one.safetensors")
+    for name, value in one.state_dict().items():
+        assert torch.equal(found.state_dict()[name], value), name
+
+
+def test_it_is_resumed_only_with_its_own_settings(scene, capsys) -> None:
+    assert run(scene, "again", "--data.init_args.held_out", "null") == 0
+    assert "persons held out" not in capsys.readouterr().out
+    first = (scene.home / "again.safetensors").read_bytes()
+    more = ["--data.init_args.held_out", "null", "--ckpt_path", "auto"]
+    assert run(scene, "again", *more) == 0
+    assert (scene.home / "again.safetensors").read_bytes() == first
+    assert run(scene, "again", "--model.init_args.least_std", "0.02", *more) == 2
+    assert "settings least_std was 0.01, is 0.02" in capsys.readouterr().err
+
+
+def test_bad_input_is_refused_in_one_line(scene, capsys) -> None:
+    folders = {}
+    for name in ("holes", "timeless"):
+        folders[name] = scene.home / name
+        folders[name].mkdir(exist_ok=True)
+        path = write_trial(folders[name], "p6", 0)
+        with np.load(path) as file:
+            arrays = dict(file)
+        if name == "holes":
+            arrays["joints"][9, 4] = np.nan
+        else:
+            del arrays["fps"]
+        np.savez(path, **arrays)
+    nobody = ["--data.init_args.held_out", "null", "--data.init_args.paths"]
+    for more, message in (
+        (["--data.init_args.persons", "[p9]"], "'p9' is nobody's name"),
+        (["--data.init_args.actions", "[hop]"], "no recording of hop; there are walk0, walk1"),
+        (["--data.init_args.without", "[p9_9]"], "no file named p9_9"),
+        (["--data.init_args.held_out", "[p0, p1, p2]"], "nobody is left to learn from"),
+        (["--data.init_args.fps", "0"], "fps must be positive"),
+        (["--model.init_args.least_std", "-1"], "least_std must be zero or more"),
+        (["--data", "train.data.RecordingsDataModule"], "train.limbs.LimbData"),
+        ([*nobody, f"['{folders['holes']}']"], "p6_0: left_elbow is missing in frame 9"),
+        ([*nobody, f"['{folders['timeless']}']"], "does not say its frame rate"),
+    ):
+        assert run(scene, "bad", *more) == 2, more
+        error = capsys.readouterr().err
+        assert message in error and error.count("\n") == 1, error
+    assert not (scene.home / "bad.safetensors").exists()

@@ -1,0 +1,172 @@
+"""What `torchpose info` says of what the body trackers learn: manifolds, limbs, actions; and of poses."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+__all__ = ["DESCRIBED", "describe_body_poses"]
+
+Facts = dict[str, str]
+_LISTED, _SOURCES = 12, 3  # persons or actions that are named, and sources
+
+
+def describe_manifold(path: Path) -> Facts:
+    """A manifold of poses."""
+    from torchpose.priors.gplvm import BackConstrainedGPLVM
+
+    manifold = BackConstrainedGPLVM.load(path)
+    info = manifold.info
+    n_frames, n_columns = manifold.poses.shape
+    known = bool(manifold.std_pose.isfinite().all())
+    return {
+        "manifold": info.name or "without a name",
+        "latent space": f"{manifold.latents.shape[-1]} dimensions",
+        "poses": f"{n_frames} frames of {n_columns} columns, rotations against the {info.frame}",
+        "noise": "for the filter" if known else "not fitted yet: the filter needs fit_noise",
+        "fps": _number(info.fps),
+        "held-out error": _number(info.extra.get("held_out_error")),
+        "actions": _listed(info.actions),
+        **_origin(info),
+        "track with": "torchpose track-body --manifold FILE",
+    }
+
+
+def describe_limbs(path: Path) -> Facts:
+    """Limb conditionals: how far each limb turns against the one above it, and how fast."""
+    from torchpose.priors.limb_conditionals import LimbConditionals
+
+    limbs = LimbConditionals.load(path)
+    info = limbs.info
+    spread = _degrees(limbs.covariance)
+    of_part = dict(zip(info.parts, _degrees(limbs.diffusion), strict=True))
+    pairs = [(info.parts[i], info.parts[j]) for i, j in limbs.edges.tolist()]
+    rows = [
+        f"{below} on {above}: {value:.0f} degrees, {of_part[below]:.1f} from frame to frame"
+        for (above, below), value in zip(pairs, spread, strict=True)
+    ]
+    rescaled = "" if info.fps == info.fitted_fps else f", learnt at {info.fitted_fps:g}"
+    return {
+        "limb conditionals": info.name or "without a name",
+        "parts": ", ".join(info.parts),
+        "fps": f"{info.fps:g}{rescaled}",
+        "frames": str(info.n_frames),
+        "limbs": "\n".join(rows),
+        "held out": _held_out(info.extra),
+        "actions": _listed(info.actions),
+        **_origin(info),
+        "track with": "torchpose track-body --method root --conditionals FILE",
+    }
+
+
+def describe_action(path: Path) -> Facts:
+    """The postures of one action."""
+    from torchpose.priors.action_space import ActionSpace
+
+    space = ActionSpace.load(path)
+    info = space.info
+    explained = "" if info.explained is None else f", {100 * info.explained:.1f} % of the variance"
+    accepted = info.extra.get("accepted")
+    told = {"body": "on a body of average proportions", "joints": "between the recorded joints"}
+    return {
+        "action": info.name or "without a name",
+        "dimensions": f"{space.n_dimensions}{explained}",
+        "mean performance": f"{space.n_postures} postures, {len(info.key_frames)} key frames",
+        "performances": str(info.performances or ""),
+        "postures": told.get(str(info.extra.get("postures")), ""),
+        "gate": ""
+        if accepted is None
+        else f"lets {100 * accepted:.0f} % of held-out postures through",
+        "fps": _number(info.fps),
+        **_origin(info),
+        "track with": "torchpose track-body --method constrained --action FILE",
+    }
+
+
+def describe_bank(path: Path) -> Facts:
+    """The postures of several actions."""
+    from torchpose.priors.action_bank import ActionBank
+
+    bank = ActionBank.load(path)
+    info = bank.info
+    sizes = zip(info.names, bank.n_dimensions.tolist(), bank.n_postures.tolist(), strict=True)
+    gated = info.gate_dimensions
+    return {
+        "action bank": f"{len(info.names)} actions, or none of them",
+        "actions": "\n".join(f"{name}: {d} dimensions, {k} postures" for name, d, k in sizes),
+        "gates": "of all dimensions" if gated is None else f"of the first {gated} dimensions",
+        "staying": f"{info.stay:g}: probability of the same action a second later",
+        "spread": f"{info.spread:g} for persons who are not of the training set",
+        "fps": _number(info.fps),
+        **_origin(info),
+        "track with": "torchpose track-body --method constrained --action FILE",
+    }
+
+
+DESCRIBED: dict[str, Callable[[Path], Facts]] = {
+    "torchpose-manifold": describe_manifold,
+    "torchpose-limb-conditionals": describe_limbs,
+    "torchpose-action-space": describe_action,
+    "torchpose-action-bank": describe_bank,
+}
+"""What describes a file, by `torchpose.priors.tensor_file.format_of`."""
+
+
+def describe_body_poses(path: Path) -> Facts:
+    """Poses of a whole body, from `torchpose track-body`."""
+    from torchpose.body_poses import BodyPoses
+    from torchpose.cli.track_body_output import action_text
+
+    poses = BodyPoses.load(path)
+    spread = poses.covariance3d.diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(0).sqrt().mean(0)
+    stds = zip(poses.names, (100 * spread).tolist(), strict=True)
+    rate = (
+        "rate unknown" if not poses.fps else f"{len(poses) / poses.fps:.1f} s at {poses.fps:g} fps"
+    )
+    return {
+        "body poses": str(path),
+        "frames": f"{len(poses)} ({rate}) from frame {poses.first_frame}",
+        "body": f"{poses.body.height:.2f} m, rotations against the "
+        + ("root" if poses.body.frame == "body" else "part above"),
+        "unseen": f"{int(poses.coasting.sum())} frames" if bool(poses.coasting.any()) else "",
+        "lost": f"{int(poses.respread.sum())} frames" if bool(poses.respread.any()) else "",
+        "details": ", ".join(poses.details),
+        "actions": action_text(poses),
+        "std (cm)": ", ".join(f"{name} {value:.1f}" for name, value in stds),
+        "notes": "; ".join(poses.notes),
+    }
+
+
+def _degrees(covariance: Any) -> list[float]:
+    """Deviation of a rotation's angle; vectors are sines of half angles."""
+    trace = covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
+    return [math.degrees(2 * math.asin(min(1.0, math.sqrt(value)))) for value in trace.tolist()]
+
+
+def _held_out(extra: dict[str, Any]) -> str:
+    found = extra.get("held_out")
+    if not isinstance(found, dict) or not {"frames", "deviation", "speed"} <= found.keys():
+        return ""
+    return (
+        f"{found['frames']} frames, whose limbs deviate {found['deviation']:.2f} times as the training "
+        f"ones and turn {found['speed']:.2f} times as fast"
+    )
+
+
+def _origin(info: Any) -> Facts:
+    persons = f"{len(info.persons)}: {_listed(info.persons)}" if info.persons else ""
+    return {
+        "persons": persons,
+        "sources": _listed(getattr(info, "sources", ()), "; ", _SOURCES),
+        "licence": info.licence,
+        "command": info.command,
+    }
+
+
+def _listed(names: tuple[str, ...], between: str = ", ", most: int = _LISTED) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return between.join(names[:most]) + more
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.4g}"
