@@ -9,7 +9,9 @@ from torchpose.priors.postures import posture_angles, posture_to_state
 from torchpose.priors.repetitions import repetition_axis, split_repetitions
 
 
-def somebody(action, speed, reach):  # five times the same; in yours joints [T, K, 3] of `read_mocap`
+def somebody(
+    action, speed, reach
+):  # five times the same; in yours joints [T, K, 3] of `read_mocap`
     body = Body.of_height(BODY_15, 1.6 + 0.2 * reach)
     phase = torch.arange(round(300 / speed), dtype=torch.float64) * (speed * 2 * math.pi / 60)
     states = torch.zeros(len(phase), body.dim, dtype=torch.float64)
