@@ -77,10 +77,21 @@ class _Stage:
     seeds: int
     seed: int
     at: int
+    gate_dimensions: int
     numbers: list[int]
     dimensions: list[int]
     progress: bool
     quick: bool
+
+    def variant(self, constrained: bool, particles: int, limb_shape: str = "cylinders") -> Variant:
+        """A tracker whose gate, if it has one, has the dimensions that were asked for."""
+        dimensions = self.gate_dimensions if constrained else DIMENSIONS
+        return Variant(constrained, particles, dimensions, limb_shape)
+
+    def both(self, tunings: Mapping[str, Tuning], *numbers: int) -> dict[Variant, Setting]:
+        """Both trackers with so many particles, and what was chosen for them."""
+        variants = [self.variant(c, n) for n in numbers for c in (True, False)]
+        return {variant: tunings[variant.label].setting for variant in variants}
 
     def settings(self, variants: Mapping[str, Variant]) -> dict[str, Tuning]:
         """What the judges' clips choose for every tracker."""
@@ -108,6 +119,7 @@ def run(
     particles: tuple[int, ...] = (100, 300, 1000, 2000, 5000, 10000),
     dimensions: tuple[int, ...] = (1, 2, 3, 5, 8, 13, 18, 25),
     at: int = 1000,
+    gate_dimensions: int = DIMENSIONS,
     azimuth: float = 70.0,
     faults: float = 0.5,
     size: str = "160x120",
@@ -129,6 +141,8 @@ def run(
         clips: recordings tracked of each person. frames: of each, from its first repetition.
         particles: how many of them, one number or more. dimensions: of the action space, likewise.
         at: particles of all parts but the first, and of the validation.
+        gate_dimensions: of the action space, 13 as published, in all parts but those of the dimensions
+            and the actions.
         azimuth: where the camera stands, degrees from ahead, to the person's left.
         faults: severity of holes, ragged edges, shadows and missing limbs; 0 for none.
         size: of the silhouettes, width x height.
@@ -145,6 +159,7 @@ def run(
             f"{clips} and {frames}"
         )
     numbers, wanted = _numbers("particles", particles), _numbers("dimensions", dimensions)
+    _numbers("gate-dimensions", [gate_dimensions])
     if quick:
         frames, seeds, at = min(frames, 8), 1, min(at, 30)
         numbers, wanted = sorted({min(n, 40) for n in numbers}), wanted[:1]
@@ -168,15 +183,16 @@ def run(
     ]
     stage = _Stage(
         trackees[: len(testers)], trackees[len(testers) :], performed, everything, centres, conditions, out,
-        seeds, seed, at, numbers, wanted, progress, quick,
+        seeds, seed, at, gate_dimensions, numbers, wanted, progress, quick,
     )  # fmt: skip
     tunings = stage.settings({
-        "constrained": Variant(True, at), "first order": Variant(False, at)
+        "constrained": stage.variant(True, at), "first order": stage.variant(False, at)
     })  # fmt: skip
     report = Report("Bend: predictions within an action, from one camera", {
         "quick": quick, "seed": seed, "seeds": seeds, "parts": chosen, "action": action,
         "persons": testers, "validation persons": judges, "frames": frames, "fps": FPS,
         "particles": numbers, "dimensions": wanted, "particles of the other parts": at,
+        "dimensions of the gates": gate_dimensions,
         "camera": f"one, 3.8 m away at {azimuth:g} degrees from ahead, to the person's left; "
         f"{SIDE:g} degrees for the hidden arm", "faults": faults, "size": size,
         "likelihood": "overlap", "redraws": REDRAWS, "precision": "float32",
@@ -199,11 +215,7 @@ def _particles(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> Non
     from torchpose.protocols.bend_pictures import plot_particles, plot_predictions, predictions
     from torchpose.viz.action_picture import plot_action_space
 
-    settings = {
-        Variant(constrained, n): tunings[Variant(constrained, n).label].setting
-        for n in stage.numbers
-        for constrained in (True, False)
-    }
+    settings = stage.both(tunings, *stage.numbers)
     runs = run_variants(
         stage.trackees, settings, stage.out, seeds=stage.seeds, seed=stage.seed,
         progress=stage.progress,
@@ -221,7 +233,7 @@ def _particles(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> Non
             )
             for t in shown
         ]
-        for variant in (Variant(True, stage.at), Variant(False, stage.at))
+        for variant in stage.both(tunings, stage.at)
     }
     figure = plot_predictions(view, shown, drawn)
     add_picture(report, stage.out, "predictions.png", figure)
@@ -246,12 +258,10 @@ def _limbs(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> None:
     """Each kind of limbs with settings of its own, chosen as those of the others were."""
     rectangles = {
         f"{v.label}, rectangles": v
-        for v in (Variant(c, stage.at, DIMENSIONS, "rectangles") for c in (True, False))
+        for v in (stage.variant(c, stage.at, "rectangles") for c in (True, False))
     }
     found = stage.settings(rectangles)
-    settings: dict[Variant, Setting] = {
-        Variant(c, stage.at): tunings[Variant(c, stage.at).label].setting for c in (True, False)
-    }
+    settings = stage.both(tunings, stage.at)
     settings |= {variant: found[name].setting for name, variant in rectangles.items()}
     runs = run_variants(
         stage.trackees, settings, stage.out, seeds=stage.seeds, seed=stage.seed,
@@ -267,9 +277,7 @@ def _occlusion(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> Non
 
     side = replace(stage.conditions, azimuths=(SIDE,))
     seen = [bend_actions.seen_in(t, t.split.test[0], side, t.step_std) for t in stage.trackees]
-    settings = {
-        Variant(c, stage.at): tunings[Variant(c, stage.at).label].setting for c in (True, False)
-    }
+    settings = stage.both(tunings, stage.at)
     common = (seen, settings, stage.out, stage.seeds, stage.seed, stage.progress)
     given, runs = hidden_arms(*common)
     lost, _ = hidden_arms(*common, displaced)
