@@ -60,7 +60,7 @@ class ActionBank(nn.Module):
         InputError: no action, a name twice, empty or "none", a setting out of range, actions of
             different frame rates.
 
-    Reference: what Rowe, Rius, Gonzalez & Villanueva, Posture constraints for Bayesian human motion
+    Reference: what Rius, Varona, Roca & Gonzalez, Posture constraints for Bayesian human motion
     tracking, AMDO 2006, leave as future work (section 5).
     """
 

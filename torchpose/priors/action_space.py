@@ -63,7 +63,7 @@ class ActionSpace(nn.Module):
         ShapeError: other sizes. InputError: not finite, or a deviation that is not positive.
         SkeletonError: limbs of other names.
 
-    Reference: Rowe, Rius, Gonzalez & Villanueva, Posture constraints for Bayesian human motion
+    Reference: Rius, Varona, Roca & Gonzalez, Posture constraints for Bayesian human motion
     tracking, AMDO 2006, section 2 and equations (1) and (6).
 
     >>> t = torch.linspace(0, 3.14, 40, dtype=torch.float64)[:, None]

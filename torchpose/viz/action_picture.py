@@ -54,7 +54,7 @@ def plot_action_space(
     Raises:
         InputError: no dimension is asked for. ShapeError: performances of another action space.
 
-    Reference: Rowe, Rius, Gonzalez & Villanueva, 2006, Figure 1.
+    Reference: Rius, Varona, Roca & Gonzalez, 2006, Figure 1.
     """
     if n_dimensions < 1:
         raise InputError(f"n_dimensions must be at least 1, got {n_dimensions}")
