@@ -32,7 +32,7 @@ def run(script: str, *options: str) -> subprocess.CompletedProcess[str]:
         env=environment,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=400,  # for a machine that has other work; alone they take seconds
         check=False,
     )
 

@@ -100,7 +100,7 @@ def test_older_versions_are_read(path):
 @pytest.mark.parametrize("keep", [0, 4, 100, -20])
 def test_truncated_files_are_refused(path, keep):
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(FileFormatError, match=r"a\.safetensors: expected a test-means.*truncated"):
+    with pytest.raises(FileFormatError, match=r"a\.safetensors: expected a test means.*truncated"):
         read_tensors(path, KIND)
 
 

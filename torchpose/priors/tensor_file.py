@@ -55,6 +55,12 @@ class FileKind(Generic[Info]):
     tensors: Mapping[str, str] = field(default_factory=dict)
     indices: Mapping[str, str] = field(default_factory=dict)
 
+    @property
+    def words(self) -> str:
+        """What it is in words: "an action space"."""
+        name = self.format.removeprefix("torchpose-").replace("-", " ")
+        return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
+
 
 def write_tensors(
     path: str | Path, kind: FileKind[Info], info: Info, tensors: Mapping[str, Tensor]
@@ -110,8 +116,8 @@ def read_tensors(path: str | Path, kind: FileKind[Info]) -> tuple[Info, dict[str
         header = json.loads(metadata.get(_HEADER, "null"))
     except (SafetensorError, OSError, ValueError, RuntimeError) as error:
         raise FileFormatError(
-            f"{path}: expected a {kind.format} as safetensors; the file is truncated or of another "
-            f"kind ({error})"
+            f"{path}: expected {kind.words} as safetensors ({kind.format}); the file is truncated or "
+            f"of another kind ({error})"
         ) from error
     try:
         info = info_from_json(kind.info, _checked_info(header, kind))
