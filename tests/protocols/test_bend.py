@@ -213,12 +213,23 @@ def test_a_killed_run_goes_on_with_the_same_numbers(done, folder, monkeypatch):
     assert str(again["dimensions"].rows) == str(report["dimensions"].rows)  # some are NaN
 
 
+def test_gates_of_other_dimensions_are_told_in_the_report(folder, tmp_path):
+    found = bend.run(folder, tmp_path, part="particles", **SMALL, gate_dimensions=3)
+    assert found.settings["dimensions of the gates"] == 3
+    accepted = found["particles"]["10", "accepted (%)"]
+    narrow = bend.run(folder, tmp_path, part="particles", **SMALL)["particles"][
+        "10", "accepted (%)"
+    ]
+    assert accepted > narrow  # a gate in fewer dimensions lets more through
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"part": "hands"}, "--part takes particles, dimensions"),
         ({"seeds": 0}, "expected --seeds and --clips of 1 or more"),
         ({"particles": (0,)}, "--particles must be one whole number or more"),
+        ({"gate_dimensions": 0}, "--gate-dimensions must be one whole number or more"),
         ({"size": "large"}, "--size must be width x height"),
         ({"test_persons": ("p9",)}, "expected recordings of person p9"),
         ({"action": "run"}, "there are bend, clap"),
