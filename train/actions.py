@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from lightning.pytorch import LightningDataModule, LightningModule
+from lightning.pytorch import LightningDataModule
 from torch import Tensor
-from torch.optim import Optimizer
 
 from torchpose.body import BODY_15, Body, body_joints, fit_body, fit_state
 from torchpose.curation import pick_persons
@@ -24,13 +23,11 @@ from torchpose.priors.action_space import ActionInfo, ActionSpace
 from torchpose.priors.postures import posture_angles, state_postures
 from torchpose.priors.repetitions import repetition_axis, split_repetitions
 from torchpose.priors.synchronisation import LEAST_FRAMES, Synchronised
-from train.callbacks import PriorWriter
+from train.body_fit import BodyFit, recording_name
 from train.data import expand_path, fingerprint
-from train.identity import check_identity
 
 __all__ = ["ActionData", "ActionFit"]
 
-_IDENTITY = "torchpose"
 _COMMON_HEIGHT = 1.75  # metres, of the body on which everybody's postures are told
 
 
@@ -159,7 +156,7 @@ class ActionData(LightningDataModule):
     def _joints(self, recording: Recording) -> Tensor:
         if recording.fps is None:
             raise InputError(
-                f"{_name(recording)}: the file does not say its frame rate, which is needed"
+                f"{recording_name(recording)}: the file does not say its frame rate, which is needed"
             )
         return resample(body_joints(recording.joints, recording.names), recording.fps, self.fps)
 
@@ -173,7 +170,7 @@ class ActionData(LightningDataModule):
                 try:
                     found[i] = posture_angles(joints[i])
                 except InputError as error:
-                    raise InputError(f"{_name(self._recordings[i])}: {error}") from error
+                    raise InputError(f"{recording_name(self._recordings[i])}: {error}") from error
             if self._postures == "body":
                 body = fit_body(torch.cat([joints[i] for i in mine]))
                 for i in mine:
@@ -181,7 +178,7 @@ class ActionData(LightningDataModule):
         return found
 
 
-class ActionFit(LightningModule):
+class ActionFit(BodyFit):
     """Fits an action space to the performances of `ActionData`, or a bank if there are several actions.
 
     Logged: `explained`, the share of the variance in the D dimensions, and with persons held out
@@ -193,6 +190,8 @@ class ActionFit(LightningModule):
         seed: of the matching that `accepted` rests on.
         picture: draw the performances before and after being synchronised beside the file.
     """
+
+    data_type, what = ActionData, "an action is"
 
     def __init__(
         self,
@@ -209,34 +208,8 @@ class ActionFit(LightningModule):
     ) -> None:
         super().__init__()
         self.save_hyperparameters()
-        self.automatic_optimization = False
         self.fitted: dict[str, tuple[ActionSpace, Synchronised]] = {}
         self._accepted: dict[str, float] = {}
-        self._identity: dict[str, Any] = {}
-
-    def setup(self, stage: str) -> None:
-        """Read the recordings."""
-        if self.trainer.world_size > 1:
-            raise InputError(
-                f"an action is fitted by one process, got {self.trainer.world_size}; set "
-                "--trainer.devices 1"
-            )
-        self._data.setup(stage)
-        self._identity = {"model": type(self).__name__, "settings": self.settings}
-        self._identity |= self._data.identity()
-
-    @property
-    def _given(self) -> Any:
-        return self.hparams
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Everything that was set and matters to the result."""
-        return {k: v for k, v in self._given.items() if k != "picture" and not k.startswith("_")}
-
-    def configure_optimizers(self) -> Sequence[Optimizer]:
-        """None."""
-        return []
 
     def training_step(self, batch: int, batch_idx: int) -> None:
         """The fit of every action."""
@@ -248,14 +221,6 @@ class ActionFit(LightningModule):
         values = {k: torch.tensor(v).double().mean() for k, v in found.items()}
         self.log_dict(values, on_step=True)
         self.trainer.should_stop = True
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Say what the checkpoint is of."""
-        checkpoint[_IDENTITY] = {"identity": self._identity}
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse a checkpoint of anything else; the fit itself is done again."""
-        check_identity(checkpoint.get(_IDENTITY), self._identity, self.trainer.ckpt_path)
 
     # --- what comes of it
 
@@ -315,10 +280,10 @@ class ActionFit(LightningModule):
 
     def finished_prior(self, **facts: str) -> None:
         """Write the action space or bank where a prior's file would be."""
-        writers = [c for c in self.trainer.callbacks if isinstance(c, PriorWriter)]  # type: ignore[attr-defined]
-        if not writers or not self.trainer.is_global_zero:
+        out = self.written_to
+        if out is None:
             return
-        found, out = self.result(**facts), writers[0].out
+        found = self.result(**facts)
         found.save(out)
         written = [out]
         if self._given.picture:
@@ -346,20 +311,6 @@ class ActionFit(LightningModule):
                 f"left out {self._data.left_out} repetitions shorter than {LEAST_FRAMES} frames"
             )
         return "\n".join([*lines, f"wrote {', '.join(map(str, written))}"])
-
-    @property
-    def _data(self) -> ActionData:
-        data = getattr(self.trainer, "datamodule", None)
-        if not isinstance(data, ActionData):
-            raise InputError(
-                f"{type(self).__name__} takes ActionData, got {type(data).__name__}; set "
-                "data.class_path to train.actions.ActionData"
-            )
-        return data
-
-
-def _name(recording: Recording) -> str:
-    return recording.person_id if recording.path is None else recording.path.stem
 
 
 def _draw(space: ActionSpace, synchronised: Synchronised, path: Path) -> Path:

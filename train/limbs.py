@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
-from lightning.pytorch import LightningDataModule, LightningModule
+from lightning.pytorch import LightningDataModule
 from torch import Tensor
-from torch.optim import Optimizer
 
 from torchpose.body import BODY_15, Body, body_joints, centres_of, fit_body, fit_state
 from torchpose.body.quaternion_vectors import compose, conjugate
@@ -21,13 +20,10 @@ from torchpose.errors import InputError
 from torchpose.io import Recording, find_recordings, read_recordings
 from torchpose.io.mocap import resample
 from torchpose.priors.limb_conditionals import LimbConditionals
-from train.callbacks import PriorWriter
+from train.body_fit import BodyFit, recording_name
 from train.data import expand_path, fingerprint
-from train.identity import check_identity
 
 __all__ = ["HeldOut", "LimbData", "LimbFit", "held_out_spread"]
-
-_IDENTITY = "torchpose"
 
 
 class LimbData(LightningDataModule):
@@ -135,7 +131,7 @@ class LimbData(LightningDataModule):
     def _joints(self, recording: Recording) -> Tensor:
         if recording.fps is None:
             raise InputError(
-                f"{_name(recording)}: the file does not say its frame rate, which is needed"
+                f"{recording_name(recording)}: the file does not say its frame rate, which is needed"
             )
         joints = body_joints(recording.joints, recording.names)
         missing = joints.isnan().any(-1)
@@ -143,7 +139,7 @@ class LimbData(LightningDataModule):
         if len(gaps):
             frame, joint = gaps[0].tolist()
             raise InputError(
-                f"{_name(recording)}: {BODY_15.names[joint]} is missing in frame {frame}; end the "
+                f"{recording_name(recording)}: {BODY_15.names[joint]} is missing in frame {frame}; end the "
                 "recording there, or fill the gap"
             )
         return resample(joints, recording.fps, self.fps)
@@ -168,7 +164,7 @@ class LimbData(LightningDataModule):
             try:
                 found.append(fit_state(bodies[owner], points).detach())
             except InputError as error:
-                raise InputError(f"{_name(recording)}: {error}") from error
+                raise InputError(f"{recording_name(recording)}: {error}") from error
         return found
 
 
@@ -215,7 +211,7 @@ def _ratio(vectors: Float[Tensor, "N M 3"], covariance: Float[Tensor, "M 3 3"]) 
     return float((vectors.square().sum((-2, -1)).mean() / learnt).sqrt())
 
 
-class LimbFit(LightningModule):
+class LimbFit(BodyFit):
     """Fits `LimbConditionals` to the states of `LimbData`.
 
     Logged, with persons held out: `deviation` and `speed` of `HeldOut`.
@@ -224,34 +220,14 @@ class LimbFit(LightningModule):
         least_std: floor of the standard deviations of q_ij, see `LimbConditionals.fit`.
     """
 
+    data_type, what = LimbData, "limb conditionals are"
+
     def __init__(self, least_std: float = 0.01) -> None:
         super().__init__()
         if not 0 <= least_std < float("inf"):
             raise InputError(f"least_std must be zero or more and finite, got {least_std:g}")
         self.save_hyperparameters()
-        self.automatic_optimization = False
         self._fitted: list[LimbConditionals] = []  # no part of the module, nor of its checkpoints
-        self._identity: dict[str, Any] = {}
-
-    def setup(self, stage: str) -> None:
-        """Read the recordings."""
-        if self.trainer.world_size > 1:
-            raise InputError(
-                f"limb conditionals are fitted by one process, got {self.trainer.world_size}; set "
-                "--trainer.devices 1"
-            )
-        self._data.setup(stage)
-        self._identity = {"model": type(self).__name__, "settings": self.settings}
-        self._identity |= self._data.identity()
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Everything that was set and matters to the result."""
-        return {k: v for k, v in dict(self.hparams).items() if not k.startswith("_")}
-
-    def configure_optimizers(self) -> Sequence[Optimizer]:
-        """None."""
-        return []
 
     def training_step(self, batch: int, batch_idx: int) -> None:
         """The fit."""
@@ -261,14 +237,6 @@ class LimbFit(LightningModule):
         }  # fmt: skip
         self.log_dict({k: torch.tensor(v).double() for k, v in values.items()}, on_step=True)
         self.trainer.should_stop = True
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Say what the checkpoint is of."""
-        checkpoint[_IDENTITY] = {"identity": self._identity}
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse a checkpoint of anything else; the fit itself is done again."""
-        check_identity(checkpoint.get(_IDENTITY), self._identity, self.trainer.ckpt_path)
 
     # --- what comes of it
 
@@ -295,10 +263,10 @@ class LimbFit(LightningModule):
 
     def finished_prior(self, **facts: str) -> None:
         """Write the conditionals where a prior's file would be."""
-        writers = [c for c in self.trainer.callbacks if isinstance(c, PriorWriter)]  # type: ignore[attr-defined]
-        if not writers or not self.trainer.is_global_zero:
+        out = self.written_to
+        if out is None:
             return
-        found, held_out, out = self.conditionals(), self.held_out(), writers[0].out
+        found, held_out = self.conditionals(), self.held_out()
         given: dict[str, Any] = {name: value for name, value in facts.items() if value}
         extra: dict[str, Any] = {"settings": self.settings}
         if held_out is not None:
@@ -306,16 +274,6 @@ class LimbFit(LightningModule):
         found.info = replace(found.info, **given, extra=extra)
         found.save(out)
         print(f"{summary(found, held_out)}\nwrote {out}", flush=True)
-
-    @property
-    def _data(self) -> LimbData:
-        data = getattr(self.trainer, "datamodule", None)
-        if not isinstance(data, LimbData):
-            raise InputError(
-                f"{type(self).__name__} takes LimbData, got {type(data).__name__}; set "
-                "data.class_path to train.limbs.LimbData"
-            )
-        return data
 
 
 def summary(conditionals: LimbConditionals, held_out: HeldOut | None) -> str:
@@ -331,7 +289,3 @@ def summary(conditionals: LimbConditionals, held_out: HeldOut | None) -> str:
         f"{text}; those of the persons held out deviate {held_out.deviation:.2f} times as much and "
         f"turn {held_out.speed:.2f} times as fast"
     )
-
-
-def _name(recording: Recording) -> str:
-    return recording.person_id if recording.path is None else recording.path.stem

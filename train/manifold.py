@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch import LightningDataModule, LightningModule
+from lightning.pytorch import LightningDataModule
 from torch import Tensor, nn
-from torch.optim import Optimizer
 
 from torchpose.body import Body, body_joints, fit_body, fit_state
 from torchpose.curation import pick_persons
@@ -25,13 +24,11 @@ from torchpose.priors.gplvm import BackConstrainedGPLVM
 from torchpose.priors.gplvm_fit import GPLVMFit, median_gamma
 from torchpose.priors.manifold_file import ManifoldInfo
 from torchpose.priors.pose_sequences import column_scale, join_sequences, thin
-from train.callbacks import PriorWriter
+from train.body_fit import BodyFit, recording_name
 from train.data import expand_path, fingerprint
-from train.identity import check_identity
 
 __all__ = ["ManifoldData", "ManifoldFit"]
 
-_IDENTITY = "torchpose"
 _SAME_RATE = 0.02  # of the frame rate that is asked for
 
 
@@ -138,11 +135,11 @@ class ManifoldData(LightningDataModule):
             persons=tuple(sorted({r.person_id for r in fitted})),
             actions=tuple(sorted({r.action for r in fitted if r.action})),
             sources=tuple(sorted({r.source or str(r.path) for r in fitted})),
-            sequences=tuple(r.person_id if _several(fitted) else _name(r) for r in fitted),
+            sequences=tuple(r.person_id if _several(fitted) else recording_name(r) for r in fitted),
         )
 
 
-class ManifoldFit(LightningModule):
+class ManifoldFit(BodyFit):
     """Fits a back-constrained GPLVM to the poses of `ManifoldData`.
 
     Logged in each step: `log_likelihood`, the objective (MR 16) before it, per number of the poses;
@@ -161,6 +158,8 @@ class ManifoldFit(LightningModule):
     Raises:
         InputError: a setting that is not positive.
     """
+
+    data_type, what = ManifoldData, "a manifold is"
 
     def __init__(
         self,
@@ -181,9 +180,7 @@ class ManifoldFit(LightningModule):
         for name, least in (("steps", 1), ("patience", 1), ("start", 0)):
             if self.hparams[name] < least:
                 raise InputError(f"{name} must be at least {least}, got {self.hparams[name]}")
-        self.automatic_optimization = False
         self.fit: Any = nn.Identity()
-        self._identity: dict[str, Any] = {}
         self._stopped = False
 
     # --- what Lightning calls
@@ -191,9 +188,8 @@ class ManifoldFit(LightningModule):
     def setup(self, stage: str) -> None:
         """The fit at its start; a checkpoint's state comes later."""
         _check_trainer(self.trainer)
-        data = self._data
-        data.setup(stage)
-        given = self._given
+        super().setup(stage)
+        data, given = self._data, self._given
         self._poses, self._lengths = join_sequences(data.train, data.info.columns)
         same = torch.ones_like(self._poses[0])
         self._scale = column_scale(self._poses) if given.standardise else same
@@ -203,21 +199,6 @@ class ManifoldFit(LightningModule):
             target, given.latent_dim, gamma, given.optimiser, given.learning_rate,
             given.smoothness, start=given.start,
         )  # fmt: skip
-        self._identity = {"model": type(self).__name__, "settings": self.settings}
-        self._identity |= data.identity()
-
-    @property
-    def _given(self) -> Any:
-        return self.hparams
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Everything that was set and matters to the result."""
-        return {k: v for k, v in self._given.items() if k != "picture" and not k.startswith("_")}
-
-    def configure_optimizers(self) -> Sequence[Optimizer]:
-        """None: the fit has its own, whose state is a part of the fit's."""
-        return []
 
     def on_train_start(self) -> None:
         """Nothing is left to do if the fit was resumed after its last step."""
@@ -234,16 +215,12 @@ class ManifoldFit(LightningModule):
         if self.finished:
             self.trainer.should_stop = True
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Say what the checkpoint is of."""
-        checkpoint[_IDENTITY] = {
-            "identity": self._identity,
-            "stopped": self.trainer.should_stop,
-        }
+    def progress_made(self) -> dict[str, Any]:
+        """Whether the fit had come to its end."""
+        return {"stopped": self.trainer.should_stop}
 
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse a checkpoint of anything else."""
-        kept = check_identity(checkpoint.get(_IDENTITY), self._identity, self.trainer.ckpt_path)
+    def go_on_from(self, kept: dict[str, Any]) -> None:
+        """Stop at once if it had."""
         self._stopped = bool(kept["stopped"])
 
     # --- what comes of it
@@ -277,10 +254,10 @@ class ManifoldFit(LightningModule):
 
     def finished_prior(self, **facts: str) -> None:
         """Write the manifold where a prior's file would be; there is no prior to be calibrated."""
-        writers = [c for c in self.trainer.callbacks if isinstance(c, PriorWriter)]  # type: ignore[attr-defined]
-        if not writers or not self.trainer.is_global_zero:
+        out = self.written_to
+        if out is None:
             return
-        manifold, out = self.manifold(**facts), writers[0].out
+        manifold = self.manifold(**facts)
         manifold.save(out)
         written = [out]
         if self._given.picture:
@@ -296,16 +273,6 @@ class ManifoldFit(LightningModule):
             f"wrote {', '.join(map(str, written))}"
         )
 
-    @property
-    def _data(self) -> ManifoldData:
-        data = getattr(self.trainer, "datamodule", None)
-        if not isinstance(data, ManifoldData):
-            raise InputError(
-                f"{type(self).__name__} takes ManifoldData, got {type(data).__name__}; set "
-                "data.class_path to train.manifold.ManifoldData"
-            )
-        return data
-
     def held_out_error(self) -> float:
         """Root mean square of x - f(g(x)) over the held-out poses, as the fit stands."""
         return self._current().reconstruction_error(torch.cat(self._data.watched))
@@ -318,10 +285,6 @@ class ManifoldFit(LightningModule):
 
 
 def _check_trainer(trainer: Any) -> None:
-    if trainer.world_size > 1:
-        raise InputError(
-            f"a manifold is fitted by one process, got {trainer.world_size}; set --trainer.devices 1"
-        )
     if trainer.strategy.root_device.type == "mps":
         raise InputError(
             "a fit needs double precision, which MPS does not have; add --trainer.accelerator cpu"
@@ -340,22 +303,18 @@ def _poses(body: Body, recording: Recording, fps: float) -> Tensor:
     """Poses of a recording at a frame rate."""
     if recording.fps is None:
         raise InputError(
-            f"{_name(recording)}: the file does not say its frame rate, which is needed"
+            f"{recording_name(recording)}: the file does not say its frame rate, which is needed"
         )
     every = max(1, round(recording.fps / fps))
     if abs(recording.fps / every / fps - 1) > _SAME_RATE:
         raise InputError(
-            f"{_name(recording)}: {recording.fps:g} frames per second are no multiple of {fps:g}; set "
-            f"--data.init_args.fps to {recording.fps / every:g}"
+            f"{recording_name(recording)}: {recording.fps:g} frames per second are no multiple of "
+            f"{fps:g}; set --data.init_args.fps to {recording.fps / every:g}"
         )
     try:
         return body.relative(fit_state(body, _joints(recording)[::every])).detach()
     except InputError as error:
-        raise InputError(f"{_name(recording)}: {error}") from error
-
-
-def _name(recording: Recording) -> str:
-    return recording.person_id if recording.path is None else recording.path.stem
+        raise InputError(f"{recording_name(recording)}: {error}") from error
 
 
 def _several(recordings: Sequence[Recording]) -> bool:
