@@ -19,7 +19,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.body.kinematics import Body, Frame
-from torchpose.body.quaternion_vectors import minimal_rotation, quaternion_vector_to_matrix
+from torchpose.body.quaternion_vectors import (
+    cross_matrix,
+    minimal_rotation,
+    quaternion_vector_to_matrix,
+)
 from torchpose.body.skeleton import BODY_15, BodySkeleton
 from torchpose.errors import InputError, SkeletonError, check_shape
 
@@ -298,7 +302,7 @@ def _linearise(body: Body, fit: _Fit, joints: Tensor, known: Tensor) -> tuple[Te
     arms = body.joint_weights.unflatten(0, (-1, 3))  # w, [P, 3, J]
     turned = torch.einsum("tpij,pjn->tnpi", fit.rotations, arms)
     residual = joints - fit.position[:, None] - turned.sum(2)
-    moves = -_skew(turned).transpose(2, 3).flatten(3)  # [T, J, 3, 3 P]
+    moves = -cross_matrix(turned).transpose(2, 3).flatten(3)  # [T, J, 3, 3 P]
     still = torch.eye(3).to(moves).expand(*moves.shape[:2], 3, 3)
     jacobian = torch.cat([still, moves], -1)
     return residual[:, known].flatten(1), jacobian[:, known].flatten(1, 2)
@@ -317,13 +321,6 @@ def _tilt_residual(fit: _Fit, tilt: _Tilt) -> tuple[Tensor, Tensor]:
     moves = axis.new_zeros(len(axis), 1, 3 + 3 * fit.rotations.shape[1])
     moves[:, 0, 3:6] = axis
     return tilt.weight.sqrt() * sine, tilt.weight.sqrt() * moves
-
-
-def _skew(vector: Tensor) -> Tensor:
-    """[v]x, with [v]x a = v x a."""
-    x, y, z = vector.unbind(-1)
-    o = torch.zeros_like(x)
-    return torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
 
 
 # --- joints and parts -----------------------------------------------------------------------------

@@ -284,7 +284,8 @@ class Body(nn.Module):
         """States with the root of `state` and other relative columns, kept in the unit ball."""
         self._check(state)
         check_shape("relative", relative, ["...", self.dim - 6])
-        lead = torch.broadcast_shapes(state.shape[:-1], relative.shape[:-1])
+        # not torch.broadcast_shapes, whose first call imports a computer algebra system
+        lead = torch.broadcast_tensors(state[..., 0], relative[..., 0])[0].shape
         parts = within_unit_ball(relative.unflatten(-1, (-1, 3))).flatten(-2)
         root = state[..., :6].expand(*lead, 6)
         return torch.cat([root, parts.expand(*lead, parts.shape[-1])], -1)

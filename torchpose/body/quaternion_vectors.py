@@ -14,6 +14,7 @@ from torchpose.errors import check_shape
 __all__ = [
     "compose",
     "conjugate",
+    "cross_matrix",
     "matrix_to_quaternion_vector",
     "mean_rotation",
     "minimal_rotation",
@@ -116,6 +117,13 @@ def compose(
     tensor([0., 0., 0.])
     """
     return quaternion_to_vector(_product(vector_to_quaternion(first), vector_to_quaternion(second)))
+
+
+def cross_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The matrix of the cross product, [v]x a = v x a."""
+    x, y, z = vector.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
 
 
 def _product(a: Tensor, b: Tensor) -> Tensor:

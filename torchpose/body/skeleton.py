@@ -16,7 +16,15 @@ from torch import Tensor
 from torchpose.errors import InputError, SkeletonError, check_shape
 from torchpose.joint_sets import canonical_names
 
-__all__ = ["BODY_15", "BodySkeleton", "TaperedCylinder", "Tip", "body_joints", "tree_levels"]
+__all__ = [
+    "BODY_15",
+    "BodySkeleton",
+    "TaperedCylinder",
+    "Tip",
+    "body_joints",
+    "other_side",
+    "tree_levels",
+]
 
 Offset = tuple[float, float, float]
 
@@ -133,7 +141,7 @@ class BodySkeleton:
     def mirrored_limbs(self) -> tuple[int, ...]:
         """Index of each limb's counterpart on the other side; its own in the middle."""
         where = {limb.name: i for i, limb in enumerate(self.limbs)}
-        return tuple(where.get(_other_side(limb.name), i) for i, limb in enumerate(self.limbs))
+        return tuple(where.get(other_side(limb.name), i) for i, limb in enumerate(self.limbs))
 
     def joint(self, name: str) -> int:
         """Index of a joint.
@@ -252,7 +260,12 @@ def _check_names(skeleton: BodySkeleton) -> None:
             )
 
 
-def _other_side(name: str) -> str:
+def other_side(name: str) -> str:
+    """The name of a joint, part or limb on the other side; the same for one in the middle.
+
+    >>> other_side("left_knee"), other_side("neck")
+    ('right_knee', 'neck')
+    """
     for side, other in (("left_", "right_"), ("right_", "left_")):
         if name.startswith(side):
             return other + name.removeprefix(side)

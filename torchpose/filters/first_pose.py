@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 
 from torchpose.body.fitting import fit_state
 from torchpose.body.kinematics import Body
+from torchpose.body.skeleton import other_side
 from torchpose.camera_rig import Cameras, as_rig
 from torchpose.errors import InputError, check_shape
 from torchpose.filters.annealed import AnnealedParticleFilter
@@ -120,7 +121,7 @@ def turned_round(body: Body, states: Float[Tensor, "K D"]) -> Float[Tensor, "K D
     The silhouettes are nearly the same; knees and elbows bend the other way.
     """
     names = body.skeleton.names
-    other = [names.index(_other_side(name)) for name in names]
+    other = [names.index(other_side(name)) for name in names]
     return fit_state(body, body.joints(states)[:, other])
 
 
@@ -151,13 +152,6 @@ def facing_evidence(
 def _both_sides(body: Body, states: Tensor, joint: str) -> Float[Tensor, "*batch 2 3"]:
     rows = [body.skeleton.joint(f"{side}_{joint}") for side in ("left", "right")]
     return body.joints(states)[..., rows, :]
-
-
-def _other_side(name: str) -> str:
-    for here, there in (("left_", "right_"), ("right_", "left_")):
-        if name.startswith(here):
-            return there + name.removeprefix(here)
-    return name
 
 
 def _mean_log_likelihood(

@@ -16,7 +16,7 @@ from torchpose.body.limb_counts import PartCounts, count_parts
 from torchpose.body.limbs import Limbs
 from torchpose.body.quaternion_vectors import quaternion_vector_to_matrix
 from torchpose.body.silhouette import PreparedSilhouettes
-from torchpose.body.skeleton import BodySkeleton
+from torchpose.body.skeleton import BodySkeleton, other_side
 from torchpose.camera_rig import Cameras
 from torchpose.errors import InputError, SkeletonError, check_shape
 from torchpose.unscented import floor_eigenvalues, moments
@@ -252,10 +252,5 @@ def _limbs_of_parts(skeleton: BodySkeleton) -> list[tuple[int, ...]]:
 def _opposing_parts(skeleton: BodySkeleton) -> list[int]:
     """The same part on the other side, without the root; a part in the middle is its own."""
     names = list(skeleton.parts)[1:]
-    swap = {"left": "right", "right": "left"}
-    mirrored = []
-    for i, name in enumerate(names):
-        side, _, kind = name.partition("_")
-        other = f"{swap[side]}_{kind}" if side in swap else name
-        mirrored.append(names.index(other) if other in names else i)
-    return mirrored
+    others = [other_side(name) for name in names]
+    return [names.index(o) if o in names else i for i, o in enumerate(others)]

@@ -13,7 +13,12 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchpose.body.kinematics import Body
-from torchpose.body.quaternion_vectors import compose, conjugate, vector_to_quaternion
+from torchpose.body.quaternion_vectors import (
+    compose,
+    conjugate,
+    cross_matrix,
+    vector_to_quaternion,
+)
 from torchpose.errors import InputError
 from torchpose.filters.base import Generators, standard_normal
 from torchpose.filters.body_frames import Frame
@@ -167,7 +172,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         order = leg_permutation(self.body.skeleton)[1:].to(memory.device)
         centres = self.body.centres.to(memory)
         shift = vector_to_quaternion(compose(conjugate(centres[1:]), centres[order]))
-        turn = shift[..., 3, None, None] * torch.eye(3).to(memory) + _cross_matrix(shift[..., :3])
+        turn = shift[..., 3, None, None] * torch.eye(3).to(memory) + cross_matrix(shift[..., :3])
         exchanged = turn @ memory[:, :, order - 1] @ turn.mT
         return torch.where(swapped[..., None, None, None], exchanged, memory)
 
@@ -243,11 +248,3 @@ def _check(body: Any, likelihood: Any, weighting: str, least_std: float, first_s
     for name, value in (("least_std", least_std), ("first_std", first_std)):
         if not 0 <= value < math.inf:
             raise InputError(f"{name} must be zero or more and finite, got {value}")
-
-
-def _cross_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """[v]_x, with [v]_x a = v x a."""
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
