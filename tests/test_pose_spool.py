@@ -28,6 +28,7 @@ def poses(n_frames, seed=0, failed_at=-1):
         torch.tensor([failed_at]),
         fps=25.0,
         notes=("a note",),
+        method="pf-walk",
     )
 
 
@@ -45,6 +46,7 @@ def test_blocks_come_back_as_one_track_that_can_be_cut_saved_and_outlives_the_sp
         assert torch.equal(getattr(track, name), whole)
         assert torch.equal(getattr(part, name), whole[:, :5])
     assert (track.fps, track.notes, int(track.lengths)) == (25.0, ("a note",), 36)
+    assert track.method == "pf-walk"
     track.save(tmp_path / "poses.npz")
     assert torch.equal(PoseTrack.load(tmp_path / "poses.npz").joints3d, track.joints3d)
 

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -236,6 +237,7 @@ def test_results_are_saved_and_loaded(prior, scene, tmp_path):
     for name in ("joints2d", "joints3d", "covariance3d", "observed", "log_evidence", "lengths"):
         torch.testing.assert_close(getattr(back, name), getattr(single, name))
     assert back.names == UPPER_BODY and back.fps == single.fps and back.notes == single.notes
+    assert back.method == single.method == "window-mixture"
     double = tracker(
         keypoints[None].expand(2, -1, -1, -1), names=NAMES, lengths=torch.tensor([150, 90])
     )
@@ -247,6 +249,15 @@ def test_results_are_saved_and_loaded(prior, scene, tmp_path):
         PoseTrack.load(tmp_path / "cut.npz")
     with pytest.raises(OutputError):
         single.save(tmp_path / "poses.npz" / "inside.npz")
+
+
+def test_files_of_older_releases_do_not_say_what_ran(prior, scene, tmp_path):
+    track = UpperBodyTracker(prior, demo_camera())(scene[1][None, :20], names=NAMES)
+    track.save(tmp_path / "poses.npz")
+    arrays = dict(np.load(tmp_path / "poses.npz"))
+    del arrays["method"]
+    np.savez(tmp_path / "older.npz", **arrays)
+    assert PoseTrack.load(tmp_path / "older.npz").method == "unknown"
 
 
 @pytest.mark.parametrize(

@@ -89,6 +89,7 @@ class PoseSpool:
             frame=like.frame,
             notes=like.notes,
             first_frame=like.first_frame,
+            method=like.method,
         )
 
     def _path(self, name: str) -> Path:

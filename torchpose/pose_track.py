@@ -1,6 +1,6 @@
 """The result of tracking: poses with covariances, and their file."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -45,6 +45,8 @@ class PoseTrack:
         frame: "camera" (x right, y down, z forward) or "body" (that of the prior's recordings).
         failed_at: [B], the first frame that is NaN because the filter degenerated, -1 if none.
         notes: what was assumed about camera, neck and hands, in plain words.
+        method: the estimator that ran, one of `torchpose.tracking.METHODS`; "unknown" in files of
+            older releases.
         first_frame: of the video or recording, that of the first pose.
     """
 
@@ -62,6 +64,7 @@ class PoseTrack:
     frame: str = "camera"
     notes: tuple[str, ...] = field(default_factory=tuple)
     first_frame: int = 0
+    method: str = "unknown"
 
     def __len__(self) -> int:
         return self.joints3d.shape[0]
@@ -71,17 +74,8 @@ class PoseTrack:
         n = int(self.lengths[index])
         rows = slice(index, index + 1) if index != -1 else slice(-1, None)
         cut: dict[str, Any] = {name: getattr(self, name)[rows, :n] for name in FRAME_FIELDS}
-        return PoseTrack(
-            **cut,
-            lengths=self.lengths[rows],
-            matrix=self.matrix,
-            failed_at=self.failed_at[rows],
-            names=self.names,
-            fps=self.fps,
-            frame=self.frame,
-            notes=self.notes,
-            first_frame=self.first_frame,
-        )
+        cut |= {name: getattr(self, name)[rows] for name in ("lengths", "failed_at")}
+        return replace(self, **cut)
 
     def save(self, path: str | Path) -> None:
         """Write an .npz: one sequence without its batch dimension, several with it.
@@ -89,7 +83,7 @@ class PoseTrack:
         `log_evidence` in the file is the score, the sum over both arms; `log_evidence_arms` has them
         apart. Keys: joints2d, joints3d, covariance2d, covariance3d, observed, log_evidence,
         log_evidence_arms, names, fps (NaN if unknown), K, frame, failed_at, lengths, notes,
-        first_frame.
+        first_frame, method.
 
         Raises:
             OutputError: the file cannot be written.
@@ -120,6 +114,7 @@ class PoseTrack:
         arrays["frame"] = np.array(self.frame)
         arrays["notes"] = np.array(self.notes, dtype=str)
         arrays["first_frame"] = np.array(self.first_frame)
+        arrays["method"] = np.array(self.method)
         write_npz(path, arrays)
 
     @classmethod
@@ -157,5 +152,7 @@ class PoseTrack:
             fps=None if np.isnan(fps) else fps,
             frame=str(arrays["frame"]),
             notes=tuple(str(n) for n in arrays["notes"]),
-            first_frame=int(arrays.get("first_frame", 0)),  # files of older releases have none
+            # files of older releases have neither
+            first_frame=int(arrays.get("first_frame", 0)),
+            method=str(arrays.get("method", "unknown")),
         )

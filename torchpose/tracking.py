@@ -332,6 +332,10 @@ class UpperBodyTracker(nn.Module):
             return None
         return suitable_window(self.prior, self.smoothing, self.fps or 30.0)
 
+    def _estimator(self) -> str:
+        """Return the name of what runs: a mixture over windows is no bank of Kalman filters."""
+        return self.method if self._window() is None else "window-mixture"
+
     def _look(
         self, measured: MeasuredJoints, lengths: Tensor | None = None, start: int = 0
     ) -> SeenInView | None:
@@ -409,6 +413,7 @@ class UpperBodyTracker(nn.Module):
             fps=self.fps,
             frame=self.frame,
             notes=notes,
+            method=self._estimator(),
         )
 
     def _read_out(self, left: FilterOutput, right: FilterOutput, view: BodyView | None) -> ReadOut:
