@@ -441,8 +441,8 @@ def print_floor(problem: Problem, n: int) -> None:
 def print_density_error(problem: Problem) -> None:
     """Largest error of the float32 log density against float64, on draws of the prior."""
     covariance = torch.diag(problem.process)
-    walk = MixtureWalk(problem.prior, covariance, torch.float32)
-    wide = MixtureWalk(problem.prior, covariance, torch.float64)
+    walk = MixtureWalk(problem.prior.parameters_tuple(), covariance, torch.float32)
+    wide = MixtureWalk(problem.prior.parameters_tuple(), covariance, torch.float64)
     x = problem.prior.sample((5000,), generator=torch.Generator().manual_seed(3))
     white = walk.whiten(x)
     pairs = zip(

@@ -434,7 +434,7 @@ def exact_densities(prior, process_cov, x):
 
 def check_densities(prior, process_cov, dtype, tolerance):
     """Draws of the prior to `tolerance`; points far off it, as a step leaves them, in proportion."""
-    walk = MixtureWalk(prior, process_cov, dtype)
+    walk = MixtureWalk(prior.parameters_tuple(), process_cov, dtype)
     x = prior.sample((600,), generator=generator())
     step = torch.randn(600, prior.dim, generator=generator(1), dtype=WIDE) @ process_cov.sqrt()
     x = torch.cat([x, x + 0.02 * step])
@@ -471,7 +471,7 @@ def test_densities_of_the_released_prior(side):
 def test_components_are_chosen_by_their_probability():
     prior = small_mixture(n_components=4, dim=2)
     process = 0.3 * torch.eye(2, dtype=WIDE)
-    walk = MixtureWalk(prior, process, WIDE)
+    walk = MixtureWalk(prior.parameters_tuple(), process, WIDE)
     x = torch.tensor([[0.3, -0.2], [-1.0, 1.0]], dtype=WIDE)
     for inflation in (0.0, 1.0, 4.0):
         parts = [
@@ -490,7 +490,7 @@ def test_components_are_chosen_by_their_probability():
 def test_moves_are_the_component_conditionals():
     prior = small_mixture(n_components=2, dim=3)
     process = tensor(random_covariance(np.random.default_rng(3), 3, 0.5))
-    walk = MixtureWalk(prior, process, WIDE)
+    walk = MixtureWalk(prior.parameters_tuple(), process, WIDE)
     moves = walk.moves(*make_transition("paper", prior.means, prior.covariances, process))
     x = torch.randn(5, 3, generator=generator(), dtype=WIDE)
     for k in range(2):

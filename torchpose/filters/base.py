@@ -22,6 +22,7 @@ from torchpose.errors import (
     check_finite,
     check_shape,
 )
+from torchpose.module_state import WideModule, derived, one_run, register_given, working_precision
 
 __all__ = [
     "FilterOutput",
@@ -151,7 +152,16 @@ def as_covariance(name: str, value: Tensor, dim: int, trailing: int = 2) -> Tens
     return value
 
 
-class RecursiveFilter(nn.Module):
+def given_covariance(name: str, value: Tensor, dim: int, trailing: int = 2) -> Tensor:
+    """A covariance to be registered: a parameter as it is, anything else as `as_covariance`; checked.
+
+    A parameter may be the diagonal [D], and stays it.
+    """
+    covariance = as_covariance(name, value, dim, trailing)
+    return value if isinstance(value, nn.Parameter) else covariance
+
+
+class RecursiveFilter(WideModule):
     """A recursive Bayesian filter over batches of sequences.
 
     Args:
@@ -177,13 +187,13 @@ class RecursiveFilter(nn.Module):
                 f"observed must hold distinct state indices in [0, {dim}), got {index.tolist()}"
             )
         self.dim = dim
-        self.dtype = dtype
-        self.register_buffer("observed", index)
-        self.register_buffer(
-            "measurement_cov", as_covariance("measurement_cov", measurement_cov, index.numel())
-        )
-        self.observed: Tensor
-        self.measurement_cov: Tensor
+        self.dtype = working_precision("dtype", dtype)
+        register_given(self, "observed", index)
+        noise = given_covariance("measurement_cov", measurement_cov, index.numel())
+        register_given(self, "measurement_cov", noise)
+
+    observed: Tensor
+    measurement_cov: Tensor
 
     @abstractmethod
     def init(self, batch_size: int, generator: Generators = None) -> Any:
@@ -221,10 +231,10 @@ class RecursiveFilter(nn.Module):
         check_shape("z", z, ["B", self.observed.numel()])
         if measurement_cov is not None and measurement_cov.ndim == 3:
             measurement_cov = measurement_cov[:, None]
-        frames = self.check(
-            z[:, None], None if mask is None else mask[:, None], measurement_cov, None, generator
-        )
-        return self.advance(state, frames.frame(0), generator, return_cov)
+        mask = None if mask is None else mask[:, None]
+        with one_run(self.observed.device):
+            frames = self.check(z[:, None], mask, measurement_cov, None, generator)
+            return self.advance(state, frames.frame(0), generator, return_cov)
 
     def forward(
         self,
@@ -253,8 +263,9 @@ class RecursiveFilter(nn.Module):
             ShapeError: wrong shapes. InputError: empty sequences, NaN or infinite values that are
             not masked, lengths outside 1..T. CovarianceError: R not symmetric positive definite.
         """
-        frames = self.check(z, mask, measurement_cov, lengths, generator)
-        return self.run(frames, generator, return_cov, progress)
+        with one_run(self.observed.device):
+            frames = self.check(z, mask, measurement_cov, lengths, generator)
+            return self.run(frames, generator, return_cov, progress)
 
     def run(
         self, frames: Measurements, generator: Generators, return_cov: bool, progress: bool
@@ -297,7 +308,7 @@ class RecursiveFilter(nn.Module):
         check_finite("z", z, mask, "mark missing values with mask=False")
         z = torch.where(mask, z, torch.zeros_like(z))
         if measurement_cov is None:
-            cov = self.measurement_cov
+            cov = self._own_noise()
         else:
             n = self.observed.numel()
             trailing = 4 if measurement_cov.ndim >= 3 else 2
@@ -310,6 +321,12 @@ class RecursiveFilter(nn.Module):
                 f"got {len(generator)}"
             )
         return Measurements(z, mask, cov, lengths)
+
+    def _own_noise(self) -> Float[Tensor, "Z Z"]:
+        """R of the filter, float64."""
+        given, count = self.measurement_cov, self.observed.numel()
+        sources = (given,)
+        return derived(self, "R", sources, lambda: as_covariance("measurement_cov", given, count))
 
     def _check_lengths(self, lengths: Tensor | None, batch: int, n_frames: int) -> Tensor:
         device = self.observed.device

@@ -83,7 +83,7 @@ def _steps(model: "MixtureKalmanFilter", edges: list[Edge]) -> list[_Step]:
 
 
 def _step(model: "MixtureKalmanFilter", edge: Edge) -> _Step:
-    matrix, observed = model.transition_matrix, model.observed
+    matrix, observed = model.transition(model.burn_in).matrix, model.observed
     whiten = edge.inverse_factor
     gain = edge.white.mT @ whiten
     offset = model.means[:, observed, None]

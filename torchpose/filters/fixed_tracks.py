@@ -159,8 +159,7 @@ def _needs_plain_loop(model: "MixtureKalmanFilter", frames: Measurements) -> boo
 
 
 def _learning(model: "MixtureKalmanFilter", frames: Measurements) -> bool:
-    tensors = [frames.z, frames.cov, model.transition_matrix, model.transition_noise]
-    tensors += [model.log_prior, model.means, model.initial_cov, model.transition_offset]
+    tensors = (frames.z, frames.cov, *model.sources)
     return torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
 
 
@@ -343,7 +342,7 @@ def _stepped_stretch(
     state: Tensor,
     span: tuple[int, int],
 ) -> tuple[_Stretch, Tensor]:
-    matrix = model.transition_matrix.to(model.dtype).mT.contiguous()
+    matrix = model.transition(model.burn_in).matrix.to(model.dtype).mT.contiguous()
     offset = model.means[:, None, model.observed].to(model.dtype)
     deviations, likelihoods, covs = [], [], []
     for t in range(*span):

@@ -159,28 +159,25 @@ def _condition(model: "MixtureKalmanFilter", group: _Group) -> tuple[Tensor, Ten
 def _gain(model: "MixtureKalmanFilter", group: _Group) -> tuple[Gain, Tensor]:
     """Gain and covariance of every component; those of a shared pattern are kept for later frames."""
     if group.mask.ndim == 1:
-        found = model.frame_gains.get(model, group.noise, group.mask)
+        found = model.frame_gains.get(group.noise, group.mask)
         if found is not None:
             return found
     gain, cov = kalman_gain(model.covariances, group.noise, model.observed, group.mask)
     gain = Gain(*(part.to(model.dtype) for part in gain))
     if group.mask.ndim == 1:
-        model.frame_gains.put(model, group.noise, group.mask, (gain, cov))
+        model.frame_gains.put(group.noise, group.mask, (gain, cov))
     return gain, cov
 
 
 class FrameGains:
-    """The gains of the latest patterns of measured dimensions and noise, while the model stays."""
+    """The gains of the latest patterns of measured dimensions and noise, for one mixture."""
 
     def __init__(self) -> None:
-        self._made_for: Tensor | None = None
         self._found: dict[tuple[Any, ...], tuple[Gain, Tensor]] = {}
 
-    def get(
-        self, model: "MixtureKalmanFilter", noise: Tensor, mask: Tensor
-    ) -> tuple[Gain, Tensor] | None:
+    def get(self, noise: Tensor, mask: Tensor) -> tuple[Gain, Tensor] | None:
         """What is known for this pattern and noise."""
-        if self._made_for is not model.covariances or _wants_gradient(model, noise):
+        if torch.is_grad_enabled() and noise.requires_grad:
             return None
         key = _key(noise, mask)
         found = self._found.pop(key, None)
@@ -188,26 +185,13 @@ class FrameGains:
             self._found[key] = found  # the latest one used is the last to go
         return found
 
-    def put(
-        self,
-        model: "MixtureKalmanFilter",
-        noise: Tensor,
-        mask: Tensor,
-        value: tuple[Gain, Tensor],
-    ) -> None:
-        """Keep it, unless a gradient runs through it; of many, the one unused longest goes."""
-        if value[1].requires_grad:
+    def put(self, noise: Tensor, mask: Tensor, value: tuple[Gain, Tensor]) -> None:
+        """Keep it, unless the noise wants gradients; the pattern unused longest makes room."""
+        if torch.is_grad_enabled() and noise.requires_grad:
             return
-        if self._made_for is not model.covariances:
-            self._made_for, self._found = model.covariances, {}
         if len(self._found) >= _PATTERNS:
             self._found.pop(next(iter(self._found)))
         self._found[_key(noise, mask)] = value
-
-
-def _wants_gradient(model: "MixtureKalmanFilter", noise: Tensor) -> bool:
-    wanted = noise.requires_grad or model.covariances.requires_grad
-    return torch.is_grad_enabled() and wanted
 
 
 def _key(noise: Tensor, mask: Tensor) -> tuple[Any, ...]:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchpose.errors import InputError, check_shape
 from torchpose.filters import fixed_tracks, sampled_tracks, split_tracks
@@ -16,6 +16,7 @@ from torchpose.filters.base import (
     RecursiveFilter,
     StepOutput,
     as_covariance,
+    given_covariance,
 )
 from torchpose.filters.frame_weights import FrameGains
 from torchpose.filters.gains import GainGraph
@@ -23,6 +24,7 @@ from torchpose.filters.smoothing import smooth_fixed_tracks
 from torchpose.filters.tracks import MKFState
 from torchpose.filters.transition import TRANSITIONS, Transition, make_transition
 from torchpose.filters.weights import normalise
+from torchpose.module_state import derived, one_run, register_given
 from torchpose.priors.gmm import GaussianMixture
 
 __all__ = ["MKFState", "MixtureKalmanFilter"]
@@ -132,65 +134,65 @@ class MixtureKalmanFilter(RecursiveFilter):
         self.weighting = weighting
         self.reset_below = reset_below
         points = torch.tensor(list(medians), dtype=torch.long)
-        self.register_buffer("medians", points, persistent=False)
-        self._graph: GainGraph | None = None
-        self.frame_gains = FrameGains()
-        if gamma is not None:
-            gamma = torch.as_tensor(gamma, dtype=torch.float64, device=gmm.means.device)
-        self._set_model(gmm, as_covariance("process_cov", process_cov, self.dim), gamma)
-        self.register_buffer("initial_cov", self._initial_cov(initial_cov, n_components))
+        self.register_buffer("medians", points, persistent=False)  # a setting, as `tracks` is
+        self._register_mixture(gmm)
+        register_given(self, "process_cov", given_covariance("process_cov", process_cov, self.dim))
+        register_given(self, "gamma", _as_wide(gamma))
+        register_given(self, "initial_cov", self._given_initial_cov(initial_cov))
         self.to(gmm.means.device)
-
-    def _set_model(self, prior: GaussianMixture, process_cov: Tensor, gamma: Tensor | None) -> None:
-        wide = torch.float64
-        weights = prior.weights.to(wide)
-        self.register_buffer("log_prior", (weights / weights.sum()).log())
-        self.register_buffer("means", prior.means.to(wide))
-        self.register_buffer("covariances", prior.covariances.to(wide))
-        self.register_buffer("process_cov", process_cov.to(prior.means.device))
-        self.register_buffer("gamma", gamma)
-        model = make_transition(
-            self.transition_kind,
-            self.means,
-            self.covariances,
-            self.process_cov,
-            gamma,
-            self.subspace,
-        )
-        for name, value in zip(model._fields, model, strict=True):
-            self.register_buffer(f"transition_{name}", value, persistent=False)
+        self.transition(self.burn_in)  # raises what does not fit before any work
 
     medians: Tensor
     log_prior: Tensor
     means: Tensor
     covariances: Tensor
     process_cov: Tensor
-    initial_cov: Tensor
+    initial_cov: Tensor | None
     gamma: Tensor | None
-    transition_matrix: Tensor
-    transition_offset: Tensor
-    transition_noise: Tensor
 
-    def _initial_cov(self, initial_cov: Tensor | None, n_components: int) -> Tensor:
-        if initial_cov is None:
-            return self.covariances
-        if initial_cov.ndim == 3:
-            check_shape("initial_cov", initial_cov, [n_components, self.dim, self.dim])
-            return as_covariance("initial_cov", initial_cov, self.dim, 3)
-        cov = as_covariance("initial_cov", initial_cov, self.dim)
-        return cov.expand(n_components, -1, -1).contiguous()
+    def _register_mixture(self, prior: GaussianMixture) -> None:
+        weights = prior.weights.to(torch.float64)
+        register_given(self, "log_prior", (weights / weights.sum()).log())
+        register_given(self, "means", _as_wide(prior.means))
+        register_given(self, "covariances", _as_wide(prior.covariances))
+
+    def _given_initial_cov(self, value: Tensor | None) -> Tensor | None:
+        if value is None:
+            return None
+        per_component = value.ndim == 3
+        if per_component:
+            check_shape("initial_cov", value, list(self.covariances.shape))
+        return given_covariance("initial_cov", value, self.dim, 3 if per_component else 2)
+
+    @property
+    def sources(self) -> tuple[Tensor, ...]:
+        """The tensors that every gain depends on, beside R."""
+        tensors = (self.log_prior, self.means, self.covariances, self.process_cov)
+        return (*tensors, *(t for t in (self.gamma, self.initial_cov) if t is not None))
+
+    @property
+    def start_cov(self) -> Float[Tensor, "K D D"]:
+        """Covariance of every component's track before the first prediction."""
+        if self.initial_cov is None:
+            return self.covariances.to(torch.float64)
+        cov = as_covariance("initial_cov", self.initial_cov, self.dim, self.initial_cov.ndim)
+        return cov.expand(self.means.shape[0], -1, -1)
 
     def transition(self, time: int) -> Transition:
         """The transition into frame `time` (0-based), with the inflated Q of the burn-in."""
-        if time >= self.burn_in:
-            return Transition(self.transition_matrix, self.transition_offset, self.transition_noise)
-        scale = self.burn_in_scale ** (1 - time / self.burn_in)
+        if time < self.burn_in:
+            return self._make_transition(self.burn_in_scale ** (1 - time / self.burn_in))
+        sources = (self.means, self.covariances, self.process_cov, self.gamma)
+        return derived(self, "transition", sources, lambda: self._make_transition(1.0))
+
+    def _make_transition(self, inflation: float) -> Transition:
+        wide = torch.float64
         return make_transition(
             self.transition_kind,
-            self.means,
-            self.covariances,
-            self.process_cov * scale,
-            self.gamma,
+            self.means.to(wide),
+            self.covariances.to(wide),
+            inflation * as_covariance("process_cov", self.process_cov, self.dim),
+            None if self.gamma is None else self.gamma.to(wide),
             self.subspace,
         )
 
@@ -204,7 +206,7 @@ class MixtureKalmanFilter(RecursiveFilter):
         return MKFState(
             normalise(self.log_prior).to(self.dtype).expand(batch_size, -1),
             self.means.to(self.dtype).expand(batch_size, -1, -1),
-            self.initial_cov[None],
+            self.start_cov[None],
             torch.zeros(batch_size, dtype=torch.long, device=device),
             0,
         )
@@ -255,8 +257,9 @@ class MixtureKalmanFilter(RecursiveFilter):
             raise InputError(
                 f"smoothing needs tracks='fixed', whose tracks have a past each, got {self.tracks!r}"
             )
-        frames = self.check(z, mask, measurement_cov, lengths, None)
-        return smooth_fixed_tracks(self, frames, lag, return_cov)
+        with one_run(self.observed.device):
+            frames = self.check(z, mask, measurement_cov, lengths, None)
+            return smooth_fixed_tracks(self, frames, lag, return_cov)
 
     @property
     def is_memoryless(self) -> bool:
@@ -266,20 +269,19 @@ class MixtureKalmanFilter(RecursiveFilter):
 
     def gain_graph(self, measurement_cov: Tensor) -> GainGraph:
         """The graph of gains for constant R, kept while model and R stay as they are."""
-        graph = self._graph
-        fresh = graph is None or graph.full()
-        if (
-            fresh
-            or graph is None
-            or graph.transition.matrix is not self.transition_matrix
-            or graph.nodes[0] is not self.initial_cov
-            or not torch.equal(graph.measurement_cov, measurement_cov)
-        ):
-            graph = GainGraph(
-                self.transition(self.burn_in), self.observed, measurement_cov, self.initial_cov
-            )
-            self._graph = graph
+        kept: dict[str, GainGraph] = derived(self, f"gains {self.dtype}", self.sources, dict)
+        graph = kept.get("graph")
+        if graph is None or graph.full() or not torch.equal(graph.measurement_cov, measurement_cov):
+            steady = self.transition(self.burn_in)
+            graph = GainGraph(steady, self.observed, measurement_cov.clone(), self.start_cov)
+            kept["graph"] = graph
         return graph
+
+    @property
+    def frame_gains(self) -> FrameGains:
+        """Gains of components by pattern of measured dimensions, kept while the mixture stays."""
+        sources = (self.means, self.covariances)
+        return derived(self, f"frame gains {self.dtype}", sources, FrameGains)
 
     def extra_repr(self) -> str:
         """Main settings, for printing."""
@@ -287,6 +289,13 @@ class MixtureKalmanFilter(RecursiveFilter):
             f"tracks={self.tracks}, n_tracks={self.n_tracks}, dim={self.dim}, "
             f"observed={self.observed.tolist()}, transition={self.transition_kind}"
         )
+
+
+def _as_wide(value: Tensor | float | None) -> Tensor | None:
+    """float64, unless it is a parameter, which stays itself."""
+    if value is None or isinstance(value, nn.Parameter):
+        return value
+    return torch.as_tensor(value, dtype=torch.float64)
 
 
 def _check_options(

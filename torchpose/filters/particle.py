@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchpose.errors import InputError, check_shape
 from torchpose.filters.base import (
@@ -16,6 +16,7 @@ from torchpose.filters.base import (
     StepOutput,
     as_covariance,
     effective_sample_size,
+    given_covariance,
     standard_normal,
     uniform,
 )
@@ -23,6 +24,8 @@ from torchpose.filters.resampling import RESAMPLING, resample
 from torchpose.filters.transition import TRANSITIONS, make_transition
 from torchpose.filters.walk import MixtureWalk, Moves, grouped_affine
 from torchpose.gaussian import LOG_2PI, safe_cholesky
+from torchpose.module_state import derived, register_given
+from torchpose.priors.em import MixtureParameters
 from torchpose.priors.gmm import GaussianMixture
 
 __all__ = ["PROPOSALS", "BootstrapParticleFilter", "ParticleState"]
@@ -46,6 +49,20 @@ class ParticleState(NamedTuple):
     log_weights: Tensor
     time: int
     log_scaling: Tensor | None
+
+
+class _Constants(NamedTuple):
+    """What the model determines before any measurement.
+
+    Attributes:
+        walk: prior density and evidence in whitened coordinates. initial: maps noise to the first
+            particles. steady: moves of the proposal "mixture" without burn-in. walk_factor: of Q.
+    """
+
+    walk: MixtureWalk
+    initial: Moves
+    steady: Moves | None
+    walk_factor: Tensor
 
 
 class BootstrapParticleFilter(RecursiveFilter):
@@ -104,11 +121,7 @@ class BootstrapParticleFilter(RecursiveFilter):
     weights: Tensor
     means: Tensor
     covariances: Tensor
-    initial_matrix: Tensor
-    initial_offset: Tensor
-    steady_matrix: Tensor
-    steady_offset: Tensor
-    walk_factor: Tensor
+    initial_cov: Tensor | None
     gamma: Tensor | None
 
     def __init__(
@@ -136,49 +149,62 @@ class BootstrapParticleFilter(RecursiveFilter):
         self.n_particles, self.resample_threshold = n_particles, resample_threshold
         self.resampling = resampling
         self.burn_in, self.burn_in_scale = burn_in, float(burn_in_scale)
-        device = gmm.means.device
-        self.to(device)
-        rate = None if gamma is None else torch.as_tensor(gamma, dtype=torch.float64).to(device)
-        process_cov = as_covariance("process_cov", process_cov, gmm.dim).to(device)
-        self.register_buffer("process_cov", process_cov.detach())
-        self.register_buffer("gamma", None if rate is None else rate.detach())
         for name, value in zip(
             ("weights", "means", "covariances"), gmm.parameters_tuple(), strict=True
         ):
-            self.register_buffer(name, value.detach().double())
-        self.walk = MixtureWalk(gmm, self.process_cov, dtype)
-        self._register_constants(initial_cov)
+            given = value if isinstance(value, nn.Parameter) else value.detach().double()
+            register_given(self, name, given)
+        register_given(self, "process_cov", given_covariance("process_cov", process_cov, self.dim))
+        if gamma is not None and not isinstance(gamma, nn.Parameter):
+            gamma = torch.as_tensor(gamma, dtype=torch.float64)
+        register_given(self, "gamma", gamma)
+        register_given(self, "initial_cov", self._given_initial_cov(initial_cov))
+        self.to(gmm.means.device)
+        self._constants()  # raises what does not fit before any work
+
+    def _given_initial_cov(self, value: Tensor | None) -> Tensor | None:
+        if value is None:
+            return None
+        per_component = value.ndim == 3
+        cov = given_covariance("initial_cov", value, self.dim, 3 if per_component else 2)
+        if per_component:
+            check_shape("initial_cov", cov, list(self.covariances.shape))
+        return cov
+
+    def _constants(self) -> "_Constants":
+        given = (self.weights, self.means, self.covariances, self.process_cov)
+        sources = (*given, self.gamma, self.initial_cov)
+        return derived(self, f"constants {self.dtype}", sources, self._make_constants)
+
+    @property
+    def walk(self) -> MixtureWalk:
+        """The random walk under the prior, in whitened coordinates."""
+        return self._constants().walk
 
     @torch.no_grad()
-    def _register_constants(self, initial_cov: Tensor | None) -> None:
-        spread = self.covariances
-        if initial_cov is not None:
-            per_component = initial_cov.ndim == 3
-            spread = as_covariance("initial_cov", initial_cov, self.dim, 3 if per_component else 2)
-            if per_component:
-                check_shape("initial_cov", spread, list(self.covariances.shape))
-            spread = spread.to(self.covariances).expand_as(self.covariances)
-        initial = self.walk.moves(torch.zeros_like(spread), self.means, spread)
-        steady = self._moves_at(1.0) if self.proposal == "mixture" else initial
-        whitener = torch.linalg.solve_triangular(
-            self.walk.scale, torch.eye(self.dim).to(spread), upper=False
+    def _make_constants(self) -> "_Constants":
+        process_cov = as_covariance("process_cov", self.process_cov, self.dim)
+        mixture = MixtureParameters(
+            self.weights.double(), self.means.double(), self.covariances.double()
         )
-        walk_cov = whitener @ self.process_cov @ whitener.mT
-        constants = {
-            "initial_matrix": initial.matrix[:, self.dim :],
-            "initial_offset": initial.offset,
-            "steady_matrix": steady.matrix,
-            "steady_offset": steady.offset,
-            "walk_factor": safe_cholesky(walk_cov).mT.contiguous().to(self.dtype),
-        }
-        for name, value in constants.items():
-            self.register_buffer(name, value, persistent=False)
+        walk = MixtureWalk(mixture, process_cov, self.dtype)
+        spread = mixture.covariances
+        if self.initial_cov is not None:
+            cov = as_covariance("initial_cov", self.initial_cov, self.dim, self.initial_cov.ndim)
+            spread = cov.expand_as(spread)
+        initial = walk.moves(torch.zeros_like(spread), mixture.means, spread)
+        steady = self._moves_at(1.0, walk) if self.proposal == "mixture" else None
+        eye = torch.eye(self.dim, dtype=torch.float64, device=spread.device)
+        whitener = torch.linalg.solve_triangular(walk.scale, eye, upper=False)
+        factor = safe_cholesky(whitener @ process_cov @ whitener.mT)
+        return _Constants(walk, initial, steady, factor.mT.contiguous().to(self.dtype))
 
-    def _moves_at(self, inflation: float) -> Moves:
-        cov = inflation * self.process_cov
-        kind = self.transition
-        parts = make_transition(kind, self.means, self.covariances, cov, self.gamma, self.subspace)
-        return self.walk.moves(*parts)
+    def _moves_at(self, inflation: float, walk: MixtureWalk) -> Moves:
+        cov = inflation * as_covariance("process_cov", self.process_cov, self.dim)
+        gamma = None if self.gamma is None else self.gamma.double()
+        mixture = self.means.double(), self.covariances.double()
+        parts = make_transition(self.transition, *mixture, cov, gamma, self.subspace)
+        return walk.moves(*parts)
 
     def inflation(self, time: int) -> float:
         """Factor of Q in frame `time` (0-based): from `burn_in_scale` geometrically to 1."""
@@ -195,13 +221,14 @@ class BootstrapParticleFilter(RecursiveFilter):
         """
         if batch_size < 1:
             raise InputError(f"batch_size must be at least 1, got {batch_size}")
-        n, like = self.n_particles, self.initial_offset
+        initial = self._constants().initial
+        n, like = self.n_particles, initial.offset
         u = uniform(batch_size, (n,), generator, like.new_empty(0, dtype=torch.float64))
         noise = standard_normal(batch_size, (n, self.dim), generator, like)
         edges = self.weights.cumsum(0)
         component = torch.searchsorted(edges, u * edges[-1], right=True)
         component = component.clamp_max(len(edges) - 1).view(-1)
-        moves = Moves(self.initial_matrix, self.initial_offset)
+        moves = Moves(initial.matrix[:, self.dim :], initial.offset)
         white = grouped_affine(noise.view(-1, self.dim), component, moves).view_as(noise)
         log_weights = torch.full_like(u, -math.log(n))
         scaling = self._prior_and_scaling(white, 0)[1] if self.proposal == "random-walk" else None
@@ -261,11 +288,11 @@ class BootstrapParticleFilter(RecursiveFilter):
         inflation = self.inflation(state.time)
         noise = standard_normal(batch, (n, dim), generator, state.white)
         if self.proposal != "mixture":
-            factor = self.walk_factor * math.sqrt(inflation)
+            factor = self._constants().walk_factor * math.sqrt(inflation)
             return (state.white.view(-1, dim).addmm(noise.view(-1, dim), factor)).view_as(noise)
-        moves = Moves(self.steady_matrix, self.steady_offset)
-        if inflation != 1.0:
-            moves = self._moves_at(inflation)
+        moves = self._constants().steady
+        if moves is None or inflation != 1.0:
+            moves = self._moves_at(inflation, self.walk)
         u = uniform(batch, (n,), generator, state.white)
         reach = inflation if self.transition == "paper" else 0.0
         component = self.walk.choose(state.white, u, reach).view(-1)

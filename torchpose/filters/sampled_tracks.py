@@ -26,7 +26,7 @@ def init(model: "MixtureKalmanFilter", batch: int, generator: Generators) -> MKF
     drawn = _draw_components(model, batch, generator)
     log_weights = torch.zeros(drawn.shape, dtype=model.dtype, device=drawn.device)
     group = torch.arange(batch, device=drawn.device)
-    mean, cov = model.means.to(model.dtype)[drawn], model.initial_cov[drawn]
+    mean, cov = model.means.to(model.dtype)[drawn], model.start_cov[drawn]
     return MKFState(normalise(log_weights), mean, cov, group, 0)
 
 

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchpose.gaussian import LOG_2PI, safe_cholesky
-from torchpose.priors.gmm import GaussianMixture
+from torchpose.priors.em import MixtureParameters
 
 __all__ = ["MixtureWalk", "Moves", "grouped_affine"]
 
@@ -32,7 +32,7 @@ class Moves(NamedTuple):
     offset: Tensor
 
 
-class MixtureWalk(nn.Module):
+class MixtureWalk:
     """Prior density and random-walk evidence of a mixture, from one product of residuals.
 
     In the generalised eigenbasis E_i of (Sigma_i, Q), with E_i E_i^T = Sigma_i and
@@ -46,7 +46,7 @@ class MixtureWalk(nn.Module):
     covariance of the whole mixture; log densities are those of y.
 
     Args:
-        gmm: the prior Phi.
+        mixture: weights, means and covariances of the prior Phi.
         process_cov: Q [D, D], float64.
         dtype: of points and densities, torch.float32 or torch.float64.
     """
@@ -57,11 +57,10 @@ class MixtureWalk(nn.Module):
     ratio: Tensor
     log_norm: Tensor
 
-    def __init__(self, gmm: GaussianMixture, process_cov: Tensor, dtype: torch.dtype) -> None:
-        super().__init__()
-        self.n_components, self.dim = gmm.n_components, gmm.dim
-        for name, value in _diagonalise(gmm, process_cov, dtype).items():
-            self.register_buffer(name, value, persistent=False)
+    def __init__(self, mixture: MixtureParameters, process_cov: Tensor, dtype: torch.dtype) -> None:
+        self.n_components, self.dim = mixture.means.shape
+        for name, value in _diagonalise(mixture, process_cov, dtype).items():
+            setattr(self, name, value)
 
     def whiten(self, x: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D"]:
         """y = L^-1 (x - m), computed in float64 and returned in the dtype of the walk."""
@@ -207,15 +206,16 @@ def _exp_(terms: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _diagonalise(
-    gmm: GaussianMixture, process_cov: Tensor, dtype: torch.dtype
+    mixture: MixtureParameters, process_cov: Tensor, dtype: torch.dtype
 ) -> dict[str, Tensor]:
-    weights, means, covariances = (p.detach().double() for p in gmm.parameters_tuple())
+    weights, means, covariances = (p.detach().double() for p in mixture)
     mean = weights @ means
     centred = means - mean
     total = torch.einsum("k,kij->ij", weights, covariances)
     scale = safe_cholesky(total + torch.einsum("k,ki,kj->ij", weights, centred, centred))
     factor = safe_cholesky(covariances)
-    eye = torch.eye(gmm.dim, dtype=torch.float64, device=means.device)
+    dim = means.shape[1]
+    eye = torch.eye(dim, dtype=torch.float64, device=means.device)
     inverse = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
     ratio, basis = torch.linalg.eigh(inverse @ process_cov @ inverse.mT)
     rows = basis.mT @ inverse @ scale  # E_i^-1 L, for whitened points
@@ -224,7 +224,7 @@ def _diagonalise(
     return {
         "mean": mean,
         "scale": scale,
-        "rows": torch.cat([rows, -shift], -1).reshape(-1, gmm.dim + 1).to(dtype).contiguous(),
+        "rows": torch.cat([rows, -shift], -1).reshape(-1, dim + 1).to(dtype).contiguous(),
         "ratio": ratio.clamp_min(0),
-        "log_norm": weights.log() + log_det - 0.5 * gmm.dim * LOG_2PI,
+        "log_norm": weights.log() + log_det - 0.5 * dim * LOG_2PI,
     }
