@@ -1,20 +1,52 @@
-"""What fits to whole bodies share: one process, the identity of a fit, and where its file goes."""
+"""What fits to whole bodies share: one process, the identity of a fit, and where its file goes.
+
+What is fitted, and to which recordings, is `torchpose.recipes`; here are the steps of Lightning.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from lightning.pytorch import LightningModule
+from lightning.pytorch import LightningDataModule, LightningModule
 from torch.optim import Optimizer
 
 from torchpose.errors import InputError
-from torchpose.io import Recording
 from train.callbacks import PriorWriter
 from train.identity import check_identity
 
-__all__ = ["BodyFit", "recording_name"]
+__all__ = ["BodyData", "BodyFit"]
 
 _ENTRY = "torchpose"  # of a checkpoint: what it is of
+
+
+class BodyData(LightningDataModule):
+    """Base of the data of a fit, which are gathered once, in `setup`.
+
+    Attributes:
+        gathered: what `gather` of the library has made of the recordings, or None before.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gathered: Any = None
+
+    def gather(self) -> Any:
+        """Read the recordings and turn them into what is fitted to."""
+        raise NotImplementedError
+
+    def setup(self, stage: str) -> None:
+        """Gather; the second call does nothing."""
+        if self.gathered is None:
+            self.gathered = self.gather()
+
+    def train_dataloader(self) -> range:
+        """One step an epoch."""
+        return range(1)
+
+    def identity(self) -> dict[str, Any]:
+        """What makes a fit the same one."""
+        found: dict[str, Any] = self.gathered.identity()
+        return found
 
 
 class BodyFit(LightningModule):
@@ -23,11 +55,11 @@ class BodyFit(LightningModule):
     A subclass calls `save_hyperparameters` in its constructor, and names its data and what it fits.
 
     Attributes:
-        data_type: the data module that it takes, with `setup` and `identity`. what: what is fitted,
-            for the refusal of several processes.
+        data_type: the data module that it takes. what: what is fitted, for the refusal of several
+            processes.
     """
 
-    data_type: ClassVar[type]
+    data_type: ClassVar[type[BodyData]]
     what: ClassVar[str]
 
     def __init__(self) -> None:
@@ -42,7 +74,7 @@ class BodyFit(LightningModule):
                 f"{self.what} fitted by one process, got {self.trainer.world_size}; set "
                 "--trainer.devices 1"
             )
-        data = self._data
+        data = self.data_module
         data.setup(stage)
         self._identity = {"model": type(self).__name__, "settings": self.settings}
         self._identity |= data.identity()
@@ -50,7 +82,8 @@ class BodyFit(LightningModule):
     @property
     def settings(self) -> dict[str, Any]:
         """Everything that was set and matters to the result."""
-        return {k: v for k, v in self._given.items() if k != "picture" and not k.startswith("_")}
+        given: Any = self.hparams
+        return {k: v for k, v in given.items() if k != "picture" and not k.startswith("_")}
 
     def configure_optimizers(self) -> Sequence[Optimizer]:
         """None that Lightning knows of."""
@@ -79,11 +112,8 @@ class BodyFit(LightningModule):
         return writers[0].out if writers and self.trainer.is_global_zero else None
 
     @property
-    def _given(self) -> Any:
-        return self.hparams
-
-    @property
-    def _data(self) -> Any:
+    def data_module(self) -> BodyData:
+        """The data, if they are of the right kind."""
         data, wanted = getattr(self.trainer, "datamodule", None), self.data_type
         if not isinstance(data, wanted):
             raise InputError(
@@ -92,7 +122,7 @@ class BodyFit(LightningModule):
             )
         return data
 
-
-def recording_name(recording: Recording) -> str:
-    """What messages call a recording: its file without the suffix, or its person."""
-    return recording.person_id if recording.path is None else recording.path.stem
+    @property
+    def gathered(self) -> Any:
+        """What is fitted to."""
+        return self.data_module.gathered

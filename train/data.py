@@ -1,9 +1,6 @@
 """Recordings for training: which files, which persons, and the mixtures to fit to them."""
 
-import hashlib
 import json
-import os
-import re
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -21,9 +18,10 @@ from torchpose.errors import InputError, OverlapError
 from torchpose.io import Recording, find_recordings, read_recordings
 from torchpose.priors.samplers import SampleSource, cached
 from torchpose.recipes import VERSION, MixtureTask, UpperBodyRecipe
+from torchpose.recipes.choosing import expand_path, fingerprint
 from train.blocks import Key, SweepLoader
 
-__all__ = ["RecordingsDataModule", "expand_path", "fingerprint", "read_sides", "split"]
+__all__ = ["RecordingsDataModule", "read_sides", "split"]
 
 _RECIPE, _CURATION = UpperBodyRecipe(), CurationSettings()
 _HELD_OUT_SHARE = 5  # held-out states: one for so many training states
@@ -126,22 +124,6 @@ class RecordingsDataModule(LightningDataModule):
         )
 
 
-def expand_path(path: str) -> str:
-    """A path with its `$NAME` and `~` filled in.
-
-    Raises:
-        InputError: a variable that is not set.
-    """
-    for braced, plain in re.findall(r"\$(?:\{(\w+)\}|(\w+))", path):
-        name = braced or plain
-        if not os.environ.get(name):
-            raise InputError(
-                f"{path}: the environment variable {name} is not set; set it to the folder of the "
-                "recordings, or give the path itself with --data.paths"
-            )
-    return os.path.expanduser(os.path.expandvars(path))
-
-
 def read_sides(
     paths: Sequence[str],
     axes: str | None,
@@ -193,24 +175,3 @@ def split(
     watched = [r for r in recordings if r.person_id in out]
     refuse_leaks(train, watched)
     return train, watched
-
-
-def fingerprint(recordings: Sequence[Recording]) -> dict[str, Any]:
-    """How many recordings, frames and persons there are, and a digest of all of it."""
-    return {
-        "count": len(recordings),
-        "frames": sum(len(r) for r in recordings),
-        "persons": sorted({r.person_id for r in recordings}),
-        "sha256": _digest(recordings),
-    }
-
-
-def _digest(recordings: Sequence[Recording]) -> str:
-    digest = hashlib.sha256()
-    for recording in recordings:
-        facts = (recording.person_id, recording.fps, recording.names, recording.joints.shape)
-        digest.update(repr(facts).encode())
-        digest.update(recording.joints.numpy().tobytes())
-        if recording.weights is not None:
-            digest.update(recording.weights.numpy().tobytes())
-    return digest.hexdigest()

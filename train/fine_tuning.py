@@ -24,7 +24,8 @@ from torchpose.priors import UpperBodyPrior, load_prior
 from torchpose.priors.fine_tuning import TunableKalman, TunableWindow, parameter_groups
 from torchpose.priors.training import collect_poses
 from torchpose.recipes.calibration import HeldOut, calibration_noise, track_held_out
-from train.data import fingerprint, read_sides
+from torchpose.recipes.choosing import fingerprint
+from train.data import read_sides
 from train.fine_tuning_batches import batches_of
 from train.identity import check_identity, differences
 from train.predict_tracking import digest_of_prior

@@ -14,7 +14,7 @@ from torchpose.body import BODY_15, Body
 from torchpose.priors.action_bank import ActionBank
 from torchpose.priors.action_space import ActionSpace
 from torchpose.priors.postures import posture_angles, posture_to_state
-from train.actions import ActionData
+from torchpose.recipes import Performances
 from train.cli import main
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -69,8 +69,7 @@ def run(scene, name: str, *more: str) -> int:
 def test_it_is_the_fit_of_the_library(scene, capsys) -> None:
     assert run(scene, "one", "--model.init_args.picture", "true") == 0
     found = ActionSpace.load(scene.home / "one.safetensors")
-    data = ActionData([str(scene.folder)], ["action0"], held_out=["p3"])
-    data.setup("fit")
+    data = Performances.gather([str(scene.folder)], ["action0"], held_out=["p3"])
     assert len(data.train) == 9 and len(data.watched) == 3
     expected = ActionSpace.fit([p.postures for p in data.train], 5, name="action0", fps=30.0)
     for name, value in expected.state_dict().items():
@@ -95,8 +94,9 @@ def test_several_actions_are_a_bank(scene) -> None:
     assert bank.names == ("action1", "action0", "none") and bank.info.stay == 0.9
     assert bank.info.gate_dimensions == 3 and bank.info.fps == 30.0
     assert "MHAD" in bank.info.licence and bank.info.persons == ("set#p0", "set#p1", "set#p2")
-    data = ActionData([str(scene.folder)], ["action1", "action0"], held_out=["p3"], postures="body")
-    data.setup("fit")
+    data = Performances.gather(
+        [str(scene.folder)], ["action1", "action0"], held_out=["p3"], postures="body"
+    )
     right = [
         bank.info.names[int(bank.recognise(p.postures).mean(0).argmax())] == p.action
         for p in data.watched
@@ -107,8 +107,7 @@ def test_several_actions_are_a_bank(scene) -> None:
 def test_recordings_are_resampled(scene) -> None:
     found = {}
     for fps in (30.0, 15.0):
-        data = ActionData([str(scene.folder)], ["action0"], fps=fps)
-        data.setup("fit")
+        data = Performances.gather([str(scene.folder)], ["action0"], fps=fps)
         found[fps] = data.train
     assert len(found[15.0]) == len(found[30.0]) == 12
     for slow, fast in zip(found[15.0], found[30.0], strict=True):
@@ -131,8 +130,7 @@ def test_on_one_body_it_makes_no_difference_where_the_shoulders_are(tmp_path) ->
         write_recording(tmp_path, person, 0, joints=body.joints(states).numpy())
     apart = {}
     for kind in ("joints", "body"):
-        data = ActionData([str(tmp_path)], ["action0"], repeated=False, postures=kind)
-        data.setup("fit")
+        data = Performances.gather([str(tmp_path)], ["action0"], repeated=False, postures=kind)
         one, two = (p.postures for p in data.train)
         apart[kind] = float((one - two).abs().max())
     assert apart["joints"] > 10 and apart["body"] < 1e-3
@@ -174,7 +172,7 @@ def test_bad_input_is_refused_in_one_line(scene, capsys) -> None:
         (["--data.init_args.persons", "[p9]"], "'p9' is nobody's name"),
         (["--data.init_args.actions", "[hop]"], "no recording of hop; there are action0, action1"),
         (["--data.init_args.actions", "[]"], "actions must be names"),
-        (["--data.init_args.held_out", "[p0, p1, p2, p3]"], "there is no performance to learn from"),
+        (["--data.init_args.held_out", "[p0, p1, p2, p3]"], "nobody is left to learn from"),
         (["--data.init_args.fps", "0"], "fps must be positive"),
         (["--model.init_args.n_dimensions", "0"], "n_dimensions must be at least 1, got 0"),
         (["--data", "train.data.RecordingsDataModule"], "train.actions.ActionData"),

@@ -12,8 +12,8 @@ pytest.importorskip("lightning", reason="lightning is not installed; training ne
 
 from torchpose.body import BODY_15, Body
 from torchpose.priors.limb_conditionals import LimbConditionals
+from torchpose.recipes.limbs import LimbStates, held_out_spread
 from train.cli import main
-from train.limbs import LimbData, held_out_spread
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / "configs" / "limbs.yaml"
@@ -98,8 +98,7 @@ def test_limbs_come_back_as_they_were_moved(scene, capsys) -> None:
 
 
 def test_it_is_the_fit_of_the_library_on_one_body(scene) -> None:
-    data = LimbData([str(scene.folder)], held_out=["p2"], actions=["walk0"])
-    data.setup("fit")
+    data = LimbStates.gather([str(scene.folder)], held_out=["p2"], actions=["walk0"])
     assert data.body.frame == "body" and len(data.train) == 2 and len(data.watched) == 1
     one = LimbConditionals.fit(data.body, data.train, 60.0)
     one.check_for(data.body)

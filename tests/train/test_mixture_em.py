@@ -13,9 +13,10 @@ from torchpose.priors import SufficientStatistics
 from torchpose.priors.samplers import BLOCK, TensorSource
 from torchpose.priors.streamed_em import StreamedEM, fit_streamed
 from torchpose.recipes import MixtureTask
+from torchpose.recipes.choosing import expand_path, fingerprint
 from torchpose.skeleton import UPPER_BODY
 from train.blocks import Key, SweepLoader
-from train.data import RecordingsDataModule, expand_path, fingerprint, split
+from train.data import RecordingsDataModule, split
 from train.identity import check_identity
 from train.mixture_em import MixtureEM
 from train.processes import first_failure

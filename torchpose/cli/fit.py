@@ -1,4 +1,4 @@
-"""`torchpose fit`: a prior from recordings of 3D joints."""
+"""`torchpose fit`: a prior from recordings of 3D joints; what body trackers learn by a word of its own."""
 
 import shlex
 from dataclasses import replace
@@ -15,6 +15,8 @@ from torchpose.cli.common import (
     save_pictures,
     show_progress,
 )
+from torchpose.cli.fit_bodies import KINDS
+from torchpose.cli.fit_bodies import main as fit_bodies
 from torchpose.errors import InputError, OutputError
 
 if TYPE_CHECKING:
@@ -26,7 +28,10 @@ torchpose fit recordings/ --out prior.safetensors
 torchpose fit recordings/ more/ clip.npz --out prior.safetensors --components 30 --seed 0 --name mine
 torchpose fit recordings/ --out prior.safetensors --without bob carol
 torchpose fit recordings/ --out prior.safetensors --noise none --samples 20000
-torchpose fit room/ --out prior.safetensors --axes z-up --harmonise true"""
+torchpose fit room/ --out prior.safetensors --axes z-up --harmonise true
+torchpose fit manifold --help
+torchpose fit limbs --help
+torchpose fit actions --help"""
 
 _SHOWN_PATHS, _SHOWN_DROPS = 8, 5
 _NOISE = ("learnt", "none")
@@ -34,6 +39,8 @@ _NOISE = ("learnt", "none")
 
 def main(arguments: list[str]) -> int:
     """Run the command and return its exit code."""
+    if arguments and arguments[0] in KINDS:
+        return fit_bodies(arguments[0], arguments[1:])
     return run(build().parse_args(arguments))
 
 
@@ -43,7 +50,8 @@ def build() -> ArgumentParser:
         "fit",
         "Fit a prior of the upper body to recorded 3D poses seen from random viewpoints, and learn "
         "from persons held out in turn how good it is on somebody new. Writes the prior, a model "
-        "card beside it (.md) and a picture of its mean poses (.png).",
+        "card beside it (.md) and a picture of its mean poses (.png). With the word manifold, limbs or "
+        "actions before the recordings, what the trackers of whole bodies learn; see their own --help.",
         _EXAMPLES,
     )
     add = parser.add_argument
@@ -110,7 +118,7 @@ def run(args: Namespace) -> int:
     from torchpose.priors import write_model_card
 
     _check_options(args)
-    out = _output_file(args.out)
+    out = output_file(args.out)
     recordings = read_recordings(find_recordings(args.recordings), args.axes)
     pictures = pictures_possible(args.pictures)
     recordings, curation = _curated(_without(recordings, args.without or []), args)
@@ -230,7 +238,12 @@ def _check_options(args: Namespace) -> None:
         raise InputError("--window-components applies only with --noise learnt")
 
 
-def _output_file(name: str) -> Path:
+def output_file(name: str) -> Path:
+    """Path of the file to be written.
+
+    Raises:
+        OutputError: another suffix than .safetensors, or a folder.
+    """
     out = Path(name)
     if out.suffix != ".safetensors":
         raise OutputError(f"{out}: expected a name that ends in .safetensors")

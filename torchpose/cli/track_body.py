@@ -80,11 +80,11 @@ def build() -> ArgumentParser:
         "limbs (needs --conditionals), or constrained to an action (needs --action) particle filter "
         "(default what the file given is for, else apf)")  # fmt: skip
     add("--manifold", type=str, metavar="FILE",
-        help="poses of an action, from `python -m train fit`")  # fmt: skip
+        help="poses of an action, from `torchpose fit manifold`")  # fmt: skip
     add("--conditionals", type=str, metavar="FILE",
-        help="how limbs stand to each other and turn, from `python -m train fit`")  # fmt: skip
+        help="how limbs stand to each other and turn, from `torchpose fit limbs`")  # fmt: skip
     add("--action", type=str, metavar="FILE",
-        help="postures of an action, or of several, from `python -m train fit`")  # fmt: skip
+        help="postures of an action, or of several, from `torchpose fit actions`")  # fmt: skip
     add("--height", type=float, default=1.75, metavar="M",
         help="height of the person, metres (default 1.75)")  # fmt: skip
     add("--body", type=str, metavar="FILE",
@@ -184,6 +184,7 @@ def _track(args: Namespace, recordings: "Recordings", model: BodyModel) -> "Body
     first = next((masks for masks in frames if _all_see(masks)), None)
     if first is None:
         return None
+    model = model.at_rate(recordings.fps)
     begun = len(recordings.packed) - 1
     generator = torch.Generator().manual_seed(args.seed)
     rig = recordings.rig

@@ -1,6 +1,6 @@
 """Which filter `torchpose track-body` tracks with, the files it needs, and the body it moves."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from jsonargparse import Namespace
@@ -22,10 +22,10 @@ __all__ = ["METHODS", "BodyModel", "check_method", "load_model"]
 METHODS = ("mrpf", "apf", "sir", "root", "constrained")
 _FILES = {"mrpf": "manifold", "root": "conditionals", "constrained": "action"}
 _HELD = {
-    "manifold": "a manifold of the action's poses (configs/manifold.yaml)",
-    "conditionals": "limb conditionals (configs/limbs.yaml)",
-    "action": "an action space, or a bank of several (configs/actions.yaml)",
-}  # and the configuration of `python -m train fit` that makes the file
+    "manifold": "a manifold of the action's poses (torchpose fit manifold)",
+    "conditionals": "limb conditionals (torchpose fit limbs)",
+    "action": "an action space, or a bank of several (torchpose fit actions)",
+}  # and the command that makes the file
 _SHARPNESS = {"constrained": 30.0}  # of the overlap; of the bidirectional likelihood:
 _SHARP = 100.0
 _LAYERS = 5  # of the annealed filter, each with its share of the particles
@@ -54,9 +54,7 @@ def check_method(args: Namespace) -> None:
         raise InputError(f"--method must be one of {', '.join(METHODS)}, got {args.method!r}")
     needed = _FILES.get(args.method)
     if needed and needed not in given:
-        raise InputError(
-            f"--method {args.method} needs --{needed} FILE, {_HELD[needed]}, from `python -m train fit`"
-        )
+        raise InputError(f"--method {args.method} needs --{needed} FILE, {_HELD[needed]}")
     for option in given:
         if option in (needed, "manifold"):
             continue
@@ -88,7 +86,8 @@ class BodyModel:
     Attributes:
         method: among `METHODS`. body: that is tracked, in the frame and with the centres that the
             method needs. upright: the same person, on whom the first pose is looked for.
-        manifold, conditionals, action: from their files, or None.
+        manifold, conditionals, action: from their files, or None. fitted_fps: of the manifold's noise,
+            before `at_rate`.
     """
 
     method: str
@@ -97,11 +96,22 @@ class BodyModel:
     manifold: "BackConstrainedGPLVM | None" = None
     conditionals: "LimbConditionals | None" = None
     action: "ActionSpace | ActionBank | None" = None
+    fitted_fps: float | None = None
 
     @property
     def action_names(self) -> tuple[str, ...]:
         """Of the columns of `details["actions"]`, with a bank."""
         return tuple(getattr(self.action, "names", ()))
+
+    def at_rate(self, fps: float) -> "BodyModel":
+        """The same with the manifold's noise for a frame rate, which only the manifold lacks.
+
+        Raises:
+            PriorError: the manifold's file does not say how its noise grows, and the rate is another.
+        """
+        if self.manifold is None:
+            return self
+        return replace(self, manifold=self.manifold.at_rate(fps), fitted_fps=self.manifold.info.fps)
 
     def make_filter(
         self, n_particles: int, sharpness: float | None, fps: float
@@ -151,6 +161,11 @@ class BodyModel:
     def notes(self, fps: float) -> tuple[str, ...]:
         """What was rescaled to the frame rate of the videos."""
         found = []
+        if self.fitted_fps is not None and self.fitted_fps != fps:
+            found.append(
+                f"the manifold's noise was learnt at {self.fitted_fps:g} frames per second and "
+                f"rescaled to {fps:g}"
+            )
         if self.conditionals is not None and self.conditionals.info.fps != fps:
             found.append(
                 f"the limbs' diffusion was learnt at {self.conditionals.info.fps:g} frames per second "
@@ -168,8 +183,8 @@ class BodyModel:
         """The body on which the performances were put, if it is not the tracked one."""
         from torchpose.body import BODY_15, Body
 
-        known = getattr(self.action.info, "extra", {"postures": "body"})  # type: ignore[union-attr]
-        common = known.get("postures") == "body"
+        known = self.action.info.extra.get("postures", "body" if self.action_names else "joints")  # type: ignore[union-attr]
+        common = known == "body"
         return Body.of_height(BODY_15, _COMMON_HEIGHT) if common else None
 
 
@@ -199,7 +214,7 @@ def load_model(args: Namespace) -> BodyModel:
             raise PriorError(
                 f"{args.conditionals}: expected limb conditionals of the parts "
                 f"{', '.join(tracked.skeleton.parts)}, got {', '.join(parts)}; fit them with "
-                "`python -m train fit --config configs/limbs.yaml`"
+                "`torchpose fit limbs`"
             )
         tracked = _rebased(tracked, "body", conditionals.centres)
     if args.action:

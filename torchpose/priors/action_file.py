@@ -49,7 +49,8 @@ class BankInfo:
             the deviation of all training postures, for none of the actions. evidence_rate: frames
             per second that count as independent of each other. gate_dimensions: of the D, how many
             the gates look at; None for all.
-        licence: of the data. command: that made it.
+        licence: of the data. command: that made it. name: of the bank. sources: recordings or data
+            sets. extra: anything else that JSON can hold.
     """
 
     names: tuple[str, ...] = ()
@@ -63,6 +64,9 @@ class BankInfo:
     gate_dimensions: int | None = None
     licence: str = ""
     command: str = ""
+    name: str = ""
+    sources: tuple[str, ...] = ()
+    extra: dict[str, Any] = field(default_factory=dict)
 
 
 SPACE_FILE = FileKind(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from torchpose.errors import FileFormatError, InputError, ShapeError, check_fini
 from torchpose.priors import gplvm_prediction
 from torchpose.priors.gplvm_fit import GPLVMFit, best_fit, median_gamma
 from torchpose.priors.gplvm_kernel import KernelParameters
-from torchpose.priors.gplvm_noise import MotionNoise, check_unseen, motion_noise, no_noise
+from torchpose.priors.gplvm_noise import MotionNoise, at_rate, check_unseen, motion_noise, no_noise
 from torchpose.priors.gplvm_prediction import Fitted, Prepared
 from torchpose.priors.manifold_file import TENSORS, ManifoldInfo, read_manifold, write_manifold
 from torchpose.priors.pose_sequences import column_scale, join_sequences, principal_axes
@@ -242,8 +241,12 @@ class BackConstrainedGPLVM(nn.Module):
         noise = motion_noise(joined, latents, self.pose_mean(latents), lengths)
         for name, value in noise._asdict().items():
             getattr(self, name).copy_(value)
-        self.info = replace(self.info, fps=float(fps))
+        self.info = self.info.with_noise(fps, latents, joined, lengths)
         return self
+
+    def at_rate(self, fps: float) -> BackConstrainedGPLVM:
+        """The same with standard deviations for another frame rate, see `gplvm_noise.at_rate`."""
+        return at_rate(self, fps)
 
     # --- both ways
 

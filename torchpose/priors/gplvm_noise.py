@@ -1,8 +1,10 @@
 """Standard deviations of a motion about its manifold, from validation poses (MR 27, 29, 30)."""
 
+import copy
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -11,7 +13,7 @@ from torch import Tensor
 from torchpose.errors import InputError
 from torchpose.priors.pose_sequences import steps_within
 
-__all__ = ["MotionNoise", "check_unseen", "motion_noise", "no_noise"]
+__all__ = ["MotionNoise", "at_rate", "check_unseen", "motion_noise", "no_noise"]
 
 _LEAST_SHARE = 0.05  # of the root mean square over all columns: a deviation that is not nothing
 
@@ -55,6 +57,24 @@ def motion_noise(
     found = (steps_within(latents, lengths), poses - returned, steps_within(poses, lengths))
     squared = [values.square().mean(0) for values in found]
     return MotionNoise(*(s.sqrt().maximum(_LEAST_SHARE * s.mean().sqrt()) for s in squared))
+
+
+def at_rate(manifold: Any, fps: float) -> Any:
+    """The same manifold with its standard deviations for another frame rate.
+
+    sigma(fps) = sigma (fps_0 / fps)^g of sigma x->z and x->x, g learnt by `fit_noise`; sigma z->x does
+    not depend on the rate.
+
+    Raises:
+        PriorError: no standard deviations, or a file that does not say how they grow.
+    """
+    known = bool(torch.isfinite(manifold.std_pose).all())
+    latent, step = manifold.info.noise_factors(fps, known)
+    other = copy.deepcopy(manifold)
+    other.std_latent *= latent
+    other.std_step *= step
+    other.info = replace(manifold.info, fps=float(fps))
+    return other
 
 
 def check_unseen(

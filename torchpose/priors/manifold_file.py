@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
 from torchpose.errors import PriorError
+from torchpose.priors.pose_sequences import steps_growth
 from torchpose.priors.tensor_file import (
     FileKind,
     info_from_json,
@@ -21,6 +22,7 @@ from torchpose.priors.tensor_file import (
 
 __all__ = ["TENSORS", "ManifoldInfo", "read_manifold", "write_manifold"]
 
+_GROWTH = "noise_growth"  # in `extra`: exponents of standard deviations over time
 _SAME_FRAME_RATE = 0.01  # of it
 _SAME_CENTRE = 1e-6  # of a quaternion vector
 
@@ -97,6 +99,26 @@ class ManifoldInfo:
                 f"the standard deviations of the manifold {self.name!r} are for {self.fps:g} frames "
                 f"per second, got {fps:g}; call fit_noise with validation poses at that rate"
             )
+
+    def with_noise(
+        self, fps: float, latents: Tensor, poses: Tensor, lengths: Sequence[int]
+    ) -> ManifoldInfo:
+        """The same with the frame rate of the standard deviations, and how they grow with time."""
+        growth = {"latent": steps_growth(latents, lengths), "step": steps_growth(poses, lengths)}
+        return replace(self, fps=float(fps), extra={**self.extra, _GROWTH: growth})
+
+    def noise_factors(self, fps: float, known: bool) -> tuple[float, float]:
+        """Factors of sigma x->z and sigma x->x for another frame rate.
+
+        Raises:
+            PriorError: as `check_rate`, if nothing says how they grow.
+        """
+        growth = self.extra.get(_GROWTH)
+        if not isinstance(growth, Mapping) or self.fps is None or not 0 < fps < math.inf:
+            self.check_rate(fps, known)
+            return 1.0, 1.0
+        ratio = self.fps / fps
+        return float(ratio ** growth["latent"]), float(ratio ** growth["step"])
 
     def to_json(self) -> str:
         """Text that `from_json` reads back."""

@@ -1,5 +1,6 @@
 """Sequences of poses as one matrix, with the ends of each remembered."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -8,9 +9,17 @@ from torch import Tensor
 
 from torchpose.errors import InputError, ShapeError
 
-__all__ = ["column_scale", "join_sequences", "principal_axes", "steps_within", "thin"]
+__all__ = [
+    "column_scale",
+    "join_sequences",
+    "principal_axes",
+    "steps_growth",
+    "steps_within",
+    "thin",
+]
 
 LEAST_FRAMES = 10
+_STRIDES = (2, 3, 4)  # frames, over which the growth of steps is looked at
 
 
 def join_sequences(
@@ -60,6 +69,29 @@ def steps_within(values: Float[Tensor, "T D"], lengths: Sequence[int]) -> Float[
     if not len(steps):
         raise InputError("a step takes two frames of one sequence, got sequences of one frame each")
     return steps
+
+
+def steps_growth(values: Float[Tensor, "T D"], lengths: Sequence[int]) -> float:
+    """Exponent g with which steps grow with the frames k between them, RMS(x_t+k - x_t) ~ k^g.
+
+    1/2 for a random walk, 1 for a motion that goes on; by least squares over 2, 3 and 4 frames, from 0
+    to 1, and 1/2 where no sequence is long enough.
+
+    Args:
+        values: of all sequences. lengths: frames of each; no step is taken from one to the next.
+
+    >>> steps_growth(torch.arange(20.0)[:, None], [20])
+    1.0
+    """
+    parts, sizes = values.split(list(lengths)), {}
+    for k in (1, *_STRIDES):
+        steps = [part[k:] - part[:-k] for part in parts if len(part) > k]
+        sizes[k] = float(torch.cat(steps).square().mean().sqrt()) if steps else 0.0
+    if not sizes[1] > 0:
+        return 0.5
+    found = [(math.log(k), math.log(sizes[k] / sizes[1])) for k in _STRIDES if sizes[k] > 0]
+    slope = sum(x * y for x, y in found) / sum(x * x for x, _ in found) if found else 0.5
+    return min(1.0, max(0.0, slope))
 
 
 def column_scale(poses: Float[Tensor, "T Q"]) -> Float[Tensor, " Q"]:

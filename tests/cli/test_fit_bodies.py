@@ -1,0 +1,237 @@
+"""`torchpose fit manifold|limbs|actions`: the files of the training loop, without Lightning; going on."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.priors.motions import motion
+from tests.priors.performances import performances
+from torchpose.body import BODY_15, Body
+from torchpose.cli.fit_bodies import KINDS, build, command_line
+from torchpose.priors import ActionBank, ActionSpace, BackConstrainedGPLVM
+from torchpose.priors.gplvm_fit import GPLVMFit
+from torchpose.priors.limb_conditionals import LimbConditionals
+from torchpose.priors.postures import posture_angles, posture_to_state
+from torchpose.priors.tensor_file import format_of
+
+LOADERS = {
+    "manifold": BackConstrainedGPLVM.load,
+    "limbs": LimbConditionals.load,
+    "actions": ActionBank.load,
+}
+QUICK = {
+    "manifold": ("--frames", 60, "--steps", 3, "--start", 1, "--validation", 1),
+    "limbs": ("--least-std", 0.02),
+    "actions": ("--actions", "action1", "action0", "--n-dimensions", 5, "--gate-dimensions", 3),
+}
+TRAINED = {
+    "manifold": {"data.frames": 60, "data.validation": 1, "model.steps": 3, "model.start": 1},
+    "limbs": {"model.least_std": 0.02},
+    "actions": {
+        "data.actions": "[action1,action0]", "model.n_dimensions": 5, "model.gate_dimensions": 3,
+    },
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def walks(tmp_path_factory) -> Path:
+    """Three persons who walk on the spot three times."""
+    folder = tmp_path_factory.mktemp("walks")
+    for person in range(3):
+        body = Body.of_height(BODY_15, 1.6 + 0.1 * person)
+        for trial in range(3):
+            poses = 0.4 * motion(
+                80, phase=float(trial), seed=10 * person + trial, speed=0.5, noise=0.01
+            )
+            state = torch.zeros(80, body.dim, dtype=torch.float64)
+            state[:, 1] = 0.9
+            write(
+                folder, f"p{person}", trial, body, body.with_relative(state, poses), 120.0, "walk"
+            )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def exercises(tmp_path_factory) -> Path:
+    """Three persons who do two things three times each."""
+    folder = tmp_path_factory.mktemp("exercises")
+    for person in range(3):
+        body = Body.of_height(BODY_15, 1.6 + 0.1 * person)
+        at_rest = torch.zeros(body.dim, dtype=torch.float64)
+        rest = posture_angles(body.joints(at_rest))
+        for action in range(2):
+            parts = performances(3, action, 30, noise=1.0, seed=person)
+            angles = rest + 0.4 * (torch.cat(parts) - parts[0].mean(0))
+            states = posture_to_state(body, angles.clamp(-80, 80), at_rest)
+            states[:, 1] += 0.9
+            write(folder, f"p{person}", action, body, states, 30.0, f"action{action}")
+    return folder
+
+
+def write(folder, person, number, body, states, fps, action):
+    np.savez(
+        folder / f"{person}_{number}.npz", joints=body.joints(states).numpy(), fps=fps, action=action,
+        names=np.array(BODY_15.names), subject=person, source="set", axes="y-up",
+    )  # fmt: skip
+
+
+def tensors_and_facts(kind, path):
+    found = LOADERS[kind](path)
+    facts = dict(vars(found.info))
+    facts.pop("command")
+    return found.state_dict(), facts
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_is_the_file_of_the_training_loop(kind, torchpose, walks, exercises, tmp_path):
+    pytest.importorskip("lightning", reason="training needs it: pip install torchpose[train]")
+    from train.cli import main as train
+
+    folder = exercises if kind == "actions" else walks
+    held_out = () if kind == "manifold" else ("--held-out", "p2")
+    out = tmp_path / "mine.safetensors"
+    done = torchpose("fit", kind, folder, "--out", out, *QUICK[kind], *held_out,
+                     "--licence", "CC0", *(("--pictures", "false") if kind != "limbs" else ()))  # fmt: skip
+    assert done.code == 0, done.err
+    assert "mine.safetensors" in done.out and "mine.md" in done.out
+    runs = str(tmp_path / "runs")
+    given = {"data.paths": f"['{folder}']", "data.persons": "null", "data.held_out": "null",
+             "data.without": "null", **TRAINED[kind]}  # fmt: skip
+    if held_out:
+        given["data.held_out"] = "[p2]"
+    if kind != "limbs":
+        given["model.picture"] = "false"
+    options = [
+        text for key, value in given.items()
+        for text in (f"--{key.replace('.', '.init_args.')}", str(value))
+    ]  # fmt: skip
+    other = tmp_path / "trained" / "mine.safetensors"
+    config = Path(__file__).parents[2] / "configs" / f"{kind}.yaml"
+    assert train(["fit", "--config", str(config), *options, "--prior.out", str(other),
+                  "--prior.licence", "CC0", "--trainer.default_root_dir", runs]) == 0  # fmt: skip
+    (one, facts), (two, theirs) = (tensors_and_facts(kind, p) for p in (out, other))
+    assert facts == theirs and facts["licence"] == "CC0"
+    assert one.keys() == two.keys()
+    assert all(torch.equal(value, two[name]) for name, value in one.items())
+
+
+def test_persons_held_out_give_a_manifold_its_noise(torchpose, walks, tmp_path):
+    out = tmp_path / "walk.safetensors"
+    line = (
+        "fit",
+        "manifold",
+        walks,
+        "--out",
+        out,
+        "--frames",
+        60,
+        "--steps",
+        2,
+        "--pictures",
+        "false",
+    )
+    done = torchpose(*line, "--held-out", "p2")
+    assert done.code == 0, done.err
+    manifold = BackConstrainedGPLVM.load(out)
+    assert manifold.info.persons == ("set#p0", "set#p1") and len(manifold.lengths) == 6
+    assert manifold.info.extra["held_out_persons"] == ["set#p2"]
+    slower = manifold.at_rate(30.0)
+    growth = manifold.info.extra["noise_growth"]
+    assert torch.equal(slower.std_pose, manifold.std_pose) and slower.info.fps == 30.0
+    torch.testing.assert_close(slower.std_step, manifold.std_step * 2 ** growth["step"])
+    torch.testing.assert_close(slower.std_latent, manifold.std_latent * 2 ** growth["latent"])
+    card = out.with_suffix(".md").read_text()
+    assert card.startswith("# walk\n") and "2: p0, p1" in card and "set#p2" in card
+    assert "--held-out p2 --" in card and "--out walk.safetensors`" in card
+
+
+def test_a_fit_that_was_killed_goes_on_to_the_same_result(torchpose, walks, tmp_path, monkeypatch):
+    line = ("fit", "manifold", walks, "--frames", 60, "--steps", 4, "--patience", 9, "--persons", "p0",
+            "--name", "one", "--pictures", "false", "--out")  # fmt: skip
+    whole, again = tmp_path / "whole.safetensors", tmp_path / "again.safetensors"
+    assert torchpose(*line, whole).code == 0
+    step = GPLVMFit.step
+
+    def die(fit):
+        if len(fit.history) == 2:
+            raise KeyboardInterrupt
+        return step(fit)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(GPLVMFit, "step", die)
+        assert torchpose(*line, again).code == 130
+    kept = tmp_path / "again.safetensors.partial"
+    assert kept.is_file() and not again.exists()
+    done = torchpose(*line, again)
+    assert done.code == 0 and "going on after 2 steps" in done.out and not kept.exists()
+    one, two = (tensors_and_facts("manifold", p) for p in (whole, again))
+    assert one[1] == two[1]
+    assert all(torch.equal(value, two[0][name]) for name, value in one[0].items())
+    kept.write_bytes(b"something else")
+    done = torchpose(*line, again)
+    assert done.code == 0 and "going on" not in done.out and not kept.exists()
+
+
+def test_one_action_is_a_space(torchpose, exercises, tmp_path):
+    out = tmp_path / "one.safetensors"
+    done = torchpose("fit", "actions", exercises, "--actions", "action0", "--out", out,
+                     "--n-dimensions", 4, "--pictures", "false")  # fmt: skip
+    assert done.code == 0, done.err
+    assert format_of(out) == "torchpose-action-space"
+    assert ActionSpace.load(out).info.extra["postures"] == "body"
+    assert out.with_suffix(".md").read_text().startswith("# action0")
+
+
+def test_a_configuration_names_the_command(torchpose, walks, tmp_path):
+    config = tmp_path / "limbs.yaml"
+    printed = torchpose(
+        "fit", "limbs", walks, "--out", tmp_path / "x.safetensors", "--print_config"
+    )
+    config.write_text(printed.out)
+    assert torchpose("fit", "limbs", "--config", config).code == 0
+    info = LimbConditionals.load(tmp_path / "x.safetensors").info
+    assert info.command == f"torchpose fit limbs --config {config}"
+    args = build("limbs").parse_args([*(f"r{i}" for i in range(20)), "--out", "a/x.safetensors"])
+    assert command_line("limbs", args) == "torchpose fit limbs r0 '...19 more' --out x.safetensors"
+
+
+def test_lightning_is_not_imported(walks, tmp_path):
+    code = (
+        "import sys; from torchpose.cli import main; "
+        f"code = main(['fit', 'limbs', {str(walks)!r}, '--out', {str(tmp_path / 'l.safetensors')!r}]); "
+        "sys.exit(code or any(name.partition('.')[0] in ('lightning', 'matplotlib', 'train') "
+        "for name in sys.modules))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ, capture_output=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (("manifold", "{walks}", "--persons", "p9"), "'p9' is nobody's name"),
+        (("manifold", "{walks}", "--held-out", "p0", "p1", "p2"), "nobody is left to learn from"),
+        (("manifold", "{walks}", "--validation", 3), "3 of them are to be held out"),
+        (("manifold", "{walks}", "--steps", 0), "steps must be at least 1"),
+        (("manifold", "{walks}", "--without-files", "p0_7"), "no file named p0_7"),
+        (("limbs", "$TORCHPOSE_NOT_SET/x"), "TORCHPOSE_NOT_SET is not set"),
+        (("limbs", "{walks}", "--least-std", -1), "least_std must be zero or more"),
+        (("limbs", "{walks}", "--axes", "up"), "--axes must be one of"),
+        (("limbs", "{walks}", "--actions", "hop"), "no recording of hop; there are walk"),
+        (("actions", "{walks}"), "--actions"),
+        (("actions", "{walks}", "--actions", "walk", "--postures", "arms"), "body or joints"),
+        (("actions",), "missing: DIR"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(torchpose, walks, tmp_path, line, said):
+    line = [str(part).format(walks=walks) for part in line]
+    done = torchpose("fit", *line, "--out", tmp_path / "bad.safetensors")
+    assert done.code == 2 and said in done.err and len(done.err.splitlines()) == 1, done.err
+    assert not list(tmp_path.iterdir())
