@@ -183,7 +183,12 @@ def test_a_manifold_of_the_motion(recorded, tmp_path, capsys):
     poses = BodyPoses.load(out / "body.npz")
     errors = (poses.joints3d - body.joints(states)).norm(dim=-1)
     assert float(errors.mean()) < 0.08
-    assert main(arguments(folder, out, *given, str(tmp_path / "slow.safetensors"))) == 2
+    assert main(arguments(folder, out, *given, str(tmp_path / "slow.safetensors"))) == 0
+    assert "noise was learnt at 30 frames per second and rescaled to 60" in capsys.readouterr().out
+    old = rising_arms_manifold(body, 30.0)
+    old.info = replace(old.info, extra={})  # as files from before say nothing about growth
+    old.save(tmp_path / "old.safetensors")
+    assert main(arguments(folder, out, *given, str(tmp_path / "old.safetensors"))) == 2
     assert "30 frames per second" in capsys.readouterr().err
 
 
