@@ -8,12 +8,12 @@ import torch
 
 from tests.filters.oracles import (
     dense_posterior,
-    enumerate_trajectories,
     paper_transition,
     random_covariance,
     random_mixture,
     tensor,
 )
+from tests.filters.small_problem import DIM, OBSERVED, Problem
 from torchpose.errors import (
     CovarianceError,
     DegenerateFilterWarning,
@@ -24,34 +24,7 @@ from torchpose.filters import MixtureKalmanFilter
 from torchpose.filters.transition import make_transition
 from torchpose.priors import GaussianMixture
 
-DIM, OBSERVED = 4, [0, 2]
 DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
-
-
-class Problem:
-    """A small mixture, its noise, and measurements with gaps."""
-
-    def __init__(self, seed=0, n_components=3, n_frames=6, batch=1, missing=0.3, spread=2.0):
-        rng = np.random.default_rng(seed)
-        self.weights, self.means, self.covs = random_mixture(rng, n_components, DIM, spread)
-        self.process = np.diag(rng.uniform(0.2, 1.0, DIM))
-        self.noise = random_covariance(rng, 2, 0.5)
-        self.z = rng.standard_normal((batch, n_frames, 2)) * 1.5
-        self.mask = rng.random((batch, n_frames, 2)) > missing
-
-    def mixture(self):
-        return GaussianMixture(tensor(self.weights), tensor(self.means), tensor(self.covs))
-
-    def filter(self, **options):
-        return MixtureKalmanFilter(
-            self.mixture(), tensor(self.process), tensor(self.noise), OBSERVED, **options
-        )
-
-    def models(self):
-        """(F, b, N) of each component."""
-        return [
-            paper_transition(m, c, self.process) for m, c in zip(self.means, self.covs, strict=True)
-        ]
 
 
 def online(model, z, mask, **options):
@@ -285,66 +258,6 @@ def test_gradients_reach_noise_gamma_and_prior():
     assert torch.autograd.gradcheck(run_gamma, [tensor([0.5, 1.0]).requires_grad_()], atol=1e-5)
 
 
-def test_smoothing_one_component_is_the_dense_joint_gaussian():
-    p = Problem(n_components=1, n_frames=7, batch=2)
-    z, mask = tensor(p.z), torch.tensor(p.mask)
-    args = (p.means[0], p.covs[0], OBSERVED, p.noise)
-    for lag in (None, 0, 2, 50):
-        out = p.filter().smooth(z, mask, lag=lag, return_cov=True)
-        for b, t in itertools.product(range(2), range(7)):
-            n = 7 if lag is None else min(7, t + lag + 1)
-            mean, cov, _ = dense_posterior(p.models() * n, *args, p.z[b, :n], p.mask[b, :n])
-            np.testing.assert_allclose(out.mean[b, t], mean[t], atol=1e-9)
-            np.testing.assert_allclose(out.cov[b, t], cov[t], atol=1e-9)
-
-
-def test_smoothing_of_two_tracks_is_near_the_enumeration_and_beats_filtering():
-    """The smoother does not mix track states; this states how much that costs for M = 2, T = 4."""
-    epsilon, errors, filtered_errors, weight_errors = 1e-2, [], [], []
-    e = 2 * epsilon / (1 + 2 * epsilon)
-    for seed in range(6):
-        p = Problem(seed=seed, n_components=2, n_frames=4, missing=0.1)
-        chain = ((1 - e) * np.eye(2) + e / 2) * p.weights
-        chain /= chain.sum(1, keepdims=True)
-        start = (p.weights + epsilon) / (1 + 2 * epsilon)
-        exact, _, indicator = enumerate_trajectories(
-            start @ chain, p.means, p.covs, p.models(), OBSERVED, p.noise, p.z[0], p.mask[0], chain
-        )
-        model = p.filter(uniform_weight=epsilon)
-        smooth = model.smooth(tensor(p.z), torch.tensor(p.mask))
-        plain = model(tensor(p.z), torch.tensor(p.mask))
-        errors.append(np.abs(smooth.mean[0].numpy() - exact).mean())
-        filtered_errors.append(np.abs(plain.mean[0].numpy() - exact).mean())
-        weight_errors.append(np.abs(smooth.log_weights[0].exp().numpy() - indicator).max())
-    # Five of the six problems are close; in one the indicator switches and the smoother is far off.
-    assert np.median(errors) < 0.05 < 0.3 < np.median(filtered_errors)
-    assert np.mean(errors) < 0.5 * np.mean(filtered_errors)
-    assert np.median(weight_errors) < 0.1
-
-
-def test_smoothing_a_batch_of_different_lengths_equals_single_calls():
-    p = Problem(n_frames=40, batch=5, missing=0.1)
-    z, mask, lengths = tensor(p.z), torch.tensor(p.mask), torch.tensor([40, 1, 25, 25, 33])
-    for lag in (None, 4):
-        out = p.filter().smooth(z, mask, lengths=lengths, lag=lag, return_cov=True)
-        for b, n in enumerate(lengths.tolist()):
-            alone = p.filter().smooth(
-                z[b : b + 1, :n], mask[b : b + 1, :n], lag=lag, return_cov=True
-            )
-            for ours, theirs in zip(out[:4], alone[:4], strict=True):
-                torch.testing.assert_close(ours[b, :n], theirs[0], rtol=1e-10, atol=1e-10)
-
-
-def test_fixed_lag_grows_into_full_smoothing_and_lag_zero_is_the_same_state():
-    p = Problem(n_frames=30, missing=0.1)
-    z, mask = tensor(p.z), torch.tensor(p.mask)
-    model = p.filter()
-    full = model.smooth(z, mask)
-    torch.testing.assert_close(model.smooth(z, mask, lag=29).mean, full.mean)
-    gaps = [(model.smooth(z, mask, lag=n).mean - full.mean).abs().mean() for n in (0, 2, 8)]
-    assert gaps[0] > gaps[1] > gaps[2]
-
-
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("tracks", ["fixed", "sampled", "split"])
 def test_float32_means_stay_close_to_float64(tracks, device):
@@ -447,11 +360,3 @@ def test_values_off_the_mask_may_be_anything():
     model = p.filter()
     expected = model(z, mask).mean
     torch.testing.assert_close(model(torch.where(mask, z, float("nan")), mask).mean, expected)
-
-
-def test_smoothing_needs_fixed_tracks_and_a_lag_that_is_not_negative():
-    p = Problem()
-    with pytest.raises(InputError, match="tracks='fixed'"):
-        p.filter(tracks="split").smooth(tensor(p.z))
-    with pytest.raises(InputError, match="lag"):
-        p.filter().smooth(tensor(p.z), lag=-1)

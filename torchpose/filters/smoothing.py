@@ -1,26 +1,27 @@
 """Smoothing of fixed tracks: over the whole sequence, or with a fixed lag.
 
-Inside a track, Rauch-Tung-Striebel; over the tracks, forward-backward on the indicator. The states of
-different tracks are not mixed, so this is an approximation when the indicator changes.
+Inside a track, Rauch-Tung-Striebel; over the tracks, forward-backward on the indicator, with the chain
+whose forward pass is the filter itself. The states of different tracks are not mixed, so this is an
+approximation when the indicator changes.
 """
 
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.errors import InputError
 from torchpose.filters.base import FilterOutput, Measurements, finish_output
 from torchpose.filters.fixed_tracks import step_fixed_weights, step_tracks
+from torchpose.filters.frame_weights import run_memoryless
 from torchpose.filters.tracks import MKFState, within_and_between
-from torchpose.filters.weights import indicator_mixing, mix_uniform, normalise
+from torchpose.filters.weights import mix_uniform, normalise
 from torchpose.gaussian import safe_cholesky, symmetrise
 
 if TYPE_CHECKING:
     from torchpose.filters.mkf import MixtureKalmanFilter
 
-__all__ = ["indicator_transition", "smooth_fixed_tracks"]
+__all__ = ["smooth_fixed_tracks"]
 
 _BUFFER_NUMBERS = 1 << 26  # numbers held for one part of the batch: half a gigabyte
 
@@ -44,23 +45,20 @@ class _Pass(NamedTuple):
     group: list[Tensor]
 
 
-def indicator_transition(log_prior: Float[Tensor, " M"], epsilon: float) -> Float[Tensor, "M M"]:
-    """T_ij prop. to ((1 - e) delta_ij + e / M) pi_j, rows normalised, e = M eps / (1 + M eps).
-
-    The Markov chain of indicators that the uniform weight epsilon (paper, after BL 49) stands for.
-    """
-    rows = indicator_mixing(log_prior, epsilon)
-    return rows / rows.sum(1, keepdim=True)
-
-
 def smooth_fixed_tracks(
     model: "MixtureKalmanFilter", frames: Measurements, lag: int | None, return_cov: bool
 ) -> FilterOutput:
     """Estimates given all measurements of a sequence, or those up to `lag` frames later.
 
     m_t|n = m_t + C_t (m_t+1|n - m^_t+1),  C_t = P_t F^T P^_t+1^-1,
-    P_t|n = P_t + C_t (P_t+1|n - P^_t+1) C_t^T  in each track; weights by forward-backward with
-    `indicator_transition`.
+    P_t|n = P_t + C_t (P_t+1|n - P^_t+1) C_t^T                                    in each track j;
+    w_t|n(j) prop. to w_t(j) beta_t(j),  beta_t(i) = sum_j T_ij N_t+1,j beta_t+1(j),  beta_n = 1,
+    T_ij = ((1 - e) delta_ij + e / M) pi_j,  e = M epsilon / (1 + M epsilon)      over the tracks.
+
+    T is the chain whose forward pass alpha_t(j) = N_tj sum_i alpha_t-1(i) T_ij gives the weights w_t of
+    the filter (BL 49): its rows do not sum to one, since every step multiplies by pi. So what uses no
+    later frame, a lag of 0 or the last frame, is the filter. Filters whose frames do not depend on each
+    other have nothing to smooth: their estimates are those of `forward`.
 
     Args:
         model: a filter with fixed tracks. frames: checked measurements.
@@ -74,6 +72,8 @@ def smooth_fixed_tracks(
         raise InputError(
             f"lag must be at least 0 frames, or None for the whole sequence, got {lag}"
         )
+    if model.is_memoryless:
+        return run_memoryless(model, frames, return_cov, progress=False)
     batch, n_frames, _ = frames.z.shape
     n_tracks, dim = model.means.shape
     per_sequence = n_frames * n_tracks * dim * (3 * dim if return_cov else 4)
@@ -104,7 +104,7 @@ def _smooth(
     if model.weighting == "frame":
         log_weights = past.log_weights
     else:
-        log_weights = _smoothed_weights(model, past.log_likelihood, later.mT, reach)
+        log_weights = _smoothed_weights(model, past, later.mT, reach)
     covs = _smoothed_covs(past, gains, later, reach) if return_cov else None
     estimate = (log_weights.exp()[:, :, None] @ means)[:, :, 0]
     total = None
@@ -168,14 +168,15 @@ def _mean_corrections(past: _Pass, gains: list[Tensor], later: Tensor, reach: in
     With a short reach all frames take each of the `reach` steps at once; when the reach is the
     whole sequence a single pass backwards over time gives the same.
     """
-    total = torch.zeros_like(past.mean)
     n_frames = past.mean.shape[0]
     if reach >= n_frames - 1:
+        totals = [torch.zeros_like(past.mean[0])]
         for t in range(n_frames - 2, -1, -1):
-            step = past.correction[t + 1] + total[t + 1]
+            step = past.correction[t + 1] + totals[-1]
             moved = _pull_back(gains[t : t + 1], past.group[t + 1 : t + 2], step[None])[0]
-            total[t] = torch.where(later[t][:, None, None], moved, torch.zeros_like(moved))
-        return total
+            totals.append(torch.where(later[t][:, None, None], moved, torch.zeros_like(moved)))
+        return torch.stack(totals[::-1])
+    total = torch.zeros_like(past.mean)
     for _ in range(reach):
         moved = _pull_back(gains, past.group[1:], past.correction[1:] + total[1:])
         moved = torch.where(later[:-1][..., None, None], moved, torch.zeros_like(moved))
@@ -196,38 +197,27 @@ def _pull_back(gains: list[Tensor], groups: list[Tensor], step: Tensor) -> Tenso
 
 
 def _smoothed_weights(
-    model: "MixtureKalmanFilter", log_likelihood: Tensor, later: Tensor, reach: int
+    model: "MixtureKalmanFilter", past: _Pass, later: Tensor, reach: int
 ) -> Tensor:
-    """log w_t|t+reach, [T, B, M]."""
-    transition = indicator_transition(model.log_prior, model.uniform_weight)
-    transition = transition.to(log_likelihood.dtype)
-    log_likelihood = model.likelihood_power * log_likelihood
-    n_frames = log_likelihood.shape[0]
-    start = mix_uniform(normalise(model.log_prior), model.uniform_weight)
-    alpha = start.to(log_likelihood.dtype).expand(log_likelihood.shape[1], -1)
-    forward = []
-    for frame in log_likelihood:
-        alpha = normalise(_log_matmul(alpha, transition) + frame)
-        forward.append(alpha)
-    beta = torch.zeros_like(log_likelihood)
+    """log w_t|t+reach = log w_t + log beta_t, normalised, [T, B, M]."""
+    factors = model.log_prior.to(past.log_weights.dtype)
+    factors = factors + model.likelihood_power * past.log_likelihood
+    n_frames = len(factors)
+
+    def pulled(after: Tensor, is_later: Tensor) -> Tensor:
+        """beta_t up to a factor, from pi_j N_t+1,j beta_t+1(j)."""
+        beta = mix_uniform(normalise(after), model.uniform_weight)
+        return torch.where(is_later[..., None], beta, torch.zeros_like(beta))
+
     if reach >= n_frames - 1:
+        betas = [torch.zeros_like(factors[0])]
         for t in range(n_frames - 2, -1, -1):
-            step = _log_matmul(log_likelihood[t + 1] + beta[t + 1], transition.mT)
-            beta[t] = torch.where(later[t][:, None], step, torch.zeros_like(step))
-    else:
-        for _ in range(reach):
-            step = _log_matmul(log_likelihood[1:] + beta[1:], transition.mT)
-            step = torch.where(later[:-1][..., None], step, torch.zeros_like(step))
-            beta = torch.cat([step, torch.zeros_like(beta[-1:])])
-    return normalise(torch.stack(forward) + beta)
-
-
-def _log_matmul(log_rows: Tensor, matrix: Tensor) -> Tensor:
-    """log(exp(log_rows) @ matrix), safe against overflow."""
-    top = log_rows.amax(-1, keepdim=True)
-    product = (log_rows - top).exp() @ matrix
-    floor = torch.finfo(product.dtype).tiny
-    return product.clamp_min(floor).log() + top
+            betas.append(pulled(factors[t + 1] + betas[-1], later[t]))
+        return normalise(past.log_weights + torch.stack(betas[::-1]))
+    beta = torch.zeros_like(factors)
+    for _ in range(reach):
+        beta = torch.cat([pulled(factors[1:] + beta[1:], later[:-1]), beta[-1:]])
+    return normalise(past.log_weights + beta)
 
 
 def _smoothed_covs(past: _Pass, gains: list[Tensor], later: Tensor, reach: int) -> list[Tensor]:
