@@ -8,20 +8,16 @@ works; gains and libraries are loaded before, by a short run.
 """
 
 import argparse
-import contextlib
-import ctypes
 import json
-import resource
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
+from _memory import MB, forget_peak, peak_resident, resident, return_free_memory
 from _timing import Report, limit_threads, machine_line, number, parser
 
-MB = 2**20
 TOLERANCE = 1e-10
 HEADER = ("case", "B", "T", "inputs MB", "outputs MB", "beyond MB", "beyond/outputs", "frames/s")
 
@@ -99,38 +95,6 @@ def measure(size: Size) -> dict[str, Any]:
     beyond = peak - before - outputs
     numbers = {"inputs": z.nbytes, "outputs": outputs, "beyond": beyond}
     return {**numbers, "seconds": seconds, "error": error}
-
-
-def resident() -> int:
-    """Bytes of resident memory now."""
-    return _status("VmRSS") or peak_resident()
-
-
-def return_free_memory() -> None:
-    """Hand what was freed back to the system, or results would be put where it counts as resident."""
-    with contextlib.suppress(AttributeError, OSError):
-        ctypes.CDLL(None).malloc_trim(0)
-
-
-def forget_peak() -> None:
-    """Start the system's count of the peak anew, where it can be done."""
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
-
-
-def peak_resident() -> int:
-    """Largest resident memory so far, in bytes; getrusage also counts the process before `exec`."""
-    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return _status("VmHWM") or used * (1 if sys.platform == "darwin" else 1024)
-
-
-def _status(key: str) -> int:
-    try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-    except OSError:
-        return 0
-    found = [line.split()[1] for line in lines if line.startswith(f"{key}:")]
-    return int(found[0]) * 1024 if found else 0
 
 
 def table_rows(sizes: list[Size], found: list[dict[str, Any]]) -> Iterator[list[str]]:

@@ -15,6 +15,7 @@ SCRIPTS = (
     "kalman_step",
     "expectation_maximisation",
     "batch_memory",
+    "gradients",
     "streamed_em",
     "silhouettes",
     "root_uncertainty",

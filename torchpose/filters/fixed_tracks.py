@@ -87,7 +87,7 @@ def advance(
     model: "MixtureKalmanFilter", state: MKFState, frame: Measurements, return_cov: bool
 ) -> tuple[MKFState, StepOutput]:
     """One step (BL 34-41, 48-49)."""
-    if model.is_memoryless and not _learning(model, frame):
+    if model.is_memoryless:
         return advance_memoryless(model, state, frame, return_cov)
     step = step_tracks(model, state, frame)
     log_weights, log_evidence = step_fixed_weights(model, state, step.log_likelihood, frame)
@@ -138,7 +138,7 @@ def run(
     model: "MixtureKalmanFilter", frames: Measurements, return_cov: bool, progress: bool
 ) -> FilterOutput:
     """All frames of a batch."""
-    if model.is_memoryless and not _learning(model, frames):
+    if model.is_memoryless:
         return run_memoryless(model, frames, return_cov, progress)
     history = None if _needs_plain_loop(model, frames) else _history(model, frames)
     if history is None:

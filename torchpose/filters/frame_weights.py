@@ -16,6 +16,7 @@ from tqdm.auto import tqdm
 
 from torchpose.filters.base import FilterOutput, Measurements, StepOutput, finish_output
 from torchpose.filters.geometric_median import median_estimate
+from torchpose.filters.recompute import recomputed, wants_gradient
 from torchpose.filters.tracks import MKFState, estimate_of
 from torchpose.filters.weights import normalise
 from torchpose.gaussian import Gain, kalman_gain
@@ -34,6 +35,7 @@ __all__ = [
 _SHARED_FRAMES = 1024  # at a time, where they share their gains
 _PATTERNS = 24  # of measured dimensions and noise whose gains are kept; about 4 MB each
 _OWN_FRAMES = 32  # at a time, where each has gains of its own
+_RECOMPUTED_FRAMES = 64  # at a time, where gradients compute them again
 _LEAST_SHARE = 2  # frames to a noise, on average, below which sharing does not pay
 
 
@@ -61,7 +63,7 @@ def frame_log_likelihood(
     model: "MixtureKalmanFilter", frames: Measurements
 ) -> Float[Tensor, "B T M"]:
     """log N(z_t; H mu_j, H Sigma_j H^T + R) of the measured dimensions of every frame."""
-    found = [(group.rows, _condition(model, group)[1]) for group in _groups(frames)]
+    found = [(group.rows, _condition(model, group)[1]) for group in _groups(frames, _SHARED_FRAMES)]
     return _in_order(found).unflatten(0, frames.z.shape[:2])
 
 
@@ -69,19 +71,16 @@ def run_memoryless(
     model: "MixtureKalmanFilter", frames: Measurements, return_cov: bool, progress: bool
 ) -> FilterOutput:
     """All frames of a filter whose predictions are the components themselves (BL 39-41, 48)."""
-    log_prior, power = model.log_prior.to(model.dtype), model.likelihood_power
     batch, n_frames, _ = frames.z.shape
+    learning = wants_gradient(frames.z, frames.cov, model.log_prior, model.means, model.covariances)
     parts: list[list[tuple[Tensor, Tensor]]] = [[], [], [], []]
     bar = tqdm(total=batch * n_frames, disable=not progress, unit="frame")
-    for group in _groups(frames):
-        means, log_likelihood, cov = _condition(model, group)
-        log_weights, evidence = frame_weights(log_prior, log_likelihood, log_likelihood, power)
-        measured = frames.mask.flatten(0, 1)[group.rows].any(-1)
-        evidence = torch.where(measured, evidence, torch.zeros_like(evidence))
-        mean, total = estimate_of(log_weights, means, cov if return_cov else None)
-        if len(model.medians):
-            mean, total = median_estimate(log_weights, means, cov, mean, total, model.medians)
-        for part, value in zip(parts, (mean, log_weights, evidence, total), strict=True):
+    for group in _groups(frames, _RECOMPUTED_FRAMES if learning else _SHARED_FRAMES):
+        if learning:
+            values = recomputed(_estimate, model, group, return_cov)
+        else:
+            values = _estimate(model, group, return_cov)
+        for part, value in zip(parts, values, strict=True):
             if value is not None:
                 part.append((group.rows, value))
         bar.update(len(group.rows))
@@ -91,6 +90,21 @@ def run_memoryless(
     )
     covs = _in_order(parts[3]).unflatten(0, (batch, n_frames)) if return_cov else None
     return finish_output(mean, log_weights, evidence, covs, frames.lengths)
+
+
+def _estimate(
+    model: "MixtureKalmanFilter", group: "_Group", return_cov: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """Estimates, log-weights, log-evidence and covariances of a group of frames."""
+    log_prior, power = model.log_prior.to(model.dtype), model.likelihood_power
+    means, log_likelihood, cov = _condition(model, group)
+    log_weights, evidence = frame_weights(log_prior, log_likelihood, log_likelihood, power)
+    measured = group.mask.any(-1).squeeze(-1)
+    evidence = torch.where(measured, evidence, torch.zeros_like(evidence))
+    mean, total = estimate_of(log_weights, means, cov if return_cov else None)
+    if len(model.medians):
+        mean, total = median_estimate(log_weights, means, cov, mean, total, model.medians)
+    return mean, log_weights, evidence, total
 
 
 def advance_memoryless(
@@ -117,7 +131,7 @@ class _Group(NamedTuple):
     noise: Tensor
 
 
-def _groups(frames: Measurements) -> Iterator[_Group]:
+def _groups(frames: Measurements, at_a_time: int) -> Iterator[_Group]:
     """Frames that measure the same dimensions with the same noise share their gains."""
     z, mask = frames.z.flatten(0, 1), frames.mask.flatten(0, 1)
     noise = None if frames.cov.ndim == 2 else frames.cov.flatten(0, 1)
@@ -132,7 +146,7 @@ def _groups(frames: Measurements) -> Iterator[_Group]:
         return
     for same in group.argsort(stable=True).split(sizes.tolist()):
         own_noise = frames.cov if noise is None else noise[same[0]]
-        for rows in same.split(_SHARED_FRAMES):
+        for rows in same.split(at_a_time):
             yield _Group(rows, z[rows], mask[same[0]], own_noise)
 
 

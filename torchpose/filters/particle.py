@@ -78,7 +78,8 @@ class BootstrapParticleFilter(RecursiveFilter):
 
     The first two have the same posterior. Particles are resampled at the start of a step when the
     effective sample size (BL 25) of the step before fell below `resample_threshold` times N;
-    otherwise the old weights stay. Estimates are weighted means before resampling.
+    otherwise the old weights stay. Estimates are weighted means before resampling. They have no
+    gradients: nothing runs through particles, whatever is asked of the measurements.
 
     Log-evidence. With V_t proportional to W_{t-1} v_t, the normalised weights of the prediction (v_t
     is the factor above without p(z_t | x_t), W_{t-1} the normalised old weights, uniform after

@@ -66,6 +66,8 @@ Likelihood = Callable[[Tensor, Tensor], Tensor]
 class SilhouetteParticleFilter(nn.Module):
     """Base of the particle filters over body poses; a subclass is its `move`.
 
+    Estimates have no gradients: nothing runs through particles.
+
     Args:
         body: whose poses are tracked; anything with the methods of `PoseSpace`.
         n_particles: N.

@@ -1,0 +1,63 @@
+"""Gradients of the public modules against finite differences, and outputs that they leave as they are."""
+
+import pytest
+import torch
+
+from tests.gradients import assert_differentiable, assert_without_gradient
+from torchpose.priors import load_prior
+from torchpose.tracking import UpperBodyTracker
+
+NAMES = ("head", "hand_left", "hand_right")
+
+
+def keypoints(batch=1, frames=9, seed=0):
+    """Head and hands that wander about, pixels."""
+    generator = torch.Generator().manual_seed(seed)
+    place = torch.tensor([[320.0, 120.0], [400.0, 240.0], [240.0, 240.0]], dtype=torch.float64)
+    steps = torch.randn(batch, frames, 3, 2, generator=generator, dtype=torch.float64)
+    return place + 4 * steps.cumsum(1)
+
+
+def poses(tracker, **arguments):
+    """A function of the keypoints, with numbers that are the same in every call."""
+
+    def track(uv):
+        generator = torch.Generator().manual_seed(0)
+        found = tracker(uv, names=NAMES, generator=generator, **arguments)
+        joints = found.joints2d, found.joints3d
+        return *joints, found.covariance2d, found.covariance3d, found.log_evidence
+
+    return track
+
+
+def make_tracker(**options):
+    prior = load_prior("kinect-upper-body")
+    return UpperBodyTracker(prior, camera=prior.camera, **options)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"smoothing": 20},
+        {"smoothing": "full"},
+        {"steady": False},
+        {"steady": False, "smoothing": "full"},
+        {"window": False},
+        {"window": False, "smoothing": 2},
+        {"window": False, "smoothing": "full"},
+    ],
+)
+def test_poses_of_the_tracker(options):
+    assert_differentiable(poses(make_tracker(**options)), keypoints(), step=1e-4)
+
+
+@pytest.mark.parametrize("method", ["mkf-sampled", "mkf-split"])
+def test_poses_of_tracks_that_are_drawn_or_selected(method):
+    tracker = make_tracker(method=method, n_tracks=12)
+    assert_differentiable(poses(tracker), keypoints(frames=5), step=1e-4)
+
+
+@pytest.mark.parametrize("method", ["pf-mixture", "pf-walk", "pf-walk-unscaled"])
+def test_poses_of_particles_have_no_gradient(method):
+    assert_without_gradient(poses(make_tracker(method=method, n_particles=200)), keypoints())

@@ -1,0 +1,63 @@
+"""Results whose gradients are computed from their arguments anew, so that little is kept for them."""
+
+import weakref
+from collections.abc import Callable
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+from torch.autograd.graph import saved_tensors_hooks
+
+__all__ = ["recomputed", "wants_gradient"]
+
+_Result = TypeVar("_Result")
+
+
+def wants_gradient(*tensors: Tensor) -> bool:
+    """Return whether a gradient is to run through any of the tensors."""
+    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+
+
+def recomputed(function: Callable[..., _Result], *arguments: object) -> _Result:
+    """Call a function, and call it again for its gradient instead of keeping what that needs.
+
+    As `torch.utils.checkpoint` without its import of the compiler, which takes a second. Under the
+    transforms of `torch.func`, which take no hooks on saved tensors, everything is kept.
+
+    Args:
+        function: without random numbers or side effects. arguments: tensors and others.
+    """
+    if torch._C._are_functorch_transforms_active():
+        return function(*arguments)
+    slots: list[weakref.ref[_Slot]] = []
+    values: weakref.WeakKeyDictionary[_Slot, Tensor] = weakref.WeakKeyDictionary()
+
+    def reserve(_: Tensor) -> _Slot:
+        slot = _Slot()
+        slots.append(weakref.ref(slot))
+        return slot
+
+    def fetch(slot: _Slot) -> Tensor:
+        if slot not in values:
+            waiting = iter(slots)
+            with (
+                torch.enable_grad(),
+                saved_tensors_hooks(lambda x: keep(next(waiting)(), x), _refuse),
+            ):
+                function(*arguments)
+        return values.pop(slot)
+
+    def keep(slot: _Slot | None, value: Tensor) -> None:
+        if slot is not None:
+            values[slot] = value.detach()
+
+    with saved_tensors_hooks(reserve, fetch):
+        return function(*arguments)
+
+
+class _Slot:
+    """The place of a tensor that a gradient needs; it lives as long as the graph of that gradient."""
+
+
+def _refuse(_: None) -> Tensor:
+    raise RuntimeError("a recomputed function has to be free of gradients of its own")
