@@ -120,6 +120,69 @@ def test_burn_in_and_initial_covariance_change_the_model_as_described(proposal):
     assert_within_error(out.log_evidence, exact_evidence, slack=2e-3)
 
 
+@pytest.mark.parametrize("proposal", EXACT_PROPOSALS)
+def test_a_measured_start_agrees_with_the_exact_filter(proposal):
+    mean, cov, process, noise, observed, z = linear_problem(seed=5)
+    mask = np.ones(z.shape, dtype=bool)
+    mask[0, 1] = False
+    still = np.eye(3), np.zeros(3), 1e-10 * np.eye(3)  # x_1 is distributed as the prior
+    models = [still] + [paper_transition(mean, cov, process)] * (len(z) - 1)
+    exact_mean, exact_cov, exact_evidence = causal_posteriors(
+        models, mean, cov, observed, noise, z, mask
+    )
+    tracker = BootstrapParticleFilter(
+        mixture([1.0], mean[None], cov[None]), tensor(process), tensor(noise), observed,
+        proposal=proposal, n_particles=4000, start="measured", dtype=WIDE,
+    )  # fmt: skip
+    out = runs_of(tracker, tensor(z), torch.tensor(mask), return_cov=True)
+    assert_within_error(out.mean, exact_mean)
+    assert_within_error(out.cov, exact_cov, slack=2e-3)
+    assert_within_error(out.log_evidence, exact_evidence, slack=2e-3)
+
+
+def test_a_measured_start_draws_from_the_posterior_of_each_element():
+    prior = small_mixture(seed=7, n_components=3, dim=3, spread=4.0)
+    noise = np.array([[0.3, 0.1], [0.1, 0.5]])
+    z = np.array([[1.0, -2.0], [3.0, 0.5], [0.0, 0.0]])
+    seen = torch.tensor([[True, True], [False, True], [False, False]])
+    tracker = BootstrapParticleFilter(
+        prior, torch.ones(3), tensor(noise), [2, 0], n_particles=40_000, start="measured"
+    )
+    state = tracker.init(3, generator())
+    state, out = tracker.step(state, tensor(z), seen, generator=generator(), return_cov=True)
+    assert torch.allclose(out.log_weights.exp(), torch.full_like(out.log_weights, 1 / 40_000))
+    points = np.random.default_rng(0).multivariate_normal(np.zeros(3), np.eye(3), 400_000)
+    chosen = np.random.default_rng(1).choice(3, len(points), p=prior.weights.numpy())
+    factors = np.linalg.cholesky(prior.covariances.numpy())
+    points = prior.means.numpy()[chosen] + np.einsum("nij,nj->ni", factors[chosen], points)
+    for b in range(3):
+        rows = seen[b].numpy()
+        residual = z[b][rows] - points[:, np.array([2, 0])[rows]]
+        inner = noise[np.ix_(rows, rows)]
+        likelihood = np.exp(-0.5 * (residual @ np.linalg.inv(inner) * residual).sum(1))
+        likelihood /= np.sqrt(np.linalg.det(2 * np.pi * inner))
+        share = likelihood / likelihood.sum()
+        mean = share @ points
+        spread = (points - mean).T @ ((points - mean) * share[:, None])
+        assert torch.allclose(out.mean[b].double(), tensor(mean), atol=0.05)
+        assert torch.allclose(out.cov[b], tensor(spread), atol=0.2)
+        assert float(out.log_evidence[b]) == pytest.approx(np.log(likelihood.mean()), abs=0.02)
+
+
+def test_a_measured_start_keeps_the_particles_that_a_start_from_the_prior_loses():
+    prior = mixture([1.0], np.zeros((1, 8)), np.eye(8)[None])
+    sizes = {}
+    for start in ("prior", "measured"):
+        tracker = BootstrapParticleFilter(
+            prior, torch.full((8,), 0.01), torch.full((8,), 1e-4), range(8),
+            proposal="random-walk", n_particles=2000, start=start,
+        )  # fmt: skip
+        out = tracker(torch.full((1, 1, 8), 0.5), generator=generator())
+        sizes[start] = float(out.effective_sample_size)
+    assert sizes["prior"] < 2
+    assert sizes["measured"] == pytest.approx(2000, rel=1e-4)
+
+
 @pytest.mark.parametrize("kind", ["stationary", "ou"])
 def test_other_transitions_keep_the_prior_and_track_one_component(kind):
     mean, cov, process, noise, observed, z = linear_problem(seed=3)
@@ -286,11 +349,14 @@ def signal(batch, n_frames, n_measured, seed=0):
 
 
 @pytest.mark.parametrize("proposal", PROPOSALS)
-@pytest.mark.parametrize("resampling", ["systematic", "residual"])
-def test_an_element_equals_its_own_call(proposal, resampling):
+@pytest.mark.parametrize(
+    ("resampling", "start"), [("systematic", "measured"), ("residual", "prior")]
+)
+def test_an_element_equals_its_own_call(proposal, resampling, start):
     tracker = BootstrapParticleFilter(
         small_mixture(dim=3), torch.full((3,), 0.2), torch.full((2,), 0.3), [0, 2],
-        proposal=proposal, n_particles=300, resampling=resampling, burn_in=2, dtype=WIDE,
+        proposal=proposal, n_particles=300, resampling=resampling, burn_in=2, start=start,
+        dtype=WIDE,
     )  # fmt: skip
     z = signal(4, 7, 2)
     z[2] *= 30  # degenerates to few particles, so that its neighbours resample at other times
@@ -312,11 +378,12 @@ def test_an_element_equals_its_own_call(proposal, resampling):
             torch.testing.assert_close(ours, theirs, rtol=1e-10, atol=1e-12, equal_nan=True)
 
 
+@pytest.mark.parametrize("start", ["prior", "measured"])
 @pytest.mark.parametrize("proposal", PROPOSALS)
-def test_online_equals_offline(proposal):
+def test_online_equals_offline(proposal, start):
     tracker = BootstrapParticleFilter(
         small_mixture(dim=2), torch.full((2,), 0.2), torch.ones(1), [1], proposal=proposal,
-        n_particles=200, burn_in=3,
+        n_particles=200, burn_in=3, start=start,
     )  # fmt: skip
     z, mask = signal(3, 6, 1), torch.rand(3, 6, 1, generator=generator(1)) > 0.2
     offline = tracker(z, mask, generator=generator(2), return_cov=True)
@@ -525,6 +592,7 @@ def test_grouped_affine_equals_a_gather(counts):
     [
         ({"proposal": "optimal"}, "proposal must be one of mixture"),
         ({"resampling": "wheel"}, "resampling must be one of systematic"),
+        ({"start": "guess"}, "start must be one of prior, measured"),
         ({"n_particles": 0}, "n_particles"),
         ({"resample_threshold": 1.5}, "resample_threshold"),
         ({"dtype": torch.float16}, "dtype"),

@@ -20,17 +20,16 @@ from torchpose.filters.base import (
     standard_normal,
     uniform,
 )
-from torchpose.filters.resampling import RESAMPLING, resample
-from torchpose.filters.transition import TRANSITIONS, make_transition
+from torchpose.filters.particle_options import PROPOSALS, check_model, check_options
+from torchpose.filters.resampling import resample
+from torchpose.filters.transition import make_transition
 from torchpose.filters.walk import MixtureWalk, Moves, grouped_affine
-from torchpose.gaussian import LOG_2PI, safe_cholesky
+from torchpose.gaussian import LOG_2PI, kalman_update, safe_cholesky
 from torchpose.module_state import derived, register_given
 from torchpose.priors.em import MixtureParameters
 from torchpose.priors.gmm import GaussianMixture
 
 __all__ = ["PROPOSALS", "BootstrapParticleFilter", "ParticleState"]
-
-PROPOSALS = ("mixture", "random-walk", "random-walk-unscaled")
 
 
 class ParticleState(NamedTuple):
@@ -56,11 +55,13 @@ class _Constants(NamedTuple):
 
     Attributes:
         walk: prior density and evidence in whitened coordinates. initial: maps noise to the first
-            particles. steady: moves of the proposal "mixture" without burn-in. walk_factor: of Q.
+            particles. initial_cov: of the components that these are drawn from [K, D, D]. steady:
+            moves of the proposal "mixture" without burn-in. walk_factor: of Q.
     """
 
     walk: MixtureWalk
     initial: Moves
+    initial_cov: Tensor
     steady: Moves | None
     walk_factor: Tensor
 
@@ -99,6 +100,10 @@ class BootstrapParticleFilter(RecursiveFilter):
             geometrically, Q_t = scale^(1 - t / burn_in) Q. 0 is no burn-in.
         initial_cov: the first particles are drawn from the prior, or if this is given ([D, D], [D]
             or [K, D, D]) from sum_i pi_i N(mu_i, initial_cov), as the mixture Kalman filter starts.
+        start: "prior": x_0 is drawn from that density, and moved and weighed like any other.
+            "measured": it is the density of x_1 instead, whose particles are drawn from
+            p(x_1 | z_1), a mixture of Gaussians, with equal weights. In many dimensions hardly any
+            particle of the prior agrees with the first measurement.
         transition, gamma, subspace: as `make_transition`. The random walks need "paper", from
             which (BL 26) follows. For "stationary" and "ou", c_i = N(x_{t-1} | mu_i, Sigma_i), so
             that the mixture of processes leaves Phi unchanged.
@@ -138,17 +143,18 @@ class BootstrapParticleFilter(RecursiveFilter):
         burn_in: int = 0,
         burn_in_scale: float = 100.0,
         initial_cov: Tensor | None = None,
+        start: str = "prior",
         transition: str = "paper",
         gamma: Tensor | float | None = None,
         subspace: int | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__(measurement_cov, observed, gmm.dim, dtype)
-        _check_options(proposal, n_particles, resample_threshold, resampling, dtype)
-        _check_model(proposal, transition, burn_in, burn_in_scale)
+        check_options(proposal, n_particles, resample_threshold, resampling, start, dtype)
+        check_model(proposal, transition, burn_in, burn_in_scale)
         self.proposal, self.transition, self.subspace = proposal, transition, subspace
         self.n_particles, self.resample_threshold = n_particles, resample_threshold
-        self.resampling = resampling
+        self.resampling, self.start = resampling, start
         self.burn_in, self.burn_in_scale = burn_in, float(burn_in_scale)
         for name, value in zip(
             ("weights", "means", "covariances"), gmm.parameters_tuple(), strict=True
@@ -193,12 +199,12 @@ class BootstrapParticleFilter(RecursiveFilter):
         if self.initial_cov is not None:
             cov = as_covariance("initial_cov", self.initial_cov, self.dim, self.initial_cov.ndim)
             spread = cov.expand_as(spread)
-        initial = walk.moves(torch.zeros_like(spread), mixture.means, spread)
+        initial = walk.noise_moves(mixture.means, spread)
         steady = self._moves_at(1.0, walk) if self.proposal == "mixture" else None
         eye = torch.eye(self.dim, dtype=torch.float64, device=spread.device)
         whitener = torch.linalg.solve_triangular(walk.scale, eye, upper=False)
         factor = safe_cholesky(whitener @ process_cov @ whitener.mT)
-        return _Constants(walk, initial, steady, factor.mT.contiguous().to(self.dtype))
+        return _Constants(walk, initial, spread, steady, factor.mT.contiguous().to(self.dtype))
 
     def _moves_at(self, inflation: float, walk: MixtureWalk) -> Moves:
         cov = inflation * as_covariance("process_cov", self.process_cov, self.dim)
@@ -222,18 +228,48 @@ class BootstrapParticleFilter(RecursiveFilter):
         """
         if batch_size < 1:
             raise InputError(f"batch_size must be at least 1, got {batch_size}")
-        initial = self._constants().initial
-        n, like = self.n_particles, initial.offset
-        u = uniform(batch_size, (n,), generator, like.new_empty(0, dtype=torch.float64))
-        noise = standard_normal(batch_size, (n, self.dim), generator, like)
-        edges = self.weights.cumsum(0)
-        component = torch.searchsorted(edges, u * edges[-1], right=True)
-        component = component.clamp_max(len(edges) - 1).view(-1)
-        moves = Moves(initial.matrix[:, self.dim :], initial.offset)
-        white = grouped_affine(noise.view(-1, self.dim), component, moves).view_as(noise)
-        log_weights = torch.full_like(u, -math.log(n))
-        scaling = self._prior_and_scaling(white, 0)[1] if self.proposal == "random-walk" else None
-        return ParticleState(white, log_weights, 0, scaling)
+        weights = self.weights.double().expand(batch_size, -1)
+        white = self._draw(weights, self._constants().initial, generator)
+        return self._evenly(white, 0)
+
+    def _draw(
+        self, weights: Float[Tensor, "B K"], moves: Moves, generator: Generators
+    ) -> Float[Tensor, "B N D"]:
+        """Draw particles of a mixture, by one map of noise for each component [K] or for all [B K]."""
+        batch, n_components = weights.shape
+        n, like = self.n_particles, moves.offset
+        u = uniform(batch, (n,), generator, like.new_empty(0, dtype=torch.float64))
+        noise = standard_normal(batch, (n, self.dim), generator, like)
+        edges = weights.cumsum(1)
+        component = torch.searchsorted(edges, u * edges[:, -1:], right=True)
+        component = component.clamp_max(n_components - 1)
+        if len(moves.offset) > n_components:
+            component += n_components * torch.arange(batch, device=u.device)[:, None]
+        white = grouped_affine(noise.view(-1, self.dim), component.view(-1), moves)
+        return white.view_as(noise)
+
+    def _evenly(self, white: Float[Tensor, "B N D"], time: int) -> ParticleState:
+        """The state of particles that all weigh the same."""
+        log_weights = white.new_full(white.shape[:2], -math.log(self.n_particles)).double()
+        scaling = (
+            self._prior_and_scaling(white, time)[1] if self.proposal == "random-walk" else None
+        )
+        return ParticleState(white, log_weights, time, scaling)
+
+    def _draw_measured(
+        self, frame: Measurements, generator: Generators
+    ) -> tuple[Float[Tensor, "B N D"], Float[Tensor, " B"]]:
+        """Draw particles of p(x | z), proportional to p(x) N(z | H x, R); also return log p(z)."""
+        constants = self._constants()
+        cov = frame.cov if frame.cov.ndim == 2 else frame.cov[:, None]
+        means, covs, log_likelihood = kalman_update(
+            self.means.double().expand(len(frame.z), -1, -1), constants.initial_cov,
+            frame.z.double()[:, None], cov, self.observed, frame.mask[:, None],
+        )  # fmt: skip
+        log_weights = self.weights.double().log() + log_likelihood
+        moves = constants.walk.noise_moves(means.flatten(0, 1), covs.flatten(0, 1))
+        white = self._draw(log_weights.softmax(1), moves, generator)
+        return white, torch.logsumexp(log_weights, 1)
 
     def particles(self, state: ParticleState) -> Float[Tensor, "B N D"]:
         """The particles in the units of the state (pixels, metres, radians), float64."""
@@ -244,6 +280,9 @@ class BootstrapParticleFilter(RecursiveFilter):
         self, state: ParticleState, frame: Measurements, generator: Generators, return_cov: bool
     ) -> tuple[ParticleState, StepOutput]:
         """Resample if due, propose, weigh, and estimate."""
+        if state.time == 0 and self.start == "measured":
+            white, evidence = self._draw_measured(frame, generator)
+            return self._output(self._evenly(white, 1), evidence, frame.mask, return_cov)
         state = self._resample(state, generator)
         white = self._propose(state, generator)
         predicted = state.log_weights
@@ -259,11 +298,16 @@ class BootstrapParticleFilter(RecursiveFilter):
         # An element whose weights all vanished, or hold NaN, is NaN from here on.
         evidence = torch.where(torch.isfinite(evidence), evidence, torch.nan)
         log_weights = log_weights - evidence[:, None]
-        mean, cov = self._moments(white, log_weights, return_cov)
         new_state = ParticleState(white, log_weights, state.time + 1, scaling)
-        evidence = self._reported(evidence, frame.mask)
+        return self._output(new_state, evidence, frame.mask, return_cov)
+
+    def _output(
+        self, state: ParticleState, evidence: Tensor, mask: Tensor, return_cov: bool
+    ) -> tuple[ParticleState, StepOutput]:
+        mean, cov = self._moments(state.white, state.log_weights, return_cov)
+        evidence = self._reported(evidence, mask)
         # kept for every frame by `forward`, so no wider than the particles
-        return new_state, StepOutput(mean, log_weights.to(self.dtype), evidence, cov)
+        return state, StepOutput(mean, state.log_weights.to(self.dtype), evidence, cov)
 
     def _resample(self, state: ParticleState, generator: Generators) -> ParticleState:
         """Resample the elements whose effective sample size is low (BL 25); the others stay."""
@@ -342,35 +386,3 @@ class BootstrapParticleFilter(RecursiveFilter):
         spread = ((white - white_mean) * weights.mT.sqrt()).double()
         cov = spread.mT @ spread
         return mean, self.walk.scale @ cov @ self.walk.scale.mT
-
-
-def _check_options(
-    proposal: str, n_particles: int, threshold: float, resampling: str, dtype: torch.dtype
-) -> None:
-    if proposal not in PROPOSALS:
-        raise InputError(f"proposal must be one of {', '.join(PROPOSALS)}, got {proposal!r}")
-    if resampling not in RESAMPLING:
-        raise InputError(f"resampling must be one of {', '.join(RESAMPLING)}, got {resampling!r}")
-    if isinstance(n_particles, bool) or not isinstance(n_particles, int) or n_particles < 1:
-        raise InputError(f"n_particles must be a whole number of at least 1, got {n_particles!r}")
-    if not 0 <= threshold <= 1:
-        raise InputError(f"resample_threshold must be a share from 0 to 1, got {threshold}")
-    if dtype not in (torch.float32, torch.float64):
-        raise InputError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
-
-
-def _check_model(proposal: str, transition: str, burn_in: int, burn_in_scale: float) -> None:
-    if transition not in TRANSITIONS:
-        raise InputError(f"transition must be one of {', '.join(TRANSITIONS)}, got {transition!r}")
-    if proposal != "mixture" and transition != "paper":
-        raise InputError(
-            f"proposal {proposal!r} weighs by (BL 26), which holds for transition 'paper' only, "
-            f"got {transition!r}; use proposal 'mixture'"
-        )
-    if burn_in and transition == "ou":
-        raise InputError("burn_in inflates Q, which transition 'ou' does not use; leave it at 0")
-    if burn_in < 0 or not (math.isfinite(burn_in_scale) and burn_in_scale > 0):
-        raise InputError(
-            "burn_in must be a number of frames >= 0 and burn_in_scale a positive factor of Q, "
-            f"got {burn_in} and {burn_in_scale}"
-        )

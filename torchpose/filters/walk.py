@@ -133,6 +133,11 @@ class MixtureWalk:
         dtype = self.rows.dtype
         return Moves(torch.cat([matrix.mT, factor.mT], 1).to(dtype), shift.to(dtype))
 
+    def noise_moves(self, means: Float[Tensor, "K D"], covs: Float[Tensor, "K D D"]) -> Moves:
+        """The map y = noise @ matrix + offset that draws from N(means, covs), for whitened points."""
+        moves = self.moves(torch.zeros_like(covs), means, covs)
+        return Moves(moves.matrix[:, self.dim :], moves.offset)
+
     def _shrink(self, inflation: float) -> Float[Tensor, "K D"]:
         return (1 / (1 + inflation * self.ratio)).to(self.rows.dtype)
 
