@@ -31,7 +31,6 @@ _SHARP = 100.0
 _LAYERS = 5  # of the annealed filter, each with its share of the particles
 _POINTS = 7  # likelihoods that a hypothesis of the root costs
 _RATE = 60.0  # frames per second for which the default noise of the filters is
-_SURVIVAL = 1e-32  # per second at that rate: 29 % of the hypotheses of a frame
 _LEG_SWAP = 0.02
 _COMMON_HEIGHT = 1.75  # metres, of the body on which postures of actions are told
 # What a constant velocity misses, at 60 Hz, about twice that of walks and exercises: metres for the
@@ -130,7 +129,7 @@ class BodyModel:
         if self.conditionals is not None:
             return filters.RootUncertaintyTracker(
                 body, self.conditionals, n_particles // _POINTS, fps=fps, step_std=step,
-                survival_per_second=_SURVIVAL ** (fps / _RATE), leg_swap=_LEG_SWAP,
+                leg_swap=_LEG_SWAP,
             )  # fmt: skip
         common: dict[str, Any] = {"step_std": step, "sharpness": sharpness}
         if self.action is not None:

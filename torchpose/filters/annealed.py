@@ -20,7 +20,7 @@ from torchpose.filters.silhouette_filter import (
     WeightedParticles,
     take_particles,
 )
-from torchpose.filters.survival import survival_exponent, survival_rate
+from torchpose.filters.survival import check_survival_rate, survival_exponent, survival_rate
 
 __all__ = ["AnnealedParticleFilter", "Annealing", "anneal"]
 
@@ -101,7 +101,7 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
     Args:
         body: as `SilhouetteParticleFilter`. n_particles: N of each layer.
         n_layers: M; a frame costs M N likelihoods. The two papers have 5 x 100 and 5 x 160.
-        survival_rate: alpha of every layer.
+        survival_rate: alpha of every layer, at least 2 / N.
         schedule: M exponents, instead of those solved from the survival rate.
         noise_decay: factor of the noise's covariance per layer; alpha if None.
         options: as `SilhouetteParticleFilter`.
@@ -128,9 +128,9 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
         super().__init__(body, n_particles, **options)
         if n_layers < 1:
             raise InputError(f"n_layers must be at least 1, got {n_layers}")
-        if not 0 < survival_rate < 1:
-            raise InputError(f"survival_rate must lie between 0 and 1, got {survival_rate}")
-        if schedule is not None:
+        if schedule is None:
+            check_survival_rate(survival_rate, n_particles)
+        else:
             finite = all(0 < b < math.inf for b in schedule)
             if len(schedule) != n_layers or not finite:
                 raise InputError(

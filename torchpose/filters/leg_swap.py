@@ -12,7 +12,14 @@ from torchpose.body.skeleton import BodySkeleton
 from torchpose.errors import InputError, SkeletonError
 from torchpose.filters.base import Generators, uniform
 
-__all__ = ["check_leg_swap", "exchange_legs", "leg_angle", "leg_permutation", "swap_legs"]
+__all__ = [
+    "check_leg_swap",
+    "exchange_legs",
+    "extra_copies",
+    "leg_angle",
+    "leg_permutation",
+    "swap_legs",
+]
 
 _LEG_PARTS = ("thigh", "shank")
 _ROOT_COLUMNS = 3  # the position; the vectors of all parts follow
@@ -69,18 +76,37 @@ def exchange_legs(body: Body, states: Float[Tensor, "*batch D"]) -> Float[Tensor
     return torch.cat([states[..., :_ROOT_COLUMNS], exchanged.flatten(-2)], -1)
 
 
+def extra_copies(ancestors: Int[Tensor, "B N"]) -> Bool[Tensor, "B N"]:
+    """Which particles are copies beside the first one of the same ancestor.
+
+    Args:
+        ancestors: of the resampled particles, in any order.
+
+    >>> extra_copies(torch.tensor([[2, 0, 2, 2, 3]])).tolist()
+    [[False, False, True, True, False]]
+    """
+    ordered, place = ancestors.sort(dim=-1, stable=True)
+    again = torch.zeros_like(ordered, dtype=torch.bool)
+    again[..., 1:] = ordered[..., 1:] == ordered[..., :-1]
+    return torch.zeros_like(again).scatter(-1, place, again)
+
+
 def swap_legs(
-    body: Any, particles: Float[Tensor, "B N D"], rate: float, generator: Generators = None
+    body: Any,
+    particles: Float[Tensor, "B N D"],
+    copies: Bool[Tensor, "B N"],
+    rate: float,
+    generator: Generators = None,
 ) -> tuple[Float[Tensor, "B N D"], Bool[Tensor, "B N"]]:
-    """Exchange the legs of some particles, the more often the wider they are apart.
+    """Exchange the legs of some extra copies of particles, the more often the wider they are apart.
 
     p(swap) = rate theta_legs / pi,   theta_legs the angle between the upper legs
 
-    After resampling a particle of some weight has several copies, so that as a rule one that is
-    swapped still has a copy that is not.
+    The first copy of every particle keeps its legs, and so does everything that was not resampled.
 
     Args:
-        particles: [B, N, D], resampled. rate: probability for legs in opposite directions, 0 to 1.
+        particles: [B, N, D], resampled. copies: those that may be swapped, see `extra_copies`.
+        rate: probability for legs in opposite directions, 0 to 1.
         generator: as for `standard_normal`; nothing is drawn at a rate of 0.
 
     Returns:
@@ -89,14 +115,15 @@ def swap_legs(
     Raises:
         InputError, SkeletonError: as `check_leg_swap`.
 
-    Reference: Daubney & Xie, section 8.
+    Reference: Daubney & Xie, section 8: an extra copy of a particle is occasionally kept with the
+    legs swapped, and the number of particles stays the same.
     """
     check_leg_swap(body, rate)
     if rate == 0:
-        return particles, torch.zeros_like(particles[..., 0], dtype=torch.bool)
+        return particles, torch.zeros_like(copies)
     batch, n = particles.shape[:2]
     drawn = uniform(batch, (n,), generator, particles)
-    swapped = drawn < rate * leg_angle(body, particles) / torch.pi
+    swapped = copies & (drawn < rate * leg_angle(body, particles) / torch.pi)
     return torch.where(swapped[..., None], exchange_legs(body, particles), particles), swapped
 
 

@@ -33,7 +33,12 @@ from torchpose.filters.limb_observations import (
     part_log_likelihood,
 )
 from torchpose.filters.silhouette_filter import SilhouetteParticleFilter
-from torchpose.filters.survival import survival_exponent, survival_rate_per_frame
+from torchpose.filters.survival import (
+    LEAST_SURVIVORS,
+    check_survival_rate,
+    survival_exponent,
+    survival_rate_per_frame,
+)
 from torchpose.filters.tree_messages import propagate
 from torchpose.priors.limb_conditionals import LimbConditionals
 from torchpose.unscented import sigma_points
@@ -48,6 +53,7 @@ PUBLISHED: dict[str, Any] = {
 }
 """Options of the tracker as published, where they differ from the defaults."""
 
+_SURVIVAL = 0.16  # a frame
 _ROOT = 6  # columns of a state: position and orientation of the root
 
 
@@ -62,7 +68,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
 
         w_n ~ (prod_i sum_{j=1}^7 p(O_i | sigma_ij))^beta   (DX 12),
 
-    with beta such that the share alpha = exp(ln alpha_c / fps) of them survives.
+    with beta such that the share alpha of them survives, as published alpha = exp(ln alpha_c / fps).
 
     The particles of the state are the roots with the parts' means, its `memory` the covariances
     [B, N, P - 1, 3, 3]. The weights are no posterior's, so the log-evidence is NaN; the standard
@@ -74,9 +80,11 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
             see `info` of the attribute.
         n_particles: N, root hypotheses. A frame costs 7 N likelihoods: 114 are worth 800 particles.
         fps: frames per second.
-        survival_per_second: alpha_c, the share of the hypotheses that lasts for a second. The
-            default keeps 0.29 of them in a frame at 60 Hz; the published 0.01 keeps 0.93, which is
-            too little selection for a root that walks and diffuses with zero mean.
+        survival_rate: alpha, the share of the hypotheses that survives a frame, at least 2 / N.
+            The default is what validation clips of walks chose at 60, 30, 20 and 15 frames a second.
+        survival_per_second: alpha_c, instead of `survival_rate`. The published 0.01 keeps 0.93 in a
+            frame at 60 Hz, which is too little selection for a root that walks and diffuses with
+            zero mean; a much smaller one leaves less than one hypothesis at low frame rates.
         normalisation: "share" of a part's own pixels, or "published": their number. See
             `part_log_likelihood`.
         camera_rule: "product" over the cameras, or "sum".
@@ -109,7 +117,8 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         n_particles: int = 114,
         *,
         fps: float,
-        survival_per_second: float = 1e-32,
+        survival_rate: float | None = None,
+        survival_per_second: float | None = None,
         normalisation: str = "share",
         camera_rule: str = "product",
         observation_sharpness: float = 8.0,
@@ -124,7 +133,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         check_rules(normalisation, camera_rule, observation_sharpness)
         conditionals.check_for(body)
         super().__init__(body, n_particles, estimate=estimate, limit_mode=limit_mode, **options)
-        self.survival_rate = survival_rate_per_frame(survival_per_second, fps)
+        self.survival_rate = _survival(survival_rate, survival_per_second, fps, n_particles)
         self.conditionals = conditionals.at_rate(fps).to(self.step_std)
         self.fps, self.normalisation, self.camera_rule = float(fps), normalisation, camera_rule
         self.observation_sharpness, self.weighting = float(observation_sharpness), weighting
@@ -233,6 +242,19 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
             f"{self.n_particles} root hypotheses, {self.fps:g} frames per second, survival "
             f"{self.survival_rate:.3g} per frame"
         )
+
+
+def _survival(rate: float | None, per_second: float | None, fps: float, n_particles: int) -> float:
+    if rate is not None and per_second is not None:
+        raise InputError(
+            f"expected survival_rate or survival_per_second, got both ({rate} and {per_second})"
+        )
+    if per_second is not None:
+        rate = survival_rate_per_frame(per_second, fps)
+    elif rate is None:
+        rate = max(_SURVIVAL, LEAST_SURVIVORS / n_particles)
+    check_survival_rate(rate, n_particles)
+    return rate
 
 
 def _check(body: Any, likelihood: Any, weighting: str, least_std: float, first_std: float) -> None:

@@ -41,7 +41,7 @@ from torchpose.filters.body_particles import (
     take_particles,
 )
 from torchpose.filters.joint_spread import joint_covariance
-from torchpose.filters.leg_swap import check_leg_swap, swap_legs
+from torchpose.filters.leg_swap import check_leg_swap, extra_copies, swap_legs
 from torchpose.filters.resampling import RESAMPLING, resample
 
 __all__ = [
@@ -83,9 +83,9 @@ class SilhouetteParticleFilter(nn.Module):
         resample_threshold: share of N below which the effective sample size leads to resampling;
             1 is in every frame, as published.
         estimate: "mean", weighted before resampling, or "map", the particle of the largest weight.
-        leg_swap: for a person whose legs may have been taken for each other: at resampling a particle
-            goes on with its legs exchanged with this probability times the angle between its upper
-            legs over pi (Daubney & Xie, section 8); 0 for never.
+        leg_swap: for a person whose legs may have been taken for each other: an extra copy that
+            resampling makes of a particle goes on with its legs exchanged with this probability times
+            the angle between its upper legs over pi (Daubney & Xie, section 8); 0 for never.
         limb_shape: of the body in silhouettes, "cylinders" or "rectangles" (AS, section 3.2).
         respread_scale: particles that all died are drawn about the last mean with this many times
             `step_std`, twice that in the second such frame, and so on.
@@ -355,7 +355,8 @@ class SilhouetteParticleFilter(nn.Module):
         if memory is not None:
             memory = take_particles(memory, ancestors)
         if self.leg_swap > 0:
-            particles, swapped = swap_legs(self.body, particles, self.leg_swap, generator)
+            extra = extra_copies(ancestors)  # of elements that were not resampled: none
+            particles, swapped = swap_legs(self.body, particles, extra, self.leg_swap, generator)
             if memory is not None:
                 memory = self.swap_memory(memory, swapped)
         log_weights = torch.where(due[:, None], -math.log(n), state.log_weights)

@@ -4,7 +4,6 @@ from typing import Any
 
 import torch
 
-from torchpose.errors import InputError
 from torchpose.filters.base import Generators
 from torchpose.filters.silhouette_filter import (
     BodyFilterState,
@@ -14,7 +13,7 @@ from torchpose.filters.silhouette_filter import (
     WeightedParticles,
     reweight,
 )
-from torchpose.filters.survival import survival_exponent
+from torchpose.filters.survival import check_survival_rate, survival_exponent
 
 __all__ = ["SIRParticleFilter"]
 
@@ -30,7 +29,7 @@ class SIRParticleFilter(SilhouetteParticleFilter):
 
     Args:
         body, n_particles, options: as `SilhouetteParticleFilter`.
-        survival_rate: per frame, or None. Daubney & Xie have 0.01 per second
+        survival_rate: per frame, at least 2 / N, or None. Daubney & Xie have 0.01 per second
             (`survival_rate_per_frame`), 800 particles and `estimate="map"`.
 
     Raises:
@@ -50,8 +49,8 @@ class SIRParticleFilter(SilhouetteParticleFilter):
         **options: Any,
     ) -> None:
         super().__init__(body, n_particles, **options)
-        if survival_rate is not None and not 0 < survival_rate < 1:
-            raise InputError(f"survival_rate must lie between 0 and 1, got {survival_rate}")
+        if survival_rate is not None:
+            check_survival_rate(survival_rate, n_particles)
         self.survival_rate = survival_rate
 
     def move(

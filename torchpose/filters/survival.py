@@ -8,7 +8,16 @@ from torch import Tensor
 
 from torchpose.errors import InputError
 
-__all__ = ["survival_exponent", "survival_rate", "survival_rate_per_frame"]
+__all__ = [
+    "LEAST_SURVIVORS",
+    "check_survival_rate",
+    "survival_exponent",
+    "survival_rate",
+    "survival_rate_per_frame",
+]
+
+LEAST_SURVIVORS = 2.0
+"""Particles that a survival rate must leave: one alone is no distribution."""
 
 _REACH = 30.0  # of the search, in log beta, on either side of where it starts
 _MOST_STEPS = 60
@@ -101,6 +110,30 @@ def _solve(relative: Tensor, alive: Tensor, start: Tensor, target: float) -> Ten
         inside = (newton > low) & (newton < high)
         u = torch.where(inside, newton, (low + high) / 2)
     return u
+
+
+def check_survival_rate(rate: float, n_particles: int) -> None:
+    """Raise unless a share of this many particles can survive.
+
+    2 / N <= alpha < 1. No exponent leaves fewer than one particle, alpha = 1 / N; a rate near it
+    hands the whole frame to the best particle.
+
+    Args:
+        rate: alpha, per frame. n_particles: N.
+
+    Raises:
+        InputError: a rate that is not below 1, or that leaves fewer than `LEAST_SURVIVORS`.
+    """
+    if not 0 < rate < 1:
+        raise InputError(f"a survival rate must lie between 0 and 1, got {rate}")
+    if rate * n_particles < LEAST_SURVIVORS * (1 - 1e-9):
+        least = LEAST_SURVIVORS / n_particles
+        way = f"ask for {least:.3g} or more" if least < 1 else "take more particles"
+        raise InputError(
+            f"a survival rate of {rate:.3g} leaves {rate * n_particles:.2g} of {n_particles} particles, "
+            f"fewer than {LEAST_SURVIVORS:g}; {way}. One per second leaves the fewer in a frame, the "
+            "fewer frames a second has"
+        )
 
 
 def survival_rate_per_frame(per_second: float, fps: float) -> float:

@@ -1,6 +1,8 @@
 """Results kept in a folder, one file each, so that a killed run goes on where it stopped."""
 
+import hashlib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,28 @@ import torch
 from torchpose.errors import TorchposeError
 from torchpose.io.files import read_npz, write_npz
 
-__all__ = ["keep", "kept", "read_kept"]
+__all__ = ["keep", "kept", "read_kept", "source_hash"]
+
+_PACKAGE = Path(__file__).parents[1]
+
+
+@cache
+def source_hash(*names: str, root: Path = _PACKAGE) -> str:
+    """Sixteen letters that change with the source of these modules and packages.
+
+    A result that is kept under them is made anew once a constant, a default or a formula of what it
+    was made with has changed. The files are read once in a process.
+
+    Args:
+        names: of files and folders in `root`, such as "filters" and "unscented.py".
+    """
+    digest = hashlib.sha256()
+    for name in names:
+        at = root / name
+        for path in sorted(at.rglob("*.py")) if at.is_dir() else [at]:
+            digest.update(path.relative_to(root).as_posix().encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def read_kept(path: Path, kind: Callable[..., Any], fields: tuple[str, ...]) -> Any:

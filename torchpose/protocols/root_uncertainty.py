@@ -41,10 +41,10 @@ from torchpose.protocols.root_uncertainty_trackees import (
     FPS,
     METHODS,
     POINTS,
-    PUBLISHED,
     Budget,
     Walker,
     prepare,
+    published,
     slower,
     with_cameras,
 )
@@ -63,7 +63,7 @@ SPACED = ("method", "persons", "cameras_used", "fps", "displaced_at")
 """Options that a command line takes as words with blanks between them."""
 
 _N_PERSONS = 3
-_VALIDATION_FRAMES = 60
+_VALIDATION_FRAMES = 90
 _TRACKED_ON = 1.0  # seconds after a displacement
 
 
@@ -118,8 +118,8 @@ def run(
         likelihood: of SIR and APF, bidirectional (MR 12) or overlap (AS 7).
         leg_swap: probability of swapping legs that point in opposite directions, all methods.
         limits: whether poses outside learnt limits are discarded, all methods.
-        settings: validation chooses survival rate and diffusion; published ones; or the folder or
-            report.json of an earlier run with those it chose.
+        settings: validation chooses survival rate and diffusion at every frame rate; published ones;
+            or the folder or report.json of an earlier run with those it chose.
 
     Raises:
         InputError: unknown methods, parts or persons, too few trials, rates that are no part of 60.
@@ -149,13 +149,22 @@ def run(
     })  # fmt: skip
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DegenerateFilterWarning)  # the tables count them
-        tunings = _tunings(first, method, budget, out, settings, quick, progress)
-        known = {name: tuning.setting for name, tuning in tunings.items()}
+        by_rate = {rate: [slower(w, n) for w in first] for rate, n in _rates(part, steps).items()}
+        tunings = {
+            rate: _tunings(some, method, budget, out, settings, quick, progress)
+            for rate, some in by_rate.items()
+        }
+        chosen_at = {
+            rate: {name: tuning.setting for name, tuning in found.items()}
+            for rate, found in tunings.items()
+        }
+        known = chosen_at.get(FPS, {})
         numbers = range(seed, seed + seeds)
         if part in ("tables", "all"):
             _fill_tables(report, walkers, known, budget, cameras_used, numbers, out, progress)
         if part in ("rates", "all"):
-            _fill_rates(report, first, known, budget, steps, numbers, out, progress)
+            asked = {rate: by_rate[rate] for rate in steps}
+            _fill_rates(report, asked, chosen_at, budget, numbers, out, progress)
         if part in ("recovery", "all"):
             some = range(seed, seed + recovery_seeds)
             seconds = min(_TRACKED_ON, frames / FPS / 2) if quick else _TRACKED_ON
@@ -163,8 +172,11 @@ def run(
             _fill_recovery(
                 report, first, known, budget, displacements, some, times, seconds, out, progress
             )
-    report.settings["settings"] = {name: setting._asdict() for name, setting in known.items()}
-    add_tuning(report, tunings)
+    report.settings["settings"] = {
+        f"{rate:g}": {name: setting._asdict() for name, setting in found.items()}
+        for rate, found in chosen_at.items()
+    }
+    add_tuning(report, tunings, budget)
     add_setup(report, walkers)
     report.save(out)
     return report
@@ -198,16 +210,16 @@ def _fill_tables(
 
 
 def _fill_rates(
-    report: Report, walkers: Sequence[Walker], settings: Mapping[str, Setting], budget: Budget,
-    steps: Mapping[float, int], seeds: Sequence[int], out: Path, progress: bool,
+    report: Report, by_rate: Mapping[float, Sequence[Walker]],
+    settings: Mapping[float, Mapping[str, Setting]], budget: Budget, seeds: Sequence[int], out: Path,
+    progress: bool,
 ) -> None:  # fmt: skip
-    """Figure 9."""
-    by_rate = {fps: [slower(walker, n) for walker in walkers] for fps, n in steps.items()}
-    total = sum(map(_frames, by_rate.values())) * len(settings) * len(seeds)
+    """Figure 9, every rate with the settings that were chosen at it."""
+    total = sum(_frames(seen) * len(settings[fps]) for fps, seen in by_rate.items()) * len(seeds)
     found: dict[float, Runs] = {}
     with progress_bar(total, progress, "frame rates") as bar:
         for fps, seen in by_rate.items():
-            found[fps] = run_condition(seen, settings, budget, out, seeds, bar)
+            found[fps] = run_condition(seen, settings[fps], budget, out, seeds, bar)
             write_csv(out / f"runs-{fps:g}-fps.csv", found[fps], fps, seeds[0])
     add_rates(report, found)
     named = {f"{fps:g}": runs for fps, runs in found.items()}
@@ -233,14 +245,22 @@ def _tunings(
     walkers: Sequence[Walker], methods: Sequence[str], budget: Budget, out: Path, settings: str,
     quick: bool, progress: bool,
 ) -> dict[str, Tuning]:  # fmt: skip
+    fps = walkers[0].fps
     if settings == "published" or (quick and settings == "validation"):
-        return {name: Tuning(PUBLISHED[name]) for name in methods}
+        return {name: Tuning(published(name, fps)) for name in methods}
     if settings != "validation":
-        return {name: Tuning(found) for name, found in read_settings(settings, methods).items()}
+        found = read_settings(settings, methods, f"{fps:g}")
+        return {name: Tuning(setting) for name, setting in found.items()}
     return {
         name: tune(walkers, name, budget, out)
-        for name in tqdm(methods, disable=not progress, desc="settings")
+        for name in tqdm(methods, disable=not progress, desc=f"settings, {fps:g} fps")
     }
+
+
+def _rates(part: str, steps: Mapping[float, int]) -> dict[float, int]:
+    """Frame rates that a part needs, each with the n of which it takes every n-th frame."""
+    whole = {FPS: 1} if part != "rates" else {}
+    return whole | (dict(steps) if part in ("rates", "all") else {})
 
 
 def _frames(walkers: Sequence[Walker]) -> int:

@@ -4,6 +4,7 @@ Every run is kept in a folder, so that parts of the protocol may be run apart an
 """
 
 from collections.abc import Mapping, Sequence
+from math import ceil
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,19 +16,23 @@ from tqdm.auto import tqdm
 from torchpose.body.kinematics import Body
 from torchpose.body.quaternion_vectors import compose
 from torchpose.filters.silhouette_filter import SilhouetteParticleFilter
+from torchpose.filters.survival import LEAST_SURVIVORS
 from torchpose.protocols.common import settings_hash
-from torchpose.protocols.kept_runs import keep, kept, read_kept
+from torchpose.protocols.kept_runs import keep, kept, read_kept, source_hash
+from torchpose.protocols.root_uncertainty_search import search_setting
 from torchpose.protocols.root_uncertainty_trackees import (
+    FPS,
     METHODS,
     Budget,
     Walker,
     make_filter,
+    published,
+    selected_among,
 )
 from torchpose.protocols.silhouette_runs import (
     Run,
     Runs,
     Tuning,
-    choose_setting,
     generators_of,
     sequence_name,
     track_view,
@@ -46,7 +51,11 @@ __all__ = [
     "tune",
 ]
 
-_VERSION = 1
+_MADE_WITH = (
+    "body", "filters", "priors", "unscented.py", "protocols/root_uncertainty_runs.py",
+    "protocols/root_uncertainty_trackees.py", "protocols/silhouette_runs.py",
+)  # fmt: skip
+"""What the numbers of a run depend on beside its facts: files and folders of the package."""
 
 
 # --- conditions -----------------------------------------------------------------------------------
@@ -83,7 +92,7 @@ def _kept(
     seeds: Sequence[int],
 ) -> list[Run]:  # fmt: skip
     """Runs of some seeds on one clip; those that are missing are filtered as one batch."""
-    facts = ["root", _VERSION, *_facts(walker, walker.body, view, method, setting, budget)]
+    facts = ["root", *_facts(walker, walker.body, view, method, setting, budget)]
     paths = {s: folder / f"run-{settings_hash([*facts, s])}.npz" for s in seeds}
     missing = [s for s in seeds if _read(paths[s]) is None]
     if missing:
@@ -104,18 +113,25 @@ def _read(path: Path) -> Run | None:
 def tune(walkers: Sequence[Walker], method: str, budget: Budget, folder: Path) -> Tuning:
     """The setting with the smallest mean error over everybody's validation clips.
 
-    Every method has the same clips, seed and number of settings to choose among.
+    Every method has the same clips and seeds to choose by.
+
+    Args:
+        walkers: at the frame rate of the choice; the lower it is, the more seeds are tracked.
     """
+    seeds = range(ceil(FPS / walkers[0].fps / 2))
 
     def error(setting: Setting) -> float:
         found = [
-            _kept_error(walker, body, view, method, setting, budget, folder)
+            _kept_error(walker, body, view, method, setting, budget, folder, seeds)
             for walker in walkers
             for body, view in walker.validation
         ]
         return sum(found) / len(found)
 
-    return choose_setting(error, METHODS[method].first, METHODS[method].values)
+    known = METHODS[method]
+    values = {*known.values, published(method, walkers[0].fps).value}
+    least = LEAST_SURVIVORS / selected_among(method, budget)
+    return search_setting(error, known.first, sorted(values), least)
 
 
 def _kept_error(
@@ -126,13 +142,15 @@ def _kept_error(
     setting: Setting,
     budget: Budget,
     folder: Path,
+    seeds: Sequence[int],
 ) -> float:
-    facts = ["root-tuning", _VERSION, *_facts(walker, body, view, method, setting, budget)]
+    facts = ["root-tuning", *_facts(walker, body, view, method, setting, budget), list(seeds)]
 
     def measured() -> float:
         tracker = make_filter(method, walker, setting, budget)
-        (run,) = track_view(tracker, body, view, view.initial_state[None], generators_of([0]))
-        return float(run.errors.double().nanmean())
+        start = view.initial_state.expand(len(seeds), -1)
+        runs = track_view(tracker, body, view, start, generators_of(seeds))
+        return float(torch.stack([run.errors for run in runs]).double().nanmean())
 
     return kept(folder / f"tuning-{settings_hash(facts)}.npz", measured)
 
@@ -142,7 +160,8 @@ def _facts(
 ) -> list[Any]:
     """Everything that a run depends on."""
     facts: list[Any] = [
-        method, list(setting), list(budget), walker.fps, view.silhouettes.byte(), view.rig.matrix,
+        source_hash(*_MADE_WITH), method, METHODS[method].options, list(setting), list(budget),
+        walker.fps, view.silhouettes.byte(), view.rig.matrix,
         view.rig.rotation, view.rig.translation, view.initial_state, view.clip.joints,
         body.offsets, body.radii, body.tips, body.centres, walker.step_std,
     ]  # fmt: skip
@@ -231,7 +250,7 @@ def _recovered(
     displacement: Displacement, at: int, n_frames: int,
 ) -> Float[Tensor, "S T"]:  # fmt: skip
     view = walker.tests[0]
-    facts = ["recovery", _VERSION, *_facts(walker, walker.body, view, method, setting, budget)]
+    facts = ["recovery", *_facts(walker, walker.body, view, method, setting, budget)]
     facts += [list(displacement), at, n_frames, list(seeds)]
     path = folder / f"recovery-{settings_hash(facts)}.npz"
     if read_kept(path, _Errors, _Errors._fields) is None:

@@ -9,7 +9,13 @@ from torch import Tensor
 from torchpose.body.fitting import fit_state
 from torchpose.protocols.report import Report
 from torchpose.protocols.root_uncertainty_runs import DISPLACEMENTS, Recovery
-from torchpose.protocols.root_uncertainty_trackees import METHODS, PUBLISHED, Walker
+from torchpose.protocols.root_uncertainty_trackees import (
+    METHODS,
+    Budget,
+    Walker,
+    published,
+    selected_among,
+)
 from torchpose.protocols.silhouette_runs import Runs, Tuning, sequence_name
 from torchpose.protocols.silhouette_tables import bootstrap, mean_of, part_errors, pooled_std
 from torchpose.protocols.silhouette_trackees import Setting
@@ -140,8 +146,8 @@ def add_rates(report: Report, conditions: Mapping[float, Runs]) -> None:
     table = report.table(
         "rates", "Error (mm) over frames per second, mean over persons", columns,
         note="Every n-th frame of the same silhouettes. Diffusion is learnt from every n-th frame of "
-        "the training clips, and the survival per second is that of 60 frames per second. ±: "
-        "standard deviation over seeds, pooled over persons; worst: of all runs.",
+        "the training clips; survival and scale of the diffusion are chosen on validation clips at "
+        "each rate. ±: standard deviation over seeds, pooled over persons; worst: of all runs.",
     )  # fmt: skip
     found: dict[float, dict[str, float]] = {}
     for fps, runs in conditions.items():
@@ -202,23 +208,37 @@ def add_speed(report: Report, runs: Runs, budget: str) -> None:
         table.add(label, [1 / each, 1000 * each])
 
 
-def add_tuning(report: Report, tunings: Mapping[str, Tuning]) -> None:
-    """What validation chose for every method, or what was given."""
+def add_tuning(
+    report: Report, tunings: Mapping[float, Mapping[str, Tuning]], budget: Budget
+) -> None:
+    """What validation chose for every method at every frame rate, or what was given."""
     table = report.table(
         "tuning", "What validation clips chose: the setting with the smallest error",
-        ["survival", "diffusion", "error (mm)", "tried: survival x diffusion, error"],
-        digits=(2, 1, 1, 0),
-        note="Survival: of particles per second for SIR and the root tracker, 0.01 as published; per "
-        "layer for APF, 0.5 as published. Diffusion: factor of its standard deviation, 1 as learnt. "
-        "First the diffusion is chosen, then the survival; the same number of settings, clips and "
-        "seeds for all. Nothing is tried where settings are given or published.",
+        ["survival", "particles", "diffusion", "error (mm)", "tried: survival x diffusion, error"],
+        digits=(2, 1, 1, 1, 0),
+        note="Survival: share of the particles that survives a frame, for APF a layer; as published "
+        "0.01 a second, and 0.5 a layer. Particles: how many that are. Diffusion: factor of its "
+        "standard deviation, 1 as learnt. First the diffusion is chosen, then the survival, then both "
+        "in turn among their neighbours; where the best is at the end of what was tried, more is "
+        "tried, so that what is chosen has larger errors beside it. The same clips and seeds for all. "
+        "Nothing is tried where settings are given or published.",
     )  # fmt: skip
-    for method, found in tunings.items():
-        tried = zip(found.tried, found.errors, strict=True)
-        text = "; ".join(f"{s.value:g} x {s.scale:g}, {e:.0f}" for s, e in tried)
-        setting: Setting = found.setting
-        chosen = f"{setting.value:g}" + (" (published)" if setting == PUBLISHED[method] else "")
-        table.add(METHODS[method].label, [chosen, setting.scale, found.error, text or "-"])
+    for fps, methods in tunings.items():
+        for method, found in methods.items():
+            tried = zip(found.tried, found.errors, strict=True)
+            text = "; ".join(f"{s.value:.2g} x {s.scale:g}, {e:.0f}" for s, e in tried)
+            setting: Setting = found.setting
+            usual = " (published)" if setting == published(method, fps) else ""
+            table.add(
+                f"{METHODS[method].label}, {fps:g} fps",
+                [
+                    f"{setting.value:.2g}{usual}",
+                    setting.value * selected_among(method, budget),
+                    setting.scale,
+                    found.error,
+                    text or "-",
+                ],
+            )
 
 
 def add_setup(report: Report, walkers: Sequence[Walker]) -> None:

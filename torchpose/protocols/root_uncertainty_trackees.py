@@ -43,12 +43,13 @@ __all__ = [
     "FPS",
     "METHODS",
     "POINTS",
-    "PUBLISHED",
     "Budget",
     "Walker",
     "hypotheses",
     "make_filter",
     "prepare",
+    "published",
+    "selected_among",
     "slower",
     "with_cameras",
 ]
@@ -58,15 +59,18 @@ POINTS = 7
 """Likelihoods of every limb that one hypothesis of the root costs (DX, section 5)."""
 
 _ROOM = 0.15  # beside the poses of training: 17 degrees
-_PER_SECOND = ("survival per second", 1e-24, (0.01, 1e-8, 1e-24, 1e-48))
-_PER_LAYER = ("survival per layer", PUBLISHED_SURVIVAL, (0.3, PUBLISHED_SURVIVAL, 0.7, 0.85))
+_SHARES = (0.04, 0.06, 0.1, 0.16, 0.25, 0.4)
+_PER_FRAME = ("survival per frame", 0.16, _SHARES)
+_LAYER_SHARES = (0.2, 0.3, 0.4, PUBLISHED_SURVIVAL, 0.6, 0.7, 0.85)
+_PER_LAYER = ("survival per layer", PUBLISHED_SURVIVAL, _LAYER_SHARES)
+_PER_SECOND = 0.01  # DX, section 8
 
 METHODS = {
-    "sir": Method("SIR", *_PER_SECOND, {}),
+    "sir": Method("SIR", *_PER_FRAME, {}),
     "apf": Method("APF", *_PER_LAYER, {}),
-    "root": Method("Root uncertainty", *_PER_SECOND, {}),
-    "root-pixels": Method("Root uncertainty, pixels", *_PER_SECOND, {"normalisation": "published"}),
-    "root-body": Method("Root uncertainty, whole body", *_PER_SECOND, {"weighting": "body"}),
+    "root": Method("Root uncertainty", *_PER_FRAME, {}),
+    "root-pixels": Method("Root uncertainty, pixels", *_PER_FRAME, {"normalisation": "published"}),
+    "root-body": Method("Root uncertainty, whole body", *_PER_FRAME, {"weighting": "body"}),
 }
 """The filters by the names that the command takes.
 
@@ -74,8 +78,16 @@ METHODS = {
 number as published; ``root-body`` weighs a hypothesis by the likelihood of the whole body.
 """
 
-PUBLISHED = {name: Setting(PUBLISHED_SURVIVAL if name == "apf" else 0.01) for name in METHODS}
-"""Survival rates of section 8, and the diffusion as learnt."""
+
+def published(name: str, fps: float) -> Setting:
+    """Survival of a frame, or of a layer, as in section 8, and the diffusion as learnt.
+
+    Args:
+        name: among `METHODS`. fps: frames per second.
+    """
+    if name == "apf":
+        return Setting(PUBLISHED_SURVIVAL)
+    return Setting(survival_rate_per_frame(_PER_SECOND, fps))
 
 
 class Budget(NamedTuple):
@@ -214,11 +226,11 @@ def make_filter(
     """A filter that evaluates as many likelihoods a frame as any other.
 
     Args:
-        name: among `METHODS`. setting: survival rate, and factor of the diffusion's deviation.
-        budget: likelihoods and options, the same for all.
+        name: among `METHODS`. setting: survival of a frame (of a layer for APF), and factor of the
+            diffusion's deviation. budget: likelihoods and options, the same for all.
 
     Raises:
-        InputError: an unknown method, or too few likelihoods.
+        InputError: an unknown method, too few likelihoods, or a survival that leaves too few particles.
     """
     if name not in METHODS:
         raise InputError(f"method must be among {', '.join(METHODS)}, got {name!r}")
@@ -233,17 +245,17 @@ def make_filter(
     }
     if name == "apf":
         return AnnealedParticleFilter(
-            walker.body, budget.particles // LAYERS, n_layers=LAYERS, estimate="mean",
+            walker.body, selected_among(name, budget), n_layers=LAYERS, estimate="mean",
             survival_rate=setting.value, likelihood=budget.likelihood, **common,
         )  # fmt: skip
     if name == "sir":
         return SIRParticleFilter(
             walker.body, budget.particles, estimate="map", likelihood=budget.likelihood,
-            survival_rate=survival_rate_per_frame(setting.value, walker.fps), **common,
+            survival_rate=setting.value, **common,
         )  # fmt: skip
     return RootUncertaintyTracker(
         walker.body, _diffusing(walker.conditionals, setting.scale),
-        hypotheses(name, budget), fps=walker.fps, survival_per_second=setting.value,
+        hypotheses(name, budget), fps=walker.fps, survival_rate=setting.value,
         estimate="map", **METHODS[name].options, **common,
     )  # fmt: skip
 
@@ -255,6 +267,13 @@ def hypotheses(name: str, budget: Budget) -> int:
     """
     whole = METHODS[name].options.get("weighting") == "body"
     return round(budget.particles / (POINTS + whole))
+
+
+def selected_among(name: str, budget: Budget) -> int:
+    """Particles of which the survival keeps a share: hypotheses, or those of a layer."""
+    if name == "apf":
+        return budget.particles // LAYERS
+    return budget.particles if name == "sir" else hypotheses(name, budget)
 
 
 def _diffusing(conditionals: LimbConditionals, scale: float) -> LimbConditionals:

@@ -142,19 +142,24 @@ def choose_setting(
     return Tuning(best(), tuple(tried), tuple(tried.values()))
 
 
-def read_settings(path: str | Path, methods: Sequence[str]) -> dict[str, Setting]:
+def read_settings(
+    path: str | Path, methods: Sequence[str], condition: str | None = None
+) -> dict[str, Setting]:
     """What an earlier run chose for these methods.
 
     Args:
         path: report.json of the run, or its folder. methods: by name.
+        condition: for which it chose, where it chose for several.
 
     Raises:
-        InputError: no such file, or a method that the run did not have.
+        InputError: no such file, or a method or condition that the run did not have.
         FileFormatError: no report of one choice for each method.
     """
     path = require_file(Path(path) / "report.json" if Path(path).is_dir() else path)
     try:
         chosen = json.loads(path.read_text(encoding="utf-8"))["settings"]["settings"]
+        if condition is not None:
+            chosen = _condition(path, chosen, condition)
         known = {name: Setting(float(s["value"]), float(s["scale"])) for name, s in chosen.items()}
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise FileFormatError(
@@ -169,6 +174,15 @@ def read_settings(path: str | Path, methods: Sequence[str]) -> dict[str, Setting
             "with --method"
         )
     return {name: known[name] for name in methods}
+
+
+def _condition(path: Path, chosen: Mapping[str, Any], condition: str) -> Any:
+    if condition not in chosen:
+        raise InputError(
+            f"{path}: expected settings for {condition}; there are only those for "
+            f"{', '.join(chosen)}: run without --settings"
+        )
+    return chosen[condition]
 
 
 def _kept_error(
