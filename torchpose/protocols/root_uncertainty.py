@@ -63,7 +63,7 @@ SPACED = ("method", "persons", "cameras_used", "fps", "displaced_at")
 """Options that a command line takes as words with blanks between them."""
 
 _N_PERSONS = 3
-_VALIDATION_FRAMES = 90
+_VALIDATION_FRAMES = 75
 _TRACKED_ON = 1.0  # seconds after a displacement
 
 

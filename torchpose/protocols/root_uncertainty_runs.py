@@ -57,6 +57,8 @@ _MADE_WITH = (
 )  # fmt: skip
 """What the numbers of a run depend on beside its facts: files and folders of the package."""
 
+_FIRST_SCALE = 1.4
+
 
 # --- conditions -----------------------------------------------------------------------------------
 
@@ -128,10 +130,10 @@ def tune(walkers: Sequence[Walker], method: str, budget: Budget, folder: Path) -
         ]
         return sum(found) / len(found)
 
-    known = METHODS[method]
-    values = {*known.values, published(method, walkers[0].fps).value}
+    known, usual = METHODS[method], published(method, walkers[0].fps).value
     least = LEAST_SURVIVORS / selected_among(method, budget)
-    return search_setting(error, known.first, sorted(values), least)
+    start = Setting(known.first, _FIRST_SCALE)
+    return search_setting(error, start, usual, known.values, least)
 
 
 def _kept_error(

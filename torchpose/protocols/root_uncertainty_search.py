@@ -14,22 +14,23 @@ _MOST = 0.97
 
 def search_setting(
     error: Callable[[Setting], float],
-    first: float,
+    start: Setting,
+    published: float,
     values: Sequence[float],
     least: float,
     scales: Sequence[float] = SCALES,
 ) -> Tuning:
-    """The setting whose error is smaller than that of all its neighbours.
+    """The setting whose error is smaller than that of its neighbours.
 
-    First the scale at the value `first`, then the value at that scale, then both in turn among their
-    neighbours until neither changes. Where the best of a row is its end, the row goes on by the
-    ratio of its last two, as long as there are such settings: what is chosen lies between others that
-    were tried, or at the least survival.
+    From the start the scale goes to better neighbours until there is none, then the survival, and both
+    in turn until neither changes. Where a row ends too early it goes on by the ratio of its last two:
+    what is chosen lies between others that were tried, or next to the least survival that can be.
 
     Args:
         error: of a setting; one that is not finite is never chosen.
-        first: value with which the scale is chosen. values: shares that survive, ascending.
-        least: share below which none is tried. scales: of the diffusion, ascending.
+        start: a value and a scale of the rows. published: a value that is tried in any case.
+        values: shares that survive, ascending. least: share below which none is tried.
+        scales: of the diffusion, ascending.
     """
     tried: dict[Setting, float] = {}
 
@@ -38,16 +39,21 @@ def search_setting(
             tried[setting] = error(setting)
         return tried[setting] if isfinite(tried[setting]) else inf
 
-    row = [value for value in values if value >= least]
-    ladder = list(scales)
-    scale = min(ladder, key=lambda s: of(Setting(first, s)))
-    scale = _descend(lambda s: of(Setting(first, s)), ladder, scale, _SCALES)
-    value = min(row, key=lambda v: of(Setting(v, scale)))
+    def along_scales(value: float, scale: float) -> float:
+        return _descend(lambda s: of(Setting(value, s)), ladder, scale, _SCALES)
+
+    def along_values(value: float, scale: float) -> float:
+        return _descend(lambda v: of(Setting(v, scale)), row, value, (least, _MOST))
+
+    row, ladder = sorted({*values, published}), list(scales)
+    value, scale = start.value, along_scales(*start)
+    if of(Setting(published, scale)) < of(Setting(value, scale)):
+        value = published
     settled = False
     while not settled:
         before = value, scale
-        value = _descend(lambda v: of(Setting(v, scale)), row, value, (least, _MOST))  # noqa: B023
-        scale = _descend(lambda s: of(Setting(value, s)), ladder, scale, _SCALES)  # noqa: B023
+        value = along_values(value, scale)
+        scale = along_scales(value, scale)
         settled = before == (value, scale)
     return Tuning(Setting(value, scale), tuple(tried), tuple(tried.values()))
 

@@ -218,9 +218,9 @@ def add_tuning(
         digits=(2, 1, 1, 1, 0),
         note="Survival: share of the particles that survives a frame, for APF a layer; as published "
         "0.01 a second, and 0.5 a layer. Particles: how many that are. Diffusion: factor of its "
-        "standard deviation, 1 as learnt. First the diffusion is chosen, then the survival, then both "
-        "in turn among their neighbours; where the best is at the end of what was tried, more is "
-        "tried, so that what is chosen has larger errors beside it. The same clips and seeds for all. "
+        "standard deviation, 1 as learnt. From one start for all rates diffusion and survival go in "
+        "turn to better neighbours until there is none, so that what is chosen has larger errors "
+        "beside it; the published survival is tried in any case. The same clips and seeds for all. "
         "Nothing is tried where settings are given or published.",
     )  # fmt: skip
     for fps, methods in tunings.items():
