@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+import torchpose
 from tests.data import data_dir_or_skip
 from torchpose.errors import InputError, ShapeError
 from torchpose.measure import FaceTracker, SkinModel
-from torchpose.measure.torso import clothes_likelihood, elbows_from_torso
+from torchpose.measure.skin import SkinState
+from torchpose.measure.torso import _supported, clothes_likelihood, elbows_from_torso
+from torchpose.measure.upper_body import UpperBodyMeasurer
 
 cv2 = pytest.importorskip("cv2")
 
@@ -91,6 +94,69 @@ def test_a_batch_is_its_elements_and_scale_does_not_matter():
     twice = elbows_from_torso(large, (2 * FACE).repeat(2, 1))
     torch.testing.assert_close(twice.points, 2 * both.points, atol=4.0, rtol=0)
     torch.testing.assert_close(twice.covariance, 4 * both.covariance, atol=40.0, rtol=0.3)
+
+
+def widened(image, size):
+    """The drawn person at another size of the face, on a canvas that all of them share."""
+    scale = size / SIZE
+    large = torch.nn.functional.interpolate(image[None], scale_factor=scale)[0]
+    canvas = torch.zeros(1, 400, 500)
+    canvas[:, : large.shape[1], : large.shape[2]] = large
+    return canvas, scale * FACE
+
+
+@pytest.mark.parametrize("sizes", [(20.0, 60.0), (60.0, 20.0), (26.7, 53.3)])
+def test_elbows_do_not_depend_on_how_near_others_are(sizes):
+    images, faces = zip(
+        *(widened(silhouette((118, 84), (44, 88)), size) for size in sizes), strict=True
+    )
+    both = elbows_from_torso(torch.cat(images), torch.cat(faces))
+    assert both.seen.all()
+    for n in range(2):
+        alone = elbows_from_torso(images[n], faces[n])
+        for found, expected in zip(both, alone, strict=True):
+            assert torch.equal(found[n], expected[0])
+
+
+def test_the_measurer_looks_at_everybody_in_an_image_of_their_own_scale():
+    measurer = UpperBodyMeasurer(torchpose.load_prior("kinect-upper-body"), elbows=True)
+    image = np.full((480, 900, 3), (190, 190, 180), np.uint8)
+    faces = torch.tensor([[700.0, 110.0, 64.0], [180.0, 120.0, 30.0], [420.0, 120.0, 20.0]])
+    for (x, y, b), cloth in zip(
+        faces.tolist(), ((40, 50, 115), (120, 40, 40), (30, 110, 50)), strict=True
+    ):
+        drawn = silhouette((118, 84), (44, 88))[0].numpy()
+        drawn = cv2.resize(drawn, None, fx=b / SIZE, fy=b / SIZE, interpolation=cv2.INTER_NEAREST)
+        top, left = round(y - 24 * b / SIZE), round(x - 80 * b / SIZE)
+        rows, columns = np.nonzero(drawn[: 480 - top])
+        inside = columns + left < 900
+        image[rows[inside] + top, columns[inside] + left] = cloth
+        cv2.circle(image, (round(x), round(y)), round(b / 2), (205, 152, 128), -1)
+    model = measurer.hand_tracker.skin
+    bins = model.byte_bins(
+        torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_RGB2Lab)).permute(2, 0, 1)[None]
+    )
+    skin = model.learn(model.init(3), bins.expand(3, -1, -1), faces)
+    together = measurer._elbows(image, faces, skin)
+    assert together.seen.all()
+    for n in range(3):
+        own = SkinState(*(x[n : n + 1] for x in skin))
+        alone = measurer._elbows(image, faces[n : n + 1], own)
+        for found, expected in zip(together, alone, strict=True):
+            assert torch.equal(found[n], expected[0])
+    nobody = measurer._elbows(image, faces[:0], SkinState(*(x[:0] for x in skin)))
+    assert nobody.points.shape == (0, 2, 2)
+
+
+def test_support_is_the_least_reach_over_rows_of_the_own_size():
+    g = torch.Generator().manual_seed(0)
+    far, size = torch.rand(3, 2, 50, generator=g), torch.tensor([8.0, 40.0, 133.0])
+    found = _supported(far, size)
+    for person, rows in enumerate((1, 3, 10)):  # 0.075 of 8 is none: at least one
+        for side in range(2):
+            reach = far[person, side].tolist()
+            least = [min(reach[max(0, v - rows) : v + rows + 1]) for v in range(50)]
+            assert found[person, side].tolist() == least
 
 
 def test_the_likelihood_is_that_of_the_colours():

@@ -136,11 +136,15 @@ def _outline(body: Tensor, faces: Tensor, side: int) -> tuple[Tensor, Tensor]:
     return reached, reached >= away[..., -1] - 0.5 * _GAP
 
 
-def _supported(far: Tensor, size: Tensor) -> Tensor:
-    """The least reach over some rows about each one: thin spikes are no elbows."""
-    mean = float(size.mean()) if len(size) else 1.0
-    rows = max(1, round(_SUPPORT * mean / 2))
-    return -torch.nn.functional.max_pool1d(-far, 2 * rows + 1, stride=1, padding=rows)
+def _supported(far: Float[Tensor, "N S H"], size: Float[Tensor, " N"]) -> Float[Tensor, "N S H"]:
+    """The least reach over some rows about each one, as many as the person's own face has."""
+    rows = (_SUPPORT * size.double() / 2).round().long().clamp_min(1)
+    most = int(rows.amax()) if len(rows) else 1
+    offsets = torch.arange(-most, most + 1, device=far.device)
+    beyond = offsets.abs() > rows[:, None]
+    padded = torch.nn.functional.pad(far, (most, most), value=torch.inf)
+    windows = padded.unfold(2, 2 * most + 1, 1)
+    return windows.masked_fill(beyond[:, None, None], torch.inf).amin(-1)
 
 
 def _at_the_end(far: Tensor, searched: Tensor) -> Tensor:

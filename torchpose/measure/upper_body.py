@@ -196,12 +196,25 @@ class UpperBodyMeasurer(nn.Module):
         return MeasurerState(tracks, persons, hand_state, state.frame + 1), measured
 
     def _elbows(self, image: Image, faces: Tensor, skin: SkinState) -> TorsoElbows:
-        """Elbows from the extent of everybody's clothes, in a small image."""
+        """Elbows from the extent of everybody's clothes, in images in which faces have one size.
+
+        A person's image depends on that person's face alone.
+        """
+        scales, group = (_TORSO_FACE / faces[:, 2]).clamp_max(1.0).unique(return_inverse=True)
+        rows = [torch.nonzero(group == k).flatten() for k in range(len(scales))]
+        if not rows:
+            rows, scales = [group], faces.new_ones(1)
+        found = [
+            self._elbows_at(image, scale, faces[own], SkinState(*(x[own] for x in skin)))
+            for scale, own in zip(scales.tolist(), rows, strict=True)
+        ]
+        order = torch.cat(rows).argsort()
+        return TorsoElbows(*(torch.cat(parts)[order] for parts in zip(*found, strict=True)))
+
+    def _elbows_at(self, image: Image, scale: float, faces: Tensor, skin: SkinState) -> TorsoElbows:
+        """Elbows of persons in an image that is made smaller by this factor."""
         import cv2
 
-        scale = 1.0
-        if len(faces):
-            scale = min(1.0, _TORSO_FACE / float(faces[:, 2].median()))
         shape = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
         small = cv2.resize(image, shape, interpolation=cv2.INTER_AREA)
         pixels = torch.from_numpy(np.asarray(small)).permute(2, 0, 1)[None].float() / 255
