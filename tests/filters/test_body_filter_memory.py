@@ -132,14 +132,19 @@ def test_every_filter_finds_legs_that_had_been_taken_for_each_other(kind):
 
 
 def test_memory_hears_of_swapped_legs():
-    options = {"step_std": 0.0, "likelihood": lambda states, frame: states[..., 0] * 0}
+    options = {"step_std": 0.0, "likelihood": lambda states, frame: 200 * states[..., 0].double()}
     model = Genealogist(walker(), 200, leg_swap=1.0, **options)
     start = strides(model.body)
-    state = model.init(start)
-    state, _ = model.step(state, torch.zeros(1, 1, dtype=WIDE), None, torch.Generator())
-    turned = (state.memory[0] == -start).all(-1)
-    swapped = ~torch.isclose(state.particles[0], start).all(-1)
-    assert (turned == swapped).all() and 20 < int(swapped.sum()) < 100
+    spread = torch.zeros(model.body.dim, dtype=WIDE)
+    spread[0] = 0.01
+    generator = torch.Generator().manual_seed(0)
+    state = model.init(start, generator, spread)
+    for _ in range(2):  # the second frame begins with the resampling by the weights of the first
+        state, _ = model.step(state, torch.zeros(1, 1, dtype=WIDE), None, generator)
+    legs = state.particles[0, :, 3:]
+    turned = (state.memory[0, :, 3:] == -start[0, 3:]).all(-1)
+    swapped = ~torch.isclose(legs, start[0, 3:]).all(-1)
+    assert (turned == swapped).all() and 5 < int(swapped.sum()) < 100
 
 
 def test_rates_and_bodies_without_legs_are_refused():

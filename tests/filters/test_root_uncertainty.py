@@ -31,7 +31,7 @@ def scene():
 
 def tracker(n=25, **options):
     body, conditionals, _, _ = scene()
-    options = {"fps": 60.0, "step_std": 0.01, "survival_per_second": 1e-20, **options}
+    options = {"fps": 60.0, "step_std": 0.01, "survival_rate": 0.46, **options}
     return RootUncertaintyTracker(body, conditionals, n, **options)
 
 
@@ -117,11 +117,11 @@ def test_hypotheses_weigh_as_the_product_over_parts_of_sums_over_places():
     torch.testing.assert_close(slope, slope[:1].expand_as(slope), rtol=1e-6, atol=0)
     weights = log_weights.exp()
     survival = float(weights.sum() ** 2 / (12 * weights.square().sum()))
-    assert survival == pytest.approx(1e-20 ** (1 / 60), rel=1e-6)
+    assert survival == pytest.approx(0.46, rel=1e-6)
 
 
 def test_the_spread_is_that_of_draws_from_the_mixture():
-    filter_ = tracker(3)
+    filter_ = tracker(3, survival_rate=0.9)
     _, _, truth, _ = scene()
     generator = torch.Generator().manual_seed(0)
     particles = truth[None, :3].clone()
@@ -141,7 +141,7 @@ def test_the_spread_is_that_of_draws_from_the_mixture():
 
 def test_swapped_legs_take_their_covariances_along():
     body, _, truth, _ = scene()
-    filter_ = tracker(2)
+    filter_ = tracker(5)
     generator = torch.Generator().manual_seed(0)
     root = 0.02 * torch.randn(1, 2, 10, 3, 3, generator=generator, dtype=torch.float64)
     memory = root @ root.mT
@@ -190,11 +190,34 @@ def test_another_frame_rate_is_rescaled_and_said():
     known = conditionals.diffusion.abs() > 0
     torch.testing.assert_close(ratio[known], expected[known])
     assert "rescaled from 60" in repr(slow) and "15 frames per second" in repr(slow)
-    assert slow.survival_rate == pytest.approx(1e-20 ** (1 / 15))
+
+
+@pytest.mark.parametrize("fps", [60.0, 30.0, 20.0, 15.0])
+def test_by_default_several_hypotheses_survive_at_every_frame_rate(fps):
+    _, _, truth, silhouettes = scene()
+    for n in (3, 20, 114):
+        filter_ = tracker(n, fps=fps, survival_rate=None)
+        assert filter_.survival_rate * n >= 2 - 1e-9
+    after, out = filter_.step(filter_.init(truth[:1]), silhouettes[:1], rig(), seeded(0))
+    weights = after.log_weights[0].exp()
+    left = float(weights.sum() ** 2 / weights.square().sum())
+    assert left == pytest.approx(114 * filter_.survival_rate, rel=1e-6) and left > 10
+    assert float(out.effective_sample_size) == pytest.approx(left)
+
+
+def test_survival_that_leaves_one_hypothesis_is_refused():
+    with pytest.raises(InputError, match=r"leaves 0\.072 of 114 particles, fewer than 2"):
+        tracker(114, fps=15.0, survival_rate=None, survival_per_second=1e-48)
+    fine = tracker(114, fps=60.0, survival_rate=None, survival_per_second=1e-48)
+    assert fine.survival_rate == pytest.approx(1e-48 ** (1 / 60))
+    with pytest.raises(InputError, match="got both"):
+        tracker(survival_per_second=0.01)
+    with pytest.raises(InputError, match="take more particles"):
+        tracker(2, survival_rate=None)
 
 
 def test_the_published_form_is_there_by_name():
-    filter_ = tracker(**PUBLISHED)
+    filter_ = tracker(**PUBLISHED, survival_rate=None)
     assert filter_.survival_rate == pytest.approx(0.926, abs=1e-3)  # section 8: 0.93 at 60 Hz
     assert filter_.normalisation == "published" and filter_.observation_sharpness == 1
 
@@ -224,7 +247,7 @@ def test_what_does_not_fit_is_refused_with_a_way_out():
         ({"camera_rule": "mean"}, "cameras must be"),
         ({"least_std": -1.0}, "least_std must be"),
         ({"first_std": math.inf}, "first_std must be"),
-        ({"survival_per_second": 0.0}, "survival rate must lie"),
+        ({"survival_rate": 0.0}, "survival_rate must lie"),
         ({"fps": 0.0}, "fps must be"),
     ):
         with pytest.raises(InputError, match=message):

@@ -1,12 +1,18 @@
 """Survival rates and the exponents that bring them about, against their definition."""
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchpose.errors import InputError
-from torchpose.filters.survival import survival_exponent, survival_rate, survival_rate_per_frame
+from torchpose.filters.survival import (
+    check_survival_rate,
+    survival_exponent,
+    survival_rate,
+    survival_rate_per_frame,
+)
 
 
 def rate_by_definition(weights):
@@ -32,6 +38,33 @@ def test_the_exponent_brings_the_rate_about(log_weights, scale, rate):
     weights = ((values - values.max()) * beta).exp()
     assert float(rate_by_definition(weights)) == pytest.approx(rate, abs=1e-6)
     assert float(survival_rate(beta * values)) == pytest.approx(rate, abs=1e-6)
+
+
+@pytest.mark.parametrize("n", [3, 114, 800])
+def test_the_exponent_is_that_of_a_search_through_exponents(n):
+    values = np.random.default_rng(n).normal(0, 30, n)
+    grid = np.exp(np.linspace(np.log(1e-4), np.log(50), 40_001))
+    weights = np.exp(np.outer(grid, values - values.max()))
+    rates = weights.sum(1) ** 2 / (n * (weights**2).sum(1))
+    for rate in (2 / n, 0.16 if n > 12 else 0.7, 0.926):
+        expected = grid[np.abs(rates - rate).argmin()]
+        beta = float(survival_exponent(torch.from_numpy(values), rate))
+        assert beta == pytest.approx(expected, rel=1e-3)
+
+
+def test_rates_that_leave_fewer_than_two_particles_are_refused():
+    # 60 frames a second: 0.16 of 114; 15: 0.0006 of them, 0.07 hypotheses
+    check_survival_rate(survival_rate_per_frame(1e-48, 60.0), 114)
+    with pytest.raises(InputError, match=r"leaves 0\.072 of 114 .* fewer than 2; ask for 0\.0175"):
+        check_survival_rate(survival_rate_per_frame(1e-48, 15.0), 114)
+    check_survival_rate(2 / 114, 114)
+    with pytest.raises(InputError, match="fewer than 2"):
+        check_survival_rate(1.99 / 114, 114)
+    with pytest.raises(InputError, match="take more particles"):
+        check_survival_rate(0.9, 2)
+    for rate in (0.0, 1.0, float("nan")):
+        with pytest.raises(InputError, match="between 0 and 1"):
+            check_survival_rate(rate, 114)
 
 
 def test_a_scale_of_the_log_weights_cancels_and_rows_are_independent():

@@ -2,11 +2,15 @@
 
 import csv
 import json
+import math
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+import torchpose
 from tests.protocols.walkers import write_walkers
 from torchpose.body.quaternion_vectors import quaternion_vector_to_matrix
 from torchpose.cli.evaluate import build
@@ -15,8 +19,11 @@ from torchpose.filters.annealed import AnnealedParticleFilter
 from torchpose.filters.root_uncertainty import RootUncertaintyTracker
 from torchpose.io.mocap import read_mocap
 from torchpose.protocols import root_uncertainty, root_uncertainty_runs
+from torchpose.protocols.common import settings_hash
+from torchpose.protocols.kept_runs import source_hash
 from torchpose.protocols.report import Report
 from torchpose.protocols.root_uncertainty_runs import Displacement, displaced
+from torchpose.protocols.root_uncertainty_search import search_setting
 from torchpose.protocols.root_uncertainty_tables import (
     add_errors,
     add_order,
@@ -25,10 +32,11 @@ from torchpose.protocols.root_uncertainty_tables import (
 )
 from torchpose.protocols.root_uncertainty_trackees import (
     METHODS,
-    PUBLISHED,
     Budget,
     make_filter,
     prepare,
+    published,
+    selected_among,
     slower,
     with_cameras,
 )
@@ -110,17 +118,78 @@ def test_every_filter_evaluates_the_same_number_of_likelihoods(walkers):
             assert tracker.n_particles * tracker.n_layers == 800 and tracker.survival_rate == 0.3
         else:
             assert tracker.n_particles == 800
-            assert tracker.survival_rate == pytest.approx(0.3 ** (1 / 30))
+            assert tracker.survival_rate == 0.3
+        assert tracker.n_particles == selected_among(name, Budget(800))
         torch.testing.assert_close(tracker.step_std, 2 * slow.step_std)
         assert tracker.limits is slow.limits and tracker.limit_mode == "discard"
         assert tracker.leg_swap == 0.2
         assert tracker.estimate == ("mean" if name == "apf" else "map")
-    plain = make_filter("sir", slow, PUBLISHED["sir"], Budget(limits=False))
+    usual = published("sir", 30.0)
+    plain = make_filter("sir", slow, usual, Budget(limits=False))
     assert plain.limits is None and plain.survival_rate == pytest.approx(0.01 ** (1 / 30))
     with pytest.raises(InputError, match="method must be among sir"):
-        make_filter("kalman", slow, PUBLISHED["sir"])
+        make_filter("kalman", slow, usual)
     with pytest.raises(InputError, match="particles must be at least 7"):
-        make_filter("root", slow, PUBLISHED["root"], Budget(6))
+        make_filter("root", slow, usual, Budget(6))
+    for name, least in (("sir", 2 / 800), ("apf", 2 / 160), ("root", 2 / 114)):
+        make_filter(name, slow, Setting(least), Budget(800))
+        with pytest.raises(InputError, match="fewer than 2"):
+            make_filter(name, slow, Setting(0.9 * least), Budget(800))
+
+
+# --- what validation chooses ----------------------------------------------------------------------
+
+
+def bowl(value, scale):
+    """An error that is smallest at this setting, which the two may trade for each other."""
+
+    def error(setting):
+        a, b = math.log(setting.value / value), math.log(setting.scale / scale)
+        return 50 + (a + 0.5 * b) ** 2 + b**2
+
+    return error
+
+
+@pytest.mark.parametrize(
+    ("value", "scale"), [(0.17, 1.3), (0.03, 4.5), (0.3, 0.4), (0.02, 0.3), (0.36, 1.0)]
+)
+def test_what_is_chosen_lies_between_worse_settings(value, scale):
+    error = bowl(value, scale)
+    rows = METHODS["root"].values
+    found = search_setting(error, Setting(0.16, 1.4), 0.926, rows, 2 / 114)
+    assert found.error == min(found.errors) == error(found.setting)
+    values = [s.value for s in found.tried if s.scale == found.setting.scale]
+    scales = [s.scale for s in found.tried if s.value == found.setting.value]
+    assert min(values) < found.setting.value < max(values)
+    assert min(scales) < found.setting.scale < max(scales)
+    assert min(values) >= 2 / 114 and max(values) < 1
+    assert 0.926 in {s.value for s in found.tried}
+    # within a step of the truth: a ratio of at most 2.4 for the survival, 2 for the diffusion
+    assert abs(math.log(found.setting.scale / scale)) < math.log(1.5)
+    assert abs(math.log(found.setting.value / value)) < math.log(2.4)
+
+
+def test_survival_that_cannot_be_is_never_tried():
+    def falling(setting):
+        return 40 + setting.value
+
+    found = search_setting(falling, Setting(0.16, 1.4), 0.926, METHODS["sir"].values, 2 / 114)
+    assert min(s.value for s in found.tried) >= 2 / 114
+    assert found.setting.value < 2 * 2 / 114, "the least of the row that can be"
+    never = search_setting(
+        lambda s: math.nan if s.value < 0.2 else 1.0,
+        Setting(0.16, 1.4),
+        0.926,
+        (0.1, 0.16, 0.25),
+        0.02,
+    )
+    assert never.setting.value > 0.2
+
+
+def test_published_survival_is_that_of_a_second():
+    for fps in (60.0, 15.0):
+        assert published("root", fps).value ** fps == pytest.approx(0.01)
+        assert published("apf", fps) == Setting(0.5, 1.0)
 
 
 # --- displacements --------------------------------------------------------------------------------
@@ -148,7 +217,7 @@ def test_displaced_bodies_are_moved_and_turned_about_the_pelvis(walkers):
 def test_a_displacement_in_the_middle_moves_particles_once(walkers):
     """Errors before it do not matter, and without one they are those of an ordinary run."""
     walker, view = walkers[0], walkers[0].tests[0]
-    tracker = make_filter("apf", walker, PUBLISHED["apf"], Budget(50))
+    tracker = make_filter("apf", walker, published("apf", 60.0), Budget(50))
     after = root_uncertainty_runs._after
     none, there = (
         after(tracker, walker.body, view, [0, 1], Displacement(metres), 4, 6)
@@ -245,7 +314,11 @@ def test_a_run_writes_tables_pictures_and_lines(done):
     labels = ["SIR", "APF", "Root uncertainty"]
     assert list(report["3 cameras"].rows) == labels
     assert list(report["rates"].rows) == ["60", "15"]
-    assert report["tuning"]["APF", "survival"] == "0.5 (published)"
+    assert report["tuning"]["APF, 15 fps", "survival"] == "0.5 (published)"
+    assert report["tuning"]["Root uncertainty, 60 fps", "particles"] == pytest.approx(
+        5 * 0.926, abs=0.01
+    )
+    assert set(report.settings["settings"]) == {"60", "15"}
     assert list(report["recovery"].rows) == ["none, start", "40 degrees, start"]
     pictures = {"predictions.png", "sigma-points.png", "diffusion.png", "samples.png", "poses.png"}
     pictures |= {"error-over-time-3-cameras.png", "error-over-rates.png"}
@@ -263,8 +336,9 @@ def test_a_run_writes_tables_pictures_and_lines(done):
     assert any("better than SIR" in line for line in report.findings)
 
 
-def test_parts_go_on_from_what_is_kept(done, folder, monkeypatch):
+def test_parts_go_on_from_what_is_kept(done, folder, tmp_path, monkeypatch):
     out, report = done
+    settings = {"settings": str(shutil.copytree(out, tmp_path / "earlier"))}  # what it chose
 
     def never(*arguments):
         raise AssertionError("a run that is kept was made again")
@@ -273,9 +347,48 @@ def test_parts_go_on_from_what_is_kept(done, folder, monkeypatch):
     for part, table in (("rates", "rates"), ("recovery", "recovery")):
         again = root_uncertainty.run(folder, out, part=part, **SMALL)
         assert again[table].rows == report[table].rows and "3 cameras" not in again
-    settings = {"settings": str(out)}  # what an earlier run chose
     again = root_uncertainty.run(folder, out, part="rates", **settings, **SMALL)
     assert again["rates"].rows == report["rates"].rows
+    with pytest.raises(InputError, match="of sir, apf, root at 20; there are none"):
+        root_uncertainty.run(folder, out, part="rates", fps=(60.0, 20.0), **settings, **SMALL)
+
+
+def test_runs_are_made_again_once_their_source_or_options_changed(
+    done, walkers, tmp_path, monkeypatch
+):
+    walker, budget = walkers[0], Budget(50)
+    view, setting = walker.tests[0], published("root", 60.0)
+
+    def path_of():
+        facts = root_uncertainty_runs._facts(walker, walker.body, view, "root", setting, budget)
+        return settings_hash(facts)
+
+    before = path_of()
+    assert path_of() == before
+    monkeypatch.setattr(root_uncertainty_runs, "source_hash", lambda *names: "another")
+    assert path_of() != before
+    monkeypatch.undo()
+    other = METHODS["root"]._replace(options={"least_std": 0.05})
+    monkeypatch.setitem(METHODS, "root", other)
+    assert path_of() != before
+    for name in root_uncertainty_runs._MADE_WITH:
+        assert (Path(torchpose.__file__).parent / name).exists()
+
+
+def test_the_hash_of_a_source_changes_with_a_constant(tmp_path):
+    names = ("filters", "unscented.py")
+
+    def written(root, constant):
+        (root / "filters").mkdir(parents=True)
+        (root / "filters" / "tracker.py").write_text(f"_LEAST = {constant}\n")
+        (root / "unscented.py").write_text("_D = 3\n")
+        return source_hash(*names, root=root)
+
+    one = written(tmp_path / "one", 0.02)
+    assert one == written(tmp_path / "same", 0.02) != written(tmp_path / "other", 0.03)
+    (tmp_path / "one" / "docs.py").write_text("not among them")
+    source_hash.cache_clear()
+    assert source_hash(*names, root=tmp_path / "one") == one
 
 
 @pytest.mark.parametrize(

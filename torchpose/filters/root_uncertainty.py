@@ -252,7 +252,8 @@ def _survival(rate: float | None, per_second: float | None, fps: float, n_partic
     if per_second is not None:
         rate = survival_rate_per_frame(per_second, fps)
     elif rate is None:
-        rate = max(_SURVIVAL, LEAST_SURVIVORS / n_particles)
+        few = LEAST_SURVIVORS < n_particles < LEAST_SURVIVORS / _SURVIVAL
+        rate = LEAST_SURVIVORS / n_particles if few else _SURVIVAL
     check_survival_rate(rate, n_particles)
     return rate
 

@@ -125,14 +125,14 @@ def check_survival_rate(rate: float, n_particles: int) -> None:
         InputError: a rate that is not below 1, or that leaves fewer than `LEAST_SURVIVORS`.
     """
     if not 0 < rate < 1:
-        raise InputError(f"a survival rate must lie between 0 and 1, got {rate}")
+        raise InputError(f"survival_rate must lie between 0 and 1, got {rate}")
     if rate * n_particles < LEAST_SURVIVORS * (1 - 1e-9):
         least = LEAST_SURVIVORS / n_particles
         way = f"ask for {least:.3g} or more" if least < 1 else "take more particles"
         raise InputError(
-            f"a survival rate of {rate:.3g} leaves {rate * n_particles:.2g} of {n_particles} particles, "
-            f"fewer than {LEAST_SURVIVORS:g}; {way}. One per second leaves the fewer in a frame, the "
-            "fewer frames a second has"
+            f"survival_rate of {rate:.3g} leaves {rate * n_particles:.2g} of {n_particles} particles, "
+            f"fewer than {LEAST_SURVIVORS:g}; {way}. A rate per second "
+            "leaves the fewer in a frame, the fewer frames a second has"
         )
 
 

@@ -149,17 +149,17 @@ def read_settings(
 
     Args:
         path: report.json of the run, or its folder. methods: by name.
-        condition: for which it chose, where it chose for several.
+        condition: for which it chose, where it chose for several, such as frame rates.
 
     Raises:
-        InputError: no such file, or a method or condition that the run did not have.
+        InputError: no such file, or a method that the run, or the condition, did not have.
         FileFormatError: no report of one choice for each method.
     """
     path = require_file(Path(path) / "report.json" if Path(path).is_dir() else path)
     try:
         chosen = json.loads(path.read_text(encoding="utf-8"))["settings"]["settings"]
         if condition is not None:
-            chosen = _condition(path, chosen, condition)
+            chosen = chosen.get(condition, {})
         known = {name: Setting(float(s["value"]), float(s["scale"])) for name, s in chosen.items()}
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise FileFormatError(
@@ -168,21 +168,13 @@ def read_settings(
         ) from error
     missing = [name for name in methods if name not in known]
     if missing:
+        at = f" at {condition}" if condition else ""
         raise InputError(
-            f"{path}: expected settings of {', '.join(methods)}; there are none of "
-            f"{', '.join(missing)}, only of {', '.join(known)}: run without --settings, or choose "
-            "with --method"
+            f"{path}: expected settings of {', '.join(methods)}{at}; there are none of "
+            f"{', '.join(missing)}, only of {', '.join(known) or 'nobody'}: run without --settings, or "
+            "choose with --method"
         )
     return {name: known[name] for name in methods}
-
-
-def _condition(path: Path, chosen: Mapping[str, Any], condition: str) -> Any:
-    if condition not in chosen:
-        raise InputError(
-            f"{path}: expected settings for {condition}; there are only those for "
-            f"{', '.join(chosen)}: run without --settings"
-        )
-    return chosen[condition]
 
 
 def _kept_error(
