@@ -13,7 +13,7 @@ from torchpose.camera import PinholeCamera, save_cameras
 from torchpose.camera_rig import CameraRig
 from torchpose.cli import main
 from torchpose.cli.track_body import _initial_state, build
-from torchpose.cli.track_body_models import check_method, load_model
+from torchpose.cli.track_body_models import BodyModel, check_method, load_model
 from torchpose.cli.track_body_output import action_text, gate_notes
 from torchpose.priors import ActionBank, ActionSpace, BackConstrainedGPLVM, ManifoldInfo
 from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
@@ -142,7 +142,8 @@ def test_nobody_there_is_said(recorded, tmp_path, capsys):
         (["--method", "constrained", "--action", "a", "--conditionals", "b"], "take --method root"),
         (["--manifold", "a", "--conditionals", "b"], "choose by --method mrpf|root"),
         (["--conditionals", "a", "--sharpness", "9"], "--sharpness does nothing for --method root"),
-        (["--conditionals", "a", "--n-particles", "6"], "at least 7"),
+        (["--conditionals", "a", "--n-particles", "20"], "must be at least 21 for --method root"),
+        (["--n-particles", "19"], "must be at least 20 for --method apf"),
         (["--conditionals", "nowhere.safetensors"], "nowhere.safetensors: no such file"),
         (["--action", "nowhere.safetensors"], "nowhere.safetensors: no such file"),
         (["--delays", "[1,2]"], "one entry for each"),
@@ -224,6 +225,18 @@ def bank_of_arms(body):
             performances.append(state_postures(body, states))
         spaces.append(ActionSpace.fit(performances, 2, name=name, fps=30.0))
     return ActionBank(spaces)
+
+
+@pytest.mark.parametrize("fps", [60.0, 30.0, 20.0, 15.0])
+@pytest.mark.parametrize("n_particles", [21, 140, 800])
+def test_several_hypotheses_survive_a_frame_at_any_rate(recorded, fps, n_particles):
+    body = recorded[1]
+    conditionals = limbs_of_rising_arms(body, 30.0)
+    tracked = body.altered(frame="body", centres=torch.as_tensor(conditionals.centres))
+    model = BodyModel("root", tracked, body, conditionals=conditionals)
+    filter_ = model.make_filter(n_particles, None, fps)
+    assert filter_.n_particles == n_particles // 7
+    assert filter_.survival_rate * filter_.n_particles >= 2 - 1e-9
 
 
 def test_hypotheses_of_the_root(recorded, tmp_path, capsys):

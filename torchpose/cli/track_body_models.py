@@ -30,6 +30,7 @@ _SHARPNESS = {"constrained": 30.0}  # of the overlap; of the bidirectional likel
 _SHARP = 100.0
 _LAYERS = 5  # of the annealed filter, each with its share of the particles
 _POINTS = 7  # likelihoods that a hypothesis of the root costs
+_LEAST_PARTICLES = {"root": 3 * _POINTS, "apf": 4 * _LAYERS}  # of which two survive
 _RATE = 60.0  # frames per second for which the default noise of the filters is
 _LEG_SWAP = 0.02
 _COMMON_HEIGHT = 1.75  # metres, of the body on which postures of actions are told
@@ -69,13 +70,14 @@ def check_method(args: Namespace) -> None:
                 "--sharpness does nothing for --method root, whose weights keep a fixed share of the "
                 "hypotheses; leave it out"
             )
-        if args.n_particles < _POINTS:
-            raise InputError(
-                f"--n-particles must be at least {_POINTS} for --method root, of which a hypothesis "
-                f"of the root costs {_POINTS}, got {args.n_particles}"
-            )
     elif args.sharpness is None:
         args.sharpness = _SHARPNESS.get(args.method, _SHARP)
+    least = _LEAST_PARTICLES.get(args.method, 1)
+    if args.n_particles < least:
+        raise InputError(
+            f"--n-particles must be at least {least} for --method {args.method}, so that several "
+            f"survive a frame, got {args.n_particles}"
+        )
 
 
 @dataclass(frozen=True)
@@ -147,7 +149,7 @@ class BodyModel:
         if self.method == "sir":
             return filters.SIRParticleFilter(body, n_particles, **common)
         return filters.AnnealedParticleFilter(
-            body, max(1, n_particles // _LAYERS), n_layers=_LAYERS, **common
+            body, n_particles // _LAYERS, n_layers=_LAYERS, **common
         )
 
     def first_std(self, model: "SilhouetteParticleFilter") -> "Tensor":
