@@ -105,8 +105,8 @@ def test_what_is_refused():
         find_first_pose(BODY, image[:0], RIG)
     with pytest.raises(InputError, match="positive fps"):
         find_first_pose(BODY, image, RIG, fps=0.0)
-    with pytest.raises(InputError, match="n_tracking of 5 or more"):
-        find_first_pose(BODY, image, RIG, n_tracking=4)
+    with pytest.raises(InputError, match="n_tracking of 20 or more"):
+        find_first_pose(BODY, image, RIG, n_tracking=19)
     with pytest.raises(ShapeError):
         find_first_pose(BODY, image[None], RIG)
     with pytest.raises(InputError, match="are empty"):

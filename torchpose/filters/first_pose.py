@@ -21,6 +21,7 @@ from torchpose.filters.pose_search import find_candidates, world_up
 __all__ = ["FirstPose", "facing_evidence", "find_first_pose", "turned_round"]
 
 _LAYERS = 5  # of the annealed filter that tracks the candidates
+_LEAST = 4 * _LAYERS  # likelihoods of a frame: two of a layer's particles survive
 _RATE = 60.0  # frames per second for which `default_step_std` is
 _SHARPNESS = 100.0  # exponent of the mean likelihood of a frame, as of the filters
 _SURE = 3.0  # log-odds of a walk, and of bent knees, that leave no doubt
@@ -87,10 +88,10 @@ def find_first_pose(
             `find_candidates`.
     """
     check_shape("silhouettes", silhouettes, ["T", "C", "H", "W"])
-    if len(silhouettes) == 0 or n_frames < 1 or not 0 < fps < math.inf or n_tracking < _LAYERS:
+    if len(silhouettes) == 0 or n_frames < 1 or not 0 < fps < math.inf or n_tracking < _LEAST:
         raise InputError(
             "a first pose needs a frame, n_frames of 1 or more, a positive fps and n_tracking of "
-            f"{_LAYERS} or more, got {len(silhouettes)} frames, {n_frames}, {fps:g} and {n_tracking}"
+            f"{_LEAST} or more, got {len(silhouettes)} frames, {n_frames}, {fps:g} and {n_tracking}"
         )
     rig = as_rig(cameras)
     up = world_up(rig, up).to(body.offsets)
