@@ -80,8 +80,8 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
             see `info` of the attribute.
         n_particles: N, root hypotheses. A frame costs 7 N likelihoods: 114 are worth 800 particles.
         fps: frames per second.
-        survival_rate: alpha, the share of the hypotheses that survives a frame, at least 2 / N.
-            The default is what validation clips of walks chose at 60, 30, 20 and 15 frames a second.
+        survival_rate: alpha, the share of the hypotheses that survives a frame, at least 2 / N;
+            0.16 by default, 2 / N of few.
         survival_per_second: alpha_c, instead of `survival_rate`. The published 0.01 keeps 0.93 in a
             frame at 60 Hz, which is too little selection for a root that walks and diffuses with
             zero mean; a much smaller one leaves less than one hypothesis at low frame rates.
