@@ -181,8 +181,10 @@ class Bench:
         options = {"window": lever.windows is not None, "max_gap": None} | MODES[mode]
         options |= {"fps": self.persons.test.fps, "neck": prior.info.neck} | lever.options
         tracker = UpperBodyTracker(prior, CAMERA, **options)
-        for model in tracker.filters.values():
-            model.initial_cov = lever.start_factor * model.initial_cov  # type: ignore[operator]
+        if lever.start_factor != 1:
+            for side in ("left", "right"):
+                model = tracker._filter(side, ("hand", "head", "neck"))
+                model.initial_cov = lever.start_factor * model.start_cov  # type: ignore[operator]
         return tracker
 
     def _base(self, seed: int, learnt_noise: bool) -> tuple[UpperBodyPrior, float, str]:

@@ -8,7 +8,14 @@ from torch import Tensor
 from torchpose.filters.base import FilterOutput, Generators, StepOutput
 from torchpose.skeleton import ARM_JOINTS, LEFT_ARM, RIGHT_ARM
 
-__all__ = ["ARMS", "first_failure", "generators_of_arms", "joints_of_arm", "require_cov"]
+__all__ = [
+    "ARMS",
+    "first_failure",
+    "generators_of_arms",
+    "in_double",
+    "joints_of_arm",
+    "require_cov",
+]
 
 ARMS = {"left": LEFT_ARM, "right": RIGHT_ARM}
 """Indices into `UPPER_BODY` of each arm, in the order of `ARM_JOINTS`."""
@@ -51,6 +58,12 @@ def first_failure(left: FilterOutput, right: FilterOutput) -> Tensor:
     failures = torch.stack([left.failed_at, right.failed_at])
     first = failures.where(failures >= 0, n_frames).amin(0)
     return torch.where((failures >= 0).any(0), first, -1)
+
+
+def in_double(out: FilterOutput) -> FilterOutput:
+    """Return the estimates in float64, in which poses are read out of them."""
+    wide = [v.double() if v is not None and v.is_floating_point() else v for v in out]
+    return FilterOutput(*wide)  # type: ignore[arg-type]
 
 
 def require_cov(out: FilterOutput | StepOutput) -> Tensor:

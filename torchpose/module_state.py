@@ -1,9 +1,9 @@
 """State of modules: what is registered, what is derived from it, and in which precision it is kept."""
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar, overload
 from weakref import WeakKeyDictionary
 
 import torch
@@ -11,7 +11,14 @@ from torch import Tensor, nn
 
 from torchpose.errors import InputError
 
-__all__ = ["WideModule", "derived", "one_run", "register_given", "working_precision"]
+__all__ = [
+    "WideModule",
+    "derived",
+    "one_run",
+    "register_given",
+    "wide_or_parameter",
+    "working_precision",
+]
 
 T = TypeVar("T")
 
@@ -32,6 +39,17 @@ def register_given(module: nn.Module, name: str, value: Tensor | None) -> None:
         module.register_buffer(name, value)
     else:
         module.register_buffer(name, value.detach().clone(memory_format=torch.contiguous_format))
+
+
+@overload
+def wide_or_parameter(value: Tensor | float | Sequence[float]) -> Tensor: ...
+@overload
+def wide_or_parameter(value: None) -> None: ...
+def wide_or_parameter(value: Tensor | float | Sequence[float] | None) -> Tensor | None:
+    """Return a float64 tensor; a parameter stays that parameter, and None is None."""
+    if value is None or isinstance(value, nn.Parameter):
+        return value
+    return torch.as_tensor(value, dtype=torch.float64)
 
 
 class _Mark(NamedTuple):
@@ -60,7 +78,7 @@ class _Entry(NamedTuple):
 
 
 # Outside the modules: not part of their state, and neither copied nor pickled with them.
-_KEPT: "WeakKeyDictionary[nn.Module, dict[str, _Entry]]" = WeakKeyDictionary()
+_KEPT: "WeakKeyDictionary[nn.Module, dict[Hashable, _Entry]]" = WeakKeyDictionary()
 
 
 class _Graphs(threading.local):
@@ -68,7 +86,7 @@ class _Graphs(threading.local):
 
     def __init__(self) -> None:
         self.depth = 0
-        self.kept: dict[tuple[int, str], _Entry] = {}
+        self.kept: dict[Hashable, _Entry] = {}
 
 
 _GRAPHS = _Graphs()
@@ -96,7 +114,7 @@ def one_run(device: torch.device) -> Iterator[None]:
 
 
 def derived(
-    module: nn.Module, name: str, sources: tuple[Tensor | None, ...], make: Callable[[], T]
+    module: nn.Module, name: Hashable, sources: tuple[Tensor | None, ...], make: Callable[[], T]
 ) -> T:
     """Return `make()`, or what it returned before while its sources have not changed.
 
@@ -109,7 +127,7 @@ def derived(
         sources: tensors that the value depends on. make: computes it from these alone.
     """
     given = tuple(source for source in sources if source is not None)
-    if torch.compiler.is_compiling() or any(_is_opaque(source) for source in given):
+    if torch.compiler.is_compiling() or any(map(_is_opaque, given)):
         return make()
     if torch.is_grad_enabled() and any(source.requires_grad for source in given):
         if not _GRAPHS.depth:
@@ -125,7 +143,7 @@ def _without_graph(make: Callable[[], T]) -> T:
 
 
 def _kept_in(
-    kept: dict[Any, _Entry], key: Any, given: tuple[Tensor, ...], make: Callable[[], T]
+    kept: dict[Hashable, _Entry], key: Hashable, given: tuple[Tensor, ...], make: Callable[[], T]
 ) -> T:
     entry = kept.get(key)
     same = entry is not None and len(entry.marks) == len(given)

@@ -77,6 +77,14 @@ class PoseTrack:
         cut |= {name: getattr(self, name)[rows] for name in ("lengths", "failed_at")}
         return replace(self, **cut)
 
+    def in_precision(self, dtype: torch.dtype) -> Self:
+        """Return the same poses with floating-point numbers of a dtype; this track if they are."""
+        if self.joints3d.dtype == dtype:
+            return self
+        fields = {name: getattr(self, name) for name in FRAME_FIELDS}
+        narrowed = {n: v.to(dtype) for n, v in fields.items() if v.is_floating_point()}
+        return replace(self, **narrowed)
+
     def save(self, path: str | Path) -> None:
         """Write an .npz: one sequence without its batch dimension, several with it.
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.arm_windows import SeenInView, pose_of_window, window_inputs
-from torchpose.arms import ARMS, generators_of_arms, joints_of_arm, require_cov
+from torchpose.arms import ARMS, generators_of_arms, in_double, joints_of_arm, require_cov
 from torchpose.body_view import memory_frames
 from torchpose.errors import DegenerateFilterWarning, InputError, check_shape
 from torchpose.filters import MixtureKalmanFilter
@@ -251,4 +251,4 @@ def _advance(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DegenerateFilterWarning)  # told by `failed`
             out = collect(steps, lengths)
-    return state, out._replace(cov=require_cov(out))
+    return state, in_double(out._replace(cov=require_cov(out)))

@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchpose import streaming
 from torchpose.arm_filters import joint_covariances, pose_filter
@@ -18,7 +18,7 @@ from torchpose.arm_windows import (
     window_filter,
     window_inputs,
 )
-from torchpose.arms import ARMS, first_failure, generators_of_arms, joints_of_arm
+from torchpose.arms import ARMS, first_failure, generators_of_arms, in_double, joints_of_arm
 from torchpose.body_view import BodyView
 from torchpose.camera import PinholeCamera
 from torchpose.errors import CameraError, InputError, PriorError, check_shape
@@ -35,7 +35,16 @@ from torchpose.measurements import (
     pixels_per_metre,
     place_measured_neck,
 )
+from torchpose.module_state import (
+    WideModule,
+    derived,
+    one_run,
+    register_given,
+    wide_or_parameter,
+    working_precision,
+)
 from torchpose.pose_track import PoseTrack
+from torchpose.priors.gmm import GaussianMixture
 from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.priors.window import WindowLayout
 from torchpose.projection import map_pixel_covariance, map_pixels
@@ -50,7 +59,7 @@ METHODS = ("mkf-fixed", "mkf-sampled", "mkf-split", "pf-mixture", "pf-walk", "pf
 _POSE_OPTIONS = {"transition", "gamma", "subspace", "initial_cov", "process_cov"}
 
 
-class UpperBodyTracker(nn.Module):
+class UpperBodyTracker(WideModule):
     """Tracks eight joints in 2D and 3D from the keypoints of any of them, typically head and hands.
 
     Two filters, one for each arm with head and neck, run on the same measurements (BL section 3.1);
@@ -129,23 +138,48 @@ class UpperBodyTracker(nn.Module):
         self.static_camera = static_camera
         self.neck = neck
         self.max_gap = max_gap
+        self.dtype = working_precision("dtype", options.get("dtype", torch.float64))
+        std = None if measurement_std is None else wide_or_parameter(measurement_std)
+        register_given(self, "measurement_std", std)
         self.options = options
-        covariances = joint_covariances(prior, measurement_std, self.camera.matrix)
-        self.register_buffer("measurement_cov", covariances)
-        self.measurement_cov: Tensor
-        self.filters = nn.ModuleDict()
-        self.stages = nn.ModuleDict()
+        for name, value in options.items():
+            if isinstance(value, Tensor):
+                register_given(self, name, wide_or_parameter(value))
         for side in ARMS:
             self._filter(side, ("hand", "head", "neck"))
 
+    measurement_std: Tensor | None
+
+    @property
+    def measurement_cov(self) -> Float[Tensor, "8 2 2"]:
+        """R of each of the eight joints in the prior's pixels."""
+        info, learnt = self.prior.info, getattr(self.prior, "noise_measurement_std", None)
+        sources = (self.measurement_std, learnt, self.camera.matrix)
+        return derived(
+            self,
+            ("measurement_cov", info.fx, info.fy, info.cx, info.cy),
+            sources,
+            lambda: joint_covariances(self.prior, self.measurement_std, self.camera.matrix),
+        )
+
+    def _given_options(self) -> dict[str, Any]:
+        """The options, with tensors as they are registered."""
+        return {name: getattr(self, name, value) if isinstance(value, Tensor) else value
+                for name, value in self.options.items()}  # fmt: skip
+
     def _filter(self, side: str, joints: tuple[str, ...]) -> RecursiveFilter:
         """The filter of an arm that measures these joints."""
-        key = "_".join((side, *joints))
-        if key not in self.filters:
-            self.filters[key] = pose_filter(
-                self.prior, side, joints, self.measurement_cov, self.method, self.fps, self.options
-            )
-        return cast(RecursiveFilter, self.filters[key])
+        options, cov = self._given_options(), self.measurement_cov
+        tensors = [value for value in options.values() if isinstance(value, Tensor)]
+        mixture: GaussianMixture = getattr(self.prior, side)
+        sources = (*mixture.parameters_tuple(), *self.prior.noise.values(), cov, *tensors)
+        info = self.prior.info
+        return derived(
+            self,
+            (side, joints, info.fps, info.transition, info.fx, info.fy),
+            sources,
+            lambda: pose_filter(self.prior, side, joints, cov, self.method, self.fps, options),
+        )
 
     def forward(
         self,
@@ -179,17 +213,18 @@ class UpperBodyTracker(nn.Module):
             ShapeError, InputError: wrong shapes, infinite values, nothing measured in a sequence or
             for longer than `max_gap`. SkeletonError: unknown names.
         """
-        measured, notes = self._measure(keypoints, confidence, names, mask, lengths, covariance)
-        sources = generators_of_arms(generator)
-        seen = self._look(measured, lengths)
-        arms = {
-            side: self._run_arm(side, measured, seen, lengths, source, progress)
-            for side, source in zip(ARMS, sources, strict=True)
-        }
-        view = None if seen is None else seen.view
-        left, right = arms["left"], arms["right"]
-        reading = self._steady(self._read_out(left, right, view), left, right, lengths)
-        return self._poses(reading, left, right, measured.mask, lengths, notes)
+        with one_run(self.measurement_cov.device):
+            measured, notes = self._measure(keypoints, confidence, names, mask, lengths, covariance)
+            sources = generators_of_arms(generator)
+            seen = self._look(measured, lengths)
+            arms = {
+                side: self._run_arm(side, measured, seen, lengths, source, progress)
+                for side, source in zip(ARMS, sources, strict=True)
+            }
+            view = None if seen is None else seen.view
+            left, right = arms["left"], arms["right"]
+            reading = self._steady(self._read_out(left, right, view), left, right, lengths)
+            return self._poses(reading, left, right, measured.mask, lengths, notes)
 
     def init(
         self, batch_size: int, names: Sequence[str] | None = None, generator: Generators = None
@@ -213,7 +248,8 @@ class UpperBodyTracker(nn.Module):
             >>> pose.joints3d.shape
             torch.Size([1, 8, 3])
         """
-        return streaming.begin(self, batch_size, names, generator)
+        with one_run(self.measurement_cov.device):
+            return streaming.begin(self, batch_size, names, generator)
 
     def step(
         self,
@@ -240,7 +276,8 @@ class UpperBodyTracker(nn.Module):
         Raises:
             ShapeError, InputError: wrong shapes, infinite values.
         """
-        return streaming.track_frame(self, state, keypoints, confidence, mask, covariance)
+        with one_run(self.measurement_cov.device):
+            return streaming.track_frame(self, state, keypoints, confidence, mask, covariance)
 
     def advance(
         self,
@@ -263,7 +300,8 @@ class UpperBodyTracker(nn.Module):
         Raises:
             ShapeError, InputError: wrong shapes, no frames, infinite values.
         """
-        return streaming.track_frames(self, state, keypoints, confidence, mask, covariance)
+        with one_run(self.measurement_cov.device):
+            return streaming.track_frames(self, state, keypoints, confidence, mask, covariance)
 
     def _measure(
         self,
@@ -323,8 +361,9 @@ class UpperBodyTracker(nn.Module):
         model = self._filter(side, joints)
         if self.smoothing is not None and isinstance(model, MixtureKalmanFilter):
             lag = None if self.smoothing == "full" else int(self.smoothing)
-            return model.smooth(z, mask, cov, lengths, lag=lag, return_cov=True)
-        return model(z, mask, cov, lengths, generator, return_cov=True, progress=progress)
+            return in_double(model.smooth(z, mask, cov, lengths, lag=lag, return_cov=True))
+        out = model(z, mask, cov, lengths, generator, return_cov=True, progress=progress)
+        return in_double(out)
 
     def _window(self) -> tuple[str, WindowLayout] | None:
         """The window that suits what was asked for: its name, and its lags at this frame rate."""
@@ -362,17 +401,18 @@ class UpperBodyTracker(nn.Module):
         model = self._window_filter(side, seen.window, joints)
         out = model(*both, noise, lengths, return_cov=True, progress=progress)
         context = self._window_filter(side, seen.window, ())(*hands, None, lengths)
-        return pose_of_window(out, context, seen, ARMS[side], window.layout)
+        return pose_of_window(in_double(out), context, seen, ARMS[side], window.layout)
 
     def _window_filter(self, side: str, name: str, joints: tuple[str, ...]) -> MixtureKalmanFilter:
         """Fixed tracks over window states that measure these joints and all hands of the window."""
-        key = "_".join(("window", name, side, *joints))
-        if key not in self.filters:
-            window = self.prior.windows[name]
-            self.filters[key] = window_filter(
-                window, side, joints, self.measurement_cov, self.options
-            )
-        return cast(MixtureKalmanFilter, self.filters[key])
+        window, cov = self.prior.windows[name], self.measurement_cov
+        mixture: GaussianMixture = getattr(window, side)
+        return derived(
+            self,
+            (name, side, joints, window.layout, *window.settings.items()),
+            (*mixture.parameters_tuple(), cov),
+            lambda: window_filter(window, side, joints, cov, self._given_options()),
+        )
 
     def _poses(
         self,
@@ -414,7 +454,7 @@ class UpperBodyTracker(nn.Module):
             frame=self.frame,
             notes=notes,
             method=self._estimator(),
-        )
+        ).in_precision(self.dtype)
 
     def _read_out(self, left: FilterOutput, right: FilterOutput, view: BodyView | None) -> ReadOut:
         info = self.prior.info
@@ -430,13 +470,16 @@ class UpperBodyTracker(nn.Module):
         settings = self.prior.windows[name].settings
         if "joint_ratio" not in settings:
             return None
-        if name not in self.stages:
-            joint, pixel, placement = (
-                settings[f"{kind}_ratio"] for kind in ("joint", "pixel", "placement")
-            )
-            stage = MotionStage(joint, pixel, placement, self.fps or 30.0)
-            self.stages[name] = stage.to(self.measurement_cov.device)
-        return cast(MotionStage, self.stages[name])
+        joint, pixel, placement = (
+            settings[f"{kind}_ratio"] for kind in ("joint", "pixel", "placement")
+        )
+        cov = self.measurement_cov
+        return derived(
+            self,
+            ("stage", joint, pixel, placement),
+            (cov,),
+            lambda: MotionStage(joint, pixel, placement, self.fps or 30.0).to(cov.device),
+        )
 
     def _steady(
         self, reading: ReadOut, left: FilterOutput, right: FilterOutput, lengths: Tensor | None

@@ -22,7 +22,13 @@ from torchpose.errors import (
     check_finite,
     check_shape,
 )
-from torchpose.module_state import WideModule, derived, one_run, register_given, working_precision
+from torchpose.module_state import (
+    WideModule,
+    derived,
+    one_run,
+    register_given,
+    working_precision,
+)
 
 __all__ = [
     "FilterOutput",

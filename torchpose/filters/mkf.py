@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchpose.errors import InputError, check_shape
 from torchpose.filters import fixed_tracks, sampled_tracks, split_tracks
@@ -24,7 +24,7 @@ from torchpose.filters.smoothing import smooth_fixed_tracks
 from torchpose.filters.tracks import MKFState
 from torchpose.filters.transition import TRANSITIONS, Transition, make_transition
 from torchpose.filters.weights import normalise
-from torchpose.module_state import derived, one_run, register_given
+from torchpose.module_state import derived, one_run, register_given, wide_or_parameter
 from torchpose.priors.gmm import GaussianMixture
 
 __all__ = ["MKFState", "MixtureKalmanFilter"]
@@ -137,7 +137,7 @@ class MixtureKalmanFilter(RecursiveFilter):
         self.register_buffer("medians", points, persistent=False)  # a setting, as `tracks` is
         self._register_mixture(gmm)
         register_given(self, "process_cov", given_covariance("process_cov", process_cov, self.dim))
-        register_given(self, "gamma", _as_wide(gamma))
+        register_given(self, "gamma", wide_or_parameter(gamma))
         register_given(self, "initial_cov", self._given_initial_cov(initial_cov))
         self.to(gmm.means.device)
         self.transition(self.burn_in)  # raises what does not fit before any work
@@ -153,8 +153,8 @@ class MixtureKalmanFilter(RecursiveFilter):
     def _register_mixture(self, prior: GaussianMixture) -> None:
         weights = prior.weights.to(torch.float64)
         register_given(self, "log_prior", (weights / weights.sum()).log())
-        register_given(self, "means", _as_wide(prior.means))
-        register_given(self, "covariances", _as_wide(prior.covariances))
+        register_given(self, "means", wide_or_parameter(prior.means))
+        register_given(self, "covariances", wide_or_parameter(prior.covariances))
 
     def _given_initial_cov(self, value: Tensor | None) -> Tensor | None:
         if value is None:
@@ -289,13 +289,6 @@ class MixtureKalmanFilter(RecursiveFilter):
             f"tracks={self.tracks}, n_tracks={self.n_tracks}, dim={self.dim}, "
             f"observed={self.observed.tolist()}, transition={self.transition_kind}"
         )
-
-
-def _as_wide(value: Tensor | float | None) -> Tensor | None:
-    """float64, unless it is a parameter, which stays itself."""
-    if value is None or isinstance(value, nn.Parameter):
-        return value
-    return torch.as_tensor(value, dtype=torch.float64)
 
 
 def _check_options(

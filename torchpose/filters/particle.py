@@ -25,7 +25,7 @@ from torchpose.filters.resampling import resample
 from torchpose.filters.transition import make_transition
 from torchpose.filters.walk import MixtureWalk, Moves, grouped_affine
 from torchpose.gaussian import LOG_2PI, kalman_update, safe_cholesky
-from torchpose.module_state import derived, register_given
+from torchpose.module_state import derived, register_given, wide_or_parameter
 from torchpose.priors.em import MixtureParameters
 from torchpose.priors.gmm import GaussianMixture
 
@@ -162,9 +162,7 @@ class BootstrapParticleFilter(RecursiveFilter):
             given = value if isinstance(value, nn.Parameter) else value.detach().double()
             register_given(self, name, given)
         register_given(self, "process_cov", given_covariance("process_cov", process_cov, self.dim))
-        if gamma is not None and not isinstance(gamma, nn.Parameter):
-            gamma = torch.as_tensor(gamma, dtype=torch.float64)
-        register_given(self, "gamma", gamma)
+        register_given(self, "gamma", None if gamma is None else wide_or_parameter(gamma))
         register_given(self, "initial_cov", self._given_initial_cov(initial_cov))
         self.to(gmm.means.device)
         self._constants()  # raises what does not fit before any work

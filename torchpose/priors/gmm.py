@@ -20,6 +20,7 @@ from torchpose.errors import (
     check_weights,
 )
 from torchpose.gaussian import mixture_moments, symmetrise
+from torchpose.module_state import register_given
 from torchpose.priors.em import FitReport, MixtureParameters, expectation_maximisation
 from torchpose.priors.start import STARTS, floor_variances, start_mixture
 
@@ -81,8 +82,8 @@ class GaussianMixture(nn.Module):
 
     p(x) = sum_k pi_k N(x; mu_k, Sigma_k)
 
-    The three tensors become buffers as given: one that requires grad keeps its graph, and
-    gradients of `log_prob` flow back to it. Weights are divided by their sum.
+    The three tensors are copied; a parameter stays that parameter, and one with a graph keeps it, so
+    that gradients of `log_prob` flow back to it. Weights are divided by their sum.
 
     Args:
         weights: pi [K], positive, summing to one up to rounding.
@@ -116,9 +117,9 @@ class GaussianMixture(nn.Module):
     ) -> None:
         super().__init__()
         _check_mixture(weights, means, covariances)
-        self.register_buffer("weights", weights / weights.sum())
-        self.register_buffer("means", means)
-        self.register_buffer("covariances", covariances)
+        register_given(self, "weights", weights / weights.sum())
+        register_given(self, "means", means)
+        register_given(self, "covariances", covariances)
         self.fit_report: FitReport | None = None
 
     @property

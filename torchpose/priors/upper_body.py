@@ -21,6 +21,7 @@ from torchpose.errors import (
     check_finite,
 )
 from torchpose.io.files import read_npz
+from torchpose.module_state import register_given
 from torchpose.priors.arm_state import (
     STATE_DIM,
     arm_states,
@@ -114,7 +115,7 @@ class UpperBodyPrior(nn.Module):
         if not isinstance(value, Tensor) or not value.is_floating_point():
             raise InputError(f"noise {name} must be a floating-point tensor, got {value!r:.60}")
         check_finite(f"noise {name}", value)
-        self.register_buffer(f"noise_{name}", value)
+        register_given(self, f"noise_{name}", value)
         if name not in self._noise_names:
             self._noise_names.append(name)
 
@@ -152,6 +153,33 @@ class UpperBodyPrior(nn.Module):
                 "persons, or fit the same recipe without these"
             )
 
+    def get_extra_state(self) -> Tensor:
+        """What is no tensor: `info` and the settings of the windows, as bytes of JSON [N], uint8."""
+        return torch.tensor(list(self._full_info().to_json().encode()), dtype=torch.uint8)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Take what `get_extra_state` returned, so that a loaded prior is not half of another.
+
+        Raises:
+            PriorError: windows of other names. FileFormatError: not such bytes.
+        """
+        text = bytes(state.tolist()).decode(errors="replace")
+        info = PriorInfo.from_json(text)
+        facts = info.extra.get("windows", {})
+        if set(facts) != set(self.windows):
+            raise PriorError(
+                f"expected the state of a prior with the windows {sorted(self.windows)}, got one with "
+                f"{sorted(facts)}; load it into a prior of the same kind"
+            )
+        self.info = info
+        for name, window in self.windows.items():
+            loaded = WindowPrior.from_facts(window.left, window.right, facts[name])
+            window.layout, window.settings = loaded.layout, loaded.settings
+
+    def _full_info(self) -> PriorInfo:
+        facts = {name: window.facts() for name, window in self.windows.items()}
+        return replace(self.info, extra=self.info.extra | ({"windows": facts} if facts else {}))
+
     def save(self, path: str | Path) -> None:
         """Write the prior as safetensors; the file appears whole or not at all.
 
@@ -174,9 +202,7 @@ class UpperBodyPrior(nn.Module):
                 for side in _SIDES
                 for part in _PARTS
             }
-        facts = {name: window.facts() for name, window in self.windows.items()}
-        extra = self.info.extra | ({"windows": facts} if facts else {})
-        write_prior(path, replace(self.info, extra=extra), tensors)
+        write_prior(path, self._full_info(), tensors)
 
     @classmethod
     def load(cls, path: str | Path) -> UpperBodyPrior:

@@ -28,7 +28,6 @@ from tqdm.auto import tqdm
 
 from torchpose.camera import PinholeCamera
 from torchpose.errors import InputError
-from torchpose.filters.base import RecursiveFilter
 from torchpose.io.files import check_output_folder, read_npz, write_npz
 from torchpose.io.recordings import Recording, read_recordings
 from torchpose.priors.upper_body import UpperBodyPrior
@@ -247,9 +246,7 @@ def time_step(
         prior, camera, test, method, options: of the tracker. n_steps: how many to time.
     """
     tracker = UpperBodyTracker(prior, camera, method, neck=prior.info.neck, **options)
-    model: Any = next(iter(tracker.filters.values()))
-    if not isinstance(model, RecursiveFilter):
-        raise InputError(f"{method} is no recursive filter")
+    model = tracker._filter("left", ("hand", "head", "neck"))
     order = [2, 0, 1]  # hand, head, neck, as the tracker's filters measure them
     z = test.keypoints[:1, :, order].flatten(2)
     generator = torch.Generator().manual_seed(0)
