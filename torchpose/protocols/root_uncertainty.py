@@ -25,8 +25,8 @@ from torchpose.protocols.root_uncertainty_runs import (
     progress_bar,
     recover_all,
     run_condition,
-    tune,
 )
+from torchpose.protocols.root_uncertainty_search import tune
 from torchpose.protocols.root_uncertainty_tables import (
     add_differences,
     add_errors,
@@ -150,10 +150,7 @@ def run(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DegenerateFilterWarning)  # the tables count them
         by_rate = {rate: [slower(w, n) for w in first] for rate, n in _rates(part, steps).items()}
-        tunings = {
-            rate: _tunings(some, method, budget, out, settings, quick, progress)
-            for rate, some in by_rate.items()
-        }
+        tunings = _tunings(by_rate, method, budget, out, settings, quick, progress)
         chosen_at = {
             rate: {name: tuning.setting for name, tuning in found.items()}
             for rate, found in tunings.items()
@@ -242,19 +239,25 @@ def _fill_recovery(
 
 
 def _tunings(
-    walkers: Sequence[Walker], methods: Sequence[str], budget: Budget, out: Path, settings: str,
-    quick: bool, progress: bool,
-) -> dict[str, Tuning]:  # fmt: skip
-    fps = walkers[0].fps
-    if settings == "published" or (quick and settings == "validation"):
-        return {name: Tuning(published(name, fps)) for name in methods}
-    if settings != "validation":
-        found = read_settings(settings, methods, f"{fps:g}")
-        return {name: Tuning(setting) for name, setting in found.items()}
-    return {
-        name: tune(walkers, name, budget, out)
-        for name in tqdm(methods, disable=not progress, desc=f"settings, {fps:g} fps")
-    }
+    by_rate: Mapping[float, Sequence[Walker]], methods: Sequence[str], budget: Budget, out: Path,
+    settings: str, quick: bool, progress: bool,
+) -> dict[float, dict[str, Tuning]]:  # fmt: skip
+    """Of every frame rate, from the highest on; the search at one starts from the choice at the last."""
+    found: dict[float, dict[str, Tuning]] = {}
+    started: dict[str, Setting] = {}
+    for fps in sorted(by_rate, reverse=True):
+        if settings == "published" or (quick and settings == "validation"):
+            found[fps] = {name: Tuning(published(name, fps)) for name in methods}
+        elif settings != "validation":
+            read = read_settings(settings, methods, f"{fps:g}")
+            found[fps] = {name: Tuning(setting) for name, setting in read.items()}
+        else:
+            found[fps] = {
+                name: tune(by_rate[fps], name, budget, out, started.get(name))
+                for name in tqdm(methods, disable=not progress, desc=f"settings, {fps:g} fps")
+            }
+        started = {name: tuning.setting for name, tuning in found[fps].items()}
+    return found
 
 
 def _rates(part: str, steps: Mapping[float, int]) -> dict[float, int]:

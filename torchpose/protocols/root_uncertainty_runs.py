@@ -4,7 +4,6 @@ Every run is kept in a folder, so that parts of the protocol may be run apart an
 """
 
 from collections.abc import Mapping, Sequence
-from math import ceil
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,23 +15,17 @@ from tqdm.auto import tqdm
 from torchpose.body.kinematics import Body
 from torchpose.body.quaternion_vectors import compose
 from torchpose.filters.silhouette_filter import SilhouetteParticleFilter
-from torchpose.filters.survival import LEAST_SURVIVORS
 from torchpose.protocols.common import settings_hash
 from torchpose.protocols.kept_runs import keep, kept, read_kept, source_hash
-from torchpose.protocols.root_uncertainty_search import search_setting
 from torchpose.protocols.root_uncertainty_trackees import (
-    FPS,
     METHODS,
     Budget,
     Walker,
     make_filter,
-    published,
-    selected_among,
 )
 from torchpose.protocols.silhouette_runs import (
     Run,
     Runs,
-    Tuning,
     generators_of,
     sequence_name,
     track_view,
@@ -48,7 +41,7 @@ __all__ = [
     "progress_bar",
     "recover_all",
     "run_condition",
-    "tune",
+    "validation_error",
 ]
 
 _MADE_WITH = (
@@ -56,8 +49,6 @@ _MADE_WITH = (
     "protocols/root_uncertainty_trackees.py", "protocols/silhouette_runs.py",
 )  # fmt: skip
 """What the numbers of a run depend on beside its facts: files and folders of the package."""
-
-_FIRST_SCALE = 1.4
 
 
 # --- conditions -----------------------------------------------------------------------------------
@@ -112,28 +103,20 @@ def _read(path: Path) -> Run | None:
     return run
 
 
-def tune(walkers: Sequence[Walker], method: str, budget: Budget, folder: Path) -> Tuning:
-    """The setting with the smallest mean error over everybody's validation clips.
-
-    Every method has the same clips and seeds to choose by.
+def validation_error(
+    walkers: Sequence[Walker], method: str, setting: Setting, budget: Budget, folder: Path
+) -> float:
+    """Mean error over everybody's validation clips, mm, of one seed; read from the folder if there.
 
     Args:
-        walkers: at the frame rate of the choice; the lower it is, the more seeds are tracked.
+        walkers: at the frame rate that counts. Others as in `run_condition`.
     """
-    seeds = range(ceil(FPS / walkers[0].fps / 2))
-
-    def error(setting: Setting) -> float:
-        found = [
-            _kept_error(walker, body, view, method, setting, budget, folder, seeds)
-            for walker in walkers
-            for body, view in walker.validation
-        ]
-        return sum(found) / len(found)
-
-    known, usual = METHODS[method], published(method, walkers[0].fps).value
-    least = LEAST_SURVIVORS / selected_among(method, budget)
-    start = Setting(known.first, _FIRST_SCALE)
-    return search_setting(error, start, usual, known.values, least)
+    found = [
+        _kept_error(walker, body, view, method, setting, budget, folder)
+        for walker in walkers
+        for body, view in walker.validation
+    ]
+    return sum(found) / len(found)
 
 
 def _kept_error(
@@ -144,15 +127,13 @@ def _kept_error(
     setting: Setting,
     budget: Budget,
     folder: Path,
-    seeds: Sequence[int],
 ) -> float:
-    facts = ["root-tuning", *_facts(walker, body, view, method, setting, budget), list(seeds)]
+    facts = ["root-tuning", *_facts(walker, body, view, method, setting, budget)]
 
     def measured() -> float:
         tracker = make_filter(method, walker, setting, budget)
-        start = view.initial_state.expand(len(seeds), -1)
-        runs = track_view(tracker, body, view, start, generators_of(seeds))
-        return float(torch.stack([run.errors for run in runs]).double().nanmean())
+        (run,) = track_view(tracker, body, view, view.initial_state[None], generators_of([0]))
+        return float(run.errors.double().nanmean())
 
     return kept(folder / f"tuning-{settings_hash(facts)}.npz", measured)
 

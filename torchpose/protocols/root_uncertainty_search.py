@@ -2,20 +2,57 @@
 
 from collections.abc import Callable, Sequence
 from math import inf, isfinite
+from pathlib import Path
 
+from torchpose.filters.survival import LEAST_SURVIVORS
+from torchpose.protocols.root_uncertainty_runs import validation_error
+from torchpose.protocols.root_uncertainty_trackees import (
+    METHODS,
+    Budget,
+    Walker,
+    published,
+    selected_among,
+)
 from torchpose.protocols.silhouette_runs import Tuning
 from torchpose.protocols.silhouette_trackees import SCALES, Setting
 
-__all__ = ["search_setting"]
+__all__ = ["search_setting", "tune"]
 
 _SCALES = (0.1, 10.0)  # none beyond is tried
 _MOST = 0.97
+_FIRST_SCALE = 1.4
+
+
+def tune(
+    walkers: Sequence[Walker],
+    method: str,
+    budget: Budget,
+    folder: Path,
+    start: Setting | None = None,
+) -> Tuning:
+    """Survival and diffusion with the smallest mean error over everybody's validation clips.
+
+    Every method has the same clips and seed to choose by.
+
+    Args:
+        walkers: at the frame rate of the choice. budget: of the filter. folder: with what was measured.
+        start: of the search, such as what was chosen at another rate. Without one it starts from
+            `Method.first`, and the published survival is tried as well.
+    """
+    known, usual = METHODS[method], published(method, walkers[0].fps).value
+    return search_setting(
+        lambda setting: validation_error(walkers, method, setting, budget, folder),
+        start or Setting(known.first, _FIRST_SCALE),
+        None if start else usual,
+        known.values,
+        LEAST_SURVIVORS / selected_among(method, budget),
+    )
 
 
 def search_setting(
     error: Callable[[Setting], float],
     start: Setting,
-    published: float,
+    usual: float | None,
     values: Sequence[float],
     least: float,
     scales: Sequence[float] = SCALES,
@@ -28,9 +65,8 @@ def search_setting(
 
     Args:
         error: of a setting; one that is not finite is never chosen.
-        start: a value and a scale of the rows. published: a value that is tried in any case.
-        values: shares that survive, ascending. least: share below which none is tried.
-        scales: of the diffusion, ascending.
+        start: from where it starts. usual: a value that is tried in any case, or None.
+        values: shares that survive. least: share below which none is tried. scales: of the diffusion.
     """
     tried: dict[Setting, float] = {}
 
@@ -45,10 +81,11 @@ def search_setting(
     def along_values(value: float, scale: float) -> float:
         return _descend(lambda v: of(Setting(v, scale)), row, value, (least, _MOST))
 
-    row, ladder = sorted({*values, published}), list(scales)
+    row, ladder = sorted({*values, start.value}), sorted({*scales, start.scale})
     value, scale = start.value, along_scales(*start)
-    if of(Setting(published, scale)) < of(Setting(value, scale)):
-        value = published
+    if usual is not None:
+        row = sorted({*row, usual})
+        value = min(value, usual, key=lambda v: of(Setting(v, scale)))
     settled = False
     while not settled:
         before = value, scale

@@ -218,10 +218,10 @@ def add_tuning(
         digits=(2, 1, 1, 1, 0),
         note="Survival: share of the particles that survives a frame, for APF a layer; as published "
         "0.01 a second, and 0.5 a layer. Particles: how many that are. Diffusion: factor of its "
-        "standard deviation, 1 as learnt. From one start for all rates diffusion and survival go in "
-        "turn to better neighbours until there is none, so that what is chosen has larger errors "
-        "beside it; the published survival is tried in any case. The same clips and seeds for all. "
-        "Nothing is tried where settings are given or published.",
+        "standard deviation, 1 as learnt. Diffusion and survival go in turn to better neighbours "
+        "until there is none, so that what is chosen has larger errors beside it; at the highest rate "
+        "the published survival is tried as well, at another the search starts from the choice at the "
+        "last. The same clips and one seed for all. Nothing is tried where settings are given or published.",
     )  # fmt: skip
     for fps, methods in tunings.items():
         for method, found in methods.items():
