@@ -18,7 +18,11 @@ from torchpose.errors import InputError
 from torchpose.filters.annealed import AnnealedParticleFilter
 from torchpose.filters.root_uncertainty import RootUncertaintyTracker
 from torchpose.io.mocap import read_mocap
-from torchpose.protocols import root_uncertainty, root_uncertainty_runs
+from torchpose.protocols import (
+    root_uncertainty,
+    root_uncertainty_runs,
+    root_uncertainty_search,
+)
 from torchpose.protocols.common import settings_hash
 from torchpose.protocols.kept_runs import source_hash
 from torchpose.protocols.report import Report
@@ -41,7 +45,7 @@ from torchpose.protocols.root_uncertainty_trackees import (
     with_cameras,
 )
 from torchpose.protocols.silhouette_data import split_clips
-from torchpose.protocols.silhouette_runs import Run
+from torchpose.protocols.silhouette_runs import Run, Tuning
 from torchpose.protocols.silhouette_trackees import Conditions, Setting
 
 SMALL = {"progress": False, "quick": True, "size": "64x48", "frames": 8, "persons": ("p1",)}
@@ -184,6 +188,39 @@ def test_survival_that_cannot_be_is_never_tried():
         0.02,
     )
     assert never.setting.value > 0.2
+
+
+def test_a_search_starts_from_what_was_chosen_at_the_rate_above(walkers, tmp_path, monkeypatch):
+    asked = []
+
+    def tune(walkers, name, budget, folder, start):
+        asked.append((walkers[0].fps, name, start))
+        return Tuning(Setting(walkers[0].fps / 1000, 1.4))
+
+    monkeypatch.setattr(root_uncertainty, "tune", tune)
+    by_rate = {fps: [slower(walkers[0], n)] for fps, n in ((15.0, 4), (60.0, 1), (30.0, 2))}
+    found = root_uncertainty._tunings(
+        by_rate, ("sir", "root"), Budget(), tmp_path, "validation", False, False
+    )
+    above = {60.0: None, 30.0: Setting(0.06, 1.4), 15.0: Setting(0.03, 1.4)}
+    assert asked == [(fps, name, above[fps]) for fps in above for name in ("sir", "root")]
+    assert found[15.0]["root"].setting == Setting(0.015, 1.4)
+
+
+def test_kept_errors_are_what_a_search_goes_by(walkers, tmp_path, monkeypatch):
+    errors = {0.06: 70.0, 0.1: 61.0, 0.16: 60.0, 0.25: 65.0, 0.926: 90.0}
+
+    def error(walkers, method, setting, budget, folder):
+        return errors[round(setting.value, 3)] + 10 * abs(math.log(setting.scale))
+
+    monkeypatch.setattr(root_uncertainty_search, "validation_error", error)
+    first = root_uncertainty_search.tune([walkers[0]], "root", Budget(), tmp_path)
+    assert first.setting == Setting(0.16, 1.0)
+    assert any(round(s.value, 3) == 0.926 for s in first.tried)
+    again = root_uncertainty_search.tune(
+        [walkers[0]], "root", Budget(), tmp_path, Setting(0.1, 1.4)
+    )
+    assert again.setting == Setting(0.16, 1.0) and all(s.value < 0.9 for s in again.tried)
 
 
 def test_published_survival_is_that_of_a_second():
