@@ -11,23 +11,34 @@ from torch import Tensor
 from torchpose.body.kinematics import Body
 from torchpose.body.skeleton import BODY_15
 from torchpose.camera import PinholeCamera
-from torchpose.errors import FileFormatError, SkeletonError
+from torchpose.errors import FileFormatError, InputError, ShapeError, SkeletonError
+from torchpose.io.estimates import check_estimates, frame_facts, to_tensor
+from torchpose.io.fields import check_arrays, one_text, texts
 from torchpose.io.files import read_npz, write_npz
+from torchpose.io.npz import npz_keys
 
 __all__ = ["BodyPoses", "load_body"]
 
-_FRAMES = (
-    "state",
-    "state_std",
-    "joints3d",
-    "covariance3d",
-    "log_evidence",
-    "effective_sample_size",
-    "coasting",
-    "respread",
-)
+_FRAMES = {
+    "state": "f T 36",
+    "state_std": "f T 36",
+    "joints3d": "f T 15 3",
+    "covariance3d": "f T 15 3 3",
+    "log_evidence": "f T",
+    "effective_sample_size": "f T",
+    "coasting": "b T",
+    "respread": "b T",
+}  # kinds and sizes in a file
 _DETAIL = "detail_"  # of the keys of what only some filters report
-_BODY = ("bone_lengths", "offsets", "tips", "radii", "centres")
+_BODY = {
+    "bone_lengths": "f 15",
+    "offsets": "f 15 3",
+    "tips": "f K 3",
+    "radii": "f L 2",
+    "centres": "f P 3",
+}
+_APART = 1e-3  # metres between joints and where the states put them
+_HEIGHTS = (0.3, 5.0)  # metres; between them is everybody, and what is no person is outside
 
 
 @dataclass
@@ -100,31 +111,62 @@ class BodyPoses:
         """Read what `save` wrote.
 
         Raises:
-            InputError: no such file. FileFormatError: not such poses, or details of other frames.
+            InputError: no such file. FileFormatError: not such poses, or fields that do not agree: other
+                shapes or types, details of other frames, joints elsewhere than the states put them.
             SkeletonError: another skeleton.
         """
-        arrays = read_npz(path, (*_FRAMES, "fps", "notes", "first_frame"))
-        details = {
-            key.removeprefix(_DETAIL): torch.from_numpy(value)
-            for key, value in arrays.items()
-            if key.startswith(_DETAIL)
-        }
-        for name, value in details.items():
-            if value.ndim < 1 or len(value) != len(arrays["state"]):
+        there = npz_keys(path)
+        details = [key for key in there if key.startswith(_DETAIL)]
+        required = (*_FRAMES, "names", "fps", "notes")
+        arrays = read_npz(path, required, ("first_frame", "action_names", *details))
+        n_frames = check_arrays(path, arrays, _FRAMES)["T"]
+        if n_frames == 0:
+            raise FileFormatError(f"{path}: expected poses of one frame or more, got none")
+        names = texts(path, "names", arrays["names"])
+        if names != BODY_15.names:
+            raise FileFormatError(f"{path}: expected the joints {', '.join(BODY_15.names)}")
+        for key in details:
+            value = arrays[key]
+            if value.dtype.kind not in "fiub" or value.ndim < 1 or len(value) != n_frames:
                 raise FileFormatError(
-                    f"{path}: expected {_DETAIL}{name} of {len(arrays['state'])} frames, got the "
-                    f"sizes {list(value.shape)}"
+                    f"{path}: expected {key} of {n_frames} frames, got {value.dtype!s:.40} of the sizes "
+                    f"{list(value.shape)!s:.60}"
                 )
-        fps = float(arrays["fps"])
-        return cls(
+        frames: dict[str, Any] = {name: to_tensor(arrays[name]) for name in _FRAMES}
+        poses = cls(
             load_body(path),
-            **{name: torch.from_numpy(arrays[name]) for name in _FRAMES},
-            fps=None if np.isnan(fps) else fps,
-            notes=tuple(str(n) for n in arrays["notes"]),
-            first_frame=int(arrays["first_frame"]),
-            details=details,
-            action_names=tuple(str(n) for n in arrays.get("action_names", ())),
+            **frames,
+            details={key.removeprefix(_DETAIL): to_tensor(arrays[key]) for key in details},
+            action_names=texts(path, "action_names", arrays.get("action_names", np.array(()))),
+            **frame_facts(path, arrays),
         )
+        poses._check(path)
+        return poses
+
+    def _check(self, path: str | Path) -> None:
+        """Raise unless the values agree with one another; the types and shapes do."""
+        check_estimates(path, "joints3d", self.joints3d, self.covariance3d)
+        for name in ("state", "state_std", "joints3d"):
+            if not bool(getattr(self, name).isfinite().all()):
+                raise FileFormatError(f"{path}: {name} must be finite")
+        bad = self.log_evidence.isposinf().any() or self.effective_sample_size.isinf().any()
+        if bool(bad) or bool((self.state_std < 0).any()):
+            raise FileFormatError(
+                f"{path}: expected state_std that is not negative, and no infinite log_evidence or "
+                "effective_sample_size"
+            )
+        joints = self.body.joints(self.state.to(self.body.bone_lengths))
+        apart = float((joints - self.joints3d.to(joints)).abs().amax())
+        if not apart <= _APART:
+            raise FileFormatError(
+                f"{path}: expected joints3d where state puts them, they are {apart:.3g} m apart"
+            )
+        actions = self.details.get("actions")
+        if actions is not None and tuple(actions.shape[1:]) != (len(self.action_names),):
+            raise FileFormatError(
+                f"{path}: expected {_DETAIL}actions of {len(self.action_names)} actions, got the sizes "
+                f"{list(actions.shape)}"
+            )
 
     def seen_by(self, camera: PinholeCamera) -> "CameraPoses":
         """The joints in a camera's axes, for `torchpose.report.write_report`."""
@@ -159,22 +201,34 @@ def load_body(path: str | Path) -> Body:
     """The body of poses that were saved: bone lengths, limbs and centres of a person.
 
     Raises:
-        InputError: no such file. FileFormatError: not such poses. SkeletonError: another skeleton.
+        InputError: no such file. FileFormatError: not such poses, or no body of a person.
+        SkeletonError: another skeleton.
     """
-    keys = tuple(f"body_{name}" for name in (*_BODY, "skeleton", "frame"))
-    arrays = read_npz(path, keys, ())
-    skeleton, frame = str(arrays["body_skeleton"]), str(arrays["body_frame"])
+    keys = {f"body_{name}": field for name, field in _BODY.items()}
+    arrays = read_npz(path, (*keys, "body_skeleton", "body_frame"), ())
+    skeleton, frame = (one_text(path, key, arrays[key]) for key in ("body_skeleton", "body_frame"))
     if skeleton != BODY_15.name:
-        raise SkeletonError(f"{path}: expected a body of {BODY_15.name!r}, got {skeleton!r}")
+        raise SkeletonError(f"{path}: expected a body of {BODY_15.name!r}, got {skeleton!r:.60}")
     if frame not in ("parent", "body"):
-        raise FileFormatError(f"{path}: expected body_frame 'parent' or 'body', got {frame!r}")
-    tensors = {name: torch.from_numpy(arrays[f"body_{name}"]) for name in _BODY}
-    return Body(
-        BODY_15,
-        tensors["bone_lengths"],
-        tensors["radii"],
-        directions=torch.nn.functional.normalize(tensors["offsets"], dim=-1),
-        centres=tensors["centres"],
-        frame="parent" if frame == "parent" else "body",
-        tips=tensors["tips"],
-    )
+        raise FileFormatError(f"{path}: expected body_frame 'parent' or 'body', got {frame!r:.60}")
+    check_arrays(path, arrays, keys)
+    tensors = {name: to_tensor(arrays[f"body_{name}"]) for name in _BODY}
+    try:
+        body = Body(
+            BODY_15,
+            tensors["bone_lengths"],
+            tensors["radii"],
+            directions=torch.nn.functional.normalize(tensors["offsets"], dim=-1),
+            centres=tensors["centres"],
+            frame="parent" if frame == "parent" else "body",
+            tips=tensors["tips"],
+        )
+    except (InputError, ShapeError) as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    largest = max(float(tensors[name].abs().amax()) for name in _BODY)
+    if not _HEIGHTS[0] < body.height < _HEIGHTS[1] or largest > _HEIGHTS[1]:
+        raise FileFormatError(
+            f"{path}: expected the body of a person in metres, got one of {body.height:.3g} m with parts "
+            f"of up to {largest:.3g} m"
+        )
+    return body

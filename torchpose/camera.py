@@ -1,17 +1,17 @@
-"""Pinhole camera as a module, its TOML file, and random viewpoints.
+"""Pinhole camera as a module, and its TOML file.
 
 Camera axes: x right, y down, z forward. Metres, pixels, radians. The functions on tensors are in
-`torchpose.projection` and `torchpose.rotations`, and can be imported from here as well.
+`torchpose.projection` and `torchpose.rotations`, random viewpoints in `torchpose.viewpoints`; they can be
+imported from here as well.
 """
 
-import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -33,6 +33,7 @@ from torchpose.rotations import (
     matrix_to_euler,
     rotvec_to_matrix,
 )
+from torchpose.viewpoints import PAPER_VIEWS, Viewpoints, ViewRange, sample_viewpoints
 
 __all__ = [
     "PAPER_VIEWS",
@@ -55,100 +56,10 @@ __all__ = [
     "save_cameras",
 ]
 
+_FARTHEST = 1e9  # pixels or metres: no number of a camera is larger
+_LARGEST_TURN = 100.0  # radians; a few full turns mean the same as none
+_LARGEST_SIDE = 100_000  # pixels of an image
 FOCAL_PER_WIDTH = 525 / 640  # Kinect's colour camera, and a fair guess for a webcam
-
-
-# --- random viewpoints ----------------------------------------------------------------------------
-
-
-class Viewpoints(NamedTuple):
-    """Camera poses: angles (roll, pitch, yaw) [N, 3] in radians, translation [N, 3] in metres."""
-
-    angles: Tensor
-    translation: Tensor
-
-
-@dataclass(frozen=True)
-class ViewRange:
-    """Limits of random viewpoints; the defaults are the paper's, at a nominal distance of 2 m.
-
-    Args:
-        roll, pitch, yaw: largest absolute angle, radians.
-        tx, ty, tz: (low, high) of the translation, metres, in camera axes.
-    """
-
-    roll: float = math.radians(30)
-    pitch: float = math.radians(30)
-    yaw: float = math.radians(30)
-    tx: tuple[float, float] = (-0.5, 0.5)
-    ty: tuple[float, float] = (-0.5, 0.5)
-    tz: tuple[float, float] = (1.5, 2.5)
-
-    def __post_init__(self) -> None:
-        for name in ("roll", "pitch", "yaw"):
-            angle = getattr(self, name)
-            if not 0 <= angle <= math.pi:
-                raise InputError(f"ViewRange.{name} must be in [0, pi] radians, got {angle}")
-        for name in ("tx", "ty", "tz"):
-            low, high = getattr(self, name)
-            if not -math.inf < low <= high < math.inf:
-                raise InputError(
-                    f"ViewRange.{name} must be (low, high) in metres with low <= high, "
-                    f"got ({low}, {high})"
-                )
-
-    def scaled(self, factor: float) -> "ViewRange":
-        """Limits of another width about the same middle; 1 changes nothing."""
-
-        def about_middle(limits: tuple[float, float]) -> tuple[float, float]:
-            low, high = limits
-            middle, half = (low + high) / 2, factor * (high - low) / 2
-            return middle - half, middle + half
-
-        return ViewRange(
-            factor * self.roll,
-            factor * self.pitch,
-            factor * self.yaw,
-            about_middle(self.tx),
-            about_middle(self.ty),
-            about_middle(self.tz),
-        )
-
-
-PAPER_VIEWS = ViewRange()
-
-
-def sample_viewpoints(
-    n: int,
-    view_range: ViewRange = PAPER_VIEWS,
-    generator: torch.Generator | None = None,
-    dtype: torch.dtype = torch.float64,
-) -> Viewpoints:
-    """Draw camera poses, every angle and translation uniform within its limits.
-
-    Args:
-        n: how many.
-        view_range: the limits.
-        generator: source of random numbers; its device is that of the result.
-        dtype: of the result.
-
-    Returns:
-        `Viewpoints` with angles [n, 3] and translation [n, 3].
-
-    Reference: Burke & Lasenby, section 3.1 (angles up to 30 degrees, translations up to 0.5 m).
-    """
-    if n < 0:
-        raise InputError(f"n must not be negative, got {n}")
-    r = view_range
-    limits = [(-r.roll, r.roll), (-r.pitch, r.pitch), (-r.yaw, r.yaw), r.tx, r.ty, r.tz]
-    device = generator.device if generator is not None else None
-    low, high = torch.tensor(limits, dtype=dtype, device=device).unbind(-1)
-    unit = torch.rand((n, 6), generator=generator, dtype=dtype, device=device)
-    drawn = low + (high - low) * unit
-    return Viewpoints(drawn[:, :3], drawn[:, 3:])
-
-
-# --- camera and its file --------------------------------------------------------------------------
 
 
 class PinholeCamera(nn.Module):
@@ -204,7 +115,13 @@ class PinholeCamera(nn.Module):
         self.fisheye = bool(fisheye)
         self.register_buffer("matrix", matrix.reshape(3, 3))
         self.register_buffer("distortions", _vector(f"distortions of {label}", distortions, None))
-        self.register_buffer("rotation", _vector(f"rotation of {label}", rotation, 3))
+        turn = _vector(f"rotation of {label}", rotation, 3)
+        if float(turn.norm()) > _LARGEST_TURN:
+            raise CameraError(
+                f"rotation of {label} must be a Rodrigues vector in radians of at most "
+                f"{_LARGEST_TURN:g}, got {turn.tolist()}; give degrees as radians"
+            )
+        self.register_buffer("rotation", turn)
         self.register_buffer("translation", _vector(f"translation of {label}", translation, 3))
 
     @classmethod
@@ -216,10 +133,7 @@ class PinholeCamera(nn.Module):
         Raises:
             CameraError: wrong shape, singular, or not of the form (BL 4).
         """
-        try:
-            K = torch.as_tensor(matrix, dtype=torch.float64).detach().cpu()
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise CameraError(f"matrix must be 3 x 3 numbers, got {matrix!r}") from error
+        K = _numbers("matrix", matrix, "3 x 3 numbers")
         if tuple(K.shape) != (3, 3):
             raise CameraError(f"matrix must have shape [3, 3], got {list(K.shape)}")
         if float(K[2, 2]) not in (0.0, 1.0):
@@ -296,13 +210,16 @@ def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
         InputError: no such file. FileFormatError: not TOML, or no camera in it.
         CameraError: a camera lacks its matrix or has values that no camera has.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such camera file")
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise FileFormatError(f"{path}: expected a TOML camera file, but {error}") from error
+    from torchpose.io.reading import read_text, reading  # io imports this module
+
+    expected = "a TOML camera file"
+    text = read_text(path, expected, "utf-8")
+    with reading(path, expected):
+        content = tomllib.loads(text)
+        return _cameras_of(path, content)
+
+
+def _cameras_of(path: str | Path, content: Mapping[str, Any]) -> dict[str, PinholeCamera]:
     tables = {k: v for k, v in content.items() if isinstance(v, Mapping) and k != "metadata"}
     if not tables:
         raise FileFormatError(f"{path}: expected a table per camera with `matrix`, found none")
@@ -330,16 +247,31 @@ def save_cameras(cameras: Sequence[PinholeCamera], path: str | Path) -> None:
 
 
 def _vector(name: str, values: Any, length: int | None) -> Tensor:
-    try:
-        vector = torch.as_tensor(values, dtype=torch.float64).detach().clone()
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise CameraError(f"{name} must be numbers, got {values!r}") from error
+    vector = _numbers(name, values)
     if vector.ndim != 1 or (length is not None and len(vector) != length):
         wanted = "a list of numbers" if length is None else f"{length} numbers"
         raise CameraError(f"{name} must be {wanted}, got shape {list(vector.shape)}")
-    if not bool(torch.isfinite(vector).all()):
-        raise CameraError(f"{name} must be finite, got {vector.tolist()}")
+    if not bool((vector.abs() <= _FARTHEST).all()):
+        raise CameraError(
+            f"{name} must be finite and at most {_FARTHEST:g}, got {vector.tolist()!s:.200}"
+        )
     return vector
+
+
+def _numbers(name: str, values: Any, wanted: str = "numbers") -> Tensor:
+    """A tensor of numbers; true and false are none."""
+    try:
+        if _holds_bool(values):
+            raise TypeError
+        return torch.as_tensor(values, dtype=torch.float64).detach().cpu().clone()
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise CameraError(f"{name} must be {wanted}, got {values!r:.200}") from error
+
+
+def _holds_bool(values: Any) -> bool:
+    if isinstance(values, list | tuple):
+        return any(_holds_bool(value) for value in values)
+    return isinstance(values, bool) or getattr(values, "dtype", None) in (torch.bool, np.bool_)
 
 
 def _image_side(name: str, value: Any) -> int | None:
@@ -347,10 +279,13 @@ def _image_side(name: str, value: Any) -> int | None:
         return None
     try:
         side = int(value)
+        if isinstance(value, bool) or not 0 < side <= _LARGEST_SIDE or side != float(value):
+            raise ValueError
     except (TypeError, ValueError, OverflowError) as error:
-        raise CameraError(f"{name} must be a number of pixels, got {value!r}") from error
-    if side <= 0 or side != float(value):
-        raise CameraError(f"{name} must be a positive whole number of pixels, got {value!r}")
+        raise CameraError(
+            f"{name} must be a positive whole number of pixels, at most {_LARGEST_SIDE}, got "
+            f"{value!r:.60}"
+        ) from error
     return side
 
 
@@ -360,7 +295,9 @@ def _camera_from_table(where: str, name: str, table: Mapping[str, Any]) -> Pinho
     size = table.get("size", (None, None))
     try:
         if not isinstance(size, Sequence) or len(size) != 2:
-            raise CameraError(f"size must be [width, height], got {size!r}")
+            raise CameraError(f"size must be [width, height], got {size!r:.60}")
+        if not isinstance(table.get("fisheye", False), bool):
+            raise CameraError(f"fisheye must be true or false, got {table['fisheye']!r:.60}")
         base = PinholeCamera.from_matrix(table["matrix"])
         fx, fy, skew, cx, cy = (float(e) for e in intrinsics(base.matrix))
         return PinholeCamera(

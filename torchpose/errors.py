@@ -1,9 +1,11 @@
 """Typed errors, and the checks that raise them.
 
-Every message says what was expected, what came, and what to do about it.
+Every message says what was expected, what came, and what to do about it. Messages are one line of
+printable characters, whatever the file or the name that they quote.
 """
 
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any
 
 import torch
@@ -25,14 +27,41 @@ __all__ = [
     "check_covariance",
     "check_finite",
     "check_grey",
+    "check_rate",
     "check_rgb",
     "check_shape",
     "check_weights",
+    "printable",
 ]
+
+_LONGEST, _TAIL = 1200, 300  # characters of a message, and how many of those are of its end
+_FASTEST = 1000.0  # frames per second
+
+
+def printable(text: str, longest: int = _LONGEST) -> str:
+    r"""Return text as one line: controls escaped, white space joined, cut in its middle if too long.
+
+    What a file or a name holds may be printed on a terminal, where controls would act.
+
+    >>> printable("red \x1b[31m\n  text")
+    'red \\x1b[31m text'
+    """
+    if len(text) > longest:
+        tail = min(_TAIL, longest // 4)
+        cut = f" [... {len(text) - longest} characters ...] "
+        text = text[: longest - tail - len(cut)] + cut + text[len(text) - tail :]
+    if text.isprintable():
+        return text
+    line = " ".join(text.split()) if "\n" in text else text
+    escaped = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    return escaped if len(escaped) <= longest else printable(escaped, longest)
 
 
 class TorchposeError(Exception):
-    """Base class of every error that torchpose raises on purpose."""
+    """Base class of every error that torchpose raises on purpose; its message is `printable`."""
+
+    def __init__(self, *args: Any, **facts: Any) -> None:
+        super().__init__(*(printable(a) if isinstance(a, str) else a for a in args), **facts)
 
 
 class ShapeError(TorchposeError, ValueError):
@@ -133,6 +162,20 @@ def _check_image(name: str, image: Any, kind: str, channels: int | None, empty: 
     fits = len(shape) == (2 if channels is None else 3) and channels in (None, shape[-1])
     if not fits or str(dtype) != "uint8" or (not empty and 0 in shape):
         raise InputError(f"{name} must be {kind} of uint8, got {list(shape)} of {dtype}")
+
+
+def check_rate(name: str, fps: Any) -> float:
+    """Return `fps` as a float, or raise `InputError` unless it is in (0, 1000] frames per second.
+
+    Filters and windows look back for so many frames; a rate that no camera has takes the memory for
+    them.
+    """
+    number = isinstance(fps, Real) and not isinstance(fps, bool)
+    if not number or not 0 < fps <= _FASTEST:
+        raise InputError(
+            f"{name} must be positive and at most {_FASTEST:g} frames per second, got {fps!r:.60}"
+        )
+    return float(fps)
 
 
 def check_weights(name: str, weights: Tensor) -> None:

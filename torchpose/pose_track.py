@@ -8,8 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpose.errors import FileFormatError
+from torchpose.errors import CameraError, FileFormatError
+from torchpose.io.estimates import check_estimates, check_number_range, frame_facts, to_tensor
+from torchpose.io.fields import check_arrays, one_text, texts
 from torchpose.io.files import read_npz, write_npz
+from torchpose.projection import check_intrinsics
 from torchpose.skeleton import UPPER_BODY
 
 __all__ = ["FRAME_FIELDS", "PoseTrack"]
@@ -24,7 +27,17 @@ FRAME_FIELDS = (
 )
 """What a `PoseTrack` holds for every frame."""
 
-_KEYS = ("joints2d", "joints3d", "covariance3d", "observed", "log_evidence", "names")
+_FIELDS = {
+    "joints2d": ("f", "T 8 2"),
+    "joints3d": ("f", "T 8 3"),
+    "covariance2d": ("f", "T 8 2 2"),
+    "covariance3d": ("f", "T 8 3 3"),
+    "observed": ("b", "T 8"),
+    "log_evidence_arms": ("f", "T 2"),
+    "lengths": ("i", ""),
+    "failed_at": ("i", ""),
+    "K": ("f", "3 3"),
+}  # kinds and sizes in a file, of several sequences behind that of the batch
 
 
 @dataclass
@@ -130,37 +143,57 @@ class PoseTrack:
         """Read what `save` wrote.
 
         Raises:
-            InputError: no such file. FileFormatError: truncated, or not poses.
+            InputError: no such file. FileFormatError: truncated, not poses, or fields that do not
+                agree: other shapes or types, joints without a covariance, values out of range.
+            CameraError: K is no camera matrix.
         """
-        extra = ("log_evidence_arms", "covariance2d", "K", "frame", "failed_at", "lengths")
-        arrays = read_npz(path, (*_KEYS, *extra, "fps", "notes"))
-        single = arrays["joints3d"].ndim == 3
-        if arrays["joints3d"].ndim not in (3, 4) or arrays["joints3d"].shape[-1] != 3:
-            raise FileFormatError(
-                f"{path}: expected joints3d of shape [T, J, 3] or [B, T, J, 3], "
-                f"got {list(arrays['joints3d'].shape)}"
-            )
-
-        def tensor(name: str) -> Tensor:
-            value = torch.from_numpy(np.array(arrays[name]))
-            return value[None] if single else value
-
-        fps = float(arrays["fps"])
-        return cls(
-            joints2d=tensor("joints2d"),
-            joints3d=tensor("joints3d"),
-            covariance2d=tensor("covariance2d"),
-            covariance3d=tensor("covariance3d"),
-            observed=tensor("observed"),
-            log_evidence=tensor("log_evidence_arms"),
-            lengths=tensor("lengths"),
-            matrix=torch.from_numpy(arrays["K"]),
-            failed_at=tensor("failed_at"),
-            names=tuple(str(n) for n in arrays["names"]),
-            fps=None if np.isnan(fps) else fps,
-            frame=str(arrays["frame"]),
-            notes=tuple(str(n) for n in arrays["notes"]),
-            # files of older releases have neither
-            first_frame=int(arrays.get("first_frame", 0)),
-            method=str(arrays.get("method", "unknown")),
+        arrays = read_npz(
+            path, (*_FIELDS, "names", "frame", "fps", "notes"), ("first_frame", "method")
         )
+        single = arrays["joints3d"].ndim == 3
+        batch = "" if single else "B "
+        sizes = check_arrays(
+            path,
+            arrays,
+            {k: f"{kind} {batch * (k != 'K')}{size}" for k, (kind, size) in _FIELDS.items()},
+        )
+        if not all(sizes.values()):
+            raise FileFormatError(f"{path}: expected poses of one frame or more, got none")
+        tensors: dict[str, Any] = {key: to_tensor(arrays[key]) for key in _FIELDS}
+        tensors = {k: v[None] if single and k != "K" else v for k, v in tensors.items()}
+        tensors["log_evidence"] = tensors.pop("log_evidence_arms")
+        tensors["matrix"] = tensors.pop("K")
+        names = texts(path, "names", arrays["names"])
+        if names != UPPER_BODY:
+            raise FileFormatError(
+                f"{path}: expected the joints {', '.join(UPPER_BODY)}, got {', '.join(names)}"
+            )
+        track = cls(
+            **tensors, names=names, frame=one_text(path, "frame", arrays["frame"]),
+            method=one_text(path, "method", arrays.get("method", np.array("unknown"))),
+            **frame_facts(path, arrays),
+        )  # fmt: skip
+        track._check(path)
+        return track
+
+    def _check(self, path: str | Path) -> None:
+        """Raise unless the values agree with one another; the types and shapes do."""
+        if self.frame not in ("camera", "body"):
+            raise FileFormatError(
+                f"{path}: frame must be 'camera' or 'body', got {self.frame!r:.60}"
+            )
+        try:
+            check_intrinsics("K", self.matrix)
+        except CameraError as error:
+            raise CameraError(f"{path}: {error}") from error
+        n_frames = self.joints3d.shape[1]
+        check_number_range(path, "lengths", self.lengths, 1, n_frames)
+        check_number_range(path, "failed_at", self.failed_at, -1, n_frames - 1)
+        check_estimates(path, "joints2d", self.joints2d, self.covariance2d)
+        check_estimates(path, "joints3d", self.joints3d, self.covariance3d)
+        failed = torch.nonzero(self.failed_at >= 0).reshape(-1)
+        whole = self.joints3d[failed, self.failed_at[failed]].isfinite().flatten(1).all(-1)
+        if bool(whole.any()) or bool(self.log_evidence.isposinf().any()):
+            raise FileFormatError(
+                f"{path}: expected NaN in the frame of failed_at and no infinite log_evidence_arms"
+            )

@@ -22,6 +22,9 @@ __all__ = [
 ]
 
 
+_SHORTEST, _LARGEST = 1e-6, 1e9  # pixels: focal lengths and entries beyond are of no camera
+
+
 def project(
     points: Float[Tensor, "... J 3"],
     K: Float[Tensor, "... 3 3"],
@@ -150,10 +153,12 @@ def check_intrinsics(name: str, K: Tensor) -> None:
     """
     if K.ndim < 2 or tuple(K.shape[-2:]) != (3, 3):
         raise CameraError(f"{name} must have shape [3, 3], got {list(K.shape)}")
-    if not bool(torch.isfinite(K).all()):
-        raise CameraError(f"{name} must be finite, got {K.tolist()}")
+    if not bool((K.abs() <= _LARGEST).all()):
+        raise CameraError(
+            f"{name} must be finite and at most {_LARGEST:g}, got {K.tolist()!s:.200}"
+        )
     fx, fy, *_ = intrinsics(K)
-    if bool((fx <= 0).any()) or bool((fy <= 0).any()):
+    if bool((fx < _SHORTEST).any()) or bool((fy < _SHORTEST).any()):
         raise CameraError(
             f"{name} needs positive focal lengths in pixels, got fx={fx.tolist()}, fy={fy.tolist()}"
         )

@@ -251,7 +251,7 @@ BAD_INPUT = {
     "negative std": ([CLIP, "--measurement-std=-2"], "must be positive"),
     "three numbers": ([CLIP, "--camera", "1,2,3"], "fx,fy,cx,cy"),
     "no focal length": ([CLIP, "--camera", "0,0,320,240"], "positive focal lengths"),
-    "no camera file": ([CLIP, "--camera", "{tmp}/no.toml"], "no such camera file"),
+    "no camera file": ([CLIP, "--camera", "{tmp}/no.toml"], "no such file"),
     "camera of other images": ([CLIP, "--camera", "{tmp}/small.toml"], "320 x 240"),
     "unknown frame": ([CLIP, "--frame", "world"], "'camera' or 'body'"),
     "unknown neck": ([CLIP, "--neck", "long"], "mid-shoulder"),

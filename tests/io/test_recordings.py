@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.data import data_dir_or_skip
-from torchpose.errors import FileFormatError, InputError, MissingDependencyError, SkeletonError
+from torchpose.errors import FileFormatError, InputError, SkeletonError
 from torchpose.io import find_recordings, read_recording, read_recordings
 from torchpose.skeleton import SKELETONS, UPPER_BODY
 
@@ -243,11 +243,15 @@ def test_what_is_no_such_matrix(tmp_path, text):
         read_recording(path)
 
 
-def test_without_opencv(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "cv2", None)
-    (tmp_path / "a.yaml").write_text(matrix_yaml(pose().reshape(4, 24)))
-    with pytest.raises(MissingDependencyError, match="opencv-python-headless"):
-        read_recording(tmp_path / "a.yaml")
+def test_opencv_writes_what_is_read(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    joints = pose().reshape(4, 24)
+    for kind in (np.float32, np.float64):
+        storage = cv2.FileStorage(str(tmp_path / "a.yaml"), cv2.FILE_STORAGE_WRITE)
+        storage.write("joints", joints.astype(kind))
+        storage.release()
+        [one] = read_recording(tmp_path / "a.yaml")
+        assert np.array_equal(one.joints.reshape(4, 24), joints.astype(kind).astype(float))
 
 
 # --- folders --------------------------------------------------------------------------------------

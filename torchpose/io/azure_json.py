@@ -1,6 +1,5 @@
 """Azure Kinect, ``.json`` as the SDK's offline_processor writes it."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +8,7 @@ import numpy as np
 from torchpose.errors import FileFormatError
 from torchpose.io.kinect_csv import KINECT_FPS, dropped_frames
 from torchpose.io.raw_recording import BodyFrame, RawRecording, join_bodies
+from torchpose.io.reading import read_json
 from torchpose.joint_sets import SKELETONS
 
 __all__ = ["read_azure_json"]
@@ -18,6 +18,7 @@ _CONFIDENCE_WEIGHTS = (0.0, 0.5, 1.0, 1.0)  # out of range, occluded (predicted)
 _CONFIDENCE_KEYS = ("joint_confidence", "joint_confidences", "confidence_level",
                     "confidence_levels", "joint_confidence_levels")  # fmt: skip
 _MICROSECOND = 1e-6
+_LATEST = 2.0**63  # of the SDK's stamps, which are whole numbers of 64 bits
 
 
 def read_azure_json(path: Path) -> list[RawRecording]:
@@ -30,25 +31,24 @@ def read_azure_json(path: Path) -> list[RawRecording]:
     Raises:
         FileFormatError: no such file, another number of joints; the frame is named.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise FileFormatError(
-            f"{path}: expected JSON, it is truncated or damaged ({error})"
-        ) from error
+    content = read_json(path, "JSON of the Azure Kinect")
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
         raise FileFormatError(
             f"{path}: expected the Azure Kinect's 'frames' with 'bodies', found another kind of JSON"
         )
-    names = tuple(str(name) for name in content.get("joint_names", _NAMES))
+    names = content.get("joint_names", _NAMES)
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+        raise FileFormatError(f"{path}: joint_names must be a list of text, got {names!r:.60}")
+    names = tuple(names)
     frames, stamps = content["frames"], []
     bodies: list[BodyFrame] = []
     for number, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("bodies", []), list):
             raise FileFormatError(f"{path}, frame {number}: expected 'bodies'")
         bodies += [_read_body(path, number, body, len(names)) for body in frame.get("bodies", [])]
-        if isinstance(frame.get("timestamp_usec"), int | float):
-            stamps.append(frame["timestamp_usec"])
+        stamp = frame.get("timestamp_usec")
+        if isinstance(stamp, int | float) and abs(stamp) < _LATEST:
+            stamps.append(float(stamp))
     fps, notes = _rate(path, stamps)
     return join_bodies(
         path, bodies, len(frames), names, fps, axes="camera", unit=0.001, action=path.stem,
@@ -75,7 +75,7 @@ def _read_body(path: Path, frame: int, body: Any, n_joints: int) -> BodyFrame:
 def _array(where: str, key: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     try:
         array = np.array(value, dtype=np.float64)  # null becomes NaN
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise FileFormatError(f"{where}: {key} must be numbers ({error})") from error
     if array.shape != shape:
         raise FileFormatError(

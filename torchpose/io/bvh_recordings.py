@@ -9,6 +9,7 @@ import numpy as np
 
 from torchpose.errors import FileFormatError, MissingDependencyError, SkeletonError
 from torchpose.io.raw_recording import RawRecording
+from torchpose.io.reading import read_text, reading
 
 __all__ = ["bvh_joint_names", "read_bvh"]
 
@@ -24,6 +25,7 @@ _SIDED = {
 } | dict.fromkeys(_ARM_WORDS, "shoulder")  # fmt: skip
 _CENTRAL = {"hips": "hip_center", "hip": "hip_center", "pelvis": "hip_center", "spine": "spine",
             "neck": "neck", "neck01": "neck", "head": "head"}  # fmt: skip
+_LONGEST_HIERARCHY = 1_000_000  # characters; a person with all fingers has some ten thousand
 _NEEDED = ("head", "shoulder_left", "shoulder_right", "elbow_left", "elbow_right")
 
 
@@ -76,13 +78,9 @@ def read_bvh(path: Path) -> list[RawRecording]:
             f"{path}: reading BVH files needs bvhio; install torchpose[mocap]"
         ) from error
     _check(path)
-    try:
+    with reading(path, "a BVH file"):
         container = bvhio.readAsBvh(str(path))
         root = bvhio.convertBvhToHierarchy(container.Root).loadRestPose(recursive=True)
-    except (SyntaxError, ValueError, IndexError, RecursionError) as error:
-        raise FileFormatError(
-            f"{path}: expected a BVH file; it is damaged ({error.args[0] if error.args else error})"
-        ) from error
     nodes = {joint.Name: joint for joint, _, _ in reversed(root.layout())}
     names = bvh_joint_names([joint.Name for joint, _, _ in root.layout()])
     missing = [joint for joint in _NEEDED if joint not in names]
@@ -149,14 +147,16 @@ def _head_end(head: Any, posed: Any) -> tuple[Any, str]:
 
 def _check(path: Path) -> None:
     """Whether the file is whole; bvhio would read on for ever at the end of a truncated one."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path}: expected a BVH file, got bytes") from error
+    text = read_text(path, "a BVH file", "utf-8")
     hierarchy, mark, motion = text.partition("MOTION")
     if not hierarchy.lstrip().startswith("HIERARCHY") or not mark:
         raise FileFormatError(
             f"{path}: expected HIERARCHY and MOTION; it is truncated or no BVH file"
+        )
+    if len(hierarchy) > _LONGEST_HIERARCHY:
+        raise FileFormatError(
+            f"{path}: expected a HIERARCHY of at most {_LONGEST_HIERARCHY} characters, got "
+            f"{len(hierarchy)}"
         )
     if not hierarchy.count("{") == hierarchy.count("}") > 0:
         raise FileFormatError(f"{path}: the braces of the HIERARCHY do not match")
@@ -164,8 +164,8 @@ def _check(path: Path) -> None:
     if header is None:
         raise FileFormatError(f"{path}: expected 'Frames:' and 'Frame Time:' after MOTION")
     rows = [row.split() for row in motion[header.end() :].splitlines() if row.strip()]
-    channels = sum(int(n) for n in re.findall(r"CHANNELS\s+(\d+)", hierarchy))
-    if len(rows) < int(header[1]):
+    channels = sum(int(n[:9]) for n in re.findall(r"CHANNELS\s+(\d+)", hierarchy))
+    if len(rows) < int(header[1][:18]):
         raise FileFormatError(f"{path}: expected {header[1]} frames, ends after {len(rows)}")
     short = next((i for i, row in enumerate(rows) if len(row) != channels), None)
     if short is not None:

@@ -3,27 +3,17 @@
 import contextlib
 import os
 import tempfile
-import zipfile
-import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torchpose.errors import FileFormatError, InputError, OutputError
+from torchpose.errors import OutputError
+from torchpose.io.npz import read_npz
+from torchpose.io.reading import require_file
 
 __all__ = ["atomic_path", "check_output_folder", "read_npz", "require_file", "write_npz"]
-
-
-def require_file(path: str | Path) -> Path:
-    """Return `path` as a Path, or raise `InputError` if there is no such file."""
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(
-            f"{path}: {'is a folder, not a file' if path.is_dir() else 'no such file'}"
-        )
-    return path
 
 
 @contextlib.contextmanager
@@ -91,50 +81,6 @@ def check_output_folder(folder: str | Path) -> Path:
             "choose another with --out"
         ) from error
     return folder
-
-
-def read_npz(
-    path: str | Path, required: Sequence[str] = (), optional: Sequence[str] | None = None
-) -> dict[str, np.ndarray]:
-    """Read arrays of an .npz file, without ever unpickling.
-
-    Args:
-        path: the file.
-        required: keys that must be there.
-        optional: the other keys to read; None reads all.
-
-    Returns:
-        Arrays by key.
-
-    Raises:
-        InputError: no such file. FileFormatError: truncated, another kind of file, a pickled
-            array, or a required key is missing.
-    """
-    path = require_file(path)
-    try:
-        # opened here, because numpy leaves a file open that turns out to be damaged
-        with path.open("rb") as stream:
-            archive = np.load(stream, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise FileFormatError(f"{path}: expected an .npz archive, got a single array")
-            keys = archive.files
-            if optional is not None:
-                keys = [key for key in keys if key in required or key in optional]
-            found = ", ".join(sorted(archive.files)) or "nothing"
-            arrays = {key: archive[key] for key in keys}
-    except FileFormatError:
-        raise
-    except (ValueError, EOFError, OSError, KeyError, zipfile.BadZipFile, zlib.error,
-            NotImplementedError, RuntimeError, SyntaxError, TypeError) as error:  # fmt: skip
-        reason = str(error).split(". ")[0]
-        raise FileFormatError(
-            f"{path}: expected an .npz file of plain arrays; it is truncated, of another kind, or "
-            f"holds pickled objects ({reason})"
-        ) from error
-    missing = [key for key in required if key not in arrays]
-    if missing:
-        raise FileFormatError(f"{path}: expected the keys {', '.join(missing)}, found {found}")
-    return arrays
 
 
 def write_npz(path: str | Path, arrays: dict[str, Any]) -> None:

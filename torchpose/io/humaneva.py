@@ -30,6 +30,7 @@ from torchpose.io.c3d_recordings import read_c3d_points
 from torchpose.io.files import require_file
 from torchpose.io.humaneva_joints import SHOULDER_OFFSETS, joint_centres
 from torchpose.io.mocap import MocapClip
+from torchpose.io.reading import read_text, reading
 from torchpose.joint_sets import SKELETONS
 
 __all__ = [
@@ -49,6 +50,7 @@ _ALL_CAMERAS = (*COLOUR_CAMERAS, "BW1", "BW2", "BW3", "BW4")
 _COLOUR_SIZE = (640, 480)
 _MM = 1e-3
 _HALF_MARKER = 7.0  # mm
+_FAR = 1e8  # no number of a calibration or an offset is as large
 
 PARTITIONS: dict[tuple[str, str], tuple[int, int, int]] = {
     ("S1", "Walking"): (6, 590, 1203), ("S1", "Jog"): (6, 367, 740),
@@ -204,11 +206,12 @@ def read_calibration(path: str | Path) -> PinholeCamera:
             f"{path}: numbers 11 to 19 must be a rotation matrix, got {R.tolist()}"
         )
     size = _COLOUR_SIZE if path.stem in COLOUR_CAMERAS else (None, None)
-    return PinholeCamera(
-        fx, fy, cx, cy, size[0], size[1], path.stem, skew=skew * fx, distortions=values[5:10],
-        rotation=cv2.Rodrigues(R)[0].ravel().tolist(),
-        translation=[_MM * t for t in values[19:]],
-    )  # fmt: skip
+    with reading(path, "a camera of HumanEva"):
+        return PinholeCamera(
+            fx, fy, cx, cy, size[0], size[1], path.stem, skew=skew * fx, distortions=values[5:10],
+            rotation=cv2.Rodrigues(R)[0].ravel().tolist(),
+            translation=[_MM * t for t in values[19:]],
+        )  # fmt: skip
 
 
 def read_stream_offset(path: str | Path) -> StreamOffset:
@@ -231,12 +234,13 @@ def _videos(folder: Path, name: str) -> tuple[Path, ...]:
 
 
 def _numbers(path: Path, count: int) -> list[float]:
-    try:
-        values = [float(word) for word in path.read_text(encoding="utf-8").split()]
-    except (UnicodeDecodeError, ValueError) as error:
-        raise FileFormatError(f"{path}: expected {count} numbers, but {error}") from error
-    if len(values) != count or not np.isfinite(values).all():
-        raise FileFormatError(f"{path}: expected {count} finite numbers, got {len(values)}")
+    text = read_text(path, f"{count} numbers")
+    with reading(path, f"{count} numbers"):
+        values = [float(word) for word in text.split()]
+    if len(values) != count or not (np.abs(values) < _FAR).all():
+        raise FileFormatError(
+            f"{path}: expected {count} finite numbers, got {len(values)} (none may be above {_FAR:g})"
+        )
     return values
 
 
@@ -341,11 +345,15 @@ def _measures(folder: Path, person: str) -> tuple[dict[str, float], list[str]]:
     if "shoulders" not in measures:
         notes.append("no Static.c3d: the torso's upper end is not corrected for its depth")
     path = folder / f"{person}.mp"
-    text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+    text = ""
+    if path.is_file():
+        with reading(path, "numbers of a person"):
+            text = path.read_text(encoding="utf-8", errors="replace")
     for key in SHOULDER_OFFSETS:
         match = re.search(rf"\$\S*{key}\s*=\s*([-+.\deE]+)", text)
         if match:
-            measures[key] = float(match[1])
+            with reading(path, f"a number of {key}"):
+                measures[key] = float(match[1])
         else:
             notes.append(f"no {key} in {path.name}: that upper arm is not corrected for it")
     return measures, notes

@@ -5,6 +5,7 @@ says so too.
 """
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,10 +14,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpose.errors import CameraError, FileFormatError, InputError, SkeletonError
-from torchpose.io.files import atomic_path, read_npz, require_file, write_npz
+from torchpose.errors import CameraError, FileFormatError, InputError, SkeletonError, check_rate
+from torchpose.io.fields import one_number, one_text, texts
+from torchpose.io.files import atomic_path, require_file, write_npz
 from torchpose.io.landmarks import derive_joints, lacks_joints
+from torchpose.io.npz import npz_keys, read_npz
 from torchpose.io.openpose import read_openpose
+from torchpose.io.raw_recording import numbers
+from torchpose.io.reading import check_span, read_text, reading
 from torchpose.joint_sets import canonical_names, identify_skeleton
 from torchpose.projection import check_intrinsics
 from torchpose.skeleton import NECK_KINDS
@@ -24,6 +29,8 @@ from torchpose.skeleton import NECK_KINDS
 __all__ = ["Keypoints", "read_keypoints", "write_keypoints"]
 
 _MAX_GAP = 100_000  # frames; a larger jump of the frame number is taken for a damaged file
+_LARGEST_IMAGE = 100_000  # pixels of a side
+_FAR = 1e9  # pixels; no keypoint is there
 
 
 @dataclass
@@ -99,9 +106,14 @@ def read_keypoints(path: str | Path) -> Keypoints:
         CameraError: a `K` that is no camera matrix.
     """
     path = Path(path)
-    if path.is_dir():
+    with reading(path, "keypoints"):
+        return _finish(path, _read(path))
+
+
+def _read(path: Path) -> _Raw:
+    if os.path.isdir(path):
         points, confidence, names = read_openpose(path)
-        return _finish(path, _Raw(points, names, confidence))
+        return _Raw(points, names, confidence)
     path = require_file(path)
     readers = {".npz": _read_npz, ".csv": _read_csv}
     if path.suffix.lower() not in readers:
@@ -109,7 +121,7 @@ def read_keypoints(path: str | Path) -> Keypoints:
             f"{path}: expected keypoints as .npz, .csv or a folder of OpenPose JSON files, got "
             f"{path.suffix or 'no suffix'}"
         )
-    return _finish(path, readers[path.suffix.lower()](path))
+    return readers[path.suffix.lower()](path)
 
 
 def write_keypoints(path: str | Path, keypoints: Keypoints) -> None:
@@ -135,30 +147,17 @@ def write_keypoints(path: str | Path, keypoints: Keypoints) -> None:
 
 
 def _read_npz(path: Path) -> _Raw:
-    arrays = read_npz(path)
-    if "keypoints" not in arrays and "joints2d" in arrays:
-        arrays["keypoints"] = arrays["joints2d"]
-        if "visibility" in arrays:
-            arrays.setdefault("confidence", arrays["visibility"])
-    for key in ("keypoints", "names"):
-        if key not in arrays:
-            found = ", ".join(sorted(arrays)) or "nothing"
-            raise FileFormatError(f"{path}: expected the key {key}, found {found}")
-    numbers = {}
-    for key in ("keypoints", "confidence", "fps", "K", "image_size"):
-        if key in arrays:
-            if arrays[key].dtype.kind not in "fiub":
-                raise FileFormatError(f"{path}: {key} must be numbers, got {arrays[key].dtype}")
-            numbers[key] = arrays[key].astype(np.float64)
-    names = tuple(str(n) for n in np.atleast_1d(arrays["names"]).ravel())
-    fps = numbers.get("fps")
-    if fps is not None and fps.size != 1:
-        raise FileFormatError(f"{path}: fps must be one number, got shape {list(fps.shape)}")
-    neck = str(arrays["neck"].item()) if "neck" in arrays and arrays["neck"].size == 1 else None
+    there = npz_keys(path)
+    landmarks = "keypoints" not in there and "joints2d" in there
+    points, seen = ("joints2d", "visibility") if landmarks else ("keypoints", "confidence")
+    arrays = read_npz(path, (points, "names"), (seen, "fps", "K", "image_size", "neck"))
+    given = {key: numbers(f"{path}: {key}", arrays[key])
+             for key in (points, seen, "K", "image_size") if key in arrays}  # fmt: skip
+    neck = one_text(path, "neck", arrays["neck"]) if "neck" in arrays else ""
     return _Raw(
-        numbers["keypoints"], names, numbers.get("confidence"),
-        None if fps is None else float(fps.item()),
-        numbers.get("K"), numbers.get("image_size"), neck or None,
+        given[points], texts(path, "names", arrays["names"]), given.get(seen),
+        one_number(path, "fps", arrays["fps"]) if "fps" in arrays else None,
+        given.get("K"), given.get("image_size"), neck or None,
     )  # fmt: skip
 
 
@@ -177,10 +176,7 @@ def _write_npz(path: Path, data: Keypoints) -> None:
 
 
 def _read_csv(path: Path) -> _Raw:
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path}: expected comma-separated text, got bytes") from error
+    lines = read_text(path, "comma-separated text").splitlines()
     notes = [line for line in lines if line.startswith("#")]
     rows = [(number, [cell.strip() for cell in line.split(",")])
             for number, line in enumerate(lines, start=1)
@@ -267,8 +263,10 @@ def _frames(
     path: Path, frames: np.ndarray, rows: list[tuple[int, list[str]]], repeated: bool
 ) -> tuple[np.ndarray, int]:
     """Row -> index of its frame, counted from the first one, and the number of frames."""
-    steps = np.diff(frames, prepend=frames[:1] - (not repeated))
-    bad = ~np.isfinite(frames) | (frames % 1 != 0) | (steps < (not repeated)) | (steps > _MAX_GAP)
+    with np.errstate(invalid="ignore"):  # of infinite ones
+        whole = np.isfinite(frames) & (frames % 1 == 0)
+        steps = np.diff(frames, prepend=frames[:1] - (not repeated))
+    bad = ~whole | (steps < (not repeated)) | (steps > _MAX_GAP)
     if bad.any():
         at = int(np.flatnonzero(bad)[0])
         raise FileFormatError(
@@ -276,7 +274,9 @@ def _frames(
             f"got {rows[at][1][0] or 'none'}"
         )
     index = (frames - frames[:1]).astype(int)
-    return index, int(index[-1]) + 1 if len(index) else 0
+    count = int(index[-1]) + 1 if len(index) else 0
+    check_span(path, count, len(np.unique(index)))
+    return index, count
 
 
 def _csv_notes(path: Path, notes: list[str]) -> tuple[float | None, list[float] | None]:
@@ -321,9 +321,12 @@ def _finish(path: Path, raw: _Raw) -> Keypoints:
         )
     if len(points) == 0:
         raise InputError(f"{path}: the sequence is empty; expected one frame or more")
-    if np.isinf(points).any():
-        frame = int(np.argwhere(np.isinf(points))[0, 0])
-        raise FileFormatError(f"{path}: keypoints must not be infinite, frame {frame}; use NaN")
+    far = np.abs(points) > _FAR
+    if far.any():
+        frame = int(np.argwhere(far)[0, 0])
+        raise FileFormatError(
+            f"{path}: keypoints must not be infinite or beyond {_FAR:g} pixels, frame {frame}; use NaN"
+        )
     try:
         canonical_names(names)
     except SkeletonError as error:
@@ -335,8 +338,10 @@ def _finish(path: Path, raw: _Raw) -> Keypoints:
         confidence = np.where(missing, 0.0, confidence)
     if missing.all():
         raise InputError(f"{path}: no keypoint is measured in any of {len(points)} frames")
-    if raw.fps is not None and not 0 < raw.fps < math.inf:
-        raise FileFormatError(f"{path}: fps must be positive, got {raw.fps}")
+    try:
+        fps = None if raw.fps is None else check_rate("fps", raw.fps)
+    except InputError as error:
+        raise FileFormatError(f"{path}: {error}") from error
     if raw.neck is not None and raw.neck not in NECK_KINDS:
         raise FileFormatError(
             f"{path}: neck must be one of {', '.join(NECK_KINDS)}, got {raw.neck!r}"
@@ -344,7 +349,7 @@ def _finish(path: Path, raw: _Raw) -> Keypoints:
     skeleton = identify_skeleton(names)
     keypoints = Keypoints(
         torch.from_numpy(np.where(missing[..., None], np.nan, points)), names,
-        None if raw.confidence is None else torch.from_numpy(confidence), raw.fps,
+        None if raw.confidence is None else torch.from_numpy(confidence), fps,
         _check_matrix(path, raw.K), _check_size(path, raw.image_size),
         raw.neck or (None if skeleton is None else skeleton.neck), path,
     )  # fmt: skip
@@ -394,6 +399,6 @@ def _check_size(path: Path, size: np.ndarray | Sequence[float] | None) -> tuple[
     if size is None:
         return None
     values = np.asarray(size, dtype=np.float64).ravel()
-    if values.size != 2 or not (np.isfinite(values).all() and (values >= 1).all()):
+    if values.size != 2 or not ((values >= 1) & (values <= _LARGEST_IMAGE)).all():
         raise FileFormatError(f"{path}: image_size must be (width, height), got {values.tolist()}")
     return int(values[0]), int(values[1])

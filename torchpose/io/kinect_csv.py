@@ -15,6 +15,7 @@ from torchpose.io.raw_recording import (
     frame_ranges,
     join_bodies,
 )
+from torchpose.io.reading import read_text
 from torchpose.joint_sets import SKELETONS, canonical_name
 
 __all__ = [
@@ -68,10 +69,7 @@ def read_kinect_csv(path: Path) -> list[RawRecording]:
     Raises:
         FileFormatError: another layout, a row of another length, time that does not increase.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path}: expected rows of numbers, got bytes") from error
+    lines = read_text(path, "rows of numbers").splitlines()
     rows = [(i, line) for i, line in enumerate(lines, start=1) if line.strip()]
     facts = dict(_fact(line) for _, line in rows if line.lstrip().startswith("#"))
     rows = [(i, line) for i, line in rows if not line.lstrip().startswith("#")]

@@ -7,6 +7,7 @@ import numpy as np
 from torchpose.errors import FileFormatError
 from torchpose.io.kinect_csv import KINECT_FPS, read_kinect_csv, split_row
 from torchpose.io.raw_recording import BodyFrame, RawRecording, join_bodies
+from torchpose.io.reading import read_text, reading
 from torchpose.joint_sets import SKELETONS
 
 __all__ = ["read_kinect_v1"]
@@ -27,10 +28,7 @@ def read_kinect_v1(path: Path) -> list[RawRecording]:
         FileFormatError: another layout, or a truncated file. The rows of MSR-Action3D are one: their
             joints have an order of their own, for which left and right are not documented.
     """
-    try:
-        lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path}: expected rows of numbers, got bytes") from error
+    lines = [line for line in read_text(path, "rows of numbers").splitlines() if line.strip()]
     lengths = {len(split_row(line)) for line in lines[:60]}
     if lengths <= {3, 4} and len(lines) >= len(_NAMES) and lengths:
         raise FileFormatError(
@@ -45,10 +43,12 @@ def read_kinect_v1(path: Path) -> list[RawRecording]:
 
 
 def _read_daily(path: Path, lines: list[str]) -> list[RawRecording]:
-    try:
+    with reading(path, "rows of numbers"):
         values = np.array([float(cell) for line in lines for cell in line.split()])
-    except ValueError as error:
-        raise FileFormatError(f"{path}: expected numbers ({error})") from error
+    if not np.isfinite(values).all():
+        raise FileFormatError(
+            f"{path}: expected finite numbers, got {values[~np.isfinite(values)][0]}"
+        )
     n_frames, place = int(values[0]), 2
     frames: list[BodyFrame] = []
     for frame in range(n_frames):

@@ -1,16 +1,34 @@
 """The common form of a recording, .npz, and the authors' OpenCV matrix, .yaml."""
 
-import math
+import re
 from pathlib import Path
 
 import numpy as np
 
-from torchpose.errors import FileFormatError, MissingDependencyError
-from torchpose.io.files import read_npz
+from torchpose.errors import FileFormatError
+from torchpose.io.fields import one_number, one_text, texts
+from torchpose.io.npz import read_npz
 from torchpose.io.raw_recording import RawRecording, numbers
+from torchpose.io.reading import read_text, reading
 from torchpose.joint_sets import UPPER_BODY
 
 __all__ = ["read_npz_recording", "read_opencv_recording"]
+
+_COLUMNS = 3 * len(UPPER_BODY)
+_KINDS = {
+    "u": "u1",
+    "c": "i1",
+    "w": "u2",
+    "s": "i2",
+    "i": "i4",
+    "f": "f4",
+    "d": "f8",
+}  # of one channel
+_DIGITS = 9  # of the number of rows
+# A matrix as OpenCV writes it. Its own parser is not used: it overflows its stack on nested brackets.
+_MATRIX = re.compile(
+    r"!!opencv-matrix\s+rows:\s*(\d+)\s+cols:\s*(\d+)\s+dt:\s*\"?(\w+)\"?\s+data:\s*\[([^\[\]]*)\]"
+)
 
 
 def read_npz_recording(path: Path) -> list[RawRecording]:
@@ -21,16 +39,11 @@ def read_npz_recording(path: Path) -> list[RawRecording]:
         optional=("fps", "subject", "action", "source", "axes", "weights"),
     )
     joints = numbers(f"{path}: joints", arrays["joints"])
-    names = tuple(str(n) for n in np.atleast_1d(arrays["names"]).ravel())
+    names = texts(path, "names", arrays["names"])
     weights = arrays.get("weights")
-    text = {key: str(arrays[key].item()) if key in arrays and arrays[key].size == 1 else ""
+    text = {key: one_text(path, key, arrays[key]) if key in arrays else ""
             for key in ("subject", "action", "source", "axes")}  # fmt: skip
-    fps = None
-    if "fps" in arrays:
-        value = numbers(f"{path}: fps", arrays["fps"])
-        if value.size != 1 or not 0 < float(value.item()) < math.inf:
-            raise FileFormatError(f"{path}: fps must be one positive number, got {value.tolist()}")
-        fps = float(value.item())
+    fps = one_number(path, "fps", arrays["fps"]) if "fps" in arrays else None
     return [
         RawRecording(
             path, joints, names, fps, text["axes"] or None, person=text["subject"],
@@ -44,38 +57,26 @@ def read_opencv_recording(path: Path) -> list[RawRecording]:
     """Read the authors' matrix of T x 24: the eight joints of the upper body in their order.
 
     Raises:
-        MissingDependencyError: OpenCV is not installed.
+        FileFormatError: not one such matrix in OpenCV's YAML.
     """
-    try:
-        import cv2
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"{path}: reading OpenCV files needs OpenCV; install opencv-python-headless"
-        ) from error
-    expected = f"an OpenCV FileStorage with one matrix of T x {3 * len(UPPER_BODY)}"
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path}: expected {expected}, got another kind of file") from error
-    if "opencv-matrix" not in text:  # OpenCV prints its own complaint about foreign files
-        raise FileFormatError(f"{path}: expected {expected}, found no matrix")
-    try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        nodes = [storage.getNode(key) for key in storage.root().keys()]  # noqa: SIM118
-        matrices = [node.mat() for node in nodes if node.isMap()]
-        storage.release()
-    except (cv2.error, SystemError) as error:
-        raise FileFormatError(
-            f"{path}: expected {expected}; it is truncated or damaged ({_first_line(error)})"
-        ) from error
-    if len(matrices) != 1 or matrices[0] is None or matrices[0].shape[1:] != (3 * len(UPPER_BODY),):
-        shapes = [None if m is None else m.shape for m in matrices]
+    expected = f"an OpenCV FileStorage with one matrix of T x {_COLUMNS}"
+    text = read_text(path, expected)
+    found = [match.groups() for match in _MATRIX.finditer(text)]
+    shapes = [(rows, columns) for rows, columns, _, _ in found]
+    if len(found) != 1 or shapes[0][1] != str(_COLUMNS):
         raise FileFormatError(f"{path}: expected {expected}, got matrices of {shapes}")
-    joints = matrices[0].reshape(-1, len(UPPER_BODY), 3)
+    rows, _, kind, data = found[0]
+    with reading(path, expected):
+        cells = [cell.strip().lower().replace(".nan", "nan").replace(".inf", "inf")
+                 for cell in data.split(",")]  # fmt: skip
+        values = np.array([float(cell) for cell in cells if cell])
+    if kind not in _KINDS or str(len(values)) != str(_COLUMNS * int(rows[:_DIGITS])):
+        raise FileFormatError(
+            f"{path}: expected {expected} of numbers, got {len(values)} of the kind {kind!r} for "
+            f"{rows} rows"
+        )
+    with np.errstate(over="ignore"):  # what does not fit is infinite, and refused as that
+        kept = values.astype(_KINDS[kind]).astype(np.float64)
+    joints = kept.reshape(-1, len(UPPER_BODY), 3)
     # the source states no rate; Kinect v1 records 30 frames per second
     return [RawRecording(path, joints, UPPER_BODY, 30.0, "camera")]
-
-
-def _first_line(error: BaseException) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[0] if lines else type(error).__name__

@@ -7,12 +7,14 @@ import numpy as np
 
 from torchpose.errors import FileFormatError
 from torchpose.io.raw_recording import SENSOR_WEIGHTS, BodyFrame, RawRecording, join_bodies
+from torchpose.io.reading import read_text
 from torchpose.joint_sets import SKELETONS
 
 __all__ = ["read_ntu_skeleton"]
 
 _NAMES = SKELETONS["kinect-v2-25"].joints
 _FPS = 30.0
+_DIGITS = 9  # of the number of frames, bodies or joints
 _JOINT_NUMBERS = 12  # x, y, z, pixels in two images, quaternion, tracking state
 _FILE_NAME = re.compile(r"S\d{3}C\d{3}(P\d{3})R\d{3}(A\d{3})")
 
@@ -27,10 +29,7 @@ def read_ntu_skeleton(path: Path) -> list[RawRecording]:
     Raises:
         FileFormatError: truncated, or another kind of file; line and frame are named.
     """
-    try:
-        lines = path.read_text(encoding="ascii").split("\n")
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path}: expected an NTU skeleton file, got bytes") from error
+    lines = read_text(path, "an NTU skeleton file", "ascii").split("\n")
     reader = _Lines(path, lines)
     n_frames = reader.count("the number of frames")
     frames = [body for frame in range(n_frames) for body in _read_frame(reader, frame)]
@@ -63,7 +62,7 @@ class _Lines:
 
     def count(self, what: str) -> int:
         cells = self.cells(what)
-        if len(cells) != 1 or not cells[0].isdigit():
+        if len(cells) != 1 or not cells[0].isdigit() or len(cells[0]) > _DIGITS:
             got = " ".join(cells)[:40]
             raise FileFormatError(f"{self.path}, line {self.place}: expected {what}, got {got!r}")
         return int(cells[0])

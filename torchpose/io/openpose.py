@@ -6,20 +6,21 @@ the keypoints that both have); where nothing can be compared, again the one of l
 confidence. An empty list of people is a frame without measurements.
 """
 
-import json
 import re
 from pathlib import Path
 
 import numpy as np
 
 from torchpose.errors import FileFormatError, InputError
+from torchpose.io.reading import check_span, read_json, reading
 from torchpose.joint_sets import SKELETONS
 
 __all__ = ["read_openpose"]
 
 _SUFFIX = "_keypoints.json"
 _LAYOUTS = {25: SKELETONS["openpose-25"].joints, 18: SKELETONS["openpose-18"].joints}
-_MAX_FRAMES = 10_000_000
+_EXPECTED = "OpenPose's JSON with people / pose_keypoints_2d"
+_FAR = 1e9  # pixels; no keypoint is there
 
 
 def read_openpose(folder: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
@@ -62,7 +63,8 @@ def read_openpose(folder: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[str
 
 
 def _files_by_frame(folder: Path) -> dict[int, Path]:
-    files = sorted(folder.glob(f"*{_SUFFIX}"))
+    with reading(folder, "a folder"):
+        files = sorted(folder.glob(f"*{_SUFFIX}"))
     if not files:
         raise InputError(f"{folder}: expected OpenPose files *{_SUFFIX}, found none")
     found = [re.search(r"(\d+)$", path.name.removesuffix(_SUFFIX)) for path in files]
@@ -71,32 +73,24 @@ def _files_by_frame(folder: Path) -> dict[int, Path]:
         return dict(enumerate(files))
     if len(set(numbers)) < len(files):
         raise FileFormatError(f"{folder}: two files have one frame number; expected one video")
-    if max(numbers) - min(numbers) > _MAX_FRAMES:
-        raise FileFormatError(
-            f"{folder}: frame numbers from {min(numbers)} to {max(numbers)} are no single video"
-        )
+    check_span(folder, max(numbers) - min(numbers) + 1, len(numbers))
     return dict(zip(numbers, files, strict=True))
 
 
 def _people(path: Path) -> list[np.ndarray]:
     """Keypoints [J, 3] (u, v, confidence) of everybody in one file, without empty ones."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+    content = read_json(path, _EXPECTED)
+    with reading(path, _EXPECTED):
         listed = content["people"]
         flat = [p["pose_keypoints_2d"] if "pose_keypoints_2d" in p else p["pose_keypoints"]
                 for p in listed]  # fmt: skip
         arrays = [np.asarray(values, dtype=np.float64) for values in flat]
-    except (ValueError, KeyError, TypeError) as error:
-        raise FileFormatError(
-            f"{path}: expected OpenPose's people / pose_keypoints_2d; it is truncated or of another "
-            f"kind ({type(error).__name__}: {error})"
-        ) from error
     people = []
     for array in arrays:
-        if array.ndim != 1 or array.size % 3 or not np.isfinite(array).all():
+        if array.ndim != 1 or array.size % 3 or not (np.abs(array) < _FAR).all():
             raise FileFormatError(
-                f"{path}: pose_keypoints_2d must be x, y, confidence of each keypoint, finite; got "
-                f"{array.size} values"
+                f"{path}: pose_keypoints_2d must be x, y, confidence of each keypoint, below {_FAR:g}; "
+                f"got {array.size} values"
             )
         if array.size and (array[2::3] > 0).any():
             people.append(array.reshape(-1, 3))

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torchpose.errors import FileFormatError
+from torchpose.io.reading import check_span
 
 __all__ = ["SENSOR_WEIGHTS", "BodyFrame", "RawRecording", "frame_ranges", "join_bodies", "numbers"]
 
@@ -129,6 +130,8 @@ def join_bodies(
         else:
             people.append(dict(bodies[body]))
             numbers_of.append([body])
+    spans = sum(max(seen) - min(seen) + 1 for seen in people)
+    check_span(path, spans, len(frames))
     return [
         _one_person(path, seen, names, fps, which, numbers_of[which], n_frames, facts)
         for which, seen in enumerate(people)

@@ -5,7 +5,6 @@ One file per format reads what a file holds; here it is checked and converted.
 """
 
 import re
-import zipfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpose.errors import FileFormatError, InputError, SkeletonError
+from torchpose.errors import FileFormatError, InputError, SkeletonError, check_rate
 from torchpose.io.axes import axes_rotation, check_upright, default_axes
 from torchpose.io.azure_json import read_azure_json
 from torchpose.io.bvh_recordings import read_bvh
@@ -22,9 +21,11 @@ from torchpose.io.c3d_recordings import read_c3d
 from torchpose.io.files import require_file
 from torchpose.io.kinect_csv import ROW_LENGTHS, header_joints, read_kinect_csv, split_row
 from torchpose.io.kinect_v1 import read_kinect_v1
+from torchpose.io.npz import npz_keys
 from torchpose.io.npz_recordings import read_npz_recording, read_opencv_recording
 from torchpose.io.ntu_skeleton import read_ntu_skeleton
 from torchpose.io.raw_recording import RawRecording, frame_ranges
+from torchpose.io.reading import reading
 from torchpose.io.units import body_unit
 from torchpose.joint_sets import canonical_names, identify_skeleton
 from torchpose.skeleton import UpperBody, to_upper_body
@@ -46,6 +47,7 @@ _SUFFIXES = tuple(_READERS)
 _SNIFFED = 65536  # bytes from the start of a file that tell whether it is a recording
 _BESIDE_BODY = 0.3  # of its size: how far outside its other joints a centred body's origin may be
 _SHOWN_JOINTS = 3
+_FAR = 1e9  # in the unit of the file; no joint is there
 
 
 @dataclass
@@ -134,6 +136,13 @@ def read_recording(path: str | Path, axes: str | None = None) -> list[Recording]
         raise FileFormatError(
             f"{path}: expected one of {', '.join(_SUFFIXES)}, got {path.suffix or 'no suffix'}"
         )
+    with reading(path, "a recording of 3D joints"):
+        return _read_recording(path, reader, axes)
+
+
+def _read_recording(
+    path: Path, reader: Callable[[Path], list[RawRecording]], axes: str | None
+) -> list[Recording]:
     found = reader(path)
     if not found:
         raise InputError(f"{path}: nobody is in any frame; expected a body in some")
@@ -204,14 +213,13 @@ def _recordings_in(folder: Path) -> list[Path]:
 
 def _may_hold_joints(path: Path) -> bool:
     try:
-        with zipfile.ZipFile(path) as archive:
-            return {"joints.npy", "names.npy"} <= set(archive.namelist())
-    except (zipfile.BadZipFile, OSError):
+        return {"joints", "names"} <= set(npz_keys(path))
+    except (FileFormatError, InputError):
         return True  # reading it gives the error
 
 
 def _looks_recorded(path: Path) -> bool:
-    with path.open("rb") as stream:
+    with reading(path, "a recording"), path.open("rb") as stream:
         start = stream.read(_SNIFFED).decode("utf-8-sig", "replace")
     suffix = path.suffix.lower()
     if suffix in (".csv", ".txt"):
@@ -235,6 +243,10 @@ def _finish(raw: RawRecording, axes: str | None) -> Recording:
     """Check what was read and turn it into metres and camera axes."""
     where = raw.where()
     _check_shapes(raw)
+    try:
+        fps = None if raw.fps is None else check_rate("fps", raw.fps)
+    except InputError as error:
+        raise FileFormatError(f"{where}: {error}") from error
     try:
         canonical_names(raw.names)
     except SkeletonError as error:
@@ -263,7 +275,7 @@ def _finish(raw: RawRecording, axes: str | None) -> Recording:
     if raw.weights is not None:
         weights = torch.from_numpy(np.where(np.isnan(joints).any(-1), 0.0, raw.weights))
     return Recording(
-        tensor, raw.names, raw.fps, raw.person, raw.action, raw.source, raw.path, weights,
+        tensor, raw.names, fps, raw.person, raw.action, raw.source, raw.path, weights,
         "" if skeleton is None else skeleton.name, rotation, tuple(notes), raw.companion,
         raw.first_frame,
     )  # fmt: skip
@@ -278,11 +290,12 @@ def _check_shapes(raw: RawRecording) -> None:
         )
     if len(joints) == 0:
         raise InputError(f"{where}: the sequence is empty; expected one frame or more")
-    if np.isinf(joints).any():
-        frame, joint = np.argwhere(np.isinf(joints))[0, :2]
+    far = np.abs(joints) > _FAR
+    if far.any():
+        frame, joint = np.argwhere(far)[0, :2]
         raise FileFormatError(
-            f"{where}: joints must not be infinite, frame {raw.first_frame + frame} is "
-            f"({raw.names[joint]}); use NaN for what is missing"
+            f"{where}: joints must not be infinite or beyond {_FAR:g}, frame {raw.first_frame + frame} "
+            f"is ({raw.names[joint]}); use NaN for what is missing"
         )
     if np.isnan(joints).all():
         raise InputError(f"{where}: every joint is NaN; expected some that are measured")
