@@ -16,11 +16,15 @@ def poses(n_frames, seed=0, failed_at=-1):
     def draw(*shape):
         return torch.randn(1, n_frames, *shape, generator=generator, dtype=torch.float64)
 
+    def spread(dim):
+        factor = draw(8, dim, dim)
+        return factor @ factor.mT
+
     return PoseTrack(
         draw(8, 2),
         draw(8, 3),
-        draw(8, 2, 2),
-        draw(8, 3, 3),
+        spread(2),
+        spread(3),
         draw(8) > 0,
         draw(2),
         torch.tensor([n_frames]),

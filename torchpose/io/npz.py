@@ -62,7 +62,8 @@ def read_npz(
     missing = [key for key in required if key not in there]
     if missing:
         found = ", ".join(sorted(there)) or "nothing"
-        raise FileFormatError(f"{path}: expected the keys {', '.join(missing)}, found {found}")
+        words = "key" if len(missing) == 1 else "keys"
+        raise FileFormatError(f"{path}: expected the {words} {', '.join(missing)}, found {found}")
     with reading(path, _EXPECTED), zipfile.ZipFile(path) as archive:
         members = _members(archive)
         size = sum(_checked_size(path, archive, key, members[key]) for key in keys)
