@@ -216,4 +216,4 @@ def _in_order(parts: list[tuple[Tensor, Tensor]]) -> Tensor:
     """Values of all frames, in the order of the frames."""
     rows = torch.cat([rows for rows, _ in parts])
     values = torch.cat([values for _, values in parts])
-    return torch.empty_like(values).index_copy(0, rows, values)
+    return values.index_select(0, rows.argsort())

@@ -1,5 +1,6 @@
 """Results whose gradients are computed from their arguments anew, so that little is kept for them."""
 
+import threading
 import weakref
 from collections.abc import Callable
 from typing import TypeVar
@@ -11,6 +12,9 @@ from torch.autograd.graph import saved_tensors_hooks
 __all__ = ["recomputed", "wants_gradient"]
 
 _Result = TypeVar("_Result")
+# What was computed anew last, in each thread. Outputs that the gradient does not ask for leave some of
+# it over, which is dropped when the next function is called again: backward takes one after the other.
+_latest = threading.local()
 
 
 def wants_gradient(*tensors: Tensor) -> bool:
@@ -39,6 +43,8 @@ def recomputed(function: Callable[..., _Result], *arguments: object) -> _Result:
 
     def fetch(slot: _Slot) -> Tensor:
         if slot not in values:
+            getattr(_latest, "values", values).clear()
+            _latest.values = values
             waiting = iter(slots)
             with (
                 torch.enable_grad(),
