@@ -148,3 +148,31 @@ def test_lengths_hold_the_last_estimate_without_memory_too():
     torch.testing.assert_close(out.mean[1, :3], alone.mean[0])
     torch.testing.assert_close(out.cov[1, 3:], alone.cov[0, -1:].expand(4, -1, -1))
     assert not out.log_evidence[1, 3:].any()
+
+
+@pytest.mark.parametrize("kind", ["the filter's", "given", "of every frame"])
+def test_gradients_of_many_frames_without_memory_reach_prior_and_noise(kind):
+    """More frames than are computed anew at a time, of two patterns that share their gains."""
+    model, z, _ = problem(batch=2, n_frames=70, missing=0.0)
+    weights, means, covs, noise = (tensor(value) for value in model)
+    mask = torch.ones(z.shape, dtype=torch.bool)
+    mask[:, ::3, 0] = False
+    log_pi, z = weights.log(), tensor(z)
+    pull = torch.randn(2, 70, DIM, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def total(log_pi, means, factor, scale, z):
+        mixture = GaussianMixture(log_pi.softmax(0), means, factor @ factor.mT)
+        r = scale * noise
+        if kind == "of every frame":
+            r = r * (1 + 0.1 * torch.arange(70, dtype=z.dtype))[:, None, None].expand(2, 70, 1, 1)
+        f = MixtureKalmanFilter(
+            mixture, torch.ones(DIM), noise, OBSERVED, transition="ou", gamma=0.0,
+            likelihood_power=POWER, weighting="frame", medians=[1],
+        )  # fmt: skip
+        out = f(z, mask, None if kind == "the filter's" else r, return_cov=True)
+        return (out.mean * pull).sum() + out.log_evidence.sum() + out.cov.sum()
+
+    inputs = [log_pi, means, torch.linalg.cholesky(covs), tensor(1.3), z]
+    leaves = [value.clone().requires_grad_() for value in inputs]
+    leaves[3].requires_grad_(kind != "the filter's")
+    assert torch.autograd.gradcheck(total, leaves, atol=1e-4, rtol=1e-4, fast_mode=True)

@@ -63,7 +63,8 @@ def frame_log_likelihood(
     model: "MixtureKalmanFilter", frames: Measurements
 ) -> Float[Tensor, "B T M"]:
     """log N(z_t; H mu_j, H Sigma_j H^T + R) of the measured dimensions of every frame."""
-    found = [(group.rows, _condition(model, group)[1]) for group in _groups(frames, _SHARED_FRAMES)]
+    groups = _groups(frames, _SHARED_FRAMES)
+    found = [(group.rows, _condition(model, group, _gain(model, group))[1]) for group in groups]
     return _in_order(found).unflatten(0, frames.z.shape[:2])
 
 
@@ -76,10 +77,10 @@ def run_memoryless(
     parts: list[list[tuple[Tensor, Tensor]]] = [[], [], [], []]
     bar = tqdm(total=batch * n_frames, disable=not progress, unit="frame")
     for group in _groups(frames, _RECOMPUTED_FRAMES if learning else _SHARED_FRAMES):
-        if learning:
-            values = recomputed(_estimate, model, group, return_cov)
-        else:
-            values = _estimate(model, group, return_cov)
+        # Gains that groups share are not among what a gradient computes anew for one of them.
+        gain = _gain(model, group) if group.shares_gain else None
+        arguments = model, group, gain, return_cov
+        values = recomputed(_estimate, *arguments) if learning else _estimate(*arguments)
         for part, value in zip(parts, values, strict=True):
             if value is not None:
                 part.append((group.rows, value))
@@ -93,11 +94,14 @@ def run_memoryless(
 
 
 def _estimate(
-    model: "MixtureKalmanFilter", group: "_Group", return_cov: bool
+    model: "MixtureKalmanFilter",
+    group: "_Group",
+    gain: tuple[Gain, Tensor] | None,
+    return_cov: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     """Estimates, log-weights, log-evidence and covariances of a group of frames."""
     log_prior, power = model.log_prior.to(model.dtype), model.likelihood_power
-    means, log_likelihood, cov = _condition(model, group)
+    means, log_likelihood, cov = _condition(model, group, gain or _gain(model, group))
     log_weights, evidence = frame_weights(log_prior, log_likelihood, log_likelihood, power)
     measured = group.mask.any(-1).squeeze(-1)
     evidence = torch.where(measured, evidence, torch.zeros_like(evidence))
@@ -130,6 +134,11 @@ class _Group(NamedTuple):
     mask: Tensor
     noise: Tensor
 
+    @property
+    def shares_gain(self) -> bool:
+        """Whether all frames have one gain."""
+        return self.mask.ndim == 1
+
 
 def _groups(frames: Measurements, at_a_time: int) -> Iterator[_Group]:
     """Frames that measure the same dimensions with the same noise share their gains."""
@@ -156,12 +165,14 @@ def _groups_of_own(z: Tensor, mask: Tensor, noise: Tensor) -> Iterator[_Group]:
         yield _Group(rows, z[rows], mask[rows][:, None], noise[rows][:, None])
 
 
-def _condition(model: "MixtureKalmanFilter", group: _Group) -> tuple[Tensor, Tensor, Tensor]:
+def _condition(
+    model: "MixtureKalmanFilter", group: _Group, gain_and_cov: tuple[Gain, Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
     """Every component given a frame: means [N, M, D], log-likelihoods [N, M], covariances."""
-    gain, cov = _gain(model, group)
+    gain, cov = gain_and_cov
     centres = model.means.to(model.dtype)
     residual = (group.z[:, None] - centres[:, model.observed]) * group.mask
-    if group.mask.ndim == 1:
+    if group.shares_gain:
         white = torch.linalg.solve_triangular(gain.factor, residual.permute(1, 2, 0), upper=False)
         means = (centres[:, None] + white.mT @ gain.white).transpose(0, 1)
         return means, (gain.log_norm[:, None] - 0.5 * white.square().sum(1)).mT, cov
@@ -172,13 +183,13 @@ def _condition(model: "MixtureKalmanFilter", group: _Group) -> tuple[Tensor, Ten
 
 def _gain(model: "MixtureKalmanFilter", group: _Group) -> tuple[Gain, Tensor]:
     """Gain and covariance of every component; those of a shared pattern are kept for later frames."""
-    if group.mask.ndim == 1:
+    if group.shares_gain:
         found = model.frame_gains.get(group.noise, group.mask)
         if found is not None:
             return found
     gain, cov = kalman_gain(model.covariances, group.noise, model.observed, group.mask)
     gain = Gain(*(part.to(model.dtype) for part in gain))
-    if group.mask.ndim == 1:
+    if group.shares_gain:
         model.frame_gains.put(group.noise, group.mask, (gain, cov))
     return gain, cov
 

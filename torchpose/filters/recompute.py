@@ -2,7 +2,7 @@
 
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 import torch
@@ -36,8 +36,8 @@ def recomputed(function: Callable[..., _Result], *arguments: object) -> _Result:
     slots: list[weakref.ref[_Slot]] = []
     values: weakref.WeakKeyDictionary[_Slot, Tensor] = weakref.WeakKeyDictionary()
 
-    def reserve(_: Tensor) -> _Slot:
-        slot = _Slot()
+    def reserve(value: Tensor) -> _Slot:
+        slot = _Slot(value.shape)
         slots.append(weakref.ref(slot))
         return slot
 
@@ -46,16 +46,17 @@ def recomputed(function: Callable[..., _Result], *arguments: object) -> _Result:
             getattr(_latest, "values", values).clear()
             _latest.values = values
             waiting = iter(slots)
-            with (
-                torch.enable_grad(),
-                saved_tensors_hooks(lambda x: keep(next(waiting)(), x), _refuse),
-            ):
+            with torch.enable_grad(), saved_tensors_hooks(lambda x: keep(waiting, x), _refuse):
                 function(*arguments)
         return values.pop(slot)
 
-    def keep(slot: _Slot | None, value: Tensor) -> None:
-        if slot is not None:
-            values[slot] = value.detach()
+    def keep(waiting: Iterator[weakref.ref[_Slot]], value: Tensor) -> None:
+        slot = next(waiting)()
+        if slot is None:
+            return
+        if slot.shape != value.shape:
+            raise RuntimeError("a recomputed function did something else the second time")
+        values[slot] = value.detach()
 
     with saved_tensors_hooks(reserve, fetch):
         return function(*arguments)
@@ -63,6 +64,9 @@ def recomputed(function: Callable[..., _Result], *arguments: object) -> _Result:
 
 class _Slot:
     """The place of a tensor that a gradient needs; it lives as long as the graph of that gradient."""
+
+    def __init__(self, shape: torch.Size) -> None:
+        self.shape = shape
 
 
 def _refuse(_: None) -> Tensor:
