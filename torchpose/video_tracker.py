@@ -21,6 +21,7 @@ from torchpose.measure.upper_body import (
     MeasurerState,
     UpperBodyMeasurer,
 )
+from torchpose.module_state import derived
 from torchpose.person_stream import Measured, PersonStream, PersonStreamState, measured_of
 from torchpose.pose_track import PoseTrack
 from torchpose.priors.upper_body import UpperBodyPrior
@@ -113,16 +114,32 @@ class VideoTracker(nn.Module):
             raise InputError(f"candidates need hands='grid', got {hands!r}")
         self.candidates = candidates
         smoothing = options.pop("smoothing", None)
-        self.tracker = UpperBodyTracker(prior, camera, fps=fps, max_gap=None, **options)
-        self.smoother = None
-        if smoothing is not None:
-            self.smoother = UpperBodyTracker(
-                prior, camera, fps=fps, max_gap=None, smoothing=smoothing, **options
-            )
+        tracker = UpperBodyTracker(prior, camera, fps=fps, max_gap=None, **options)
         association = HandAssociation() if edges else None
-        self.stream = PersonStream(self.tracker, self.measurer.names, seed, association)
+        self.stream = PersonStream(tracker, self.measurer.names, seed, association)
+        self.smoothing = smoothing
+        self._options = {"fps": fps, "max_gap": None, **options}
+        _ = self.smoother  # raises what does not fit before any work
         self.fps = float(fps)
         self.gap = sys.maxsize if max_gap is None else round(max_gap * fps)
+
+    @property
+    def tracker(self) -> UpperBodyTracker:
+        """The tracker of every person's poses."""
+        return self.stream.tracker
+
+    @property
+    def smoother(self) -> UpperBodyTracker | None:
+        """The tracker of whole recordings, on the same prior and camera; None without smoothing."""
+        if self.smoothing is None:
+            return None
+        own = self.tracker
+        given = self._options | own._given_options()
+        given |= {"measurement_std": own.measurement_std, "smoothing": self.smoothing}
+        sources = (*own.parameters(), *own.buffers())
+        return derived(
+            self, "smoother", sources, lambda: UpperBodyTracker(own.prior, own.camera, **given)
+        )
 
     def init(self) -> VideoState:
         """Nobody was seen yet."""

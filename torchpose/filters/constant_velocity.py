@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from torchpose.errors import InputError, check_shape
 from torchpose.gaussian import kalman_gain, safe_cholesky, symmetrise
+from torchpose.module_state import derived
 
 __all__ = ["ConstantVelocityFilter", "ConstantVelocityState"]
 
@@ -25,6 +26,14 @@ class ConstantVelocityState(NamedTuple):
 
     mean: Tensor
     time: int
+
+
+class _Gains(NamedTuple):
+    """The motion matrix [2, 2], and gains frame by frame: filter [S, 2], smoother [S, 2, 2]."""
+
+    matrix: Tensor
+    filter: Tensor
+    smoother: Tensor
 
 
 class ConstantVelocityFilter(nn.Module):
@@ -58,18 +67,21 @@ class ConstantVelocityFilter(nn.Module):
         for name, value in (("ratio", ratio), ("fps", fps)):
             if not 0 < value < float("inf"):
                 raise InputError(f"{name} must be positive and finite, got {value}")
-        self.ratio, self.fps = float(ratio), float(fps)
-        dt = 1.0 / self.fps
+        for name, value in (("ratio", ratio), ("fps", fps)):
+            self.register_buffer(name, torch.tensor(float(value), dtype=torch.float64))
+
+    ratio: Tensor
+    fps: Tensor
+
+    def _gains(self) -> "_Gains":
+        return derived(self, "gains", (self.ratio, self.fps), self._make_gains)
+
+    def _make_gains(self) -> "_Gains":
+        dt = 1.0 / float(self.fps)
         matrix = torch.tensor([[1.0, dt], [0.0, 1.0]], dtype=torch.float64)
         noise = torch.tensor([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], dtype=torch.float64)
-        gains, smoother = _riccati(matrix, self.ratio * noise)
-        self.register_buffer("matrix", matrix)
-        self.register_buffer("gains", gains)
-        self.register_buffer("smoother_gains", smoother)
-
-    matrix: Tensor
-    gains: Tensor
-    smoother_gains: Tensor
+        gains = _riccati(matrix, float(self.ratio) * noise)
+        return _Gains(*(part.to(self.ratio.device) for part in (matrix, *gains)))
 
     def init(self, z: Float[Tensor, "B N"]) -> ConstantVelocityState:
         """The state before the first frame, whose values are `z`."""
@@ -93,8 +105,9 @@ class ConstantVelocityFilter(nn.Module):
         self, state: ConstantVelocityState, z: Tensor
     ) -> tuple[ConstantVelocityState, Tensor]:
         """The next state, and by how much it differs from its prediction [B, 2, N]."""
-        predicted = state.mean if state.time == 0 else self.matrix.to(state.mean) @ state.mean
-        gain = self.gains[min(state.time, len(self.gains) - 1)].to(z)
+        known = self._gains()
+        predicted = state.mean if state.time == 0 else known.matrix.to(state.mean) @ state.mean
+        gain = known.filter[min(state.time, len(known.filter) - 1)].to(z)
         correction = gain[:, None] * (z - predicted[:, 0])[:, None]
         return ConstantVelocityState(predicted + correction, state.time + 1), correction
 
@@ -138,7 +151,8 @@ class ConstantVelocityFilter(nn.Module):
         if lengths is None:
             lengths = torch.full((len(z),), n_frames, device=z.device)
         later = (frames + 1 < lengths[:, None])[..., None, None]
-        gains = self.smoother_gains[frames.clamp(max=len(self.smoother_gains) - 1)].to(z)
+        known = self._gains().smoother
+        gains = known[frames.clamp(max=len(known) - 1)].to(z)
         change = torch.zeros_like(means)
         if lag is None or lag >= n_frames - 1:
             for t in range(n_frames - 2, -1, -1):
@@ -152,7 +166,7 @@ class ConstantVelocityFilter(nn.Module):
 
     def extra_repr(self) -> str:
         """Settings, for printing."""
-        return f"ratio={self.ratio:g}, fps={self.fps:g}"
+        return f"ratio={float(self.ratio):g}, fps={float(self.fps):g}"
 
 
 def _riccati(matrix: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:

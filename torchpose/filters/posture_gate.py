@@ -59,7 +59,7 @@ class PostureGate(nn.Module):
             )
         check_gate_width(width)
         if posture_body is None:
-            posture_body = body
+            posture_body = deepcopy(body)  # that of the filter has its own place in the state
         elif posture_body.skeleton != body.skeleton:
             raise SkeletonError(
                 f"expected a posture_body of skeleton {body.skeleton.name!r}, got "

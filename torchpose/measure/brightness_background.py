@@ -1,8 +1,8 @@
 """Foreground, shadow and highlight by brightness and chromaticity against a learnt background."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -90,6 +90,7 @@ class BrightnessBackground(nn.Module):
         self.chromaticity, self.brightness, self.darkest = chromaticity, brightness, darkest
         for name in ("mean", "std", "brightness_rms", "chromaticity_rms"):
             self.register_buffer(name, torch.empty(0))
+        self.register_load_state_dict_pre_hook(_make_room)
 
     def fit(self, frames: UInt8[Tensor, "N 3 H W"]) -> "BrightnessBackground":
         """Learn an empty scene from one frame or more; some tens are better.
@@ -176,3 +177,11 @@ def _sum(parts: Iterable[Tensor]) -> Tensor:
     if total is None:
         raise InputError("frames must hold at least one frame of the empty scene, got none")
     return total
+
+
+def _make_room(module: nn.Module, state_dict: Mapping[str, Any], prefix: str, *_: object) -> None:
+    """Give buffers the size of those to be loaded: a scene has the size of its images."""
+    for name, buffer in module.named_buffers(recurse=False):
+        loaded = state_dict.get(prefix + name)
+        if isinstance(loaded, Tensor):
+            setattr(module, name, buffer.new_empty(loaded.shape))

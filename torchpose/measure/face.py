@@ -4,7 +4,7 @@ A detector misses faces and sees some where there are none. Tracks bridge the fi
 once they have lasted, which the second rarely do.
 """
 
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -58,6 +58,19 @@ class FaceDetector(Protocol):
         ...
 
 
+def _frontal_faces() -> Any:
+    """OpenCV's cascade for frontal faces."""
+    import cv2
+
+    path = f"{cv2.data.haarcascades}haarcascade_frontalface_default.xml"  # type: ignore[attr-defined]
+    cascade = cv2.CascadeClassifier(path)
+    if cascade.empty():
+        raise InputError(
+            f"{path}: expected OpenCV's face cascade; install opencv-python-headless>=4.10,<5"
+        )
+    return cascade
+
+
 class HaarFaceDetector:
     """The cascade of Viola & Jones that comes with OpenCV, for frontal faces.
 
@@ -75,25 +88,25 @@ class HaarFaceDetector:
     def __init__(
         self, scale_factor: float = 1.1, min_neighbours: int = 3, min_size: int = 40
     ) -> None:
-        import cv2
-
         if not scale_factor > 1 or min_neighbours < 0 or min_size < 1:
             raise InputError(
                 "scale_factor must be above 1, min_neighbours at least 0 and min_size at least 1, "
                 f"got {scale_factor}, {min_neighbours} and {min_size}"
-            )
-        folder = cv2.data.haarcascades  # type: ignore[attr-defined]
-        path = folder + "haarcascade_frontalface_default.xml"
-        self._cascade = cv2.CascadeClassifier(path)
-        if self._cascade.empty():
-            raise InputError(
-                f"{path}: expected OpenCV's face cascade; install opencv-python-headless>=4.10,<5"
             )
         self.scale_factor, self.min_neighbours, self.min_size = (
             scale_factor,
             min_neighbours,
             min_size,
         )
+        self._cascade = _frontal_faces()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {
+            "_cascade": None
+        }  # OpenCV's classifier can be neither copied nor pickled
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__ = state | {"_cascade": _frontal_faces()}
 
     def __call__(self, image: Image, region: Region | None = None) -> Float[Tensor, "N 3"]:
         """See `FaceDetector`."""

@@ -3,7 +3,6 @@
 from torchpose.priors.action_bank import ActionBank
 from torchpose.priors.action_space import ActionInfo, ActionSpace
 from torchpose.priors.arm_state import arm_state, arm_states, mirror_arm_state, mirror_mixture
-from torchpose.priors.density import FastMixtureDensity
 from torchpose.priors.em import (
     FitReport,
     MixtureParameters,
@@ -39,7 +38,6 @@ __all__ = [
     "ActionSpace",
     "BackConstrainedGPLVM",
     "ConditionedMixture",
-    "FastMixtureDensity",
     "FitReport",
     "GaussianMixture",
     "ManifoldInfo",

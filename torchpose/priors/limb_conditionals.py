@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -19,6 +19,7 @@ from torchpose.body.kinematics import Body, centres_of
 from torchpose.body.quaternion_vectors import compose, conjugate, vector_to_quaternion
 from torchpose.body.skeleton import BodySkeleton
 from torchpose.errors import InputError, PriorError, check_finite, check_shape
+from torchpose.module_state import derived, register_given
 from torchpose.priors.tensor_file import FileKind, read_tensors, write_tensors
 from torchpose.rotation_gaussians import (
     fit_gaussian,
@@ -88,6 +89,13 @@ _KIND = FileKind(
 )  # fmt: skip
 
 
+class _Products(NamedTuple):
+    """Of quaternions, for messages along every edge; see `LimbConditionals._make_products`."""
+
+    predict: Tensor
+    carry: Tensor
+
+
 class LimbConditionals(nn.Module):
     """Gaussians over the rotations between connected parts, and over those from frame to frame.
 
@@ -130,8 +138,6 @@ class LimbConditionals(nn.Module):
     centres: Tensor
     diffusion: Tensor
     growth: Tensor
-    _predict: Tensor
-    _carry: Tensor
 
     def __init__(
         self,
@@ -154,7 +160,7 @@ class LimbConditionals(nn.Module):
                 "out of the tree"
             )
         self.info, self.directions, self.tree = info, directions, _tree(edges, n_parts)
-        self.register_buffer("edges", edges)
+        register_given(self, "edges", edges)
         growth = torch.ones_like(diffusion[:, 0, 0]) if growth is None else growth
         for name, value, sizes in (
             ("mean", mean, [n_edges, 3]),
@@ -166,9 +172,7 @@ class LimbConditionals(nn.Module):
         ):
             check_shape(name, value, sizes)
             check_finite(name, value)
-            self.register_buffer(name, value)
-        self._set_constants()
-        self.register_load_state_dict_post_hook(lambda module, _: module._set_constants())
+            register_given(self, name, value)
 
     @classmethod
     def fit(
@@ -343,7 +347,19 @@ class LimbConditionals(nn.Module):
     def _tensors(self) -> dict[str, Tensor]:
         return {name: self.get_buffer(name) for name in (*_KIND.tensors, *_KIND.indices)}
 
-    def _set_constants(self) -> None:
+    @property
+    def _predict(self) -> Tensor:
+        return self._products().predict
+
+    @property
+    def _carry(self) -> Tensor:
+        return self._products().carry
+
+    def _products(self) -> "_Products":
+        sources = (self.edges, self.mean, self.covariance, self.edge_centres, self.centres)
+        return derived(self, "products", sources, self._make_products)
+
+    def _make_products(self) -> "_Products":
         """What every message along an edge has in common, down and up: products of quaternions.
 
         Down, C_j R(x_j) = C_i R(x_i) C_ij R(x_ij) is linear in the quaternion of x_i for each sigma
@@ -358,8 +374,7 @@ class LimbConditionals(nn.Module):
         first = left_matrix(torch.stack([q := vector_to_quaternion(between), q * inverse]))
         second = right_matrix(torch.stack([turns, turns * inverse]))
         predict = (first[:, :, None] @ second).flatten(2, 3)
-        self.register_buffer("_predict", predict, persistent=False)
-        self.register_buffer("_carry", first @ second[:, :, 0], persistent=False)
+        return _Products(predict, first @ second[:, :, 0])
 
 
 def in_body_frame(
