@@ -102,10 +102,10 @@ class ActionFit(BodyFit):
 
     def finished_prior(self, **facts: str) -> None:
         """Write the action space or bank where a prior's file would be."""
-        out = self.written_to
-        if out is not None:
+        if self.results is not None:
+            results, name = self.results
             picture = bool(self.hparams["picture"])
-            print(write_action_files(self._fit(), out, picture, **facts), flush=True)
+            print(write_action_files(self._fit(), results, name, picture, **facts), flush=True)
 
     def _fit(self) -> FittedActions:
         if self._fitted is None:  # after a resumed run, too, whose step is not done again

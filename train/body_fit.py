@@ -4,13 +4,13 @@ What is fitted, and to which recordings, is `torchpose.recipes`; here are the st
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, ClassVar
 
 from lightning.pytorch import LightningDataModule, LightningModule
 from torch.optim import Optimizer
 
 from torchpose.errors import InputError
+from torchpose.io import ResultsFolder
 from train.callbacks import PriorWriter
 from train.identity import check_identity
 
@@ -106,10 +106,12 @@ class BodyFit(LightningModule):
         """Take up what `progress_made` gave."""
 
     @property
-    def written_to(self) -> Path | None:
-        """Where a prior's file would be; None in other processes, or if none is wanted."""
+    def results(self) -> tuple[ResultsFolder, str] | None:
+        """Where a prior's file would be, and its name; None in other processes."""
         writers = [c for c in self.trainer.callbacks if isinstance(c, PriorWriter)]  # type: ignore[attr-defined]
-        return writers[0].out if writers and self.trainer.is_global_zero else None
+        if not writers or not self.trainer.is_global_zero:
+            return None
+        return writers[0].results, writers[0].out.name
 
     @property
     def data_module(self) -> BodyData:

@@ -1,6 +1,7 @@
 """What happens beside the steps of a fit: the bar, the checkpoint, the pictures, the prior's file."""
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,10 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tqdm.auto import tqdm
 
 from torchpose.cli.common import show_progress
-from torchpose.cli.fit import summary
+from torchpose.cli.fit import summary, write_prior
+from torchpose.cli.prior_files import prior_results
 from torchpose.errors import OutputError
-from torchpose.io.files import check_output_folder
-from torchpose.priors import UpperBodyPrior, write_model_card
+from torchpose.priors import UpperBodyPrior
 from train.blocks import Sweep
 from train.mixture_em import MixtureEM
 
@@ -188,11 +189,15 @@ class PriorWriter(Callback):
             raise OutputError(f"{out}: is a folder; give the name of a file")
         self._facts = {"name": name or self.out.stem, "licence": licence, "command": command}
         self._pictures = pictures
+        self._open = ExitStack()
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """See that the prior can be written, before any work."""
+        """See that the prior can be written, and that nothing else is in its place, before any work."""
         if trainer.is_global_zero and stage == "fit":
-            check_output_folder(self.out.parent)
+            given = [value for value in pl_module.hparams.values() if isinstance(value, str)]
+            beside = (".md", ".png") if self._pictures else (".md",)
+            self.results = prior_results(self.out, given, beside)
+            self._open.enter_context(self.results)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write everything, from the first process."""
@@ -200,12 +205,15 @@ class PriorWriter(Callback):
         prior = finish(**self._facts) if finish else None
         if prior is None:
             return
-        prior.save(self.out)
-        write_model_card(prior, self.out.with_suffix(".md"))
-        written = [self.out, self.out.with_suffix(".md")]
-        if self._pictures:
-            from torchpose.viz import plot_prior_means, save_figure
+        written = write_prior(prior, self.results, self.out.name, self._pictures)
+        print(summary(prior, written, self.results.notes), flush=True)
 
-            arms = {"left arm": prior.left, "right arm": prior.right}
-            written.append(save_figure(plot_prior_means(arms), self.out.with_suffix(".png")))
-        print(summary(prior, written), flush=True)
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Remove what is temporary."""
+        self._open.close()
+
+    def on_exception(
+        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
+    ) -> None:
+        """Remove what is temporary."""
+        self._open.close()

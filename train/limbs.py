@@ -75,9 +75,7 @@ class LimbFit(BodyFit):
 
     def finished_prior(self, **facts: str) -> None:
         """Write the conditionals where a prior's file would be."""
-        out = self.written_to
-        if out is not None:
-            print(
-                write_limb_files(self.gathered, out, self.settings["least_std"], **facts),
-                flush=True,
-            )
+        if self.results is not None:
+            results, name = self.results
+            least = self.settings["least_std"]
+            print(write_limb_files(self.gathered, results, name, least, **facts), flush=True)

@@ -122,10 +122,10 @@ class ManifoldFit(BodyFit):
 
     def finished_prior(self, **facts: str) -> None:
         """Write the manifold where a prior's file would be; there is no prior to be calibrated."""
-        out = self.written_to
-        if out is not None:
+        if self.results is not None:
+            results, name = self.results
             picture = bool(self.hparams["picture"])
-            print(write_manifold_files(self.fitting, out, picture, **facts), flush=True)
+            print(write_manifold_files(self.fitting, results, name, picture, **facts), flush=True)
 
 
 def _check_trainer(trainer: Any) -> None:

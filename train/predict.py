@@ -20,15 +20,15 @@ from tqdm.auto import tqdm
 from torchpose.cli.common import one_line, show_progress
 from torchpose.errors import InputError, OutputError, TorchposeError
 from torchpose.io.files import check_output_folder
+from torchpose.io.leftovers import clear_leftovers
 from train.predict_claims import Claim, Claims, Run
 from train.predict_recordings import Recording, find_keypoints, share
-from train.predict_summary import Outcome, count_outcomes, write_summary
+from train.predict_summary import Outcome, check_summary, count_outcomes, write_summary
 from train.predict_tracking import (
     BatchTracker,
     TrackSettings,
     facts_of,
     read_origin,
-    remove_leftovers,
     save_result,
 )
 
@@ -137,6 +137,7 @@ def predict(
         OutputError: results cannot be written. A recording that is bad raises nothing.
     """
     out = check_output_folder(out)
+    check_summary(out / SUMMARY)
     found = find_keypoints(recordings, out)
     tracker = BatchTracker(settings or TrackSettings(), _own_device(device))
     claims = Claims(out / CLAIMS, alone=world == 1)
@@ -190,7 +191,7 @@ class Batch(NamedTuple):
         result = self.out / f"{recording.name}.npz"
         try:
             origin = self.tracker.origin(recording)
-            there = read_origin(result) if result.is_file() else None
+            there = read_origin(result, known=bool(claim.history)) if result.is_file() else None
         except (OSError, InputError) as error:
             return Outcome(recording.name, "failed", error=one_line(error))
         if there is not None and there["origin"] == origin:
@@ -199,7 +200,7 @@ class Batch(NamedTuple):
         if last.get("event") == "failed" and last["origin"] == origin and self._final(last):
             return Outcome(recording.name, "failed", error=last["error"])
         if claim.deaths:
-            remove_leftovers(result)
+            clear_leftovers(result.parent)
         if claim.deaths >= _MOST_DEATHS and not self.retry_failed:
             text = f"{claim.deaths} processes died at it, of memory perhaps"
             claim.record("failed", origin=origin, error=text, final=True, run=self.run.id)

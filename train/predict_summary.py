@@ -2,14 +2,16 @@
 
 import csv
 import io
+import os
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from torchpose.errors import OutputError
 from torchpose.io.files import atomic_path
 
-__all__ = ["COLUMNS", "Outcome", "count_outcomes", "write_summary"]
+__all__ = ["COLUMNS", "Outcome", "check_summary", "count_outcomes", "write_summary"]
 
 COLUMNS = ("recording", "state", "frames", "fps", "seconds", "log_evidence",
            "log_evidence_per_frame", "missing", "failed_at", "took_seconds", "error")  # fmt: skip
@@ -43,6 +45,25 @@ class Outcome(NamedTuple):
         numbers = {key: _text(facts[key]) for key in COLUMNS if key in facts}
         state = "done" if self.good else "degenerate"
         return numbers | {"recording": self.recording, "state": state, "error": self.error}
+
+
+def check_summary(path: Path) -> None:
+    """See that there is no other table in the place of the summary.
+
+    Raises:
+        OutputError: there is.
+    """
+    if not os.path.lexists(path):
+        return
+    header = b""
+    if path.is_file():
+        with path.open("rb") as stream:
+            header = stream.readline().strip()
+    if header != ",".join(COLUMNS).encode():
+        raise OutputError(
+            f"{path}: is there already, but was not written by this command; move it or choose another "
+            "--out"
+        )
 
 
 def write_summary(path: Path, outcomes: Mapping[str, Outcome]) -> None:

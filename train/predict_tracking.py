@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import re
 import time
 import warnings
 import zipfile
@@ -35,14 +34,12 @@ __all__ = [
     "digest_of_prior",
     "facts_of",
     "read_origin",
-    "remove_leftovers",
     "save_result",
 ]
 
 _FORMAT = 1  # of what is stored in a result; another one is made again
 _ORIGIN = "origin.npy"
 _KEPT_TRACKERS = 8
-_RANDOM = 8  # characters
 
 
 @dataclass(frozen=True)
@@ -229,21 +226,14 @@ def save_result(
             archive.writestr(_ORIGIN, buffer.getvalue())
 
 
-def remove_leftovers(path: Path) -> None:
-    """Remove what a killed process had written of a result; nobody may be at work on it."""
-    once = rf"-[a-z0-9_]{{{_RANDOM}}}"  # as `tempfile` names files
-    pattern = re.compile(rf"\.{{1,2}}{re.escape(path.stem)}{once}({once})?\.npz")
-    if path.parent.is_dir():
-        for file in path.parent.glob(".*.npz"):
-            if pattern.fullmatch(file.name):
-                file.unlink(missing_ok=True)
-
-
-def read_origin(path: Path) -> dict[str, Any] | None:
+def read_origin(path: Path, known: bool = True) -> dict[str, Any] | None:
     """Origin and facts of a result, without reading its poses; None if it is damaged.
 
+    Args:
+        path: of the file. known: whether a result was written there before.
+
     Raises:
-        InputError: the file is whole, but not a result with an origin.
+        InputError: the file is not a result with an origin, or damaged and not known to be one.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -252,7 +242,8 @@ def read_origin(path: Path) -> dict[str, Any] | None:
                     text = np.lib.format.read_array(stream, allow_pickle=False)
                 return json.loads(str(text))
     except (zipfile.BadZipFile, ValueError, EOFError):
-        return None
+        if known:
+            return None
     raise InputError(
         f"{path}: is there already, but was not written by this command; move it or choose another "
         "--out"

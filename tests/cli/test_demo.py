@@ -33,6 +33,7 @@ def test_demo_beats_the_mean_pose(torchpose, shipped, tmp_path):
     assert done.out.splitlines()[-5] == "Pictures:"
     assert all((out / name).read_bytes().startswith(b"\x89PNG") for name in names)
     everything = {*names, "keypoints.npz", "poses.npz", "poses.csv", "poses.bvh"}
+    everything |= {".torchpose-track.json"}
     assert {p.name for p in out.iterdir()} == everything
 
     clip, poses = read_keypoints(out / "keypoints.npz"), PoseTrack.load(out / "poses.npz")

@@ -29,7 +29,9 @@ def test_prior_is_that_of_the_library(torchpose, files, tmp_path):
     assert prior.info.command.startswith(f"torchpose fit {folder} --out {out} --components 2")
     assert "kept     2 recordings of 2 persons, 900 frames" in done.out
     assert out.with_suffix(".md").read_text().startswith("# mine")
-    assert {p.name for p in out.parent.iterdir()} == {"mine.safetensors", "mine.md"}
+    assert {p.name for p in out.parent.iterdir()} == {
+        "mine.safetensors", "mine.md", ".torchpose-fit-mine.json"
+    }  # fmt: skip
 
 
 def test_picture_and_name(torchpose, files, tmp_path):

@@ -103,6 +103,7 @@ def test_pictures(torchpose, files, tmp_path):
         assert f"wrote    {tmp_path / name}" in done.out
     assert {p.name for p in tmp_path.iterdir()} == {
         "poses.npz", "poses.csv", "poses.bvh", "pose_strip.png", "joint_curves.png",
+        ".torchpose-track.json",
     }  # fmt: skip
 
 

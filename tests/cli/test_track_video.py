@@ -18,6 +18,7 @@ from torchpose.video import CameraSource, VideoWriter, open_video
 
 N = 45
 SUFFIXES = (".npz", ".csv", ".bvh")
+LIST = ".torchpose-track.json"
 
 
 def _no_space(*_, **__):
@@ -52,7 +53,7 @@ def test_a_video_gives_poses_overlay_and_report(clip, track):
     path, truth = clip
     done, out = track(path)
     assert done.code == 0, done.err
-    expected = {*(f"poses{s}" for s in SUFFIXES), "overlay.mp4", "report.html"}
+    expected = {*(f"poses{s}" for s in SUFFIXES), "overlay.mp4", "report.html", LIST}
     assert {p.name for p in out.iterdir()} == expected
     poses = PoseTrack.load(out / "poses.npz")
     n = poses.joints2d.shape[1]
@@ -73,7 +74,7 @@ def test_options_reach_the_tracker(clip, track):
     options = ("--smoothing", "full", "--edges", "true", "--elbows", "true", "--background", "true")
     done, out = track(path, *options, "--overlay", "false", "--camera", "525,525,319.5,239.5")
     assert done.code == 0, done.err
-    assert {p.name for p in out.iterdir()} == {f"poses{s}" for s in SUFFIXES}
+    assert {p.name for p in out.iterdir()} == {LIST, *(f"poses{s}" for s in SUFFIXES)}
     assert "smoothed" in done.out and "525" in done.out and "assumed" not in done.out
     elbows = PoseTrack.load(out / "poses.npz").observed[0, :, UPPER_BODY.index("elbow_left")]
     assert bool(elbows.any())
@@ -103,7 +104,7 @@ def test_a_video_without_a_face_has_no_poses(track, tmp_path):
     assert not list(out.glob("poses*"))
 
 
-def test_several_persons_and_what_a_run_before_left(clip, track, tmp_path):
+def test_several_persons_and_then_one(clip, track, tmp_path):
     path, _ = clip
     wide = tmp_path / "wide.mp4"
     with open_video(path) as source, VideoWriter(wide, 30.0, (1000, 480)) as writer:
@@ -112,16 +113,25 @@ def test_several_persons_and_what_a_run_before_left(clip, track, tmp_path):
             writer.write(np.concatenate(both, 1))
     out = tmp_path / "out"
     out.mkdir()
-    (out / "poses_p03.npz").write_bytes(b"of another video")
+    mine = {"poses_p03.npz": b"of another video", "poses_p02_edited_by_me.csv": b"edited"}
+    for name, content in mine.items():
+        (out / name).write_bytes(content)
     done, out = track(wide)
     assert done.code == 0, done.err
     names = {p.name for p in out.iterdir()}
     assert {"poses.npz", "poses_p02.npz", "poses_p02.csv", "poses_p02.bvh"} <= names
-    assert "poses_p03.npz" not in names
     assert "person 1: frames" in done.out and "person 2: frames" in done.out
     first, second = (PoseTrack.load(out / f"poses{s}.npz") for s in ("", "_p02"))
     apart = first.joints2d[0, 20, 3] - second.joints2d[0, 20, 3]
     assert abs(abs(float(apart[0])) - 500) < 15
+
+    (out / "poses_p02.csv").write_text("edited")
+    done, out = track(path)
+    assert done.code == 0, done.err
+    names = {p.name for p in out.iterdir()}
+    assert {n for n in names if n.startswith("poses_")} == {*mine, "poses_p02.csv"}
+    assert (out / "poses_p02.csv").read_text() == "edited"
+    assert {name: (out / name).read_bytes() for name in mine} == mine
 
 
 @pytest.mark.parametrize("full_disk", [False, True])
@@ -226,7 +236,7 @@ def test_poses_are_kept_when_the_overlay_does_not_fit(clip, track, monkeypatch):
     monkeypatch.setattr("torchpose.video.VideoWriter.write", _no_space)
     done, out = track(clip[0])
     assert done.code == 2 and "No space left" in done.err
-    assert {f"poses{s}" for s in SUFFIXES} == {p.name for p in out.iterdir()}
+    assert {LIST, *(f"poses{s}" for s in SUFFIXES)} == {p.name for p in out.iterdir()}
 
 
 def test_torch_frames_are_frames(clip, files):

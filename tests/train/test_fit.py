@@ -74,7 +74,7 @@ def test_windows_and_a_first_pass(recordings, tmp_path):
 
 def test_files_and_logs(fitted):
     assert {p.name for p in fitted.iterdir()} == {
-        "fit.yaml", "runs", "p.safetensors", "p.md", "p.png"
+        "fit.yaml", "runs", "p.safetensors", "p.md", "p.png", ".torchpose-fit-p.json"
     }  # fmt: skip
     runs = fitted / "runs"
     assert {p.name for p in runs.iterdir()} == {"version_0", "checkpoints"}

@@ -19,6 +19,7 @@ from tests.priors.poses import poses, recording
 from torchpose.cli.track import build as track_parser
 from torchpose.cli.track import run as track
 from torchpose.errors import InputError, OutputError, PriorError
+from torchpose.io import atomic_path
 from torchpose.pose_track import PoseTrack
 from torchpose.priors import fit_upper_body_prior
 from train import predict as module
@@ -156,22 +157,37 @@ def test_other_input_prior_or_settings_are_made_again(data, prior_file, tmp_path
 
 def test_what_a_killed_process_left_is_removed(data, prior_file, tmp_path) -> None:
     out = tmp_path / "out"
-    with Claims(out / ".claims").claim("a") as claim:
+    with Claims(out / ".claims").claim("sub/e") as claim:
         claim.record("started", rank=0)
-    dead = [".a-abcdefgh.npz", "..a-abcdefgh-01234_67.npz"]
-    alive = [".a-b-abcdefgh.npz", ".aa-abcdefgh.npz", ".a-abc.npz"]
-    for name in dead + alive:
-        (out / name).touch()
-    predict([data / "a.npz"], out, TrackSettings(prior=prior_file))
-    assert sorted(p.name for p in out.glob("*.npz")) == sorted([*alive, "a.npz"])
+    (out / "sub").mkdir()
+    dead, mine = out / "sub" / ".torchpose-tmp-abcdefgh.npz", out / "sub" / ".e-abcdefgh.npz"
+    dead.touch()
+    mine.touch()
+    with atomic_path(out / "sub" / "f.npz") as alive:
+        predict([data], out, TrackSettings(prior=prior_file))
+        assert alive.exists() and mine.exists() and not dead.exists()
 
 
-def test_foreign_files_are_not_overwritten(data, prior_file, tmp_path) -> None:
-    (tmp_path / "out").mkdir()
-    np.savez(tmp_path / "out" / "a.npz", mine=np.ones(3))
+@pytest.mark.parametrize("whole", [True, False])
+def test_foreign_files_are_not_overwritten(data, prior_file, tmp_path, whole) -> None:
+    place = tmp_path / "out" / "a.npz"
+    place.parent.mkdir()
+    np.savez(place, mine=np.ones(3))
+    if not whole:
+        place.write_bytes(place.read_bytes()[:-30])
+    before = place.read_bytes()
     outcomes = predict([data / "a.npz"], tmp_path / "out", TrackSettings(prior=prior_file))
     assert "was not written by this command" in outcomes["a"].error
-    assert list(np.load(tmp_path / "out" / "a.npz")) == ["mine"]
+    assert place.read_bytes() == before
+
+
+def test_another_table_is_not_overwritten(data, prior_file, tmp_path) -> None:
+    table = tmp_path / "out" / "summary.csv"
+    table.parent.mkdir()
+    table.write_text("mine\n")
+    with pytest.raises(OutputError, match=r"summary\.csv: is there already"):
+        predict([data / "a.npz"], tmp_path / "out", TrackSettings(prior=prior_file))
+    assert table.read_text() == "mine\n" and not (tmp_path / "out" / "a.npz").exists()
 
 
 def test_what_suits_no_recording_is_refused_before_any_work(data, prior_file, tmp_path, capsys):

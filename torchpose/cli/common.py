@@ -11,13 +11,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
-from jsonargparse import ActionConfigFile, ArgumentParser
+from jsonargparse import ActionConfigFile, ArgumentParser, Namespace
 
 from torchpose.errors import InputError
 
 __all__ = [
     "UntilInterrupted",
     "add_seed",
+    "input_files",
     "new_parser",
     "one_line",
     "pictures_possible",
@@ -66,6 +67,20 @@ def add_seed(parser: ArgumentParser, of: str) -> None:
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help=f"seed of {of} (default 0)"
     )
+
+
+def input_files(args: Namespace, output: str = "out") -> list[Path]:
+    """Files that the options name, that of the output apart."""
+    given = [value for key, value in vars(args).items() if key != output]
+    words = [word for value in given for word in (value if isinstance(value, list) else [value])]
+    return [Path(word) for word in words if isinstance(word, str) and _is_file(word)]
+
+
+def _is_file(word: str) -> bool:
+    try:
+        return Path(word).is_file()
+    except (OSError, ValueError):  # too long, or with a zero byte
+        return False
 
 
 def positive(name: str, value: float | None) -> None:

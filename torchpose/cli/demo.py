@@ -1,9 +1,16 @@
 """`torchpose demo`: the animated performer, tracked in video or from keypoints, and scored."""
 
+import re
+from typing import TYPE_CHECKING
+
 from jsonargparse import ArgumentParser, Namespace
 
 from torchpose.cli.common import add_seed, new_parser, pictures_possible
 from torchpose.errors import InputError
+
+if TYPE_CHECKING:
+    from torchpose.io import ResultsFolder
+    from torchpose.priors import UpperBodyPrior
 
 _EXAMPLES = """
 torchpose demo --out demo-output
@@ -11,6 +18,8 @@ torchpose demo --out demo-output --seed 3 --seconds 10
 torchpose demo --out demo-output --input keypoints
 torchpose demo --out demo-output --prior prior.safetensors"""
 _INPUTS = ("video", "keypoints")
+_VIDEO_FILES = ("clip.mp4", "truth.npz")
+_KEYPOINT_FILES = ("keypoints.npz", "pose_3d.png", "errors.png")
 
 
 def main(arguments: list[str]) -> int:
@@ -58,9 +67,7 @@ def build() -> ArgumentParser:
 
 def run(args: Namespace) -> int:
     """Perform, track, score, draw; exit code 1 if the mean pose is not beaten."""
-    from torchpose.cli.demo_keypoints import demo_keypoints
-    from torchpose.cli.demo_video import demo_video
-    from torchpose.io import check_output_folder
+    from torchpose.cli.track_output import track_results
     from torchpose.priors import load_prior
 
     if not 1 <= args.seconds <= 3600:
@@ -69,10 +76,23 @@ def run(args: Namespace) -> int:
         raise InputError(f"--input must be one of {', '.join(_INPUTS)}, got {args.input!r}")
     prior = load_prior(args.prior)
     pictures = pictures_possible(args.pictures)
-    out = check_output_folder(args.out)
+    video = args.input == "video"
+    more = (*_VIDEO_FILES, *_KEYPOINT_FILES)
+    expected = _VIDEO_FILES if video else (_KEYPOINT_FILES if pictures else _KEYPOINT_FILES[:1])
+    own = "|".join(map(re.escape, more))
+    with track_results(args, pictures, video, expected, own) as results:
+        return _perform(args, prior, results, pictures)
+
+
+def _perform(
+    args: Namespace, prior: "UpperBodyPrior", results: "ResultsFolder", pictures: bool
+) -> int:
+    from torchpose.cli.demo_keypoints import demo_keypoints
+    from torchpose.cli.demo_video import demo_video
+
     print(
         "This is a smoke test on an animated performer, with made-up movements and noise. It shows "
         "that\nthe tracker works, not how well it does on people: see `torchpose evaluate`.\n"
     )
     demo = demo_video if args.input == "video" else demo_keypoints
-    return demo(prior, out, args.seconds, args.seed, pictures)
+    return demo(prior, results, args.seconds, args.seed, pictures)

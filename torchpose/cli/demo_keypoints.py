@@ -13,10 +13,11 @@ from torchpose.cli.demo_scores import (
     score,
     score_mean_pose,
 )
+from torchpose.cli.track_output import track_pictures, write_track
 
 if TYPE_CHECKING:
     from torchpose.demo import Performance
-    from torchpose.io import Keypoints
+    from torchpose.io import Keypoints, ResultsFolder
     from torchpose.pose_track import PoseTrack
     from torchpose.priors import UpperBodyPrior
 
@@ -28,7 +29,7 @@ _GAP_JOINT, _GAP_START, _GAP_LENGTH = "hand_right", 2.6, 1.0
 
 
 def demo_keypoints(
-    prior: "UpperBodyPrior", out: Path, seconds: float, seed: int, pictures: bool
+    prior: "UpperBodyPrior", results: "ResultsFolder", seconds: float, seed: int, pictures: bool
 ) -> int:
     """Perform, track, score, draw; exit code 1 if the mean pose is not beaten."""
     from torchpose.io import write_keypoints
@@ -42,12 +43,18 @@ def demo_keypoints(
     scores[MEAN_POSE] = score_mean_pose(prior, performance.joints)
     measured = "head and neck are measured, with hands; elbows and shoulders never are"
     print(report(scores, measured, Hidden(_GAP_JOINT, gap)))
-    write_keypoints(out / "keypoints.npz", clip)
-    written = write_results(out, tracks["filtered"], scores, performance, gap, pictures)
-    print(f"\nThe keypoints: {out / 'keypoints.npz'}; the poses: {out / 'poses.npz'}, poses.csv")
+    stage = results.stage
+    file = stage / "keypoints.npz"
+    write_keypoints(file, clip)
+    poses = write_track(tracks["filtered"], stage)
+    drawn = _draw(stage, tracks["filtered"], scores, performance, gap) if pictures else []
+    at, *places = results.commit([file, *poses, *drawn])
+    print(f"\nThe keypoints: {at}; the poses: {places[0]}, poses.csv")
     good = beaten(scores)
-    if written:
-        print("Pictures:\n" + "\n".join(f"  {path}" for path in written))
+    if drawn:
+        print("Pictures:\n" + "\n".join(f"  {path}" for path in places[len(poses) :]))
+    for note in results.notes:
+        print(f"note: {note}")
     return 0 if good else 1
 
 
@@ -89,20 +96,14 @@ def track_clip(prior: "UpperBodyPrior", clip: "Keypoints", smoothing: str | None
     return tracker(clip.keypoints[None], names=clip.names, progress=show_progress())
 
 
-def write_results(
+def _draw(
     out: Path,
     track: "PoseTrack",
     scores: dict[str, Scores],
     performance: "Performance",
     gap: slice,
-    pictures: bool,
 ) -> list[Path]:
-    """Write the poses and, if asked for, the pictures; returns the paths of those."""
-    from torchpose.cli.track_output import track_pictures, write_track
-
-    write_track(track, out, pictures=False)
-    if not pictures:
-        return []
+    """Draw the poses, one of them in 3D, and the errors; returns the paths of the pictures."""
     from torchpose import viz
 
     middle = (gap.start + gap.stop) // 2

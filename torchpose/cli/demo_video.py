@@ -12,6 +12,7 @@ from torchpose.cli.track_video import write_overlay, write_people
 
 if TYPE_CHECKING:
     from torchpose.demo import Performance
+    from torchpose.io import ResultsFolder
     from torchpose.pose_track import PoseTrack
     from torchpose.priors import UpperBodyPrior
     from torchpose.recording import TrackedPerson
@@ -24,7 +25,7 @@ _DISTANCE = 1.8  # metres: near enough for the face, far enough for raised arms
 
 
 def demo_video(
-    prior: "UpperBodyPrior", out: Path, seconds: float, seed: int, pictures: bool
+    prior: "UpperBodyPrior", results: "ResultsFolder", seconds: float, seed: int, pictures: bool
 ) -> int:
     """Render, track, score, draw; exit code 1 if the mean pose is not beaten."""
     from torchpose import VideoTracker
@@ -36,14 +37,16 @@ def demo_video(
         performer(round(seconds * _FPS), _FPS, seed, distance=_DISTANCE),
         demo_camera(),
     )
-    clip = out / "clip.mp4"
+    stage = results.stage
+    clip, truth_file = stage / "clip.mp4", stage / "truth.npz"
     _render(clip, performance, seed)
     tracker = VideoTracker(prior, camera, fps=_FPS)
     start = time.perf_counter()
     with open_video(clip) as source:
-        people = tracker(source, progress=show_progress(), n_frames=source.n_frames, folder=out)
+        people = tracker(source, progress=show_progress(), n_frames=source.n_frames, folder=stage)
     elapsed = time.perf_counter() - start
     if not people:
+        results.commit([clip, truth_file])
         print("torchpose: the demo failed: nobody was found in its video", file=sys.stderr)
         return 1
     person, n_frames = people[0], len(performance.joints)
@@ -53,17 +56,20 @@ def demo_video(
     scores[MEAN_POSE] = score_mean_pose(prior, truth)
     print(report(scores, "measured in the video: head and neck from the face, and the hands"))
     print(f"\n{_seen(person)}; {n_frames / elapsed:.0f} frames a second, drawing apart")
+    overlay = stage / "overlay.mp4"
     with open_video(clip) as source:
-        write_overlay(out / "overlay.mp4", source, people, n_frames)
-    write_people(people, out, pictures=False)
-    _write_report(out, people, performance, camera_text(camera))
-    if pictures:
-        _draw(out, person.track, performance, person.first_frame)
+        write_overlay(overlay, source, people, n_frames)
+    poses = write_people(people, stage)
+    page = _write_report(stage, people, performance, camera_text(camera))
+    drawn = _draw(stage, person.track, performance, person.first_frame) if pictures else []
+    at = results.commit([clip, truth_file, overlay, page, *poses, *drawn])
     good = beaten(scores)
     print(
-        f"\nThe video: {clip}, its truth: {out / 'truth.npz'}\nThe poses drawn into it: "
-        f"{out / 'overlay.mp4'}\nThe report, with the skeleton to turn: {out / 'report.html'}"
+        f"\nThe video: {at[0]}, its truth: {at[1]}\nThe poses drawn into it: {at[2]}\n"
+        f"The report, with the skeleton to turn: {at[3]}"
     )
+    for note in results.notes:
+        print(f"note: {note}")
     return 0 if good else 1
 
 
@@ -95,11 +101,11 @@ def _seen(person: "TrackedPerson") -> str:
 
 def _write_report(
     out: Path, people: "list[TrackedPerson]", performance: "Performance", camera: str
-) -> None:
+) -> Path:
     from torchpose.report import write_report
 
     first = people[0].first_frame
-    write_report(
+    return write_report(
         out / "report.html",
         [person.track for person in people],
         overlay=out / "overlay.mp4",
@@ -111,6 +117,7 @@ def _write_report(
     )
 
 
-def _draw(out: Path, track: "PoseTrack", performance: "Performance", first: int) -> None:
+def _draw(out: Path, track: "PoseTrack", performance: "Performance", first: int) -> list[Path]:
     rows = slice(first, first + track.joints3d.shape[1])
-    save_pictures(out, track_pictures(track, performance.joints[rows], performance.labels[rows]))
+    drawn = track_pictures(track, performance.joints[rows], performance.labels[rows])
+    return save_pictures(out, drawn)

@@ -1,6 +1,7 @@
 """`torchpose fit`: a prior from recordings of 3D joints; what body trackers learn by a word of its own."""
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean, stdev
@@ -10,6 +11,7 @@ from jsonargparse import ArgumentParser, Namespace
 
 from torchpose.cli.common import (
     add_seed,
+    input_files,
     new_parser,
     pictures_possible,
     save_pictures,
@@ -17,10 +19,11 @@ from torchpose.cli.common import (
 )
 from torchpose.cli.fit_bodies import KINDS
 from torchpose.cli.fit_bodies import main as fit_bodies
+from torchpose.cli.prior_files import prior_results
 from torchpose.errors import InputError, OutputError
 
 if TYPE_CHECKING:
-    from torchpose.io import Recording
+    from torchpose.io import Recording, ResultsFolder
     from torchpose.priors import UpperBodyPrior
 
 _EXAMPLES = """
@@ -114,32 +117,45 @@ def build() -> ArgumentParser:
 
 def run(args: Namespace) -> int:
     """Read, curate, fit, write and report; every check of an option comes before any work."""
-    from torchpose.io import check_output_folder, find_recordings, read_recordings
-    from torchpose.priors import write_model_card
+    from torchpose.io import find_recordings, read_recordings
 
     _check_options(args)
     out = output_file(args.out)
     recordings = read_recordings(find_recordings(args.recordings), args.axes)
     pictures = pictures_possible(args.pictures)
     recordings, curation = _curated(_without(recordings, args.without or []), args)
-    check_output_folder(out.parent)
-    print(curation["said"], flush=True)
-    prior = _fit(recordings, args, args.name or out.stem)
-    prior.info = replace(prior.info, extra=prior.info.extra | curation["facts"])
+    with prior_results(
+        out, input_files(args), (".md", ".png") if pictures else (".md",)
+    ) as results:
+        print(curation["said"], flush=True)
+        prior = _fit(recordings, args, args.name or out.stem)
+        prior.info = replace(prior.info, extra=prior.info.extra | curation["facts"])
+        written = write_prior(prior, results, out.name, pictures)
+    print(summary(prior, written, results.notes))
+    return 0
+
+
+def write_prior(
+    prior: "UpperBodyPrior", results: "ResultsFolder", name: str, pictures: bool
+) -> list[Path]:
+    """Write the prior, its model card and, if asked for, the picture of its mean poses."""
+    from torchpose.priors import write_model_card
+
+    out = results.stage / name
+    card = out.with_suffix(".md")
     prior.save(out)
-    write_model_card(prior, out.with_suffix(".md"))
-    written = [out, out.with_suffix(".md")]
+    write_model_card(prior, card)
+    written = results.commit([out, card])  # first of all: the picture only shows it
     if pictures:
         from torchpose import viz
 
         arms = {"left arm": prior.left, "right arm": prior.right}
-        picture = out.with_suffix(".png").name
-        written += save_pictures(out.parent, {picture: lambda: viz.plot_prior_means(arms)})
-    print(summary(prior, written))
-    return 0
+        drawn = {out.with_suffix(".png").name: lambda: viz.plot_prior_means(arms)}
+        written += results.commit(save_pictures(results.stage, drawn))
+    return written
 
 
-def summary(prior: "UpperBodyPrior", written: list[Path]) -> str:
+def summary(prior: "UpperBodyPrior", written: list[Path], notes: Sequence[str] = ()) -> str:
     """A few lines for people: what was fitted, on what, how well it will do, which files."""
     info = prior.info
     windows = [w.left.n_components for w in prior.windows.values()]
@@ -159,6 +175,7 @@ def summary(prior: "UpperBodyPrior", written: list[Path]) -> str:
         )
     lines.append(f"noise    {', '.join(prior.noise) or 'not learnt'}")
     lines += [f"expect   {line}" for line in _expected(info.extra.get("held_out", {}))]
+    lines += [f"note     {note}" for note in notes]
     return "\n".join([*lines, *(f"wrote    {path}" for path in written)])
 
 

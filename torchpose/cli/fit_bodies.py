@@ -2,12 +2,15 @@
 
 import shlex
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jsonargparse import ArgumentParser, Namespace
 
-from torchpose.cli.common import add_seed, new_parser, pictures_possible, show_progress
+from torchpose.cli.common import add_seed, input_files, new_parser, pictures_possible, show_progress
 from torchpose.errors import InputError
+
+if TYPE_CHECKING:
+    from torchpose.io import ResultsFolder
 
 __all__ = ["KINDS", "build", "main"]
 
@@ -76,14 +79,17 @@ def build(kind: str) -> ArgumentParser:
 def run(kind: str, args: Namespace) -> int:
     """Read, fit, write and report; every check of an option comes before any work."""
     from torchpose.cli.fit import output_file
-    from torchpose.io import AXES, check_output_folder
+    from torchpose.cli.prior_files import prior_results
+    from torchpose.io import AXES
 
     if args.axes is not None and args.axes not in AXES:
         raise InputError(f"--axes must be one of {', '.join(AXES)}, got {args.axes!r}")
     out = output_file(args.out)
-    check_output_folder(out.parent)
     facts = {"name": args.name or out.stem, "licence": args.licence}
-    print(_FITS[kind](args, out, facts | {"command": command_line(kind, args)}))
+    facts |= {"command": command_line(kind, args)}
+    beside = (".md", ".png") if getattr(args, "pictures", False) else (".md",)
+    with prior_results(out, input_files(args), beside) as results:
+        print(_FITS[kind](args, results, out, facts))
     return 0
 
 
@@ -131,7 +137,9 @@ def _manifold_options(parser: ArgumentParser) -> None:
     add_seed(parser, "the frames that tell the scale of distances, where there are very many")
 
 
-def _fit_manifold(args: Namespace, out: Path, facts: dict[str, str]) -> str:
+def _fit_manifold(
+    args: Namespace, results: "ResultsFolder", out: Path, facts: dict[str, str]
+) -> str:
     from torchpose.recipes.files import write_manifold_files
     from torchpose.recipes.manifold import ManifoldFitting, ManifoldPoses, ManifoldRecipe
     from torchpose.recipes.resuming import run_to_end, taken_up
@@ -149,7 +157,7 @@ def _fit_manifold(args: Namespace, out: Path, facts: dict[str, str]) -> str:
     if taken:
         print(f"going on after {taken} steps, from {kept}", flush=True)
     run_to_end(fitting, kept, show_progress())
-    return write_manifold_files(fitting, out, pictures, **facts)
+    return write_manifold_files(fitting, results, out.name, pictures, **facts)
 
 
 # --- limbs ----------------------------------------------------------------------------------------
@@ -160,13 +168,13 @@ def _limb_options(parser: ArgumentParser) -> None:
         help="least deviation of a limb in any direction, sine of half an angle (default 0.01)")  # fmt: skip
 
 
-def _fit_limbs(args: Namespace, out: Path, facts: dict[str, str]) -> str:
+def _fit_limbs(args: Namespace, results: "ResultsFolder", out: Path, facts: dict[str, str]) -> str:
     from torchpose.recipes.files import write_limb_files
     from torchpose.recipes.limbs import LimbStates, check_least_std
 
     check_least_std(args.least_std)
     states = LimbStates.gather(args.recordings, without=args.without_files, **_chosen(args))
-    return write_limb_files(states, out, args.least_std, **facts)
+    return write_limb_files(states, results, out.name, args.least_std, **facts)
 
 
 # --- actions --------------------------------------------------------------------------------------
@@ -199,7 +207,9 @@ def _action_options(parser: ArgumentParser) -> None:
     add_seed(parser, "the trial of the gate")
 
 
-def _fit_actions(args: Namespace, out: Path, facts: dict[str, str]) -> str:
+def _fit_actions(
+    args: Namespace, results: "ResultsFolder", out: Path, facts: dict[str, str]
+) -> str:
     from torchpose.recipes.actions import ActionRecipe, Performances, fit_actions
     from torchpose.recipes.files import write_action_files
 
@@ -213,7 +223,8 @@ def _fit_actions(args: Namespace, out: Path, facts: dict[str, str]) -> str:
         args.recordings, without=args.without_files, repeated=args.repeated,
         postures=args.postures, **_chosen(args),
     )  # fmt: skip
-    return write_action_files(fit_actions(performances, recipe), out, pictures, **facts)
+    fitted = fit_actions(performances, recipe)
+    return write_action_files(fitted, results, out.name, pictures, **facts)
 
 
 def _chosen(args: Namespace) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 import sys
 import time
 import warnings
+from contextlib import ExitStack
 from dataclasses import replace
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
@@ -19,12 +20,13 @@ from torchpose.cli.common import (
 )
 from torchpose.cli.track_body_models import METHODS, BodyModel, check_method, load_model
 from torchpose.cli.track_body_output import (
+    body_results,
     draw,
     facts_of,
     gate_notes,
     summary,
-    write_csv,
     write_page,
+    write_poses,
 )
 from torchpose.cli.track_body_videos import Recordings
 from torchpose.errors import CameraError, DegenerateFilterWarning, InputError
@@ -115,31 +117,31 @@ def build() -> ArgumentParser:
 
 def run(args: Namespace) -> int:
     """Track, write and report; exit code 1 if nobody was seen or the filter lost the person."""
-    from torchpose.io import check_output_folder
-
     _check(args)
     share_cores()
     cameras = _cameras(args)
     model = load_model(args)
-    out = check_output_folder(args.out)
     pictures = pictures_possible(args.pictures)
-    with Recordings(args, cameras) as recordings:
-        start = time.perf_counter()
-        poses = _track(args, recordings, model)
-        seconds = time.perf_counter() - start
-        if poses is None:
-            print(
-                "torchpose: nobody was seen by all cameras, so there are no poses", file=sys.stderr
-            )
-            return 1
-        poses.save(out / "body.npz")
-        write_csv(out / "joints.csv", poses)
-        written = [out / "body.npz", out / "joints.csv"]
-        if args.overlay or pictures:
-            written += draw(recordings, poses, out, args.overlay, pictures)
-    facts = facts_of(args, recordings, poses, seconds)
-    written += write_page(recordings, poses, facts, out)
-    return summary(poses, facts, written)
+    with ExitStack() as stack:
+        results = stack.enter_context(body_results(args, cameras, pictures))
+        with Recordings(args, cameras) as recordings:
+            start = time.perf_counter()
+            poses = _track(args, recordings, model)
+            seconds = time.perf_counter() - start
+            if poses is None:
+                print(
+                    "torchpose: nobody was seen by all cameras, so there are no poses",
+                    file=sys.stderr,
+                )
+                return 1
+            written = results.commit(write_poses(results.stage, poses))
+            shown = []
+            if args.overlay or pictures:
+                shown = draw(recordings, poses, results.stage, args.overlay, pictures)
+        facts = facts_of(args, recordings, poses, seconds)
+        shown += write_page(recordings, poses, facts, results.stage)
+        written += results.commit(shown)
+    return summary(poses, facts, written, results.notes)
 
 
 def _check(args: Namespace) -> None:

@@ -7,29 +7,65 @@ from typing import TYPE_CHECKING, Any
 
 from jsonargparse import Namespace
 
+from torchpose.cli.common import input_files
+
 if TYPE_CHECKING:
     from torch import Tensor
 
     from torchpose.body_poses import BodyPoses
     from torchpose.camera import PinholeCamera
     from torchpose.cli.track_body_videos import Recordings
+    from torchpose.io import ResultsFolder
     from torchpose.measure.silhouettes import SilhouetteView
 
 __all__ = [
     "action_text",
+    "body_results",
     "draw",
     "facts_of",
     "gate_notes",
     "project_joints",
     "summary",
-    "write_csv",
     "write_page",
+    "write_poses",
 ]
 
+_POSES = ("body.npz", "joints.csv")
+_OWN = r"body\.npz|joints\.csv|overlay(_.+\.mp4|\.png)|report\.html"
 _MOST_RUNS = 8  # of actions that are listed by their frames
 
 
-def write_csv(path: Path, poses: "BodyPoses") -> None:
+def body_results(
+    args: Namespace, cameras: "Sequence[PinholeCamera]", pictures: bool
+) -> "ResultsFolder":
+    """The folder of `--out`, for poses of a body and what shows them."""
+    from torchpose.io import ResultsFolder
+    from torchpose.io.results import holds_arrays
+
+    videos = [_overlay_name(camera.name) for camera in cameras] if args.overlay else []
+    return ResultsFolder(
+        args.out,
+        "track",
+        _OWN,
+        [*_POSES, *videos, *(["overlay.png"] if pictures else []), "report.html"],
+        input_files(args),
+        lambda out: holds_arrays(out / _POSES[0], ("state", "joints3d", "body_skeleton")),
+    )
+
+
+def _overlay_name(camera: str) -> str:
+    return f"overlay_{camera}.mp4"
+
+
+def write_poses(out: Path, poses: "BodyPoses") -> list[Path]:
+    """The poses as an .npz and as a table."""
+    written = [out / name for name in _POSES]
+    poses.save(written[0])
+    _write_csv(written[1], poses)
+    return written
+
+
+def _write_csv(path: Path, poses: "BodyPoses") -> None:
     """One row per frame: x, y, z of every joint in metres, and its standard deviation."""
     from torchpose.io.files import atomic_path
 
@@ -54,7 +90,7 @@ def draw(
     from torchpose.video import VideoWriter
 
     names = recordings.rig.names
-    files = [out / f"overlay_{name}.mp4" for name in names] if videos else []
+    files = [out / _overlay_name(name) for name in names] if videos else []
     chosen = {round(i * (len(poses) - 1) / 5) + poses.first_frame for i in range(6)}
     strip: list[list[Any]] = []
     with ExitStack() as stack:
@@ -210,7 +246,7 @@ def write_page(
     from torchpose.report import write_report
 
     camera = recordings.views[0].source
-    overlay = out / f"overlay_{recordings.rig.names[0]}.mp4"
+    overlay = out / _overlay_name(recordings.rig.names[0])
     bones = [(p, j) for j, p in enumerate(poses.body.skeleton.parents) if p >= 0]
     page = write_report(
         out / "report.html", [poses.seen_by(camera)], overlay=overlay if overlay.exists() else None,
@@ -220,7 +256,9 @@ def write_page(
     return [page]
 
 
-def summary(poses: "BodyPoses", facts: dict[str, str], written: Sequence[Path]) -> int:
+def summary(
+    poses: "BodyPoses", facts: dict[str, str], written: Sequence[Path], notes: Sequence[str] = ()
+) -> int:
     """Say what was found; 1 if the filter lost the person in more than half of the frames."""
     for name, fact in facts.items():
         print(f"{name:<12} {fact}")
@@ -230,7 +268,7 @@ def summary(poses: "BodyPoses", facts: dict[str, str], written: Sequence[Path]) 
         print(f"{'unseen':<12} {coasting} frames, in which the pose only diffused")
     if respread:
         print(f"{'lost':<12} {respread} frames, in which particles were spread anew")
-    for note in poses.notes:
+    for note in (*poses.notes, *notes):
         print(f"{'note':<12} {note}")
     print(f"{'written':<12} " + ", ".join(map(str, written)))
     if 2 * (coasting + respread) <= len(poses):

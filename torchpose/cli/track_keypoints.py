@@ -12,6 +12,8 @@ from torchpose.cli.track_output import (
     report_failure,
     smoothing_text,
     summary,
+    track_results,
+    write_pictures,
     write_track,
 )
 from torchpose.errors import DegenerateFilterWarning, InputError
@@ -28,7 +30,7 @@ def track_keypoints(args: Namespace) -> int:
 
     from torchpose.cli.camera_option import resolve_camera
     from torchpose.cli.track import filter_options
-    from torchpose.io import check_output_folder, read_keypoints
+    from torchpose.io import read_keypoints
     from torchpose.priors import load_prior
     from torchpose.tracking import UpperBodyTracker
 
@@ -59,24 +61,28 @@ def track_keypoints(args: Namespace) -> int:
         **filter_options(args),
     )
     pictures = pictures_possible(args.pictures)
-    out = check_output_folder(args.out)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DegenerateFilterWarning)  # reported below in plain words
-        track = tracker(
-            keypoints.keypoints[None],
-            None if keypoints.confidence is None else keypoints.confidence[None],
-            names,
-            generator=torch.Generator().manual_seed(args.seed),
-            progress=show_progress(),
-        )
-    track = replace(track, notes=notes + tuple(keypoints.notes) + more + track.notes)
-    written = write_track(track, out, pictures)
+    with track_results(args, pictures, video=False) as results:
+        with warnings.catch_warnings():
+            warnings.simplefilter(
+                "ignore", DegenerateFilterWarning
+            )  # reported below in plain words
+            track = tracker(
+                keypoints.keypoints[None],
+                None if keypoints.confidence is None else keypoints.confidence[None],
+                names,
+                generator=torch.Generator().manual_seed(args.seed),
+                progress=show_progress(),
+            )
+        track = replace(track, notes=notes + tuple(keypoints.notes) + more + track.notes)
+        written = results.commit(write_track(track, results.stage))
+        if pictures:
+            written += results.commit(write_pictures(track, results.stage))
     settings = {
         "prior": prior.info.name or args.prior,
         "camera": camera_text(camera),
         "method": args.method + smoothing_text(args.smoothing),
     }
-    print(summary(track, written, settings))
+    print(summary(track, written, settings, results.notes))
     return report_failure(track)
 
 

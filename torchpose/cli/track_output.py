@@ -1,13 +1,22 @@
 """What `torchpose track` writes and prints, from keypoints and from video alike."""
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchpose.cli.common import save_pictures
+from jsonargparse import Namespace
+
+from torchpose.cli.common import input_files, save_pictures
 
 if TYPE_CHECKING:
+    from torchpose.io import ResultsFolder
     from torchpose.pose_track import PoseTrack
+
+_POSES = ("poses.npz", "poses.csv", "poses.bvh")
+_PICTURES = ("pose_strip.png", "joint_curves.png")
+_VIDEO = ("overlay.mp4", "report.html")
+_OWN = r"poses(_p\d\d+)?\.(npz|csv|bvh)|overlay\.mp4|report\.html|(pose_strip|joint_curves)\.png"
 
 __all__ = [
     "camera_text",
@@ -16,12 +25,36 @@ __all__ = [
     "smoothing_text",
     "summary",
     "track_pictures",
+    "track_results",
+    "write_pictures",
     "write_track",
 ]
 
 
-def write_track(track: "PoseTrack", out: Path, pictures: bool, suffix: str = "") -> list[Path]:
-    """Write poses.npz, .csv, .bvh and, if asked for, the pictures of one sequence.
+def track_results(
+    args: Namespace, pictures: bool, video: bool, more: Sequence[str] = (), own: str = ""
+) -> "ResultsFolder":
+    """The folder of `--out`, for poses of persons and what shows them.
+
+    Args:
+        args: of the command. pictures, video: whether they are going to be written.
+        more: further names that are. own: pattern of further names that a run may write.
+    """
+    from torchpose.io import ResultsFolder
+    from torchpose.io.results import holds_arrays
+
+    return ResultsFolder(
+        args.out,
+        "track",
+        f"{_OWN}|{own}" if own else _OWN,
+        [*_POSES, *(_PICTURES if pictures else ()), *(_VIDEO if video else ()), *more],
+        input_files(args),
+        lambda out: holds_arrays(out / _POSES[0], ("joints3d", "covariance3d", "observed")),
+    )
+
+
+def write_track(track: "PoseTrack", out: Path, suffix: str = "") -> list[Path]:
+    """Write poses.npz, .csv and, if there is a pose in them, .bvh of one sequence.
 
     Args:
         suffix: of the names, such as "_p02".
@@ -32,12 +65,19 @@ def write_track(track: "PoseTrack", out: Path, pictures: bool, suffix: str = "")
     written = [out / f"poses{suffix}.{kind}" for kind in ("npz", "csv", "bvh")]
     track.save(written[0])
     write_pose_csv(track, written[1])
-    if not bool(track.joints3d.isfinite().all(-1).any()):
+    if not _has_poses(track):
         return written[:2]
     write_bvh(track, written[2])
-    if pictures:
-        written += save_pictures(out, track_pictures(track))
     return written
+
+
+def write_pictures(track: "PoseTrack", out: Path) -> list[Path]:
+    """Draw one sequence, if there is a pose in it."""
+    return save_pictures(out, track_pictures(track)) if _has_poses(track) else []
+
+
+def _has_poses(track: "PoseTrack") -> bool:
+    return bool(track.joints3d.isfinite().all(-1).any())
 
 
 def track_pictures(track: "PoseTrack", truth: Any = None, labels: Any = None) -> dict[str, Any]:
@@ -56,7 +96,9 @@ def track_pictures(track: "PoseTrack", truth: Any = None, labels: Any = None) ->
     }  # fmt: skip
 
 
-def summary(track: "PoseTrack", written: list[Path], settings: dict[str, str]) -> str:
+def summary(
+    track: "PoseTrack", written: list[Path], settings: dict[str, str], notes: Sequence[str] = ()
+) -> str:
     """A few lines for people: frames, what was measured, what was assumed, which files."""
     n, fps = track.joints3d.shape[1], track.fps
     length = f" ({n / fps:.1f} s at {fps:g} fps)" if fps else ""
@@ -70,7 +112,7 @@ def summary(track: "PoseTrack", written: list[Path], settings: dict[str, str]) -
             *(f"{name:<9}{value}" for name, value in settings.items()),
             f"measured {measured}",
             *([f"inferred {', '.join(hidden)}"] if hidden else []),
-            *(f"note     {note}" for note in track.notes),
+            *(f"note     {note}" for note in (*track.notes, *notes)),
             *(f"wrote    {path}" for path in written),
         ]
     )

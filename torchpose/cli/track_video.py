@@ -3,7 +3,7 @@
 import contextlib
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +22,8 @@ from torchpose.cli.track_output import (
     report_failure,
     smoothing_text,
     summary,
+    track_results,
+    write_pictures,
     write_track,
 )
 from torchpose.errors import FileFormatError, InputError, OutputError
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
     from torchpose.video import VideoSource
     from torchpose.video_tracker import VideoTracker
 
+_OVERLAY = "overlay.mp4"
 _KEYPOINTS = "keypoints are expected as .npz, .csv or a folder of OpenPose JSON files"
 
 __all__ = ["track_video", "write_overlay", "write_people"]
@@ -40,7 +43,6 @@ __all__ = ["track_video", "write_overlay", "write_people"]
 def track_video(args: Namespace) -> int:
     """Track everybody, write and report; exit code 1 if there is nobody."""
     from torchpose.cli.camera_option import resolve_camera
-    from torchpose.io import check_output_folder
     from torchpose.priors import load_prior
 
     for option, value in (("--fps", args.fps), ("--max-gap", args.max_gap)):
@@ -49,33 +51,42 @@ def track_video(args: Namespace) -> int:
     share_cores()
     prior = load_prior(args.prior)
     pictures = pictures_possible(args.pictures)
-    with _open(args.input, args.fps) as source:
-        camera, notes = resolve_camera(args.camera, args.camera_name, source.size, None, args.input)
-        tracker = _tracker(args, prior, camera, source.fps)
-        out = check_output_folder(args.out)
-        start = time.perf_counter()
-        if source.reopenable:
-            people, n_frames = _track_recording(tracker, source, out)
-        else:
-            people, n_frames = _track_camera(tracker, source, out, args.overlay)
-        seconds = time.perf_counter() - start
-        notes += tuple(source.notes)
-    facts = {
-        "video": f"{args.input}, {source.size[0]} x {source.size[1]}, {source.fps:g} fps",
-        "prior": prior.info.name or args.prior,
-        "camera": camera_text(camera),
-        "method": f"{args.method}{smoothing_text(args.smoothing)}, hands by {args.hands}",
-        "speed": f"{n_frames / max(seconds, 1e-9):.0f} frames a second, without drawing",
-    }
-    if not people:
-        return _nobody(args, n_frames, notes, out)
-    people = [replace(p, track=replace(p.track, notes=notes + p.track.notes)) for p in people]
-    written = write_people(people, out, pictures)  # first of all: the rest only shows them
-    if args.overlay:
-        if source.reopenable:
-            write_overlay(out / "overlay.mp4", source.reopen(), people, n_frames)
-        written += _write_report(out, people, n_frames, facts, notes, Path(args.input).name)
-    print(_summary(people, written, facts, out))
+    with contextlib.ExitStack() as stack:
+        with _open(args.input, args.fps) as source:
+            camera, notes = resolve_camera(
+                args.camera, args.camera_name, source.size, None, args.input
+            )
+            tracker = _tracker(args, prior, camera, source.fps)
+            results = stack.enter_context(track_results(args, pictures, args.overlay))
+            start = time.perf_counter()
+            if source.reopenable:
+                people, n_frames = _track_recording(tracker, source, results.stage)
+            else:
+                people, n_frames = _track_camera(tracker, source, results.stage, args.overlay)
+            seconds = time.perf_counter() - start
+            notes += tuple(source.notes)
+        facts = {
+            "video": f"{args.input}, {source.size[0]} x {source.size[1]}, {source.fps:g} fps",
+            "prior": prior.info.name or args.prior,
+            "camera": camera_text(camera),
+            "method": f"{args.method}{smoothing_text(args.smoothing)}, hands by {args.hands}",
+            "speed": f"{n_frames / max(seconds, 1e-9):.0f} frames a second, without drawing",
+        }
+        if not people:
+            return _nobody(args, n_frames, notes, results.folder)
+        people = [replace(p, track=replace(p.track, notes=notes + p.track.notes)) for p in people]
+        # first of all: the rest only shows them
+        written = results.commit(write_people(people, results.stage))
+        if pictures:
+            written += results.commit(write_pictures(people[0].track, results.stage))
+        if args.overlay:
+            overlay = results.stage / _OVERLAY
+            if source.reopenable:
+                write_overlay(overlay, source.reopen(), people, n_frames)
+            title = Path(args.input).name
+            shown = _write_report(results.stage, people, n_frames, facts, notes, title)
+            written += results.commit(shown)
+    print(_summary(people, written, facts, results.notes))
     return max(report_failure(person.track) for person in people)
 
 
@@ -153,7 +164,7 @@ def _track_camera(
         print(f"live at {view.url}; q, the button on the page or Ctrl-C stop it")
         writers = []
         if overlay:
-            writer = VideoWriter(out / "overlay.mp4", source.fps, source.size)
+            writer = VideoWriter(out / _OVERLAY, source.fps, source.size)
             writers.append(stack.enter_context(writer))
 
         def watch(image: Any, measured: Any, poses: dict[int, Any]) -> None:
@@ -228,18 +239,11 @@ def _drawn(
     )
 
 
-def write_people(people: list["TrackedPerson"], out: Path, pictures: bool) -> list[Path]:
-    """Poses of everybody: the one seen longest without a number, others as poses_p02 and so on.
-
-    Files of other persons from a run before are removed.
-    """
+def write_people(people: list["TrackedPerson"], out: Path) -> list[Path]:
+    """Poses of everybody: the one seen longest without a number, others as poses_p02 and so on."""
     written = []
-    for place, person in enumerate(people):
-        suffix = "" if place == 0 else f"_p{place + 1:02d}"
-        written += write_track(person.track, out, pictures and place == 0, suffix)
-    for old in out.glob("poses_p[0-9][0-9]*.*"):
-        if old not in written:
-            old.unlink()
+    for place, person in enumerate(people, 1):
+        written += write_track(person.track, out, "" if place == 1 else f"_p{place:02d}")
     return written
 
 
@@ -253,7 +257,7 @@ def _write_report(
 ) -> list[Path]:
     from torchpose.report import write_report
 
-    overlay = out / "overlay.mp4"
+    overlay = out / _OVERLAY
     written = [overlay] if overlay.exists() else []
     write_report(
         out / "report.html",
@@ -284,10 +288,10 @@ def _nobody(args: Namespace, n_frames: int, notes: tuple[str, ...], out: Path) -
 
 
 def _summary(
-    people: list["TrackedPerson"], written: list[Path], facts: dict[str, str], out: Path
+    people: list["TrackedPerson"], written: list[Path], facts: dict[str, str], notes: Sequence[str]
 ) -> str:
     """What was found, for people."""
-    first = summary(people[0].track, written, facts)
+    first = summary(people[0].track, written, facts, notes)
     if len(people) == 1:
         return first
     others = [

@@ -10,11 +10,13 @@ from torchpose.io.files import (
 )
 from torchpose.io.keypoints import Keypoints, read_keypoints, write_keypoints
 from torchpose.io.recordings import Recording, find_recordings, read_recording, read_recordings
+from torchpose.io.results import ResultsFolder
 
 __all__ = [
     "AXES",
     "Keypoints",
     "Recording",
+    "ResultsFolder",
     "atomic_path",
     "check_output_folder",
     "find_recordings",

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from torchpose.errors import OutputError
+from torchpose.io.leftovers import clear_leftovers, make_temporary_file
 from torchpose.io.npz import read_npz
 from torchpose.io.reading import require_file
 
@@ -21,7 +22,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """A temporary file in the same folder that becomes `path` when the block succeeds.
 
     The temporary file keeps the suffix of `path` (`numpy.savez` and picture writers look at it).
-    When the block fails it is removed, and what stood at `path` before is untouched.
+    When the block fails it is removed, and what stood at `path` before is untouched. What a killed
+    process left is removed by the next `check_output_folder`.
 
     Args:
         path: where the file is to appear; its folder must exist.
@@ -43,13 +45,11 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     if path.is_dir():
         raise OutputError(f"{path}: is a folder; give the name of a file")
     try:
-        handle, name = tempfile.mkstemp(
-            dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix
-        )
-        os.close(handle)
+        handle, temporary = make_temporary_file(path.parent, path.suffix)
     except OSError as error:
         raise OutputError(f"{path}: cannot write here ({error.strerror or error})") from error
-    temporary = Path(name)
+    if os.name == "nt":  # an open file cannot be renamed there
+        os.close(handle)
     try:
         yield temporary
         umask = os.umask(0)
@@ -62,10 +62,12 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
     finally:
         temporary.unlink(missing_ok=True)
+        if os.name != "nt":
+            os.close(handle)
 
 
 def check_output_folder(folder: str | Path) -> Path:
-    """Make the folder if need be and see that files can be written there, before any work.
+    """Make the folder if need be, see that files can be written there, clear what killed runs left.
 
     Raises:
         OutputError: it is a file, cannot be made, or is not writable.
@@ -75,6 +77,7 @@ def check_output_folder(folder: str | Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
+        clear_leftovers(folder)
     except OSError as error:
         raise OutputError(
             f"{folder}: results cannot be written to this folder ({error.strerror or error}); "

@@ -1,11 +1,13 @@
 """A manifold's fit from its start to its end, which goes on where an earlier one was stopped."""
 
+import os
 import pickle
 from pathlib import Path
 
 import torch
 from tqdm.auto import tqdm
 
+from torchpose.errors import OutputError
 from torchpose.io.files import atomic_path
 from torchpose.recipes.manifold import ManifoldFitting
 
@@ -38,12 +40,27 @@ def run_to_end(
 
 
 def taken_up(fitting: ManifoldFitting, kept: str | Path) -> int:
-    """Take up a fit that `run_to_end` kept, if it is the same one; returns its steps so far, or 0."""
+    """Take up a fit that `run_to_end` kept, if it is the same one; returns its steps so far, or 0.
+
+    Raises:
+        OutputError: the file is something else, which `run_to_end` would write over.
+    """
+    if not os.path.lexists(kept):
+        return 0
     try:
         found = torch.load(kept, weights_only=True)
         if found["of"] != fitting.identity():
             return 0
         fitting.load_state_dict(found["fit"])
-    except (OSError, RuntimeError, pickle.UnpicklingError, EOFError, LookupError, TypeError):
-        return 0  # none there, or damaged: the fit starts anew
+    except (
+        OSError,
+        RuntimeError,
+        pickle.UnpicklingError,
+        EOFError,
+        LookupError,
+        TypeError,
+    ) as error:
+        raise OutputError(
+            f"{kept}: is in the place where a fit is kept, and is none; move it away"
+        ) from error
     return len(fitting.fit.scores)
