@@ -52,7 +52,9 @@ def _fit(arguments: list[str]) -> int:
     except ModuleNotFoundError as error:
         if debug or (error.name or "").partition(".")[0] not in ("lightning", "tensorboard"):
             raise
-        return _refuse(f"training needs {error.name}; run `pip install torchpose[train]`")
+        return _refuse(
+            f"training needs {error.name}; run `python -m pip install -e '.[train]'` in the checkout"
+        )
     from train.refusals import reason
 
     try:

@@ -89,7 +89,7 @@ def tensors_and_facts(kind, path):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_is_the_file_of_the_training_loop(kind, torchpose, walks, exercises, tmp_path):
-    pytest.importorskip("lightning", reason="training needs it: pip install torchpose[train]")
+    pytest.importorskip("lightning", reason="training needs the extra `train`")
     from train.cli import main as train
 
     folder = exercises if kind == "actions" else walks

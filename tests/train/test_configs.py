@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("lightning", reason="training needs it: pip install torchpose[train]")
+pytest.importorskip("lightning", reason="training needs the extra `train`")
 
 from train.cli import main
 

@@ -6,8 +6,8 @@ import shutil
 import pytest
 import torch
 
-pytest.importorskip("lightning", reason="training needs it: pip install torchpose[train]")
-pytest.importorskip("tensorboard", reason="training needs it: pip install torchpose[train]")
+pytest.importorskip("lightning", reason="training needs the extra `train`")
+pytest.importorskip("tensorboard", reason="training needs the extra `train`")
 
 from tests.train.people import RECIPE, WINDOWS, settings, write_recordings, write_settings
 from torchpose.curation import CurationSettings, curate

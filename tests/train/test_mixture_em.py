@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-pytest.importorskip("lightning", reason="training needs it: pip install torchpose[train]")
+pytest.importorskip("lightning", reason="training needs the extra `train`")
 
 from torchpose.errors import FileFormatError, InputError, OverlapError
 from torchpose.io import Recording

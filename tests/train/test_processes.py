@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("lightning", reason="training needs it: pip install torchpose[train]")
-pytest.importorskip("tensorboard", reason="training needs it: pip install torchpose[train]")
+pytest.importorskip("lightning", reason="training needs the extra `train`")
+pytest.importorskip("tensorboard", reason="training needs the extra `train`")
 
 from tests.train.people import settings, write_recordings, write_settings
 from tests.train.test_fit import assert_same

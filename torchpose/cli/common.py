@@ -156,7 +156,9 @@ def show_progress() -> bool:
 def pictures_possible(wanted: bool) -> bool:
     """Whether pictures are wanted and can be drawn; says how to get them if they cannot."""
     if wanted and find_spec("matplotlib") is None:
-        print("no pictures: matplotlib is not installed; `pip install torchpose[plots]` brings it")
+        print(
+            "no pictures: matplotlib is not installed; `python -m pip install matplotlib` brings it"
+        )
         return False
     return wanted
 

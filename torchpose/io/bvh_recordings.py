@@ -75,7 +75,7 @@ def read_bvh(path: Path) -> list[RawRecording]:
             import bvhio
     except ImportError as error:
         raise MissingDependencyError(
-            f"{path}: reading BVH files needs bvhio; install torchpose[mocap]"
+            f"{path}: reading BVH files needs bvhio; run `python -m pip install bvhio`"
         ) from error
     _check(path)
     with reading(path, "a BVH file"):

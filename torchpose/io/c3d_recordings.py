@@ -61,7 +61,7 @@ def read_c3d_points(path: Path) -> C3DPoints:
         import c3d
     except ImportError as error:
         raise MissingDependencyError(
-            f"{path}: reading C3D files needs c3d; install torchpose[mocap]"
+            f"{path}: reading C3D files needs c3d; run `python -m pip install c3d`"
         ) from error
     try:
         with path.open("rb") as stream, warnings.catch_warnings(record=True) as said:

@@ -123,7 +123,7 @@ def _read() -> Image:
     except ImportError as error:
         raise MissingDependencyError(
             "the rendered performer has the face of a portrait that comes with matplotlib, which is "
-            "not installed; pip install 'torchpose[plots]'"
+            "not installed; `python -m pip install matplotlib` brings it"
         ) from error
     import cv2
 

@@ -54,7 +54,7 @@ def require_matplotlib() -> None:
     except ImportError as error:
         raise MissingDependencyError(
             "pictures need the package matplotlib, which is not installed; "
-            "run `pip install torchpose[plots]`"
+            "run `python -m pip install matplotlib`"
         ) from error
 
 
