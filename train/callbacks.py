@@ -14,6 +14,7 @@ from torchpose.cli.common import show_progress
 from torchpose.cli.fit import summary, write_prior
 from torchpose.cli.prior_files import prior_results
 from torchpose.errors import OutputError
+from torchpose.io.leftovers import clear_leftovers
 from torchpose.priors import UpperBodyPrior
 from train.blocks import Sweep
 from train.mixture_em import MixtureEM
@@ -28,6 +29,11 @@ def checkpoint_file(folder: str | Path) -> Path:
 
 class LastCheckpoint(Checkpoint):
     """After every step, the whole state of the fit in `checkpoints/last.ckpt`."""
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Clear what a killed fit left."""
+        if trainer.is_global_zero:
+            clear_leftovers(checkpoint_file(trainer.default_root_dir).parent)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write it."""

@@ -1,6 +1,7 @@
 """`python -m train`: which command, and what becomes of its errors."""
 
 import os
+import signal
 import sys
 from collections.abc import Sequence
 
@@ -25,7 +26,9 @@ examples:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command and return its exit code: 0 done, 1 done but not all is good, 2 refused.
+    """Run a command and return its exit code.
+
+    0 done, 1 done but not all is good, 2 refused, 130 interrupted (Ctrl-C), 143 terminated (SIGTERM).
 
     Args:
         argv: what stands after `python -m train`; `sys.argv[1:]` if None.
@@ -56,15 +59,17 @@ def _fit(arguments: list[str]) -> int:
             f"training needs {error.name}; run `python -m pip install -e '.[train]'` in the checkout"
         )
     from train.refusals import reason
+    from train.stopping import signal_of, stopped_by_signals
 
     try:
-        run(arguments)
-    except SystemExit as stop:  # --help and --print_config
-        return stop.code if isinstance(stop.code, int) else 0
-    except KeyboardInterrupt:
-        print("train: interrupted; go on with --ckpt_path last", file=sys.stderr)
-        return 130
-    except Exception as error:
+        with stopped_by_signals():
+            run(arguments)
+    except BaseException as error:
+        stopped = signal_of(error)
+        if stopped is not None:
+            return _stop(stopped)
+        if isinstance(error, SystemExit):  # --help and --print_config
+            return error.code if isinstance(error.code, int) else 0
         text = None if debug else reason(error, arguments)
         if text is None:
             raise
@@ -72,8 +77,22 @@ def _fit(arguments: list[str]) -> int:
     return 0
 
 
+def _stop(stopped: signal.Signals) -> int:
+    """Say how to go on; the exit code that shells give to a process that a signal has ended."""
+    from train.command import how_to_go_on
+
+    if _rank() == "0":
+        what = "interrupted" if stopped == signal.SIGINT else "terminated"
+        print(f"train: {what}; {how_to_go_on()}", file=sys.stderr)
+    return 128 + stopped
+
+
+def _rank() -> str:
+    return os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0"))
+
+
 def _refuse(text: str) -> int:
-    rank = os.environ.get("RANK", os.environ.get("LOCAL_RANK", "0"))
+    rank = _rank()
     of = "" if rank == "0" else f" (process {rank})"
     print(f"train: error{of}: {text}", file=sys.stderr)
     return 2

@@ -17,8 +17,9 @@ from torchpose.errors import InputError
 from train import strategy
 from train.callbacks import FitPictures, FitProgress, LastCheckpoint, PriorWriter, checkpoint_file
 from train.selection import SelectingTrainer
+from train.stopping import StopAtOnce
 
-__all__ = ["run"]
+__all__ = ["how_to_go_on", "run"]
 
 _MODEL = {"class_path": "train.mixture_em.MixtureEM"}
 _DATA = {"class_path": "train.data.RecordingsDataModule"}
@@ -51,7 +52,7 @@ def run(arguments: Sequence[str]) -> None:
     warnings.filterwarnings("ignore", r".*LeafSpec", FutureWarning)
     warnings.filterwarnings("ignore", category=DeprecationWarning, module="lightning|jsonargparse")
     strategy.register()
-    _Command.arguments = list(arguments)
+    _Command.arguments, _Command.folder = list(arguments), None
     quiet: dict[str, Any] = {"exit_on_error": False}
     _Command(
         LightningModule,
@@ -68,8 +69,17 @@ def run(arguments: Sequence[str]) -> None:
     )
 
 
+def how_to_go_on() -> str:
+    """What to do about a command that was stopped, in words."""
+    folder = _Command.folder
+    if folder is not None and checkpoint_file(folder).is_file():
+        return "go on with --ckpt_path last, which takes up the fit after its last step"
+    return "no step was finished: run the same command again"
+
+
 class _Command(LightningCLI):
     arguments: list[str]
+    folder: Path | None = None
 
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
@@ -97,6 +107,8 @@ class _Command(LightningCLI):
         if not settings["trainer"]["default_root_dir"]:
             name = Path(settings["prior"]["out"]).stem
             settings["trainer"]["default_root_dir"] = str(Path("runs") / name)
+        if self.subcommand == "fit":
+            _Command.folder = Path(settings["trainer"]["default_root_dir"])
         _follow_torchrun(settings["trainer"])
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
@@ -105,7 +117,7 @@ class _Command(LightningCLI):
         own = [
             kind() for kind in (LastCheckpoint, FitProgress) if given[_SWITCHES[kind]] is not False
         ]
-        given["callbacks"] = callbacks + own
+        given["callbacks"] = [*callbacks, *own, StopAtOnce()]
         if given["logger"] in (None, True):
             given["logger"] = _loggers(given["default_root_dir"])
         given["plugins"] = [*(given["plugins"] or []), strategy.AtomicCheckpoints()]

@@ -58,15 +58,15 @@ def write_settings(folder: Path, values: dict[str, Any]) -> Path:
 
 
 class Kill(Callback):
-    """SIGKILL in the middle of a step, after some blocks of it.
+    """A signal, SIGKILL by default, in the middle of a step, after some blocks of it.
 
     Args:
-        step: number of the step, from 0. rank: of the process.
+        step: number of the step, from 0. rank: of the process. signum: of the signal.
     """
 
-    def __init__(self, step: int, rank: int = 0) -> None:
-        self.step, self.rank = step, rank
+    def __init__(self, step: int, rank: int = 0, signum: int = signal.SIGKILL) -> None:
+        self.step, self.rank, self.signum = step, rank, signum
 
     def on_train_batch_start(self, trainer, module, batch, batch_idx):
         if (trainer.current_epoch, trainer.global_rank) == (self.step, self.rank):
-            batch.watchers.append(lambda: os.kill(os.getpid(), signal.SIGKILL))
+            batch.watchers.append(lambda: os.kill(os.getpid(), self.signum))

@@ -5,6 +5,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,58 @@ def start(arguments, *launcher):
 def end(process):
     """What it wrote as errors, once it is over."""
     return process.communicate(timeout=300)[1]
+
+
+GO_ON = "train: {}; go on with --ckpt_path last, which takes up the fit after its last step\n"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.parametrize(
+    ("signum", "code", "what"),
+    [(signal.SIGTERM, 143, "terminated"), (signal.SIGINT, 130, "interrupted")],
+)
+def test_a_signal_has_its_exit_code(recordings, tmp_path, signum, code, what):
+    """From outside, after the first step of very many; the same command then goes on."""
+    values = settings(recordings, tmp_path, pose_steps=10_000)
+    config = write_settings(tmp_path, values)
+    process = start(["--config", config])
+    last = tmp_path / "runs" / "checkpoints" / "last.ckpt"
+    while process.poll() is None and not last.is_file():
+        time.sleep(0.05)
+    process.send_signal(signum)
+    assert end(process) == GO_ON.format(what)
+    assert process.returncode == code
+    assert {p.name for p in tmp_path.iterdir()} == {"fit.yaml", "runs"}
+    assert [p.name for p in last.parent.iterdir()] == ["last.ckpt"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.parametrize(("signum", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize("when", ["reading", "first step", "calibration"])
+def test_a_signal_at_any_time(recordings, tmp_path, monkeypatch, capsys, when, signum, code):
+    before = [signal.getsignal(s) for s in (signal.SIGTERM, signal.SIGINT)]
+    values = settings(recordings, tmp_path)
+    if when == "first step":
+        kill = {"step": 0, "signum": int(signum)}
+        values["trainer"]["callbacks"] = [
+            {"class_path": "tests.train.people.Kill", "init_args": kill}
+        ]
+    else:
+        where = {
+            "reading": "train.data.read_recordings",
+            "calibration": "torchpose.recipes.UpperBodyRecipe.hold_out",
+        }
+        monkeypatch.setattr(where[when], lambda *_, **__: os.kill(os.getpid(), signum))
+    assert main(["fit", "--config", str(write_settings(tmp_path, values))]) == code
+    said = capsys.readouterr().err
+    if when == "calibration":
+        assert said == GO_ON.format("terminated" if code == 143 else "interrupted")
+    else:
+        assert "no step was finished: run the same command again" in said
+    assert len(said.splitlines()) == 1
+    assert {p.name for p in tmp_path.iterdir()} <= {"fit.yaml", "runs"}
+    for number, handler in zip((signal.SIGTERM, signal.SIGINT), before, strict=True):
+        assert signal.signal(number, handler) in (handler, signal.SIG_IGN)
 
 
 def node(port):
