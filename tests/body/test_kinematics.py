@@ -263,3 +263,17 @@ def test_states_of_another_size_are_refused():
     other = Body.of_height(replace(BODY_15, name="other"), 1.8)
     with pytest.raises(SkeletonError, match="cannot be converted"):
         body.convert(random_states(body), other)
+
+
+def test_a_changed_bone_moves_what_hangs_on_it():
+    body, longer = (Body.of_height(BODY_15, 1.75) for _ in range(2))
+    state = torch.zeros(1, body.dim, dtype=torch.float64)
+    wrist = BODY_15.names.index("left_wrist")
+    before = longer.joints(state)[0]
+    with torch.no_grad():
+        longer.bone_lengths[wrist] += 0.1
+    moved = longer.joints(state)[0] - before
+    assert abs(float(moved[wrist].norm()) - 0.1) < 1e-12
+    assert float(moved[[i for i in range(15) if i != wrist]].norm()) < 1e-12
+    body.load_state_dict(longer.state_dict())
+    torch.testing.assert_close(body.joints(state), longer.joints(state), rtol=0, atol=0)

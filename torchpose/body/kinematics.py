@@ -6,7 +6,7 @@ quaternion vector (`torchpose.body.quaternion_vectors`). Every function takes an
 """
 
 import math
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -32,6 +32,7 @@ from torchpose.body.quaternion_vectors import (
 )
 from torchpose.body.skeleton import BodySkeleton
 from torchpose.errors import InputError, ShapeError, SkeletonError, check_finite, check_shape
+from torchpose.module_state import derived, register_given
 
 __all__ = ["FRAMES", "Body", "Frame", "centres_of"]
 
@@ -41,6 +42,16 @@ FRAMES: tuple[Frame, ...] = ("parent", "body")
 _ROOT = slice(0, 3)
 _HEADING = slice(3, 6)
 _RELATIVE = slice(6, None)
+
+
+class _Geometry(NamedTuple):
+    """What follows from a body's measures; see `Body`. `centred`: whether a part has a centre."""
+
+    offsets: Tensor
+    centre_rotations: Tensor
+    joint_weights: Tensor
+    limb_weights: Tensor
+    centred: bool
 
 
 class Body(nn.Module):
@@ -69,8 +80,9 @@ class Body(nn.Module):
     Attributes:
         skeleton, frame: as given. dim: D, the numbers in a state.
 
-    Buffers: bone_lengths [J], offsets [J, 3], tips [K, 3], radii, centres [P, 3], centre_rotations
-    [P, 3, 3], joint_weights [3 P, J], limb_weights [3 P, 2 L].
+    Buffers: bone_lengths [J], directions [J, 3], tips [K, 3], radii, centres [P, 3]. What follows from
+    them follows their changes: offsets [J, 3], centre_rotations [P, 3, 3], joint_weights [3 P, J],
+    limb_weights [3 P, 2 L].
 
     Raises:
         InputError: a bone length that is not positive, a limb of zero length, negative radii, a
@@ -83,13 +95,10 @@ class Body(nn.Module):
     """
 
     bone_lengths: Tensor
-    offsets: Tensor
+    directions: Tensor
     tips: Tensor
     radii: Tensor
     centres: Tensor
-    centre_rotations: Tensor
-    joint_weights: Tensor
-    limb_weights: Tensor
     _order: Tensor
 
     def __init__(
@@ -110,7 +119,7 @@ class Body(nn.Module):
         self.skeleton, self.frame, self.dim = skeleton, frame, skeleton.dim
         device = bone_lengths.device
         lengths = checked_lengths(skeleton, bone_lengths.double())
-        offsets = lengths[:, None] * checked_directions(skeleton, directions, device)
+        directions = checked_directions(skeleton, directions, device)
         tips = checked_tips(skeleton, lengths, tips)
         if centres is None:
             centres = torch.zeros(len(skeleton.parts), 3, dtype=torch.float64, device=device)
@@ -119,26 +128,55 @@ class Body(nn.Module):
         centres = within_unit_ball(centres.to(device, torch.float64))
         if bool(centres[0].any()):
             raise InputError("the root part has no centre: centres[0] must be zero")
-        weights = point_weights(skeleton, offsets, tips)
-        at = {name: i for i, name in enumerate(skeleton.points)}
-        ends = [at[e] for limb in skeleton.limbs for e in (limb.start, limb.end)]
-        limb_weights = weights[:, ends]
-        check_limb_lengths(skeleton, limb_weights)
         for name, value in {
             "bone_lengths": lengths,
-            "offsets": offsets,
+            "directions": directions,
             "tips": tips,
             "radii": checked_radii(skeleton, radii),
             "centres": centres,
-            "centre_rotations": quaternion_vector_to_matrix(centres),
-            "joint_weights": weights[:, : len(skeleton.names)].contiguous(),
-            "limb_weights": limb_weights,
         }.items():
-            self.register_buffer(name, value.to(device, dtype))
-        self._centred = bool(centres.any())  # a product with unit matrices would cost a tenth
-        self.register_load_state_dict_post_hook(_look_for_centres)
+            register_given(self, name, value.to(device, dtype))
+        check_limb_lengths(skeleton, self.limb_weights)
         for name, index in level_plan(skeleton).items():
             self.register_buffer(name, torch.tensor(index, device=device), persistent=False)
+
+    @property
+    def offsets(self) -> Float[Tensor, "J 3"]:
+        """Place of every joint from its parent in the rest pose, metres."""
+        return self._geometry().offsets
+
+    @property
+    def centre_rotations(self) -> Float[Tensor, "P 3 3"]:
+        """Rotation of every part's centre."""
+        return self._geometry().centre_rotations
+
+    @property
+    def joint_weights(self) -> Float[Tensor, "P3 J"]:
+        """How the joints depend on the columns of the parts' rotations, [3 P, J]."""
+        return self._geometry().joint_weights
+
+    @property
+    def limb_weights(self) -> Float[Tensor, "P3 L2"]:
+        """How the ends of the limbs depend on them, [3 P, 2 L]."""
+        return self._geometry().limb_weights
+
+    def _geometry(self) -> "_Geometry":
+        sources = (self.bone_lengths, self.directions, self.tips, self.centres)
+        return derived(self, "geometry", sources, self._make_geometry)
+
+    def _make_geometry(self) -> "_Geometry":
+        skeleton, dtype = self.skeleton, self.bone_lengths.dtype
+        offsets = self.bone_lengths.double()[:, None] * self.directions.double()
+        weights = point_weights(skeleton, offsets, self.tips.double())
+        at = {name: i for i, name in enumerate(skeleton.points)}
+        ends = [at[e] for limb in skeleton.limbs for e in (limb.start, limb.end)]
+        return _Geometry(
+            offsets.to(dtype),
+            quaternion_vector_to_matrix(self.centres.double()).to(dtype),
+            weights[:, : len(skeleton.names)].contiguous().to(dtype),
+            weights[:, ends].to(dtype),
+            bool(self.centres.any()),
+        )
 
     @classmethod
     def of_height(
@@ -167,7 +205,7 @@ class Body(nn.Module):
             self.skeleton,
             self.bone_lengths,
             self.radii if radii is None else radii,
-            directions=torch.nn.functional.normalize(self.offsets, dim=-1),
+            directions=self.directions,
             centres=self.centres if centres is None else centres,
             frame=self.frame if frame is None else frame,
             tips=self.tips,
@@ -191,8 +229,9 @@ class Body(nn.Module):
         """Rotations of all parts, from part axes to world axes."""
         self._check(state)
         turns = quaternion_vector_to_matrix(state[..., 3:].unflatten(-1, (-1, 3)))
-        if self._centred:
-            turns = self.centre_rotations @ turns
+        geometry = self._geometry()
+        if geometry.centred:  # a product with unit matrices would cost a tenth
+            turns = geometry.centre_rotations @ turns
         if self.frame == "body":
             root, others = turns[..., :1, :, :], turns[..., 1:, :, :]
             return torch.cat([root, root @ others], -3)
@@ -359,7 +398,3 @@ def centres_of(body: Body, states: Float[Tensor, "*batch D"]) -> Float[Tensor, "
     vectors = states[:, 3:].unflatten(-1, (-1, 3)).transpose(0, 1)
     centres = compose(body.centres, mean_rotation(vectors))
     return torch.cat([torch.zeros_like(centres[:1]), centres[1:]])
-
-
-def _look_for_centres(body: nn.Module, _: object) -> None:
-    setattr(body, "_centred", bool(body.get_buffer("centres").any()))  # noqa: B010, a Body
