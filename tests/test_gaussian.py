@@ -127,15 +127,57 @@ def test_a_step_factorises_once_and_loses_only_what_is_not_positive_definite(rng
         assert torch.equal(found[0], value[0]) and bool(torch.isnan(found[1]).any())
 
 
-def test_a_factor_is_found_for_what_rounding_made_indefinite_and_nan_for_what_is(rng):
-    good, thin = random_covariance(rng, 3), np.outer([1.0, 2.0, 3.0], [1.0, 2.0, 3.0])
-    negative = -np.eye(3)
-    matrices = tensor(np.stack([good, thin - 1e-13 * np.eye(3), negative, np.zeros((3, 3))]))
-    factor = gaussian.safe_cholesky(matrices)
-    torch.testing.assert_close(factor[0], torch.linalg.cholesky(matrices[0]))
-    torch.testing.assert_close(factor[1] @ factor[1].mT, matrices[1], atol=1e-4, rtol=0)
-    assert torch.isnan(factor[2]).all()
-    assert torch.isfinite(factor[3]).all() and factor[3].abs().max() < 1e-8
+def indefinite_correlations(rng, dim, lowest):
+    """A symmetric matrix of unit diagonal whose smallest eigenvalue is `lowest`, in long double."""
+    a = rng.standard_normal((dim, dim - 1)).astype(np.longdouble)
+    a /= np.sqrt((a**2).sum(1, keepdims=True))
+    return (a @ a.T - np.diag(np.full(dim, -lowest))) / (1 + lowest)
+
+
+@pytest.mark.parametrize("lowest", [-3e-15, -3e-13, -3e-11, -3e-9, -3e-7])
+def test_a_mended_matrix_keeps_every_variance_whatever_its_unit(rng, lowest):
+    scale = np.array([1e2, 30.0, 1.0, 1e-2, 1e-3])  # pixels, metres, radians
+    matrices, least = [], []
+    for _ in range(20):
+        correlations = indefinite_correlations(rng, 5, lowest)
+        matrices.append(np.float64(scale[:, None] * correlations * scale))
+        least.append(np.linalg.eigvalsh(np.float64(correlations))[0])
+    factor, jitter = gaussian.mended_cholesky(tensor(np.stack(matrices)))
+    expected = 10.0 ** (2 * np.ceil(np.log10(-np.array(least)) / 2))
+    if lowest < -1e-13:  # smaller ones are no more than rounding of the matrix itself
+        np.testing.assert_array_equal(jitter, expected)
+    assert float(jitter.max()) <= max(-30 * lowest, 1e-12)
+    for found, share, matrix in zip(factor, jitter, matrices, strict=True):
+        change = (found @ found.mT).numpy() - matrix
+        relative = change / np.sqrt(np.outer(matrix.diagonal(), matrix.diagonal()))
+        np.testing.assert_allclose(relative, float(share) * np.eye(5), atol=3e-15)
+
+
+def test_what_is_positive_definite_keeps_its_factor_beside_what_is_mended_or_lost(rng):
+    good = np.stack([random_covariance(rng, 3) * 10.0**k for k in (-8, 0, 8)])
+    thin = np.outer([1.0, 2.0, 4.0], [1.0, 2.0, 4.0])
+    hopeless = [-np.eye(3), np.eye(3) * np.nan, np.ones((3, 3)) - 1e-3 * np.eye(3)]
+    hopeless.append(np.array([[1.0, 9.0, 0.0], [9.0, 1.0, 0.0], [0.0, 0.0, 1e9]]))
+    matrices = tensor(np.stack([*good, thin, np.zeros((3, 3)), *hopeless])).requires_grad_()
+    factor, jitter = gaussian.mended_cholesky(matrices)
+    assert torch.equal(factor[:3], torch.linalg.cholesky(matrices[:3]))
+    assert jitter.tolist() == [0, 0, 0, 1e-14, 1e-14, 0, 0, 0, 0]
+    torch.testing.assert_close(factor[3] @ factor[3].mT, tensor(thin), atol=1e-12, rtol=0)
+    assert torch.isfinite(factor[4]).all() and factor[4].abs().max() < 1e-8
+    assert torch.isnan(factor[5:]).all()
+    (slope,) = torch.autograd.grad(factor[:4].sum(), matrices)
+    assert torch.isfinite(slope[:4]).all()
+    assert gaussian.mended_cholesky(matrices[:3].detach())[1] is None
+
+
+@pytest.mark.parametrize("variance", [0.0, -1e-13, 1e-18])
+def test_a_variance_that_is_rounding_is_mended_by_the_scale_of_the_others(variance):
+    matrix = np.diag([1.0, 3.0, variance])
+    matrix[0, 2] = matrix[2, 0] = 1e-8
+    factor, jitter = gaussian.mended_cholesky(tensor(matrix))
+    expected = matrix + float(jitter) * np.diag([1.0, 3.0, 4 / 3])
+    np.testing.assert_allclose((factor @ factor.mT).numpy(), expected, atol=1e-15)
+    assert 0 < float(jitter) <= 1e-12
 
 
 def test_moments_of_a_mixture_are_those_of_its_draws(rng):

@@ -14,6 +14,7 @@ __all__ = [
     "generators_of_arms",
     "in_double",
     "joints_of_arm",
+    "mending_notes",
     "require_cov",
 ]
 
@@ -64,6 +65,19 @@ def in_double(out: FilterOutput) -> FilterOutput:
     """Return the estimates in float64, in which poses are read out of them."""
     wide = [v.double() if v is not None and v.is_floating_point() else v for v in out]
     return FilterOutput(*wide)  # type: ignore[arg-type]
+
+
+def mending_notes(left: FilterOutput, right: FilterOutput) -> tuple[str, ...]:
+    """What is worth a note about covariances that were mended; nothing where none was."""
+    outputs = [out for out in (left, right) if out.mended is not None and out.jitter is not None]
+    count = sum(int(out.mended.sum()) for out in outputs if out.mended is not None)
+    if not count:
+        return ()
+    most = max(float(out.jitter.max()) for out in outputs if out.jitter is not None)
+    return (
+        f"{count} covariances were not positive definite in rounding and were mended: their "
+        f"variances grew by at most {most:.0e} of themselves",
+    )
 
 
 def require_cov(out: FilterOutput | StepOutput) -> Tensor:

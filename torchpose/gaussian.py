@@ -22,6 +22,7 @@ __all__ = [
     "least_exponent",
     "log_prob",
     "marginal",
+    "mended_cholesky",
     "mixture_moments",
     "product",
     "safe_cholesky",
@@ -30,7 +31,7 @@ __all__ = [
 
 LOG_2PI = math.log(2 * math.pi)
 _JITTER = (1e-14, 1e-12, 1e-10, 1e-8, 1e-6)
-_LEAST_SCALE = 1e-18  # of a matrix of zeros, such as the covariance of a single particle
+_LEAST_VARIANCE = 1e-18  # of a matrix of zeros, such as the covariance of a single particle
 _LANES = 8  # products of small matrices take half the time where this divides their columns
 
 
@@ -40,34 +41,74 @@ def symmetrise(matrix: Float[Tensor, "... D D"]) -> Float[Tensor, "... D D"]:
 
 
 def safe_cholesky(matrix: Float[Tensor, "... D D"]) -> Float[Tensor, "... D D"]:
-    """Cholesky factor of each matrix, with an answer for what is not positive definite.
+    """Return the Cholesky factor of each matrix, mended where rounding made it indefinite.
 
-    A matrix that rounding has pushed off the positive definite cone gets the smallest multiple of
-    its mean diagonal, from 1e-14 to 1e-6, that makes it factorise (zeros count as
-    1e-18). A matrix that no such multiple mends gets a factor of NaN, so that its batch element is
-    lost and no other.
+    Args, Raises: as `mended_cholesky`.
+
+    Returns:
+        Lower triangular L [..., D, D] with L L^T = matrix.
+    """
+    return mended_cholesky(matrix)[0]
+
+
+def mended_cholesky(
+    matrix: Float[Tensor, "... D D"],
+) -> tuple[Float[Tensor, "... D D"], Float[Tensor, "..."] | None]:
+    """Return the Cholesky factor of each matrix, and the jitter that it took.
+
+    A matrix A that rounding has pushed off the positive definite cone is whitened by its own
+    variances, S = diag(A), and gets the smallest jitter j of 1e-14, 1e-12, ... 1e-6 that makes it
+    factorise:
+
+    L L^T = A + j S,   from the factor of S^-1/2 A S^-1/2 + j I.
+
+    So every variance grows by the same share j, whether it is in pixels, metres or radians. A
+    variance that is rounding beside the largest one, zero or below has no scale of its own; it takes
+    the mean of the diagonal for S, at least 1e-18. A matrix that no such jitter mends gets a factor
+    of NaN, so that its batch element is lost and no other.
 
     Args:
         matrix: [..., D, D], symmetric; only the lower triangle is read.
 
     Returns:
-        Lower triangular L [..., D, D] with L L^T = matrix.
+        Lower triangular L [..., D, D], and j [...]: 0 for matrices that factorise as they are, and
+        for those that are lost. None if all factorise as they are, which is the rule.
     """
     factor, info = torch.linalg.cholesky_ex(matrix)
     if not bool(info.any()):
-        return factor
-    scale = (
-        matrix.diagonal(dim1=-2, dim2=-1).abs().mean(-1)[..., None, None].clamp_min(_LEAST_SCALE)
-    )
+        return factor, None
+    with torch.no_grad():
+        scale = _own_scale(matrix)
+        both = scale[..., :, None] * scale[..., None, :]
+        jitter = _least_jitter(matrix / both, info)
+    # One factorisation for all, of what factorises: no gradient passes through one that failed.
     eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    for jitter in _JITTER:
-        retry, retry_info = torch.linalg.cholesky_ex(matrix + jitter * scale * eye)
-        mended = (info != 0) & (retry_info == 0)
-        factor = torch.where(mended[..., None, None], retry, factor)
-        info = torch.where(mended, retry_info, info)
-        if not bool(info.any()):
-            return factor
-    return torch.where((info != 0)[..., None, None], torch.full_like(factor, math.nan), factor)
+    mended, lost = (jitter > 0)[..., None, None], torch.isnan(jitter)[..., None, None]
+    whitened = torch.where(mended, matrix / both + jitter[..., None, None] * eye, matrix)
+    factor = torch.linalg.cholesky_ex(torch.where(lost, eye, whitened)).L
+    factor = torch.where(mended, scale[..., None] * factor, factor)
+    return torch.where(lost, torch.full_like(factor, math.nan), factor), jitter.nan_to_num(0.0)
+
+
+def _own_scale(matrix: Float[Tensor, "... D D"]) -> Float[Tensor, "... D"]:
+    """Return the standard deviation of each dimension, that of the mean where it is rounding."""
+    variance = matrix.diagonal(dim1=-2, dim2=-1)
+    size = variance.abs()
+    rounding = torch.finfo(matrix.dtype).eps * size.amax(-1, keepdim=True)
+    mean = size.mean(-1, keepdim=True).clamp_min(_LEAST_VARIANCE)
+    return torch.where(variance > rounding, variance, mean).sqrt()
+
+
+def _least_jitter(
+    whitened: Float[Tensor, "... D D"], info: Int[Tensor, "..."]
+) -> Float[Tensor, "..."]:
+    """Return the least jitter that makes each matrix factorise: 0 where it does, NaN where none."""
+    eye = torch.eye(whitened.shape[-1], dtype=whitened.dtype, device=whitened.device)
+    jitter = torch.where(info == 0, 0.0, torch.full_like(whitened[..., 0, 0], math.nan))
+    for candidate in _JITTER:
+        retried = torch.linalg.cholesky_ex(whitened + candidate * eye).info
+        jitter = torch.where(torch.isnan(jitter) & (retried == 0), candidate, jitter)
+    return jitter
 
 
 def least_exponent(dtype: torch.dtype) -> float:
@@ -162,11 +203,24 @@ class Gain(NamedTuple):
             measurement has the row and column of the identity.
         white: W = L^-1 H P [..., Z, D], so that K = W^T L^-1 and P - K S K^T = P - W^T W.
         log_norm: -sum log diag L - n/2 log 2 pi, n the number of measured dimensions, [...].
+        jitter: what the innovation covariances took to factorise, [...]; None if they all did as
+            they were. See `mended_cholesky`.
     """
 
     factor: Tensor
     white: Tensor
     log_norm: Tensor
+    jitter: Tensor | None = None
+
+    def to(self, dtype: torch.dtype) -> "Gain":
+        """Return the same gain in another precision."""
+        factor, white, log_norm = (part.to(dtype) for part in self[:3])
+        return Gain(factor, white, log_norm, self.jitter)
+
+    def of(self, rows: Int[Tensor, "..."]) -> "Gain":
+        """Return the gains of some rows of the first dimension."""
+        jitter = None if self.jitter is None else self.jitter[rows]
+        return Gain(self.factor[rows], self.white[rows], self.log_norm[rows], jitter)
 
 
 def kalman_predict(
@@ -217,23 +271,25 @@ def kalman_gain(
     Returns:
         The `Gain` and the covariance after the update [..., D, D].
     """
-    cross, factor, count = _innovation(cov, measurement_cov, observed, mask)
+    cross, factor, count, jitter = _innovation(cov, measurement_cov, observed, mask)
     white = torch.linalg.solve_triangular(factor, cross, upper=False)
-    return Gain(factor, white, _log_norm(factor, count)), cov - white.mT @ white
+    return Gain(factor, white, _log_norm(factor, count), jitter), cov - white.mT @ white
 
 
 def _innovation(
     cov: Tensor, measurement_cov: Tensor, observed: Tensor, mask: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor | int]:
-    """H P, the factor of H P H^T + R, and the number of measured dimensions."""
+) -> tuple[Tensor, Tensor, Tensor | int, Tensor | None]:
+    """H P, the factor of H P H^T + R, the number of measured dimensions, and the factor's jitter."""
     cross = cov.index_select(-2, observed)
     innovation = cross.index_select(-1, observed) + measurement_cov
     if mask is None:
-        return cross, safe_cholesky(innovation), observed.numel()
+        factor, jitter = mended_cholesky(innovation)
+        return cross, factor, observed.numel(), jitter
     both = mask[..., :, None] & mask[..., None, :]
     eye = torch.eye(mask.shape[-1], dtype=cov.dtype, device=cov.device)
     innovation = torch.where(both, innovation, eye)
-    return cross * mask[..., None], safe_cholesky(innovation), mask.sum(-1).to(cov.dtype)
+    factor, jitter = mended_cholesky(innovation)
+    return cross * mask[..., None], factor, mask.sum(-1).to(cov.dtype), jitter
 
 
 def _log_norm(factor: Tensor, count: Tensor | int) -> Tensor:
@@ -292,7 +348,25 @@ def kalman_update(
     Returns:
         Mean, covariance and log-likelihood log N(z | H x, H P H^T + R) of what was measured.
     """
-    cross, factor, count = _innovation(cov, measurement_cov, observed, mask)
+    mean, cov, log_likelihood, _ = mended_update(mean, cov, z, measurement_cov, observed, mask)
+    return mean, cov, log_likelihood
+
+
+def mended_update(
+    mean: Float[Tensor, "... D"],
+    cov: Float[Tensor, "... D D"],
+    z: Float[Tensor, "... Z"],
+    measurement_cov: Float[Tensor, "... Z Z"],
+    observed: Int[Tensor, " Z"],
+    mask: Bool[Tensor, "... Z"] | None = None,
+) -> tuple[
+    Float[Tensor, "... D"],
+    Float[Tensor, "... D D"],
+    Float[Tensor, "..."],
+    Float[Tensor, "..."] | None,
+]:
+    """`kalman_update`, with the jitter of the innovation covariances (`mended_cholesky`) beside it."""
+    cross, factor, count, jitter = _innovation(cov, measurement_cov, observed, mask)
     residual = z - mean.index_select(-1, observed)
     if mask is not None:
         residual = torch.where(mask, residual, torch.zeros_like(residual))
@@ -301,7 +375,8 @@ def kalman_update(
     white = torch.linalg.solve_triangular(factor, _beside(cross, residual), upper=False)
     change = _multiply(white.mT, white)
     log_likelihood = torch.sub(_log_norm(factor, count), change[..., dim, dim], alpha=0.5)
-    return mean + change[..., :dim, dim], cov - change[..., :dim, :dim], log_likelihood
+    mean = mean + change[..., :dim, dim]
+    return mean, cov - change[..., :dim, :dim], log_likelihood, jitter
 
 
 def mixture_moments(

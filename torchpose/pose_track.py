@@ -57,7 +57,8 @@ class PoseTrack:
         matrix: camera matrix K [3, 3] of the input.
         frame: "camera" (x right, y down, z forward) or "body" (that of the prior's recordings).
         failed_at: [B], the first frame that is NaN because the filter degenerated, -1 if none.
-        notes: what was assumed about camera, neck and hands, in plain words.
+        notes: what was assumed about camera, neck and hands, and whether covariances had to be
+            mended, in plain words.
         method: the estimator that ran, one of `torchpose.tracking.METHODS`; "unknown" in files of
             older releases.
         first_frame: of the video or recording, that of the first pose.

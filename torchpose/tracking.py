@@ -18,7 +18,14 @@ from torchpose.arm_windows import (
     window_filter,
     window_inputs,
 )
-from torchpose.arms import ARMS, first_failure, generators_of_arms, in_double, joints_of_arm
+from torchpose.arms import (
+    ARMS,
+    first_failure,
+    generators_of_arms,
+    in_double,
+    joints_of_arm,
+    mending_notes,
+)
 from torchpose.body_view import BodyView
 from torchpose.camera import PinholeCamera
 from torchpose.errors import CameraError, InputError, PriorError, check_shape
@@ -452,7 +459,7 @@ class UpperBodyTracker(WideModule):
             failed_at=first_failure(left, right),
             fps=self.fps,
             frame=self.frame,
-            notes=notes,
+            notes=(*notes, *mending_notes(left, right)),
             method=self._estimator(),
         ).in_precision(self.dtype)
 

@@ -81,9 +81,8 @@ def test_online_offline_and_smoothed_weights_are_the_same(gamma, own_noise):
     for t in range(z.shape[1]):
         now = None if noise is None else noise[:, t]
         state, step = f.step(state, z[:, t], mask[:, t], now, return_cov=True)
-        for found, whole in zip(
-            step, (out.mean, out.log_weights, out.log_evidence, out.cov), strict=True
-        ):
+        values = out.mean, out.log_weights, out.log_evidence, out.cov, out.mended, out.jitter
+        for found, whole in zip(step, values, strict=True):
             torch.testing.assert_close(found, whole[:, t])
     torch.testing.assert_close(f.smooth(z, mask, noise).log_weights, out.log_weights)
 

@@ -22,6 +22,7 @@ from torchpose.errors import (
     check_finite,
     check_shape,
 )
+from torchpose.filters.mending import Mending, mending, stacked
 from torchpose.module_state import (
     WideModule,
     derived,
@@ -52,12 +53,15 @@ class StepOutput(NamedTuple):
         mean: [B, D]. log_weights: of the M tracks or particles, normalised, [B, M].
         log_evidence: log p(z_t | z_1:t-1), [B]; 0 where nothing is measured, NaN for variants
             that drop the evidence term. cov: [B, D, D] on request.
+        mended, jitter: as in `FilterOutput`, [B]; None stands for 0.
     """
 
     mean: Tensor
     log_weights: Tensor
     log_evidence: Tensor
     cov: Tensor | None = None
+    mended: Tensor | None = None
+    jitter: Tensor | None = None
 
 
 class FilterOutput(NamedTuple):
@@ -70,6 +74,10 @@ class FilterOutput(NamedTuple):
         cov: [B, T, D, D], or None unless asked for.
         failed_at: [B], the first frame at which an element degenerated, -1 where it did not. From
             that frame on the element's estimates are NaN.
+        mended: number of covariances of the frame's tracks that rounding had made indefinite and
+            that were mended (`torchpose.gaussian.mended_cholesky`), [B, T]; 0 as a rule and past the
+            length.
+        jitter: the largest share by which their variances grew, [B, T], float64; at most 1e-6.
     """
 
     mean: Tensor
@@ -77,6 +85,8 @@ class FilterOutput(NamedTuple):
     log_evidence: Tensor
     cov: Tensor | None
     failed_at: Tensor
+    mended: Tensor | None = None
+    jitter: Tensor | None = None
 
     @property
     def effective_sample_size(self) -> Tensor:
@@ -352,12 +362,17 @@ def collect(steps: Sequence[StepOutput], lengths: Int[Tensor, " B"]) -> FilterOu
     cov = None
     if steps[0].cov is not None:
         cov = torch.stack([s.cov for s in steps if s.cov is not None], 1)
+    none = mending(steps[0].mean)
+    work = [
+        none if s.mended is None or s.jitter is None else Mending(s.mended, s.jitter) for s in steps
+    ]
     return finish_output(
         torch.stack([s.mean for s in steps], 1),
         torch.stack([s.log_weights for s in steps], 1),
         torch.stack([s.log_evidence for s in steps], 1),
         cov,
         lengths,
+        stacked(work),
     )
 
 
@@ -367,6 +382,7 @@ def finish_output(
     log_evidence: Float[Tensor, "B T"],
     cov: Float[Tensor, "B T D D"] | None,
     lengths: Int[Tensor, " B"],
+    work: Mending,
 ) -> FilterOutput:
     """Repeat the last estimate past each length, and report the elements that degenerated."""
     batch, n_frames = log_evidence.shape
@@ -378,6 +394,7 @@ def finish_output(
         cov = None if cov is None else cov[rows, held]
         inside = frames < lengths[:, None]
         log_evidence = torch.where(inside, log_evidence, torch.zeros_like(log_evidence))
+        work = Mending(*(part * inside for part in work))
     failed_at = _first_failure(mean)
     if bool((failed_at >= 0).any()):
         lost = frames >= failed_at[:, None]
@@ -394,7 +411,7 @@ def finish_output(
             DegenerateFilterWarning,
             stacklevel=3,
         )
-    return FilterOutput(mean, log_weights, log_evidence, cov, failed_at)
+    return FilterOutput(mean, log_weights, log_evidence, cov, failed_at, *work)
 
 
 def _first_failure(mean: Float[Tensor, "B T D"]) -> Int[Tensor, " B"]:

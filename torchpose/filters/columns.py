@@ -13,6 +13,7 @@ from tqdm.auto import tqdm
 
 from torchpose.filters.base import FilterOutput, Measurements, finish_output
 from torchpose.filters.gains import Edge
+from torchpose.filters.mending import mending_of_edges
 from torchpose.filters.weights import indicator_mixing, steps_between_rescaling
 from torchpose.gaussian import least_exponent
 
@@ -69,8 +70,10 @@ def run_columns(
         _run_part(model, frames.z[part], steps, out, bar)
     bar.close()
     evidence = torch.where(frames.mask.any(-1), evidence.mT, torch.zeros_like(evidence.mT))
+    shared = torch.zeros(batch, dtype=torch.long, device=frames.z.device)
+    work = mending_of_edges([[edge] for edge in edges], shared)
     return finish_output(
-        means.transpose(0, 1), log_weights.transpose(0, 1), evidence, None, frames.lengths
+        means.transpose(0, 1), log_weights.transpose(0, 1), evidence, None, frames.lengths, work
     )
 
 

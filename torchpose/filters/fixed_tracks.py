@@ -21,6 +21,7 @@ from torchpose.filters.frame_weights import (
     run_memoryless,
 )
 from torchpose.filters.gains import MAX_EDGES, Edge, GainGraph
+from torchpose.filters.mending import mending, mending_of_edges
 from torchpose.filters.scan import Workspace, scan_blocks
 from torchpose.filters.tracks import MKFState, estimate_of, within_and_between
 from torchpose.filters.weights import mix_uniform, sequence_weights, step_weights
@@ -39,6 +40,7 @@ class TrackStep(NamedTuple):
         predicted, mean: track means before and after the measurement [B, M, D].
         log_likelihood: [B, M]. predicted_cov, cov: before and after, [G, M, D, D].
         group: row of the covariances for each element [B].
+        jitter: of the innovation covariances [B, M], or None; see `mended_cholesky`.
     """
 
     predicted: Tensor
@@ -47,6 +49,7 @@ class TrackStep(NamedTuple):
     predicted_cov: Tensor
     cov: Tensor
     group: Tensor
+    jitter: Tensor | None
 
 
 def step_tracks(model: "MixtureKalmanFilter", state: MKFState, frame: Measurements) -> TrackStep:
@@ -55,16 +58,17 @@ def step_tracks(model: "MixtureKalmanFilter", state: MKFState, frame: Measuremen
     cov, group, mask, noise_cov = distinct_histories(state, frame)
     predicted_cov = symmetrise(matrix @ cov @ matrix.mT + noise)
     gain, cov = kalman_gain(predicted_cov, noise_cov, model.observed, mask)
-    gain = Gain(*(part.to(model.dtype) for part in gain))
+    gain = gain.to(model.dtype)
     moving = matrix.to(model.dtype), offset.to(model.dtype)
     if cov.shape[0] == 1:
         means = _correct_shared(model, state.mean, moving, gain, frame)
     else:
         predicted = (moving[0] @ state.mean[..., None])[..., 0] + moving[1]
-        own = Gain(*(part[group] for part in gain))
+        own = gain.of(group)
         z, seen = frame.z[:, None], frame.mask[:, None]
         means = predicted, *kalman_correct(predicted, z, own, model.observed, seen)
-    return TrackStep(*means, predicted_cov, cov, group)
+    jitter = None if gain.jitter is None else gain.jitter[group]
+    return TrackStep(*means, predicted_cov, cov, group, jitter)
 
 
 def step_fixed_weights(
@@ -95,7 +99,8 @@ def advance(
     estimate, total = estimate_of(log_weights, step.mean, covs)
     carried = mix_uniform(log_weights, model.uniform_weight)
     new_state = MKFState(carried, step.mean, step.cov, step.group, state.time + 1)
-    return new_state, StepOutput(estimate, log_weights, log_evidence, total)
+    work = mending(estimate, step.jitter)
+    return new_state, StepOutput(estimate, log_weights, log_evidence, total, *work)
 
 
 def _correct_shared(
@@ -243,8 +248,9 @@ def _run_shared(
     bar.close()
     evidence = torch.where(frames.mask.any(-1), evidences.mT, torch.zeros_like(evidences.mT))
     cov = None if covs is None else covs.transpose(0, 1)
+    work = mending_of_edges(history.edges, history.group)
     return finish_output(
-        estimates.transpose(0, 1), posteriors.transpose(0, 1), evidence, cov, frames.lengths
+        estimates.transpose(0, 1), posteriors.transpose(0, 1), evidence, cov, frames.lengths, work
     )
 
 

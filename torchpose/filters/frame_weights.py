@@ -16,6 +16,7 @@ from tqdm.auto import tqdm
 
 from torchpose.filters.base import FilterOutput, Measurements, StepOutput, finish_output
 from torchpose.filters.geometric_median import median_estimate
+from torchpose.filters.mending import Mending, mending
 from torchpose.filters.recompute import recomputed, wants_gradient
 from torchpose.filters.tracks import MKFState, estimate_of
 from torchpose.filters.weights import normalise
@@ -74,7 +75,7 @@ def run_memoryless(
     """All frames of a filter whose predictions are the components themselves (BL 39-41, 48)."""
     batch, n_frames, _ = frames.z.shape
     learning = wants_gradient(frames.z, frames.cov, model.log_prior, model.means, model.covariances)
-    parts: list[list[tuple[Tensor, Tensor]]] = [[], [], [], []]
+    parts: list[list[tuple[Tensor, Tensor]]] = [[], [], [], [], [], []]
     bar = tqdm(total=batch * n_frames, disable=not progress, unit="frame")
     for group in _groups(frames, _RECOMPUTED_FRAMES if learning else _SHARED_FRAMES):
         # Gains that groups share are not among what a gradient computes anew for one of them.
@@ -90,7 +91,8 @@ def run_memoryless(
         _in_order(part).unflatten(0, (batch, n_frames)) for part in parts[:3]
     )
     covs = _in_order(parts[3]).unflatten(0, (batch, n_frames)) if return_cov else None
-    return finish_output(mean, log_weights, evidence, covs, frames.lengths)
+    work = Mending(*(_in_order(part).unflatten(0, (batch, n_frames)) for part in parts[4:]))
+    return finish_output(mean, log_weights, evidence, covs, frames.lengths, work)
 
 
 def _estimate(
@@ -98,17 +100,18 @@ def _estimate(
     group: "_Group",
     gain: tuple[Gain, Tensor] | None,
     return_cov: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """Estimates, log-weights, log-evidence and covariances of a group of frames."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor]:
+    """Estimates, log-weights, log-evidence, covariances and mending of a group of frames."""
     log_prior, power = model.log_prior.to(model.dtype), model.likelihood_power
-    means, log_likelihood, cov = _condition(model, group, gain or _gain(model, group))
+    gain = gain or _gain(model, group)
+    means, log_likelihood, cov, jitter = _condition(model, group, gain)
     log_weights, evidence = frame_weights(log_prior, log_likelihood, log_likelihood, power)
     measured = group.mask.any(-1).squeeze(-1)
     evidence = torch.where(measured, evidence, torch.zeros_like(evidence))
     mean, total = estimate_of(log_weights, means, cov if return_cov else None)
     if len(model.medians):
         mean, total = median_estimate(log_weights, means, cov, mean, total, model.medians)
-    return mean, log_weights, evidence, total
+    return mean, log_weights, evidence, total, *mending(mean, jitter)
 
 
 def advance_memoryless(
@@ -118,7 +121,9 @@ def advance_memoryless(
     out = run_memoryless(model, frame.as_sequences(), return_cov, progress=False)
     cov = None if out.cov is None else out.cov[:, 0]
     step = StepOutput(out.mean[:, 0], out.log_weights[:, 0], out.log_evidence[:, 0], cov)
-    return state._replace(time=state.time + 1), step
+    mended = None if out.mended is None else out.mended[:, 0]
+    jitter = None if out.jitter is None else out.jitter[:, 0]
+    return state._replace(time=state.time + 1), step._replace(mended=mended, jitter=jitter)
 
 
 class _Group(NamedTuple):
@@ -167,18 +172,20 @@ def _groups_of_own(z: Tensor, mask: Tensor, noise: Tensor) -> Iterator[_Group]:
 
 def _condition(
     model: "MixtureKalmanFilter", group: _Group, gain_and_cov: tuple[Gain, Tensor]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Every component given a frame: means [N, M, D], log-likelihoods [N, M], covariances."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """Every component given a frame: means [N, M, D], log-likelihoods [N, M], covariances, jitter."""
     gain, cov = gain_and_cov
     centres = model.means.to(model.dtype)
     residual = (group.z[:, None] - centres[:, model.observed]) * group.mask
     if group.shares_gain:
         white = torch.linalg.solve_triangular(gain.factor, residual.permute(1, 2, 0), upper=False)
         means = (centres[:, None] + white.mT @ gain.white).transpose(0, 1)
-        return means, (gain.log_norm[:, None] - 0.5 * white.square().sum(1)).mT, cov
+        log_likelihood = (gain.log_norm[:, None] - 0.5 * white.square().sum(1)).mT
+        jitter = None if gain.jitter is None else gain.jitter.expand(len(group.rows), -1)
+        return means, log_likelihood, cov, jitter
     white = torch.linalg.solve_triangular(gain.factor, residual[..., None], upper=False)
     means = centres + (gain.white.mT @ white)[..., 0]
-    return means, gain.log_norm - 0.5 * white.square().sum((-2, -1)), cov
+    return means, gain.log_norm - 0.5 * white.square().sum((-2, -1)), cov, gain.jitter
 
 
 def _gain(model: "MixtureKalmanFilter", group: _Group) -> tuple[Gain, Tensor]:
@@ -188,7 +195,7 @@ def _gain(model: "MixtureKalmanFilter", group: _Group) -> tuple[Gain, Tensor]:
         if found is not None:
             return found
     gain, cov = kalman_gain(model.covariances, group.noise, model.observed, group.mask)
-    gain = Gain(*(part.to(model.dtype) for part in gain))
+    gain = gain.to(model.dtype)
     if group.shares_gain:
         model.frame_gains.put(group.noise, group.mask, (gain, cov))
     return gain, cov

@@ -28,6 +28,7 @@ class Edge(NamedTuple):
         target: the node that the step leads to. inverse_factor: L^-1 [M, Z, Z] of the innovation
             covariance. white: W = L^-1 H P [M, Z, D]. log_norm: [M], constant of the likelihood.
         predicted_cov: covariance before the update [M, D, D].
+        mended: number of innovation covariances that were mended. jitter: the largest they took.
     """
 
     target: int
@@ -35,6 +36,8 @@ class Edge(NamedTuple):
     white: Tensor
     log_norm: Tensor
     predicted_cov: Tensor
+    mended: int
+    jitter: float
 
 
 class GainGraph:
@@ -94,7 +97,10 @@ class GainGraph:
         if mask is not None:
             inverse = inverse * mask
         target = self._target(node, pattern, updated)
-        return Edge(target, inverse, gain.white, gain.log_norm, predicted)
+        mended, jitter = 0, 0.0
+        if gain.jitter is not None:
+            mended, jitter = int((gain.jitter > 0).sum()), float(gain.jitter.max())
+        return Edge(target, inverse, gain.white, gain.log_norm, predicted, mended, jitter)
 
     def _target(self, node: int, pattern: int, updated: Tensor) -> int:
         if _same(updated, self.nodes[node]):

@@ -20,11 +20,12 @@ from torchpose.filters.base import (
     standard_normal,
     uniform,
 )
+from torchpose.filters.mending import Mending, mending
 from torchpose.filters.particle_options import PROPOSALS, check_model, check_options
 from torchpose.filters.resampling import resample
 from torchpose.filters.transition import make_transition
 from torchpose.filters.walk import MixtureWalk, Moves, grouped_affine
-from torchpose.gaussian import LOG_2PI, kalman_update, safe_cholesky
+from torchpose.gaussian import LOG_2PI, mended_cholesky, mended_update, safe_cholesky
 from torchpose.module_state import derived, register_given, wide_or_parameter
 from torchpose.priors.em import MixtureParameters
 from torchpose.priors.gmm import GaussianMixture
@@ -256,18 +257,18 @@ class BootstrapParticleFilter(RecursiveFilter):
 
     def _draw_measured(
         self, frame: Measurements, generator: Generators
-    ) -> tuple[Float[Tensor, "B N D"], Float[Tensor, " B"]]:
+    ) -> tuple[Float[Tensor, "B N D"], Float[Tensor, " B"], Mending]:
         """Draw particles of p(x | z), proportional to p(x) N(z | H x, R); also return log p(z)."""
         constants = self._constants()
         cov = frame.cov if frame.cov.ndim == 2 else frame.cov[:, None]
-        means, covs, log_likelihood = kalman_update(
+        means, covs, log_likelihood, jitter = mended_update(
             self.means.double().expand(len(frame.z), -1, -1), constants.initial_cov,
             frame.z.double()[:, None], cov, self.observed, frame.mask[:, None],
         )  # fmt: skip
         log_weights = self.weights.double().log() + log_likelihood
         moves = constants.walk.noise_moves(means.flatten(0, 1), covs.flatten(0, 1))
         white = self._draw(log_weights.softmax(1), moves, generator)
-        return white, torch.logsumexp(log_weights, 1)
+        return white, torch.logsumexp(log_weights, 1), mending(white, jitter, moves.jitter)
 
     def particles(self, state: ParticleState) -> Float[Tensor, "B N D"]:
         """The particles in the units of the state (pixels, metres, radians), float64."""
@@ -279,8 +280,8 @@ class BootstrapParticleFilter(RecursiveFilter):
     ) -> tuple[ParticleState, StepOutput]:
         """Resample if due, propose, weigh, and estimate."""
         if state.time == 0 and self.start == "measured":
-            white, evidence = self._draw_measured(frame, generator)
-            return self._output(self._evenly(white, 1), evidence, frame.mask, return_cov)
+            white, evidence, work = self._draw_measured(frame, generator)
+            return self._output(self._evenly(white, 1), evidence, frame.mask, return_cov, work)
         state = self._resample(state, generator)
         white = self._propose(state, generator)
         predicted = state.log_weights
@@ -291,21 +292,27 @@ class BootstrapParticleFilter(RecursiveFilter):
             if state.log_scaling is not None:
                 predicted = predicted - state.log_scaling
             predicted = predicted - torch.logsumexp(predicted, -1, keepdim=True)
-        log_weights = predicted + self._log_likelihood(white, frame)
+        log_likelihood, work = self._log_likelihood(white, frame)
+        log_weights = predicted + log_likelihood
         evidence = torch.logsumexp(log_weights, -1)
         # An element whose weights all vanished, or hold NaN, is NaN from here on.
         evidence = torch.where(torch.isfinite(evidence), evidence, torch.nan)
         log_weights = log_weights - evidence[:, None]
         new_state = ParticleState(white, log_weights, state.time + 1, scaling)
-        return self._output(new_state, evidence, frame.mask, return_cov)
+        return self._output(new_state, evidence, frame.mask, return_cov, work)
 
     def _output(
-        self, state: ParticleState, evidence: Tensor, mask: Tensor, return_cov: bool
+        self,
+        state: ParticleState,
+        evidence: Tensor,
+        mask: Tensor,
+        return_cov: bool,
+        work: Mending,
     ) -> tuple[ParticleState, StepOutput]:
         mean, cov = self._moments(state.white, state.log_weights, return_cov)
         evidence = self._reported(evidence, mask)
         # kept for every frame by `forward`, so no wider than the particles
-        return state, StepOutput(mean, state.log_weights.to(self.dtype), evidence, cov)
+        return state, StepOutput(mean, state.log_weights.to(self.dtype), evidence, cov, *work)
 
     def _resample(self, state: ParticleState, generator: Generators) -> ParticleState:
         """Resample the elements whose effective sample size is low (BL 25); the others stay."""
@@ -350,19 +357,21 @@ class BootstrapParticleFilter(RecursiveFilter):
 
     def _log_likelihood(
         self, white: Float[Tensor, "B N D"], frame: Measurements
-    ) -> Float[Tensor, "B N"]:
+    ) -> tuple[Float[Tensor, "B N"], Mending]:
         """log N(z | H x, R) (BL 15) over the measured dimensions, zero where there are none."""
         mask, z = frame.mask, frame.z.double()
         eye = torch.eye(z.shape[1], dtype=z.dtype, device=z.device)
-        factor = safe_cholesky(torch.where(mask[:, :, None] & mask[:, None, :], frame.cov, eye))
+        both = mask[:, :, None] & mask[:, None, :]
+        factor, jitter = mended_cholesky(torch.where(both, frame.cov, eye))
         rows = self.walk.scale[self.observed] * mask[..., None]
         target = torch.where(mask, z - self.walk.mean[self.observed], 0.0)
-        both = torch.cat([rows, target[..., None]], -1)
-        both = torch.linalg.solve_triangular(factor, both, upper=False).to(white.dtype)
-        residual = torch.baddbmm(both[:, None, :, -1], white, both[..., :-1].mT, alpha=-1)
+        joint = torch.cat([rows, target[..., None]], -1)
+        joint = torch.linalg.solve_triangular(factor, joint, upper=False).to(white.dtype)
+        residual = torch.baddbmm(joint[:, None, :, -1], white, joint[..., :-1].mT, alpha=-1)
         log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         log_norm = -log_det - 0.5 * LOG_2PI * mask.sum(-1)
-        return log_norm[:, None] - 0.5 * residual.square().sum(-1)
+        log_likelihood = log_norm[:, None] - 0.5 * residual.square().sum(-1)
+        return log_likelihood, mending(white, jitter)
 
     def _reported(
         self, evidence: Float[Tensor, " B"], mask: Bool[Tensor, "B Z"]

@@ -12,10 +12,11 @@ from torchpose.filters.base import (
     effective_sample_size,
     uniform,
 )
+from torchpose.filters.mending import mending
 from torchpose.filters.resampling import systematic
 from torchpose.filters.tracks import MKFState, estimate_of
 from torchpose.filters.weights import normalise
-from torchpose.gaussian import kalman_predict, kalman_update
+from torchpose.gaussian import kalman_predict, mended_update
 
 if TYPE_CHECKING:
     from torchpose.filters.mkf import MixtureKalmanFilter
@@ -44,7 +45,7 @@ def advance(
     mean, cov = kalman_predict(state.mean.to(wide), state.cov, matrix, offset, noise)
     noise_cov = frame.cov if frame.cov.ndim == 2 else frame.cov[:, None]
     mask = frame.mask[:, None].expand(*mean.shape[:2], -1)
-    mean, cov, log_likelihood = kalman_update(
+    mean, cov, log_likelihood, jitter = mended_update(
         mean, cov, frame.z[:, None].to(wide), noise_cov, model.observed, mask
     )
     mean = mean.to(model.dtype)
@@ -57,7 +58,7 @@ def advance(
     group = torch.arange(frame.z.shape[0], device=mean.device)
     return (
         MKFState(*carried, group, state.time + 1),
-        StepOutput(estimate, log_weights, log_evidence, total),
+        StepOutput(estimate, log_weights, log_evidence, total, *mending(estimate, jitter)),
     )
 
 

@@ -14,9 +14,10 @@ from torchpose.errors import InputError
 from torchpose.filters.base import FilterOutput, Measurements, finish_output
 from torchpose.filters.fixed_tracks import step_fixed_weights, step_tracks
 from torchpose.filters.frame_weights import run_memoryless
+from torchpose.filters.mending import Mending, mending, stacked
 from torchpose.filters.tracks import MKFState, within_and_between
 from torchpose.filters.weights import mix_uniform, normalise
-from torchpose.gaussian import safe_cholesky, symmetrise
+from torchpose.gaussian import mended_cholesky, symmetrise
 
 if TYPE_CHECKING:
     from torchpose.filters.mkf import MixtureKalmanFilter
@@ -33,6 +34,7 @@ class _Pass(NamedTuple):
         mean: filtered track means [T, B, M, D]. correction: filtered minus predicted [T, B, M, D].
         log_likelihood, log_weights: [T, B, M]. log_evidence: of the filter [T, B].
         cov, predicted_cov: per frame, [G, M, D, D]. group: per frame, row for each element [B].
+        jitter: per frame, of the innovation covariances [B, M], or None.
     """
 
     mean: Tensor
@@ -43,6 +45,7 @@ class _Pass(NamedTuple):
     cov: list[Tensor]
     predicted_cov: list[Tensor]
     group: list[Tensor]
+    jitter: list[Tensor | None]
 
 
 def smooth_fixed_tracks(
@@ -89,16 +92,17 @@ def smooth_fixed_tracks(
     evidence = torch.cat([out[2] for out in outputs])
     parts = [out[3] for out in outputs if out[3] is not None]
     cov = torch.cat(parts) if parts else None
-    return finish_output(mean, log_weights, evidence, cov, frames.lengths)
+    work = Mending(*(torch.cat(part) for part in zip(*(out[4] for out in outputs), strict=True)))
+    return finish_output(mean, log_weights, evidence, cov, frames.lengths, work)
 
 
 def _smooth(
     model: "MixtureKalmanFilter", frames: Measurements, lag: int | None, return_cov: bool
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Mending]:
     past = _forward(model, frames, return_cov)
     n_frames = frames.z.shape[1]
     reach = n_frames - 1 if lag is None else min(lag, n_frames - 1)
-    gains = _smoother_gains(model, past)
+    gains, jitters = _smoother_gains(model, past)
     later = torch.arange(1, n_frames + 1, device=frames.z.device) < frames.lengths[:, None]
     means = past.mean + _mean_corrections(past, gains, later.mT, reach)
     if model.weighting == "frame":
@@ -113,7 +117,9 @@ def _smooth(
         frames_of = zip(log_weights.exp(), means, estimate, covs, strict=True)
         total = torch.stack([within_and_between(w, m, e, c[finest]) for w, m, e, c in frames_of], 1)
     evidence = past.log_evidence.mT
-    return estimate.transpose(0, 1), log_weights.transpose(0, 1), evidence, total
+    pairs = zip(past.jitter, jitters, strict=True)
+    work = stacked([mending(past.mean[0], *pair) for pair in pairs])
+    return estimate.transpose(0, 1), log_weights.transpose(0, 1), evidence, total, work
 
 
 def _forward(model: "MixtureKalmanFilter", frames: Measurements, by_length: bool) -> _Pass:
@@ -124,7 +130,7 @@ def _forward(model: "MixtureKalmanFilter", frames: Measurements, by_length: bool
         lengths, group = torch.unique(frames.lengths, return_inverse=True)
         state = state._replace(cov=state.cov.expand(lengths.numel(), -1, -1, -1), group=group)
     means, corrections, likelihoods, weights, evidences = [], [], [], [], []
-    covs, predicted_covs, groups = [], [], []
+    covs, predicted_covs, groups, jitters = [], [], [], []
     for t in range(frames.z.shape[1]):
         frame = frames.frame(t)
         step = step_tracks(model, state, frame)
@@ -137,22 +143,28 @@ def _forward(model: "MixtureKalmanFilter", frames: Measurements, by_length: bool
         covs.append(step.cov)
         predicted_covs.append(step.predicted_cov)
         groups.append(step.group)
+        jitters.append(step.jitter)
         carried = mix_uniform(log_weights, model.uniform_weight)
         state = MKFState(carried, step.mean, step.cov, step.group, t + 1)
     values = (means, corrections, likelihoods, weights, evidences)
     mean, correction, likelihood, weight, evidence = (torch.stack(frames) for frames in values)
-    return _Pass(mean, correction, likelihood, weight, evidence, covs, predicted_covs, groups)
+    covariances = covs, predicted_covs, groups, jitters
+    return _Pass(mean, correction, likelihood, weight, evidence, *covariances)
 
 
-def _smoother_gains(model: "MixtureKalmanFilter", past: _Pass) -> list[Tensor]:
-    """C_t for t = 0..T-2, in the groups of frame t+1, [G, M, D, D]."""
-    gains = []
+def _smoother_gains(
+    model: "MixtureKalmanFilter", past: _Pass
+) -> tuple[list[Tensor], list[Tensor | None]]:
+    """C_t for t = 0..T-2, in the groups of frame t+1 [G, M, D, D]; the jitter of each P^_t [B, M]."""
+    gains: list[Tensor] = []
+    jitters: list[Tensor | None] = [None]
     for t in range(len(past.cov) - 1):
         matrix = model.transition(t + 1).matrix
         cov = past.cov[t][_parents(past.group[t], past.group[t + 1])]
-        factor = safe_cholesky(past.predicted_cov[t + 1])
+        factor, jitter = mended_cholesky(past.predicted_cov[t + 1])
+        jitters.append(None if jitter is None else jitter[past.group[t + 1]])
         gains.append(torch.cholesky_solve(matrix @ cov, factor).mT)
-    return gains
+    return gains, jitters
 
 
 def _parents(group: Tensor, following: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchpose.filters.base import Measurements, StepOutput
+from torchpose.filters.mending import mending
 from torchpose.filters.tracks import MKFState, estimate_of
 from torchpose.filters.weights import normalise
 from torchpose.gaussian import kalman_correct, kalman_gain, symmetrise
@@ -24,7 +25,7 @@ def advance(
     wide = torch.float64
     track_cov = state.cov[state.group]
     mean = state.mean.to(wide)
-    log_joint = _candidate_weights(model, state, mean, track_cov, frame)
+    log_joint, choice_jitter = _candidate_weights(model, state, mean, track_cov, frame)
     flat = log_joint.flatten(1)
     log_evidence = torch.logsumexp(flat, -1)
     # The first frames may have fewer candidates than tracks: the rest stays empty, at weight zero.
@@ -36,18 +37,20 @@ def advance(
     log_evidence = torch.where(frame.mask.any(-1), log_evidence, torch.zeros_like(log_evidence))
     n_components = model.means.shape[0]
     parent, component = chosen // n_components, chosen % n_components
-    mean, cov = _continue(model, state.time, mean, track_cov, parent, component, frame)
+    mean, cov, jitter = _continue(model, state.time, mean, track_cov, parent, component, frame)
     mean = mean.to(model.dtype)
     estimate, total = estimate_of(log_weights, mean, cov if return_cov else None)
     group = torch.arange(mean.shape[0], device=mean.device)
     new_state = MKFState(log_weights, mean, cov, group, state.time + 1)
-    return new_state, StepOutput(estimate, log_weights, log_evidence.to(model.dtype), total)
+    work = mending(estimate, choice_jitter, jitter)
+    log_evidence = log_evidence.to(model.dtype)
+    return new_state, StepOutput(estimate, log_weights, log_evidence, total, *work)
 
 
 def _candidate_weights(
     model: "MixtureKalmanFilter", state: MKFState, mean: Tensor, cov: Tensor, frame: Measurements
-) -> Tensor:
-    """log w_i pi_j N(z | track i continued by component j), [B, M, K]."""
+) -> tuple[Tensor, Tensor | None]:
+    """log w_i pi_j N(z | track i continued by component j) [B, M, K], and the jitter of its S."""
     matrix, offset, noise = model.transition(state.time)
     rows = matrix[:, model.observed]
     expected = torch.einsum("kzd,bmd->bmkz", rows, mean) + offset[:, model.observed]
@@ -60,7 +63,7 @@ def _candidate_weights(
     z = frame.z[:, None, None].to(expected.dtype)
     _, log_likelihood = kalman_correct(expected, z, gain, everything, mask)
     log_weights = state.log_weights.to(expected.dtype)
-    return log_weights[..., None] + model.log_prior + log_likelihood
+    return log_weights[..., None] + model.log_prior + log_likelihood, gain.jitter
 
 
 def _continue(
@@ -71,8 +74,8 @@ def _continue(
     parent: Tensor,
     component: Tensor,
     frame: Measurements,
-) -> tuple[Tensor, Tensor]:
-    """Full Kalman step of the kept tracks."""
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Full Kalman step of the kept tracks, and the jitter of its innovation covariances."""
     rows = torch.arange(mean.shape[0], device=mean.device)[:, None]
     matrix, offset, noise = (part[component] for part in model.transition(time))
     mean = (matrix @ mean[rows, parent][..., None])[..., 0] + offset
@@ -81,4 +84,4 @@ def _continue(
     mask = frame.mask[:, None].expand(*mean.shape[:2], -1)
     gain, cov = kalman_gain(cov, noise_cov, model.observed, mask)
     mean, _ = kalman_correct(mean, frame.z[:, None].to(mean.dtype), gain, model.observed, mask)
-    return mean, cov
+    return mean, cov, gain.jitter

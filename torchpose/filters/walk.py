@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.gaussian import LOG_2PI, safe_cholesky
+from torchpose.gaussian import LOG_2PI, mended_cholesky, safe_cholesky
 from torchpose.priors.em import MixtureParameters
 
 __all__ = ["MixtureWalk", "Moves", "grouped_affine"]
@@ -26,10 +26,12 @@ class Moves(NamedTuple):
 
     Attributes:
         matrix: [K, 2 D, D]. offset: [K, D].
+        jitter: of the covariances of the noise [K], or None; see `mended_cholesky`.
     """
 
     matrix: Tensor
     offset: Tensor
+    jitter: Tensor | None = None
 
 
 class MixtureWalk:
@@ -129,14 +131,15 @@ class MixtureWalk:
         centred = (transition @ self.mean + offset - self.mean)[..., None]
         shift = torch.linalg.solve_triangular(self.scale, centred, upper=False)[..., 0]
         half = torch.linalg.solve_triangular(self.scale, noise, upper=False)
-        factor = safe_cholesky(torch.linalg.solve_triangular(self.scale, half.mT, upper=False))
+        whitened = torch.linalg.solve_triangular(self.scale, half.mT, upper=False)
+        factor, jitter = mended_cholesky(whitened)
         dtype = self.rows.dtype
-        return Moves(torch.cat([matrix.mT, factor.mT], 1).to(dtype), shift.to(dtype))
+        return Moves(torch.cat([matrix.mT, factor.mT], 1).to(dtype), shift.to(dtype), jitter)
 
     def noise_moves(self, means: Float[Tensor, "K D"], covs: Float[Tensor, "K D D"]) -> Moves:
         """The map y = noise @ matrix + offset that draws from N(means, covs), for whitened points."""
         moves = self.moves(torch.zeros_like(covs), means, covs)
-        return Moves(moves.matrix[:, self.dim :], moves.offset)
+        return moves._replace(matrix=moves.matrix[:, self.dim :])
 
     def _shrink(self, inflation: float) -> Float[Tensor, "K D"]:
         return (1 / (1 + inflation * self.ratio)).to(self.rows.dtype)
