@@ -58,7 +58,7 @@ def read_openpose(folder: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[str
         if people[frame]:
             followed = _pick(np.stack(people[frame]), followed)
             table[frame - first] = followed
-    confidence = table[..., 2]
+    confidence = table[..., 2].clip(max=1.0)  # a peak of the heat map, which may exceed 1
     return np.where(confidence[..., None] > 0, table[..., :2], np.nan), confidence, names
 
 
