@@ -6,6 +6,7 @@ from torchpose.filters.constant_velocity import ConstantVelocityFilter, Constant
 from torchpose.filters.constrained import ConstrainedParticleFilter
 from torchpose.filters.first_order import constant_velocity_std
 from torchpose.filters.first_pose import FirstPose, find_first_pose
+from torchpose.filters.gamma import fit_gamma
 from torchpose.filters.manifold import ManifoldParticleFilter
 from torchpose.filters.mkf import MixtureKalmanFilter, MKFState
 from torchpose.filters.particle import BootstrapParticleFilter, ParticleState
@@ -46,6 +47,7 @@ __all__ = [
     "default_step_std",
     "find_first_pose",
     "find_pose",
+    "fit_gamma",
     "fit_sharpness",
     "motion_std",
     "resample",
