@@ -178,7 +178,8 @@ class Bench:
         return settings_hash([VERSION, self.size, self.persons.digest, *facts])
 
     def _tracker(self, prior: UpperBodyPrior, lever: Lever, mode: str) -> UpperBodyTracker:
-        options = {"window": lever.windows is not None, "max_gap": None} | MODES[mode]
+        method = "mkf-fixed" if lever.windows is None else "window-mixture"
+        options = {"method": method, "max_gap": None} | MODES[mode]
         options |= {"fps": self.persons.test.fps, "neck": prior.info.neck} | lever.options
         tracker = UpperBodyTracker(prior, CAMERA, **options)
         if lever.start_factor != 1:

@@ -69,7 +69,7 @@ def tuned(
 
 def error(prior: UpperBodyPrior, test: Trials) -> float:
     """Mean 3D error in cm."""
-    estimate = track(prior, CAMERA, test, window=False)
+    estimate = track(prior, CAMERA, test, method="mkf-fixed")
     return 100 * float(score(estimate, test).errors3d.nanmean())
 
 

@@ -25,7 +25,11 @@ from torchpose.protocols.ub_people import TEST_PERSONS, people, sway
 FOCAL, CENTRE = 525.0, (319.5, 239.5)
 TRUE = PinholeCamera(FOCAL, FOCAL, *CENTRE, 640, 480)
 FACTORS = (0.7, 0.85, 1.0, 1.2, 1.4)
-TRACKERS = {"as it comes": {}, "smoothed": {"smoothing": "full"}, "single poses": {"window": False}}
+TRACKERS = {
+    "as it comes": {},
+    "smoothed": {"smoothing": "full"},
+    "single poses": {"method": "mkf-fixed"},
+}
 HEADER = ("tracker", "f / true f", "3D error (cm)", "moving root (cm)", "pixel error")
 
 

@@ -43,7 +43,6 @@ from torchpose.priors import TRAINING_VIEWS
 from torchpose.priors.window import WindowLayout
 
 HEADER = ("lever", "filtered (cm)", "jitter", "fit (s)", "smoothed (cm)", "jitter", "fit (s)")
-SINGLE = {"window": False}
 
 
 def layouts(own: Sequence[int], other: Sequence[int]) -> dict[str, WindowLayout]:

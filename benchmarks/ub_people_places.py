@@ -27,7 +27,7 @@ FITTED, TRACKED = ("s1", "s2", "s3"), ("s4", "s5", "s6")
 TRACKERS = {
     "windows, filtered": {},
     "windows, smoothed": {"smoothing": "full"},
-    "single poses": {"window": False},
+    "single poses": {"method": "mkf-fixed"},
 }
 PLACES = {
     "usual place": (0.0, 0.0, 0.0),

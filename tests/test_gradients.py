@@ -43,9 +43,9 @@ def make_tracker(**options):
         {"smoothing": "full"},
         {"steady": False},
         {"steady": False, "smoothing": "full"},
-        {"window": False},
-        {"window": False, "smoothing": 2},
-        {"window": False, "smoothing": "full"},
+        {"method": "mkf-fixed"},
+        {"method": "mkf-fixed", "smoothing": 2},
+        {"method": "mkf-fixed", "smoothing": "full"},
     ],
 )
 def test_poses_of_the_tracker(options):

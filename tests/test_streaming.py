@@ -57,11 +57,9 @@ def check_equal(poses, track, fields=FIELDS):
 
 
 @pytest.mark.parametrize("uncertain", [False, True])
-@pytest.mark.parametrize("method", [*METHODS, "single poses"])
+@pytest.mark.parametrize("method", METHODS)
 def test_steps_are_the_frames_of_forward(prior, keypoints, method, uncertain):
     options = {"n_particles": 100} if method.startswith("pf") else {}
-    if method == "single poses":
-        method, options = "mkf-fixed", {"window": False}
     tracker = UpperBodyTracker(prior, demo_camera(), method=method, max_gap=None, **options)
     confidence = mask = None
     if uncertain:
@@ -74,7 +72,7 @@ def test_steps_are_the_frames_of_forward(prior, keypoints, method, uncertain):
     check_equal(poses, track)
 
 
-@pytest.mark.parametrize("options", [{}, {"window": False}, {"method": "mkf-sampled"}])
+@pytest.mark.parametrize("options", [{}, {"method": "mkf-fixed"}, {"method": "mkf-sampled"}])
 def test_blocks_of_frames_are_those_of_forward(prior, keypoints, options):
     tracker = UpperBodyTracker(prior, demo_camera(), max_gap=None, **options)
     generators = [[torch.Generator().manual_seed(b) for b in range(3)] for _ in range(2)]

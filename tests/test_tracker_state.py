@@ -17,7 +17,7 @@ from torchpose.priors.window import WindowPrior
 NAMES = ["head", "neck", "hand_left", "hand_right"]
 METHODS = {
     "windows": {},
-    "poses": {"method": "mkf-fixed", "window": False},
+    "poses": {"method": "mkf-fixed"},
     "sampled": {"method": "mkf-sampled"},
     "particles": {"method": "pf-mixture", "n_particles": 100},
 }

@@ -56,10 +56,10 @@ def mean_error(track, truth):
 
 
 @pytest.mark.parametrize("smoothing", [None, "full", 3, 20])
-@pytest.mark.parametrize("window", [True, False])
-def test_the_performer_is_tracked_better_than_by_the_mean_pose(prior, scene, window, smoothing):
+@pytest.mark.parametrize("method", [None, "mkf-fixed"])
+def test_the_performer_is_tracked_better_than_by_the_mean_pose(prior, scene, method, smoothing):
     truth, keypoints = scene
-    tracker = UpperBodyTracker(prior, demo_camera(), window=window, smoothing=smoothing)
+    tracker = UpperBodyTracker(prior, demo_camera(), method, smoothing=smoothing)
     track = tracker(keypoints[None], names=NAMES)
     joints = prior.left.moments()[0][:15].view(5, 3), prior.right.moments()[0][:15].view(5, 3)
     uvl = torch.cat([joints[0], joints[1][:3].flip(0)])
@@ -112,7 +112,7 @@ def test_names_may_come_in_any_order_and_subset(prior, scene):
 def test_elbows_are_measured_where_they_are_given(prior, scene):
     truth, _ = scene
     eight = project(truth, demo_camera().matrix, torch.eye(3).double(), torch.zeros(3).double())
-    tracker = UpperBodyTracker(prior, demo_camera(), window=False)
+    tracker = UpperBodyTracker(prior, demo_camera(), method="mkf-fixed")
     few = eight[None, ..., :2].clone()
     few[:, :, [1, 2, 5, 6]] = torch.nan
     assert mean_error(tracker(eight[None, ..., :2]), truth) < mean_error(tracker(few), truth)
@@ -133,7 +133,7 @@ def test_another_camera_is_mapped_to_the_priors(prior, scene):
 
 def test_confidence_zero_is_missing_and_low_confidence_counts_less(prior, scene):
     _, keypoints = scene
-    tracker = UpperBodyTracker(prior, demo_camera(), window=False)
+    tracker = UpperBodyTracker(prior, demo_camera(), method="mkf-fixed")
     ones = torch.ones(1, 150, 4, dtype=torch.float64)
     plain = tracker(keypoints[None], names=NAMES)
     torch.testing.assert_close(tracker(keypoints[None], ones, NAMES).joints3d, plain.joints3d)
@@ -141,24 +141,26 @@ def test_confidence_zero_is_missing_and_low_confidence_counts_less(prior, scene)
     hidden[:, 20:40, 2] = 0
     track = tracker(keypoints[None], hidden, NAMES)
     assert not track.observed[0, 20:40, 0].any()
+    hidden[:, 20:40, 2] = torch.nan
+    torch.testing.assert_close(tracker(keypoints[None], hidden, NAMES).joints3d, track.joints3d)
     low = ones.clone()
     low[:, :, 2] = 0.1
     wide = tracker(keypoints[None], low, NAMES)
     assert (wide.covariance2d[0, :, 0, 0, 0] > plain.covariance2d[0, :, 0, 0, 0]).all()
 
 
-@pytest.mark.parametrize("window", [True, False])
-def test_the_same_covariance_everywhere_is_a_measurement_std(prior, scene, window):
+@pytest.mark.parametrize("method", ["window-mixture", "mkf-fixed"])
+def test_the_same_covariance_everywhere_is_a_measurement_std(prior, scene, method):
     camera, keypoints = demo_camera(), scene[1]
     points = keypoints[None, :30]
     std = torch.tensor([4.0, 3.0, 3.0, 2.0, 5.0])
-    usual = UpperBodyTracker(prior, camera, measurement_std=std, window=window)
-    each = UpperBodyTracker(prior, camera, window=window)
+    usual = UpperBodyTracker(prior, camera, method, measurement_std=std)
+    each = UpperBodyTracker(prior, camera, method)
     by_name = {"head": 2.0, "neck": 5.0, "hand": 4.0}
     own = torch.tensor([by_name[name.split("_")[0]] for name in NAMES], dtype=torch.float64)
     cov = (own.square()[:, None, None] * torch.eye(2)).expand(1, 30, 4, 2, 2)
     one, other = usual(points, names=NAMES), each(points, names=NAMES, covariance=cov)
-    if not window:
+    if method == "mkf-fixed":
         torch.testing.assert_close(one.joints3d, other.joints3d, rtol=1e-9, atol=1e-9)
         return
     # the hands of earlier frames keep the tracker's own noise
@@ -192,8 +194,8 @@ def test_a_covariance_that_is_none_is_refused(prior, scene):
 
 def test_covariances_grow_in_the_gap(prior, scene):
     _, keypoints = scene
-    for window in (True, False):
-        track = UpperBodyTracker(prior, demo_camera(), window=window)(keypoints[None], names=NAMES)
+    for method in ("window-mixture", "mkf-fixed"):
+        track = UpperBodyTracker(prior, demo_camera(), method)(keypoints[None], names=NAMES)
         spread = track.covariance3d[0, :, 7].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
         assert spread[70:85].mean() > spread[30:55].mean()
 
@@ -212,8 +214,8 @@ def test_frames_and_the_static_camera(prior, scene):
 
 
 def test_process_noise_follows_the_frame_rate(prior):
-    slow = UpperBodyTracker(prior, demo_camera(), fps=15.0, window=False)
-    fast = UpperBodyTracker(prior, demo_camera(), fps=60.0, window=False)
+    slow = UpperBodyTracker(prior, demo_camera(), fps=15.0, method="mkf-fixed")
+    fast = UpperBodyTracker(prior, demo_camera(), fps=60.0, method="mkf-fixed")
     a, b = (t._filter("left", ("hand", "head", "neck")).process_cov for t in (slow, fast))
     torch.testing.assert_close(a, 4 * b)
 
@@ -222,8 +224,8 @@ def test_evidence_is_that_of_each_frame_and_zero_without_measurements(prior, sce
     _, keypoints = scene
     eight = keypoints[None].clone()
     eight[:, 30:40] = torch.nan
-    for window in (True, False):
-        track = UpperBodyTracker(prior, demo_camera(), window=window)(eight, names=NAMES)
+    for method in ("window-mixture", "mkf-fixed"):
+        track = UpperBodyTracker(prior, demo_camera(), method)(eight, names=NAMES)
         assert (track.log_evidence[:, 30:40] == 0).all()
         assert (track.log_evidence[:, :30] != 0).all()
 
@@ -268,11 +270,31 @@ def test_files_of_older_releases_do_not_say_what_ran(prior, scene, tmp_path):
         ({"smoothing": "half"}, InputError, "smoothing"),
         ({"smoothing": -1}, InputError, "smoothing"),
         ({"smoothing": 3, "method": "mkf-split"}, InputError, "mkf-fixed"),
+        ({"smoothing": 3, "method": "window-mixture"}, InputError, "look 16 frames ahead"),
+        ({"frame": "body", "static_camera": True}, InputError, "static_camera"),
+        ({"method": "mkf-fixed", "steady": True}, InputError, "steady=True needs"),
         ({"frame": "world"}, InputError, "camera"),
         ({"fps": 0.0}, InputError, "fps"),
         ({"measurement_std": 0.0}, InputError, "positive"),
         ({"measurement_std": [1.0, 2.0]}, ShapeError, "measurement_std"),
-        ({"n_particles": 10}, InputError, "does not fit"),
+        ({"n_particles": 10}, InputError, "pf-mixture, pf-walk, pf-walk-unscaled"),
+        ({"uniform_weight": 0.1}, InputError, "is of mkf-fixed"),
+        ({"burn_in": 5}, InputError, "is of mkf-fixed, mkf-sampled, mkf-split"),
+        ({"reset_below": -9.0}, InputError, "is of mkf-fixed"),
+        ({"tracks": "split"}, InputError, "of no method"),
+        ({"method": "mkf-sampled", "likelihood_power": 0.5}, InputError, "does not apply"),
+        ({"method": "mkf-split", "reset_below": -9.0}, InputError, "does not apply"),
+        ({"method": "mkf-fixed", "gamma": 0.9}, InputError, "transition 'paper'"),
+        (
+            {
+                "method": "mkf-fixed",
+                "transition": "ou",
+                "gamma": 0.9,
+                "process_cov": torch.ones(21),
+            },
+            InputError,
+            "process_cov does not apply",
+        ),
     ],
 )
 def test_bad_settings_are_refused(prior, options, error, message):
@@ -300,6 +322,8 @@ def test_a_prior_of_another_kind_is_refused(prior):
         ({"names": ["head"]}, InputError, "4 keypoints"),
         ({"names": None}, InputError, "names may be left out"),
         ({"confidence": torch.ones(1, 10, 3)}, ShapeError, "confidence"),
+        ({"confidence": torch.full((1, 10, 4), 7.0)}, InputError, r"\[0, 1\]"),
+        ({"confidence": torch.full((1, 10, 4), -0.1)}, InputError, r"\[0, 1\]"),
         ({"mask": torch.ones(1, 9, 4, dtype=torch.bool)}, ShapeError, "mask"),
     ],
 )

@@ -1,7 +1,7 @@
 """The filter over single poses of an arm, and the noise that it takes."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -10,9 +10,9 @@ from torch import Tensor
 
 from torchpose.arms import ARMS
 from torchpose.errors import InputError, check_finite, check_shape
-from torchpose.filters import BootstrapParticleFilter, MixtureKalmanFilter
 from torchpose.filters.base import RecursiveFilter
 from torchpose.measurements import pixel_indices
+from torchpose.methods import SINGLE_POSES, check_options, pose_model
 from torchpose.priors.arm_state import STATE_DIM
 from torchpose.priors.upper_body import UpperBodyPrior, released_process_cov
 from torchpose.projection import map_pixel_covariance
@@ -20,11 +20,6 @@ from torchpose.skeleton import ARM_JOINTS, UPPER_BODY
 
 __all__ = ["default_process_cov", "joint_covariances", "noise_options", "pose_filter"]
 
-_PROPOSALS = {
-    "pf-mixture": "mixture",
-    "pf-walk": "random-walk",
-    "pf-walk-unscaled": "random-walk-unscaled",
-}
 _DEFAULT_STD = 3.0
 
 
@@ -46,40 +41,66 @@ def pose_filter(
             brings is used for the others.
 
     Raises:
-        InputError: an option that the method does not know.
+        InputError: an option that the method does not use.
     """
+    check_options(method, options)
     arm = ARMS[side]
     blocks = [measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
-    options = noise_options(prior, side, method, fps) | options
-    process_cov = options.pop("process_cov")
-    mixture, observed = getattr(prior, side), pixel_indices(joints)
-    arguments = (mixture, process_cov, torch.block_diag(*blocks), observed)
-    try:
-        if method in _PROPOSALS:
-            return BootstrapParticleFilter(*arguments, proposal=_PROPOSALS[method], **options)
-        return MixtureKalmanFilter(*arguments, tracks=method.removeprefix("mkf-"), **options)
-    except TypeError as error:
-        raise InputError(f"an option does not fit the method {method!r}: {error}") from error
+    arguments = noise_options(prior, side, method, fps, options)
+    model, kind = pose_model(method)
+    return model(
+        getattr(prior, side),
+        measurement_cov=torch.block_diag(*blocks),
+        observed=pixel_indices(joints),
+        **kind,
+        **arguments,
+    )
 
 
 def noise_options(
-    prior: UpperBodyPrior, side: str, method: str, fps: float | None
+    prior: UpperBodyPrior,
+    side: str,
+    method: str,
+    fps: float | None,
+    options: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Noise and transition that the prior brings, scaled to the frame rate."""
+    """Return the caller's options, and for the others the noise and transition of the prior.
+
+    Args:
+        prior: what it brings is scaled to the frame rate, and left out where a choice of the caller
+            has no use for it. side: "left" or "right". method: a filter over single poses. fps: frame
+            rate. options: of the caller.
+
+    Raises:
+        InputError: process_cov for the transition "ou", which has no Q.
+    """
+    own = dict(options or {})
+    brought = _brought_by(prior, side, method, fps)
+    kind = own.get("transition", brought.get("transition"))
+    if kind == "ou" and "process_cov" in own:
+        raise InputError("process_cov does not apply to transition 'ou', whose noise is gamma's")
+    if kind != "ou":
+        brought.pop("gamma", None)
+    if own.get("weighting") == "frame":
+        brought.pop("uniform_weight", None)
+    return brought | own
+
+
+def _brought_by(prior: UpperBodyPrior, side: str, method: str, fps: float | None) -> dict[str, Any]:
     noise, info = prior.noise, prior.info
     ratio = 1.0 if not fps or not info.fps else info.fps / fps
     process_cov = noise.get(f"process_cov_{side}", noise.get("process_cov"))
     if process_cov is None:
         process_cov = default_process_cov(prior)
     options: dict[str, Any] = {"process_cov": process_cov * ratio}
-    if method in _PROPOSALS:
+    if method.startswith("pf-"):
         return options
     options["transition"] = info.transition
     gamma = noise.get(f"gamma_{side}", noise.get("gamma"))
-    if gamma is not None and info.transition == "ou":
+    if gamma is not None:
         options["gamma"] = gamma**ratio
     epsilon = noise.get("uniform_weight")
-    if epsilon is not None and method == "mkf-fixed":
+    if epsilon is not None and method == SINGLE_POSES:
         options["uniform_weight"] = float(epsilon)
     return options
 

@@ -32,6 +32,7 @@ from torchpose.priors.window import WindowLayout, WindowPrior, window_measuremen
 from torchpose.skeleton import ARM_JOINTS, UPPER_BODY
 
 __all__ = [
+    "WINDOW_OPTIONS",
     "SeenInView",
     "pose_of_window",
     "see_in_view",
@@ -39,6 +40,9 @@ __all__ = [
     "window_filter",
     "window_inputs",
 ]
+
+WINDOW_OPTIONS = ("likelihood_power", "dtype")
+"""Options of `MixtureKalmanFilter` that count where every frame is conditioned on by itself."""
 
 _BIMODAL = 2  # hand and elbow, which may be before or behind the body
 _HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
@@ -148,7 +152,7 @@ def window_filter(
 
     Args:
         window: whose mixture is taken. side: "left" or "right". joints: of `ARM_JOINTS`.
-        measurement_cov: R of the eight joints, the prior's pixels. options: of the caller.
+        measurement_cov: R of the eight joints, the prior's pixels. options: among `WINDOW_OPTIONS`.
     """
     arm, layout = ARMS[side], window.layout
     blocks = [measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]

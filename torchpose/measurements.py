@@ -195,7 +195,8 @@ def measure_joints(
         own_cov: R of every single keypoint in place of that.
 
     Raises:
-        InputError: infinite values. ShapeError: confidence or mask do not fit the keypoints.
+        InputError: infinite values, or the confidence of a measured keypoint is outside 0..1.
+        ShapeError: confidence or mask do not fit the keypoints.
     """
     check_finite("keypoints", keypoints, ~keypoints.isnan(), "missing keypoints are NaN")
     measured = torch.isfinite(keypoints).all(-1)
@@ -204,7 +205,9 @@ def measure_joints(
         measured = measured & mask.to(measured.device, torch.bool)
     if confidence is not None:
         check_shape("confidence", confidence, list(measured.shape))
-        measured = measured & (confidence.to(measured.device) > 0)
+        confidence = confidence.to(measured.device)
+        _check_confidence(confidence, measured)
+        measured = measured & (confidence > 0)
     picked = [max(i, 0) for i in indices]
     present = torch.tensor([i >= 0 for i in indices], device=measured.device)
     measured = measured[:, :, picked] & present
@@ -217,6 +220,17 @@ def measure_joints(
         if bool((weight < 1).any()):
             cov = cov / weight[..., None, None]
     return MeasuredJoints(uv, measured, cov)
+
+
+def _check_confidence(confidence: Tensor, measured: Bool[Tensor, "B T J"]) -> None:
+    """Refuse a confidence outside [0, 1] of a keypoint that is there; NaN is missing."""
+    outside = measured & ((confidence < 0) | (confidence > 1))
+    if bool(outside.any()):
+        b, t, j = outside.nonzero()[0].tolist()
+        raise InputError(
+            f"confidence must lie in [0, 1] (0 or NaN is missing), got {float(confidence[b, t, j]):g} "
+            f"of keypoint {j} in frame {t} of sequence {b}; scale scores of another range to it"
+        )
 
 
 def check_gaps(

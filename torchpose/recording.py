@@ -212,5 +212,6 @@ def _nobody(n_frames: int, tracker: UpperBodyTracker) -> PoseTrack:
         failed_at=torch.tensor([-1]),
         fps=tracker.fps,
         frame=tracker.frame,
-        method=tracker._estimator(),
+        notes=tracker.notes,
+        method=tracker.method,
     )

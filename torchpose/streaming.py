@@ -102,7 +102,7 @@ def begin(
     sources = dict(zip(ARMS, generators_of_arms(generator), strict=True))
     filters = {
         side: tuple(
-            model.init(batch_size, sources[side]) for model in _models(tracker, side, joints[side])
+            model.init(batch_size, sources[side]) for model in tracker._models(side, joints[side])
         )
         for side in ARMS
     }
@@ -116,16 +116,6 @@ def begin(
     )
     unseen = torch.zeros(batch_size, dtype=torch.long, device=like.device)
     return StreamState(recent, filters, None, unseen, Stream(n_keypoints, picked, joints, sources))
-
-
-def _models(
-    tracker: "UpperBodyTracker", side: str, joints: tuple[str, ...]
-) -> tuple[RecursiveFilter, ...]:
-    """The filter of an arm; with windows, also the one of the window's hands alone."""
-    window = tracker._window()
-    if window is None:
-        return (tracker._filter(side, joints),)
-    return tuple(tracker._window_filter(side, window[0], measured) for measured in (joints, ()))
 
 
 def track_frame(
@@ -188,7 +178,7 @@ def track_frames(
     stage, motion = tracker._motion_stage(), state.motion
     if stage is not None:
         motion, reading = stage.advance(motion or stage.init(reading), reading)
-    track = tracker._poses(reading, left, right, measured.mask, None, ())
+    track = tracker._poses(reading, left, right, measured.mask, None, tracker.notes)
     unseen = _unseen(state.unseen, measured.mask.any(-1))
     return StreamState(recent, filters, motion, unseen, stream), track
 
@@ -217,7 +207,7 @@ def _advance_arm(
 ) -> tuple[tuple[Any, ...], FilterOutput]:
     """Next states of an arm's filters, and their estimates."""
     joints, generator = state.stream.joints[side], state.stream.generators[side]
-    models, states = _models(tracker, side, joints), state.filters[side]
+    models, states = tracker._models(side, joints), state.filters[side]
     if seen is None:
         z, mask, cov = arm_measurements(ARMS[side], joints, measured)
         after, out = _advance(models[0], states[0], z, mask, cov, generator)

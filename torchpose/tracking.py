@@ -1,6 +1,7 @@
 """The main job: 2D keypoints of head, neck and hands to 2D and 3D poses of eight joints."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -42,6 +43,7 @@ from torchpose.measurements import (
     pixels_per_metre,
     place_measured_neck,
 )
+from torchpose.methods import METHODS, SINGLE_POSES, WINDOWS, choose_method, options_of_before
 from torchpose.module_state import (
     WideModule,
     derived,
@@ -61,46 +63,52 @@ from torchpose.streaming import LivePose, StreamState
 
 __all__ = ["METHODS", "PoseTrack", "UpperBodyTracker"]
 
-METHODS = ("mkf-fixed", "mkf-sampled", "mkf-split", "pf-mixture", "pf-walk", "pf-walk-unscaled")
-# These options are those of a filter over single poses.
-_POSE_OPTIONS = {"transition", "gamma", "subspace", "initial_cov", "process_cov"}
-
 
 class UpperBodyTracker(WideModule):
     """Tracks eight joints in 2D and 3D from the keypoints of any of them, typically head and hands.
 
     Two filters, one for each arm with head and neck, run on the same measurements (BL section 3.1);
     head, neck and camera of the two are averaged and their covariances bounded, never fused as if
-    they were independent. Mixtures over windows see the body through a virtual camera that follows
-    it, so that it may move about, farther away or beside the views that the prior was fitted to.
-    `forward` tracks whole sequences, `init` and `step` live streams.
+    they were independent. `forward` tracks whole sequences, `init` and `step` live streams.
+
+    The method is an estimator:
+
+    - ``window-mixture``: the prior's mixture over short windows of motion is conditioned on every
+      frame and the hands round it, each frame by itself; filters of constant velocity follow. The body
+      is seen through a virtual camera that follows it, so that it may move about, farther away or
+      beside the views that the prior was fitted to.
+    - ``mkf-fixed``, ``mkf-sampled``, ``mkf-split``: banks of Kalman filters over single poses (BL
+      section 3.4), see `MixtureKalmanFilter`.
+    - ``pf-mixture``, ``pf-walk``, ``pf-walk-unscaled``: particles over single poses (BL section 3.3),
+      see `BootstrapParticleFilter`.
 
     Args:
         prior: from `load_prior` or `fit_upper_body_prior`.
         camera: of the keypoints. One other than the prior's is mapped to it.
-        method: one of `METHODS`.
+        method: one of `METHODS`; by default "window-mixture" where the prior has windows that suit, else
+            "mkf-fixed". The attribute `method` and `PoseTrack.method` say which one runs.
         measurement_std: standard deviation of a keypoint in the camera's pixels, one number or one
             for each of hand, elbow, shoulder, head, neck; by default what the prior brings, else 3.
         fps: frame rate of the keypoints; by default that of the prior. Process noise is scaled.
         smoothing: None, the number of later frames that an estimate may use, or "full"; only for
-            "mkf-fixed".
+            "window-mixture", whose windows then look a few frames ahead, and "mkf-fixed".
         frame: "camera" (axes of the camera) or "body" (of the prior's recordings).
         static_camera: put the body, turned by the estimated rotation, in front of a camera that
             stays at the prior's mean place, as the authors' released demo does.
-        window: use the prior's mixtures over short windows of motion where it brings them (only for
-            "mkf-fixed"; smoothed estimates then look a few frames ahead); False tracks single poses,
-            as the paper does, and so do options that only make sense there (transition, gamma).
+        window: deprecated; False stands for method "mkf-fixed", True for the default.
         steady: pass what windows give through filters of constant velocity (`MotionStage`), which take
-            the trembling out; smoothers if `smoothing` is asked for.
+            the trembling out; smoothers if `smoothing` is asked for. By default where there are windows.
         calibrated: recalibrate `covariance3d` as the prior's training persons showed, if it says how.
         neck: kind of neck of the keypoints, where their names do not tell it (see
             `torchpose.skeleton.NECK_KINDS`). A neck of another kind than the prior's is put where the
             prior has it, between the middle of the shoulders and the head, or else not measured.
         max_gap: seconds over which nothing at all may be measured; None is no bound.
-        options: to the filter, such as n_particles, n_tracks, uniform_weight or transition.
+        options: of the method's filter (`torchpose.methods.method_options`), such as n_particles,
+            n_tracks, uniform_weight or transition.
 
     Raises:
-        InputError: an unknown method or option. CameraError: no camera. PriorError: no such prior.
+        InputError: an unknown method, or an option that the method does not use. CameraError: no
+            camera. PriorError: no such prior.
 
     Example:
         >>> import torch, torchpose
@@ -117,29 +125,41 @@ class UpperBodyTracker(WideModule):
         self,
         prior: UpperBodyPrior,
         camera: PinholeCamera | None = None,
-        method: str = "mkf-fixed",
+        method: str | None = None,
         *,
         measurement_std: float | Sequence[float] | Tensor | None = None,
         fps: float | None = None,
         smoothing: int | str | None = None,
         frame: str = "camera",
         static_camera: bool = False,
-        window: bool = True,
-        steady: bool = True,
+        window: bool | None = None,
+        steady: bool | None = None,
         calibrated: bool = True,
         neck: str | None = None,
         max_gap: float | None = 5.0,
         **options: Any,
     ) -> None:
         super().__init__()
-        _check_settings(prior, method, smoothing, frame, fps)
+        _check_settings(prior, smoothing, frame, static_camera, fps)
+        if window is not None:
+            warnings.warn(
+                f"window={window} is deprecated: method={WINDOWS!r} follows windows of motion, "
+                f"{SINGLE_POSES!r} single poses, and without a method the tracker chooses",
+                DeprecationWarning,
+                stacklevel=2,
+            )
+            method, steady = options_of_before(method, window, steady)
         self.prior = prior
         self.camera = _require_camera(camera)
-        self.method = method
         self.fps = fps or prior.info.fps
+        self.method, self.notes = choose_method(prior, method, smoothing, self.fps, options)
         self.smoothing = smoothing
-        self.window = window
-        self.steady = steady
+        self.steady = self._can_steady() if steady is None else steady
+        if self.steady and not self._can_steady():
+            raise InputError(
+                f"steady=True needs method {WINDOWS!r} and a prior that says how brisk its motions "
+                f"are, got method {self.method!r}; leave it out"
+            )
         self.calibrated = calibrated
         self.frame = frame
         self.static_camera = static_camera
@@ -153,7 +173,14 @@ class UpperBodyTracker(WideModule):
             if isinstance(value, Tensor):
                 register_given(self, name, wide_or_parameter(value))
         for side in ARMS:
-            self._filter(side, ("hand", "head", "neck"))
+            self._models(side, ("hand", "head", "neck"))
+
+    def _models(self, side: str, joints: tuple[str, ...]) -> tuple[RecursiveFilter, ...]:
+        """The filter of an arm that measures these joints; with windows, also that of their hands alone."""
+        window = self._window()
+        if window is None:
+            return (self._filter(side, joints),)
+        return tuple(self._window_filter(side, window[0], measured) for measured in (joints, ()))
 
     measurement_std: Tensor | None
 
@@ -231,6 +258,7 @@ class UpperBodyTracker(WideModule):
             view = None if seen is None else seen.view
             left, right = arms["left"], arms["right"]
             reading = self._steady(self._read_out(left, right, view), left, right, lengths)
+            notes = self.notes + notes
             return self._poses(reading, left, right, measured.mask, lengths, notes)
 
     def init(
@@ -374,13 +402,9 @@ class UpperBodyTracker(WideModule):
 
     def _window(self) -> tuple[str, WindowLayout] | None:
         """The window that suits what was asked for: its name, and its lags at this frame rate."""
-        if self.method != "mkf-fixed" or not self.window or _POSE_OPTIONS & self.options.keys():
+        if self.method != WINDOWS:
             return None
         return suitable_window(self.prior, self.smoothing, self.fps or 30.0)
-
-    def _estimator(self) -> str:
-        """Return the name of what runs: a mixture over windows is no bank of Kalman filters."""
-        return self.method if self._window() is None else "window-mixture"
 
     def _look(
         self, measured: MeasuredJoints, lengths: Tensor | None = None, start: int = 0
@@ -460,7 +484,7 @@ class UpperBodyTracker(WideModule):
             fps=self.fps,
             frame=self.frame,
             notes=(*notes, *mending_notes(left, right)),
-            method=self._estimator(),
+            method=self.method,
         ).in_precision(self.dtype)
 
     def _read_out(self, left: FilterOutput, right: FilterOutput, view: BodyView | None) -> ReadOut:
@@ -469,14 +493,12 @@ class UpperBodyTracker(WideModule):
         return read_out(left, right, info.matrix.to(left.mean), order, view)
 
     def _motion_stage(self) -> MotionStage | None:
-        """The filter over what windows give, if the prior says how brisk its motions are."""
+        """The filter over what windows give."""
         window = self._window()
         if window is None or not self.steady:
             return None
         name = window[0]
         settings = self.prior.windows[name].settings
-        if "joint_ratio" not in settings:
-            return None
         joint, pixel, placement = (
             settings[f"{kind}_ratio"] for kind in ("joint", "pixel", "placement")
         )
@@ -487,6 +509,11 @@ class UpperBodyTracker(WideModule):
             (cov,),
             lambda: MotionStage(joint, pixel, placement, self.fps or 30.0).to(cov.device),
         )
+
+    def _can_steady(self) -> bool:
+        """Whether there are windows, and the prior says how brisk its motions are."""
+        window = self._window()
+        return window is not None and "joint_ratio" in self.prior.windows[window[0]].settings
 
     def _steady(
         self, reading: ReadOut, left: FilterOutput, right: FilterOutput, lengths: Tensor | None
@@ -524,23 +551,21 @@ def _require_camera(camera: PinholeCamera | None) -> PinholeCamera:
 
 def _check_settings(
     prior: UpperBodyPrior,
-    method: str,
     smoothing: int | str | None,
     frame: str,
+    static_camera: bool,
     fps: float | None,
 ) -> None:
     if not isinstance(prior, UpperBodyPrior):
         raise PriorError(
             f"prior must be an UpperBodyPrior, got {type(prior).__name__}; see torchpose.load_prior"
         )
-    if method not in METHODS:
-        raise InputError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
     if frame not in ("camera", "body"):
         raise InputError(f"frame must be 'camera' or 'body', got {frame!r}")
+    if static_camera and frame == "body":
+        raise InputError("static_camera needs frame='camera': the body's axes know no camera")
     if fps is not None and not (fps > 0 and math.isfinite(fps)):
         raise InputError(f"fps must be positive, got {fps}")
     wrong_lag = isinstance(smoothing, int) and smoothing < 0
     if wrong_lag or (isinstance(smoothing, str) and smoothing != "full"):
         raise InputError(f"smoothing must be None, a number of frames or 'full', got {smoothing!r}")
-    if smoothing is not None and method != "mkf-fixed":
-        raise InputError(f"smoothing needs method 'mkf-fixed', got {method!r}")

@@ -18,7 +18,7 @@ from jsonargparse import Namespace
 import torchpose
 from torchpose.cli.camera_option import resolve_camera
 from torchpose.cli.common import positive
-from torchpose.cli.track import filter_options
+from torchpose.cli.track import tracker_options
 from torchpose.cli.track_keypoints import joint_names, kind_of_neck
 from torchpose.errors import DegenerateFilterWarning, InputError, OutputError
 from torchpose.io import read_keypoints
@@ -48,7 +48,8 @@ class TrackSettings:
 
     Args:
         prior: a prior that comes with torchpose, or a .safetensors file.
-        method: mkf-fixed, mkf-sampled, mkf-split, pf-mixture, pf-walk or pf-walk-unscaled.
+        method: window-mixture, mkf-fixed, mkf-sampled, mkf-split, pf-mixture, pf-walk or
+            pf-walk-unscaled; null is window-mixture where the prior brings windows that suit.
         camera: a TOML file or fx,fy,cx,cy in pixels; without it K or the image size of each file.
         camera_name: which camera of a file with several.
         measurement_std: pixels, one number or five: hand, elbow, shoulder, head, neck.
@@ -56,7 +57,7 @@ class TrackSettings:
         n_particles: of the pf methods. n_tracks: of mkf-sampled and mkf-split.
         frame: axes of the 3D poses: camera or body.
         static_camera: let the body turn in front of a camera that stays where it is.
-        window: use the prior's mixtures over windows. steady: take out the trembling.
+        window: deprecated, see `method`. steady: take out the trembling of windows.
         neck: kind of the keypoints' neck if their names do not tell.
         nose_as_head: take a nose for the head where there is none.
         fps: frames per second, if the files do not say or err.
@@ -65,7 +66,7 @@ class TrackSettings:
     """
 
     prior: str = "kinect-upper-body"
-    method: str = "mkf-fixed"
+    method: str | None = None
     camera: str | None = None
     camera_name: str | None = None
     measurement_std: float | list[float] | None = None
@@ -74,8 +75,8 @@ class TrackSettings:
     n_tracks: int | None = None
     frame: str = "camera"
     static_camera: bool = False
-    window: bool = True
-    steady: bool = True
+    window: bool | None = None
+    steady: bool | None = None
     neck: str | None = None
     nose_as_head: bool = False
     fps: float | None = None
@@ -113,7 +114,7 @@ class BatchTracker:
         except (RuntimeError, AssertionError) as error:
             reason = str(error).splitlines()[0]
             raise InputError(f"device {device!r} cannot be used: {reason}") from error
-        self._options: dict[str, Any] = filter_options(Namespace(**asdict(settings)))
+        self._options: dict[str, Any] = tracker_options(Namespace(**asdict(settings)))
         # refuses here what would be refused for every recording
         UpperBodyTracker(self.prior, self.prior.camera, **self._settings(), neck=settings.neck)
         camera = settings.camera
@@ -187,10 +188,7 @@ class BatchTracker:
 
     def _settings(self) -> dict[str, Any]:
         """Settings of a tracker that are the same for every recording."""
-        names = [
-            "method", "measurement_std", "smoothing", "frame", "static_camera", "window", "steady",
-            "max_gap",
-        ]  # fmt: skip
+        names = ("measurement_std", "max_gap")
         return {name: getattr(self.settings, name) for name in names} | self._options
 
     def _tracker(self, key: _Input, camera: torchpose.PinholeCamera) -> UpperBodyTracker:

@@ -16,6 +16,7 @@ from torchpose.priors import load_prior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.tracking import METHODS, UpperBodyTracker
 
+SMALL = "kinect-upper-body-small"  # a prior with windows
 KEYS = ("joints2d", "joints3d", "covariance3d", "observed", "log_evidence")
 
 
@@ -37,7 +38,7 @@ def expected(files, clip=None, camera=None, **options) -> PoseTrack:
     """The same by the library."""
     clip = clip or read_keypoints(files / "keypoints.npz")
     camera = camera or PinholeCamera.from_matrix(clip.K)
-    prior = load_prior(files / "prior.safetensors")
+    prior = options.pop("prior", None) or load_prior(files / "prior.safetensors")
     tracker = UpperBodyTracker(prior, camera, fps=30.0, **options)
     generator = torch.Generator().manual_seed(0)
     return tracker(clip.keypoints[None], clip.confidence, clip.names, generator=generator)
@@ -122,9 +123,12 @@ def test_without_matplotlib_it_says_how_to_get_pictures(torchpose, files, tmp_pa
 @pytest.mark.parametrize("method", METHODS)
 def test_methods(track, files, method):
     options = ("--n-particles", 50) if method.startswith("pf-") else ()
-    _, poses = track("--method", method, *options)
     more = {"n_particles": 50} if options else {}
+    if method == "window-mixture":
+        options, more = ("--prior", SMALL), {"prior": load_prior(SMALL)}
+    done, poses = track("--method", method, *options)
     same(poses, expected(files, method=method, **more))
+    assert poses.method == method and f"method   {method}, filtered" in done.out
 
 
 def test_options_reach_the_tracker(track, files):
@@ -134,9 +138,35 @@ def test_options_reach_the_tracker(track, files):
     stds = (5.0, 6.0, 6.0, 2.0, 3.0)
     text = ",".join(str(s) for s in stds)
     same(track("--measurement-std", text)[1], expected(files, measurement_std=stds))
-    same(track("--window", "false")[1], expected(files, window=False))
     same(track("--steady", "false")[1], expected(files, steady=False))
     same(track("--static-camera", "true")[1], expected(files, static_camera=True))
+
+
+def test_the_summary_says_what_ran_where_no_method_was_given(track):
+    done, poses = track("--prior", SMALL)
+    assert poses.method == "window-mixture" and "method   window-mixture, filtered" in done.out
+    done, poses = track()
+    assert poses.method == "mkf-fixed" and "method   mkf-fixed, filtered" in done.out
+    assert "note" not in done.out
+    done, poses = track("--prior", SMALL, "--smoothing", 2)
+    assert poses.method == "mkf-fixed" and "method   mkf-fixed, smoothed with 2" in done.out
+    assert "note     single poses are tracked (mkf-fixed), since the prior's windows" in done.out
+
+
+@pytest.mark.parametrize("method", ["mkf-fixed", "mkf-split"])
+@pytest.mark.parametrize("window", ["true", "false"])
+def test_config_files_of_older_releases_mean_what_they_meant(
+    torchpose, files, tmp_path, method, window
+):
+    (tmp_path / "older.yaml").write_text(f"method: {method}\nwindow: {window}\nsteady: true\n")
+    line = (files / "keypoints.npz", "--out", tmp_path, "--prior", SMALL)
+    done = torchpose("track", *line, "--pictures", "false", "--config", tmp_path / "older.yaml")
+    assert done.code == 0 and "--window is deprecated" in done.err
+    windows = method == "mkf-fixed" and window == "true"
+    same(
+        PoseTrack.load(tmp_path / "poses.npz"),
+        expected(files, prior=load_prior(SMALL), method="window-mixture" if windows else method),
+    )
 
 
 def test_another_neck_is_not_measured(track):
@@ -244,6 +274,8 @@ BAD_INPUT = {
     "unknown method": ([CLIP, "--method", "kf"], ", ".join(METHODS)),
     "method has no particles": ([CLIP, "--n-particles", "9"], "does not apply"),
     "no particles": ([CLIP, "--method", "pf-walk", "--n-particles", "0"], "at least 1"),
+    "option of another method": ([CLIP, "--method", "mkf-fixed", "--steady", "true"], "steady"),
+    "tracks of the default": ([CLIP, "--n-tracks", "9"], "it is of mkf-sampled, mkf-split"),
     "smoothing of particles": ([CLIP, "--method", "pf-walk", "--smoothing", "3"], "mkf-fixed"),
     "bad smoothing": ([CLIP, "--smoothing", "half"], "a number of frames or 'full'"),
     "negative smoothing": ([CLIP, "--smoothing", "-1"], "a number of frames or 'full'"),

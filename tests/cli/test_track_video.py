@@ -65,7 +65,7 @@ def test_a_video_gives_poses_overlay_and_report(clip, track):
     with open_video(out / "overlay.mp4") as overlay:
         assert overlay.size == (640, 480) and sum(1 for _ in overlay) == N
     page = (out / "report.html").read_text()
-    assert "clip.mp4" in page and "mkf-fixed" in page
+    assert "clip.mp4" in page and f"{poses.method}, filtered" in page
     assert "a focal length of 525 pixels" in done.out and "frames a second" in done.out
 
 

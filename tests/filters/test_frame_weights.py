@@ -128,8 +128,12 @@ def test_gradients_reach_the_prior_through_the_weights():
 
 def test_settings_that_contradict_it_are_refused():
     model, *_ = problem()
-    with pytest.raises(InputError, match="weighting 'frame' needs tracks='fixed'"):
-        make_filter(model, tracks="sampled")
+    with pytest.raises(InputError, match="weighting does not apply to tracks='sampled'"):
+        make_filter(model, tracks="sampled", likelihood_power=1.0)
+    with pytest.raises(InputError, match="uniform_weight"):
+        make_filter(model, uniform_weight=1e-3)
+    with pytest.raises(InputError, match=r"medians .* gamma=0"):
+        make_filter(model, medians=[0])
     with pytest.raises(InputError, match="reset_below"):
         make_filter(model, reset_below=-50.0)
     with pytest.raises(InputError, match="weighting must be one of"):

@@ -21,6 +21,7 @@ from torchpose.errors import (
     ShapeError,
 )
 from torchpose.filters import MixtureKalmanFilter
+from torchpose.filters.mkf import TRACK_OPTIONS
 from torchpose.filters.transition import make_transition
 from torchpose.priors import GaussianMixture
 
@@ -296,6 +297,40 @@ def test_a_degenerate_element_is_reported_and_the_others_finish():
     torch.testing.assert_close(out.mean[[0, 2]], good.mean[[0, 2]])
 
 
+def test_every_option_changes_what_it_is_said_to_change():
+    """Each one that is taken moves the estimate: none is taken and then ignored."""
+    p = Problem(n_frames=12)
+    values = {
+        "n_tracks": 7, "uniform_weight": 0.3, "likelihood_power": 0.2, "reset_below": 100.0,
+        "weighting": "frame", "initial_cov": 40 * torch.eye(4), "burn_in": 4, "resample_threshold": 1.0,
+        "transition": "stationary",
+    }  # fmt: skip
+
+    def estimate(tracks, **options):
+        draws = torch.Generator().manual_seed(3)
+        return p.filter(tracks=tracks, **options)(
+            tensor(p.z), torch.tensor(p.mask), generator=draws
+        ).mean
+
+    for tracks in ("fixed", "sampled", "split"):
+        plain = estimate(tracks)
+        for name, value in values.items():
+            if tracks in TRACK_OPTIONS.get(name, (tracks,)):
+                assert (estimate(tracks, **{name: value}) - plain).abs().max() > 1e-6, (
+                    tracks,
+                    name,
+                )
+            else:
+                with pytest.raises(InputError, match=name):
+                    estimate(tracks, **{name: value})
+
+
+def test_smoothing_refuses_settings_of_the_filter_alone():
+    p = Problem()
+    with pytest.raises(InputError, match="reset_below"):
+        p.filter(reset_below=-50.0).smooth(tensor(p.z))
+
+
 def good_arguments():
     p = Problem()
     return {
@@ -319,6 +354,24 @@ def good_arguments():
         ({"tracks": "frozen"}, InputError, "fixed, sampled, split"),
         ({"n_tracks": 7}, InputError, "fixed tracks are one for each"),
         ({"uniform_weight": -1.0}, InputError, "at least 0"),
+        ({"tracks": "sampled", "resample_threshold": 7}, InputError, "from 0 to 1"),
+        ({"tracks": "sampled", "resample_threshold": -1}, InputError, "from 0 to 1"),
+        ({"burn_in": -1}, InputError, "burn_in"),
+        ({"burn_in": 2.5}, InputError, "burn_in"),
+        ({"burn_in": 3, "burn_in_scale": 0.0}, InputError, "positive factor"),
+        ({"burn_in": 3, "burn_in_scale": -1.0}, InputError, "positive factor"),
+        ({"burn_in_scale": 50.0}, InputError, "burn_in = 0"),
+        ({"transition": "ou", "gamma": 0.9, "burn_in": 3}, InputError, "burn_in inflates Q"),
+        ({"gamma": 0.9}, InputError, "gamma does not apply to transition 'paper'"),
+        ({"subspace": 2}, InputError, "subspace does not apply to transition 'paper'"),
+        ({"tracks": "sampled", "likelihood_power": 0.5}, InputError, "tracks='fixed'"),
+        ({"tracks": "split", "likelihood_power": 0.5}, InputError, "tracks='fixed'"),
+        ({"tracks": "sampled", "reset_below": -9.0}, InputError, "tracks='fixed'"),
+        ({"tracks": "split", "reset_below": -9.0}, InputError, "tracks='fixed'"),
+        ({"tracks": "split", "uniform_weight": 1e-3}, InputError, "tracks='fixed'"),
+        ({"tracks": "split", "resample_threshold": 0.5}, InputError, "tracks='sampled'"),
+        ({"resample_threshold": 0.5}, InputError, "tracks='sampled'"),
+        ({"medians": [0]}, InputError, "medians"),
         ({"transition": "walk"}, InputError, "paper, stationary, ou"),
         ({"transition": "ou"}, InputError, "needs gamma"),
         ({"transition": "ou", "gamma": 1.0}, InputError, r"\[0, 1\)"),

@@ -163,7 +163,7 @@ def test_the_loss_of_noise_falls_and_the_tuned_prior_tracks_better(prior, sequen
     loaded = UpperBodyPrior.load(tmp_path / "tuned.safetensors")
     errors = []
     for own in (start, loaded):
-        tracker = UpperBodyTracker(own, own.camera, window=False, max_gap=None)
+        tracker = UpperBodyTracker(own, own.camera, method="mkf-fixed", max_gap=None)
         track = tracker(batch.keypoints.clone(), lengths=batch.lengths)
         errors.append(float(joint_errors_3d(track.joints3d, batch.poses)[batch.inside].mean()))
     assert errors[1] < errors[0]
@@ -171,7 +171,7 @@ def test_the_loss_of_noise_falls_and_the_tuned_prior_tracks_better(prior, sequen
 
 def test_the_model_errs_as_the_tracker_does(prior, sequences):
     batch = pieces(sequences, prior, 3, frames=20)
-    tracker = UpperBodyTracker(prior, prior.camera, window=False, max_gap=None)
+    tracker = UpperBodyTracker(prior, prior.camera, method="mkf-fixed", max_gap=None)
     track = tracker(batch.keypoints.clone(), lengths=batch.lengths)
     error = joint_errors_3d(track.joints3d, batch.poses)[batch.inside].mean()
     # the tracker lifts by the unscented transform, which carries covariances along

@@ -1,5 +1,6 @@
 """`torchpose track`: video or 2D keypoints to 2D and 3D poses with covariances."""
 
+import sys
 from argparse import ArgumentError
 from pathlib import Path
 from typing import Any
@@ -57,9 +58,9 @@ def build() -> ArgumentParser:
     add(
         "--method",
         type=str,
-        default="mkf-fixed",
         metavar="METHOD",
-        help="mkf-fixed (default), mkf-sampled, mkf-split, pf-mixture, pf-walk, pf-walk-unscaled",
+        help="window-mixture (default if the prior brings windows that suit), mkf-fixed (default "
+        "otherwise), mkf-sampled, mkf-split, pf-mixture, pf-walk, pf-walk-unscaled",
     )
     add(
         "--camera",
@@ -79,7 +80,7 @@ def build() -> ArgumentParser:
         "--smoothing",
         type=parse_smoothing,
         metavar="N|full",
-        help="use N later frames, or all of them, for each estimate (mkf-fixed only)",
+        help="use N later frames, or all of them, for each estimate (window-mixture and mkf-fixed)",
     )
     add("--n-particles", type=int, metavar="N", help="particles of the pf methods (default 10000)")
     add("--n-tracks", type=int, metavar="N", help="tracks of mkf-sampled and mkf-split")
@@ -99,19 +100,18 @@ def build() -> ArgumentParser:
     )
     add(
         "--window",
-        type=bool,
-        default=True,
+        type=bool | None,
+        default=None,
         metavar="true|false",
-        help="use the prior's mixtures over short windows of motion, if it brings them (mkf-fixed "
-        "only); false tracks single poses, as the paper does (default true)",
+        help="deprecated: false stands for --method mkf-fixed, true for the default",
     )
     add(
         "--steady",
-        type=bool,
-        default=True,
+        type=bool | None,
+        default=None,
         metavar="true|false",
         help="take the trembling out of what windows give, by filters of constant velocity (default "
-        "true)",
+        "true for window-mixture)",
     )
     add(
         "--neck",
@@ -249,19 +249,35 @@ def parse_smoothing(value: Any) -> int | str:
     return lag
 
 
-def filter_options(args: Namespace) -> dict[str, Any]:
-    """Options of the filter that were given and that the method has."""
-    from torchpose.tracking import METHODS
+def tracker_options(args: Namespace) -> dict[str, Any]:
+    """Method, smoothing, frame and the filter's options, as `UpperBodyTracker` takes them.
 
-    if args.method not in METHODS:
-        return {}  # the tracker refuses it, and lists those it knows
-    has = {"n_particles": args.method.startswith("pf-"),
-           "n_tracks": args.method in ("mkf-sampled", "mkf-split")}  # fmt: skip
-    given = {name: getattr(args, name) for name in has if getattr(args, name) is not None}
-    for name, value in given.items():
-        option = f"--{name.replace('_', '-')}"
-        if not has[name]:
-            raise InputError(f"{option} does not apply to --method {args.method}")
+    Raises:
+        InputError: an option that the method does not have.
+    """
+    from torchpose.methods import METHODS, WINDOWS, method_options, options_of_before
+
+    method, steady = args.method, args.steady
+    if args.window is not None:
+        print(
+            "torchpose: --window is deprecated; say --method window-mixture or mkf-fixed, or leave "
+            "both out",
+            file=sys.stderr,
+        )
+        method, steady = options_of_before(method, args.window, steady)
+    names = ("smoothing", "frame", "static_camera")
+    options = {name: getattr(args, name) for name in names} | {"method": method, "steady": steady}
+    for name in ("n_particles", "n_tracks"):
+        value, option = getattr(args, name), f"--{name.replace('_', '-')}"
+        if value is None:
+            continue
+        having = [other for other in METHODS if name in method_options(other)]
+        if method is None or (method in METHODS and method not in having):
+            raise InputError(
+                f"{option} does not apply to --method {method or WINDOWS}; it is of "
+                f"{', '.join(having)}"
+            )
         if value < 1:
             raise InputError(f"{option} must be at least 1, got {value}")
-    return given
+        options[name] = value
+    return options

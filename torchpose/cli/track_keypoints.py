@@ -29,7 +29,7 @@ def track_keypoints(args: Namespace) -> int:
     import torch
 
     from torchpose.cli.camera_option import resolve_camera
-    from torchpose.cli.track import filter_options
+    from torchpose.cli.track import tracker_options
     from torchpose.io import read_keypoints
     from torchpose.priors import load_prior
     from torchpose.tracking import UpperBodyTracker
@@ -48,17 +48,11 @@ def track_keypoints(args: Namespace) -> int:
     tracker = UpperBodyTracker(
         prior,
         camera,
-        args.method,
         measurement_std=args.measurement_std,
         fps=fps,
-        smoothing=args.smoothing,
-        frame=args.frame,
-        static_camera=args.static_camera,
-        window=args.window,
-        steady=args.steady,
         neck=kind_of_neck(args.neck, keypoints),
         max_gap=args.max_gap,
-        **filter_options(args),
+        **tracker_options(args),
     )
     pictures = pictures_possible(args.pictures)
     with track_results(args, pictures, video=False) as results:
@@ -80,7 +74,7 @@ def track_keypoints(args: Namespace) -> int:
     settings = {
         "prior": prior.info.name or args.prior,
         "camera": camera_text(camera),
-        "method": args.method + smoothing_text(args.smoothing),
+        "method": track.method + smoothing_text(args.smoothing),
     }
     print(summary(track, written, settings, results.notes))
     return report_failure(track)

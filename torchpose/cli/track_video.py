@@ -65,15 +65,16 @@ def track_video(args: Namespace) -> int:
                 people, n_frames = _track_camera(tracker, source, results.stage, args.overlay)
             seconds = time.perf_counter() - start
             notes += tuple(source.notes)
+        if not people:
+            return _nobody(args, n_frames, notes, results.folder)
         facts = {
             "video": f"{args.input}, {source.size[0]} x {source.size[1]}, {source.fps:g} fps",
             "prior": prior.info.name or args.prior,
             "camera": camera_text(camera),
-            "method": f"{args.method}{smoothing_text(args.smoothing)}, hands by {args.hands}",
+            "method": people[0].track.method
+            + f"{smoothing_text(args.smoothing)}, hands by {args.hands}",
             "speed": f"{n_frames / max(seconds, 1e-9):.0f} frames a second, without drawing",
         }
-        if not people:
-            return _nobody(args, n_frames, notes, results.folder)
         people = [replace(p, track=replace(p.track, notes=notes + p.track.notes)) for p in people]
         # first of all: the rest only shows them
         written = results.commit(write_people(people, results.stage))
@@ -112,19 +113,11 @@ def _refuse_keypoint_options(args: Namespace) -> None:
 
 
 def _tracker(args: Namespace, prior: Any, camera: "PinholeCamera", fps: float) -> "VideoTracker":
-    from torchpose.cli.track import filter_options
+    from torchpose.cli.track import tracker_options
     from torchpose.measure import MediaPipeFaceDetector
     from torchpose.video_tracker import VideoTracker
 
     detector = None if args.face_model is None else MediaPipeFaceDetector(args.face_model)
-    options = {
-        "method": args.method,
-        "smoothing": args.smoothing,
-        "frame": args.frame,
-        "static_camera": args.static_camera,
-        "window": args.window,
-        "steady": args.steady,
-    }
     return VideoTracker(
         prior,
         camera,
@@ -138,8 +131,7 @@ def _tracker(args: Namespace, prior: Any, camera: "PinholeCamera", fps: float) -
         max_persons=args.max_persons,
         max_gap=args.max_gap,
         seed=args.seed,
-        **options,
-        **filter_options(args),
+        **tracker_options(args),
     )
 
 

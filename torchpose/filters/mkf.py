@@ -22,7 +22,12 @@ from torchpose.filters.frame_weights import FrameGains
 from torchpose.filters.gains import GainGraph
 from torchpose.filters.smoothing import smooth_fixed_tracks
 from torchpose.filters.tracks import MKFState
-from torchpose.filters.transition import TRANSITIONS, Transition, make_transition
+from torchpose.filters.transition import (
+    BURN_IN_SCALE,
+    Transition,
+    check_transition_options,
+    make_transition,
+)
 from torchpose.filters.weights import normalise
 from torchpose.module_state import derived, one_run, register_given, wide_or_parameter
 from torchpose.priors.gmm import GaussianMixture
@@ -31,6 +36,17 @@ __all__ = ["MKFState", "MixtureKalmanFilter"]
 
 TRACKS = ("fixed", "sampled", "split")
 WEIGHTINGS = ("sequence", "frame")
+_UNIFORM_WEIGHT = 1e-3
+TRACK_OPTIONS = {
+    "n_tracks": ("sampled", "split"),
+    "resample_threshold": ("sampled",),
+    "uniform_weight": ("fixed",),
+    "likelihood_power": ("fixed",),
+    "weighting": ("fixed",),
+    "reset_below": ("fixed",),
+    "medians": ("fixed",),
+}
+"""Options that only some kinds of tracks use, and which."""
 
 
 class MixtureKalmanFilter(RecursiveFilter):
@@ -55,26 +71,28 @@ class MixtureKalmanFilter(RecursiveFilter):
         observed: the Z state indices that are measured.
         tracks: "fixed", "sampled" or "split".
         n_tracks: M; K by default, and always K for fixed tracks.
-        uniform_weight: epsilon, only for fixed tracks.
+        uniform_weight: epsilon, 1e-3 by default; only for fixed tracks whose weighting is "sequence".
         initial_cov: covariance of every track before the first prediction, [D, D], [D] or [K, D, D];
             by default that of its component.
         transition: "paper", "stationary" or "ou", see `make_transition`. gamma, subspace: of "ou".
-        resample_threshold: share of M, only for sampled tracks.
-        burn_in: number of frames over which Q starts inflated by `burn_in_scale` and decays to
-            itself geometrically (paper section 3.3, after BL 26). 0 is no burn-in.
+        resample_threshold: share of M, 0 (never) to 1 (always), 0.5 by default; only for sampled tracks.
+        burn_in: number of frames over which Q starts inflated by `burn_in_scale` (100 by default) and
+            decays to itself geometrically (paper section 3.3, after BL 26). 0 is no burn-in, as it has
+            to be for "ou", which has no Q.
         likelihood_power: exponent of the likelihood in the weights of fixed tracks; 1 as published,
             below 1 where the components are surer of themselves than they should be.
         weighting: "sequence" as published, or "frame" (fixed tracks only): the weights of a frame are
             those that the mixture gives to its measurement alone, w_j prop. to
             pi_j N(z_t; H mu_j, H Sigma_j H^T + R), see `frame_weights`. For mixtures whose state
-            holds the past already; epsilon and `reset_below` then play no part.
+            holds the past already.
         reset_below: fixed tracks only; see `step_weights`.
         dtype: of means and measurements; covariances are always float64.
         medians: first of three dimensions each, points whose estimate is the geometric median of the
             mixture instead of its mean (BL 48); only where frames do not depend on each other.
 
     Raises:
-        InputError, ShapeError, CovarianceError: for what does not fit, before any work.
+        InputError, ShapeError, CovarianceError: for what does not fit, before any work; InputError also
+            for an option that the kind of tracks, weighting or transition does not use.
 
     Reference:
         M. Burke, J. Lasenby, "Single camera pose estimation using Bayesian filtering and Kinect
@@ -102,14 +120,14 @@ class MixtureKalmanFilter(RecursiveFilter):
         observed: Sequence[int] | Tensor,
         tracks: str = "fixed",
         n_tracks: int | None = None,
-        uniform_weight: float = 1e-3,
+        uniform_weight: float | None = None,
         initial_cov: Tensor | None = None,
         transition: str = "paper",
         gamma: Tensor | float | None = None,
         subspace: int | None = None,
-        resample_threshold: float = 0.5,
+        resample_threshold: float | None = None,
         burn_in: int = 0,
-        burn_in_scale: float = 100.0,
+        burn_in_scale: float | None = None,
         likelihood_power: float = 1.0,
         weighting: str = "sequence",
         reset_below: float | None = None,
@@ -118,10 +136,23 @@ class MixtureKalmanFilter(RecursiveFilter):
     ) -> None:
         super().__init__(measurement_cov, observed, gmm.means.shape[-1], dtype)
         n_components = gmm.means.shape[0]
-        _check_options(tracks, n_tracks, n_components, uniform_weight, transition)
-        _check_weighting(weighting, tracks, reset_below)
-        if not 0 < likelihood_power <= 1:
-            raise InputError(f"likelihood_power must lie in (0, 1], got {likelihood_power}")
+        _check_tracks(tracks, n_tracks, n_components)
+        unlike_default = {
+            "resample_threshold": resample_threshold is not None,
+            "uniform_weight": uniform_weight is not None,
+            "likelihood_power": likelihood_power != 1,
+            "weighting": weighting != "sequence",
+            "reset_below": reset_below is not None,
+            "medians": len(medians) > 0,
+        }
+        _refuse_unused(tracks, [name for name, given in unlike_default.items() if given])
+        _check_weighting(weighting, uniform_weight, reset_below)
+        check_transition_options(transition, gamma, subspace, burn_in, burn_in_scale)
+        uniform_weight = _UNIFORM_WEIGHT if uniform_weight is None else uniform_weight
+        resample_threshold = 0.5 if resample_threshold is None else resample_threshold
+        _check_ranges(uniform_weight, resample_threshold, likelihood_power)
+        if len(medians):
+            _check_memoryless(weighting, transition, gamma)
         self.tracks = tracks
         self.n_tracks = n_tracks or n_components
         self.uniform_weight = float(uniform_weight) if tracks == "fixed" else 0.0
@@ -129,7 +160,7 @@ class MixtureKalmanFilter(RecursiveFilter):
         self.subspace = subspace
         self.resample_threshold = resample_threshold
         self.burn_in = burn_in
-        self.burn_in_scale = burn_in_scale
+        self.burn_in_scale = BURN_IN_SCALE if burn_in_scale is None else float(burn_in_scale)
         self.likelihood_power = float(likelihood_power)
         self.weighting = weighting
         self.reset_below = reset_below
@@ -248,7 +279,8 @@ class MixtureKalmanFilter(RecursiveFilter):
             `FilterOutput` with smoothed mean, weights and covariance, and the filter's log-evidence.
 
         Raises:
-            InputError: tracks are not fixed, or lag is negative; else as `forward`.
+            InputError: tracks are not fixed, they have settings of the filter alone (`reset_below`,
+            `medians`), or lag is negative; else as `forward`.
 
         Reference:
             H. Rauch, F. Tung, C. Striebel (1965); see `smooth_fixed_tracks`.
@@ -256,6 +288,11 @@ class MixtureKalmanFilter(RecursiveFilter):
         if self.tracks != "fixed":
             raise InputError(
                 f"smoothing needs tracks='fixed', whose tracks have a past each, got {self.tracks!r}"
+            )
+        if self.reset_below is not None or len(self.medians):
+            raise InputError(
+                "reset_below and medians are of filtered estimates: smoothing uses neither, got "
+                f"reset_below={self.reset_below} and {len(self.medians)} medians"
             )
         with one_run(self.observed.device):
             frames = self.check(z, mask, measurement_cov, lengths, None)
@@ -291,13 +328,9 @@ class MixtureKalmanFilter(RecursiveFilter):
         )
 
 
-def _check_options(
-    tracks: str, n_tracks: int | None, n_components: int, uniform_weight: float, transition: str
-) -> None:
+def _check_tracks(tracks: str, n_tracks: int | None, n_components: int) -> None:
     if tracks not in TRACKS:
         raise InputError(f"tracks must be one of {', '.join(TRACKS)}, got {tracks!r}")
-    if transition not in TRANSITIONS:
-        raise InputError(f"transition must be one of {', '.join(TRANSITIONS)}, got {transition!r}")
     if n_tracks is not None and n_tracks < 1:
         raise InputError(f"n_tracks must be at least 1, got {n_tracks}")
     if tracks == "fixed" and n_tracks not in (None, n_components):
@@ -305,15 +338,44 @@ def _check_options(
             f"fixed tracks are one for each of the {n_components} components, got "
             f"n_tracks={n_tracks}; leave it out, or use tracks='sampled'"
         )
-    if not (uniform_weight >= 0 and math.isfinite(uniform_weight)):
-        raise InputError(f"uniform_weight must be at least 0, got {uniform_weight}")
 
 
-def _check_weighting(weighting: str, tracks: str, reset_below: float | None) -> None:
+def _refuse_unused(tracks: str, given: Sequence[str]) -> None:
+    for name in given:
+        if tracks not in TRACK_OPTIONS[name]:
+            raise InputError(
+                f"{name} does not apply to tracks={tracks!r}; it is of tracks="
+                f"{' or '.join(map(repr, TRACK_OPTIONS[name]))}"
+            )
+
+
+def _check_weighting(
+    weighting: str, uniform_weight: float | None, reset_below: float | None
+) -> None:
     if weighting not in WEIGHTINGS:
         raise InputError(f"weighting must be one of {', '.join(WEIGHTINGS)}, got {weighting!r}")
-    if weighting == "frame" and (tracks != "fixed" or reset_below is not None):
+    if weighting == "frame" and not (reset_below is None and uniform_weight is None):
         raise InputError(
-            "weighting 'frame' needs tracks='fixed' and no reset_below, got "
-            f"tracks={tracks!r} and reset_below={reset_below}"
+            "weighting 'frame' takes every frame's weights from that frame alone: uniform_weight and "
+            f"reset_below are of 'sequence', got {uniform_weight} and {reset_below}"
         )
+
+
+def _check_memoryless(weighting: str, transition: str, gamma: Tensor | float | None) -> None:
+    still = gamma is not None and bool((torch.as_tensor(gamma) == 0).all())
+    if not (still and transition == "ou" and weighting == "frame"):
+        raise InputError(
+            "medians are of frames that do not depend on each other: they need weighting='frame', "
+            f"transition='ou' and gamma=0, got {weighting!r}, {transition!r} and gamma={gamma}"
+        )
+
+
+def _check_ranges(uniform_weight: float, resample_threshold: float, power: float) -> None:
+    if not (uniform_weight >= 0 and math.isfinite(uniform_weight)):
+        raise InputError(f"uniform_weight must be at least 0, got {uniform_weight}")
+    if not 0 <= resample_threshold <= 1:
+        raise InputError(
+            f"resample_threshold must be a share from 0 to 1, got {resample_threshold}"
+        )
+    if not 0 < power <= 1:
+        raise InputError(f"likelihood_power must lie in (0, 1], got {power}")

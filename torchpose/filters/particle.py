@@ -23,7 +23,11 @@ from torchpose.filters.base import (
 from torchpose.filters.mending import Mending, mending
 from torchpose.filters.particle_options import PROPOSALS, check_model, check_options
 from torchpose.filters.resampling import resample
-from torchpose.filters.transition import make_transition
+from torchpose.filters.transition import (
+    BURN_IN_SCALE,
+    check_transition_options,
+    make_transition,
+)
 from torchpose.filters.walk import MixtureWalk, Moves, grouped_affine
 from torchpose.gaussian import LOG_2PI, mended_cholesky, mended_update, safe_cholesky
 from torchpose.module_state import derived, register_given, wide_or_parameter
@@ -97,8 +101,8 @@ class BootstrapParticleFilter(RecursiveFilter):
         proposal: "mixture", "random-walk" or "random-walk-unscaled".
         n_particles: N. resample_threshold: share of N, 0 (never) to 1 (always).
         resampling: "systematic", "stratified", "multinomial" or "residual".
-        burn_in: number of frames over which Q starts inflated by `burn_in_scale` and decays to itself
-            geometrically, Q_t = scale^(1 - t / burn_in) Q. 0 is no burn-in.
+        burn_in: number of frames over which Q starts inflated by `burn_in_scale` (100 by default) and
+            decays to itself geometrically, Q_t = scale^(1 - t / burn_in) Q. 0 is no burn-in.
         initial_cov: the first particles are drawn from the prior, or if this is given ([D, D], [D]
             or [K, D, D]) from sum_i pi_i N(mu_i, initial_cov), as the mixture Kalman filter starts.
         start: "prior": x_0 is drawn from that density, and moved and weighed like any other.
@@ -142,7 +146,7 @@ class BootstrapParticleFilter(RecursiveFilter):
         resample_threshold: float = 0.5,
         resampling: str = "systematic",
         burn_in: int = 0,
-        burn_in_scale: float = 100.0,
+        burn_in_scale: float | None = None,
         initial_cov: Tensor | None = None,
         start: str = "prior",
         transition: str = "paper",
@@ -152,11 +156,13 @@ class BootstrapParticleFilter(RecursiveFilter):
     ) -> None:
         super().__init__(measurement_cov, observed, gmm.dim, dtype)
         check_options(proposal, n_particles, resample_threshold, resampling, start, dtype)
-        check_model(proposal, transition, burn_in, burn_in_scale)
+        check_transition_options(transition, gamma, subspace, burn_in, burn_in_scale)
+        check_model(proposal, transition)
         self.proposal, self.transition, self.subspace = proposal, transition, subspace
         self.n_particles, self.resample_threshold = n_particles, resample_threshold
         self.resampling, self.start = resampling, start
-        self.burn_in, self.burn_in_scale = burn_in, float(burn_in_scale)
+        self.burn_in = burn_in
+        self.burn_in_scale = BURN_IN_SCALE if burn_in_scale is None else float(burn_in_scale)
         for name, value in zip(
             ("weights", "means", "covariances"), gmm.parameters_tuple(), strict=True
         ):

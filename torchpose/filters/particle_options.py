@@ -1,12 +1,9 @@
 """What can be asked of a bootstrap particle filter, and the checks of it."""
 
-import math
-
 import torch
 
 from torchpose.errors import InputError
 from torchpose.filters.resampling import RESAMPLING
-from torchpose.filters.transition import TRANSITIONS
 
 __all__ = ["PROPOSALS", "STARTS", "check_model", "check_options"]
 
@@ -37,19 +34,10 @@ def check_options(
         raise InputError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
 
 
-def check_model(proposal: str, transition: str, burn_in: int, burn_in_scale: float) -> None:
-    """Raise `InputError` for a transition or a burn-in that does not go with the proposal."""
-    if transition not in TRANSITIONS:
-        raise InputError(f"transition must be one of {', '.join(TRANSITIONS)}, got {transition!r}")
+def check_model(proposal: str, transition: str) -> None:
+    """Raise `InputError` for a transition that does not go with the proposal."""
     if proposal != "mixture" and transition != "paper":
         raise InputError(
             f"proposal {proposal!r} weighs by (BL 26), which holds for transition 'paper' only, "
             f"got {transition!r}; use proposal 'mixture'"
-        )
-    if burn_in and transition == "ou":
-        raise InputError("burn_in inflates Q, which transition 'ou' does not use; leave it at 0")
-    if burn_in < 0 or not (math.isfinite(burn_in_scale) and burn_in_scale > 0):
-        raise InputError(
-            "burn_in must be a number of frames >= 0 and burn_in_scale a positive factor of Q, "
-            f"got {burn_in} and {burn_in_scale}"
         )

@@ -1,6 +1,7 @@
 """Transition models: a mixture of discrete Ornstein-Uhlenbeck processes, one per prior component."""
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -9,9 +10,17 @@ from torch import Tensor
 from torchpose.errors import InputError
 from torchpose.gaussian import safe_cholesky, symmetrise
 
-__all__ = ["TRANSITIONS", "Transition", "make_transition"]
+__all__ = [
+    "BURN_IN_SCALE",
+    "TRANSITIONS",
+    "Transition",
+    "check_transition_options",
+    "make_transition",
+]
 
 TRANSITIONS = ("paper", "stationary", "ou")
+BURN_IN_SCALE = 100.0
+"""Factor of Q in the first frame of a burn-in, where none is given."""
 
 
 class Transition(NamedTuple):
@@ -24,6 +33,41 @@ class Transition(NamedTuple):
     matrix: Tensor
     offset: Tensor
     noise: Tensor
+
+
+def check_transition_options(
+    kind: str,
+    gamma: Any,
+    subspace: int | None,
+    burn_in: int,
+    burn_in_scale: float | None,
+) -> None:
+    """Refuse a transition that does not exist, and options that the chosen one does not use.
+
+    Args:
+        kind: one of `TRANSITIONS`. gamma, subspace: of "ou", None where they were not given.
+        burn_in: number of frames with an inflated Q, which "ou" has not. burn_in_scale: factor of Q
+            in the first of them, None where it was not given.
+
+    Raises:
+        InputError: an unknown kind, an option without use, or a burn-in out of range.
+    """
+    if kind not in TRANSITIONS:
+        raise InputError(f"transition must be one of {', '.join(TRANSITIONS)}, got {kind!r}")
+    for name, value in (("gamma", gamma), ("subspace", subspace)):
+        if kind != "ou" and value is not None:
+            raise InputError(f"{name} does not apply to transition {kind!r}; it is of 'ou'")
+    whole = isinstance(burn_in, int) and not isinstance(burn_in, bool)
+    scale = BURN_IN_SCALE if burn_in_scale is None else burn_in_scale
+    if not whole or burn_in < 0 or not (math.isfinite(scale) and scale > 0):
+        raise InputError(
+            "burn_in must be a number of frames >= 0 and burn_in_scale a positive factor of Q, "
+            f"got {burn_in} and {scale}"
+        )
+    if burn_in and kind == "ou":
+        raise InputError("burn_in inflates Q, which transition 'ou' does not use; leave it at 0")
+    if burn_in == 0 and burn_in_scale is not None:
+        raise InputError(f"burn_in_scale is of a burn-in: got {scale} and burn_in = 0")
 
 
 def make_transition(

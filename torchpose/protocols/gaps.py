@@ -126,9 +126,12 @@ def _models(prior: UpperBodyPrior) -> dict[str, tuple[UpperBodyPrior, dict[str, 
     plain = plain_prior(prior)
     models: dict[str, tuple[UpperBodyPrior, dict[str, Any]]] = {"MKF": (prior, {})}
     if prior.windows:
-        models["MKF, single poses"] = (prior, {"window": False})
+        models["MKF, single poses"] = (prior, {"method": "mkf-fixed"})
     models["paper, hand-set noise"] = (plain, {})
-    models["stationary, hand-set noise"] = (plain, {"transition": "stationary"})
+    models["stationary, hand-set noise"] = (
+        plain,
+        {"method": "mkf-fixed", "transition": "stationary"},
+    )
     return models
 
 

@@ -189,15 +189,15 @@ def _variants(prior: UpperBodyPrior, lag: int) -> dict[str, tuple[UpperBodyPrior
     if any(name.startswith("calibration") for name in prior.noise):
         variants[UNCALIBRATED] = (prior, {"calibrated": False})
         variants[f"{SMOOTHED}, uncalibrated"] = (prior, smooth | {"calibrated": False})
-    poses = {"window": False}
+    poses = {"method": "mkf-fixed"}
     if prior.windows:
         variants[f"{MAIN}, single poses"] = (prior, poses)
         variants[f"{SMOOTHED}, single poses"] = (prior, poses | smooth)
     if lag:
         variants[f"{LAGGED} {lag}, single poses"] = (prior, poses | {"smoothing": lag})
     variants[BASELINE] = (plain, {})
-    variants["MKF stationary, hand-set noise"] = (plain, {"transition": "stationary"})
-    variants["MKF ou 0.95, hand-set noise"] = (plain, {"transition": "ou", "gamma": 0.95})
+    variants["MKF stationary, hand-set noise"] = (plain, poses | {"transition": "stationary"})
+    variants["MKF ou 0.95, hand-set noise"] = (plain, poses | {"transition": "ou", "gamma": 0.95})
     variants[f"{BASELINE}, smoothed"] = (plain, smooth)
     return variants
 

@@ -19,9 +19,9 @@ from torchpose.tracking import UpperBodyTracker
 __all__ = ["MODES", "HeldOut", "calibration_noise", "fit_calibration", "folds", "track_held_out"]
 
 MODES: dict[str, dict[str, Any]] = {
-    "pose": {"window": False},
-    "causal": {},
-    "full": {"smoothing": "full"},
+    "pose": {"method": "mkf-fixed"},
+    "causal": {"method": "window-mixture"},
+    "full": {"method": "window-mixture", "smoothing": "full"},
 }
 """The ways of tracking that have a calibration of their own, with their options of the tracker."""
 
