@@ -4,12 +4,15 @@ import os
 import signal
 import subprocess
 import sys
+from types import ModuleType
 
 import numpy as np
 import pytest
 
 from torchpose.io import ResultsFolder
 from torchpose.pose_track import PoseTrack
+from torchpose.protocols.common import add_picture
+from torchpose.protocols.report import Report
 from torchpose.video import VideoWriter
 
 POSES = ("poses.npz", "poses.csv", "poses.bvh")
@@ -190,3 +193,39 @@ def test_a_fit_again_and_one_beside_it(torchpose, files, tmp_path):
     done = torchpose("fit", files / "recordings", "--out", tmp_path / "one.safetensors", *line)
     assert done.code == 0 and "earlier-1" in done.out
     assert (tmp_path / "earlier-1" / "one.md").read_bytes() == card
+
+
+@pytest.fixture
+def protocol(monkeypatch):
+    """A protocol that stands in for ub-people, and writes a report with a picture."""
+    figures = pytest.importorskip("matplotlib.figure")
+
+    def run(data, out, *, seed=0, progress=True):
+        report = Report("example", settings={"seed": seed})
+        add_picture(report, out, "pcp.png", figures.Figure())
+        report.save(out)
+        return report
+
+    module = ModuleType("torchpose.protocols.ub_people")
+    module.run = run
+    monkeypatch.setitem(sys.modules, "torchpose.protocols.ub_people", module)
+
+
+def test_an_evaluation_spares_other_reports_and_moves_other_pictures(torchpose, protocol, tmp_path):
+    line = ("evaluate", "ub-people", "--data", tmp_path, "--out", tmp_path)
+    (tmp_path / "report.md").write_bytes(b"mine")
+    refused(torchpose(*line), "report.md: is there, and is not known")
+    assert content(tmp_path) == {"report.md": b"mine"}
+    (tmp_path / "report.md").unlink()
+    (tmp_path / "pcp.png").write_bytes(b"mine")
+    done = torchpose(*line)
+    assert done.code == 0 and f"was moved to {tmp_path / 'earlier-1' / 'pcp.png'}" in done.out
+    assert content(tmp_path / "earlier-1") == {"pcp.png": b"mine"}
+    names = {"report.md", "report.json", "pcp.png", ".torchpose-evaluate.json"}
+    done = torchpose(*line, "--seed", 1)
+    assert done.code == 0 and "moved" not in done.out and content(tmp_path).keys() == names
+    report = (tmp_path / "report.md").read_bytes()
+    (tmp_path / ".torchpose-evaluate.json").unlink()  # as an earlier version left it
+    assert torchpose(*line).code == 0
+    assert (tmp_path / "earlier-1" / "report.md").read_bytes() == report
+    assert (tmp_path / "report.md").read_bytes() != report

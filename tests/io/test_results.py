@@ -1,6 +1,5 @@
 """Folders of results: all files of a run or none, and never a file of the user's lost."""
 
-import json
 import os
 import signal
 import sys
@@ -12,7 +11,7 @@ import pytest
 from torchpose.errors import OutputError
 from torchpose.io import ResultsFolder, check_output_folder
 from torchpose.io.files import atomic_path
-from torchpose.io.results import replace_own
+from torchpose.io.results import refuse_stranger, replace_own
 
 NAMES = ("a.txt", "b.txt", "c.txt")
 LIST = ".torchpose-notes.json"
@@ -246,20 +245,26 @@ def test_what_a_killed_run_left_is_cleared_and_what_a_live_one_needs_is_not(tmp_
     assert content(tmp_path) == {"y.txt": "alive"}
 
 
-def test_own_files_are_replaced_one_by_one(tmp_path):
+def test_own_files_are_replaced_one_by_one_and_others_moved_aside(tmp_path):
     for text in ("one", "two"):
         with replace_own(tmp_path / "report.md", "pages") as temporary:
             temporary.write_text(text)
         assert content(tmp_path) == {"report.md": text}
+    refuse_stranger(tmp_path / "report.md", "pages")
     (tmp_path / "report.md").write_text("edited")
     (tmp_path / "plot.md").write_text("mine")
-    for name in ("report.md", "plot.md"):
-        with (
-            pytest.raises(OutputError, match="move it away"),
-            replace_own(tmp_path / name, "pages"),
-        ):
-            pass
-    assert content(tmp_path) == {"report.md": "edited", "plot.md": "mine"}
-    assert list(json.loads((tmp_path / ".torchpose-pages.json").read_text())["files"]) == [
-        "report.md"
-    ]
+    for name in ("report.md", "plot.md", "report.md"):
+        with replace_own(tmp_path / name, "pages") as temporary:
+            temporary.write_text("three")
+    assert content(tmp_path) == {"report.md": "three", "plot.md": "three"}
+    assert content(tmp_path / "earlier-1") == {"report.md": "edited", "plot.md": "mine"}
+    with pytest.raises(OutputError, match="move it away"):
+        refuse_stranger(tmp_path / "report.md", "others")
+    refuse_stranger(tmp_path / "report.md", "others", earlier=True)
+    (tmp_path / "report.md").write_text("edited again")
+    with pytest.raises(ZeroDivisionError), replace_own(tmp_path / "report.md", "pages"):
+        raise ZeroDivisionError
+    assert (tmp_path / "report.md").read_text() == "edited again"
+    with replace_own(tmp_path / "report.md", "pages"):
+        pass
+    assert (tmp_path / "earlier-2" / "report.md").read_text() == "edited again"

@@ -1,6 +1,7 @@
 """`torchpose evaluate`: the protocols that published figures come from."""
 
 import inspect
+import json
 import re
 import typing
 from argparse import ArgumentError
@@ -52,6 +53,7 @@ _SEVERAL = ("leave-one-person-out",)
 _MOCAP = ("silhouette", "root-uncertainty", "bend")
 """Protocols on any one folder of motion capture."""
 _COMMON = ("data", "out", "seed", "progress")
+_MOVED = "earlier-*/*"
 _PLAIN = (int, float, bool, str, type(None))
 
 
@@ -111,9 +113,32 @@ def run(name: str, args: Namespace) -> int:
 
         own["prior"] = load_prior(args.prior)
     out = check_output_folder(args.out)
+    _refuse_other_reports(out)
+    moved = {*out.glob(_MOVED)}
     report = function(data, out, seed=args.seed, progress=show_progress(), **own)
     print(report.summary())
+    for path in sorted({*out.glob(_MOVED)} - moved):
+        print(f"note: what was in the place of {path.name} was moved to {path}")
     return 0
+
+
+def _refuse_other_reports(out: Path) -> None:
+    """See that the report will be written over none but an earlier one."""
+    from torchpose.io.results import refuse_stranger
+    from torchpose.protocols.report import RESULTS
+
+    earlier = _is_report(out / "report.json")
+    for name in ("report.json", "report.md"):
+        refuse_stranger(out / name, RESULTS, earlier)
+
+
+def _is_report(path: Path) -> bool:
+    """Whether it is a report of this command, which earlier versions kept no list of."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(found, dict) and {"settings", "tables", "findings"} <= found.keys()
 
 
 def _folders(args: Namespace) -> list[Path]:

@@ -16,7 +16,7 @@ from torchpose.io.files import atomic_path, check_output_folder
 from torchpose.io.leftovers import hold
 from torchpose.io.npz import npz_keys
 
-__all__ = ["ResultsFolder", "holds_arrays", "replace_own"]
+__all__ = ["ResultsFolder", "holds_arrays", "refuse_stranger", "replace_own"]
 
 _BLOCK = 2**20
 _LISTED = 5
@@ -164,7 +164,7 @@ class ResultsFolder:
         self._before = []
         moves: list[tuple[Path, Path]] = []
         if strangers:
-            aside = self._aside()
+            aside = _free_folder(self.folder, strangers)
             moves = [(self.folder / name, aside / name) for name in strangers]
         trash = self.stage / ".old"
         trash.mkdir(exist_ok=True)
@@ -183,35 +183,44 @@ class ResultsFolder:
                 f"{aside}: {_some(strangers)}"
             )
 
-    def _aside(self) -> Path:
-        number = 1
-        while True:
-            with contextlib.suppress(FileExistsError):
-                folder = self.folder / f"earlier-{number}"
-                folder.mkdir()
-                return folder
-            number += 1
-
 
 @contextlib.contextmanager
 def replace_own(path: str | Path, kind: str) -> Iterator[Path]:
     """A temporary file that becomes `path` when the block succeeds, as `atomic_path` does.
 
-    What stands at `path` has to be what was written in this way before, with the same `kind`.
+    What stands at `path` and was not written in this way before, with the same `kind`, or was changed
+    since, is moved to a folder `earlier-1` (or 2, ...) beside it.
 
     Yields:
         Path of the temporary file.
 
     Raises:
-        OutputError: something else is there, or the file cannot be written.
+        OutputError: the file cannot be written.
     """
     path = Path(path)
-    _refuse_stranger(path, _read_list(path.parent, kind) or {})
     with atomic_path(path) as temporary:
         yield temporary
         with _as_output_error(path), _locked_folder(path.parent):
             listed = _read_list(path.parent, kind) or {}
+            if os.path.lexists(path) and not _is_listed(path, listed):
+                path.rename(_free_folder(path.parent, [path.name]) / path.name)
             _write_list(path.parent, kind, listed | {path.name: _facts(temporary)})
+
+
+def refuse_stranger(path: str | Path, kind: str, earlier: bool = False) -> None:
+    """See that there is nothing in the place of a result but what a run has written.
+
+    Args:
+        path: of the result. kind: of the results in its folder.
+        earlier: whether it may be of an earlier version, which kept no list.
+
+    Raises:
+        OutputError: there is something else, or it was changed since.
+    """
+    path = Path(path)
+    listed = _read_list(path.parent, kind)
+    if listed is not None or not earlier:
+        _refuse_stranger(path, listed or {})
 
 
 def holds_arrays(path: str | Path, names: Iterable[str]) -> bool:
@@ -290,6 +299,16 @@ def _renamed(moves: Sequence[tuple[Path, Path]]) -> Iterator[None]:
         for source, target in reversed(done):
             target.rename(source)
         raise
+
+
+def _free_folder(folder: Path, names: Sequence[str]) -> Path:
+    """The first folder `earlier-N` in which none of these names is taken."""
+    number = 1
+    while any(os.path.lexists(folder / f"earlier-{number}" / name) for name in names):
+        number += 1
+    free = folder / f"earlier-{number}"
+    free.mkdir(exist_ok=True)
+    return free
 
 
 def _same(path: Path, other: Path) -> bool:

@@ -9,10 +9,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.body.skeleton import BODY_15
-from torchpose.io.files import atomic_path
+from torchpose.io.results import replace_own
 from torchpose.protocols.bend_runs import BendRun, BendRuns, mean_squared
 from torchpose.protocols.bend_trackees import BendTrackee, Variant, true_acceptance
-from torchpose.protocols.report import Report
+from torchpose.protocols.report import RESULTS, Report
 from torchpose.protocols.silhouette_runs import Tuning, sequence_name
 from torchpose.protocols.silhouette_tables import bootstrap, mean_of, pooled_std
 
@@ -216,7 +216,10 @@ def add_sequences(report: Report, trackees: Sequence[BendTrackee]) -> None:
 
 def write_csv(path: Path, runs: BendRuns, first_seed: int = 0) -> None:
     """One line for every run."""
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as out:
+    with (
+        replace_own(path, RESULTS) as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as out,
+    ):
         writer = csv.writer(out)
         writer.writerow(["sequence", *Variant._fields, "seed", "mse_degrees2", "root_mm", "joints_mm",
                          "acceptance", "clamped", "respread_frames", "ms_per_frame"])  # fmt: skip

@@ -20,6 +20,7 @@ from torchpose.camera import PinholeCamera, sample_viewpoints
 from torchpose.errors import InputError, TorchposeError
 from torchpose.filters.base import Generators
 from torchpose.io.recordings import Recording
+from torchpose.io.results import replace_own
 from torchpose.metrics import (
     PCP,
     Coverage,
@@ -34,7 +35,7 @@ from torchpose.metrics import (
 from torchpose.priors.training import TRAINING_VIEWS, collect_poses
 from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.projection import project
-from torchpose.protocols.report import Report
+from torchpose.protocols.report import RESULTS, Report
 from torchpose.rotations import euler_to_matrix
 from torchpose.skeleton import UPPER_BODY, mirror_pose
 from torchpose.tracking import UpperBodyTracker
@@ -316,7 +317,8 @@ def add_picture(report: Report, out: Path, name: str, figure: Any) -> None:
     """Write a matplotlib figure to the folder and list it in the report."""
     from torchpose.viz import save_figure
 
-    save_figure(figure, out / name)
+    with replace_own(out / name, RESULTS) as temporary:
+        save_figure(figure, temporary)
     report.pictures.append(name)
 
 

@@ -12,9 +12,12 @@ from typing import Any
 from torch import Tensor
 
 from torchpose.errors import InputError
-from torchpose.io.files import atomic_path
+from torchpose.io.results import replace_own
 
-__all__ = ["Report", "Table"]
+__all__ = ["RESULTS", "Report", "Table"]
+
+RESULTS = "evaluate"
+"""Kind of the files in the folder of a protocol, for `torchpose.io.results.replace_own`."""
 
 Cell = float | int | str | None
 
@@ -156,11 +159,13 @@ class Report(Mapping[str, Table]):
     def save(self, out: Path) -> None:
         """Write ``report.json`` and ``report.md``, each whole or not at all.
 
+        Files of these names that are of something else are moved to a folder ``earlier-1``.
+
         Raises:
             OutputError: a file cannot be written.
         """
         for name, text in (("report.json", self.to_json()), ("report.md", self.to_markdown())):
-            with atomic_path(Path(out) / name) as temporary:
+            with replace_own(Path(out) / name, RESULTS) as temporary:
                 temporary.write_text(text, encoding="utf-8")
 
 

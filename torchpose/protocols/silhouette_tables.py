@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.body.skeleton import BODY_15
-from torchpose.io.files import atomic_path
-from torchpose.protocols.report import Report
+from torchpose.io.results import replace_own
+from torchpose.protocols.report import RESULTS, Report
 from torchpose.protocols.silhouette_data import Split
 from torchpose.protocols.silhouette_runs import Runs, Tuning, sequence_name
 from torchpose.protocols.silhouette_trackees import (
@@ -284,7 +284,10 @@ def _manifold_of(split: Split) -> str:
 
 def write_csv(path: Path, runs: Runs, fps: float, first_seed: int = 0) -> None:
     """One line for every run: sequence, method, seed, errors by part (mm), drift (mm/s)."""
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as out:
+    with (
+        replace_own(path, RESULTS) as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as out,
+    ):
         writer = csv.writer(out)
         head = ["sequence", "method", "seed", "error_mm", *(f"{part}_mm" for part in PARTS)]
         writer.writerow([*head, "drift_mm_per_s", "coasting_frames", "respread_frames"])
