@@ -133,7 +133,7 @@ def _forward(model: "MixtureKalmanFilter", frames: Measurements, by_length: bool
     covs, predicted_covs, groups, jitters = [], [], [], []
     for t in range(frames.z.shape[1]):
         frame = frames.frame(t)
-        step = step_tracks(model, state, frame)
+        step = step_tracks(model, state, frame, model.transition(t))
         log_weights, evidence = step_fixed_weights(model, state, step.log_likelihood, frame)
         means.append(step.mean)
         corrections.append(step.mean - step.predicted)
