@@ -61,3 +61,15 @@ def test_poses_of_tracks_that_are_drawn_or_selected(method):
 @pytest.mark.parametrize("method", ["pf-mixture", "pf-walk", "pf-walk-unscaled"])
 def test_poses_of_particles_have_no_gradient(method):
     assert_without_gradient(poses(make_tracker(method=method, n_particles=200)), keypoints())
+
+
+@pytest.mark.parametrize("window", [True, False])
+def test_what_inference_mode_left_behind_serves_gradients(window):
+    tracker, uv = make_tracker(window=window), keypoints(frames=3)
+    with torch.inference_mode():
+        plain = tracker(uv, names=NAMES).joints3d
+    leaf = uv.clone().requires_grad_()
+    found = tracker(leaf, names=NAMES).joints3d
+    found.sum().backward()
+    torch.testing.assert_close(found.detach(), plain.clone(), rtol=1e-10, atol=1e-10)
+    assert float(leaf.grad.norm()) > 0

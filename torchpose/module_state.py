@@ -15,6 +15,7 @@ __all__ = [
     "WideModule",
     "derived",
     "one_run",
+    "outside_inference",
     "register_given",
     "wide_or_parameter",
     "working_precision",
@@ -137,9 +138,19 @@ def derived(
 
 
 def _without_graph(make: Callable[[], T]) -> T:
-    """`make()` for use anywhere: what inference mode makes could not be used for gradients later."""
+    """`make()` for use anywhere."""
     with torch.inference_mode(False), torch.no_grad():
         return make()
+
+
+@contextmanager
+def outside_inference() -> Iterator[None]:
+    """Make tensors that may be kept: those of inference mode could not be used for gradients later."""
+    if not torch.is_inference_mode_enabled():
+        yield
+        return
+    with torch.inference_mode(False), torch.no_grad():
+        yield
 
 
 def _kept_in(

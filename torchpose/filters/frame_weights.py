@@ -21,6 +21,7 @@ from torchpose.filters.recompute import recomputed, wants_gradient
 from torchpose.filters.tracks import MKFState, estimate_of
 from torchpose.filters.weights import normalise
 from torchpose.gaussian import Gain, kalman_gain
+from torchpose.module_state import outside_inference
 
 if TYPE_CHECKING:
     from torchpose.filters.mkf import MixtureKalmanFilter
@@ -190,15 +191,19 @@ def _condition(
 
 def _gain(model: "MixtureKalmanFilter", group: _Group) -> tuple[Gain, Tensor]:
     """Gain and covariance of every component; those of a shared pattern are kept for later frames."""
-    if group.shares_gain:
-        found = model.frame_gains.get(group.noise, group.mask)
-        if found is not None:
-            return found
+    if not group.shares_gain:
+        return _make_gain(model, group)
+    found = model.frame_gains.get(group.noise, group.mask)
+    if found is None:
+        with outside_inference():
+            found = _make_gain(model, group)
+        model.frame_gains.put(group.noise, group.mask, found)
+    return found
+
+
+def _make_gain(model: "MixtureKalmanFilter", group: _Group) -> tuple[Gain, Tensor]:
     gain, cov = kalman_gain(model.covariances, group.noise, model.observed, group.mask)
-    gain = gain.to(model.dtype)
-    if group.shares_gain:
-        model.frame_gains.put(group.noise, group.mask, (gain, cov))
-    return gain, cov
+    return gain.to(model.dtype), cov
 
 
 class FrameGains:

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchpose.filters.scan import BlockModel, block_model
 from torchpose.filters.transition import Transition
 from torchpose.gaussian import kalman_gain, symmetrise
+from torchpose.module_state import outside_inference
 
 __all__ = ["Edge", "GainGraph"]
 
@@ -67,7 +68,8 @@ class GainGraph:
         """The step from `node` under `pattern`, whose bit k says whether dimension k is measured."""
         key = (node, pattern)
         if key not in self.edges:
-            self.edges[key] = self._make(node, pattern)
+            with outside_inference():
+                self.edges[key] = self._make(node, pattern)
         return self.edges[key]
 
     def is_steady(self, node: int, pattern: int) -> bool:

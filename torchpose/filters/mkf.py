@@ -29,7 +29,13 @@ from torchpose.filters.transition import (
     make_transition,
 )
 from torchpose.filters.weights import normalise
-from torchpose.module_state import derived, one_run, register_given, wide_or_parameter
+from torchpose.module_state import (
+    derived,
+    one_run,
+    outside_inference,
+    register_given,
+    wide_or_parameter,
+)
 from torchpose.priors.gmm import GaussianMixture
 
 __all__ = ["MKFState", "MixtureKalmanFilter"]
@@ -310,7 +316,8 @@ class MixtureKalmanFilter(RecursiveFilter):
         graph = kept.get("graph")
         if graph is None or graph.full() or not torch.equal(graph.measurement_cov, measurement_cov):
             steady = self.transition(self.burn_in)
-            graph = GainGraph(steady, self.observed, measurement_cov.clone(), self.start_cov)
+            with outside_inference():
+                graph = GainGraph(steady, self.observed, measurement_cov.clone(), self.start_cov)
             kept["graph"] = graph
         return graph
 
