@@ -19,15 +19,16 @@ from typing import Any, NamedTuple
 from _memory import MB, forget_peak, peak_resident, resident, return_free_memory
 from _timing import Report, limit_threads, machine_line, number, parser
 
+METHODS = ("window-mixture", "mkf-fixed")
 NAMES = ("head", "hand_left", "hand_right")
 TOLERANCE, SLOPE_TOLERANCE = 1e-9, 1e-5
-HEADER = ("tracker", "B", "T", "CPU s", "with gradients", "ratio", "MB", "with gradients")
+HEADER = ("method", "B", "T", "CPU s", "with gradients", "ratio", "MB", "with gradients")
 
 
 class Case(NamedTuple):
-    """Whether windows are used, sequences, and frames."""
+    """Which of `METHODS`, sequences, and frames."""
 
-    window: bool
+    method: int
     batch: int
     frames: int
 
@@ -36,13 +37,13 @@ def main() -> None:
     args = parse_args()
     limit_threads(args.threads)
     if args.worker:
-        window, batch, frames, gradients = args.worker
-        print(json.dumps(measure(Case(bool(window), batch, frames), bool(gradients))))
+        *case, gradients = args.worker
+        print(json.dumps(measure(Case(*case), bool(gradients))))
         return
     report = Report("Gradients of poses", args.out)
-    cases = [Case(window, batch, 100) for window in (True, False) for batch in (1, 16)]
+    cases = [Case(method, batch, 100) for method in (0, 1) for batch in (1, 16)]
     if args.quick:
-        cases = [Case(True, 1, 6), Case(False, 1, 6)]
+        cases = [Case(0, 1, 6), Case(1, 1, 6)]
     found = [[in_a_process(case, on, args.threads) for on in (False, True)] for case in cases]
     report.table(HEADER, table_rows(cases, found))
     moved = max(result["moved"] for _, result in found)
@@ -79,7 +80,7 @@ def measure(case: Case, gradients: bool) -> dict[str, Any]:
     from torchpose import UpperBodyTracker, load_prior
 
     prior = load_prior("kinect-upper-body")
-    tracker = UpperBodyTracker(prior, camera=prior.camera, window=case.window)
+    tracker = UpperBodyTracker(prior, camera=prior.camera, method=METHODS[case.method])
     keypoints = draw_keypoints(case.batch, case.frames)
     with torch.no_grad():
         plain = tracker(keypoints, names=NAMES)  # gains are known from here on
@@ -135,7 +136,7 @@ def draw_keypoints(batch: int, frames: int) -> Any:
 
 def table_rows(cases: list[Case], found: list[list[dict[str, Any]]]) -> Iterator[list[str]]:
     for case, (plain, learning) in zip(cases, found, strict=True):
-        name = "windows (default)" if case.window else "single poses"
+        name = METHODS[case.method]
         seconds = [number(result["seconds"]) for result in (plain, learning)]
         memory = [f"{result['beyond'] / MB:.0f}" for result in (plain, learning)]
         share = f"{learning['seconds'] / plain['seconds']:.1f}"
