@@ -42,6 +42,29 @@ def test_modules_load_no_optional_package():
     assert not loaded & set(HEAVY)
 
 
+FILTERS = """
+import torch
+from torchpose.filters import BootstrapParticleFilter, MixtureKalmanFilter
+from torchpose.gaussian import kalman_update
+from torchpose.priors import GaussianMixture
+gmm = GaussianMixture(torch.full((2,), 0.5), torch.eye(2), torch.eye(2).repeat(2, 1, 1))
+z, mask = torch.zeros(2, 3, 2), torch.ones(2, 3, 2, dtype=torch.bool)
+mask[0, 1, 0] = False
+noise = torch.eye(2).repeat(2, 3, 1, 1)
+for tracks in ("fixed", "sampled", "split"):
+    model = MixtureKalmanFilter(gmm, torch.ones(2), torch.ones(2), [0, 1], tracks)
+    model(z, mask), model(z, mask, noise)
+eye, zeros = torch.eye(2), torch.zeros(4, 3, 2)
+kalman_update(zeros, eye.repeat(3, 1, 1), zeros, eye, torch.tensor([0, 1]))  # shared covariances
+BootstrapParticleFilter(gmm, torch.ones(2), torch.ones(2), [0, 1], n_particles=9)(z, mask)
+"""
+
+
+def test_no_filter_loads_a_computer_algebra_system_on_its_way():
+    """torch.broadcast_shapes does, which takes a second in the middle of a track."""
+    assert "sympy" not in loaded_after(FILTERS)
+
+
 @pytest.mark.parametrize("name", [*torchpose.__all__, *sorted(torchpose._SUBMODULES)])
 def test_every_public_name_resolves(name):
     assert name in dir(torchpose)

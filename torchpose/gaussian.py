@@ -312,7 +312,8 @@ def _beside(cross: Tensor, residual: Tensor) -> Tensor:
     """[H P, z - H x, 0 ...]."""
     dim = cross.shape[-1]
     if cross.shape[:-2] != residual.shape[:-1]:
-        batch = torch.broadcast_shapes(cross.shape[:-2], residual.shape[:-1])
+        # not torch.broadcast_shapes, whose first call imports a computer algebra system
+        batch = torch.broadcast_tensors(cross[..., 0, 0], residual[..., 0])[0].shape
         cross, residual = cross.expand(*batch, -1, -1), residual.expand(*batch, -1)
     joint = pad(cross, (0, _spare(dim)))
     joint[..., dim] = residual

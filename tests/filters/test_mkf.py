@@ -20,7 +20,7 @@ from torchpose.errors import (
     InputError,
     ShapeError,
 )
-from torchpose.filters import MixtureKalmanFilter
+from torchpose.filters import MixtureKalmanFilter, RecursiveFilter, SilhouetteParticleFilter
 from torchpose.filters.mkf import TRACK_OPTIONS
 from torchpose.filters.transition import make_transition
 from torchpose.priors import GaussianMixture
@@ -329,6 +329,13 @@ def test_smoothing_refuses_settings_of_the_filter_alone():
     p = Problem()
     with pytest.raises(InputError, match="reset_below"):
         p.filter(reset_below=-50.0).smooth(tensor(p.z))
+
+
+@pytest.mark.parametrize("base", [RecursiveFilter, SilhouetteParticleFilter])
+def test_a_tracker_that_leaves_out_a_step_cannot_be_made(base):
+    unfinished = type("Unfinished", (base,), {})
+    with pytest.raises(TypeError, match="abstract"):
+        unfinished(torch.ones(1), [0], 1, torch.float64)
 
 
 def good_arguments():

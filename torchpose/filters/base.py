@@ -5,7 +5,7 @@ implements `init` and `advance`; shapes, masks, lengths and failures are handled
 """
 
 import warnings
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -177,7 +177,7 @@ def given_covariance(name: str, value: Tensor, dim: int, trailing: int = 2) -> T
     return value if isinstance(value, nn.Parameter) else covariance
 
 
-class RecursiveFilter(WideModule):
+class RecursiveFilter(WideModule, ABC):
     """A recursive Bayesian filter over batches of sequences.
 
     Args:

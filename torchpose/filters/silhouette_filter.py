@@ -5,7 +5,7 @@ empty silhouettes, dead particles and the loop over time are handled here.
 """
 
 import math
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -63,7 +63,7 @@ _MOST_SPREAD = 10  # frames over which the noise of a filter that stays lost kee
 Likelihood = Callable[[Tensor, Tensor], Tensor]
 
 
-class SilhouetteParticleFilter(nn.Module):
+class SilhouetteParticleFilter(nn.Module, ABC):
     """Base of the particle filters over body poses; a subclass is its `move`.
 
     Estimates have no gradients: nothing runs through particles.
