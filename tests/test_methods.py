@@ -88,7 +88,7 @@ VALUES = {
     "initial_cov": 1e3 * torch.ones(21), "transition": "stationary", "gamma": 0.5, "burn_in": 20,
     "resample_threshold": 1.0, "burn_in_scale": 7.0, "likelihood_power": 0.01, "weighting": "frame",
     "reset_below": 1e6, "dtype": torch.float32, "n_particles": 30, "resampling": "multinomial",
-    "start": "measured",
+    "start": "prior",
 }  # fmt: skip
 BESIDE = {
     "subspace": {"transition": "ou", "gamma": 0.5},

@@ -1,6 +1,5 @@
 """The filter over single poses of an arm, and the noise that it takes."""
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,8 +12,8 @@ from torchpose.errors import InputError, check_finite, check_shape
 from torchpose.filters.base import RecursiveFilter
 from torchpose.measurements import pixel_indices
 from torchpose.methods import SINGLE_POSES, check_options, pose_model
-from torchpose.priors.arm_state import STATE_DIM
-from torchpose.priors.upper_body import UpperBodyPrior, released_process_cov
+from torchpose.priors.upper_body import UpperBodyPrior
+from torchpose.process_noise import default_process_cov, process_cov
 from torchpose.projection import map_pixel_covariance
 from torchpose.skeleton import ARM_JOINTS, UPPER_BODY
 
@@ -89,12 +88,9 @@ def noise_options(
 def _brought_by(prior: UpperBodyPrior, side: str, method: str, fps: float | None) -> dict[str, Any]:
     noise, info = prior.noise, prior.info
     ratio = 1.0 if not fps or not info.fps else info.fps / fps
-    process_cov = noise.get(f"process_cov_{side}", noise.get("process_cov"))
-    if process_cov is None:
-        process_cov = default_process_cov(prior)
-    options: dict[str, Any] = {"process_cov": process_cov * ratio}
+    options: dict[str, Any] = {"process_cov": ratio * process_cov(prior, side, method)}
     if method.startswith("pf-"):
-        return options
+        return options | {"start": "measured"}
     options["transition"] = info.transition
     gamma = noise.get(f"gamma_{side}", noise.get("gamma"))
     if gamma is not None:
@@ -103,24 +99,6 @@ def _brought_by(prior: UpperBodyPrior, side: str, method: str, fps: float | None
     if epsilon is not None and method == SINGLE_POSES:
         options["uniform_weight"] = float(epsilon)
     return options
-
-
-def default_process_cov(prior: UpperBodyPrior) -> Float[Tensor, " 21"]:
-    """Diagonal of Q per frame where a prior brings none: that of the authors' released tracker.
-
-    They set it by hand for f = 1550 pixels, a person 4.5 m away and 25 frames per second; the same
-    movement in metres is f / depth times as many pixels elsewhere.
-
-    Args:
-        prior: whose camera, mean depth and frame rate are used.
-    """
-    depth = prior.left.moments()[0][2:15:3].mean().clamp_min(0.1)
-    pixels = math.sqrt(prior.info.fx * prior.info.fy) / depth / (1550 / 4.5)
-    released = released_process_cov().to(pixels)
-    in_pixels = torch.zeros(STATE_DIM, dtype=torch.bool, device=released.device)
-    in_pixels[pixel_indices(ARM_JOINTS)] = True
-    scaled = torch.where(in_pixels, released * pixels.square(), released)
-    return scaled * (25.0 / (prior.info.fps or 30.0))
 
 
 def joint_covariances(

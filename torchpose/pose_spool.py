@@ -3,6 +3,7 @@
 import shutil
 import tempfile
 import weakref
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpose.collapse import note_collapse
 from torchpose.errors import InputError, OutputError
 from torchpose.pose_track import FRAME_FIELDS, PoseTrack
 
@@ -79,18 +81,9 @@ class PoseSpool:
             shape = (self._n_frames, *sample.shape[1:])
             stored = np.memmap(self._path(name), sample.dtype, mode="c", shape=shape)
             fields[name] = torch.from_numpy(stored[:count])[None]
-        return PoseTrack(
-            **fields,
-            lengths=torch.tensor([count]),
-            matrix=like.matrix,
-            failed_at=torch.tensor([self.failed_at]),
-            names=like.names,
-            fps=like.fps,
-            frame=like.frame,
-            notes=like.notes,
-            first_frame=like.first_frame,
-            method=like.method,
-        )
+        fields["lengths"] = torch.tensor([count])
+        fields["failed_at"] = torch.tensor([self.failed_at])
+        return note_collapse(replace(like, **fields))
 
     def _path(self, name: str) -> Path:
         return self._folder / f"{name}.bin"

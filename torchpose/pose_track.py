@@ -24,9 +24,11 @@ FRAME_FIELDS = (
     "covariance3d",
     "observed",
     "log_evidence",
+    "effective_sample_size",
 )
 """What a `PoseTrack` holds for every frame."""
 
+_ADDED = "effective_sample_size"  # files of older releases have none
 _FIELDS = {
     "joints2d": ("f", "T 8 2"),
     "joints3d": ("f", "T 8 3"),
@@ -34,6 +36,7 @@ _FIELDS = {
     "covariance3d": ("f", "T 8 3 3"),
     "observed": ("b", "T 8"),
     "log_evidence_arms": ("f", "T 2"),
+    _ADDED: ("f", "T 2"),
     "lengths": ("i", ""),
     "failed_at": ("i", ""),
     "K": ("f", "3 3"),
@@ -62,6 +65,9 @@ class PoseTrack:
         method: the estimator that ran, one of `torchpose.tracking.METHODS`; "unknown" in files of
             older releases.
         first_frame: of the video or recording, that of the first pose.
+        effective_sample_size: 1 / sum_j w_j^2 (BL 25) of the particles or tracks of the left and of the
+            right arm, [B, T, 2]; NaN in files of older releases. One particle that has all the weight
+            is no estimate; one track that has it is a Gaussian, sure of its component.
     """
 
     joints2d: Tensor
@@ -79,6 +85,11 @@ class PoseTrack:
     notes: tuple[str, ...] = field(default_factory=tuple)
     first_frame: int = 0
     method: str = "unknown"
+    effective_sample_size: Tensor = field(default_factory=lambda: torch.empty(0))
+
+    def __post_init__(self) -> None:
+        if self.effective_sample_size.numel() == 0:
+            self.effective_sample_size = torch.full_like(self.log_evidence, torch.nan)
 
     def __len__(self) -> int:
         return self.joints3d.shape[0]
@@ -104,8 +115,8 @@ class PoseTrack:
 
         `log_evidence` in the file is the score, the sum over both arms; `log_evidence_arms` has them
         apart. Keys: joints2d, joints3d, covariance2d, covariance3d, observed, log_evidence,
-        log_evidence_arms, names, fps (NaN if unknown), K, frame, failed_at, lengths, notes,
-        first_frame, method.
+        log_evidence_arms, effective_sample_size, names, fps (NaN if unknown), K, frame, failed_at,
+        lengths, notes, first_frame, method.
 
         Raises:
             OutputError: the file cannot be written.
@@ -117,16 +128,7 @@ class PoseTrack:
             return (value[0] if single else value).numpy()
 
         arrays: dict[str, Any] = {
-            name: array(getattr(self, name))
-            for name in (
-                "joints2d",
-                "joints3d",
-                "covariance2d",
-                "covariance3d",
-                "observed",
-                "failed_at",
-                "lengths",
-            )
+            name: array(getattr(self, name)) for name in (*FRAME_FIELDS, "failed_at", "lengths")
         }
         arrays["log_evidence"] = array(self.log_evidence.sum(-1))
         arrays["log_evidence_arms"] = array(self.log_evidence)
@@ -148,19 +150,19 @@ class PoseTrack:
                 agree: other shapes or types, joints without a covariance, values out of range.
             CameraError: K is no camera matrix.
         """
-        arrays = read_npz(
-            path, (*_FIELDS, "names", "frame", "fps", "notes"), ("first_frame", "method")
-        )
+        required = (*(key for key in _FIELDS if key != _ADDED), "names", "frame", "fps", "notes")
+        arrays = read_npz(path, required, ("first_frame", "method", _ADDED))
+        fields = {key: size for key, size in _FIELDS.items() if key in arrays}
         single = arrays["joints3d"].ndim == 3
         batch = "" if single else "B "
         sizes = check_arrays(
             path,
             arrays,
-            {k: f"{kind} {batch * (k != 'K')}{size}" for k, (kind, size) in _FIELDS.items()},
+            {k: f"{kind} {batch * (k != 'K')}{size}" for k, (kind, size) in fields.items()},
         )
         if not all(sizes.values()):
             raise FileFormatError(f"{path}: expected poses of one frame or more, got none")
-        tensors: dict[str, Any] = {key: to_tensor(arrays[key]) for key in _FIELDS}
+        tensors: dict[str, Any] = {key: to_tensor(arrays[key]) for key in fields}
         tensors = {k: v[None] if single and k != "K" else v for k, v in tensors.items()}
         tensors["log_evidence"] = tensors.pop("log_evidence_arms")
         tensors["matrix"] = tensors.pop("K")

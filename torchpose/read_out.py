@@ -22,7 +22,15 @@ from torchpose.projection import lift, project
 from torchpose.rotations import RotationOrder, euler_to_matrix, matrix_to_euler
 from torchpose.torso import onto_torso
 
-__all__ = ["MotionStage", "MotionState", "ReadOut", "on_their_rays", "read_out", "recalibrated"]
+__all__ = [
+    "MotionStage",
+    "MotionState",
+    "ReadOut",
+    "calibration_mode",
+    "on_their_rays",
+    "read_out",
+    "recalibrated",
+]
 
 _LIMB_ENDS = tuple(
     UPPER_BODY.index(f"{j}_{s}") for j in ("hand", "elbow") for s in ("left", "right")
@@ -30,6 +38,7 @@ _LIMB_ENDS = tuple(
 _HAND_OF = tuple(
     UPPER_BODY.index(f"hand_{'right' if 'right' in j else 'left'}") for j in UPPER_BODY
 )
+_WINDOWS = ("causal", "full")
 _NEAREST = 0.1  # metres before the camera, from where a projection means something
 
 
@@ -138,14 +147,22 @@ def on_their_rays(
     return reading._replace(joints=joints, uv=uv)
 
 
+def calibration_mode(method: str) -> str:
+    """Return the name under which a prior keeps the calibration of a method over single poses."""
+    return "pose" if method == "mkf-fixed" else method.replace("-", "_")
+
+
 def recalibrated(
     covs: Float[Tensor, "B T 8 3 3"], noise: Mapping[str, Tensor], mode: str
 ) -> Float[Tensor, "B T 8 3 3"]:
     """s C + f I for each joint, as a prior's training persons showed; C if it does not say.
 
     Args:
-        covs: C, metres squared. noise: of a prior. mode: name of the window, or "pose".
+        covs: C, metres squared. noise: of a prior. mode: name of the window, or `calibration_mode`;
+            without a calibration of its own, a method over single poses has that of "pose".
     """
+    if f"calibration_scale_{mode}" not in noise and mode not in _WINDOWS:
+        mode = "pose"
     scale = noise.get(f"calibration_scale_{mode}")
     floor = noise.get(f"calibration_floor_{mode}")
     if scale is None or floor is None:

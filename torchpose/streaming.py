@@ -67,6 +67,7 @@ class LivePose(NamedTuple):
         covariance2d: [B, 8, 2, 2]. covariance3d: [B, 8, 3, 3].
         observed: [B, 8], True where the joint was measured in this frame.
         log_evidence: of the left and the right arm, [B, 2].
+        effective_sample_size: of the particles or tracks of each arm, [B, 2]; see `PoseTrack`.
         unseen: seconds since any joint was measured, [B]; 0 where one is.
         failed: [B], True where the filter degenerated: poses are NaN until the stream is begun anew.
     """
@@ -77,6 +78,7 @@ class LivePose(NamedTuple):
     covariance3d: Tensor
     observed: Tensor
     log_evidence: Tensor
+    effective_sample_size: Tensor
     unseen: Tensor
     failed: Tensor
 
@@ -139,6 +141,7 @@ def track_frame(
         track.covariance3d[:, 0],
         track.observed[:, 0],
         track.log_evidence[:, 0],
+        track.effective_sample_size[:, 0],
         state.unseen / (tracker.fps or 30.0),
         track.failed_at >= 0,
     )

@@ -29,6 +29,7 @@ from torchpose.arms import (
 )
 from torchpose.body_view import BodyView
 from torchpose.camera import PinholeCamera
+from torchpose.collapse import note_collapse
 from torchpose.errors import CameraError, InputError, PriorError, check_shape
 from torchpose.filters import FilterOutput, MixtureKalmanFilter
 from torchpose.filters.base import Generators, RecursiveFilter
@@ -57,7 +58,14 @@ from torchpose.priors.gmm import GaussianMixture
 from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.priors.window import WindowLayout
 from torchpose.projection import map_pixel_covariance, map_pixels
-from torchpose.read_out import MotionStage, ReadOut, on_their_rays, read_out, recalibrated
+from torchpose.read_out import (
+    MotionStage,
+    ReadOut,
+    calibration_mode,
+    on_their_rays,
+    read_out,
+    recalibrated,
+)
 from torchpose.rotations import RotationOrder, euler_to_matrix
 from torchpose.streaming import LivePose, StreamState
 
@@ -259,7 +267,8 @@ class UpperBodyTracker(WideModule):
             left, right = arms["left"], arms["right"]
             reading = self._steady(self._read_out(left, right, view), left, right, lengths)
             notes = self.notes + notes
-            return self._poses(reading, left, right, measured.mask, lengths, notes)
+            poses = self._poses(reading, left, right, measured.mask, lengths, notes)
+        return note_collapse(poses)
 
     def init(
         self, batch_size: int, names: Sequence[str] | None = None, generator: Generators = None
@@ -478,6 +487,9 @@ class UpperBodyTracker(WideModule):
             covariance3d=covs3d,
             observed=observed,
             log_evidence=torch.stack([left.log_evidence, right.log_evidence], -1),
+            effective_sample_size=torch.stack(
+                [out.effective_sample_size.double() for out in (left, right)], -1
+            ),
             lengths=lengths,
             matrix=self.camera.matrix,
             failed_at=first_failure(left, right),
@@ -537,7 +549,8 @@ class UpperBodyTracker(WideModule):
         if not self.calibrated:
             return covs
         window = self._window()
-        return recalibrated(covs, self.prior.noise, "pose" if window is None else window[0])
+        mode = calibration_mode(self.method) if window is None else window[0]
+        return recalibrated(covs, self.prior.noise, mode)
 
 
 def _require_camera(camera: PinholeCamera | None) -> PinholeCamera:

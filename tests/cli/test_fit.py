@@ -9,7 +9,7 @@ import torch
 from torchpose.cli.fit import build, command_line
 from torchpose.curation import curate
 from torchpose.io import read_recordings
-from torchpose.priors import fit_upper_body_prior, load_prior
+from torchpose.priors import UpperBodyPrior, fit_upper_body_prior, load_prior
 from torchpose.recipes import UpperBodyRecipe
 
 QUICK = ("--components", 2, "--samples", 500, "--noise", "none", "--pictures", "false")
@@ -44,7 +44,18 @@ def test_picture_and_name(torchpose, files, tmp_path):
     assert load_prior(out).info.name == "both"
 
 
-RECIPE = ("--components", 2, "--samples", 500, "--window-components", 0, "--pictures", "false")
+RECIPE = (
+    "--components",
+    2,
+    "--samples",
+    500,
+    "--window-components",
+    0,
+    "--drawn-pieces",
+    0,
+    "--pictures",
+    "false",
+)
 
 
 def test_the_recipe_holds_persons_out_and_says_what_to_expect(torchpose, files, tmp_path):
@@ -53,7 +64,7 @@ def test_the_recipe_holds_persons_out_and_says_what_to_expect(torchpose, files, 
     done = torchpose(*line)
     assert done.code == 0, done.err
     prior = load_prior(out)
-    recipe = UpperBodyRecipe(2, 500, window_components=0, seed=2)
+    recipe = UpperBodyRecipe(2, 500, window_components=0, drawn_pieces=0, seed=2)
     wanted = recipe.fit(curate(read_recordings(files / "recordings")).recordings)
     torch.testing.assert_close(prior.left.means, wanted.left.means, rtol=0, atol=0)
     assert set(prior.info.extra["held_out"]["pose"]) == {"recordings#p1", "recordings#p2"}
@@ -62,6 +73,26 @@ def test_the_recipe_holds_persons_out_and_says_what_to_expect(torchpose, files, 
     card = out.with_suffix(".md").read_text()
     assert "On persons that it was not fitted on" in card and "| recordings#p2 |" in card
     assert prior.info.extra["curation"]["after"]["frames"] == 900
+
+
+def test_noise_is_learnt_anew_for_a_prior_that_is_there(torchpose, files, tmp_path):
+    old, out = (tmp_path / name for name in ("old.safetensors", "new.safetensors"))
+    recordings = curate(read_recordings(files / "recordings")).recordings
+    made = UpperBodyRecipe(2, 500, window_components=0, calibration_folds=0, seed=2).fit(recordings)
+    noise = {"process_cov": torch.ones(21).double(), "measurement_std": torch.full((5,), 3.0)}
+    UpperBodyPrior(made.left, made.right, made.info, noise).save(old)
+    line = ("fit", files / "recordings", "--out", out, "--noise-of", old, *RECIPE[6:])
+    done = torchpose(*line, "--folds", 0)
+    assert done.code == 0, done.err
+    new = load_prior(out)
+    assert torch.equal(new.left.means, made.left.means) and "process_cov" not in new.noise
+    torch.testing.assert_close(
+        new.noise["increment_cov_right"], made.noise["increment_cov_right"], rtol=0, atol=0
+    )
+    assert "--noise-of" in new.info.extra["noise"]["command"]
+    assert "--noise-of" in out.with_suffix(".md").read_text()
+    stranger = torchpose(*line, "--without", "recordings#p1")
+    assert stranger.code != 0 and "recordings#p2" in stranger.err
 
 
 def test_persons_are_left_out_by_name(torchpose, files, tmp_path):
@@ -87,7 +118,7 @@ def test_what_jumps_is_left_out_and_said(torchpose, files, tmp_path):
     arrays["joints"][100, 0] += 1.5  # a hand that is somewhere else for one frame
     np.savez(folder / "p1.npz", **arrays)
     quick = (*RECIPE, "--noise", "none")[2:]
-    quick = tuple(q for q in quick if q not in ("--window-components", 0))
+    quick = tuple(q for q in quick if q not in ("--window-components", "--drawn-pieces", 0))
     done = torchpose("fit", folder, "--out", tmp_path / "p.safetensors", *quick)
     assert done.code == 0, done.err
     assert "jump:" in done.out and "hand_left in 1 frame 100" in done.out

@@ -19,6 +19,7 @@ RECIPE = {
     "pose_tol": 0.0,
     "window_components": 0,
     "calibration_folds": 2,
+    "drawn_pieces": 0,
 }
 WINDOWS = {
     "window_components": 2,

@@ -32,6 +32,7 @@ torchpose fit recordings/ more/ clip.npz --out prior.safetensors --components 30
 torchpose fit recordings/ --out prior.safetensors --without bob carol
 torchpose fit recordings/ --out prior.safetensors --noise none --samples 20000
 torchpose fit room/ --out prior.safetensors --axes z-up --harmonise true
+torchpose fit recordings/ --out renewed.safetensors --noise-of prior.safetensors
 torchpose fit manifold --help
 torchpose fit limbs --help
 torchpose fit actions --help"""
@@ -101,8 +102,14 @@ def build() -> ArgumentParser:
         help="the whole recipe with its noise, windows and calibration (default), or mixtures over "
         "single poses alone",
     )
+    add("--noise-of", type=str, metavar="PRIOR",
+        help="keep the mixtures and windows of this prior, a name or a file, which was fitted to the same "
+        "recordings, and learn its process noise and its calibration over single poses")  # fmt: skip
     add("--folds", type=int, default=6, metavar="N",
         help="groups of persons that are held out in turn (default 6; 0 for none)")  # fmt: skip
+    add("--drawn-pieces", type=int, default=6, metavar="N",
+        help="pieces of recordings, of 60 frames, of each of these groups on which the covariances of "
+        "the methods that draw are calibrated (default 6; 0 for none)")  # fmt: skip
     add(
         "--neck",
         type=str,
@@ -201,10 +208,20 @@ def _fit(recordings: list["Recording"], args: Namespace, name: str) -> "UpperBod
         return fit_upper_body_prior(recordings, args.components, args.seed, **settings)
     from torchpose.recipes import UpperBodyRecipe
 
+    if args.noise_of is not None:
+        from torchpose.priors import load_prior
+        from torchpose.recipes.renewal import renew_noise
+
+        before = load_prior(args.noise_of)
+        return renew_noise(
+            before, recordings, calibration_folds=args.folds, drawn_pieces=args.drawn_pieces,
+            command=facts["command"], progress=show_progress(),
+        )  # fmt: skip
     recipe = UpperBodyRecipe(
         n_components=args.components,
         window_components=args.window_components,
         calibration_folds=args.folds,
+        drawn_pieces=args.drawn_pieces,
         seed=args.seed,
         **own,
     )
@@ -248,9 +265,12 @@ def _check_options(args: Namespace) -> None:
         ("--samples", args.samples, 1),
         ("--window-components", args.window_components, 0),
         ("--folds", args.folds, 0),
+        ("--drawn-pieces", args.drawn_pieces, 0),
     ):
         if count is not None and count < least:
             raise InputError(f"{option} must be at least {least}, got {count}")
+    if args.noise == "none" and args.noise_of:
+        raise InputError("--noise-of learns noise; leave --noise out")
     if args.noise == "none" and args.window_components:
         raise InputError("--window-components applies only with --noise learnt")
 

@@ -9,6 +9,8 @@ from torchpose.cli.common import new_parser
 from torchpose.errors import InputError
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from torchpose.io import Keypoints
     from torchpose.priors import UpperBodyPrior
 
@@ -165,6 +167,7 @@ def describe_poses(path: Path) -> str:
             track.frame, track.frame
         ),
         "score": f"{float(track.log_evidence.sum(-1).mean()):.3f} per frame (log evidence, both arms)",
+        "sample size": _sample_sizes(track.effective_sample_size),
         "failed at": ", ".join(str(int(i)) for i in track.failed_at if i >= 0),
         "notes": "; ".join(track.notes),
     }
@@ -174,6 +177,15 @@ def describe_poses(path: Path) -> str:
     for name, share, spread in zip(track.names, shares, spreads, strict=True):
         rows.append(f"{name:<16}{100 * share:>7.1f} %{100 * spread:>11.1f}")
     return _table(facts) + "\n\n" + "\n".join(rows)
+
+
+def _sample_sizes(size: "Tensor") -> str:
+    """Median effective sample size of each arm; empty where a file does not say."""
+    known = size[size.isfinite().all(-1)]
+    if not len(known):
+        return ""
+    left, right = known.quantile(0.5, 0).tolist()
+    return f"{left:.3g} (left arm), {right:.3g} (right arm), median"
 
 
 def describe_keypoints(keypoints: "Keypoints") -> str:

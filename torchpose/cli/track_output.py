@@ -112,10 +112,23 @@ def summary(
             *(f"{name:<9}{value}" for name, value in settings.items()),
             f"measured {measured}",
             *([f"inferred {', '.join(hidden)}"] if hidden else []),
+            *_sample_size(track),
             *(f"note     {note}" for note in (*track.notes, *notes)),
             *(f"wrote    {path}" for path in written),
         ]
     )
+
+
+def _sample_size(track: "PoseTrack") -> list[str]:
+    """A line on how many particles or tracks carry the weight, where it is known."""
+    size = track.effective_sample_size[0]
+    size = size[size.isfinite().all(-1)]
+    if not len(size):
+        return []
+    kinds = {"pf": "particles", "window": "components"}
+    kind = kinds.get(track.method.partition("-")[0], "tracks")
+    left, right = size.quantile(0.5, 0).tolist()
+    return [f"weight   on {left:.3g} (left arm) and {right:.3g} (right arm) {kind}, median"]
 
 
 def report_failure(track: "PoseTrack") -> int:

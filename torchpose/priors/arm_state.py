@@ -23,6 +23,7 @@ __all__ = [
     "arm_states",
     "check_rotation_order",
     "mirror_arm_state",
+    "mirror_covariance",
     "mirror_mixture",
 ]
 
@@ -121,9 +122,14 @@ def mirror_mixture(mixture: GaussianMixture, cx: float) -> GaussianMixture:
         mixture: over states of one arm.
         cx: principal point, pixels.
     """
-    sign, _ = _mirror_map(mixture.means, cx)
-    covariances = mixture.covariances * sign * sign.unsqueeze(-1)
-    return GaussianMixture(mixture.weights, mirror_arm_state(mixture.means, cx), covariances)
+    means, covariances = mirror_arm_state(mixture.means, cx), mirror_covariance(mixture.covariances)
+    return GaussianMixture(mixture.weights, means, covariances)
+
+
+def mirror_covariance(cov: Float[Tensor, "*batch 21 21"]) -> Float[Tensor, "*batch 21 21"]:
+    """Return the covariance of the mirrored state (`mirror_arm_state`), M C M with M = diag(+-1)."""
+    sign, _ = _mirror_map(cov, 0.0)
+    return cov * sign * sign[:, None]
 
 
 def check_rotation_order(order: str) -> RotationOrder:

@@ -144,7 +144,24 @@ def _noise(prior: UpperBodyPrior) -> str:
     if not prior.noise:
         return ""
     names = ", ".join(f"`{name}` {list(value.shape)}" for name, value in prior.noise.items())
-    return f"Learnt for the transition `{prior.info.transition}`: {names}."
+    text = f"Learnt for the transition `{prior.info.transition}`: {names}."
+    later = prior.info.extra.get("noise")
+    if later:
+        text += (
+            f" Process noise and calibration over single poses by recipe {later['recipe']}, "
+            + (f"`{later['command']}`." if later["command"] else "after the mixtures.")
+        )
+    return text + _drawn(prior)
+
+
+def _drawn(prior: UpperBodyPrior) -> str:
+    """Errors of the filters that draw, on fewer frames of the same held-out persons."""
+    held_out: Mapping[str, Mapping[str, float]] = prior.info.extra.get("held_out_drawn", {})
+    errors = ", ".join(
+        f"`{mode.replace('_', '-')}` {100 * fmean(persons.values()):.1f}"
+        for mode, persons in held_out.items()
+    )
+    return f"\n\nOver single poses, mean over persons held out, cm: {errors}." if errors else ""
 
 
 def _held_out(prior: UpperBodyPrior) -> str:

@@ -27,6 +27,7 @@ from torchpose.priors.arm_state import (
     arm_states,
     check_rotation_order,
     mirror_arm_state,
+    mirror_covariance,
     mirror_mixture,
 )
 from torchpose.priors.gmm import GaussianMixture
@@ -60,8 +61,10 @@ class UpperBodyPrior(nn.Module):
     Args:
         left, right: mixtures over the 21 dimensions of an arm's state (`arm_states`).
         info: what they were fitted on, and in which conventions the states are.
-        noise: learnt noise as named tensors, such as process_cov_left, process_cov_right,
-            measurement_std, gamma or calibration. They become buffers and go into the file.
+        noise: learnt noise as named tensors, such as increment_cov_left and increment_cov_right
+            (`increment_covs`, of which each method makes its Q), process_cov_left, process_cov_right
+            (Q itself, of the Kalman filters), measurement_std, gamma or calibration. They become
+            buffers and go into the file.
         windows: mixtures over short windows of motion by name ("causal", "full"; `WindowPrior`).
 
     Raises:
@@ -134,7 +137,7 @@ class UpperBodyPrior(nn.Module):
 
         Noise by side changes sides; `info` and the rest stay.
         """
-        noise = {_other_side(name): value for name, value in self.noise.items()}
+        noise = {_other_side(name): _mirrored_noise(v) for name, v in self.noise.items()}
         cx = self.info.cx
         windows = {name: window.mirrored(cx) for name, window in self.windows.items()}
         arms = mirror_mixture(self.right, cx), mirror_mixture(self.left, cx)
@@ -394,6 +397,11 @@ def _fit_facts(mixture: GaussianMixture, seed: int) -> dict[str, Any]:
             "reseeded": report.reseeded,
         },
     }
+
+
+def _mirrored_noise(value: Tensor) -> Tensor:
+    """The noise of the mirror image: a covariance of states changes signs, variances do not."""
+    return mirror_covariance(value) if value.shape == (STATE_DIM, STATE_DIM) else value
 
 
 def _other_side(name: str) -> str:

@@ -14,9 +14,18 @@ from torchpose.metrics import align
 from torchpose.priors.seen_keypoints import seen_keypoints
 from torchpose.priors.training import PoseSet
 from torchpose.priors.upper_body import UpperBodyPrior
+from torchpose.read_out import calibration_mode
 from torchpose.tracking import UpperBodyTracker
 
-__all__ = ["MODES", "HeldOut", "calibration_noise", "fit_calibration", "folds", "track_held_out"]
+__all__ = [
+    "DRAWN",
+    "MODES",
+    "HeldOut",
+    "calibration_noise",
+    "fit_calibration",
+    "folds",
+    "track_held_out",
+]
 
 MODES: dict[str, dict[str, Any]] = {
     "pose": {"method": "mkf-fixed"},
@@ -25,9 +34,16 @@ MODES: dict[str, dict[str, Any]] = {
 }
 """The ways of tracking that have a calibration of their own, with their options of the tracker."""
 
+DRAWN = {
+    calibration_mode(method): {"method": method}
+    for method in ("mkf-sampled", "mkf-split", "pf-mixture", "pf-walk", "pf-walk-unscaled")
+}
+"""Those that follow a sample of what is possible. They take longer, and are tried on fewer frames."""
+
 _VIEWS = 0.5  # of the training views' width: cameras are mostly in front of a person
 _FRAMES, _SEQUENCES = 8000, 48  # in all, and of each group of persons
 _PIECE = 300  # frames at most, so that one long recording does not pad all others
+_SHORT = 60  # frames of a piece for the filters that draw
 _NOISE = 3.0  # pixels
 
 
@@ -66,13 +82,14 @@ def folds(persons: Sequence[str], n_folds: int) -> list[set[str]]:
 
 
 def track_held_out(
-    prior: UpperBodyPrior, poses: PoseSet, persons: set[str], seed: int
+    prior: UpperBodyPrior, poses: PoseSet, persons: set[str], seed: int, drawn_pieces: int = 0
 ) -> dict[str, HeldOut]:
     """Track recordings of some persons in every way that the prior allows; score complete frames.
 
     Args:
         prior: fitted without these persons. poses: of everybody, centred as the prior's are.
-        persons: whose recordings are tracked. seed: of viewpoints and noise.
+        persons: whose recordings are tracked. seed: of viewpoints, noise and what filters draw.
+        drawn_pieces: pieces of recordings, of 60 frames at most, for the ways in `DRAWN`.
     """
     pieces = [
         (piece, person)
@@ -83,22 +100,36 @@ def track_held_out(
     pieces = pieces[:: max(1, len(pieces) // _SEQUENCES)]
     if not pieces:
         return {}
+    usual = {mode: s for mode, s in MODES.items() if mode == "pose" or mode in prior.windows}
+    found = _track(prior, pieces, usual, seed)
+    if drawn_pieces:
+        step = max(1, len(pieces) // drawn_pieces)
+        few = [(piece[:_SHORT], person) for piece, person in pieces[::step][:drawn_pieces]]
+        found |= _track(prior, few, DRAWN, seed)
+    return found
+
+
+def _track(
+    prior: UpperBodyPrior,
+    pieces: list[tuple[Tensor, str]],
+    modes: Mapping[str, dict[str, Any]],
+    seed: int,
+) -> dict[str, HeldOut]:
+    """What tracking pieces of recordings in some ways comes to."""
     keypoints, truth, inside = _seen(prior, [piece for piece, _ in pieces], seed)
     scored = inside & torch.isfinite(truth).flatten(2).all(2)
     who = [pieces[i][1] for i in scored.nonzero()[:, 0].tolist()]
-    if not who:
-        return {}
     found = {}
-    for mode, settings in MODES.items():
-        if mode == "pose" or mode in prior.windows:
-            tracker = UpperBodyTracker(prior, prior.camera, **settings)
-            with torch.inference_mode():
-                track = tracker(keypoints, lengths=inside.sum(1))
-            covs = track.covariance3d[scored]
-            aligned = align(track.joints3d[scored], truth[scored], covariance=covs)
-            if aligned.covariance is None:
-                raise RuntimeError("align was given covariances and returned none")
-            found[mode] = HeldOut(aligned.points - truth[scored], aligned.covariance, who)
+    for mode, settings in modes.items() if who else ():
+        tracker = UpperBodyTracker(prior, prior.camera, calibrated=False, **settings)
+        generator = torch.Generator().manual_seed(seed)
+        with torch.inference_mode():
+            track = tracker(keypoints, lengths=inside.sum(1), generator=generator)
+        covs = track.covariance3d[scored]
+        aligned = align(track.joints3d[scored], truth[scored], covariance=covs)
+        if aligned.covariance is None:
+            raise RuntimeError("align was given covariances and returned none")
+        found[mode] = HeldOut(aligned.points - truth[scored], aligned.covariance, who)
     return found
 
 

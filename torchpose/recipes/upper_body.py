@@ -7,7 +7,7 @@ them, `assemble` makes a prior of them and `calibrate` finds out how good it is 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,11 +16,11 @@ from tqdm.auto import tqdm
 from torchpose.camera import PinholeCamera, ViewRange
 from torchpose.errors import InputError, PriorError
 from torchpose.priors.arm_state import check_rotation_order
-from torchpose.priors.completion import ColumnsSource, complete_mixture
+from torchpose.priors.completion import ColumnsSource
 from torchpose.priors.gmm import GaussianMixture
+from torchpose.priors.increments import increment_covs
 from torchpose.priors.prior_file import PriorInfo
-from torchpose.priors.samplers import SampleSource, WindowSource, cached, derived_seed
-from torchpose.priors.streamed_em import fit_streamed
+from torchpose.priors.samplers import SampleSource, WindowSource, derived_seed
 from torchpose.priors.training import (
     TRAINING_VIEWS,
     ArmSources,
@@ -29,13 +29,21 @@ from torchpose.priors.training import (
     arm_sources,
     collect_poses,
 )
-from torchpose.priors.upper_body import UpperBodyPrior, prior_of_arms, released_process_cov
+from torchpose.priors.upper_body import UpperBodyPrior, prior_of_arms
 from torchpose.priors.window import WindowLayout, WindowPrior
-from torchpose.recipes.calibration import HeldOut, calibration_noise, folds, track_held_out
+from torchpose.recipes.calibration import (
+    DRAWN,
+    MODES,
+    HeldOut,
+    calibration_noise,
+    folds,
+    track_held_out,
+)
+from torchpose.recipes.mixture_task import MixtureTask
 
 __all__ = ["VERSION", "MixtureTask", "UpperBodyRecipe", "fit_kinect_prior"]
 
-VERSION = "4"
+VERSION = "5"
 """Changes whenever the recipe does, so that priors cached under an older one are not taken for it."""
 
 _SIDES = ("left", "right")
@@ -51,45 +59,17 @@ _WINDOW_SAMPLES, _WINDOWS_PER_FRAME = 120_000, 60
 _FRAMES_PER_COMPONENT = 180  # of a mixture over windows; fewer explain the person, not the motion
 
 
-class MixtureTask(NamedTuple):
-    """One mixture to be fitted.
-
-    Attributes:
-        source: of its training states. n_components: K. max_iter, tol: of the steps of EM; a
-            tolerance of 0 takes all of them. seed: of the start.
-    """
-
-    source: SampleSource
-    n_components: int
-    max_iter: int
-    tol: float
-    seed: int
-
-    def fit(self) -> GaussianMixture:
-        """The whole mixture, fitted in this process."""
-        source = cached(self.source)
-        fitted = fit_streamed(
-            source, self.n_components, self.seed, max_iter=self.max_iter, tol=self.tol
-        )
-        return self.whole(fitted)
-
-    def whole(self, mixture: GaussianMixture) -> GaussianMixture:
-        """The mixture over all dimensions of its states, if it was fitted to some of them only."""
-        source = self.source
-        if not isinstance(source, ColumnsSource) or mixture.dim == source.source.dim:
-            return mixture
-        return complete_mixture(mixture, source.source, source.columns)
-
-
 @dataclass(frozen=True)
 class UpperBodyRecipe:
     """Every setting of a fit.
 
-    1. One mixture per arm over single poses (BL section 3.1), and process noise for the filters.
+    1. One mixture per arm over single poses (BL section 3.1), and process noise for the filters, from
+       how far a frame moves the recorded bodies (`increment_covs`).
     2. Mixtures per arm over windows: poses with the hands' pixels around them (`WindowPrior`), from
        bodies of varied size, once with the past alone ("causal") and once with both sides ("full").
-    3. For each of the three, a scale and a floor per joint that bring the covariances of the 3D
-       joints of held-out training persons to their nominal coverage (`fit_calibration`).
+    3. For each of the three, and each of the filters that draw, a scale and a floor per joint that
+       bring the covariances of the 3D joints of held-out training persons to their nominal coverage
+       (`fit_calibration`).
 
     Args:
         n_components: Gaussians per arm over single poses. n_samples: states each arm is fitted to.
@@ -104,6 +84,8 @@ class UpperBodyRecipe:
         views: limits of the random viewpoints.
         calibration_folds: groups of persons that are held out in turn; below 2, or with a single
             person, nothing is calibrated.
+        drawn_pieces: pieces of recordings, of 60 frames at most, of each of these groups for the
+            calibration of the filters that draw; 0 leaves them with that of the fixed tracks.
         seed: of everything random.
         camera_matrix: fx, fy, cx, cy of the camera whose pixels the states are in.
         rotation_order: "zxy" (paper) or "zyx" (released priors).
@@ -128,6 +110,7 @@ class UpperBodyRecipe:
     mirror_share: float = 0.25
     views: ViewRange = TRAINING_VIEWS
     calibration_folds: int = 6
+    drawn_pieces: int = 6
     seed: int = 0
     camera_matrix: tuple[float, float, float, float] = (525.0, 525.0, 319.5, 239.5)
     rotation_order: str = "zxy"
@@ -141,7 +124,7 @@ class UpperBodyRecipe:
         for name in ("n_components", "n_samples", "pose_steps", "window_steps"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("window_components", "window_samples", "calibration_folds"):
+        for name in ("window_components", "window_samples", "calibration_folds", "drawn_pieces"):
             value = getattr(self, name)
             if value is not None and value < 0:
                 raise InputError(f"{name} must not be negative, got {value}")
@@ -263,14 +246,32 @@ class UpperBodyRecipe:
             licence=licence, command=command, views=asdict(self.views), **facts,
         )  # fmt: skip
         base = prior_of_arms(mixtures["pose"], mixtures.get("pose.right"), info, self.seed)
-        noise = {
-            "process_cov": released_process_cov(),
-            "measurement_std": torch.full((5,), _MEASUREMENT_STD, dtype=torch.float64),
-        }
+        noise = {"measurement_std": torch.full((5,), _MEASUREMENT_STD, dtype=torch.float64)}
+        noise |= self.process_noise(base, recordings)
         windows = {
             mode: self.window(mode, mixtures) for mode in self.layouts if f"{mode}.left" in mixtures
         }
         return UpperBodyPrior(base.left, base.right, base.info, noise, windows)
+
+    def process_noise(
+        self, prior: UpperBodyPrior, recordings: Sequence[RecordingLike]
+    ) -> dict[str, Tensor]:
+        """Return the second moments of recorded steps, by the names that the filters look for.
+
+        Args:
+            prior: mixtures over poses; a millionth of their variance keeps Q regular. recordings: what
+                they were fitted on.
+        """
+        poses = collect_poses(recordings, self.neck, "sequence", self.nose_as_head)
+        covs = increment_covs(
+            poses, self.matrix, self.views, self.rotation_order, self.mirror, self.seed
+        )
+        noise = {}
+        for side, cov in covs.items():
+            mixture = getattr(prior, side)
+            within = torch.einsum("k,kii->i", mixture.weights, mixture.covariances)
+            noise[f"increment_cov_{side}"] = cov + 1e-6 * torch.diag(within)
+        return noise
 
     def window(self, mode: str, mixtures: Mapping[str, GaussianMixture]) -> WindowPrior:
         """Windows of one name, of the mixtures that were fitted to them."""
@@ -306,7 +307,8 @@ class UpperBodyRecipe:
         """Errors of some persons, tracked by a fit of half the size to all others."""
         seen = [r for r in recordings if r.person_id not in persons]
         partial = self.smaller().fit(seen)
-        return track_held_out(partial, self.poses(recordings), persons, self.seed)
+        poses = self.poses(recordings)
+        return track_held_out(partial, poses, persons, self.seed, self.drawn_pieces)
 
     def finish(self, prior: UpperBodyPrior, parts: Sequence[dict[str, HeldOut]]) -> UpperBodyPrior:
         """Calibrate a prior by what `hold_out` found for each group of persons."""
@@ -315,12 +317,15 @@ class UpperBodyRecipe:
         for key, value in calibration_noise(found).items():
             prior.set_noise(key, value)
         errors = {mode: _rounded(held_out.error_by_person()) for mode, held_out in found.items()}
+        before = prior.info.extra
         extra: dict[str, Any] = {
-            "calibrated": sorted(prior.noise.keys() - {"process_cov", "measurement_std"})
+            "calibrated": sorted(name for name in prior.noise if name.startswith("calibration"))
         }
-        if errors:
-            extra["held_out"] = errors
-        prior.info = replace(prior.info, extra=prior.info.extra | extra)
+        for name, among in (("held_out", set(MODES)), ("held_out_drawn", set(DRAWN))):
+            own = {mode: value for mode, value in errors.items() if mode in among}
+            if own:
+                extra[name] = before.get(name, {}) | own
+        prior.info = replace(prior.info, extra=before | extra)
         return prior
 
     def fit(
