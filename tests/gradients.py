@@ -38,6 +38,7 @@ def assert_differentiable(
                 (learning[i] * weight).nansum(), leaf, retain_graph=True, allow_unused=True
             )
             assert gradient is not None, f"output {i} has no gradient"
+            assert bool(gradient.isfinite().all()), f"the gradient of output {i} is not finite"
             found = (gradient * direction).sum()
             scale = gradient.norm() * direction.norm() / max(direction.numel(), 1) ** 0.5
             assert abs(found - slope) <= tolerance * max(scale, abs(slope), 1e-6), (

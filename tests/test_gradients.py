@@ -52,6 +52,30 @@ def test_poses_of_the_tracker(options):
     assert_differentiable(poses(make_tracker(**options)), keypoints(), step=1e-4)
 
 
+@pytest.mark.parametrize("method", ["window-mixture", "mkf-fixed"])
+def test_poses_of_keypoints_with_gaps_and_noise_of_their_own(method):
+    """Batches of other lengths, missing keypoints, confidences and covariances of every keypoint."""
+    uv, confidence = keypoints(batch=2), torch.full((2, 9, 3), 0.7)
+    uv[0, 3:6, 1] = float("nan")
+    confidence[1, 2:4] = 0.0
+    confidence[0, 7] = 0.2
+    lengths = torch.tensor([9, 6])
+    track = poses(make_tracker(method=method), confidence=confidence, lengths=lengths)
+    assert_differentiable(track, uv, step=1e-4)
+    own = (1 + torch.arange(9.0).double())[:, None, None, None] * torch.eye(2).double()
+    own = own.expand(2, 9, 3, 2, 2)
+    track = poses(make_tracker(method=method, frame="body"), covariance=own, lengths=lengths)
+    assert_differentiable(track, uv, step=1e-4)
+
+
+def test_poses_of_shoulders_whose_neck_is_placed():
+    names = ("head", "shoulder_left", "shoulder_right", "hand_left", "hand_right")
+    place = [[320.0, 120.0], [370.0, 170.0], [270.0, 170.0], [400.0, 240.0], [240.0, 240.0]]
+    uv = torch.tensor(place, dtype=torch.float64) + keypoints(frames=5)[:, :, :1] - 320.0
+    tracker = make_tracker()
+    assert_differentiable(lambda x: [tracker(x, names=names).joints3d], uv, step=1e-4)
+
+
 @pytest.mark.parametrize("method", ["mkf-sampled", "mkf-split"])
 def test_poses_of_tracks_that_are_drawn_or_selected(method):
     tracker = make_tracker(method=method, n_tracks=12)

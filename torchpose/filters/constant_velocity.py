@@ -153,15 +153,17 @@ class ConstantVelocityFilter(nn.Module):
         later = (frames + 1 < lengths[:, None])[..., None, None]
         known = self._gains().smoother
         gains = known[frames.clamp(max=len(known) - 1)].to(z)
-        change = torch.zeros_like(means)
         if lag is None or lag >= n_frames - 1:
+            changes = [torch.zeros_like(means[:, 0])]
             for t in range(n_frames - 2, -1, -1):
-                pulled = gains[t] @ (corrections[:, t + 1] + change[:, t + 1])
-                change[:, t] = torch.where(later[:, t], pulled, torch.zeros_like(pulled))
-            return (means + change)[:, :, 0]
+                pulled = gains[t] @ (corrections[:, t + 1] + changes[-1])
+                changes.append(torch.where(later[:, t], pulled, torch.zeros_like(pulled)))
+            return (means + torch.stack(changes[::-1], 1))[:, :, 0]
+        change = torch.zeros_like(means)
         for _ in range(lag):
             pulled = gains[:-1] @ (corrections[:, 1:] + change[:, 1:])
-            change[:, :-1] = torch.where(later[:, :-1], pulled, torch.zeros_like(pulled))
+            pulled = torch.where(later[:, :-1], pulled, torch.zeros_like(pulled))
+            change = torch.cat([pulled, change[:, -1:]], 1)
         return (means + change)[:, :, 0]
 
     def extra_repr(self) -> str:
