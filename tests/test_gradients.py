@@ -68,6 +68,19 @@ def test_poses_of_keypoints_with_gaps_and_noise_of_their_own(method):
     assert_differentiable(track, uv, step=1e-4)
 
 
+@pytest.mark.parametrize("method", ["window-mixture", "mkf-fixed"])
+def test_poses_of_streams(method):
+    tracker = make_tracker(method=method)
+
+    def track(uv):
+        state = tracker.init(len(uv), NAMES)
+        state, some = tracker.advance(state, uv[:, :5])
+        state, live = tracker.step(state, uv[:, 5])
+        return some.joints3d, some.covariance3d, live.joints2d, live.joints3d, live.covariance3d
+
+    assert_differentiable(track, keypoints(frames=6), step=1e-4)
+
+
 def test_poses_of_shoulders_whose_neck_is_placed():
     names = ("head", "shoulder_left", "shoulder_right", "hand_left", "hand_right")
     place = [[320.0, 120.0], [370.0, 170.0], [270.0, 170.0], [400.0, 240.0], [240.0, 240.0]]

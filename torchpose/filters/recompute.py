@@ -26,12 +26,13 @@ def recomputed(function: Callable[..., _Result], *arguments: object) -> _Result:
     """Call a function, and call it again for its gradient instead of keeping what that needs.
 
     As `torch.utils.checkpoint` without its import of the compiler, which takes a second. Under the
-    transforms of `torch.func`, which take no hooks on saved tensors, everything is kept.
+    transforms of `torch.func`, which take no hooks on saved tensors, and in what is compiled, which
+    decides for itself what to keep, the function is simply called.
 
     Args:
         function: without random numbers or side effects. arguments: tensors and others.
     """
-    if torch._C._are_functorch_transforms_active():
+    if torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active():
         return function(*arguments)
     slots: list[weakref.ref[_Slot]] = []
     values: weakref.WeakKeyDictionary[_Slot, Tensor] = weakref.WeakKeyDictionary()
