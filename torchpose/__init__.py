@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from torchpose.errors import TorchposeError as TorchposeError
     from torchpose.pose_track import PoseTrack as PoseTrack
     from torchpose.priors.gmm import GaussianMixture as GaussianMixture
+    from torchpose.priors.shipped import load_action as load_action
+    from torchpose.priors.shipped import load_limb_conditionals as load_limb_conditionals
+    from torchpose.priors.shipped import load_manifold as load_manifold
     from torchpose.priors.upper_body import UpperBodyPrior as UpperBodyPrior
     from torchpose.priors.upper_body import load_prior as load_prior
     from torchpose.tracking import UpperBodyTracker as UpperBodyTracker
@@ -63,6 +66,9 @@ _HOME = {
     "UpperBodyPrior": "torchpose.priors.upper_body",
     "UpperBodyTracker": "torchpose.tracking",
     "VideoTracker": "torchpose.video_tracker",
+    "load_action": "torchpose.priors.shipped",
+    "load_limb_conditionals": "torchpose.priors.shipped",
+    "load_manifold": "torchpose.priors.shipped",
     "load_prior": "torchpose.priors.upper_body",
 }
 
@@ -74,6 +80,9 @@ __all__ = [
     "UpperBodyPrior",
     "UpperBodyTracker",
     "VideoTracker",
+    "load_action",
+    "load_limb_conditionals",
+    "load_manifold",
     "load_prior",
 ]
 

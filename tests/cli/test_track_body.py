@@ -136,8 +136,8 @@ def test_nobody_there_is_said(recorded, tmp_path, capsys):
     [
         (["--method", "mrpf"], "needs --manifold"),
         (["--method", "ekf"], "mrpf, apf, sir, root, constrained"),
-        (["--method", "root"], "--method root needs --conditionals FILE, limb conditionals"),
-        (["--method", "constrained"], "needs --action FILE, an action space"),
+        (["--method", "root"], "--method root needs --conditionals NAME|FILE, limb conditionals"),
+        (["--method", "constrained"], "needs --action NAME|FILE, an action space"),
         (["--method", "sir", "--action", "a"], "leave it out or take --method constrained"),
         (["--method", "constrained", "--action", "a", "--conditionals", "b"], "take --method root"),
         (["--manifold", "a", "--conditionals", "b"], "choose by --method mrpf|root"),

@@ -43,6 +43,10 @@ PROTOCOLS = {
         "root_uncertainty",
         "whole bodies by many hypotheses of the root, over cameras, frame rates, displacements",
     ),
+    "body-models": (
+        "body_models",
+        "whole bodies of persons whom a manifold, limb conditionals or actions do not know",
+    ),
     "bend": (
         "bend",
         "an action tracked from one camera, with and without the constraints of its action model",
@@ -50,7 +54,7 @@ PROTOCOLS = {
 }
 _SEVERAL = ("leave-one-person-out",)
 """Protocols on recordings from any folders; the others know theirs by name."""
-_MOCAP = ("silhouette", "root-uncertainty", "bend")
+_MOCAP = ("silhouette", "root-uncertainty", "body-models", "bend")
 """Protocols on any one folder of motion capture."""
 _COMMON = ("data", "out", "seed", "progress")
 _MOVED = "earlier-*/*"

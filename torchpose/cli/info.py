@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 _EXAMPLES = """
 torchpose info
 torchpose info kinect-upper-body
+torchpose info walk
 torchpose info limbs.safetensors
 torchpose info result/poses.npz
 torchpose info keypoints.csv"""
@@ -44,7 +45,7 @@ def build() -> ArgumentParser:
         nargs="?",
         type=str,
         metavar="PRIOR|FILE",
-        help="name of a prior, a file or a folder",
+        help="name of a prior or a model of whole bodies, a file or a folder",
     )
     return parser
 
@@ -60,6 +61,7 @@ def _installation() -> str:
 
     import torchpose
     from torchpose.priors import known_priors
+    from torchpose.priors.shipped import KINDS, known_models
 
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     return _table(
@@ -68,6 +70,7 @@ def _installation() -> str:
             "torch": torch.__version__,
             "CUDA device": device,
             "priors": ", ".join(known_priors()) or "none in this installation",
+            **{kind: ", ".join(known_models(kind)) for kind in KINDS},
             "folder": str(Path(torchpose.__file__).parent),
         }
     )
@@ -77,13 +80,15 @@ def _describe(what: str) -> str:
     from torchpose.priors import known_priors, load_prior
 
     path = Path(what)
-    if path.suffix == ".safetensors" and path.is_file():
+    files = _models_of(what) or ([path] if path.suffix == ".safetensors" and path.is_file() else [])
+    if files and what not in known_priors():
         from torchpose.cli.info_models import DESCRIBED
         from torchpose.priors.tensor_file import format_of
 
-        describe = DESCRIBED.get(format_of(path) or "")
-        if describe is not None:
-            return _table(describe(path))
+        found = [(DESCRIBED.get(format_of(file) or ""), file) for file in files]
+        tables = [_table(describe(file)) for describe, file in found if describe is not None]
+        if tables:
+            return "\n\n".join(tables)
     if what in known_priors() or path.suffix == ".safetensors" or not path.exists():
         return describe_prior(load_prior(what))
     if path.suffix == ".toml":
@@ -99,6 +104,13 @@ def _describe(what: str) -> str:
     from torchpose.io import read_keypoints
 
     return describe_keypoints(read_keypoints(path))
+
+
+def _models_of(name: str) -> list[Path]:
+    """Files of the models of whole bodies that come with the package under this name."""
+    from torchpose.priors.shipped import KINDS, find_model, known_models
+
+    return [find_model(kind, name) for kind in KINDS if name in known_models(kind)]
 
 
 def _describe_npz(path: Path) -> str:

@@ -28,7 +28,7 @@ def describe_manifold(path: Path) -> Facts:
         "held-out error": _number(info.extra.get("held_out_error")),
         "actions": _listed(info.actions),
         **_origin(info),
-        "track with": "torchpose track-body --manifold FILE",
+        "track with": "torchpose track-body --manifold NAME|FILE",
     }
 
 
@@ -55,7 +55,7 @@ def describe_limbs(path: Path) -> Facts:
         "held out": _held_out(info.extra),
         "actions": _listed(info.actions),
         **_origin(info),
-        "track with": "torchpose track-body --method root --conditionals FILE",
+        "track with": "torchpose track-body --method root --conditionals NAME|FILE",
     }
 
 
@@ -79,7 +79,7 @@ def describe_action(path: Path) -> Facts:
         else f"lets {100 * accepted:.0f} % of held-out postures through",
         "fps": _number(info.fps),
         **_origin(info),
-        "track with": "torchpose track-body --method constrained --action FILE",
+        "track with": "torchpose track-body --method constrained --action NAME|FILE",
     }
 
 
@@ -92,15 +92,22 @@ def describe_bank(path: Path) -> Facts:
     sizes = zip(info.names, bank.n_dimensions.tolist(), bank.n_postures.tolist(), strict=True)
     gated = info.gate_dimensions
     return {
-        "action bank": f"{len(info.names)} actions, or none of them",
-        "actions": "\n".join(f"{name}: {d} dimensions, {k} postures" for name, d, k in sizes),
+        "action bank": f"{info.name or 'without a name'}: {len(info.names)} actions, or none of them",
+        "actions": "\n".join(
+            f"{name}: {d} dimensions, {k} postures{_passed(info, name)}" for name, d, k in sizes
+        ),
         "gates": "of all dimensions" if gated is None else f"of the first {gated} dimensions",
         "staying": f"{info.stay:g}: probability of the same action a second later",
         "spread": f"{info.spread:g} for persons who are not of the training set",
         "fps": _number(info.fps),
         **_origin(info),
-        "track with": "torchpose track-body --method constrained --action FILE",
+        "track with": "torchpose track-body --method constrained --action NAME|FILE",
     }
+
+
+def _passed(info: Any, action: str) -> str:
+    share = info.extra.get("accepted", {}).get(action)
+    return "" if share is None else f"; {100 * share:.0f} % of held-out postures pass its gate"
 
 
 DESCRIBED: dict[str, Callable[[Path], Facts]] = {

@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 _EXAMPLES = """
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 cam3.mp4 --out result
 torchpose track-body cameras.toml cam*.mp4 --background empty*.png --height 1.82 --out result
-torchpose track-body cameras.toml cam*.mp4 --manifold walk.safetensors --out result
-torchpose track-body cameras.toml cam*.mp4 --method root --conditionals limbs.safetensors --out result
+torchpose track-body cameras.toml cam*.mp4 --manifold walk --out result
+torchpose track-body cameras.toml cam*.mp4 --method root --conditionals walk --out result
 torchpose track-body cameras.toml cam1.mp4 --method constrained --action bend.safetensors --out result
 torchpose track-body cameras.toml cam*.mp4 --body result/body.npz --facing [1,0,0] --out again"""
 _LOOK_AHEAD = 0.5  # seconds that decide where the person looks at first
@@ -81,12 +81,12 @@ def build() -> ArgumentParser:
         help="manifold-regularised (needs --manifold), annealed, plain, root hypotheses with Gaussian "
         "limbs (needs --conditionals), or constrained to an action (needs --action) particle filter "
         "(default what the file given is for, else apf)")  # fmt: skip
-    add("--manifold", type=str, metavar="FILE",
-        help="poses of an action, from `torchpose fit manifold`")  # fmt: skip
-    add("--conditionals", type=str, metavar="FILE",
-        help="how limbs stand to each other and turn, from `torchpose fit limbs`")  # fmt: skip
-    add("--action", type=str, metavar="FILE",
-        help="postures of an action, or of several, from `torchpose fit actions`")  # fmt: skip
+    add("--manifold", type=str, metavar="NAME|FILE",
+        help="poses of an action, by a name that `torchpose info` lists, or a file")  # fmt: skip
+    add("--conditionals", type=str, metavar="NAME|FILE",
+        help="how limbs stand to each other and turn, by name, or a file")  # fmt: skip
+    add("--action", type=str, metavar="NAME|FILE",
+        help="postures of an action, or of several, by name, or a file")  # fmt: skip
     add("--height", type=float, default=1.75, metavar="M",
         help="height of the person, metres (default 1.75)")  # fmt: skip
     add("--body", type=str, metavar="FILE",

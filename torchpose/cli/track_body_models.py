@@ -17,14 +17,21 @@ if TYPE_CHECKING:
     from torchpose.priors.gplvm import BackConstrainedGPLVM
     from torchpose.priors.limb_conditionals import LimbConditionals
 
-__all__ = ["METHODS", "BodyModel", "check_method", "load_model"]
+__all__ = [
+    "METHODS",
+    "BodyModel",
+    "check_method",
+    "default_sharpness",
+    "load_model",
+    "model_of",
+]
 
 METHODS = ("mrpf", "apf", "sir", "root", "constrained")
 _FILES = {"mrpf": "manifold", "root": "conditionals", "constrained": "action"}
 _HELD = {
-    "manifold": "a manifold of the action's poses (torchpose fit manifold)",
-    "conditionals": "limb conditionals (torchpose fit limbs)",
-    "action": "an action space, or a bank of several (torchpose fit actions)",
+    "manifold": "a manifold of the action's poses (such as walk, or of torchpose fit manifold)",
+    "conditionals": "limb conditionals (such as walk, or of torchpose fit limbs)",
+    "action": "an action space or a bank of several (such as exercises, or of torchpose fit actions)",
 }  # and the command that makes the file
 _SHARPNESS = {"constrained": 30.0}  # of the overlap; of the bidirectional likelihood:
 _SHARP = 100.0
@@ -54,7 +61,7 @@ def check_method(args: Namespace) -> None:
         raise InputError(f"--method must be one of {', '.join(METHODS)}, got {args.method!r}")
     needed = _FILES.get(args.method)
     if needed and needed not in given:
-        raise InputError(f"--method {args.method} needs --{needed} FILE, {_HELD[needed]}")
+        raise InputError(f"--method {args.method} needs --{needed} NAME|FILE, {_HELD[needed]}")
     for option in given:
         if option in (needed, "manifold"):
             continue
@@ -71,13 +78,18 @@ def check_method(args: Namespace) -> None:
                 "hypotheses; leave it out"
             )
     elif args.sharpness is None:
-        args.sharpness = _SHARPNESS.get(args.method, _SHARP)
+        args.sharpness = default_sharpness(args.method)
     least = _LEAST_PARTICLES.get(args.method, 1)
     if args.n_particles < least:
         raise InputError(
             f"--n-particles must be at least {least} for --method {args.method}, so that several "
             f"survive a frame, got {args.n_particles}"
         )
+
+
+def default_sharpness(method: str) -> float | None:
+    """Exponent of the likelihood; None for the method "root", which has none."""
+    return None if method == "root" else _SHARPNESS.get(method, _SHARP)
 
 
 @dataclass(frozen=True)
@@ -190,37 +202,58 @@ class BodyModel:
 
 
 def load_model(args: Namespace) -> BodyModel:
-    """The files of the options, and the body put into the frame and centres that they need.
+    """The models of the options, and the body put into the frame and centres that they need.
 
     Raises:
-        InputError: no such file. FileFormatError: a file of another kind. PriorError: of another body.
+        PriorError: no such name or file, or of another body. FileFormatError: a file of another kind.
         SkeletonError: of other limbs.
     """
-    from torchpose.priors.gplvm import BackConstrainedGPLVM
-    from torchpose.priors.limb_conditionals import LimbConditionals
+    from torchpose.priors.shipped import load_action, load_limb_conditionals, load_manifold
 
-    upright = tracked = _rebased(_person(args), "parent", None)
-    manifold = conditionals = action = None
-    if args.manifold:
-        manifold = BackConstrainedGPLVM.load(args.manifold)
+    manifold = load_manifold(args.manifold) if args.manifold else None
+    learnt: Any = manifold if args.method == "mrpf" else None
+    if args.conditionals:
+        learnt = load_limb_conditionals(args.conditionals)
+    if args.action:
+        learnt = load_action(args.action)
+    return model_of(args.method, _person(args), learnt, manifold)
+
+
+def model_of(
+    method: str,
+    person: "Body",
+    learnt: "BackConstrainedGPLVM | LimbConditionals | ActionSpace | ActionBank | None" = None,
+    manifold: "BackConstrainedGPLVM | None" = None,
+) -> BodyModel:
+    """A method with what it has learnt, and a person put into the frame and centres that this needs.
+
+    Args:
+        method: among `METHODS`. person: bone lengths and shape. learnt: what the method tracks with, a
+            manifold, limb conditionals or actions; None for methods that need nothing.
+        manifold: to look for the first pose with, where the method tracks without one.
+
+    Raises:
+        PriorError: of another body. SkeletonError: of other limbs.
+    """
+    manifold = learnt if method == "mrpf" else manifold  # type: ignore[assignment]
+    upright = tracked = _rebased(person, "parent", None)
+    if manifold is not None:
         info = manifold.info
         if info.skeleton == upright.skeleton.names:  # else it is refused below
             upright = _rebased(upright, info.frame, info.centres or None)
         manifold.check_for(upright)
-        tracked = upright if args.method == "mrpf" else tracked
-    if args.conditionals:
-        conditionals = LimbConditionals.load(args.conditionals)
+        tracked = upright if method == "mrpf" else tracked
+    conditionals: Any = learnt if method == "root" else None
+    if conditionals is not None:
         parts = conditionals.info.parts
         if parts != tracked.skeleton.parts:
             raise PriorError(
-                f"{args.conditionals}: expected limb conditionals of the parts "
-                f"{', '.join(tracked.skeleton.parts)}, got {', '.join(parts)}; fit them with "
-                "`torchpose fit limbs`"
+                f"expected limb conditionals of the parts {', '.join(tracked.skeleton.parts)}, got "
+                f"{', '.join(parts)} ({conditionals.info.name}); fit them with `torchpose fit limbs`"
             )
         tracked = _rebased(tracked, "body", conditionals.centres)
-    if args.action:
-        action = _load_action(args.action)
-    return BodyModel(args.method, tracked, upright, manifold, conditionals, action)
+    action: Any = learnt if method == "constrained" else None
+    return BodyModel(method, tracked, upright, manifold, conditionals, action)
 
 
 def _person(args: Namespace) -> "Body":
@@ -239,12 +272,3 @@ def _rebased(body: "Body", frame: Any, centres: Any) -> "Body":
     if body.frame == frame and torch.equal(body.centres, wanted):
         return body
     return body.altered(frame=frame, centres=wanted)
-
-
-def _load_action(path: str) -> "ActionSpace | ActionBank":
-    from torchpose.priors.action_bank import ActionBank
-    from torchpose.priors.action_space import ActionSpace
-    from torchpose.priors.tensor_file import format_of
-
-    bank = format_of(path) == "torchpose-action-bank"
-    return ActionBank.load(path) if bank else ActionSpace.load(path)

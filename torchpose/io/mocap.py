@@ -32,6 +32,7 @@ class MocapClip:
         recorded: [T, J, 3], every joint of the file, the same axes. names: their J names.
         up: [3], the unit vector that points up.
         fps: frames per second. person, action: from the file. trial: name of the file.
+        person_id: the person, told apart from others of the same name (`Recording.person_id`).
     """
 
     joints: Tensor
@@ -42,6 +43,7 @@ class MocapClip:
     person: str = _UNNAMED
     action: str = ""
     trial: str = ""
+    person_id: str = ""
 
     def __len__(self) -> int:
         return len(self.joints)
@@ -167,7 +169,7 @@ def _clip(recording: Recording, fps: float | None) -> MocapClip:
     return MocapClip(
         body_joints(recorded, recording.names), recorded, recording.names, -down, rate,
         words[0] if words else _UNNAMED, recording.action,
-        recording.path.stem if recording.path is not None else "",
+        recording.path.stem if recording.path is not None else "", recording.person_id,
     )  # fmt: skip
 
 

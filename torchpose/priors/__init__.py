@@ -23,6 +23,12 @@ from torchpose.priors.neck import (
     place_neck,
 )
 from torchpose.priors.prior_file import PriorInfo
+from torchpose.priors.shipped import (
+    known_models,
+    load_action,
+    load_limb_conditionals,
+    load_manifold,
+)
 from torchpose.priors.training import TRAINING_VIEWS, arm_sources, collect_poses
 from torchpose.priors.upper_body import (
     UpperBodyPrior,
@@ -54,9 +60,13 @@ __all__ = [
     "e_step",
     "expectation_maximisation",
     "fit_upper_body_prior",
+    "known_models",
     "known_priors",
     "learn_neck_fraction",
     "learn_neck_offset",
+    "load_action",
+    "load_limb_conditionals",
+    "load_manifold",
     "load_prior",
     "m_step",
     "mirror_arm_state",
