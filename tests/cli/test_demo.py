@@ -1,5 +1,6 @@
 """`torchpose demo`: files, scores, exit code."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -103,3 +104,35 @@ def test_refusals(torchpose, shipped, tmp_path):
         done = torchpose("demo", "--out", tmp_path / "out", *options)
         assert done.code == 2 and message in done.err and len(done.err.splitlines()) == 1
         assert not (tmp_path / "out").exists()
+
+
+def test_a_walk_in_three_cameras_needs_no_data(torchpose, tmp_path, monkeypatch):
+    from torchpose.cli import demo_walk
+
+    monkeypatch.setattr(demo_walk, "_PARTICLES", 100)
+    monkeypatch.delenv("TORCHPOSE_DATA", raising=False)
+    out = tmp_path / "walk"
+    done = torchpose("demo", "--input", "walk", "--seconds", 1, "--out", out, "--pictures", "false")
+    assert done.code == 0, done.err
+    assert "neither recorded nor drawn from the manifold" in " ".join(done.out.split())
+    cells = next(row.split() for row in done.out.splitlines() if row.startswith("all joints"))
+    tracked, still = float(cells[2]), float(cells[3])
+    with np.load(out / "body.npz") as found, np.load(out / "truth.npz") as truth:
+        apart = np.linalg.norm(found["joints3d"] - truth["joints"], axis=-1)
+        moved = np.linalg.norm(truth["joints"] - truth["joints"][:1], axis=-1)
+    assert tracked == pytest.approx(1000 * apart.mean(), abs=0.6) and tracked < 200
+    assert still == pytest.approx(1000 * moved.mean(), abs=0.6) and still > 300
+    names = {path.name for path in out.iterdir()}
+    assert {"cameras.toml", "cam_03.mp4", "cam_03-empty.png", "truth.npz", "report.html"} <= names
+
+
+def test_standing_still_that_is_no_worse_fails_the_demo(torchpose, tmp_path, monkeypatch):
+    from torchpose.cli import demo_walk
+
+    monkeypatch.setattr(demo_walk, "_PARTICLES", 20)
+    monkeypatch.setattr(demo_walk, "_still", lambda truth: torch.zeros(len(truth), 15))
+    options = ("--input", "walk", "--seconds", 1, "--pictures", "false")
+    done = torchpose("demo", *options, "--out", tmp_path / "out")
+    assert done.code == 1 and "no better than standing still" in done.err
+    done = torchpose("demo", "--input", "walk", "--seconds", 9, "--out", tmp_path / "out")
+    assert done.code == 2 and "from 1 to 4" in done.err

@@ -1,4 +1,4 @@
-"""`torchpose demo`: the animated performer, tracked in video or from keypoints, and scored."""
+"""`torchpose demo`: an animated performer tracked in video or from keypoints, or a walk in three cameras."""
 
 import re
 from typing import TYPE_CHECKING
@@ -16,8 +16,11 @@ _EXAMPLES = """
 torchpose demo --out demo-output
 torchpose demo --out demo-output --seed 3 --seconds 10
 torchpose demo --out demo-output --input keypoints
+torchpose demo --out demo-output/walk --input walk
 torchpose demo --out demo-output --prior prior.safetensors"""
-_INPUTS = ("video", "keypoints")
+_INPUTS = ("video", "keypoints", "walk")
+_SECONDS = {"video": 20.0, "keypoints": 20.0, "walk": 2.5}
+_MOST_SECONDS = {"video": 3600, "keypoints": 3600, "walk": 4}  # then they are past the cameras
 _VIDEO_FILES = ("clip.mp4", "truth.npz")
 _KEYPOINT_FILES = ("keypoints.npz", "pose_3d.png", "errors.png")
 
@@ -33,7 +36,9 @@ def build() -> ArgumentParser:
         "demo",
         "Animate and render a performer, track the video, and score and draw the result; or, with "
         "--input keypoints, track noisy keypoints of head, neck and hands with one hand hidden for a "
-        "second. Needs no data. Exit code 1 if the tracker does not beat the mean pose of its prior.",
+        "second; or, with --input walk, track a whole body in three cameras with a manifold of walking. "
+        "Needs no data. Exit code 1 if the tracker does not beat the mean pose of its prior, or standing "
+        "still.",
         _EXAMPLES,
     )
     add = parser.add_argument
@@ -42,7 +47,7 @@ def build() -> ArgumentParser:
         "--input",
         type=str,
         default="video",
-        metavar="video|keypoints",
+        metavar="video|keypoints|walk",
         help="what is tracked (default video; needs matplotlib for the performer's face)",
     )
     add(
@@ -56,9 +61,8 @@ def build() -> ArgumentParser:
     add(
         "--seconds",
         type=float,
-        default=20.0,
         metavar="S",
-        help="length; the performance takes 20 s and starts over (default 20)",
+        help="length; the performance takes 20 s and starts over (default 20; of the walk 2.5)",
     )
     add("--pictures", type=bool, default=True, metavar="true|false",
         help="draw pictures (default true)")  # fmt: skip
@@ -66,14 +70,20 @@ def build() -> ArgumentParser:
 
 
 def run(args: Namespace) -> int:
-    """Perform, track, score, draw; exit code 1 if the mean pose is not beaten."""
+    """Perform, track, score, draw; exit code 1 if the mean pose, or standing still, is not beaten."""
     from torchpose.cli.track_output import track_results
     from torchpose.priors import load_prior
 
-    if not 1 <= args.seconds <= 3600:
-        raise InputError(f"--seconds must be from 1 to 3600, got {args.seconds:g}")
     if args.input not in _INPUTS:
         raise InputError(f"--input must be one of {', '.join(_INPUTS)}, got {args.input!r}")
+    args.seconds = _SECONDS[args.input] if args.seconds is None else args.seconds
+    most = _MOST_SECONDS[args.input]
+    if not 1 <= args.seconds <= most:
+        raise InputError(f"--seconds must be from 1 to {most}, got {args.seconds:g}")
+    if args.input == "walk":
+        from torchpose.cli.demo_walk import demo_walk
+
+        return demo_walk(args.out, args.seconds, args.seed, pictures_possible(args.pictures))
     prior = load_prior(args.prior)
     pictures = pictures_possible(args.pictures)
     video = args.input == "video"

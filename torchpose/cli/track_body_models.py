@@ -39,6 +39,7 @@ _LAYERS = 5  # of the annealed filter, each with its share of the particles
 _POINTS = 7  # likelihoods that a hypothesis of the root costs
 _LEAST_PARTICLES = {"root": 3 * _POINTS, "apf": 4 * _LAYERS}  # of which two survive
 _RATE = 60.0  # frames per second for which the default noise of the filters is
+_MANIFOLD_STEP = 2.0  # times sigma x->x of the manifold, which was learnt from the true poses
 _LEG_SWAP = 0.02
 _COMMON_HEIGHT = 1.75  # metres, of the body on which postures of actions are told
 # What a constant velocity misses, at 60 Hz, about twice that of walks and exercises: metres for the
@@ -154,7 +155,7 @@ class BodyModel:
                 posture_body=self._posture_body(), **common,
             )  # fmt: skip
         if self.method == "mrpf" and self.manifold is not None:
-            step[list(body.relative_columns)] = self.manifold.std_step.to(step)
+            step[list(body.relative_columns)] = _MANIFOLD_STEP * self.manifold.std_step.to(step)
             return filters.ManifoldParticleFilter(
                 body, self.manifold, n_particles, fps=fps, **common
             )

@@ -18,6 +18,7 @@ from torchpose.io.mocap import MocapClip, select_persons
 
 __all__ = [
     "Split",
+    "cameras_around",
     "in_view",
     "looped",
     "place_cameras",
@@ -151,12 +152,19 @@ def _share(
 
 
 def place_cameras(
+    clip: MocapClip, azimuths: Sequence[float] = AZIMUTHS, **options: float
+) -> CameraRig:
+    """The rig of `cameras_around` a clip, which takes the options."""
+    return CameraRig(cameras_around(clip, azimuths, **options))
+
+
+def cameras_around(
     clip: MocapClip,
     azimuths: Sequence[float] = AZIMUTHS,
     distance: float = 3.8,
     height: float = 1.5,
     focal: float = 450.0,
-) -> CameraRig:
+) -> list[PinholeCamera]:
     """Cameras of 640 x 480 pixels around the middle of the way, which they look at.
 
     They stand at `azimuths` from the direction of the walk, none of them in its line, so that the
@@ -180,7 +188,7 @@ def place_cameras(
         place = middle + distance * (math.cos(angle) * forward + math.sin(angle) * left)
         place = place + (floor + height) * up
         cameras.append(_looking(place, target, up, focal, f"cam_{i:02d}"))
-    return CameraRig(cameras)
+    return cameras
 
 
 def _way(clip: MocapClip) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:

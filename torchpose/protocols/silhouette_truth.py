@@ -22,7 +22,7 @@ from torchpose.camera_rig import CameraRig
 from torchpose.io.mocap import MocapClip
 from torchpose.joint_sets import canonical_names
 
-__all__ = ["TrueShape", "true_limbs", "true_silhouettes"]
+__all__ = ["TrueShape", "limb_kinds", "true_limbs", "true_silhouettes"]
 
 _SIDES = ("left", "right")
 _LEG = 0.84
@@ -118,6 +118,12 @@ def true_limbs(clip: MocapClip, shape: TrueShape) -> Limbs:
         dtype=start.dtype,
     )
     return Limbs(start, end, radii)
+
+
+def limb_kinds() -> list[str]:
+    """Kind of each limb of `true_limbs`, such as "forearm"."""
+    sides = [row[0] for row in _LIMBS_OF_SIDES for _ in _SIDES]
+    return [*sides, *(row[0] for row in _LIMBS_OF_MIDDLE)]
 
 
 # --- where the outline is -------------------------------------------------------------------------
