@@ -13,7 +13,7 @@ TEST_PROCESSES ?= 2
 .PHONY: help demo test lint format docs docs-serve install clean
 
 help:
-	@echo "make demo       track the animated performer; pictures and scores in demo-output/"
+	@echo "make demo       track the animated performer, and a walk in three cameras; see demo-output/"
 	@echo "make test       run the tests"
 	@echo "make lint       ruff and mypy"
 	@echo "make docs       build the documentation into site/, warnings are errors"
@@ -23,6 +23,7 @@ help:
 
 demo: $(VENV)/.installed-plots
 	$(BIN)/torchpose demo --out demo-output
+	$(BIN)/torchpose demo --input walk --out demo-output/walk
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) $(PYTEST_ARGS)

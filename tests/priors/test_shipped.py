@@ -7,7 +7,7 @@ import pytest
 import torch
 import yaml
 
-from tests.data import data_path
+from tests.data import data_dir_or_skip
 from torchpose import load_action, load_limb_conditionals, load_manifold
 from torchpose.body import BODY_15, Body
 from torchpose.cli.fit_bodies import build
@@ -65,7 +65,7 @@ def test_its_configuration_makes_it_and_holds_persons_out(kind, name):
 
 @pytest.mark.data
 def test_the_manifold_is_made_again_by_its_configuration(tmp_path, torchpose_command):
-    data_path("mocap_cmu_walk")
+    data_dir_or_skip("mocap_cmu_walk")
     out = tmp_path / "walk.safetensors"
     kept = load_manifold("walk")
     config = ROOT / kept.info.command.split("--config ")[1]
