@@ -86,6 +86,7 @@ def test_written_command_lines_parse(line, monkeypatch, tmp_path):
     for name in COMMANDS:
         module = f"torchpose.cli.{name.replace('-', '_')}"
         monkeypatch.setattr(f"{module}.run", lambda *args: parsed.append(args) or 0)
+    monkeypatch.setattr("torchpose.cli.fit_bodies.run", lambda *args: parsed.append(args) or 0)
     words = shlex.split(line)[1:]
     if "--config" in words:  # the file has to be there
         config = tmp_path / "config.yaml"
