@@ -24,6 +24,10 @@ def test_all_trackers(data, tmp_path):
     )  # fmt: skip
     for key in ("errors_2d", "errors_3d", "behaviour", "pcp", "time"):
         assert set(report[key].rows) >= set(ub_one.TRACKERS)
+    ran_with = {name: report["summary"][name, "process noise"] for name in ub_one.TRACKERS}
+    assert ran_with["MKF fixed tracks"] == ran_with["PF mixture, Q of the MKF"] == "the released Q"
+    assert ran_with["PF mixture"] == "4 x the released Q"
+    assert ran_with["PF walk, scaled"] == "0.3 x human steps, burn-in of 15 frames"
     assert all(row[0] > 0 for row in report["time"].rows.values())
     assert report["errors_2d"]["MKF sampled", "spread"] > 0  # two seeds
     assert len(report.findings) >= 8

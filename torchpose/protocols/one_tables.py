@@ -13,9 +13,14 @@ from torchpose.metrics import jitter, share_below
 from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.protocols.common import HANDS, Scores, Trials, add_picture
 from torchpose.protocols.people_tables import SHORT_NAMES
-from torchpose.protocols.report import Report
+from torchpose.protocols.report import Report, Table
 
-__all__ = ["SAMPLED", "add_findings", "add_pictures", "add_tables"]
+__all__ = ["SAMPLED", "SUMMARY", "add_findings", "add_pictures", "add_tables", "fill_summary"]
+
+SUMMARY = (
+    "2D error (px)", "3D error (cm)", "jitter (m/s2)", "arm raised (cm)", "iteration (ms)",
+    "the paper's", "process noise",
+)  # fmt: skip
 
 SAMPLED = ("mkf-sampled", "pf-walk", "pf-walk-unscaled", "pf-mixture")
 FIXED, DRAWN, SPLIT = "MKF fixed tracks", "MKF sampled", "split tracks"
@@ -81,6 +86,24 @@ def add_tables(
     )
     for name, milliseconds in times.items():
         table.add(name, [milliseconds, _PAPER_SECONDS.get(name)])
+
+
+def fill_summary(table: Table, report: Report, noise: Mapping[str, str], title: str) -> None:
+    """Fill the table that stands first from the others, with the process noise that each row ran with.
+
+    Args:
+        table: with the columns `SUMMARY`. report: after `add_tables`. noise: of each tracker, in words;
+            rows without are of the recipe's own.
+        title: what all rows have in common.
+    """
+    table.title = title
+    timed = report["time"].rows
+    for name in report["errors_2d"].rows:
+        table.add(name, [
+            report["errors_2d"][name, "mean"], report["errors_3d"][name, "mean"],
+            report["behaviour"][name, "jitter (m/s2)"], report["behaviour"][name, "arm raised"],
+            *timed.get(name, (None, None)), noise.get(name, "the recipe's"),
+        ])  # fmt: skip
 
 
 def _behaviour(scores: Scores, raised: Bool[Tensor, "T 2"]) -> list[float]:

@@ -45,7 +45,14 @@ from torchpose.protocols.common import (
     settings_hash,
     track,
 )
-from torchpose.protocols.one_tables import SAMPLED, add_findings, add_pictures, add_tables
+from torchpose.protocols.one_tables import (
+    SAMPLED,
+    SUMMARY,
+    add_findings,
+    add_pictures,
+    add_tables,
+    fill_summary,
+)
 from torchpose.protocols.report import Report
 from torchpose.recipes import fit_kinect_prior
 from torchpose.tracking import UpperBodyTracker
@@ -119,15 +126,16 @@ def run(
     plain = plain_prior(prior)
     scores: dict[str, list[Scores]] = {}
     times: dict[str, float] = {}
+    noise: dict[str, str] = {}
     for name, method in tqdm(TRACKERS.items(), disable=not progress, desc="trackers"):
         factor = mixture_q if name == "PF mixture" else walk_q if "walk" in method else 1.0
-        own, options = _model(plain, method, particles, factor)
+        options, noise[name] = _model(plain, method, particles, factor)
         seeds = range(seed, seed + (n_seeds if method in SAMPLED else 1))
         scores[name] = [
-            score(_estimate(out, own, camera, test, method, s, options, progress), test)
+            score(_estimate(out, plain, camera, test, method, s, options, progress), test)
             for s in seeds
         ]
-        times[name] = time_step(own, camera, test, method, options)
+        times[name] = time_step(plain, camera, test, method, options)
     scores["recipe's prior, filtered"] = [score(track(prior, camera, test), test)]
     smooth = track(prior, camera, test, smoothing="full")
     scores["recipe's prior, smoothed"] = [score(smooth, test)]
@@ -138,7 +146,11 @@ def run(
         "learnt transition": prior.info.transition, "threads": torch.get_num_threads(),
     })  # fmt: skip
     raised = raised_arms(pose)
+    summary = report.table("summary", "", SUMMARY, digits=(1, 1, 0, 1, 2, 0, 0))
     add_tables(report, scores, times, test, raised)
+    fill_summary(
+        summary, report, noise, f"{particles:,} particles, {prior.n_components} components"
+    )
     add_findings(report, scores, times, raised)
     add_pictures(
         report, out, {n: s[0] for n, s in scores.items() if n in TRACKERS}, test.fps, plain
@@ -193,17 +205,19 @@ def walk_process_cov(prior: UpperBodyPrior) -> Float[Tensor, " 21"]:
 
 def _model(
     plain: UpperBodyPrior, method: str, particles: int, factor: float
-) -> tuple[UpperBodyPrior, dict[str, Any]]:
-    """Prior with the noise of a tracker, and its options."""
-    if not method.startswith("pf"):
-        return plain, {}
-    options: dict[str, Any] = {"n_particles": particles}
-    process_cov = plain.noise["process_cov"]
-    if method != "pf-mixture":
+) -> tuple[dict[str, Any], str]:
+    """Options of a tracker, its process noise among them, and that noise in words."""
+    walks = method.startswith("pf-walk")
+    process_cov = walk_process_cov(plain) if walks else plain.noise["process_cov"]
+    options: dict[str, Any] = {"process_cov": factor * process_cov}
+    if method.startswith("pf"):
+        options |= {"n_particles": particles, "start": "prior"}
+    burn_in = ""
+    if walks:
         options["burn_in"] = BURN_IN
-        process_cov = walk_process_cov(plain)
-    noise = {"process_cov": factor * process_cov}
-    return UpperBodyPrior(plain.left, plain.right, plain.info, noise), options
+        burn_in = f", burn-in of {BURN_IN} frames"
+    share = "" if factor == 1.0 else f"{factor:g} x "
+    return options, f"{share}{'human steps' if walks else 'the released Q'}{burn_in}"
 
 
 def _estimate(
