@@ -11,7 +11,6 @@ a run that was stopped goes on.
 """
 
 import argparse
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -80,15 +79,22 @@ def run_method(prior: UpperBodyPrior, test: Trials, method: str, arguments: Any)
     return run
 
 
-def problems(arguments: argparse.Namespace) -> Iterator[tuple[str, list[Recording], Trials]]:
-    """Name, training recordings and test set of each protocol."""
+def ub_people(arguments: argparse.Namespace) -> tuple[list[Recording], Trials]:
+    """Training recordings and test set: some sequences of persons never seen."""
     train, tested = people(arguments.data)
     tested = tested[:: arguments.every]
     poses = [centred_on_neck(r.upper_body().joints) for r in tested]
-    yield "UB-people", train, make_test_set(poses, CAMERA, tested[0].fps or 30.0)
+    return train, make_test_set(poses, CAMERA, tested[0].fps or 30.0)
+
+
+def ub_one(arguments: argparse.Namespace) -> tuple[list[Recording], Trials]:
+    """The first part of the authors' own recording, and frames of the rest."""
     first, rest = split_recording(arguments.data)
     pose = centred_on_neck(rest.upper_body().joints)[: arguments.frames or None]
-    yield "UB-one", [first], make_test_set([pose], CAMERA, rest.fps or 30.0)
+    return [first], make_test_set([pose], CAMERA, rest.fps or 30.0)
+
+
+PROTOCOLS = {"UB-people": ub_people, "UB-one": ub_one}
 
 
 def compare(
@@ -96,7 +102,10 @@ def compare(
 ) -> None:
     """A table for each recipe: error, coverage and sample size of every method."""
     still = mean_pose(test, *projected_training_poses(recordings, CAMERA, 20_000))
-    for recipe, settings in RECIPES.items():
+    for recipe in arguments.recipes:
+        settings = RECIPES[recipe]
+        if arguments.folds is not None:
+            settings = settings | {"calibration_folds": arguments.folds}
         if not arguments.windows:
             settings = settings | {"window_components": 0}
         prior = cached_prior(
@@ -167,14 +176,17 @@ def main() -> None:
     parser.add_argument(
         "--windows", choices=("true", "false"), default="true", help="fit windows as well"
     )
+    parser.add_argument("--folds", type=int, help="of the calibration (default the recipe's)")
+    parser.add_argument("--recipes", nargs="+", choices=RECIPES, default=[*RECIPES])
+    parser.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=[*PROTOCOLS])
     parser.add_argument("--progress", action="store_true", help="show bars")
     arguments = parser.parse_args()
     arguments.windows = arguments.windows == "true"
     arguments.out = check_output_folder(arguments.out)
-    shown = ("every", "frames", "particles", "windows")
+    shown = ("every", "frames", "particles", "windows", "folds", "recipes", "protocols")
     report = Report("All trackers", {name: getattr(arguments, name) for name in shown})
-    for name, recordings, test in problems(arguments):
-        compare(name, recordings, test, report, arguments)
+    for name in arguments.protocols:
+        compare(name, *PROTOCOLS[name](arguments), report, arguments)
     report.save(arguments.out)
     print((arguments.out / "report.md").read_text())
 

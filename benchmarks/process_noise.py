@@ -1,0 +1,77 @@
+"""Factors of the recorded steps' second moment: the error of each method on training persons held out.
+
+A prior of s1 to s4 of UTD-MHAD tracks every n-th sequence of s5 and s6 in the test camera, with Q = k S
+for the walks and Q = k diag(S) for the others; the shipped factors are
+`torchpose.process_noise.INCREMENT_FACTORS`.
+
+    python benchmarks/process_noise.py --data DIR
+    python benchmarks/process_noise.py --data DIR --every 5 --methods mkf-fixed mkf-sampled mkf-split
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchpose.camera import PinholeCamera
+from torchpose.priors.upper_body import UpperBodyPrior
+from torchpose.process_noise import INCREMENT_FACTORS
+from torchpose.protocols.common import (
+    Trials,
+    centred_on_neck,
+    make_test_set,
+    plain_prior,
+    score,
+    track,
+)
+from torchpose.protocols.ub_people import people
+from torchpose.recipes import UpperBodyRecipe
+
+SEEN, TRIED = ("s1", "s2", "s3", "s4"), ("s5", "s6")
+CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
+
+
+def main() -> None:
+    """Print a line for each method and factor."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
+    parser.add_argument("--every", type=int, default=24, help="take every n-th sequence")
+    parser.add_argument(
+        "--methods", nargs="+", choices=INCREMENT_FACTORS, default=[*INCREMENT_FACTORS]
+    )
+    parser.add_argument("--factors", nargs="+", type=float, default=[0.3, 1.0, 10.0, 100.0])
+    parser.add_argument("--particles", type=int, default=3000)
+    arguments = parser.parse_args()
+    train, _ = people(arguments.data)
+    recipe = UpperBodyRecipe(window_components=0, calibration_folds=0)
+    prior = recipe.fit([r for r in train if r.person in SEEN])
+    tried = [r for r in train if r.person in TRIED][:: arguments.every]
+    poses = [centred_on_neck(r.upper_body().joints) for r in tried]
+    test = make_test_set(poses, CAMERA, tried[0].fps or 30.0)
+    print(f"{len(test.lengths)} sequences, {int(test.lengths.sum())} frames")
+    for method in arguments.methods:
+        particles = {"n_particles": arguments.particles} if method.startswith("pf-") else {}
+        print(f"{method} released: {error(plain_prior(prior), method, particles, test):.2f} cm")
+        for factor in arguments.factors:
+            ratio = factor / INCREMENT_FACTORS[method]
+            noise = {name: value for name, value in prior.noise.items() if "increment" in name}
+            own = UpperBodyPrior(
+                prior.left, prior.right, prior.info, {n: ratio * v for n, v in noise.items()}
+            )
+            shape = "S" if "walk" in method else "diag(S)"
+            print(
+                f"{method} {factor:g} {shape}: {error(own, method, particles, test):.2f} cm",
+                flush=True,
+            )
+
+
+def error(prior: UpperBodyPrior, method: str, options: dict[str, Any], test: Trials) -> float:
+    """Mean 3D error after Procrustes, cm."""
+    generator = torch.Generator().manual_seed(0)
+    found = score(track(prior, CAMERA, test, method=method, generator=generator, **options), test)
+    return 100 * float(found.errors3d.nanmean())
+
+
+if __name__ == "__main__":
+    main()
