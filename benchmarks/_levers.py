@@ -18,6 +18,7 @@ from torchpose.io.recordings import Recording, read_recordings
 from torchpose.measurements import pixel_indices
 from torchpose.priors import TRAINING_VIEWS, GaussianMixture, UpperBodyPrior
 from torchpose.priors.window import WindowLayout, WindowPrior
+from torchpose.process_noise import process_cov
 from torchpose.protocols.common import (
     MEASURED,
     Estimate,
@@ -293,7 +294,7 @@ def learn_noise(prior: UpperBodyPrior, recordings: list[Recording], size: Size, 
     test = make_test_set(poses, CAMERA, recordings[0].fps or 30.0, seed + 1)
     rows = [ARM_JOINTS.index(joint) for joint in JOINTS]
     std = prior.noise["measurement_std"]
-    log_process = prior.noise["process_cov"].log().requires_grad_()
+    log_process = process_cov(prior, "left", "mkf-fixed").log().requires_grad_()
     log_measurement = std[rows].square().log().requires_grad_()
     adam = torch.optim.Adam([log_process, log_measurement], lr=0.2)
     gains = []

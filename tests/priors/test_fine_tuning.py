@@ -21,6 +21,7 @@ from torchpose.priors.fine_tuning import (
     parameter_groups,
     pose_error,
 )
+from torchpose.priors.upper_body import released_process_cov
 from torchpose.recipes import UpperBodyRecipe
 from torchpose.tracking import UpperBodyTracker
 
@@ -146,7 +147,7 @@ def test_the_gradient_through_the_filter_is_that_of_finite_differences(
 
 
 def test_the_loss_of_noise_falls_and_the_tuned_prior_tracks_better(prior, sequences, tmp_path):
-    poor = dict(prior.noise) | {"process_cov": prior.noise["process_cov"] * 1e-3}
+    poor = dict(prior.noise) | {"process_cov": released_process_cov() * 1e-3}
     start = UpperBodyPrior(prior.left, prior.right, prior.info, poor)
     model = TunableKalman(start)
     adam = torch.optim.Adam(model.parameters(), lr=0.3)
