@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from torchpose.priors.upper_body import UpperBodyPrior as UpperBodyPrior
     from torchpose.priors.upper_body import load_prior as load_prior
     from torchpose.tracking import UpperBodyTracker as UpperBodyTracker
+    from torchpose.value_checks import without_value_checks as without_value_checks
     from torchpose.video_tracker import VideoTracker as VideoTracker
 
     __version__: str
@@ -53,6 +54,7 @@ _SUBMODULES = frozenset(
         "torchmetrics_adapters",
         "tracking",
         "unscented",
+        "value_checks",
         "video",
         "video_tracker",
         "viz",
@@ -70,6 +72,7 @@ _HOME = {
     "load_limb_conditionals": "torchpose.priors.shipped",
     "load_manifold": "torchpose.priors.shipped",
     "load_prior": "torchpose.priors.upper_body",
+    "without_value_checks": "torchpose.value_checks",
 }
 
 __all__ = [
@@ -84,6 +87,7 @@ __all__ = [
     "load_limb_conditionals",
     "load_manifold",
     "load_prior",
+    "without_value_checks",
 ]
 
 

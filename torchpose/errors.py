@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchpose.value_checks import values_visible
+
 __all__ = [
     "CameraError",
     "CovarianceError",
@@ -32,6 +34,7 @@ __all__ = [
     "check_shape",
     "check_weights",
     "printable",
+    "refuse_export",
 ]
 
 _LONGEST, _TAIL = 1200, 300  # characters of a message, and how many of those are of its end
@@ -108,6 +111,17 @@ class DegenerateFilterWarning(UserWarning):
     """Some elements of a batch degenerated; the others finished."""
 
 
+def refuse_export(what: str, instead: str) -> None:
+    """Raise `InputError` while `torch.export` traces what depends on values.
+
+    Args:
+        what: cannot be exported. instead: what can.
+    """
+    is_exporting = getattr(torch.compiler, "is_exporting", None)  # not in all releases
+    if is_exporting is not None and is_exporting():
+        raise InputError(f"{what} cannot be exported; export {instead}")
+
+
 def check_shape(name: str, tensor: Tensor, expected: Sequence[int | str | None]) -> None:
     """Raise `ShapeError` unless `tensor` has the expected sizes.
 
@@ -135,6 +149,8 @@ def check_shape(name: str, tensor: Tensor, expected: Sequence[int | str | None])
 
 def check_finite(name: str, tensor: Tensor, where: Tensor | None = None, hint: str = "") -> None:
     """Raise `InputError` if an element is NaN or infinite (where `where` is True, if given)."""
+    if not values_visible():
+        return
     bad = ~torch.isfinite(tensor)
     if where is not None:
         bad = bad & where
@@ -183,7 +199,7 @@ def check_weights(name: str, weights: Tensor) -> None:
     check_finite(name, weights)
     if weights.numel() == 0:
         raise InputError(f"{name} must hold at least one weight, got none")
-    if bool((weights <= 0).any()):
+    if values_visible() and bool((weights <= 0).any()):
         index = int(torch.nonzero((weights <= 0).reshape(-1))[0])
         raise InputError(
             f"{name} must be positive, got {float(weights.reshape(-1)[index]):g} at index {index}; "
@@ -205,6 +221,8 @@ def check_covariance(name: str, covariance: Tensor, tolerance: float = 1e-6) -> 
     """
     if covariance.ndim < 2 or covariance.shape[-1] != covariance.shape[-2]:
         raise ShapeError(f"{name} must have shape [..., D, D], got {list(covariance.shape)}")
+    if not values_visible():
+        return
     check_finite(name, covariance)
     scale = covariance.abs().amax((-2, -1)).clamp_min(torch.finfo(covariance.dtype).tiny)
     skew = (covariance - covariance.mT).abs().amax((-2, -1)) / scale

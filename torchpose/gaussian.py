@@ -12,6 +12,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchpose.value_checks import values_visible
+
 __all__ = [
     "Gain",
     "condition",
@@ -72,10 +74,10 @@ def mended_cholesky(
 
     Returns:
         Lower triangular L [..., D, D], and j [...]: 0 for matrices that factorise as they are, and
-        for those that are lost. None if all factorise as they are, which is the rule.
+        for those that are lost. None if all are seen to factorise as they are, which is the rule.
     """
     factor, info = torch.linalg.cholesky_ex(matrix)
-    if not bool(info.any()):
+    if values_visible() and not bool(info.any()):
         return factor, None
     with torch.no_grad():
         scale = _own_scale(matrix)
@@ -241,8 +243,7 @@ def kalman_predict(
     dim = cov.shape[-1]
     right = _multiply(cov, pad(transition, (0, 0, 0, _spare(dim))).mT)
     if right.shape[:-2] == mean.shape[:-1]:  # one product, F [P F^T, x]
-        right[..., dim] = mean
-        both = _multiply(transition, right)
+        both = _multiply(transition, _with_column(right, dim, mean))
         moved = both[..., dim]
     else:
         both = _multiply(transition, right)
@@ -315,9 +316,15 @@ def _beside(cross: Tensor, residual: Tensor) -> Tensor:
         # not torch.broadcast_shapes, whose first call imports a computer algebra system
         batch = torch.broadcast_tensors(cross[..., 0, 0], residual[..., 0])[0].shape
         cross, residual = cross.expand(*batch, -1, -1), residual.expand(*batch, -1)
-    joint = pad(cross, (0, _spare(dim)))
-    joint[..., dim] = residual
-    return joint
+    return _with_column(pad(cross, (0, _spare(dim))), dim, residual)
+
+
+def _with_column(matrix: Tensor, index: int, column: Tensor) -> Tensor:
+    """Put a column into a new matrix that nothing else holds."""
+    if not values_visible():  # vmap may have only one of the two in its batch
+        return torch.cat([matrix[..., :index], column[..., None], matrix[..., index + 1 :]], -1)
+    matrix[..., index] = column
+    return matrix
 
 
 def kalman_correct(

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchpose.errors import InputError
+from torchpose.value_checks import values_visible
 
 __all__ = [
     "WideModule",
@@ -88,6 +89,7 @@ class _Graphs(threading.local):
     def __init__(self) -> None:
         self.depth = 0
         self.kept: dict[Hashable, _Entry] = {}
+        self.traced: dict[Hashable, tuple[tuple[Tensor, ...], Any]] = {}
 
 
 _GRAPHS = _Graphs()
@@ -102,7 +104,7 @@ def one_run(device: torch.device) -> Iterator[None]:
     has to build its own.
     """
     with torch.autocast(device.type, enabled=False):
-        if torch.compiler.is_compiling():
+        if torch.compiler.is_dynamo_compiling():
             yield
             return
         _GRAPHS.depth += 1
@@ -112,6 +114,7 @@ def one_run(device: torch.device) -> Iterator[None]:
             _GRAPHS.depth -= 1
             if _GRAPHS.depth == 0:
                 _GRAPHS.kept.clear()
+                _GRAPHS.traced.clear()
 
 
 def derived(
@@ -121,15 +124,19 @@ def derived(
 
     A source has changed if it is another tensor, or was written to in place: by an optimiser, by
     `load_state_dict`, by hand. (Writing through `tensor.data` hides from PyTorch, and so from here.)
-    Under `torch.compile` and inside `torch.func` transforms nothing is kept.
+    Under `torch.compile` nothing is kept, and inside `torch.export` and `torch.func` transforms
+    nothing beyond the run.
 
     Args:
         module: whose value it is; when it goes, so does the value. name: among those of the module.
         sources: tensors that the value depends on. make: computes it from these alone.
     """
     given = tuple(source for source in sources if source is not None)
-    if torch.compiler.is_compiling() or any(map(_is_opaque, given)):
+    name = (name, values_visible())  # what was made without checks is not for those with
+    if torch.compiler.is_dynamo_compiling():
         return make()
+    if torch.compiler.is_compiling() or any(map(_is_opaque, given)):
+        return _kept_in_this_run((id(module), name), given, make) if _GRAPHS.depth else make()
     if torch.is_grad_enabled() and any(source.requires_grad for source in given):
         if not _GRAPHS.depth:
             return make()
@@ -165,6 +172,14 @@ def _kept_in(
         entry = _Entry(marks, make())
         kept[key] = entry
     return entry.value
+
+
+def _kept_in_this_run(key: Hashable, given: tuple[Tensor, ...], make: Callable[[], T]) -> T:
+    """`make()`, or what it returned before in this run for the very same tensors."""
+    found = _GRAPHS.traced.get(key)
+    if found is None or [*map(id, found[0])] != [*map(id, given)]:
+        found = _GRAPHS.traced[key] = (given, make())
+    return found[1]
 
 
 def _is_opaque(tensor: Tensor) -> bool:

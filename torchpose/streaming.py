@@ -12,7 +12,8 @@ from torchpose.arms import ARMS, generators_of_arms, in_double, joints_of_arm, r
 from torchpose.body_view import memory_frames
 from torchpose.errors import DegenerateFilterWarning, InputError, check_shape
 from torchpose.filters import MixtureKalmanFilter
-from torchpose.filters.base import FilterOutput, Generators, RecursiveFilter, collect
+from torchpose.filters.base import FilterOutput, Generators, RecursiveFilter
+from torchpose.filters.outputs import collect
 from torchpose.measurements import MeasuredJoints, Picked, arm_measurements, pick_joints
 from torchpose.read_out import MotionState
 from torchpose.skeleton import UPPER_BODY

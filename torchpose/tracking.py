@@ -30,7 +30,7 @@ from torchpose.arms import (
 from torchpose.body_view import BodyView
 from torchpose.camera import PinholeCamera
 from torchpose.collapse import note_collapse
-from torchpose.errors import CameraError, InputError, PriorError, check_shape
+from torchpose.errors import CameraError, InputError, PriorError, check_shape, refuse_export
 from torchpose.filters import FilterOutput, MixtureKalmanFilter
 from torchpose.filters.base import Generators, RecursiveFilter
 from torchpose.measurements import (
@@ -255,6 +255,7 @@ class UpperBodyTracker(WideModule):
             ShapeError, InputError: wrong shapes, infinite values, nothing measured in a sequence or
             for longer than `max_gap`. SkeletonError: unknown names.
         """
+        _refuse_export()
         with one_run(self.measurement_cov.device):
             measured, notes = self._measure(keypoints, confidence, names, mask, lengths, covariance)
             sources = generators_of_arms(generator)
@@ -320,6 +321,7 @@ class UpperBodyTracker(WideModule):
         Raises:
             ShapeError, InputError: wrong shapes, infinite values.
         """
+        _refuse_export()
         with one_run(self.measurement_cov.device):
             return streaming.track_frame(self, state, keypoints, confidence, mask, covariance)
 
@@ -344,6 +346,7 @@ class UpperBodyTracker(WideModule):
         Raises:
             ShapeError, InputError: wrong shapes, no frames, infinite values.
         """
+        _refuse_export()
         with one_run(self.measurement_cov.device):
             return streaming.track_frames(self, state, keypoints, confidence, mask, covariance)
 
@@ -551,6 +554,13 @@ class UpperBodyTracker(WideModule):
         window = self._window()
         mode = calibration_mode(self.method) if window is None else window[0]
         return recalibrated(covs, self.prior.noise, mode)
+
+
+def _refuse_export() -> None:
+    refuse_export(
+        "UpperBodyTracker, which chooses its filters by what was measured,",
+        "a step of a filter of torchpose.filters",
+    )
 
 
 def _require_camera(camera: PinholeCamera | None) -> PinholeCamera:

@@ -4,7 +4,6 @@ A filter is a fixed model (buffers) and pure steps over a state, which is a Name
 implements `init` and `advance`; shapes, masks, lengths and failures are handled here.
 """
 
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -15,14 +14,18 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from torchpose.errors import (
-    DegenerateFilterWarning,
     InputError,
     ShapeError,
     check_covariance,
     check_finite,
     check_shape,
 )
-from torchpose.filters.mending import Mending, mending, stacked
+from torchpose.filters.outputs import (
+    FilterOutput,
+    StepOutput,
+    collect,
+    effective_sample_size,
+)
 from torchpose.module_state import (
     WideModule,
     derived,
@@ -30,6 +33,7 @@ from torchpose.module_state import (
     register_given,
     working_precision,
 )
+from torchpose.value_checks import values_visible
 
 __all__ = [
     "FilterOutput",
@@ -44,54 +48,6 @@ __all__ = [
 ]
 
 Generators = torch.Generator | Sequence[torch.Generator] | None
-
-
-class StepOutput(NamedTuple):
-    """The estimate after one time step.
-
-    Attributes:
-        mean: [B, D]. log_weights: of the M tracks or particles, normalised, [B, M].
-        log_evidence: log p(z_t | z_1:t-1), [B]; 0 where nothing is measured, NaN for variants
-            that drop the evidence term. cov: [B, D, D] on request.
-        mended, jitter: as in `FilterOutput`, [B]; None stands for 0.
-    """
-
-    mean: Tensor
-    log_weights: Tensor
-    log_evidence: Tensor
-    cov: Tensor | None = None
-    mended: Tensor | None = None
-    jitter: Tensor | None = None
-
-
-class FilterOutput(NamedTuple):
-    """Estimates of a batch of sequences; past the length of a sequence its last one is repeated.
-
-    Attributes:
-        mean: [B, T, D]. log_weights: [B, T, M], of the estimate, normalised.
-        log_evidence: increments log p(z_t | z_1:t-1) [B, T]; 0 where nothing is measured and past
-            the length, NaN for variants that drop the evidence term.
-        cov: [B, T, D, D], or None unless asked for.
-        failed_at: [B], the first frame at which an element degenerated, -1 where it did not. From
-            that frame on the element's estimates are NaN.
-        mended: number of covariances of the frame's tracks that rounding had made indefinite and
-            that were mended (`torchpose.gaussian.mended_cholesky`), [B, T]; 0 as a rule and past the
-            length.
-        jitter: the largest share by which their variances grew, [B, T], float64; at most 1e-6.
-    """
-
-    mean: Tensor
-    log_weights: Tensor
-    log_evidence: Tensor
-    cov: Tensor | None
-    failed_at: Tensor
-    mended: Tensor | None = None
-    jitter: Tensor | None = None
-
-    @property
-    def effective_sample_size(self) -> Tensor:
-        """1 / sum_j w_j^2 (BL 25), [B, T]."""
-        return effective_sample_size(self.log_weights)
 
 
 class Measurements(NamedTuple):
@@ -116,11 +72,6 @@ class Measurements(NamedTuple):
         """Those of one frame, as sequences of a single frame."""
         cov = self.cov if self.cov.ndim == 2 else self.cov[:, None]
         return Measurements(self.z[:, None], self.mask[:, None], cov, self.lengths)
-
-
-def effective_sample_size(log_weights: Float[Tensor, "*batch M"]) -> Float[Tensor, "*batch"]:
-    """N_eff = 1 / sum_j w_j^2 for normalised log-weights (BL 25)."""
-    return torch.exp(-torch.logsumexp(2 * log_weights, -1))
 
 
 def standard_normal(
@@ -310,17 +261,15 @@ class RecursiveFilter(WideModule, ABC):
             raise InputError(f"z must hold at least one sequence of one frame, got {list(z.shape)}")
         z = z.to(self.observed.device, self.dtype)
         lengths = self._check_lengths(lengths, batch, n_frames)
+        inside = torch.arange(n_frames, device=z.device) < lengths[:, None]
         if mask is None:
-            inside = torch.arange(n_frames, device=z.device) < lengths[:, None]
             mask = inside[..., None].expand(z.shape)
         else:
             if mask.dtype != torch.bool:
                 raise InputError(f"mask must be bool (True = measured), got {mask.dtype}")
             check_shape("mask", mask, list(z.shape))
             mask = mask.to(z.device)
-            if bool((lengths < n_frames).any()):
-                inside = torch.arange(n_frames, device=z.device) < lengths[:, None]
-                mask = mask & inside[..., None]
+            mask = mask & inside[..., None]
         check_finite("z", z, mask, "mark missing values with mask=False")
         z = torch.where(mask, z, torch.zeros_like(z))
         if measurement_cov is None:
@@ -350,71 +299,9 @@ class RecursiveFilter(WideModule, ABC):
             return torch.full((batch,), n_frames, device=device)
         lengths = torch.as_tensor(lengths, device=device)
         check_shape("lengths", lengths, [batch])
-        if lengths.dtype.is_floating_point or bool(((lengths < 1) | (lengths > n_frames)).any()):
+        outside = (lengths < 1) | (lengths > n_frames)
+        if lengths.dtype.is_floating_point or (values_visible() and bool(outside.any())):
             raise InputError(
                 f"lengths must be integers from 1 to {n_frames}, got {lengths.tolist()}"
             )
         return lengths.long()
-
-
-def collect(steps: Sequence[StepOutput], lengths: Int[Tensor, " B"]) -> FilterOutput:
-    """Stack the steps of a run into its output."""
-    cov = None
-    if steps[0].cov is not None:
-        cov = torch.stack([s.cov for s in steps if s.cov is not None], 1)
-    none = mending(steps[0].mean)
-    work = [
-        none if s.mended is None or s.jitter is None else Mending(s.mended, s.jitter) for s in steps
-    ]
-    return finish_output(
-        torch.stack([s.mean for s in steps], 1),
-        torch.stack([s.log_weights for s in steps], 1),
-        torch.stack([s.log_evidence for s in steps], 1),
-        cov,
-        lengths,
-        stacked(work),
-    )
-
-
-def finish_output(
-    mean: Float[Tensor, "B T D"],
-    log_weights: Float[Tensor, "B T M"],
-    log_evidence: Float[Tensor, "B T"],
-    cov: Float[Tensor, "B T D D"] | None,
-    lengths: Int[Tensor, " B"],
-    work: Mending,
-) -> FilterOutput:
-    """Repeat the last estimate past each length, and report the elements that degenerated."""
-    batch, n_frames = log_evidence.shape
-    frames = torch.arange(n_frames, device=mean.device)
-    if bool((lengths < n_frames).any()):
-        held = torch.minimum(frames, lengths[:, None] - 1)
-        rows = torch.arange(batch, device=mean.device)[:, None]
-        mean, log_weights = mean[rows, held], log_weights[rows, held]
-        cov = None if cov is None else cov[rows, held]
-        inside = frames < lengths[:, None]
-        log_evidence = torch.where(inside, log_evidence, torch.zeros_like(log_evidence))
-        work = Mending(*(part * inside for part in work))
-    failed_at = _first_failure(mean)
-    if bool((failed_at >= 0).any()):
-        lost = frames >= failed_at[:, None]
-        lost = lost & (failed_at >= 0)[:, None]
-        log_weights = log_weights.masked_fill(lost[..., None], float("nan"))
-        listed = ", ".join(
-            f"element {b} at frame {int(failed_at[b])}"
-            for b in torch.nonzero(failed_at >= 0).reshape(-1).tolist()[:8]
-        )
-        warnings.warn(
-            f"{int((failed_at >= 0).sum())} of {batch} sequences degenerated ({listed}); "
-            "their estimates are NaN from there on, the others finished. Check the scale of the "
-            "measurements, or widen the measurement covariance",
-            DegenerateFilterWarning,
-            stacklevel=3,
-        )
-    return FilterOutput(mean, log_weights, log_evidence, cov, failed_at, *work)
-
-
-def _first_failure(mean: Float[Tensor, "B T D"]) -> Int[Tensor, " B"]:
-    bad = ~torch.isfinite(mean).all(-1)
-    first = bad.int().argmax(1)
-    return torch.where(bad.any(1), first, torch.full_like(first, -1))

@@ -11,9 +11,10 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose.filters.base import FilterOutput, Measurements, finish_output
+from torchpose.filters.base import FilterOutput, Measurements
 from torchpose.filters.gains import Edge
 from torchpose.filters.mending import mending_of_edges
+from torchpose.filters.outputs import finish_output
 from torchpose.filters.weights import indicator_mixing, steps_between_rescaling
 from torchpose.gaussian import least_exponent
 

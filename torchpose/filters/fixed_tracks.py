@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose.filters.base import FilterOutput, Measurements, StepOutput, collect
+from torchpose.filters.base import FilterOutput, Measurements, StepOutput
 from torchpose.filters.columns import run_columns, suits_columns
 from torchpose.filters.frame_weights import (
     advance_memoryless,
@@ -20,6 +20,7 @@ from torchpose.filters.frame_weights import (
     run_memoryless,
 )
 from torchpose.filters.mending import mending
+from torchpose.filters.outputs import collect
 from torchpose.filters.recompute import recomputed, wants_gradient
 from torchpose.filters.shared_gains import (
     RECOMPUTED_FRAMES,
@@ -31,6 +32,7 @@ from torchpose.filters.tracks import MKFState, estimate_of
 from torchpose.filters.transition import Transition
 from torchpose.filters.weights import mix_uniform, step_weights
 from torchpose.gaussian import Gain, kalman_correct, kalman_gain, symmetrise
+from torchpose.value_checks import values_visible
 
 if TYPE_CHECKING:
     from torchpose.filters.mkf import MixtureKalmanFilter
@@ -108,8 +110,30 @@ def advance(
     model: "MixtureKalmanFilter", state: MKFState, frame: Measurements, return_cov: bool
 ) -> tuple[MKFState, StepOutput]:
     """One step (BL 34-41, 48-49)."""
+    if not values_visible():
+        return _advance_unseen(model, state, frame, return_cov)
     if model.is_memoryless:
         return advance_memoryless(model, state, frame, return_cov)
+    return _advance_tracks(model, state, frame, return_cov)
+
+
+def _advance_unseen(
+    model: "MixtureKalmanFilter", state: MKFState, frame: Measurements, return_cov: bool
+) -> tuple[MKFState, StepOutput]:
+    """One step while nobody may look whether the rate is 0; without medians it makes no difference."""
+    new_state, out = _advance_tracks(model, state, frame, return_cov)
+    if model.gamma is None or not len(model.medians) or not model.weighs_frames_alone:
+        return new_state, out
+    _, alone = advance_memoryless(model, state, frame, return_cov)
+    still = (model.gamma == 0).all()
+    pairs = zip(alone, out, strict=True)
+    chosen = (a if a is None or b is None else torch.where(still, a, b) for a, b in pairs)
+    return new_state, StepOutput(*chosen)  # type: ignore[arg-type]
+
+
+def _advance_tracks(
+    model: "MixtureKalmanFilter", state: MKFState, frame: Measurements, return_cov: bool
+) -> tuple[MKFState, StepOutput]:
     step = step_tracks(model, state, frame, model.transition(state.time))
     weights = step_fixed_weights(model, state, step.log_likelihood, frame)
     return _estimate(model, state, step, *weights, return_cov)
@@ -153,9 +177,10 @@ def distinct_histories(
     state: MKFState, frame: Measurements
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Covariances, groups, masks and noise for the distinct histories of this frame."""
-    if frame.cov.ndim == 3:
+    if frame.cov.ndim == 3 or not values_visible():
         own = torch.arange(frame.z.shape[0], device=frame.z.device)
-        return state.cov[state.group], own, frame.mask[:, None], frame.cov[:, None]
+        noise = frame.cov if frame.cov.ndim == 2 else frame.cov[:, None]
+        return state.cov[state.group], own, frame.mask[:, None], noise
     if state.cov.shape[0] == 1 and bool((frame.mask == frame.mask[:1]).all()):
         return state.cov, state.group, frame.mask[:1, None], frame.cov
     bits = 2 ** torch.arange(frame.mask.shape[1], device=frame.mask.device)

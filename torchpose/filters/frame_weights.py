@@ -14,14 +14,16 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose.filters.base import FilterOutput, Measurements, StepOutput, finish_output
+from torchpose.filters.base import FilterOutput, Measurements, StepOutput
 from torchpose.filters.geometric_median import median_estimate
 from torchpose.filters.mending import Mending, mending
+from torchpose.filters.outputs import finish_output
 from torchpose.filters.recompute import recomputed, wants_gradient
 from torchpose.filters.tracks import MKFState, estimate_of
 from torchpose.filters.weights import normalise
 from torchpose.gaussian import Gain, kalman_gain
 from torchpose.module_state import outside_inference
+from torchpose.value_checks import values_visible
 
 if TYPE_CHECKING:
     from torchpose.filters.mkf import MixtureKalmanFilter
@@ -119,6 +121,11 @@ def advance_memoryless(
     model: "MixtureKalmanFilter", state: MKFState, frame: Measurements, return_cov: bool
 ) -> tuple[MKFState, StepOutput]:
     """One frame of `run_memoryless`."""
+    if not values_visible():
+        (group,) = _groups(frame.as_sequences(), len(frame.z))
+        mean, log_weights, evidence, cov, *work = _estimate(model, group, None, return_cov)
+        step = StepOutput(mean, log_weights, evidence, cov, *work)
+        return state._replace(time=state.time + 1), step
     out = run_memoryless(model, frame.as_sequences(), return_cov, progress=False)
     cov = None if out.cov is None else out.cov[:, 0]
     step = StepOutput(out.mean[:, 0], out.log_weights[:, 0], out.log_evidence[:, 0], cov)
@@ -150,6 +157,10 @@ def _groups(frames: Measurements, at_a_time: int) -> Iterator[_Group]:
     """Frames that measure the same dimensions with the same noise share their gains."""
     z, mask = frames.z.flatten(0, 1), frames.mask.flatten(0, 1)
     noise = None if frames.cov.ndim == 2 else frames.cov.flatten(0, 1)
+    if not values_visible():
+        each = frames.cov if noise is None else noise[:, None]
+        yield _Group(torch.arange(len(z), device=z.device), z, mask[:, None], each)
+        return
     settings = mask if noise is None else torch.cat([mask.to(noise), noise.flatten(1)], 1)
     if noise is not None and noise.requires_grad:
         yield from _groups_of_own(z, mask, noise)

@@ -37,6 +37,7 @@ from torchpose.module_state import (
     wide_or_parameter,
 )
 from torchpose.priors.gmm import GaussianMixture
+from torchpose.value_checks import values_visible
 
 __all__ = ["MKFState", "MixtureKalmanFilter"]
 
@@ -262,7 +263,7 @@ class MixtureKalmanFilter(RecursiveFilter):
         self, frames: Measurements, generator: Generators, return_cov: bool, progress: bool
     ) -> FilterOutput:
         """All frames: fixed tracks share their gains and need no loop where those are constant."""
-        if self.tracks == "fixed":
+        if self.tracks == "fixed" and values_visible():
             return fixed_tracks.run(self, frames, return_cov, progress)
         return super().run(frames, generator, return_cov, progress)
 
@@ -308,7 +309,12 @@ class MixtureKalmanFilter(RecursiveFilter):
     def is_memoryless(self) -> bool:
         """Whether frames do not depend on each other: neither the weights nor the states do."""
         still = self.gamma is not None and bool((self.gamma == 0).all())
-        return self.weighting == "frame" and self.transition_kind == "ou" and still
+        return self.weighs_frames_alone and still
+
+    @property
+    def weighs_frames_alone(self) -> bool:
+        """Whether neither weights nor, at a rate of 0, states depend on the frames before."""
+        return self.weighting == "frame" and self.transition_kind == "ou"
 
     def gain_graph(self, measurement_cov: Tensor) -> GainGraph:
         """The graph of gains for constant R, kept while model and R stay as they are."""

@@ -33,6 +33,7 @@ from torchpose.gaussian import LOG_2PI, mended_cholesky, mended_update, safe_cho
 from torchpose.module_state import derived, register_given, wide_or_parameter
 from torchpose.priors.em import MixtureParameters
 from torchpose.priors.gmm import GaussianMixture
+from torchpose.value_checks import values_visible
 
 __all__ = ["PROPOSALS", "BootstrapParticleFilter", "ParticleState"]
 
@@ -308,12 +309,7 @@ class BootstrapParticleFilter(RecursiveFilter):
         return self._output(new_state, evidence, frame.mask, return_cov, work)
 
     def _output(
-        self,
-        state: ParticleState,
-        evidence: Tensor,
-        mask: Tensor,
-        return_cov: bool,
-        work: Mending,
+        self, state: ParticleState, evidence: Tensor, mask: Tensor, return_cov: bool, work: Mending
     ) -> tuple[ParticleState, StepOutput]:
         mean, cov = self._moments(state.white, state.log_weights, return_cov)
         evidence = self._reported(evidence, mask)
@@ -326,7 +322,7 @@ class BootstrapParticleFilter(RecursiveFilter):
         due = effective_sample_size(state.log_weights) < self.resample_threshold * n
         # drawn for all: what an element draws must not depend on its neighbours
         ancestors = resample(state.log_weights, self.resampling, generator)
-        if not bool(due.any()):
+        if values_visible() and not bool(due.any()):
             return state
         own = torch.arange(n, device=ancestors.device)
         ancestors = torch.where(due[:, None], ancestors, own)

@@ -85,7 +85,7 @@ def residual(
     fraction = (expected - copies).clamp_min(0)
     steps = _steps(log_weights, n)
     kept = copies.cumsum(-1).nan_to_num()
-    whole = torch.searchsorted(kept, steps.expand(len(kept), n).contiguous(), right=True)
+    whole = torch.searchsorted(kept, steps + torch.zeros_like(kept[:, :1]), right=True)
     drawn = _search(fraction, u)
     chosen = torch.where(steps < kept[:, -1:], whole, drawn)
     return torch.where(torch.isfinite(expected).all(-1, keepdim=True), chosen, drawn)
@@ -154,8 +154,9 @@ def _search(weights: Float[Tensor, "B N"], positions: Float[Tensor, "B n"]) -> I
     edges = weights.cumsum(-1)
     # Divided by its own end, the last edge is exactly 1, and right=True steps over zero weights.
     edges = edges / edges[:, -1:]
-    index = torch.searchsorted(edges, positions.clamp_max(BELOW_ONE).contiguous(), right=True)
-    last = weights.shape[1] - 1
     dead = ~torch.isfinite(edges[:, -1:])
+    positions = torch.where(dead, 0.0, positions.clamp_max(BELOW_ONE))
+    index = torch.searchsorted(edges, positions.contiguous(), right=True)
+    last = weights.shape[1] - 1
     steps = torch.arange(index.shape[1], device=index.device).clamp_max(last)
     return torch.where(dead, steps, index.clamp_max(last))

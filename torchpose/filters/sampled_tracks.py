@@ -17,6 +17,7 @@ from torchpose.filters.resampling import systematic
 from torchpose.filters.tracks import MKFState, estimate_of
 from torchpose.filters.weights import normalise
 from torchpose.gaussian import kalman_predict, mended_update
+from torchpose.value_checks import values_visible
 
 if TYPE_CHECKING:
     from torchpose.filters.mkf import MixtureKalmanFilter
@@ -78,7 +79,7 @@ def _resample(
     """Resampled tracks with equal weights, for the elements that need it; all of them draw."""
     resampled = systematic(log_weights, generator)
     needed = effective_sample_size(log_weights) < model.resample_threshold * model.n_tracks
-    if not bool(needed.any()):
+    if values_visible() and not bool(needed.any()):
         return log_weights, mean, cov
     own = torch.arange(model.n_tracks, device=mean.device)
     index = torch.where(needed[:, None], resampled, own)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchpose.errors import InputError
 from torchpose.gaussian import safe_cholesky, symmetrise
+from torchpose.value_checks import values_visible
 
 __all__ = [
     "BURN_IN_SCALE",
@@ -124,7 +125,8 @@ def _scalar_rate(
             "fit it with torchpose.filters.fit_gamma or pass for instance 0.95"
         )
     with torch.no_grad():
-        if bool(((gamma < 0) | (gamma >= 1) | ~torch.isfinite(gamma)).any()):
+        outside = (gamma < 0) | (gamma >= 1) | ~torch.isfinite(gamma)
+        if values_visible() and bool(outside.any()):
             raise InputError(f"gamma must lie in [0, 1), got {gamma.tolist()}")
     rate = gamma.expand(means.shape[0])[:, None, None]
     dim = means.shape[-1]

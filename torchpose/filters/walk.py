@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchpose.gaussian import LOG_2PI, mended_cholesky, safe_cholesky
 from torchpose.priors.em import MixtureParameters
+from torchpose.value_checks import values_visible
 
 __all__ = ["MixtureWalk", "Moves", "grouped_affine"]
 
@@ -77,10 +78,8 @@ class MixtureWalk:
     def log_prior(self, y: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch"]:
         """log Phi (BL 7) at every whitened point."""
         weights = torch.ones_like(self._shrink(0.0))[:, None]
-        out = y.new_empty(y[..., 0].numel())
-        for start, terms in self._terms(y, weights, self.log_norm[None]):
-            out[start : start + terms.shape[-1]] = _log_sum_exp_(terms[0])
-        return out.view(y.shape[:-1])
+        chunks = self._terms(y, weights, self.log_norm[None])
+        return torch.cat([_log_sum_exp_(terms[0]) for terms in chunks]).view(y.shape[:-1])
 
     def log_prior_and_evidence(
         self, y: Float[Tensor, "*batch D"], inflation: float = 1.0
@@ -93,10 +92,9 @@ class MixtureWalk:
         shrink = self._shrink(inflation)
         weights = torch.stack([torch.ones_like(shrink), shrink], 1)
         constant = torch.stack([self.log_norm, self._log_norm(inflation)])
-        out = y.new_empty(2, y[..., 0].numel())
-        for start, terms in self._terms(y, weights, constant):
-            out[:, start : start + terms.shape[-1]] = _log_sum_exp_(terms)
-        return out[0].view(y.shape[:-1]), out[1].view(y.shape[:-1])
+        chunks = self._terms(y, weights, constant)
+        prior, evidence = torch.cat([_log_sum_exp_(terms) for terms in chunks], 1).unbind()
+        return prior.view(y.shape[:-1]), evidence.view(y.shape[:-1])
 
     def choose(
         self, y: Float[Tensor, "*batch D"], u: Float[Tensor, "*batch"], inflation: float = 1.0
@@ -109,16 +107,16 @@ class MixtureWalk:
         """
         weights = self._shrink(inflation)[:, None]
         constant = self._log_norm(inflation)[None]
-        out = torch.empty(u.numel(), dtype=torch.long, device=y.device)
+        chosen, start = [], 0
         triangle = torch.ones(self.n_components, self.n_components, dtype=y.dtype, device=y.device)
         triangle, u = triangle.tril(), u.reshape(-1)
-        for start, terms in self._terms(y, weights, constant):
-            stop = start + terms.shape[-1]
-            logits = terms[0]
+        for terms in self._terms(y, weights, constant):
+            logits, own = terms[0], u[start : start + terms.shape[-1]]
             # a product with a triangle is a cumulative sum, three times as fast
             edges = triangle @ _exp_(logits.sub_(logits.amax(0)))
-            out[start:stop] = (edges <= u[start:stop] * edges[-1]).sum(0)
-        return out.clamp_max_(self.n_components - 1).view(y.shape[:-1])
+            chosen.append((edges <= own * edges[-1]).sum(0))
+            start += terms.shape[-1]
+        return torch.cat(chosen).clamp_max_(self.n_components - 1).view(y.shape[:-1])
 
     def moves(
         self,
@@ -149,7 +147,7 @@ class MixtureWalk:
 
     def _terms(
         self, y: Tensor, weights: Float[Tensor, "K S D"], constant: Float[Tensor, "S K"]
-    ) -> Iterator[tuple[int, Float[Tensor, "S K n"]]]:
+    ) -> Iterator[Float[Tensor, "S K n"]]:
         """Log terms of S mixtures, for chunks of points whose residuals stay in cache."""
         points = y.reshape(-1, self.dim)
         # the row of ones carries the offset: cheaper than adding it to every residual
@@ -159,14 +157,16 @@ class MixtureWalk:
         budget = CHUNK_ELEMENTS if points.device.type == "cpu" else 64 * CHUNK_ELEMENTS
         size = min(max(1, budget // n_rows), points.shape[1])
         # one buffer for all chunks: fresh pages would cost more than the product
-        buffer = points.new_empty(n_rows * size)
-        for start in range(0, points.shape[1], size):
-            chunk = points[:, start : start + size]
-            residual = buffer[: n_rows * chunk.shape[1]].view(n_rows, -1)
-            torch.mm(self.rows, chunk, out=residual)
-            squared = residual.square_().view(self.n_components, self.dim, -1)
+        buffer = points.new_empty(n_rows * size) if values_visible() else None
+        for chunk in points.split(size, 1):
+            if buffer is None:  # vmap writes into nothing that is not in its batch
+                residual = self.rows @ chunk
+            else:
+                residual = buffer[: n_rows * chunk.shape[1]].view(n_rows, -1)
+                torch.mm(self.rows, chunk, out=residual)
+            squared = residual.mul_(residual).view(self.n_components, self.dim, -1)
             quadratic = torch.bmm(weights, squared).transpose(0, 1)
-            yield start, torch.add(constant, quadratic, alpha=-0.5)
+            yield torch.add(constant, quadratic, alpha=-0.5)
 
 
 def grouped_affine(
@@ -182,17 +182,17 @@ def grouped_affine(
     """
     n, n_groups = len(group), len(moves.offset)
     order = group.argsort()
-    count = torch.bincount(group, minlength=n_groups)
+    count = group.new_zeros(n_groups).scatter_add(0, group, group.new_ones(n))
     tiles = (count + TILE - 1) // TILE
     last_tile, last_row = tiles.cumsum(0), count.cumsum(0)
     # from the place of a row in the sorted order to its place in the padded tiles
     padding = (last_tile - tiles) * TILE - (last_row - count)
-    slot = torch.empty_like(order)
-    slot[order] = torch.arange(n, device=x.device) + padding[group[order]]
+    rank = torch.arange(n, device=x.device)
+    slot = torch.empty_like(order).scatter(0, order, rank + padding[group[order]])
     n_tiles = n // TILE + n_groups
-    source = torch.zeros(n_tiles * TILE, dtype=torch.long, device=x.device)
-    source[slot] = torch.arange(n, device=x.device)
-    owner = torch.searchsorted(last_tile, torch.arange(n_tiles, device=x.device), right=True)
+    source = rank.new_zeros(n_tiles * TILE).scatter(0, slot, rank)
+    places = torch.arange(n_tiles, device=x.device) + torch.zeros_like(last_tile[:1])
+    owner = torch.searchsorted(last_tile, places, right=True)
     owner = owner.clamp_max(n_groups - 1)
     rows = x.index_select(0, source).view(n_tiles, TILE, -1)
     out = torch.baddbmm(

@@ -1,0 +1,163 @@
+"""Steps that have no values to look at: exported, compiled, vectorised; the numbers of plain steps."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch.utils import _pytree as pytree
+
+import torchpose
+from tests.filters.traced_steps import (
+    KALMAN,
+    PARTICLES,
+    Run,
+    Step,
+    begun,
+    frames,
+    largest_difference,
+    make,
+    seeded,
+)
+from torchpose.errors import CovarianceError, InputError, ShapeError, check_covariance
+from torchpose.gaussian import mended_cholesky
+from torchpose.value_checks import values_visible
+
+FILTERS = (*KALMAN, *PARTICLES)
+TRACED = (
+    *(f"{way}/{name}" for way in ("eager", "export") for name in ("fixed", "split", "sampled")),
+    "eager/medians",
+    "eager/mixture",
+    "export/mixture",
+    "aot_eager/fixed",
+    "export run/fixed",
+)
+
+
+@pytest.fixture(scope="module")
+def differences():
+    """Of every traced step; in a process without shape checks, which are not for tracing."""
+    root = Path(__file__).parents[2]
+    environment = os.environ | {"PYTHONPATH": str(root), "TORCHPOSE_SHAPE_CHECKS": "0"}
+    command = [sys.executable, "-m", "tests.filters.traced_steps", *TRACED]
+    run = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr[-4000:]
+    return dict(json.loads(line) for line in run.stdout.splitlines())
+
+
+@pytest.mark.parametrize("case", TRACED)
+def test_a_traced_step_has_no_break_and_gives_the_numbers_of_the_plain_one(differences, case):
+    assert differences[case] <= 1e-12
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_without_value_checks_steps_give_the_same_numbers(name):
+    model, (z, mask) = make(name), frames()
+    state = unseen = seeded(model.init, 3)
+    for now in zip(z, mask, strict=True):
+        state, out = seeded(Step(model), state, *now)
+        with torchpose.without_value_checks():
+            unseen, found = seeded(Step(model), unseen, *now)
+        assert largest_difference(found, out) <= 1e-12
+
+
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("with_states", [False, True])
+def test_vmap_of_two_steps_is_a_loop(name, with_states):
+    model, (z, mask) = make(name), frames()
+    leaves, spec = pytree.tree_flatten(begun(model))
+    start = [leaf for leaf in leaves if isinstance(leaf, torch.Tensor)]
+
+    def estimates(z, mask, *tensors):
+        rest = iter(tensors)
+        whole = [next(rest) if isinstance(leaf, torch.Tensor) else leaf for leaf in leaves]
+        state = pytree.tree_unflatten(whole, spec)
+        for _ in range(2):
+            state, out = Step(model)(state, z, mask)
+        return tuple(out)
+
+    def moved(tensor, k):
+        return tensor + k * 0.01 if tensor.is_floating_point() and tensor.ndim == 3 else tensor
+
+    many = [[moved(x, k) if with_states else x for x in start] for k in range(3)]
+    looped = [seeded(estimates, z[k], mask[k], *many[k]) for k in range(3)]
+    states = [torch.stack(x) for x in zip(*many, strict=True)] if with_states else start
+    dims = (0, 0, *(0 if with_states else None for _ in start))
+    with torchpose.without_value_checks():
+        vectorised = torch.func.vmap(estimates, dims, randomness="same")
+        found = seeded(vectorised, z[:3], mask[:3], *states)
+    expected = [torch.stack(x) for x in zip(*looped, strict=True)]
+    assert largest_difference(found, expected) <= 1e-12
+
+
+@pytest.mark.parametrize("name", ["fixed", "memoryless", "sampled", "mixture"])
+def test_vmap_of_a_run_is_a_loop(name):
+    run, (z, mask) = Run(make(name)), (x.transpose(0, 1) for x in frames())
+    many = torch.stack([z, z + 0.5]), torch.stack([mask, ~mask])
+    expected = [
+        torch.stack(x)
+        for x in zip(*(seeded(run, *x) for x in zip(*many, strict=True)), strict=True)
+    ]
+    with torchpose.without_value_checks():
+        found = seeded(torch.func.vmap(run, randomness="same"), *many)
+    assert largest_difference(found, expected) <= 1e-12
+
+
+def test_values_are_seen_again_after_the_context_and_after_an_error_in_it():
+    bad = -torch.eye(2)
+    with pytest.raises(CovarianceError):
+        check_covariance("R", bad)
+    with pytest.raises(KeyError), torchpose.without_value_checks():
+        check_covariance("R", bad)
+        with torchpose.without_value_checks():
+            assert not values_visible()
+        assert not values_visible()
+        with pytest.raises(ShapeError):
+            check_covariance("R", bad[0])
+        raise KeyError
+    assert values_visible()
+    with pytest.raises(CovarianceError):
+        check_covariance("R", bad)
+
+
+def test_what_was_made_without_checks_is_checked_by_those_who_see():
+    model, (z, mask) = make("fixed"), frames()
+    model.measurement_cov.neg_()
+    with torchpose.without_value_checks():
+        _, out = model.step(model.init(3), z[0], mask[0])
+    assert torch.isnan(out.mean).any()
+    with pytest.raises(CovarianceError):
+        model.step(model.init(3), z[0], mask[0])
+
+
+def test_unseen_matrices_are_mended_alike():
+    thin = torch.outer(*2 * (torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64),))
+    good = thin + torch.eye(3, dtype=torch.float64)
+    matrices = torch.stack([good, thin, -good, torch.zeros_like(thin)])
+    seen = mended_cholesky(matrices)
+    with torchpose.without_value_checks():
+        unseen = mended_cholesky(matrices)
+        each = torch.func.vmap(mended_cholesky)(matrices)
+        assert mended_cholesky(good)[1].item() == 0.0
+    assert largest_difference(unseen, seen) == 0.0
+    assert largest_difference(each, seen) == 0.0
+
+
+def test_a_tracker_that_chooses_by_what_it_measured_says_that_it_cannot_be_exported():
+    prior = torchpose.load_prior("kinect-upper-body")
+    tracker = torchpose.UpperBodyTracker(prior, camera=prior.camera)
+    keypoints = torch.full((1, 2, 3, 2), 240.0)
+
+    class Poses(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.tracker = tracker
+
+        def forward(self, keypoints):
+            return self.tracker(keypoints, names=["head", "hand_left", "hand_right"]).joints3d
+
+    with pytest.raises(InputError, match=r"UpperBodyTracker.*cannot be exported"):
+        torch.export.export(Poses(), (keypoints,))

@@ -1,0 +1,124 @@
+"""Steps of filters that are exported or compiled, against the plain steps; run without shape checks.
+
+`python -m tests.filters.traced_steps` prints a line for each: its name and the largest difference.
+"""
+
+import json
+import sys
+import warnings
+
+import torch
+from torch import nn
+from torch.utils import _pytree as pytree
+
+import torchpose
+from tests.filters.oracles import tensor
+from tests.filters.small_problem import OBSERVED, Problem
+from torchpose.filters import BootstrapParticleFilter
+
+SEED = 5
+KALMAN = {
+    "fixed": {},
+    "power and reset": {"likelihood_power": 0.5, "reset_below": -700.0},
+    "weighted by frames": {"weighting": "frame"},
+    "memoryless": {"weighting": "frame", "transition": "ou", "gamma": 0.0},
+    "medians": {"weighting": "frame", "transition": "ou", "gamma": 0.0, "medians": [1]},
+    "split": {"tracks": "split"},
+    "sampled": {"tracks": "sampled", "resample_threshold": 0.9},
+}
+PARTICLES = ("mixture", "random-walk", "random-walk-unscaled")
+
+
+def problem():
+    return Problem(batch=3, n_frames=4, seed=2)
+
+
+def make(name):
+    """A small filter by its name."""
+    p = problem()
+    if name in KALMAN:
+        return p.filter(**KALMAN[name])
+    model = p.mixture(), tensor(p.process), tensor(p.noise), OBSERVED
+    options = {"n_particles": 50, "dtype": torch.float64}
+    return BootstrapParticleFilter(*model, proposal=name, **options)
+
+
+def frames():
+    """z and mask, time first."""
+    p = problem()
+    return tensor(p.z).transpose(0, 1), torch.as_tensor(p.mask).transpose(0, 1)
+
+
+def seeded(function, *arguments):
+    torch.manual_seed(SEED)
+    return function(*arguments)
+
+
+def begun(model):
+    """A state after one step whose elements have covariances of their own."""
+    z, mask = frames()
+    with torchpose.without_value_checks():
+        return seeded(lambda: model.step(model.init(3), z[0], mask[0])[0])
+
+
+class Step(nn.Module):
+    def __init__(self, model):
+        super().__init__()
+        self.model = model
+
+    def forward(self, state, z, mask):
+        return self.model.step(state, z, mask, return_cov=True)
+
+
+def largest_difference(found, expected):
+    """Of all tensors of two trees; infinite where they are not alike."""
+    pairs = zip(pytree.tree_leaves(found), pytree.tree_leaves(expected), strict=True)
+    largest = 0.0
+    for a, b in pairs:
+        if not isinstance(b, torch.Tensor):
+            continue
+        if a.shape != b.shape or a.dtype != b.dtype:
+            return float("inf")
+        apart = (a.double() - b.double()).abs()
+        apart = torch.where(torch.isnan(a.double()) & torch.isnan(b.double()), 0.0, apart)
+        largest = max(largest, float(apart.nan_to_num(torch.inf).max()))
+    return largest
+
+
+class Run(nn.Module):
+    def __init__(self, model):
+        super().__init__()
+        self.model = model
+
+    def forward(self, z, mask):
+        return tuple(self.model(z, mask, return_cov=True))
+
+
+def run_difference(name):
+    """Between all frames that were exported and plain ones."""
+    run, sequences = Run(make(name)), [x.transpose(0, 1) for x in frames()]
+    exported = torch.export.export(run, tuple(sequences)).module()
+    return largest_difference(seeded(exported, *sequences), seeded(run, *sequences))
+
+
+def difference(way, name):
+    """Between a step that was traced on one frame and the plain step, on another frame."""
+    if way == "export run":
+        return run_difference(name)
+    model, (z, mask) = make(name), frames()
+    state, step = begun(model), Step(model)
+    if way == "export":
+        traced = torch.export.export(step, (state, z[1], mask[1])).module()
+    else:
+        torch.compiler.reset()
+        traced = torch.compile(step, fullgraph=True, backend=way)
+        traced(state, z[1], mask[1])
+    # the plain step gives covariances to histories, not to elements
+    expected = seeded(step, state, z[2], mask[2])[1]
+    return largest_difference(seeded(traced, state, z[2], mask[2])[1], expected)
+
+
+if __name__ == "__main__":
+    warnings.simplefilter("error")
+    for case in sys.argv[1:]:
+        print(json.dumps([case, difference(*case.split("/"))]), flush=True)

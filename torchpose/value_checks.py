@@ -1,0 +1,47 @@
+"""Whether values may be looked at: the switch for what cannot be exported, compiled or vectorised.
+
+Checks of values raise errors that name the element at fault, and some computations are left out where
+values show that they would change nothing. Both need the numbers, which there are none of while a
+function is traced.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+import torch
+
+__all__ = ["values_visible", "without_value_checks"]
+
+_HIDDEN: ContextVar[bool] = ContextVar("torchpose_values_hidden", default=False)
+
+
+@contextmanager
+def without_value_checks() -> Iterator[None]:
+    """Switch off checks of values, and branches on them, for `torch.func.vmap` and the like.
+
+    A step of a filter inside it depends on the shapes of its arguments alone and returns the same
+    numbers, for which it computes more: every element of a batch has covariances of its own. Shapes
+    are still checked. What is NaN, infinite or not a covariance raises nothing and comes out as NaN.
+
+    `torch.compile` and `torch.export` see the step so without it.
+
+    Example:
+        >>> import torch, torchpose
+        >>> from torchpose.errors import check_finite
+        >>> with torchpose.without_value_checks():
+        ...     check_finite("z", torch.tensor(float("nan")))
+    """
+    if torch.compiler.is_compiling():
+        yield
+        return
+    token = _HIDDEN.set(True)
+    try:
+        yield
+    finally:
+        _HIDDEN.reset(token)
+
+
+def values_visible() -> bool:
+    """Return whether values may be looked at: not while traced, nor in `without_value_checks`."""
+    return not (torch.compiler.is_compiling() or _HIDDEN.get())
