@@ -68,7 +68,6 @@ def test_smoothed_weights_are_the_enumeration_of_the_chain_of_indicators(epsilon
         {},
         {"uniform_weight": 0.0},
         {"likelihood_power": 0.3},
-        {"reset_below": -4.0},
         {"weighting": "frame", "transition": "ou", "gamma": 0.5},
         {"weighting": "frame", "transition": "ou", "gamma": 0.0, "medians": [1]},
     ],

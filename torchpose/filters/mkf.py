@@ -286,8 +286,8 @@ class MixtureKalmanFilter(RecursiveFilter):
             `FilterOutput` with smoothed mean, weights and covariance, and the filter's log-evidence.
 
         Raises:
-            InputError: tracks are not fixed, they have settings of the filter alone (`reset_below`,
-            `medians`), or lag is negative; else as `forward`.
+            InputError: tracks are not fixed, their weights may be reset (`reset_below`), or lag is
+            negative; else as `forward`.
 
         Reference:
             H. Rauch, F. Tung, C. Striebel (1965); see `smooth_fixed_tracks`.
@@ -296,10 +296,10 @@ class MixtureKalmanFilter(RecursiveFilter):
             raise InputError(
                 f"smoothing needs tracks='fixed', whose tracks have a past each, got {self.tracks!r}"
             )
-        if self.reset_below is not None or len(self.medians):
+        if self.reset_below is not None:
             raise InputError(
-                "reset_below and medians are of filtered estimates: smoothing uses neither, got "
-                f"reset_below={self.reset_below} and {len(self.medians)} medians"
+                "smoothing goes back along the weights, which a reset cuts off, got "
+                f"reset_below={self.reset_below}; leave it out"
             )
         with one_run(self.observed.device):
             frames = self.check(z, mask, measurement_cov, lengths, None)
