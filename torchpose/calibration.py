@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchpose.errors import InputError, check_shape
 from torchpose.gaussian import log_prob, safe_cholesky
+from torchpose.metric_arguments import as_pair, as_values
 
 __all__ = [
     "Coverage",
@@ -51,6 +52,7 @@ def chi2_cdf(x: Float[Tensor, "*batch"], dof: int = 3) -> Float[Tensor, "*batch"
     >>> chi2_cdf(torch.tensor([7.8147]))
     tensor([0.9500])
     """
+    x = as_values("x", x, ["..."])
     half = torch.full_like(x, dof / 2)
     return torch.special.gammainc(half, x.clamp_min(0) / 2)
 
@@ -66,8 +68,9 @@ def chi2_quantile(p: Float[Tensor, "*batch"], dof: int = 3) -> Float[Tensor, "*b
     >>> chi2_quantile(torch.tensor([0.5, 0.9], dtype=torch.float64))
     tensor([2.3660, 6.2514], dtype=torch.float64)
     """
+    p = as_values("p", p, ["..."])
     if not bool(((p >= 0) & (p <= 1)).all()):
-        raise InputError(f"p must be probabilities in [0, 1], got {p.tolist()}")
+        raise InputError(f"p must be probabilities in [0, 1], got {p.tolist()!s:.120}")
     wide = p.double()
     # Over the radius, which resolves the small quantiles better than its square.
     low, high = torch.zeros_like(wide), torch.full_like(wide, (100.0 + 10.0 * dof) ** 0.5)
@@ -90,9 +93,10 @@ def mahalanobis_squared(
     Returns:
         [*batch, J]; NaN where masked, where anything is NaN, and where C is not positive definite.
     """
+    estimate, truth = as_pair(estimate, truth, mask, ["...", None, None])
     dim = estimate.shape[-1]
-    check_shape("truth", truth, ["...", estimate.shape[-2], dim])
-    check_shape("covariance", covariance, ["...", estimate.shape[-2], dim, dim])
+    check_shape("covariance", covariance, [*estimate.shape, dim])
+    covariance = as_values("covariance", covariance, ["...", None, None]).to(estimate)
     known = torch.isfinite(covariance).all(-1).all(-1)
     eye = torch.eye(dim, dtype=covariance.dtype, device=covariance.device)
     factor = safe_cholesky(torch.where(known[..., None, None], covariance, eye))
@@ -124,7 +128,7 @@ def coverage(
     Returns:
         `Coverage`; joints whose distance is NaN (see `mahalanobis_squared`) are left out.
     """
-    check_shape("estimate", estimate, ["...", None, None])
+    estimate = as_values("estimate", estimate, ["...", None, None])
     nominal = torch.as_tensor(levels, dtype=torch.float64, device=estimate.device)
     squared = mahalanobis_squared(estimate, covariance, truth, mask)
     flat = squared.reshape(-1, squared.shape[-1])
@@ -167,7 +171,11 @@ def predictive_log_likelihood(
     Returns:
         [*batch], nats; NaN where `value` is NaN.
     """
-    check_shape("value", value, ["...", means.shape[-1]])
+    means = as_values("means", means, ["...", None, None])
+    *batch, count, dim = means.shape
+    covariance = as_values("covariance", covariance, [*batch, count, dim, dim]).to(means)
+    value = as_values("value", value, [*batch, dim]).to(means)
+    log_weights = as_values("log_weights", log_weights, [*batch, count]).to(means)
     log_weights = torch.log_softmax(log_weights, -1)
     each = log_prob(value[..., None, :], means, safe_cholesky(covariance))
     return torch.logsumexp(log_weights + each, -1)

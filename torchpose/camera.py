@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose.errors import CameraError, FileFormatError, InputError
+from torchpose.errors import CameraError, FileFormatError, InputError, check_floating
 from torchpose.projection import (
     backproject,
     check_intrinsics,
@@ -187,6 +187,7 @@ class PinholeCamera(nn.Module):
 
     def forward(self, points: Float[Tensor, "... J 3"]) -> Float[Tensor, "... J 3"]:
         """(u, v, lambda) of world points [..., J, 3] by K, rotation and translation (BL 3)."""
+        check_floating("points", points)
         K, R, t = (m.to(points) for m in (self.matrix, self.rotation_matrix, self.translation))
         return project(points, K, R, t)
 

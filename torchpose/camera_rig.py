@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from torchpose.camera import PinholeCamera, load_cameras
-from torchpose.errors import CameraError, InputError, check_shape
+from torchpose.errors import CameraError, InputError, check_floating, check_shape
 
 __all__ = ["CameraRig", "Cameras", "RigView", "as_rig", "scale_matrix", "undistortion_maps"]
 
@@ -107,6 +107,7 @@ class CameraRig(nn.Module):
 
         Reference: Burke & Lasenby, equation (3).
         """
+        check_floating("points", points)
         check_shape("points", points, ["...", "N", 3])
         K, R, t = (b.to(points) for b in (self.matrix, self.rotation, self.translation))
         homogeneous = points.unsqueeze(-3) @ (K @ R).mT + (K @ t.unsqueeze(-1)).mT

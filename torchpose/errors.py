@@ -28,6 +28,7 @@ __all__ = [
     "TorchposeError",
     "check_covariance",
     "check_finite",
+    "check_floating",
     "check_grey",
     "check_rate",
     "check_rgb",
@@ -160,6 +161,15 @@ def check_finite(name: str, tensor: Tensor, where: Tensor | None = None, hint: s
         count = int(bad.sum())
         message = f"{name} must be finite, got {value} at index {index} ({count} such values)"
         raise InputError(f"{message}; {hint}" if hint else message)
+
+
+def check_floating(name: str, tensor: Any) -> None:
+    """Raise `InputError` unless `tensor` holds real floating-point numbers."""
+    if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
+        kind = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
+        raise InputError(
+            f"{name} must be a floating-point tensor, got {kind}; convert it with .double()"
+        )
 
 
 def check_rgb(name: str, image: Any, empty: bool = True) -> None:

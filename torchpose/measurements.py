@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose.errors import InputError, check_covariance, check_finite, check_shape
+from torchpose.errors import InputError, check_covariance, check_finite, check_floating, check_shape
 from torchpose.priors.neck import KINECT_NECK, NeckFraction
 from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.skeleton import ARM_JOINTS, UPPER_BODY, upper_body_indices
@@ -204,6 +204,7 @@ def measure_joints(
         check_shape("mask", mask, list(measured.shape))
         measured = measured & mask.to(measured.device, torch.bool)
     if confidence is not None:
+        check_floating("confidence", confidence)
         check_shape("confidence", confidence, list(measured.shape))
         confidence = confidence.to(measured.device)
         _check_confidence(confidence, measured)

@@ -27,6 +27,7 @@ from torchpose.calibration import (
     reliability,
 )
 from torchpose.errors import InputError, check_shape
+from torchpose.metric_arguments import as_pair, as_values
 
 __all__ = [
     "ALIGN_JOINTS",
@@ -106,8 +107,7 @@ def procrustes(
     >>> procrustes(square, square + 1).translation
     tensor([1., 1., 1.])
     """
-    check_shape("source", source, ["...", None, 3])
-    check_shape("target", target, ["...", source.shape[-2], 3])
+    source, target = as_pair(source, target, mask, ["...", None, 3], ("source", "target"))
     use = torch.isfinite(source).all(-1) & torch.isfinite(target).all(-1)
     if mask is not None:
         use = use & mask
@@ -152,7 +152,7 @@ def align(
     Reference: Burke & Lasenby, section 6 ("aligning the head, neck and shoulders using fixed scale
     Procrustes analysis").
     """
-    check_shape("estimate", estimate, ["...", None, 3])
+    estimate, truth = as_pair(estimate, truth, mask, ["...", None, 3])
     chosen = list(range(estimate.shape[-2])) if joints is None else list(joints)
     if len(chosen) < 3 or not all(0 <= j < estimate.shape[-2] for j in chosen):
         raise InputError(
@@ -162,7 +162,8 @@ def align(
     motion = procrustes(estimate[..., chosen, :], truth[..., chosen, :], part)
     points = estimate @ motion.rotation.mT + motion.translation[..., None, :]
     if covariance is not None:
-        check_shape("covariance", covariance, ["...", estimate.shape[-2], 3, 3])
+        check_shape("covariance", covariance, [*estimate.shape, 3])
+        covariance = as_values("covariance", covariance, ["...", None, None]).to(points)
         turn = motion.rotation[..., None, :, :]
         covariance = turn @ covariance @ turn.mT
     return Alignment(points, covariance, motion)
@@ -202,8 +203,7 @@ def joint_errors(
         [*batch, J] in the input's unit; NaN where masked or where either side is NaN, to be
         averaged with `summarise_errors`, which leaves those out and counts the others.
     """
-    check_shape("estimate", estimate, ["...", None, None])
-    check_shape("truth", truth, ["...", estimate.shape[-2], estimate.shape[-1]])
+    estimate, truth = as_pair(estimate, truth, mask, ["...", None, None])
     errors = torch.linalg.vector_norm(estimate - truth, dim=-1)
     return errors if mask is None else errors.masked_fill(~mask, math.nan)
 
@@ -241,8 +241,9 @@ def joint_errors_3d(
 
 def summarise_errors(errors: Float[Tensor, "*batch J"]) -> ErrorSummary:
     """Mean of all errors pooled and per joint, NaN left out (and NaN where nothing is left)."""
-    check_shape("errors", errors, ["...", None])
+    errors = as_values("errors", errors, ["...", None])
     flat = errors.reshape(-1, errors.shape[-1])
+    flat = flat if len(flat) else flat.new_full((1, errors.shape[-1]), math.nan)
     count = torch.isfinite(flat).sum(0)
     mean = flat.nanmean(0)
     std = (flat - mean).square().nanmean(0).sqrt()
@@ -260,7 +261,7 @@ def share_below(
     >>> share_below(torch.tensor([[0.1], [0.3], [math.nan]]), 0.2)
     (tensor([0.5000]), tensor([2]))
     """
-    check_shape("errors", errors, ["...", None])
+    errors = as_values("errors", errors, ["...", None])
     flat = errors.reshape(-1, errors.shape[-1])
     count = (~flat.isnan()).sum(0)
     return (flat < bound).sum(0) / count.to(errors.dtype), count
@@ -293,9 +294,13 @@ def limb_hits(
     mask: Bool[Tensor, "*batch J"] | None = None,
 ) -> tuple[Bool[Tensor, "*batch L P"], Bool[Tensor, "*batch L"]]:
     """Which limbs are correct at which threshold, and which have a known truth; see `pcp`."""
-    check_shape("estimate", estimate, ["...", None, None])
-    check_shape("truth", truth, ["...", estimate.shape[-2], estimate.shape[-1]])
+    estimate, truth = as_pair(estimate, truth, mask, ["...", None, None])
+    thresholds = as_values("thresholds", thresholds, ["P"])
     ends = torch.tensor(limbs, device=estimate.device).reshape(-1, 2)
+    if not len(ends) or not bool(((ends >= 0) & (ends < estimate.shape[-2])).all()):
+        raise InputError(
+            f"limbs must be pairs of joints below {estimate.shape[-2]}, got {ends.tolist()!s:.120}"
+        )
     a, b = ends.unbind(-1)
     length = torch.linalg.vector_norm(truth[..., a, :] - truth[..., b, :], dim=-1)
     errors = torch.linalg.vector_norm(estimate - truth, dim=-1)
@@ -337,6 +342,7 @@ def pcp(
     >>> pcp(true + torch.tensor([0.0, 3.0]), true, [0.2, 0.5], [(0, 1)]).overall
     tensor([0., 1.])
     """
+    estimate, truth = as_pair(estimate, truth, mask, ["...", None, None])
     levels = torch.as_tensor(thresholds, dtype=truth.dtype, device=truth.device)
     hits, known = limb_hits(estimate, truth, levels, limbs, mask)
     hits, known = hits.reshape(-1, *hits.shape[-2:]), known.reshape(-1, known.shape[-1])
@@ -365,7 +371,7 @@ def jitter(points: Float[Tensor, "*batch T J D"], fps: float) -> Float[Tensor, "
     >>> round(float(jitter(3 * time**2, fps=10.0)), 3)
     6.0
     """
-    check_shape("points", points, ["...", None, None, None])
+    points = as_values("points", points, ["...", None, None, None])
     if points.shape[-3] < 3 or not fps > 0:
         raise InputError(
             f"jitter needs three frames or more and fps > 0, got {points.shape[-3]} frames "

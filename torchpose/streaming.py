@@ -10,7 +10,7 @@ from torch import Tensor
 from torchpose.arm_windows import SeenInView, pose_of_window, window_inputs
 from torchpose.arms import ARMS, generators_of_arms, in_double, joints_of_arm, require_cov
 from torchpose.body_view import memory_frames
-from torchpose.errors import DegenerateFilterWarning, InputError, check_shape
+from torchpose.errors import DegenerateFilterWarning, InputError, check_floating, check_shape
 from torchpose.filters import MixtureKalmanFilter
 from torchpose.filters.base import FilterOutput, Generators, RecursiveFilter
 from torchpose.filters.outputs import collect
@@ -159,6 +159,7 @@ def track_frames(
 ) -> tuple[StreamState, "PoseTrack"]:
     """Some more frames of every stream; see `UpperBodyTracker.advance`."""
     stream, batch = state.stream, len(state.unseen)
+    check_floating("keypoints", keypoints)
     check_shape("keypoints", keypoints, [batch, "T", stream.n_keypoints, 2])
     n_frames = keypoints.shape[1]
     if n_frames == 0:

@@ -1,6 +1,5 @@
 """The main job: 2D keypoints of head, neck and hands to 2D and 3D poses of eight joints."""
 
-import math
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -30,7 +29,15 @@ from torchpose.arms import (
 from torchpose.body_view import BodyView
 from torchpose.camera import PinholeCamera
 from torchpose.collapse import note_collapse
-from torchpose.errors import CameraError, InputError, PriorError, check_shape, refuse_export
+from torchpose.errors import (
+    CameraError,
+    InputError,
+    PriorError,
+    check_floating,
+    check_rate,
+    check_shape,
+    refuse_export,
+)
 from torchpose.filters import FilterOutput, MixtureKalmanFilter
 from torchpose.filters.base import Generators, RecursiveFilter
 from torchpose.measurements import (
@@ -360,6 +367,7 @@ class UpperBodyTracker(WideModule):
         covariance: Tensor | None,
     ) -> tuple[MeasuredJoints, tuple[str, ...]]:
         """The eight joints in the prior's pixels, checked; and what was assumed."""
+        check_floating("keypoints", keypoints)
         check_shape("keypoints", keypoints, ["B", "T", "J", 2])
         keypoints = keypoints.to(self.measurement_cov)
         if keypoints.shape[0] == 0 or keypoints.shape[1] == 0:
@@ -587,8 +595,8 @@ def _check_settings(
         raise InputError(f"frame must be 'camera' or 'body', got {frame!r}")
     if static_camera and frame == "body":
         raise InputError("static_camera needs frame='camera': the body's axes know no camera")
-    if fps is not None and not (fps > 0 and math.isfinite(fps)):
-        raise InputError(f"fps must be positive, got {fps}")
+    if fps is not None:
+        check_rate("fps", fps)
     wrong_lag = isinstance(smoothing, int) and smoothing < 0
     if wrong_lag or (isinstance(smoothing, str) and smoothing != "full"):
         raise InputError(f"smoothing must be None, a number of frames or 'full', got {smoothing!r}")

@@ -94,15 +94,12 @@ def _poses(path: Path) -> None:
     _need(not bool(track.log_evidence.isposinf().any()), "log_evidence is infinite")
     _rate(track.fps)
     _words("notes", track.notes)
-    there = _finite_or_lost("joints3d", track.joints3d, 2)
-    _need(
-        bool((there == _finite_or_lost("joints2d", track.joints2d, 2)).all()), "joints2d are lost"
-    )
+    there = _finite_or_lost("joints3d", track.joints3d)
     _covariance("covariance3d", track.covariance3d, there)
-    _covariance("covariance2d", track.covariance2d, there)
+    _covariance("covariance2d", track.covariance2d, _finite_or_lost("joints2d", track.joints2d))
     for b in range(batch):
         failed = int(track.failed_at[b])
-        _need(failed < 0 or not bool(there[b, failed]), "failed_at a pose that is there")
+        _need(failed < 0 or not bool(there[b, failed].all()), "failed_at a pose that is there")
     _need(len(track.sequence(0)) == 1, "sequence")
 
 
@@ -208,7 +205,7 @@ def _prior(path: Path) -> None:
     _finite(prior)
     _json_facts(prior.info)
     for side in (prior.left, prior.right):
-        _need(bool((torch.linalg.eigvalsh(side.covariances) > 0).all()), "covariances")
+        _covariance("covariances", side.covariances, torch.ones(side.n_components) > 0)
         _need(side.means.shape[-1] == 21, "dimensions")
     _need(bool(prior.camera.matrix.isfinite().all()), "camera")
     for name, value in prior.noise.items():
@@ -218,8 +215,8 @@ def _prior(path: Path) -> None:
 
 
 def _models(path: Path) -> None:
-    load = {"manifold": BackConstrainedGPLVM, "limbs": LimbConditionals, "space": ActionSpace,
-            "bank": ActionBank}[path.stem.split(".")[0]]  # fmt: skip
+    kinds = {"manifold": BackConstrainedGPLVM, "limbs": LimbConditionals, "space": ActionSpace}
+    load = kinds.get(path.stem, ActionBank)
     model = load.load(path)
     unknown = ("std_latent", "std_pose", "std_step") if load is BackConstrainedGPLVM else ()
     _finite(model, unknown)

@@ -190,7 +190,7 @@ def _cameras(path: Path) -> None:
 def _manifold(path: Path) -> None:
     body = Body.of_height(BODY_15, 1.7)
     info = ManifoldInfo.of_body(body, name="walk", fps=60.0, persons=("a",))
-    BackConstrainedGPLVM.fit([motion(40), motion(30)], steps=1, info=info).save(path)
+    BackConstrainedGPLVM.fit([motion(20), motion(15)], steps=1, info=info).save(path)
 
 
 def _limbs(path: Path) -> None:

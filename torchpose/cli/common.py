@@ -5,7 +5,7 @@ import re
 import signal
 import sys
 import textwrap
-from argparse import RawDescriptionHelpFormatter
+from argparse import ArgumentError, RawDescriptionHelpFormatter
 from collections.abc import Callable, Iterable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any, Generic, Self, TypeVar
 
 from jsonargparse import ActionConfigFile, ArgumentParser, Namespace
 
-from torchpose.errors import InputError
+from torchpose.errors import InputError, printable
 
 __all__ = [
     "UntilInterrupted",
@@ -29,6 +29,7 @@ __all__ = [
 ]
 
 T = TypeVar("T")
+_SEED_DIGITS = 18  # so that it stays one of 64 bits when a little is added
 
 _COMMON = """\
 exit codes: 0 done; 1 done, but the result is not good; 2 refused, with one line on stderr
@@ -65,7 +66,7 @@ def new_parser(command: str, description: str, examples: str) -> ArgumentParser:
 def add_seed(parser: ArgumentParser, of: str) -> None:
     """Add --seed; `of` says what it is the seed of."""
     parser.add_argument(
-        "--seed", type=int, default=0, metavar="N", help=f"seed of {of} (default 0)"
+        "--seed", type=_seed, default=0, metavar="N", help=f"seed of {of} (default 0)"
     )
 
 
@@ -81,6 +82,17 @@ def _is_file(word: str) -> bool:
         return Path(word).is_file()
     except (OSError, ValueError):  # too long, or with a zero byte
         return False
+
+
+def _seed(value: Any) -> int:
+    """A whole number that generators take."""
+    text = str(value)
+    if not (text.isascii() and text.isdigit() and len(text) <= _SEED_DIGITS):
+        raise ArgumentError(
+            None,
+            f"--seed must be a whole number of at most {_SEED_DIGITS} digits, got {text!r:.60}",
+        )
+    return int(text)
 
 
 def positive(name: str, value: float | None) -> None:
@@ -99,7 +111,7 @@ def one_line(error: BaseException) -> str:
         names = (missing[1] or missing[2]).split(", ")
         options = (_POSITIONALS.get(name, f"--{name}") for name in names)
         text = f"missing: {', '.join(options)}; see --help for examples"
-    return text
+    return printable(text)
 
 
 class UntilInterrupted(Generic[T]):

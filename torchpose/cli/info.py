@@ -1,5 +1,6 @@
 """`torchpose info`: the version, the priors that are there, and what a file holds."""
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,9 @@ torchpose info walk
 torchpose info limbs.safetensors
 torchpose info result/poses.npz
 torchpose info keypoints.csv"""
+
+_SNIFFED = 65536  # characters of a table that tell what it is
+_NAME = 60  # characters of what stands on the left
 
 
 def main(arguments: list[str]) -> int:
@@ -80,7 +84,9 @@ def _describe(what: str) -> str:
     from torchpose.priors import known_priors, load_prior
 
     path = Path(what)
-    files = _models_of(what) or ([path] if path.suffix == ".safetensors" and path.is_file() else [])
+    files = _models_of(what) or (
+        [path] if path.suffix == ".safetensors" and os.path.isfile(path) else []
+    )
     if files and what not in known_priors():
         from torchpose.cli.info_models import DESCRIBED
         from torchpose.priors.tensor_file import format_of
@@ -89,7 +95,7 @@ def _describe(what: str) -> str:
         tables = [_table(describe(file)) for describe, file in found if describe is not None]
         if tables:
             return "\n\n".join(tables)
-    if what in known_priors() or path.suffix == ".safetensors" or not path.exists():
+    if what in known_priors() or path.suffix == ".safetensors" or not os.path.exists(path):
         return describe_prior(load_prior(what))
     if path.suffix == ".toml":
         return _describe_cameras(path)
@@ -115,9 +121,10 @@ def _models_of(name: str) -> list[Path]:
 
 def _describe_npz(path: Path) -> str:
     """Poses, recordings or keypoints, by the keys."""
-    from torchpose.io import read_keypoints, read_npz
+    from torchpose.io import read_keypoints
+    from torchpose.io.npz import npz_keys
 
-    keys = set(read_npz(path, optional=None))
+    keys = set(npz_keys(path))
     if {"state", "body_frame"} <= keys:
         from torchpose.cli.info_models import describe_body_poses
 
@@ -256,8 +263,12 @@ def _describe_cameras(path: Path) -> str:
 
 def _starts_as_keypoints(path: Path) -> bool:
     """Whether the first line that is no comment is a header, as keypoints have and Kinect has not."""
-    with path.open(encoding="utf-8-sig", errors="replace") as stream:
-        first = next((line for line in stream if line.strip() and not line.startswith("#")), "")
+    from torchpose.io.reading import reading, require_file
+
+    path = require_file(path)
+    with reading(path, "a table"), path.open(encoding="utf-8-sig", errors="replace") as stream:
+        lines = stream.read(_SNIFFED).splitlines()
+    first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
     return first.lower().startswith("frame")
 
 
@@ -271,7 +282,10 @@ def _length(n_frames: int, fps: float | None) -> str:
 
 def _table(facts: dict[str, str]) -> str:
     """Lines of a name and a value, further lines of which are indented; empty ones are left out."""
-    rows = {name: value for name, value in facts.items() if value}
+    from torchpose.errors import printable
+
+    rows = {printable(name, _NAME): value.split("\n") for name, value in facts.items() if value}
     width = max(len(name) for name in rows) + 2
-    rows = {name: value.replace("\n", "\n" + " " * width) for name, value in rows.items()}
-    return "\n".join(f"{name:<{width}}{value}" for name, value in rows.items())
+    lines = {name: [printable(line) for line in value] for name, value in rows.items()}
+    indent = "\n" + " " * width
+    return "\n".join(f"{name:<{width}}{indent.join(value)}" for name, value in lines.items())

@@ -43,6 +43,7 @@ __all__ = [
     "StepOutput",
     "as_covariance",
     "effective_sample_size",
+    "require_state",
     "standard_normal",
     "uniform",
 ]
@@ -104,6 +105,8 @@ def as_covariance(name: str, value: Tensor, dim: int, trailing: int = 2) -> Tens
     Raises:
         ShapeError, InputError, CovarianceError.
     """
+    if isinstance(value, Tensor) and value.is_complex():
+        raise InputError(f"{name} must be real, got {value.dtype}")
     value = torch.as_tensor(value, dtype=torch.float64)
     if value.ndim == trailing - 1:
         check_shape(name, value, ["...", dim])
@@ -126,6 +129,27 @@ def given_covariance(name: str, value: Tensor, dim: int, trailing: int = 2) -> T
     """
     covariance = as_covariance(name, value, dim, trailing)
     return value if isinstance(value, nn.Parameter) else covariance
+
+
+def require_state(state: Any, kind: type, field: str, shape: Sequence[int | None]) -> None:
+    """Raise unless a state is of a kind, with a tensor of this shape; for `check_state`.
+
+    Raises:
+        InputError: of another filter. ShapeError: of another batch, or of a filter of another size.
+    """
+    if not isinstance(state, kind):
+        raise InputError(
+            f"state must be a {kind.__name__} from this filter's init or step, got {type(state).__name__}"
+        )
+    found = getattr(state, field)
+    if not isinstance(found, Tensor):
+        raise InputError(f"state.{field} must be a tensor, got {type(found).__name__}")
+    try:
+        check_shape(f"state.{field}", found, shape)
+    except ShapeError as error:
+        raise ShapeError(
+            f"{error}, for this filter and the {shape[0]} elements of z; begin with init({shape[0]})"
+        ) from error
 
 
 class RecursiveFilter(WideModule, ABC):
@@ -172,6 +196,9 @@ class RecursiveFilter(WideModule, ABC):
     ) -> tuple[Any, StepOutput]:
         """One time step on checked measurements of one frame."""
 
+    def check_state(self, state: Any, batch: int) -> None:
+        """Raise unless a state is one of this filter's, of so many elements; filters may leave it out."""
+
     def step(
         self,
         state: Any,
@@ -196,6 +223,7 @@ class RecursiveFilter(WideModule, ABC):
             ShapeError, InputError, CovarianceError: as `forward`.
         """
         check_shape("z", z, ["B", self.observed.numel()])
+        self.check_state(state, len(z))
         if measurement_cov is not None and measurement_cov.ndim == 3:
             measurement_cov = measurement_cov[:, None]
         mask = None if mask is None else mask[:, None]
@@ -300,7 +328,8 @@ class RecursiveFilter(WideModule, ABC):
         lengths = torch.as_tensor(lengths, device=device)
         check_shape("lengths", lengths, [batch])
         outside = (lengths < 1) | (lengths > n_frames)
-        if lengths.dtype.is_floating_point or (values_visible() and bool(outside.any())):
+        numbers = lengths.dtype.is_floating_point or lengths.is_complex()
+        if numbers or (values_visible() and bool(outside.any())):
             raise InputError(
                 f"lengths must be integers from 1 to {n_frames}, got {lengths.tolist()}"
             )

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,6 +18,7 @@ from torchpose.filters.base import (
     StepOutput,
     as_covariance,
     given_covariance,
+    require_state,
 )
 from torchpose.filters.frame_weights import FrameGains
 from torchpose.filters.gains import GainGraph
@@ -248,6 +250,13 @@ class MixtureKalmanFilter(RecursiveFilter):
             torch.zeros(batch_size, dtype=torch.long, device=device),
             0,
         )
+
+    def check_state(self, state: Any, batch: int) -> None:
+        """Raise unless a state is one of this filter's, of so many elements."""
+        tracks = (
+            None if self.tracks == "split" else self.n_tracks
+        )  # which are first one per component
+        require_state(state, MKFState, "mean", (batch, tracks, self.dim))
 
     def advance(
         self, state: MKFState, frame: Measurements, generator: Generators, return_cov: bool

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,6 +17,7 @@ from torchpose.filters.base import (
     as_covariance,
     effective_sample_size,
     given_covariance,
+    require_state,
     standard_normal,
     uniform,
 )
@@ -237,6 +238,10 @@ class BootstrapParticleFilter(RecursiveFilter):
         weights = self.weights.double().expand(batch_size, -1)
         white = self._draw(weights, self._constants().initial, generator)
         return self._evenly(white, 0)
+
+    def check_state(self, state: Any, batch: int) -> None:
+        """Raise unless a state is one of this filter's, of so many elements."""
+        require_state(state, ParticleState, "white", (batch, self.n_particles, self.dim))
 
     def _draw(
         self, weights: Float[Tensor, "B K"], moves: Moves, generator: Generators

@@ -73,7 +73,7 @@ def reading(path: str | Path, expected: str) -> Iterator[None]:
         raise FileFormatError(f"{path}: expected {expected}; it is nested too deeply") from error
     except _DAMAGE as error:
         raise FileFormatError(
-            f"{path}: expected {expected}; it is truncated, damaged or of another kind "
+            f"{path}: expected {expected}; it is truncated or of another kind, or damaged "
             f"({_reason(error)})"
         ) from error
 

@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchpose.errors import FileFormatError, InputError, check_finite, check_shape
+from torchpose.io.estimates import check_number_range
+from torchpose.io.reading import reading
 from torchpose.priors.action_chain import chain_step, chain_transition, check_chain, evidence_share
 from torchpose.priors.action_file import BANK_FILE, BankInfo
 from torchpose.priors.action_gate import (
@@ -288,13 +290,16 @@ class ActionBank(nn.Module):
                 of another kind. SkeletonError: limbs of other names.
         """
         info, tensors = read_tensors(path, BANK_FILE)
-        check_limbs(info.limbs)
+        with reading(path, "a bank of actions"):
+            check_limbs(info.limbs)
+            _check_settings(info)
         if len(info.names) != len(tensors["mean"]):
             raise FileFormatError(
                 f"{path}: expected a name for each of {len(tensors['mean'])} actions, got "
                 f"{len(info.names)}; fit the bank again"
             )
-        _check_settings(info)
+        for name, size in zip(BANK_FILE.indices, tensors["performance"].shape[1:], strict=True):
+            check_number_range(path, name, tensors[name], 1, size)
         bank = cls.__new__(cls)
         nn.Module.__init__(bank)
         bank.info = info

@@ -82,6 +82,7 @@ SPACE_FILE = FileKind(
         "variances": "D",
         "lost_variance": "",
     },
+    positive=("std", "match_std"),
 )
 """Files of `ActionSpace`."""
 
@@ -101,5 +102,6 @@ BANK_FILE = FileKind(
         "background_std": "36",
     },
     indices={"n_postures": "A", "n_dimensions": "A"},
+    positive=("std", "match_std", "residual_std", "background_std"),
 )
 """Files of `ActionBank`."""

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchpose.errors import InputError, PriorError, check_finite, check_shape
+from torchpose.io.reading import reading
 from torchpose.priors.action_file import SPACE_FILE, ActionInfo
 from torchpose.priors.action_fit import fit_action
 from torchpose.priors.action_gate import (
@@ -331,7 +332,8 @@ class ActionSpace(nn.Module):
             SkeletonError: limbs of other names.
         """
         info, tensors = read_tensors(path, SPACE_FILE)
-        return cls(**tensors, info=info)
+        with reading(path, "an action space"):
+            return cls(**tensors, info=info)
 
     def check_for(self, limbs: Sequence[str]) -> None:
         """Raise `PriorError` unless the postures are of these limbs."""

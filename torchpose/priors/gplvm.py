@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchpose.errors import FileFormatError, InputError, ShapeError, check_finite, check_shape
+from torchpose.io.reading import reading
 from torchpose.priors import gplvm_prediction
 from torchpose.priors.gplvm_fit import GPLVMFit, best_fit, median_gamma
 from torchpose.priors.gplvm_kernel import KernelParameters
@@ -365,13 +366,16 @@ class BackConstrainedGPLVM(nn.Module):
         """
         info, kept = read_manifold(path)
         kernel = KernelParameters(*kept["log_kernel"].unbind())
-        try:
-            manifold = cls(
-                kept["poses"], kept["lengths"], kept["weights"], kept["bias"], kept["gamma_x"],
-                kernel, scale=kept["scale"], info=info,
-            )  # fmt: skip
-        except (InputError, ShapeError) as error:
-            raise FileFormatError(f"{path}: {error}") from error
+        with reading(path, "a manifold"):
+            try:
+                manifold = cls(
+                    kept["poses"], kept["lengths"], kept["weights"], kept["bias"], kept["gamma_x"],
+                    kernel, scale=kept["scale"], info=info,
+                )  # fmt: skip
+            except (InputError, ShapeError) as error:
+                raise FileFormatError(f"{path}: {error}") from error
+        if not all(bool(b.isfinite().all()) for b in (manifold.latents, *manifold._prepared)):
+            raise FileFormatError(f"{path}: its numbers make no manifold; fit it again")
         for name in MotionNoise._fields:
             getattr(manifold, name).copy_(kept[name])
         return manifold

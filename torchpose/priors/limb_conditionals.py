@@ -18,7 +18,8 @@ from torch import Tensor, nn
 from torchpose.body.kinematics import Body, centres_of
 from torchpose.body.quaternion_vectors import compose, conjugate, vector_to_quaternion
 from torchpose.body.skeleton import BodySkeleton
-from torchpose.errors import InputError, PriorError, check_finite, check_shape
+from torchpose.errors import InputError, PriorError, check_finite, check_rate, check_shape
+from torchpose.io.reading import reading
 from torchpose.module_state import derived, register_given
 from torchpose.priors.tensor_file import FileKind, read_tensors, write_tensors
 from torchpose.rotation_gaussians import (
@@ -86,6 +87,7 @@ _KIND = FileKind(
         "diffusion": "P 3 3", "growth": "P",
     },
     indices={"edges": "E 2"},
+    covariances=("covariance", "diffusion"),
 )  # fmt: skip
 
 
@@ -154,6 +156,10 @@ class LimbConditionals(nn.Module):
         super().__init__()
         n_parts, n_edges = len(info.parts), edges.shape[0]
         check_shape("edges", edges, [None, 2])
+        if bool(((edges < 0) | (edges >= n_parts)).any()):
+            raise PriorError(
+                f"edges must be between the {n_parts} parts of `info`, got {edges.tolist()!s:.120}"
+            )
         if bool((edges == 0).any()):
             raise PriorError(
                 f"the root part {info.parts[0]!r} conditions all others and has no edges; leave it "
@@ -336,7 +342,8 @@ class LimbConditionals(nn.Module):
         info, tensors = read_tensors(path, _KIND)
         edges = tensors.pop("edges")
         plain = {name: value.double() for name, value in tensors.items()}
-        return cls(info, edges, **plain, directions="eigen")
+        with reading(path, "limb conditionals"):
+            return cls(info, edges, **plain, directions="eigen")
 
     def extra_repr(self) -> str:
         rescaled = self.info.fps != self.info.fitted_fps
@@ -422,8 +429,7 @@ def _check_body_frame(body: Body) -> None:
 
 
 def _check_rate(fps: float) -> None:
-    if not 0 < fps < float("inf"):
-        raise InputError(f"fps must be positive and finite, got {fps}")
+    check_rate("fps", fps)
 
 
 def _steps(turns: Sequence[Tensor], stride: int) -> Tensor | None:

@@ -143,6 +143,8 @@ _KIND = FileKind(
         "log_kernel": "4", "std_latent": "d", "std_pose": "Q", "std_step": "Q",
     },
     indices={"lengths": "S"},
+    positive=("scale", "gamma_x", "std_latent", "std_pose", "std_step"),
+    unknown=("std_latent", "std_pose", "std_step"),
 )  # fmt: skip
 TENSORS = (*_KIND.tensors, *_KIND.indices)  # names of those that a manifold's file holds
 

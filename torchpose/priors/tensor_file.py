@@ -6,8 +6,10 @@ belong in it. `write_tensors` and `read_tensors` do the rest.
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from types import NoneType, UnionType
@@ -18,8 +20,17 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from torchpose.errors import FileFormatError, OutputError, PriorError, TorchposeError
-from torchpose.io.files import atomic_path, require_file
+from torchpose.errors import (
+    FileFormatError,
+    OutputError,
+    PriorError,
+    check_covariance,
+    check_finite,
+    check_rate,
+)
+from torchpose.io.fields import sizes_fit
+from torchpose.io.files import atomic_path
+from torchpose.io.reading import reading, require_file
 
 __all__ = [
     "FileKind",
@@ -31,6 +42,7 @@ __all__ = [
     "write_tensors",
 ]
 
+_LARGEST = 2**63  # of whole numbers in facts
 _HEADER = "torchpose"  # one key: the order of several is not reproducible in safetensors
 Info = TypeVar("Info")
 
@@ -46,6 +58,8 @@ class FileKind(Generic[Info]):
         tensors: sizes of each floating-point tensor by its name, such as {"mean": "E 3",
             "covariance": "E 3 3"}; a letter stands for the same size in all of them.
         indices: the same of tensors of whole numbers. Where both are empty any tensors will do.
+        positive, covariances: which tensors hold deviations or scales, and which covariances.
+        unknown: which tensors are NaN, as a whole, as long as they are not known; all others are finite.
     """
 
     format: str
@@ -54,6 +68,9 @@ class FileKind(Generic[Info]):
     older: tuple[int, ...] = ()
     tensors: Mapping[str, str] = field(default_factory=dict)
     indices: Mapping[str, str] = field(default_factory=dict)
+    positive: tuple[str, ...] = ()
+    covariances: tuple[str, ...] = ()
+    unknown: tuple[str, ...] = ()
 
     @property
     def words(self) -> str:
@@ -106,24 +123,17 @@ def read_tensors(path: str | Path, kind: FileKind[Info]) -> tuple[Info, dict[str
             dataclass does not allow the facts.
     """
     path = require_file(path)
-    try:
-        with safe_open(path, framework="pt") as file:
+    with reading(path, f"{kind.words} as safetensors ({kind.format})"):
+        with _opened(path) as file:
             metadata = file.metadata() or {}
             tensors: dict[str, Tensor] = {
                 key: file.get_tensor(key)
                 for key in file.keys()  # noqa: SIM118
             }
         header = json.loads(metadata.get(_HEADER, "null"))
-    except (SafetensorError, OSError, ValueError, RuntimeError) as error:
-        raise FileFormatError(
-            f"{path}: expected {kind.words} as safetensors ({kind.format}); the file is truncated or "
-            f"of another kind ({error})"
-        ) from error
-    try:
         info = info_from_json(kind.info, _checked_info(header, kind))
         _check_tensors(tensors, kind)
-    except TorchposeError as error:
-        raise type(error)(f"{path}: {error}") from error
+        _check_values(tensors, kind)
     return info, tensors
 
 
@@ -134,12 +144,22 @@ def format_of(path: str | Path) -> str | None:
         InputError: no such file.
     """
     try:
-        with safe_open(require_file(path), framework="pt") as file:
+        with _opened(require_file(path)) as file:
             header = json.loads((file.metadata() or {}).get(_HEADER, "null"))
-    except (SafetensorError, OSError, ValueError, RuntimeError):
+    except (ValueError, OSError, RuntimeError):
         return None
     found = header.get("format") if isinstance(header, dict) else None
     return found if isinstance(found, str) else None
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """A file of safetensors; what its library raises becomes a `ValueError`."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            yield file
+    except SafetensorError as error:
+        raise ValueError(str(error)) from error
 
 
 def require_tensor(path: str | Path, tensors: Mapping[str, Tensor], key: str) -> Tensor:
@@ -174,8 +194,8 @@ def info_from_json(cls: type[Info], text: str) -> Info:
     """
     what = f"in the JSON of a {cls.__name__}"
     try:
-        values = json.loads(text)
-    except ValueError as error:
+        values = json.loads(text, parse_constant=_no_number, parse_float=_finite)
+    except (ValueError, RecursionError) as error:
         raise FileFormatError(f"expected the JSON of a {cls.__name__}: {error}") from error
     if not isinstance(values, dict):
         raise FileFormatError(f"expected the JSON of a {cls.__name__}, got {text!r:.60}")
@@ -186,8 +206,10 @@ def info_from_json(cls: type[Info], text: str) -> Info:
             raise FileFormatError(
                 f"unknown field {key!r} {what}, known are {', '.join(known)}; use a torchpose that fits"
             )
-        if not isinstance(value, _json_types(hints[key])):
+        if not _fits(value, hints[key]):
             raise FileFormatError(f"bad value of {key} {what}: {value!r:.60}")
+        if key == "fps" and value is not None:
+            check_rate(f"fps {what}", value)
     return cls(**{k: _tuples(v) if isinstance(v, list) else v for k, v in values.items()})
 
 
@@ -218,31 +240,70 @@ def _check_tensors(tensors: Mapping[str, Tensor], kind: FileKind[Any]) -> None:
         )
     letters: dict[str, int] = {}
     for name, text in expected.items():
-        tensor, sizes = tensors[name], text.split()
+        tensor = tensors[name]
         whole = not (
             tensor.is_floating_point() or tensor.is_complex() or tensor.dtype == torch.bool
         )
         if not (whole if name in kind.indices else tensor.is_floating_point()):
             numbers = "whole" if name in kind.indices else "floating-point"
             raise FileFormatError(f"expected {numbers} numbers in {name}, got {tensor.dtype}")
-        fits = tensor.ndim == len(sizes) and all(
-            (int(size) if size.isdigit() else letters.setdefault(size, found)) == found
-            for size, found in zip(sizes, tensor.shape, strict=True)
-        )
-        if not fits:
+        if not sizes_fit(text, tuple(tensor.shape), letters):
             known = ", ".join(f"{letter} = {size}" for letter, size in letters.items())
             raise FileFormatError(
-                f"expected the sizes [{', '.join(sizes)}] of {name}, got {list(tensor.shape)}"
+                f"expected the sizes [{', '.join(text.split())}] of {name}, got {list(tensor.shape)}"
                 + (f" where {known}" if known else "")
             )
 
 
-def _json_types(hint: Any) -> Any:
-    """What a value of this type is when it comes from JSON, for `isinstance`."""
-    origin = get_origin(hint) or hint
+def _check_values(tensors: Mapping[str, Tensor], kind: FileKind[Any]) -> None:
+    """Raise unless the numbers are finite, deviations positive and covariances some."""
+    for name, tensor in tensors.items():
+        if name in kind.unknown and bool(tensor.isnan().all()):
+            continue
+        if tensor.is_floating_point():
+            check_finite(name, tensor, hint="the file is damaged; fit it again")
+        if name in kind.positive and not bool((tensor > 0).all()):
+            raise FileFormatError(
+                f"{name} must be positive, got {float(tensor.min()):g}; fit it again"
+            )
+        if name in kind.covariances:
+            check_covariance(name, _inflated(tensor.double()))
+
+
+def _inflated(cov: Tensor) -> Tensor:
+    """A little larger, so that what has no extent in some direction passes for a covariance."""
+    size = cov.abs().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(torch.float32).tiny)
+    return cov + 1e-7 * size * torch.eye(cov.shape[-1], dtype=cov.dtype)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value from JSON is of a type, with all that it holds."""
+    origin, parts = get_origin(hint) or hint, get_args(hint)
     if origin in (Union, UnionType):
-        return tuple(_json_types(part) for part in get_args(hint))
-    return {tuple: list, float: (float, int), None: NoneType, Any: object}.get(origin, origin)
+        return any(_fits(value, part) for part in parts)
+    if origin is tuple:
+        return isinstance(value, list) and (not parts or all(_fits(v, parts[0]) for v in value))
+    if origin is dict:
+        return isinstance(value, dict)
+    if origin is Any:
+        return True
+    if origin is float:
+        whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) < _LARGEST
+        return whole or isinstance(value, float)
+    if origin is int:
+        return isinstance(value, int) and not isinstance(value, bool) and abs(value) < _LARGEST
+    return value is None if origin is NoneType else isinstance(value, origin)
+
+
+def _no_number(text: str) -> float:
+    raise ValueError(f"{text} is no number of JSON")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if math.isinf(number):
+        raise ValueError(f"{text:.40} is beyond double precision")
+    return number
 
 
 def _tuples(value: Any) -> Any:

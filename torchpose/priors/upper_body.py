@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -20,7 +21,8 @@ from torchpose.errors import (
     check_covariance,
     check_finite,
 )
-from torchpose.io.files import read_npz
+from torchpose.io.npz import read_npz
+from torchpose.io.reading import reading
 from torchpose.module_state import register_given
 from torchpose.priors.arm_state import (
     STATE_DIM,
@@ -32,6 +34,7 @@ from torchpose.priors.arm_state import (
 )
 from torchpose.priors.gmm import GaussianMixture
 from torchpose.priors.prior_file import PriorInfo, read_prior, write_prior
+from torchpose.priors.prior_noise import check_noise
 from torchpose.priors.samplers import ArmSource, all_samples
 from torchpose.priors.tensor_file import require_tensor
 from torchpose.priors.training import TRAINING_VIEWS, RecordingLike, arm_sources, collect_poses
@@ -111,13 +114,15 @@ class UpperBodyPrior(nn.Module):
         """Store a tensor of learnt noise under a name.
 
         Raises:
-            InputError: not a finite floating-point tensor, or the name is no identifier.
+            InputError: not a finite floating-point tensor, one that noise of this name cannot be, or
+                the name is no identifier.
         """
         if not name.isidentifier():
             raise InputError(f"a name of noise must be an identifier, got {name!r}")
         if not isinstance(value, Tensor) or not value.is_floating_point():
             raise InputError(f"noise {name} must be a floating-point tensor, got {value!r:.60}")
         check_finite(f"noise {name}", value)
+        check_noise(name, value)
         register_given(self, f"noise_{name}", value)
         if name not in self._noise_names:
             self._noise_names.append(name)
@@ -216,6 +221,13 @@ class UpperBodyPrior(nn.Module):
                 version. PriorError: other skeleton, unknown rotation order.
         """
         info, tensors = read_prior(path)
+        with reading(path, "a prior"):
+            return cls._of_tensors(path, info, tensors)
+
+    @classmethod
+    def _of_tensors(
+        cls, path: str | Path, info: PriorInfo, tensors: Mapping[str, Tensor]
+    ) -> UpperBodyPrior:
         left, right = (_mixture(path, side, tensors) for side in _SIDES)
         noise = {
             key.removeprefix("noise."): value.to(torch.float64)
@@ -364,10 +376,14 @@ def load_prior(name_or_path: str | Path) -> UpperBodyPrior:
     Raises:
         PriorError: neither a known name nor a file. FileFormatError: a damaged or foreign file.
     """
+    if not isinstance(name_or_path, str | Path):
+        raise PriorError(
+            f"expected the name of a prior or a .safetensors file, got {name_or_path!r:.60}"
+        )
     shipped = WEIGHTS / f"{name_or_path}.safetensors"
     if str(name_or_path) in known_priors():
         return UpperBodyPrior.load(shipped)
-    if Path(name_or_path).is_file():
+    if os.path.isfile(name_or_path):
         return UpperBodyPrior.load(name_or_path)
     names = ", ".join(known_priors()) or "none in this installation"
     raise PriorError(

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol, runtime_checkable
 
-from torchpose.errors import FileFormatError, InputError
+from torchpose.errors import FileFormatError, InputError, check_rate
 from torchpose.video.base import VideoFrame, VideoSource
 
 __all__ = ["CameraSource", "Capture"]
@@ -52,10 +52,8 @@ class CameraSource(VideoSource):
         super().__init__(f"camera {index}")
         if index < 0:
             raise InputError(f"the number of a camera is 0 or more, got {index}")
-        if fps is not None and not 0 < fps < float("inf"):
-            raise InputError(
-                f"fps must be positive, got {fps:g}; leave it out for the camera's own"
-            )
+        if fps is not None:
+            check_rate("fps", fps)
         self._capture = (capture or _open)(index)
         try:
             self._prepare(index, fps)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchpose.errors import FileFormatError, InputError
+from torchpose.errors import FileFormatError, check_rate
 from torchpose.io.files import require_file
 from torchpose.video.base import Image, VideoFrame, VideoSource
 from torchpose.video.probe import Scan, is_cover, open_container, scan_packets
@@ -50,9 +50,10 @@ class FileSource(VideoSource):
 
     def __init__(self, path: str | Path, fps: float | None = None) -> None:
         super().__init__(str(path))
-        if fps is not None and not 0 < fps < float("inf"):
-            raise InputError(f"fps must be positive, got {fps:g}; leave it out for the file's own")
-        self.path, self._wanted = require_file(path), fps
+        self.path, self._wanted = (
+            require_file(path),
+            None if fps is None else check_rate("fps", fps),
+        )
         self._closed = True  # until there is something to close
         scan = self._scan()
         self._container, self._stream = open_container(self.path)

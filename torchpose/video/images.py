@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchpose.errors import FileFormatError, InputError
+from torchpose.errors import FileFormatError, InputError, check_rate
 from torchpose.video.base import Image, VideoFrame, VideoSource
 
 __all__ = ["FolderSource", "find_images", "natural_key"]
@@ -68,10 +68,7 @@ class FolderSource(VideoSource):
 
     def __init__(self, folder: str | Path, fps: float | None = None) -> None:
         super().__init__(str(folder))
-        if fps is not None and not 0 < fps < float("inf"):
-            raise InputError(
-                f"fps must be positive, got {fps:g}; leave it out for {_DEFAULT_FPS:g}"
-            )
+        fps = None if fps is None else check_rate("fps", fps)
         self.folder, self._wanted = Path(folder), fps
         self._paths = find_images(folder)
         self.n_frames, self.fps = len(self._paths), fps or _DEFAULT_FPS

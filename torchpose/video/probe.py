@@ -46,7 +46,8 @@ def open_container(path: Path) -> tuple["av.container.InputContainer", "av.Video
     import av
 
     try:
-        container = av.open(str(path.absolute()))
+        # titles are in any encoding, and nobody needs them here
+        container = av.open(str(path.absolute()), metadata_errors="replace")
     except av.FFmpegError as error:
         raise FileFormatError(f"{path}: {_why_not(path, error)}") from error
     try:

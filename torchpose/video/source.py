@@ -1,5 +1,6 @@
 """Open a video, whatever it is: a file, a folder of images, or a camera."""
 
+import os
 from pathlib import Path
 
 from torchpose.errors import InputError
@@ -46,13 +47,13 @@ def open_video(
         raise InputError(f"kind must be one of {', '.join(_KINDS)} or None, got {kind!r}")
     text, path = str(where), Path(where)
     digits = text.isascii() and text.isdigit()
-    if kind == "camera" or (kind is None and digits and not path.exists()):
+    if kind == "camera" or (kind is None and digits and not os.path.exists(path)):
         if not digits:
             raise InputError(f"a camera is given by its number, 0 or more; got {text!r}")
         return CameraSource(int(text), fps)
-    if kind == "folder" or (kind is None and path.is_dir()):
+    if kind == "folder" or (kind is None and os.path.isdir(path)):
         return FolderSource(path, fps)
-    if not path.exists():
+    if not os.path.exists(path):
         raise InputError(f"{text}: no such file or folder; a camera is given by its number")
     if not (path.is_file() or path.is_dir()):
         raise InputError(f"{text}: is a device or a pipe; a camera is given by its number")
