@@ -17,6 +17,15 @@ if os.environ.get("TORCHPOSE_SHAPE_CHECKS", "1") != "0":
     install_import_hook("torchpose", "tests.shape_checks.check_after_call")
 
 
+def pytest_addoption(parser):
+    parser.addoption(
+        "--fuzz-seconds",
+        type=float,
+        default=30.0,
+        help="processor time for damaged files and odd calls (tests/fuzz; default 30)",
+    )
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _one_thread():
     """Timings and sums that do not depend on the number of cores; xdist runs processes instead."""

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from tests.priors.poses import poses
+from torchpose import body_view
 from torchpose.body_view import (
     MEMORY,
     PathModel,
@@ -174,3 +175,24 @@ def test_a_hand_of_before_is_carried_along_with_the_body():
     left = uv[0, 30:50, 0] - uv[0, 40:60, 0]
     assert (carried - uv[0, 40:, 0]).norm(dim=-1).max() < 0.25 * left.norm(dim=-1).min()
     assert math.isclose(float(path.carried(uv[:, :, 0], 0)[0, 5, 0]), float(uv[0, 5, 0, 0]))
+
+
+@pytest.mark.parametrize("variance", [False, True])
+def test_patterns_at_a_time_are_bounded_and_change_nothing(monkeypatch, variance):
+    """At 1,000 frames per second the covariance of a second's pixels has four million numbers."""
+    uv, mask = scene(40)
+    own = 4 + uv[..., 3, :].abs() / 100 if variance else None
+    before = body_path(uv, mask, (0, 4), 2, 30.0, MODEL, variance=own)
+    seen = []
+    weights = body_view._Regression.weights
+
+    def counted(self, known, more):
+        seen.append(len(known) * len(self.measured) ** 2)
+        return weights(self, known, more)
+
+    monkeypatch.setattr(body_view._Regression, "weights", counted)
+    monkeypatch.setattr(body_view, "_NUMBERS_AT_A_TIME", 50_000)
+    after = body_path(uv, mask, (0, 4), 2, 30.0, MODEL, variance=own)
+    torch.testing.assert_close(after.neck, before.neck)
+    torch.testing.assert_close(after.height, before.height)
+    assert len(seen) > 5 and max(seen) <= 50_000

@@ -43,7 +43,7 @@ _FARTHER, _NEARER = (0.15, 0.25), (0.3, 0.5)
 _REACH = 0.8  # metres from the neck to a hand, at most
 _BESIDE = 0.05  # radians beside the usual place, up to which the camera is not turned
 _LARGEST_ZOOM = 6.0
-_FRAMES_AT_A_TIME = 4096
+_FRAMES_AT_A_TIME, _NUMBERS_AT_A_TIME = 4096, 1 << 24
 
 
 class PathModel(NamedTuple):
@@ -131,7 +131,9 @@ def body_path(
     frames = torch.cat([torch.where(known > 0, anchors, 0.0), known, more * known], -1)
     frames = torch.nn.functional.pad(frames, (0, 0, 0, 0, past - start, ahead))
     batch, n_frames, width = uv.shape[0], uv.shape[1] - start, past + ahead + 1
-    step = max(1, (_FRAMES_AT_A_TIME if variance is None else _FRAMES_AT_A_TIME // 8) // batch)
+    most = _FRAMES_AT_A_TIME if variance is None else _FRAMES_AT_A_TIME // 8
+    most = min(most, _NUMBERS_AT_A_TIME // (2 * width) ** 2)  # a covariance for each pattern
+    step = max(1, most // batch)
     parts = []
     for first in range(0, n_frames, step):
         span = slice(first, min(first + step, n_frames) + width - 1)

@@ -94,3 +94,22 @@ def test_written_command_lines_parse(line, monkeypatch, tmp_path):
         words[words.index("--config") + 1] = str(config)
     assert main_function(words) == 0
     assert parsed or {"--help", "--version", "--print_config"} & {*words}
+
+
+@pytest.mark.parametrize("seed", ["-1", str(2**64), "9" * 5000, "1.5", "x", ""])
+def test_seeds_that_no_generator_takes(torchpose, files, tmp_path, seed):
+    done = torchpose("track", files / "keypoints.npz", "--out", tmp_path / "out", "--seed", seed)
+    assert done.code == 2 and "--seed" in done.err and len(done.err.splitlines()) == 1
+    assert len(done.err) < 1500
+
+
+def test_a_prior_that_is_null(torchpose, files, tmp_path):
+    config = tmp_path / "track.yaml"
+    config.write_text(f"input: {files / 'keypoints.npz'}\nout: {tmp_path / 'out'}\nprior: null\n")
+    done = torchpose("track", "--config", config)
+    assert done.code == 2 and len(done.err.splitlines()) == 1
+
+
+def test_a_rate_that_no_camera_has(torchpose, files, tmp_path):
+    done = torchpose("track", files / "keypoints.npz", "--out", tmp_path / "out", "--fps", "10000")
+    assert done.code == 2 and "at most 1000 frames per second" in done.err

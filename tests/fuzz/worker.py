@@ -8,7 +8,6 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections import Counter
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -22,7 +21,7 @@ from torchpose.errors import DegenerateFilterWarning, TorchposeError
 
 __all__ = ["KINDS", "main"]
 
-KINDS = (*SAMPLES, "info", "calls")
+KINDS = (*SAMPLES, "info", "calls")  # as in `tests.fuzz.engine`, which starts without the library
 _MEMORY = 512 << 20  # bytes that a case may take beyond those of the start
 _SECONDS = 10
 
@@ -145,14 +144,6 @@ def _slow(*_: object) -> None:
 
 def _say(**facts: Any) -> None:
     print(json.dumps(facts), file=sys.__stdout__, flush=True)
-
-
-def tally(lines: list[dict[str, Any]]) -> dict[str, Counter[str]]:
-    """Outcomes of each kind."""
-    found: dict[str, Counter[str]] = {}
-    for line in lines:
-        found.setdefault(line["kind"], Counter())[line["outcome"]] += 1
-    return found
 
 
 if __name__ == "__main__":

@@ -552,3 +552,27 @@ def test_high_dynamic_range_is_said(tmp_path):
     path = make_video(tmp_path / "a.mkv", 3, codec="libx265", pix_fmt="yuv420p10le", tags=tags)
     _, source = read(path)
     assert "high dynamic range (HLG)" in source.notes[0]
+
+
+def test_a_title_in_another_encoding(tmp_path):
+    path = tmp_path / "a.mkv"
+    with av.open(str(path), "w") as out:
+        out.metadata["title"] = "CafXX"
+        stream = out.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for i in range(3):
+            frame = av.VideoFrame.from_ndarray(numbered(i), "rgb24").reformat(format="yuv420p")
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode(None))
+    data = path.read_bytes()
+    assert data.count(b"CafXX") == 1
+    path.write_bytes(data.replace(b"CafXX", b"Caf\xe9!"))
+    with FileSource(path) as source:
+        assert [number_of(frame.image) for frame in source] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("fps", [0.0, -1.0, 10_000.0, float("nan")])
+def test_rates_that_no_video_has(tmp_path, fps):
+    make_video(tmp_path / "a.mp4", 3)
+    with pytest.raises(InputError, match="at most 1000 frames per second"):
+        FileSource(tmp_path / "a.mp4", fps)
