@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["damage_content", "place"]
+__all__ = ["bomb", "damage_content", "place"]
 
 _BOMB = 700 << 20  # bytes of zeros that an entry of an archive unpacks to, above the memory allowed
 _RAW = "@raw@"
@@ -298,7 +298,7 @@ def _odd_array(array: np.ndarray, rng: Random) -> np.ndarray:
 
 
 @functools.cache
-def _bomb() -> bytes:
+def bomb() -> bytes:
     """A .npz with one entry: zeros that unpack to `_BOMB` bytes."""
     stream = io.BytesIO()
     with (
@@ -322,16 +322,18 @@ def _with_bomb(archive: bytes, key: str) -> bytes:
         for name in whole.namelist():
             if name != f"{key}.npy":
                 made.writestr(name, whole.read(name))
-    with zipfile.ZipFile(io.BytesIO(_bomb())) as source:
+    with zipfile.ZipFile(io.BytesIO(bomb())) as source:
         info = source.getinfo("bomb.npy")
     return _append_raw(stream.getvalue(), info, key)
 
 
 def _append_raw(archive: bytes, info: zipfile.ZipInfo, key: str) -> bytes:
     """Append an entry that is compressed already: its bytes as they are, the directory anew."""
-    bomb = _bomb()
-    start = info.header_offset + 30 + sum(struct.unpack("<HH", bomb[info.header_offset + 26 :][:4]))
-    packed = bomb[start : start + info.compress_size]
+    whole = bomb()
+    start = (
+        info.header_offset + 30 + sum(struct.unpack("<HH", whole[info.header_offset + 26 :][:4]))
+    )
+    packed = whole[start : start + info.compress_size]
     name = f"{key}.npy".encode()
     directory = archive.rfind(b"PK\x05\x06")
     size, offset = struct.unpack("<II", archive[directory + 12 : directory + 20])

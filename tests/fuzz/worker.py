@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from tests.fuzz import calls, readers
+from tests.fuzz import calls, mutate, readers
 from tests.fuzz.mutate import place
 from tests.fuzz.samples import SAMPLES, Content
 from torchpose.errors import DegenerateFilterWarning, TorchposeError
@@ -23,7 +23,7 @@ __all__ = ["KINDS", "main"]
 
 KINDS = (*SAMPLES, "info", "calls")  # as in `tests.fuzz.engine`, which starts without the library
 _MEMORY = 512 << 20  # bytes that a case may take beyond those of the start
-_SECONDS = 10
+_SECONDS, _WAITING = 10, 60  # of processor time, and by the clock for what waits for something
 
 
 class _Slow(BaseException):
@@ -54,13 +54,15 @@ def run_case(
     with tempfile.TemporaryDirectory(dir=folder) as name, warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", DegenerateFilterWarning)
-        signal.setitimer(signal.ITIMER_REAL, _SECONDS)
+        signal.setitimer(signal.ITIMER_PROF, _SECONDS)
+        signal.setitimer(signal.ITIMER_REAL, _WAITING)
         try:
             outcome, detail = _outcome(kind, rng, Path(name), whole)
         except _Slow:
             outcome, detail = "slow", ""
         finally:
-            signal.setitimer(signal.ITIMER_REAL, 0)
+            for timer in (signal.ITIMER_PROF, signal.ITIMER_REAL):
+                signal.setitimer(timer, 0)
     taken = round(time.perf_counter() - began, 3)
     return {"kind": kind, "index": index, "outcome": outcome, "detail": detail[:600], "s": taken}
 
@@ -108,6 +110,7 @@ def _where() -> str:
 
 
 def _samples(folder: Path) -> dict[str, dict[str, Content]]:
+    mutate.bomb()  # before time and memory are bounded
     made = folder / "whole"
     made.mkdir()
     return {
@@ -135,7 +138,8 @@ def _limit() -> None:
     most = pages * resource.getpagesize() + _MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (most, resource.RLIM_INFINITY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    signal.signal(signal.SIGALRM, _slow)
+    for number in (signal.SIGALRM, signal.SIGPROF):
+        signal.signal(number, _slow)
 
 
 def _slow(*_: object) -> None:

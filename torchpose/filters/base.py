@@ -18,6 +18,7 @@ from torchpose.errors import (
     ShapeError,
     check_covariance,
     check_finite,
+    check_floating,
     check_shape,
 )
 from torchpose.filters.outputs import (
@@ -283,6 +284,7 @@ class RecursiveFilter(WideModule, ABC):
         generator: Generators,
     ) -> Measurements:
         """Check the arguments of `forward` before any work is done."""
+        check_floating("z", z)
         check_shape("z", z, ["B", "T", self.observed.numel()])
         batch, n_frames = z.shape[:2]
         if batch == 0 or n_frames == 0:
