@@ -329,9 +329,9 @@ class RecursiveFilter(WideModule, ABC):
             return torch.full((batch,), n_frames, device=device)
         lengths = torch.as_tensor(lengths, device=device)
         check_shape("lengths", lengths, [batch])
-        outside = (lengths < 1) | (lengths > n_frames)
-        numbers = lengths.dtype.is_floating_point or lengths.is_complex()
-        if numbers or (values_visible() and bool(outside.any())):
+        broken = lengths.dtype.is_floating_point or lengths.is_complex()
+        outside = torch.zeros_like(lengths) if broken else (lengths < 1) | (lengths > n_frames)
+        if broken or (values_visible() and bool(outside.any())):
             raise InputError(
                 f"lengths must be integers from 1 to {n_frames}, got {lengths.tolist()}"
             )
