@@ -1,6 +1,7 @@
 """Public functions of tensors, called with tensors of wrong shapes, types and values."""
 
 import functools
+import warnings
 from collections.abc import Callable
 from random import Random
 from typing import Any, NamedTuple
@@ -152,7 +153,9 @@ def odd_call(rng: Random) -> str:
     arguments = dict(call.arguments)
     for _ in range(rng.choice((1, 1, 2))):
         key = rng.choice(list(arguments))
-        arguments[key] = _odd(arguments[key], rng)
+        with warnings.catch_warnings():  # about complex numbers made real again
+            warnings.simplefilter("ignore")
+            arguments[key] = _odd(arguments[key], rng)
     result = call.run(**arguments)
     _check_failures(name, result)
     if all(_moderate(value) for value in arguments.values()):
