@@ -52,7 +52,8 @@ def check_equal(poses, track, fields=FIELDS):
     for name in fields:
         live = torch.stack([getattr(pose, name) for pose in poses], 1)
         whole = getattr(track, name)
-        torch.testing.assert_close(live, whole, rtol=1e-10, atol=1e-10, equal_nan=True)
+        # up to rounding, which a camera that hardly moves in the recordings, and so in Q, makes larger
+        torch.testing.assert_close(live, whole, rtol=1e-7, atol=1e-7, equal_nan=True)
     assert torch.equal(torch.stack([pose.observed for pose in poses], 1), track.observed)
 
 
