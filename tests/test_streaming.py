@@ -48,12 +48,19 @@ def stream(tracker, keypoints, generator=None, confidence=None, mask=None, names
     return state, poses
 
 
+def in_units_of(whole, cov):
+    """Covariances over the standard deviations of the whole track, whatever their unit."""
+    std = whole.diagonal(dim1=-2, dim2=-1).sqrt()
+    return cov / (std[..., :, None] * std[..., None, :])
+
+
 def check_equal(poses, track, fields=FIELDS):
     for name in fields:
         live = torch.stack([getattr(pose, name) for pose in poses], 1)
         whole = getattr(track, name)
-        # up to rounding, which a camera that hardly moves in the recordings, and so in Q, makes larger
-        torch.testing.assert_close(live, whole, rtol=1e-7, atol=1e-7, equal_nan=True)
+        if name.startswith("covariance"):
+            live, whole = in_units_of(whole, live), in_units_of(whole, whole)
+        torch.testing.assert_close(live, whole, rtol=1e-10, atol=1e-10, equal_nan=True)
     assert torch.equal(torch.stack([pose.observed for pose in poses], 1), track.observed)
 
 
