@@ -60,6 +60,10 @@ def check_equal(poses, track, fields=FIELDS):
         whole = getattr(track, name)
         if name.startswith("covariance"):
             live, whole = in_units_of(whole, live), in_units_of(whole, whole)
+            # `forward` takes covariances as settled once a step changes them by less than 4e-13;
+            # a camera that hardly moves comes to rest over a thousand such steps.
+            torch.testing.assert_close(live, whole, rtol=0, atol=2e-9, equal_nan=True)
+            continue
         torch.testing.assert_close(live, whole, rtol=1e-10, atol=1e-10, equal_nan=True)
     assert torch.equal(torch.stack([pose.observed for pose in poses], 1), track.observed)
 
