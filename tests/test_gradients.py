@@ -92,7 +92,8 @@ def test_poses_of_shoulders_whose_neck_is_placed():
 @pytest.mark.parametrize("method", ["mkf-sampled", "mkf-split"])
 def test_poses_of_tracks_that_are_drawn_or_selected(method):
     tracker = make_tracker(method=method, n_tracks=12)
-    assert_differentiable(poses(tracker), keypoints(frames=5), step=1e-4)
+    # small steps: where another track is kept than before, split tracks jump
+    assert_differentiable(poses(tracker), keypoints(frames=5), step=2e-5)
 
 
 @pytest.mark.parametrize("method", ["pf-mixture", "pf-walk", "pf-walk-unscaled"])

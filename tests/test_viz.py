@@ -172,5 +172,5 @@ def test_bad_input_is_named(scene) -> None:
 @pytest.mark.parametrize("draw", [viz.plot_joint_curves, viz.plot_pose_strip])
 def test_without_matplotlib_the_error_says_what_to_install(draw, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(MissingDependencyError, match="plots"):
+    with pytest.raises(MissingDependencyError, match="pip install matplotlib"):
         draw(torch.zeros(5, 8, 3))

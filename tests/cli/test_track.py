@@ -290,7 +290,7 @@ BAD_INPUT = {
     "unknown neck": ([CLIP, "--neck", "long"], "mid-shoulder"),
     "no nose": (["{tmp}/no_head.npz", "--nose-as-head", "true"], "needs a nose"),
     "bad fps": ([CLIP, "--fps", "0"], "--fps must be positive"),
-    "bad number": ([CLIP, "--seed", "one"], "argument --seed"),
+    "bad number": ([CLIP, "--seed", "one"], "--seed must be a whole number"),
     "bad flag": ([CLIP, "--pictures", "maybe"], "argument --pictures"),
     "unknown option": ([CLIP, "--speed", "9"], "--speed"),
     "no config": ([CLIP, "--config", "{tmp}/no.yaml"], "no.yaml"),

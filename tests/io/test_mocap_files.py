@@ -205,7 +205,7 @@ def test_what_is_no_bvh(tmp_path, spoil, error, word):
 @pytest.mark.parametrize(("name", "library"), [("a.bvh", "bvhio"), ("a.c3d", "c3d")])
 def test_without_the_library(tmp_path, monkeypatch, name, library):
     monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(MissingDependencyError, match=rf"{name}.*torchpose\[mocap\]"):
+    with pytest.raises(MissingDependencyError, match=rf"{name}.*pip install {library}"):
         read_recording(write(tmp_path, bvh_text(at_rest(2)), name))
 
 

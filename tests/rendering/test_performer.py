@@ -202,7 +202,7 @@ def test_without_matplotlib_the_message_says_what_to_install(monkeypatch):
     load_portrait.cache_clear()
     monkeypatch.setitem(__import__("sys").modules, "matplotlib", None)
     look = Look((1.0, 2.0, 3.0))
-    with pytest.raises(MissingDependencyError, match=r"torchpose\[plots\]"):
+    with pytest.raises(MissingDependencyError, match="pip install matplotlib"):
         render_performance(performer(1), CAMERA, look=look)
 
 

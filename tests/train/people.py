@@ -65,7 +65,7 @@ class Kill(Callback):
         step: number of the step, from 0. rank: of the process. signum: of the signal.
     """
 
-    def __init__(self, step: int, rank: int = 0, signum: int = signal.SIGKILL) -> None:
+    def __init__(self, step: int, rank: int = 0, signum: int = int(signal.SIGKILL)) -> None:
         self.step, self.rank, self.signum = step, rank, signum
 
     def on_train_batch_start(self, trainer, module, batch, batch_idx):

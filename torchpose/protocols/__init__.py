@@ -26,6 +26,7 @@ PROTOCOLS = (
     "uncommon-poses",
     "silhouette",
     "root-uncertainty",
+    "body-models",
     "bend",
 )
 

@@ -41,7 +41,7 @@ def open_video(
         >>> _ = cv2.imwrite(f"{folder}/1.png", np.zeros((48, 64, 3), np.uint8))
         >>> with open_video(folder, fps=25) as source:
         ...     print(source.size, source.fps, [frame.image.shape for frame in source])
-        (64, 48) 25 [(48, 64, 3)]
+        (64, 48) 25.0 [(48, 64, 3)]
     """
     if kind not in (None, *_KINDS):
         raise InputError(f"kind must be one of {', '.join(_KINDS)} or None, got {kind!r}")
