@@ -64,8 +64,9 @@ def test_its_configuration_makes_it_and_holds_persons_out(kind, name):
 
 
 @pytest.mark.data
-def test_the_manifold_is_made_again_by_its_configuration(tmp_path, torchpose_command):
-    data_dir_or_skip("mocap_cmu_walk")
+def test_the_manifold_is_made_again_by_its_configuration(tmp_path, torchpose_command, monkeypatch):
+    data = data_dir_or_skip("mocap_cmu_walk")
+    monkeypatch.setenv("TORCHPOSE_DATA", str(data.parent))
     out = tmp_path / "walk.safetensors"
     kept = load_manifold("walk")
     config = ROOT / kept.info.command.split("--config ")[1]
