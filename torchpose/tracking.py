@@ -181,8 +181,7 @@ class UpperBodyTracker(WideModule):
         self.neck = neck
         self.max_gap = max_gap
         self.dtype = working_precision("dtype", options.get("dtype", torch.float64))
-        std = None if measurement_std is None else wide_or_parameter(measurement_std)
-        register_given(self, "measurement_std", std)
+        register_given(self, "measurement_std", wide_or_parameter(measurement_std))
         self.options = options
         for name, value in options.items():
             if isinstance(value, Tensor):

@@ -153,6 +153,21 @@ def require_state(state: Any, kind: type, field: str, shape: Sequence[int | None
         ) from error
 
 
+def given_initial_cov(value: Tensor | None, covariances: Tensor) -> Tensor | None:
+    """An initial covariance [D, D], [D] or [K, D, D] to be registered; checked, None where none is given.
+
+    Args:
+        covariances: of the K components, [K, D, D].
+    """
+    if value is None:
+        return None
+    per_component = value.ndim == 3
+    if per_component:
+        check_shape("initial_cov", value, list(covariances.shape))
+    trailing = 3 if per_component else 2
+    return given_covariance("initial_cov", value, covariances.shape[-1], trailing)
+
+
 class RecursiveFilter(WideModule, ABC):
     """A recursive Bayesian filter over batches of sequences.
 

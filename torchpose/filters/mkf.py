@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import InputError
 from torchpose.filters import fixed_tracks, sampled_tracks, split_tracks
 from torchpose.filters.base import (
     FilterOutput,
@@ -18,6 +18,7 @@ from torchpose.filters.base import (
     StepOutput,
     as_covariance,
     given_covariance,
+    given_initial_cov,
     require_state,
 )
 from torchpose.filters.frame_weights import FrameGains
@@ -178,7 +179,7 @@ class MixtureKalmanFilter(RecursiveFilter):
         self._register_mixture(gmm)
         register_given(self, "process_cov", given_covariance("process_cov", process_cov, self.dim))
         register_given(self, "gamma", wide_or_parameter(gamma))
-        register_given(self, "initial_cov", self._given_initial_cov(initial_cov))
+        register_given(self, "initial_cov", given_initial_cov(initial_cov, self.covariances))
         self.to(gmm.means.device)
         self.transition(self.burn_in)  # raises what does not fit before any work
 
@@ -195,14 +196,6 @@ class MixtureKalmanFilter(RecursiveFilter):
         register_given(self, "log_prior", (weights / weights.sum()).log())
         register_given(self, "means", wide_or_parameter(prior.means))
         register_given(self, "covariances", wide_or_parameter(prior.covariances))
-
-    def _given_initial_cov(self, value: Tensor | None) -> Tensor | None:
-        if value is None:
-            return None
-        per_component = value.ndim == 3
-        if per_component:
-            check_shape("initial_cov", value, list(self.covariances.shape))
-        return given_covariance("initial_cov", value, self.dim, 3 if per_component else 2)
 
     @property
     def sources(self) -> tuple[Tensor, ...]:

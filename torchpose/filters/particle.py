@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import InputError
 from torchpose.filters.base import (
     Generators,
     Measurements,
@@ -17,6 +17,7 @@ from torchpose.filters.base import (
     as_covariance,
     effective_sample_size,
     given_covariance,
+    given_initial_cov,
     require_state,
     standard_normal,
     uniform,
@@ -171,19 +172,10 @@ class BootstrapParticleFilter(RecursiveFilter):
             given = value if isinstance(value, nn.Parameter) else value.detach().double()
             register_given(self, name, given)
         register_given(self, "process_cov", given_covariance("process_cov", process_cov, self.dim))
-        register_given(self, "gamma", None if gamma is None else wide_or_parameter(gamma))
-        register_given(self, "initial_cov", self._given_initial_cov(initial_cov))
+        register_given(self, "gamma", wide_or_parameter(gamma))
+        register_given(self, "initial_cov", given_initial_cov(initial_cov, self.covariances))
         self.to(gmm.means.device)
         self._constants()  # raises what does not fit before any work
-
-    def _given_initial_cov(self, value: Tensor | None) -> Tensor | None:
-        if value is None:
-            return None
-        per_component = value.ndim == 3
-        cov = given_covariance("initial_cov", value, self.dim, 3 if per_component else 2)
-        if per_component:
-            check_shape("initial_cov", cov, list(self.covariances.shape))
-        return cov
 
     def _constants(self) -> "_Constants":
         given = (self.weights, self.means, self.covariances, self.process_cov)
