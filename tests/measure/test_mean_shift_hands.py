@@ -156,6 +156,32 @@ def test_a_batch_of_persons_is_its_elements():
     assert together.seen.all()
 
 
+@pytest.mark.parametrize("likelihood", ["back-projection", "ratio"])
+@pytest.mark.parametrize("by_prior", [False, True])
+def test_a_person_is_measured_alike_beside_somebody_whose_face_has_another_size(
+    likelihood, by_prior
+):
+    faces = torch.tensor([[120.0, 60.0, 58.0], [520.0, 60.0, 19.0]])  # maps of a third, and whole
+    foreground = np.full((240, 640), 255, np.uint8)
+    foreground[:, :20] = 0
+    prior = HandPrior.from_prior(load_prior("kinect-upper-body")) if by_prior else None
+    tracker = MeanShiftHandTracker(likelihood, prior=prior)
+    both, alone = tracker.init(), [tracker.init(), tracker.init()]
+    for i in range(5):
+        canvas = np.full((240, 640, 3), WALL, np.uint8)
+        larger = draw([(200 + i, 180 - 2 * i), (60, 170)], faces[0].tolist(), canvas, seed=i)
+        frame = draw([(545, 110 + i), (495 - i, 115)], faces[1].tolist(), larger, seed=9 + i)
+        both, together = tracker.step(both, frame, faces, torch.tensor([4, 7]), foreground)
+        assert together.seen.all()
+        for n in range(2):
+            own, name = faces[n : n + 1], both.identity[n : n + 1]
+            alone[n], single = tracker.step(alone[n], frame, own, name, foreground)
+            for found, expected in zip(together, single, strict=True):
+                torch.testing.assert_close(found[n : n + 1], expected, rtol=1e-6, atol=1e-6)
+            for found, expected in zip(both.skin, alone[n].skin, strict=True):
+                assert torch.equal(found[n : n + 1], expected)
+
+
 def test_with_the_prior_a_hand_may_begin_on_the_other_side():
     frames = [draw([None, (60, 150)])] * 2 + [draw([(128, 150), (60, 150)])] * 3
     prior = HandPrior.from_prior(load_prior("kinect-upper-body"))

@@ -3,6 +3,7 @@
 The paper's own recipe, for all persons and both of their hands at once.
 """
 
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from torchpose.measure.hand_measurements import HandMeasurements, check_frame
 from torchpose.measure.hand_prior import HandPrior
 from torchpose.measure.mean_shift import mean_shift
 from torchpose.measure.persons import match_rows
+from torchpose.measure.scaled_frame import ScaledFrame, scale_frame, scales_of_faces
 from torchpose.measure.skin import SkinModel, SkinState
 
 __all__ = ["MeanShiftHandState", "MeanShiftHandTracker"]
@@ -24,11 +26,7 @@ __all__ = ["MeanShiftHandState", "MeanShiftHandTracker"]
 Image = NDArray[np.uint8]
 Likelihood = Literal["back-projection", "ratio"]
 _THRESHOLDS = {"back-projection": 0.1, "ratio": 0.25}
-_FACE_PIXELS = 19.0  # size of a face in the map: a window on a hand is then some 15 pixels wide
-_LARGEST_MAP = 640
 # Lengths in sizes of the face.
-_FACE = (0.65, -0.1, 0.9)  # half the width, centre and half the height of the ellipse taken out
-_NECK = (0.4, 1.1)  # half the width, bottom
 _REACH = 4.5  # farthest hand from the face
 _PLAUSIBLE = -4.5  # log density of the prior per squared size of the face
 _VELOCITY = 0.1  # deviation of a new hand's, per frame
@@ -54,6 +52,16 @@ class MeanShiftHandState(NamedTuple):
     skin: SkinState
 
 
+class _Look(NamedTuple):
+    """What N persons' hands look like in a frame; lengths in its pixels."""
+
+    skin: SkinState
+    centre: Float[Tensor, "N 2 2"]
+    noise: Float[Tensor, "N 2 2 2"]
+    average: Float[Tensor, "N 2"]
+    seen: Bool[Tensor, "N 2"]
+
+
 class MeanShiftHandTracker(nn.Module):
     """Follows hands by mean shift in the likelihood of skin.
 
@@ -77,7 +85,10 @@ class MeanShiftHandTracker(nn.Module):
         skin: by default `SkinModel`. prior: look for lost hands wherever it finds them plausible,
             the likelier the sooner, instead of in the initialisation areas.
 
-    All lengths are in sizes of the face.
+    All lengths are in sizes of the face. Every person is looked for in the frame made so small that
+    the own face has some 19 pixels; persons for whom that is the same image are one batch. Of the
+    others only the heads, which are no hands, and the columns nearer to them, in which no hand of
+    this person begins, play a part.
 
     Raises:
         InputError: settings that make no sense.
@@ -173,28 +184,37 @@ class MeanShiftHandTracker(nn.Module):
         if not len(faces):
             return state, _measurements(state, *_nothing(faces))
         state = self._predict(state, faces)
-        image, scale = _smaller(frame, _map_scale(faces, frame))
-        # a pixel's centre has whole coordinates, its corner half of one less
-        small = torch.cat([(faces[:, :2] + 0.5) * scale - 0.5, faces[:, 2:] * scale.mean()], 1)
-        predicted = (state.mean[..., :2] + 0.5) * scale - 0.5
-        colours, skin = self._skin(state, image, small, predicted)
-        skin = skin * _not_head(small, skin.shape[1:])
-        if foreground is not None:
-            skin = skin * torch.from_numpy(_resized(foreground, *skin.shape[1:]) > 0)
-        maps = self._without_the_other(skin, predicted, state.tracked, small)
-        start, found = predicted, state.tracked
+        divisors, group = scales_of_faces(faces, frame).unique(return_inverse=True)
+        rows = [torch.nonzero(group == k).flatten() for k in range(len(divisors))]
+        looks = [
+            self._look(state, scale_frame(frame, foreground, faces, divisor, self.skin), own)
+            for divisor, own in zip(divisors.tolist(), rows, strict=True)
+        ]
+        order = torch.cat(rows).argsort()
+        skin = SkinState(*_merged([look.skin for look in looks], order))
+        centre, noise, average, seen = _merged([look[1:] for look in looks], order)
+        state = self._update(state, centre, noise, seen, faces)._replace(skin=skin)
+        return state, _measurements(state, centre, noise, average, seen)
+
+    def _look(self, state: MeanShiftHandState, view: ScaledFrame, rows: Tensor) -> _Look:
+        """The hands of some persons in an image that suits the size of their faces."""
+        faces, tracked = view.faces[rows], state.tracked[rows]
+        predicted = view.from_frame(state.mean[rows, :, :2])
+        colours = SkinState(*(table[rows] for table in state.skin))
+        colours, skin = self._skin(colours, view.bins, faces, predicted, tracked)
+        maps = self._without_the_other(skin * view.usable, predicted, tracked, faces)
+        start, found = predicted, tracked
         if not bool(found.all()):
-            start, found = self._detect(maps, small, state.tracked)
-            start = torch.where(state.tracked[..., None], predicted, start)
-        size = (self.window * small[:, None, 2:]).expand(-1, 2, 2)
+            start, found = self._detect(maps, view.faces, rows, tracked)
+            start = torch.where(tracked[..., None], predicted, start)
+        size = (self.window * faces[:, None, 2:]).expand(-1, 2, 2)
         rest = mean_shift(maps.flatten(0, 1), start.flatten(0, 1), size.flatten(0, 1))
         centre = rest.centre.view_as(start)
         average = rest.mass.view_as(found) / _area_inside(centre, size, maps.shape[2:])
-        seen = (state.tracked | found) & (average >= self.threshold)
-        centre = (centre + 0.5) / scale - 0.5
-        noise = self._noise(rest.covariance.view(-1, 2, 2, 2), small) / scale / scale[:, None]
-        state = self._update(state, centre, noise, seen, faces)._replace(skin=colours)
-        return state, _measurements(state, centre, noise, average, seen)
+        seen = (tracked | found) & (average >= self.threshold)
+        noise = self._noise(rest.covariance.view(-1, 2, 2, 2), faces)
+        noise = noise / view.scale / view.scale[:, None]
+        return _Look(colours, view.to_frame(centre), noise, average, seen)
 
     def _matched(self, state: MeanShiftHandState, identity: Tensor) -> MeanShiftHandState:
         """The state's rows in the order of `identity`; who is new has neither hands nor colours."""
@@ -221,18 +241,14 @@ class MeanShiftHandTracker(nn.Module):
         return state._replace(mean=mean, cov=cov)
 
     def _skin(
-        self, state: MeanShiftHandState, image: Image, faces: Tensor, predicted: Tensor
+        self, state: SkinState, bins: Tensor, faces: Tensor, predicted: Tensor, tracked: Tensor
     ) -> tuple[SkinState, Tensor]:
         """Colours after this frame, and the likelihood of skin [N, H, W]."""
-        import cv2
-
-        lab = torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_RGB2Lab)).permute(2, 0, 1)[None]
-        bins = self.skin.byte_bins(lab)
-        discs = _squared_distance(predicted, bins.shape[1:])
+        discs = _squared_distance(predicted, bins.shape)
         discs = discs < (_HAND_RADIUS * faces[:, 2]).square()[:, None, None, None]
-        hands = (discs & state.tracked[..., None, None]).any(1).to(faces)
+        hands = (discs & tracked[..., None, None]).any(1).to(faces)
         of_each = bins.expand(len(faces), -1, -1)
-        colours = self.skin.learn(state.skin, of_each, faces, hands)
+        colours = self.skin.learn(state, of_each, faces, hands)
         if self.likelihood == "ratio":
             return colours, self.skin.find(colours, of_each)
         histogram = colours.face.sum(1).flatten(1)  # over a and b: hands are lit otherwise
@@ -248,13 +264,18 @@ class MeanShiftHandTracker(nn.Module):
         masked = masked & tracked.flip(1)[..., None, None]
         return skin[:, None] * ~masked
 
-    def _detect(self, maps: Tensor, faces: Tensor, tracked: Tensor) -> tuple[Tensor, Tensor]:
-        """Best window where each hand may begin [N, 2, 2], and whether it is good enough."""
+    def _detect(
+        self, maps: Tensor, faces: Tensor, rows: Tensor, tracked: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Best window where each hand may begin [N, 2, 2], and whether it is good enough.
+
+        `faces` are those of everybody, and `rows` whose maps these are.
+        """
         height, width = maps.shape[2:]
-        side = self.window * faces[:, 2, None]
+        side = self.window * faces[rows, 2, None]
         across, down = _box_sums(width, side), _box_sums(height, side)
         average = down[:, None] @ maps @ across[:, None] / side.square()[..., None, None]
-        area = self._areas(faces, (height, width))
+        area = self._areas(faces, rows, (height, width))
         usable = (average >= self.threshold) & (area > 0)
         best, place = torch.where(usable, average * area, -1.0).flatten(2).max(2)
         start = torch.stack([place % width, place // width], -1).to(faces)
@@ -263,13 +284,14 @@ class MeanShiftHandTracker(nn.Module):
         better = best >= best.amax(1, keepdim=True)
         return start, (best > 0) & (better | ~same[:, None])
 
-    def _areas(self, faces: Tensor, shape: tuple[int, int]) -> Tensor:
+    def _areas(self, faces: Tensor, rows: Tensor, shape: tuple[int, int]) -> Tensor:
         """How readily a hand is taken for the left or right one at each place [N, 2, H, W]."""
         x, y, size = faces[..., None].unbind(1)
-        across = (torch.arange(shape[1]).to(faces) - x) / size
-        down = (torch.arange(shape[0]).to(faces) - y) / size
+        of_all = (torch.arange(shape[1]).to(faces) - x) / size
+        across = of_all[rows]
+        down = (torch.arange(shape[0]).to(faces) - y[rows]) / size[rows]
         # everybody has the columns nearest to the own face
-        own = (across.abs() == across.abs().amin(0, keepdim=True))[:, None, None]
+        own = (across.abs() == of_all.abs().amin(0))[:, None, None]
         if self.prior is None:
             halves = torch.stack([across > 0, across < 0], 1)[:, :, None]
             near = across.square()[:, None] + down.square()[..., None] < _REACH**2
@@ -313,41 +335,15 @@ def _measurements(
     return HandMeasurements(points, covariance, average.clamp(0, 1), seen)
 
 
+def _merged(parts: Sequence[tuple[Tensor, ...]], order: Tensor) -> list[Tensor]:
+    """Tensors of all groups of persons, in the order of the persons."""
+    return [torch.cat(tensors)[order] for tensors in zip(*parts, strict=True)]
+
+
 def _nothing(faces: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Centres, noise, average likelihood and `seen` of no persons."""
     centre = faces.new_zeros(0, 2, 2)
     return centre, faces.new_zeros(0, 2, 2, 2), centre[..., 0], centre[..., 0] > 0
-
-
-def _map_scale(faces: Tensor, frame: Image) -> float:
-    """Pixels of the map for one of the frame, a fraction 1 / n: the smallest face has some 19 there."""
-    factor = max(float(faces[:, 2].min()) / _FACE_PIXELS, max(frame.shape[:2]) / _LARGEST_MAP)
-    return 1 / max(round(factor), 1)
-
-
-def _smaller(frame: Image, scale: float) -> tuple[Image, Tensor]:
-    """The frame for the map, and its pixels for one of the frame, across and down."""
-    height, width = (max(round(n * scale), 1) for n in frame.shape[:2])
-    return _resized(frame, height, width), torch.tensor(
-        [width / frame.shape[1], height / frame.shape[0]]
-    )
-
-
-def _resized(image: Image, height: int, width: int) -> Image:
-    import cv2
-
-    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    return np.asarray(small, dtype=np.uint8)
-
-
-def _not_head(faces: Tensor, shape: Any) -> Tensor:
-    """False on the faces and necks of all persons, [H, W]."""
-    x, y, size = faces[:, :, None, None].unbind(1)
-    across = ((torch.arange(shape[1]).to(faces) - x) / size).abs()
-    down = (torch.arange(shape[0]).to(faces)[:, None] - y) / size
-    head = ((across / _FACE[0]).square() + ((down - _FACE[1]) / _FACE[2]).square() < 1).any(0)
-    neck = ((across < _NECK[0]) & (down > 0) & (down < _NECK[1])).any(0)
-    return ~(head | neck)
 
 
 def _squared_distance(points: Tensor, shape: Any) -> Tensor:
