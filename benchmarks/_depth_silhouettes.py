@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpose.body import BODY_15, Body, body_joints, render
-from torchpose.camera import PinholeCamera
-from torchpose.camera_rig import CameraRig
-from torchpose.io.files import atomic_path, check_output_folder
-from torchpose.protocols.report import Report
-from torchpose.protocols.silhouette_tables import PARTS
+from benchmarks.silhouette.tables import PARTS
+from torchpose._core.files import atomic_path, check_output_folder
+from torchpose.body import BODY_15, Body, body_joints
+from torchpose.camera import CameraRig, PinholeCamera
+from torchpose.evaluation import Report
 from torchpose.video.body_overlay import draw_body
+from torchpose.whole_body import render
 
 _ENLARGED = 2  # pixels of the picture for one of a silhouette
 HEAD_TOP = 0.11

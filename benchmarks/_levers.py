@@ -11,15 +11,9 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from torchpose._core.files import atomic_path
 from torchpose.camera import PinholeCamera, ViewRange
-from torchpose.filters import MixtureKalmanFilter
-from torchpose.io.files import atomic_path
-from torchpose.io.recordings import Recording, read_recordings
-from torchpose.measurements import pixel_indices
-from torchpose.priors import TRAINING_VIEWS, GaussianMixture, UpperBodyPrior
-from torchpose.priors.window import WindowLayout, WindowPrior
-from torchpose.process_noise import process_cov
-from torchpose.protocols.common import (
+from torchpose.evaluation.common import (
     MEASURED,
     Estimate,
     Trials,
@@ -29,9 +23,16 @@ from torchpose.protocols.common import (
     score,
     settings_hash,
 )
-from torchpose.recipes import VERSION, UpperBodyRecipe
+from torchpose.filters import MixtureKalmanFilter
+from torchpose.io import Recording, read_recordings
+from torchpose.learning import TRAINING_VIEWS
+from torchpose.learning.recipes import VERSION, UpperBodyRecipe
+from torchpose.priors import GaussianMixture, UpperBodyPrior
+from torchpose.priors.window import WindowLayout, WindowPrior
 from torchpose.skeleton import ARM_JOINTS
-from torchpose.tracking import UpperBodyTracker
+from torchpose.upper_body import UpperBodyTracker
+from torchpose.upper_body.measurements import pixel_indices
+from torchpose.upper_body.process_noise import process_cov
 
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 FIT_PERSONS, SCORED_PERSONS = ("s1", "s2", "s4", "s5"), ("s3", "s6")

@@ -2,12 +2,12 @@
 
 UB-people (prior of s1 to s6, every n-th sequence of s7 and s8) and UB-one (prior of the first 60 % of
 one recording, the first frames of the rest), each with the number of components of kinect-upper-body
-and of kinect-upper-body-small. Every method of `torchpose.tracking.METHODS` runs with its defaults,
+and of kinect-upper-body-small. Every method of `torchpose.upper_body.METHODS` runs with its defaults,
 beside the mean pose of the training persons. What was fitted and tracked is kept in the folder, so that
 a run that was stopped goes on.
 
-    python benchmarks/all_trackers.py --data DIR --out DIR
-    python benchmarks/all_trackers.py --data DIR --out DIR --every 12 --frames 300 --windows false
+    python -m benchmarks.all_trackers --data DIR --out DIR
+    python -m benchmarks.all_trackers --data DIR --out DIR --every 12 --frames 300 --windows false
 """
 
 import argparse
@@ -18,11 +18,12 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks.ub_one import split_recording
+from benchmarks.ub_people import mean_pose, people
+from torchpose._core.files import check_output_folder
 from torchpose.camera import PinholeCamera
-from torchpose.io import check_output_folder
-from torchpose.io.recordings import Recording
-from torchpose.priors.upper_body import UpperBodyPrior
-from torchpose.protocols.common import (
+from torchpose.evaluation import Report
+from torchpose.evaluation.common import (
     MEASURED,
     Estimate,
     Trials,
@@ -33,12 +34,11 @@ from torchpose.protocols.common import (
     score,
     settings_hash,
 )
-from torchpose.protocols.kept_runs import keep, read_kept
-from torchpose.protocols.report import Report
-from torchpose.protocols.ub_one import split_recording
-from torchpose.protocols.ub_people import mean_pose, people
-from torchpose.recipes import fit_kinect_prior
-from torchpose.tracking import METHODS, UpperBodyTracker
+from torchpose.evaluation.kept_runs import keep, read_kept
+from torchpose.io import Recording
+from torchpose.learning.recipes import fit_kinect_prior
+from torchpose.priors import UpperBodyPrior
+from torchpose.upper_body import METHODS, UpperBodyTracker
 
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 RECIPES: dict[str, dict[str, Any]] = {

@@ -6,7 +6,7 @@ seven clips of video_asl, tracked from their faces with head and neck put at sev
 MediaPipe's hands; how far the inferred elbows and shoulders are from MediaPipe's, in pixels, and the
 mean score. MediaPipe's shoulders are higher than Kinect's, so theirs do not tell which offset is right.
 
-    python benchmarks/face_offsets.py --data DIR
+    python -m benchmarks.face_offsets --data DIR
 """
 
 import argparse
@@ -16,15 +16,14 @@ import av
 import cv2
 import numpy as np
 import torch
-from _asl import CLIPS, SIZE, read_clip
 
+from benchmarks._asl import CLIPS, SIZE, read_clip
 from torchpose.camera import PinholeCamera
-from torchpose.measure.face import FaceTracker
-from torchpose.measure.head_neck import FACE_OFFSETS, HeadNeck
-from torchpose.measure.upper_body import MEASURED, rounded_covariance
+from torchpose.measure import FACE_OFFSETS, MEASURED, FaceTracker, HeadNeck
+from torchpose.measure.upper_body import rounded_covariance
 from torchpose.priors import load_prior
 from torchpose.skeleton import UPPER_BODY
-from torchpose.tracking import UpperBodyTracker
+from torchpose.upper_body import UpperBodyTracker
 
 HEADS, NECKS = (-0.4, -0.3, -0.2, -0.12, 0.0), (0.85, 1.0, 1.1, 1.2, 1.3)
 HAND_STD = 8.0  # pixels

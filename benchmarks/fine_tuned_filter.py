@@ -6,7 +6,7 @@ head, neck and hands with 3 px noise, by the prior as it is with hand-set Q and 
 transition), with the released Q, and tuned. Each seed draws other viewpoints, starts and batches. The
 error is the 3D distance after fixed-scale Procrustes, pooled over joints and frames, without windows.
 
-    python benchmarks/fine_tuned_filter.py --data DIR --out DIR [--splits A B C] [--seeds 0 1 2]
+    python -m benchmarks.fine_tuned_filter --data DIR --out DIR [--splits A B C] [--seeds 0 1 2]
 
 A seed of a split takes about a minute and a half. Finished ones lie in `--out` and are read from there.
 """
@@ -17,15 +17,12 @@ from pathlib import Path
 from statistics import fmean, stdev
 
 import torch
-from _levers import CAMERA
-from _timing import machine_line, markdown_table
 from tqdm.auto import tqdm
 
-from torchpose.io.files import atomic_path, check_output_folder
-from torchpose.io.recordings import Recording, read_recordings
-from torchpose.priors import UpperBodyPrior
-from torchpose.priors.fine_tuning import TunableKalman, draw_sequences, parameter_groups
-from torchpose.protocols.common import (
+from benchmarks._levers import CAMERA
+from benchmarks.speed._timing import machine_line, markdown_table
+from torchpose._core.files import atomic_path, check_output_folder
+from torchpose.evaluation.common import (
     Trials,
     centred_on_neck,
     data_folder,
@@ -34,7 +31,10 @@ from torchpose.protocols.common import (
     score,
     track,
 )
-from torchpose.recipes import UpperBodyRecipe
+from torchpose.io import Recording, read_recordings
+from torchpose.learning.fine_tuning import TunableKalman, draw_sequences, parameter_groups
+from torchpose.learning.recipes import UpperBodyRecipe
+from torchpose.priors import UpperBodyPrior
 
 SPLITS = {"A": ("s3", "s6"), "B": ("s2", "s4"), "C": ("s1", "s5")}
 """Persons who are tracked; the other four of s1 to s6 are fitted and tuned on."""

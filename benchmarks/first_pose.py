@@ -3,7 +3,7 @@
 Walks of four persons (`mocap_cmu_walk`) are rendered as in the protocol Silhouette; where the data has
 them, the four views of a balancing man (`multicam_pose2sim`) are searched from several of their frames.
 
-    python benchmarks/first_pose.py --data DIR [--seeds 3] [--cameras 3] [--manifold]
+    python -m benchmarks.first_pose --data DIR [--seeds 3] [--cameras 3] [--manifold]
 """
 
 import argparse
@@ -12,18 +12,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from real_silhouettes import HEIGHT, four_views
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks.real_silhouettes import HEIGHT, four_views
+from benchmarks.silhouette.data import split_clips
+from benchmarks.silhouette.protocol import FPS, WALKERS
+from benchmarks.silhouette.trackees import Conditions, prepare
 from torchpose.body import BODY_15, Body, fit_state
-from torchpose.camera_rig import CameraRig
-from torchpose.filters import find_first_pose, find_pose
+from torchpose.camera import CameraRig
 from torchpose.io.mocap import read_mocap
 from torchpose.priors import BackConstrainedGPLVM
-from torchpose.protocols.silhouette import FPS, WALKERS
-from torchpose.protocols.silhouette_data import split_clips
-from torchpose.protocols.silhouette_trackees import Conditions, prepare
+from torchpose.whole_body import find_first_pose, find_pose
 
 LOOK_AHEAD = 30  # frames at 60 Hz
 TRIALS, CLIP = 3, 45  # of each person, and frames that the cameras stand around

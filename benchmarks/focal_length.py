@@ -1,10 +1,10 @@
 """What a wrong focal length costs.
 
-The test of `torchpose evaluate ub-people` (persons s7 and s8 of UTD-MHAD, head, neck and hands with
+The test of `python -m benchmarks.ub_people` (persons s7 and s8 of UTD-MHAD, head, neck and hands with
 3 px noise), tracked with a camera whose focal length is so many times the true one. A camera that is
 not calibrated is usually within 0.85 to 1.2.
 
-    python benchmarks/focal_length.py --data DIR [--prior OUT/prior-....safetensors]
+    python -m benchmarks.focal_length --data DIR [--prior OUT/prior-....safetensors]
 
 `--prior` takes the prior that the protocol fitted to s1 to s6 and left in its output folder. Without
 it the shipped prior is used, which has seen s7 and s8: then the table says so, and only the
@@ -16,11 +16,11 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.ub_people import TEST_PERSONS, people, sway
 from torchpose.camera import PinholeCamera
 from torchpose.errors import OverlapError
+from torchpose.evaluation.common import Trials, centred_on_neck, make_test_set, score, track
 from torchpose.priors import UpperBodyPrior, load_prior
-from torchpose.protocols.common import Trials, centred_on_neck, make_test_set, score, track
-from torchpose.protocols.ub_people import TEST_PERSONS, people, sway
 
 FOCAL, CENTRE = 525.0, (319.5, 239.5)
 TRUE = PinholeCamera(FOCAL, FOCAL, *CENTRE, 640, 480)

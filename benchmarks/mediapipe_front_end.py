@@ -6,7 +6,7 @@ model): how much they tremble, how gaps are bridged, how far elbows and shoulder
 the hands are off, and how much the poses in space differ. MediaPipe is no truth, in space least of all:
 beside it stands how much its own full and heavy models differ.
 
-    python benchmarks/mediapipe_front_end.py --data DIR
+    python -m benchmarks.mediapipe_front_end --data DIR
 """
 
 import argparse
@@ -14,16 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, pad, read_clip
 from torch import Tensor
 
+from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, pad, read_clip
 from torchpose.camera import PinholeCamera
+from torchpose.evaluation import Report
 from torchpose.metrics import jitter, joint_errors_3d
-from torchpose.pose_track import PoseTrack
 from torchpose.priors import UpperBodyPrior, load_prior
-from torchpose.protocols.report import Report
 from torchpose.skeleton import UPPER_BODY
-from torchpose.tracking import UpperBodyTracker
+from torchpose.upper_body import PoseTrack, UpperBodyTracker
 
 HEAD, NECK, LEFT, RIGHT = (
     UPPER_BODY.index(n) for n in ("head", "neck", "shoulder_left", "shoulder_right")
@@ -96,7 +95,7 @@ def jitter_tables(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) ->
         "Jitter in the image: mean acceleration (px/s²), and distance from MediaPipe's joints (px)",
         [*GROUPS, *(f"{g}, distance" for g in GROUPS)],
         digits=(0, 0, 0, 0, 1, 1, 1, 1),
-        note="The head is the prior's (see torchpose.io.landmarks), not MediaPipe's.",
+        note="The head is the prior's (see torchpose.skeleton.mediapipe_landmarks), not MediaPipe's.",
     )
     space = report.table(
         "jitter3d",
@@ -173,7 +172,7 @@ def inferred_table(bench: Bench, report: Report) -> None:
 
 
 def place_table(bench: Bench, report: Report) -> None:
-    """What the places of head and neck of `torchpose.io.landmarks` were chosen from."""
+    """What the places of head and neck of `torchpose.skeleton.mediapipe_landmarks` were chosen from."""
     table = report.table(
         "places",
         "Where head and neck are put: inferred elbows / shoulders (shoulder widths)",

@@ -5,7 +5,7 @@ own, so it gets an environment of its own, in which torchpose is not installed:
 
     python -m venv .venv-mediapipe
     .venv-mediapipe/bin/python -m pip install mediapipe==0.10.21
-    .venv-mediapipe/bin/python benchmarks/mediapipe_landmarks.py clip.mp4 --out clip_landmarks.npz
+    .venv-mediapipe/bin/python -m benchmarks.mediapipe_landmarks clip.mp4 --out clip_landmarks.npz
     torchpose track clip_landmarks.npz --out result
 
 Keys of the file: joints2d [T, 33, 2] (pixels), joints3d [T, 33, 3] (MediaPipe's own estimate: metres,

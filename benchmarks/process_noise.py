@@ -2,10 +2,10 @@
 
 A prior of s1 to s4 of UTD-MHAD tracks every n-th sequence of s5 and s6 in the test camera, with Q = k S
 for the walks and Q = k diag(S) for the others; the shipped factors are
-`torchpose.process_noise.INCREMENT_FACTORS`.
+`torchpose.upper_body.process_noise.INCREMENT_FACTORS`.
 
-    python benchmarks/process_noise.py --data DIR
-    python benchmarks/process_noise.py --data DIR --every 5 --methods mkf-fixed mkf-sampled mkf-split
+    python -m benchmarks.process_noise --data DIR
+    python -m benchmarks.process_noise --data DIR --every 5 --methods mkf-fixed mkf-sampled mkf-split
 """
 
 import argparse
@@ -14,10 +14,9 @@ from typing import Any
 
 import torch
 
+from benchmarks.ub_people import people
 from torchpose.camera import PinholeCamera
-from torchpose.priors.upper_body import UpperBodyPrior
-from torchpose.process_noise import INCREMENT_FACTORS
-from torchpose.protocols.common import (
+from torchpose.evaluation.common import (
     Trials,
     centred_on_neck,
     make_test_set,
@@ -25,8 +24,9 @@ from torchpose.protocols.common import (
     score,
     track,
 )
-from torchpose.protocols.ub_people import people
-from torchpose.recipes import UpperBodyRecipe
+from torchpose.learning.recipes import UpperBodyRecipe
+from torchpose.priors import UpperBodyPrior
+from torchpose.upper_body.process_noise import INCREMENT_FACTORS
 
 SEEN, TRIED = ("s1", "s2", "s3", "s4"), ("s5", "s6")
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)

@@ -8,7 +8,7 @@ errors stand what tells why: how well the estimate covers the silhouette and how
 does, and errors across the view apart from those along it. It writes real-bends.md and the folder
 real-bends of its pictures into the folder of the results.
 
-    python benchmarks/real_bends.py --data DIR --out DIR
+    python -m benchmarks.real_bends --data DIR --out DIR
 """
 
 import argparse
@@ -18,25 +18,26 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from _depth_silhouettes import HEAD_TOP, PELVIS, Filmed, draw, kinect, one_view, seeded
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose.body import Body, fit_body, fit_state
-from torchpose.body.kinematics import centres_of
-from torchpose.body.shape import fit_radii
-from torchpose.body.silhouette import count_pixels
-from torchpose.body.silhouette_likelihood import intersection_over_union
+from benchmarks._depth_silhouettes import HEAD_TOP, PELVIS, Filmed, draw, kinect, one_view, seeded
+from benchmarks.bend.trackees import REDRAWS, SHARPNESS, fit_space
+from benchmarks.silhouette.runs import choose_setting
+from benchmarks.silhouette.trackees import Setting
+from torchpose._core.files import atomic_path, check_output_folder
+from torchpose.body import Body, centres_of, fit_body, fit_state
 from torchpose.errors import DegenerateFilterWarning
-from torchpose.filters.constrained import ConstrainedParticleFilter
-from torchpose.filters.first_order import constant_velocity_std
-from torchpose.io.files import atomic_path, check_output_folder
-from torchpose.priors.action_space import ActionSpace
-from torchpose.priors.postures import state_postures
-from torchpose.protocols.bend_trackees import REDRAWS, SHARPNESS, fit_space
-from torchpose.protocols.report import Report
-from torchpose.protocols.silhouette_runs import choose_setting
-from torchpose.protocols.silhouette_trackees import Setting
+from torchpose.evaluation import Report
+from torchpose.priors import ActionSpace
+from torchpose.priors.actions.postures import state_postures
+from torchpose.whole_body import (
+    ConstrainedParticleFilter,
+    constant_velocity_std,
+    count_pixels,
+    fit_radii,
+    intersection_over_union,
+)
 
 ACTION, FPS = "pickup_throw", 30.0
 TEST, TUNING, OTHERS = ("s02", "s04", "s06"), "s08", ("s01", "s03", "s05", "s07")

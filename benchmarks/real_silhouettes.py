@@ -1,7 +1,7 @@
 """Real silhouettes: four cameras around a balancing man, and one depth camera before eight persons.
 
 The four views (`multicam_pose2sim`) are silhouettes of its videos against pictures of the empty room,
-made by `torchpose.measure.silhouettes`; the reference is the set's triangulated 3D, which no marker
+made by `torchpose.video.silhouettes`; the reference is the set's triangulated 3D, which no marker
 measured, so the table is a difference and not an error. The single view (`utd_mhad_silhouettes`) is
 segmented depth, paired with the Kinect's skeleton at the lag that the set gives; body, noise and
 manifold come from other recordings than the one that is tracked, sharpness from another person. A
@@ -11,7 +11,7 @@ the pelvis.
 It writes real-silhouettes.md and the folder real-silhouettes of its pictures into the folder of the
 results.
 
-    python benchmarks/real_silhouettes.py --data DIR --out DIR
+    python -m benchmarks.real_silhouettes --data DIR --out DIR
 """
 
 import argparse
@@ -22,7 +22,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from _depth_silhouettes import (
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from benchmarks._depth_silhouettes import (
     HEAD_TOP,
     Filmed,
     draw,
@@ -32,36 +35,24 @@ from _depth_silhouettes import (
     part_means,
     seeded,
 )
-from torch import Tensor
-from tqdm.auto import tqdm
-
-from torchpose.body import (
-    BODY_15,
-    Body,
-    JointLimits,
-    body_joints,
-    fit_body,
-    fit_state,
+from benchmarks.silhouette.tables import PARTS
+from benchmarks.silhouette.trackees import METHODS
+from torchpose._core.files import atomic_path, check_output_folder
+from torchpose.body import BODY_15, Body, JointLimits, body_joints, fit_body, fit_state
+from torchpose.camera import CameraRig, load_cameras
+from torchpose.evaluation import Report
+from torchpose.priors import BackConstrainedGPLVM, ManifoldInfo
+from torchpose.video import SilhouetteMeasurer, open_video, read_silhouettes
+from torchpose.video.silhouettes import fit_views, read_empty_scene
+from torchpose.whole_body import (
+    AnnealedParticleFilter,
+    ManifoldParticleFilter,
+    SilhouetteParticleFilter,
+    SIRParticleFilter,
+    find_pose,
+    fit_radii,
+    motion_std,
 )
-from torchpose.body.shape import fit_radii
-from torchpose.camera import load_cameras
-from torchpose.camera_rig import CameraRig
-from torchpose.filters import AnnealedParticleFilter, ManifoldParticleFilter, SIRParticleFilter
-from torchpose.filters.pose_search import find_pose
-from torchpose.filters.silhouette_filter import SilhouetteParticleFilter, motion_std
-from torchpose.io.files import atomic_path, check_output_folder
-from torchpose.measure.silhouettes import (
-    SilhouetteMeasurer,
-    fit_views,
-    read_empty_scene,
-    read_silhouettes,
-)
-from torchpose.priors.gplvm import BackConstrainedGPLVM
-from torchpose.priors.manifold_file import ManifoldInfo
-from torchpose.protocols.report import Report
-from torchpose.protocols.silhouette_tables import PARTS
-from torchpose.protocols.silhouette_trackees import METHODS
-from torchpose.video import open_video
 
 ROWS = 160
 HEIGHT = 1.75  # metres, of the man in the four views: nobody wrote it down

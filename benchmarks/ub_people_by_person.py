@@ -2,11 +2,11 @@
 
 For each of s1 to s6 a prior is fitted to the other five, without calibration, and tracks that person
 in the test camera. Scale and floor of the covariances then come from the errors of the other five,
-each under the prior that did not know them (`torchpose.recipes.fit_calibration`). The table shows the
+each under the prior that did not know them (`torchpose.learning.recipes.fit_calibration`). The table shows the
 error and the share of true joints inside the 50 % and 90 % ellipsoids, person by person: its spread
 is what a calibration on a handful of persons can promise for the next one.
 
-    python benchmarks/ub_people_by_person.py --data DIR --out DIR
+    python -m benchmarks.ub_people_by_person --data DIR --out DIR
 """
 
 import argparse
@@ -17,20 +17,14 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose.calibration import coverage
+from benchmarks.ub_people import people
+from torchpose._core.files import check_output_folder
 from torchpose.camera import PinholeCamera
-from torchpose.io import check_output_folder
-from torchpose.io.recordings import Recording
-from torchpose.metrics import align
-from torchpose.protocols.common import (
-    cached_prior,
-    centred_on_neck,
-    make_test_set,
-    track,
-)
-from torchpose.protocols.people_tables import SHORT_NAMES
-from torchpose.protocols.ub_people import people
-from torchpose.recipes import fit_calibration, fit_kinect_prior
+from torchpose.evaluation.common import cached_prior, centred_on_neck, make_test_set, track
+from torchpose.evaluation.people_tables import SHORT_NAMES
+from torchpose.io import Recording
+from torchpose.learning.recipes import fit_calibration, fit_kinect_prior
+from torchpose.metrics import align, coverage
 
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 LEVELS = (0.5, 0.9)

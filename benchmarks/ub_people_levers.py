@@ -1,14 +1,14 @@
 """What each choice of the recipe gave: the tracker of UB-people with one of them changed at a time.
 
 Measured on training persons alone: s1, s2, s4 and s5 of UTD-MHAD are fitted, and every third sequence
-of s3 and s6 is tracked from head, neck and hands with 3 px noise, as `torchpose evaluate ub-people`
+of s3 and s6 is tracked from head, neck and hands with 3 px noise, as `python -m benchmarks.ub_people`
 tracks its test persons. Files of the test persons, s7 and s8, are not opened.
 
 The error is the 3D distance after fixed-scale Procrustes, pooled over joints and frames. Seconds are
 CPU time of the fit of the mixtures that a row tracks with (both arms); rows that change the tracker
 alone repeat the default's. "another seed" says how far two fits of the same kind are apart.
 
-    python benchmarks/ub_people_levers.py --data DIR --out DIR [--only GROUP ...] [--seeds 0 1]
+    python -m benchmarks.ub_people_levers --data DIR --out DIR [--only GROUP ...] [--seeds 0 1]
 
 All of it takes hours. Fits and finished rows lie in the folder `--out` and are read from there the
 next time; levers.md there holds the table as far as it goes. After a change of the tracker delete
@@ -22,7 +22,9 @@ from statistics import mean, stdev
 from typing import NamedTuple
 
 import torch
-from _levers import (
+from tqdm.auto import tqdm
+
+from benchmarks._levers import (
     FIT_PERSONS,
     MODES,
     QUICK,
@@ -34,12 +36,10 @@ from _levers import (
     Windows,
     read_persons,
 )
-from _timing import machine_line, markdown_table
-from tqdm.auto import tqdm
-
+from benchmarks.speed._timing import machine_line, markdown_table
+from torchpose._core.files import atomic_path, check_output_folder
 from torchpose.camera import PAPER_VIEWS
-from torchpose.io.files import atomic_path, check_output_folder
-from torchpose.priors import TRAINING_VIEWS
+from torchpose.learning import TRAINING_VIEWS
 from torchpose.priors.window import WindowLayout
 
 HEADER = ("lever", "filtered (cm)", "jitter", "fit (s)", "smoothed (cm)", "jitter", "fit (s)")

@@ -2,9 +2,9 @@
 
 A prior is fitted to the training persons s1 to s3 of UB-people and tracks s4 to s6 in the test camera,
 still at the usual place (about 2 m away), walking in a circle, and standing elsewhere. Windows see
-the body by a virtual camera that follows it (`torchpose.body_view`), single poses do not.
+the body by a virtual camera that follows it (`torchpose.camera.virtual_camera`), single poses do not.
 
-    python benchmarks/ub_people_places.py --data DIR --out DIR
+    python -m benchmarks.ub_people_places --data DIR --out DIR
 """
 
 import argparse
@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks.ub_people import people, sway
+from torchpose._core.files import check_output_folder
 from torchpose.camera import PinholeCamera
-from torchpose.io import check_output_folder
+from torchpose.evaluation.common import Trials, cached_prior, centred_on_neck, make_test_set, score
+from torchpose.evaluation.common import track as track_test
+from torchpose.learning.recipes import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
-from torchpose.protocols.common import Trials, cached_prior, centred_on_neck, make_test_set, score
-from torchpose.protocols.common import track as track_test
-from torchpose.protocols.ub_people import people, sway
-from torchpose.recipes import fit_kinect_prior
 
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 FITTED, TRACKED = ("s1", "s2", "s3"), ("s4", "s5", "s6")

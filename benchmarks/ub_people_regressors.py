@@ -1,7 +1,7 @@
 """Learned regressors beside the mixture Kalman filter on UB-people.
 
 Trained on persons s1 to s6 of UTD-MHAD seen from the same random views as the prior, tested on s7
-and s8 with the same measurements as `torchpose evaluate ub-people`:
+and s8 with the same measurements as `python -m benchmarks.ub_people`:
 
 - MLP, 8-256-256-24: every frame alone, on 100,000 projected poses;
 - GRU, 2 x 128, causal: 1,500 steps of 32 sequences of 64 frames;
@@ -13,9 +13,9 @@ body's own axes (`--targets body`) or in those of the camera (`--targets camera`
 to be undone; the error is taken after Procrustes, so both are scored alike. The mean over the seeds
 and its spread are printed.
 
-    python benchmarks/ub_people_regressors.py --data DIR [--report OUT/report.json]
+    python -m benchmarks.ub_people_regressors --data DIR [--report OUT/report.json]
 
-`--report` prints the rows of a finished `torchpose evaluate ub-people` beside them.
+`--report` prints the rows of a finished `python -m benchmarks.ub_people` beside them.
 """
 
 import argparse
@@ -28,10 +28,10 @@ import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from torchpose.camera import PinholeCamera, sample_viewpoints
-from torchpose.priors import TRAINING_VIEWS
-from torchpose.projection import project
-from torchpose.protocols.common import (
+from benchmarks.ub_people import people, sway
+from torchpose.camera import PinholeCamera, project, sample_viewpoints
+from torchpose.evaluation import Report
+from torchpose.evaluation.common import (
     MEASURED,
     Estimate,
     Trials,
@@ -39,10 +39,9 @@ from torchpose.protocols.common import (
     make_test_set,
     score,
 )
-from torchpose.protocols.people_tables import SHORT_NAMES
-from torchpose.protocols.report import Report
-from torchpose.protocols.ub_people import people, sway
-from torchpose.rotations import euler_to_matrix
+from torchpose.evaluation.people_tables import SHORT_NAMES
+from torchpose.learning import TRAINING_VIEWS
+from torchpose.math import euler_to_matrix
 from torchpose.skeleton import UPPER_BODY, mirror_pose
 
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
@@ -172,7 +171,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", type=Path, required=True, help="folder kinect_utd_mhad")
-    parser.add_argument("--report", type=Path, help="report.json of torchpose evaluate ub-people")
+    parser.add_argument("--report", type=Path, help="report.json of python -m benchmarks.ub_people")
     parser.add_argument("--seeds", type=int, default=1, help="runs of each; ten minutes each")
     parser.add_argument("--targets", choices=("body", "camera"), default="body")
     parser.add_argument("--quick", action="store_true", help="a minute, to see that it works")

@@ -1,6 +1,6 @@
 """How well are hands found in ordinary webcam video?
 
-    python benchmarks/video_asl_hands.py --data FOLDER [--trackers grid,mean-shift] [--ablation]
+    python -m benchmarks.video_asl_hands --data FOLDER [--trackers grid,mean-shift] [--ablation]
         [--changed] [--pictures DIR] [--out FILE]
 
 On the seven clips of `video_asl` (three signers). The truth is MediaPipe's centre of the hand, wrist +
@@ -27,17 +27,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from _asl import BURN_IN, CLIPS, FPS, Clip, read_clip
-from _timing import Report, limit_threads, machine_line
 from torch import Tensor
 
-from torchpose.measure.edges import edge_map
-from torchpose.measure.face import FaceTracker
-from torchpose.measure.hand_prior import HandPrior
-from torchpose.measure.hand_settings import HandSettings
-from torchpose.measure.hands import HandTracker
+from benchmarks._asl import BURN_IN, CLIPS, FPS, Clip, read_clip
+from benchmarks.speed._timing import Report, limit_threads, machine_line
+from torchpose.measure import FaceTracker, HandPrior, HandSettings, HandTracker, edge_map
 from torchpose.priors import load_prior
-from torchpose.video.source import open_video
+from torchpose.video import open_video
 
 EASY = CLIPS[:3]  # dark long sleeves
 HEADER = ("", *CLIPS, "all", "first 3", "px", "px, first 3", "swapped", "missing", "ms")
@@ -164,7 +160,7 @@ def trackers(
             made[name] = lambda fps: HandTracker(prior, fps=fps)
         elif name == "mean-shift":
             try:
-                from torchpose.measure.mean_shift_hands import MeanShiftHandTracker
+                from torchpose.measure import MeanShiftHandTracker
             except ImportError as error:
                 report.add(f"The paper's recipe is left out: {error}.")
                 continue

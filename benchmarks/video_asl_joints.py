@@ -7,7 +7,7 @@ frames. Elbows and shoulders are inferred, never measured. The paper compares it
 (2012), whose code is not to be had; MediaPipe's joints are the reference here as Kinect's are there, and
 its Figure 12 has the pipeline with and without background subtraction, as here.
 
-    python benchmarks/video_asl_joints.py --data DIR --out video-joints.md --pictures DIR
+    python -m benchmarks.video_asl_joints --data DIR --out video-joints.md --pictures DIR
 """
 
 import argparse
@@ -16,18 +16,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from _asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, read_clip
 from torch import Tensor
 
+from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, read_clip
+from torchpose._core.files import check_output_folder
 from torchpose.camera import PinholeCamera
-from torchpose.io import check_output_folder
+from torchpose.evaluation import Report
 from torchpose.metrics import ARM_LIMBS, PCP, pcp
 from torchpose.priors import UpperBodyPrior, load_prior
-from torchpose.protocols.report import Report
 from torchpose.skeleton import UPPER_BODY
-from torchpose.tracking import UpperBodyTracker
+from torchpose.upper_body import UpperBodyTracker
 from torchpose.video import VideoFrame, open_video
-from torchpose.video_tracker import VideoTracker
+from torchpose.video.tracker import VideoTracker
 
 HEAD = UPPER_BODY.index("head")
 TRUNK = (HEAD, UPPER_BODY.index("neck"))
@@ -185,7 +185,7 @@ def pictures(
 ) -> list[str]:
     """The PCP curve (Figure 13) and the errors over time of one clip (Figure 12)."""
     from torchpose import viz
-    from torchpose.viz.style import save_figure
+    from torchpose.viz import save_figure
 
     save_figure(
         viz.plot_pcp(curves, by_limb=True, title="Correct limbs, seven clips"), out / "pcp.png"

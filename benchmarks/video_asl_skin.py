@@ -1,6 +1,6 @@
 """Does a Gaussian mixture find skin better than a histogram, and what does it cost?
 
-    python benchmarks/video_asl_skin.py --data FOLDER
+    python -m benchmarks.video_asl_skin --data FOLDER
 
 On the seven webcam clips of `video_asl` (three signers), at a quarter of their size. A pixel is skin if it
 lies in a disc about a hand that MediaPipe saw (a third of the face's size, about wrist + 0.7 (index -
@@ -21,14 +21,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from _asl import BURN_IN, CLIPS, read_clip
-from _timing import markdown_table, processor_model
 from torch import Tensor
 
-from torchpose.measure.face import FaceTracker
-from torchpose.measure.skin import SkinModel, rgb_to_lab
-from torchpose.measure.skin_mixture import SkinMixtureModel
-from torchpose.video.source import open_video
+from benchmarks._asl import BURN_IN, CLIPS, read_clip
+from benchmarks.speed._timing import markdown_table, processor_model
+from torchpose.measure import FaceTracker, SkinMixtureModel, SkinModel, rgb_to_lab
+from torchpose.video import open_video
 
 SCALE = 4
 DISC = 1 / 3  # radius of a hand, in sizes of the face

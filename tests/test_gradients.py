@@ -5,7 +5,7 @@ import torch
 
 from tests.gradients import assert_differentiable, assert_without_gradient
 from torchpose.priors import load_prior
-from torchpose.tracking import UpperBodyTracker
+from torchpose.upper_body import UpperBodyTracker
 
 NAMES = ("head", "hand_left", "hand_right")
 

@@ -7,15 +7,15 @@ import torch
 from torch import nn
 
 import torchpose
-from tests import test_module_state as modules
-from tests.filters.bending_body import BODY
-from tests.filters.walking_body import HEIGHT, WIDTH, rig, walk, walker
+from tests._core import test_module_state as modules
 from tests.gradients import assert_differentiable, assert_without_gradient
+from tests.whole_body.filters.bending_body import BODY
+from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walker
 from torchpose import body, filters, priors
-from torchpose.priors.part_postures import PartPostures
-from torchpose.projection import backproject, lift, map_pixels, project
-from torchpose.read_out import MotionStage, ReadOut
-from torchpose.rotations import euler_to_matrix, matrix_to_euler
+from torchpose.camera import backproject, lift, map_pixels, project
+from torchpose.math import euler_to_matrix, matrix_to_euler
+from torchpose.priors.actions.part_postures import PartPostures
+from torchpose.upper_body.fusion import MotionStage, ReadOut
 
 POINTS = modules.points
 ELSEWHERE = {

@@ -6,8 +6,9 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
-from torchpose import gaussian, projection
+from torchpose.camera import projection
 from torchpose.errors import ShapeError
+from torchpose.math import gaussian
 
 pytestmark = pytest.mark.skipif(
     os.environ.get("TORCHPOSE_SHAPE_CHECKS") == "0", reason="shape checks are switched off"

@@ -8,18 +8,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from torchpose.camera import PinholeCamera as PinholeCamera
-    from torchpose.errors import TorchposeError as TorchposeError
-    from torchpose.pose_track import PoseTrack as PoseTrack
-    from torchpose.priors.gmm import GaussianMixture as GaussianMixture
-    from torchpose.priors.shipped import load_action as load_action
-    from torchpose.priors.shipped import load_limb_conditionals as load_limb_conditionals
-    from torchpose.priors.shipped import load_manifold as load_manifold
-    from torchpose.priors.upper_body import UpperBodyPrior as UpperBodyPrior
-    from torchpose.priors.upper_body import load_prior as load_prior
-    from torchpose.tracking import UpperBodyTracker as UpperBodyTracker
-    from torchpose.value_checks import without_value_checks as without_value_checks
-    from torchpose.video_tracker import VideoTracker as VideoTracker
+    from torchpose._core.value_checks import without_value_checks
+    from torchpose.camera.pinhole import PinholeCamera
+    from torchpose.errors import TorchposeError
+    from torchpose.priors.gaussian_mixture import GaussianMixture
+    from torchpose.priors.shipped import load_action, load_limb_conditionals, load_manifold
+    from torchpose.priors.upper_body import UpperBodyPrior, load_prior
+    from torchpose.upper_body.pose_track import PoseTrack
+    from torchpose.upper_body.tracker import UpperBodyTracker
+    from torchpose.video.tracker import VideoTracker
 
     __version__: str
 
@@ -61,18 +58,18 @@ _SUBMODULES = frozenset(
     }
 )
 _HOME = {
-    "GaussianMixture": "torchpose.priors.gmm",
+    "GaussianMixture": "torchpose.priors.gaussian_mixture",
     "PinholeCamera": "torchpose.camera",
-    "PoseTrack": "torchpose.pose_track",
+    "PoseTrack": "torchpose.upper_body.pose_track",
     "TorchposeError": "torchpose.errors",
     "UpperBodyPrior": "torchpose.priors.upper_body",
-    "UpperBodyTracker": "torchpose.tracking",
-    "VideoTracker": "torchpose.video_tracker",
+    "UpperBodyTracker": "torchpose.upper_body.tracker",
+    "VideoTracker": "torchpose.video.tracker",
     "load_action": "torchpose.priors.shipped",
     "load_limb_conditionals": "torchpose.priors.shipped",
     "load_manifold": "torchpose.priors.shipped",
     "load_prior": "torchpose.priors.upper_body",
-    "without_value_checks": "torchpose.value_checks",
+    "without_value_checks": "torchpose._core.value_checks",
 }
 
 __all__ = [

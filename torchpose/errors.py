@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpose.value_checks import values_visible
+from torchpose._core.value_checks import values_visible
 
 __all__ = [
     "CameraError",

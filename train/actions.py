@@ -1,21 +1,16 @@
 """Fit of action spaces, or of a bank, with Lightning: one step.
 
-The fit itself is `torchpose.recipes.actions`.
+The fit itself is `torchpose.learning.recipes.actions`.
 """
 
 from typing import Any, Literal
 
 import torch
 
-from torchpose.priors.action_bank import BankInfo
-from torchpose.recipes.actions import (
-    ActionRecipe,
-    FittedActions,
-    Performances,
-    check_actions,
-    fit_actions,
-)
-from torchpose.recipes.files import write_action_files
+from torchpose.learning.recipes import ActionRecipe, Performances, fit_actions
+from torchpose.learning.recipes.actions import FittedActions, check_actions
+from torchpose.learning.recipes.files import write_action_files
+from torchpose.priors.actions.file import BankInfo
 from train.body_fit import BodyData, BodyFit
 
 __all__ = ["ActionData", "ActionFit"]

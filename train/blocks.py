@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from torchpose.errors import InputError
-from torchpose.priors.samplers import PRODUCT, Samples, SampleSource, join_samples
-from torchpose.priors.usable_samples import usable_block
+from torchpose.learning.samplers import PRODUCT, Samples, SampleSource, join_samples
+from torchpose.learning.usable_samples import usable_block
 
 __all__ = ["Block", "Key", "Part", "ShareSampler", "Sweep", "SweepLoader", "list_blocks"]
 

@@ -1,6 +1,6 @@
 """What fits to whole bodies share: one process, the identity of a fit, and where its file goes.
 
-What is fitted, and to which recordings, is `torchpose.recipes`; here are the steps of Lightning.
+What is fitted, and to which recordings, is `torchpose.learning.recipes`; here are the steps of Lightning.
 """
 
 from collections.abc import Sequence

@@ -10,11 +10,11 @@ from lightning.pytorch.callbacks import Checkpoint, ProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 from tqdm.auto import tqdm
 
+from torchpose._core.leftovers import clear_leftovers
 from torchpose.cli.common import show_progress
 from torchpose.cli.fit import summary, write_prior
-from torchpose.cli.prior_files import prior_results
 from torchpose.errors import OutputError
-from torchpose.io.leftovers import clear_leftovers
+from torchpose.learning.prior_files import prior_results
 from torchpose.priors import UpperBodyPrior
 from train.blocks import Sweep
 from train.mixture_em import MixtureEM
@@ -135,11 +135,7 @@ class FitPictures(Callback):
 def _pictures(
     module: MixtureEM, prior: UpperBodyPrior, n_shown: int
 ) -> dict[str, Callable[[], Any]]:
-    from torchpose.viz.prior_pictures import (
-        plot_log_likelihood,
-        plot_prior_components,
-        plot_prior_samples,
-    )
+    from torchpose.viz import plot_log_likelihood, plot_prior_components, plot_prior_samples
 
     found: dict[str, Callable[[], Any]] = {
         "likelihood": lambda: plot_log_likelihood(module.histories, module.held_out_history),

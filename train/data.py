@@ -7,18 +7,18 @@ from typing import Any
 
 from lightning.pytorch import LightningDataModule
 
-from torchpose.curation import (
+from torchpose.errors import InputError, OverlapError
+from torchpose.io import Recording, find_recordings, read_recordings
+from torchpose.learning.curation import (
     CurationReport,
     CurationSettings,
     curate,
     pick_persons,
     refuse_leaks,
 )
-from torchpose.errors import InputError, OverlapError
-from torchpose.io import Recording, find_recordings, read_recordings
-from torchpose.priors.samplers import SampleSource, cached
-from torchpose.recipes import VERSION, MixtureTask, UpperBodyRecipe
-from torchpose.recipes.choosing import expand_path, fingerprint
+from torchpose.learning.recipes import VERSION, MixtureTask, UpperBodyRecipe
+from torchpose.learning.recipes.choosing import expand_path, fingerprint
+from torchpose.learning.samplers import SampleSource, cached
 from train.blocks import Key, SweepLoader
 
 __all__ = ["RecordingsDataModule", "read_sides", "split"]

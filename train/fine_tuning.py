@@ -17,14 +17,14 @@ from torch import Tensor, nn
 from torch.optim import Adam
 from torch.optim.lr_scheduler import LambdaLR
 
-from torchpose.curation import CurationSettings
 from torchpose.errors import InputError
 from torchpose.io import Recording
+from torchpose.learning import collect_poses
+from torchpose.learning.curation import CurationSettings
+from torchpose.learning.fine_tuning import TunableKalman, TunableWindow, parameter_groups
+from torchpose.learning.recipes.calibration import HeldOut, calibration_noise, track_held_out
+from torchpose.learning.recipes.choosing import fingerprint
 from torchpose.priors import UpperBodyPrior, load_prior
-from torchpose.priors.fine_tuning import TunableKalman, TunableWindow, parameter_groups
-from torchpose.priors.training import collect_poses
-from torchpose.recipes.calibration import HeldOut, calibration_noise, track_held_out
-from torchpose.recipes.choosing import fingerprint
 from train.data import read_sides
 from train.fine_tuning_batches import batches_of
 from train.identity import check_identity, differences

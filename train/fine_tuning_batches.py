@@ -14,18 +14,18 @@ from torch import Tensor
 from torchpose.camera import ViewRange
 from torchpose.errors import InputError
 from torchpose.io import Recording
-from torchpose.priors import UpperBodyPrior
-from torchpose.priors.completion import ColumnsSource
-from torchpose.priors.fine_tuning import (
+from torchpose.learning import collect_poses
+from torchpose.learning.completion import ColumnsSource
+from torchpose.learning.fine_tuning import (
     TunableKalman,
     TunableWindow,
     WindowBatch,
     draw_sequences,
     draw_windows,
 )
-from torchpose.priors.samplers import WindowSource, derived_seed
-from torchpose.priors.training import collect_poses
-from torchpose.recipes import UpperBodyRecipe
+from torchpose.learning.recipes import UpperBodyRecipe
+from torchpose.learning.samplers import WindowSource, derived_seed
+from torchpose.priors import UpperBodyPrior
 
 __all__ = ["Batches", "SequenceBatches", "WindowBatches", "batches_of"]
 

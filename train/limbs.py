@@ -1,12 +1,13 @@
-"""Fit of limb conditionals with Lightning: one step; the fit itself is `torchpose.recipes.limbs`."""
+"""Fit of limb conditionals with Lightning: one step; the fit itself is `torchpose.learning.recipes.limbs`."""
 
 from typing import Any
 
 import torch
 
 from torchpose.errors import InputError
-from torchpose.recipes.files import write_limb_files
-from torchpose.recipes.limbs import LimbStates, check_least_std, fit_limbs
+from torchpose.learning.recipes import LimbStates, fit_limbs
+from torchpose.learning.recipes.files import write_limb_files
+from torchpose.learning.recipes.limbs import check_least_std
 from train.body_fit import BodyData, BodyFit
 
 __all__ = ["LimbData", "LimbFit"]

@@ -15,11 +15,13 @@ from torch import nn
 from torch.optim import Optimizer
 
 from torchpose.errors import InputError, TorchposeError
-from torchpose.priors import GaussianMixture, SufficientStatistics, UpperBodyPrior
-from torchpose.priors.stepwise_em import stepwise_pass
-from torchpose.priors.streamed_em import Share, StreamedEM
-from torchpose.recipes import MixtureTask
-from torchpose.recipes.calibration import folds
+from torchpose.learning.recipes import MixtureTask
+from torchpose.learning.recipes.calibration import folds
+from torchpose.learning.share import Share
+from torchpose.learning.stepwise_em import stepwise_pass
+from torchpose.learning.streamed_em import StreamedEM
+from torchpose.math import SufficientStatistics
+from torchpose.priors import GaussianMixture, UpperBodyPrior
 from train.blocks import Key, Sweep
 from train.data import RecordingsDataModule
 from train.identity import check_identity, differences

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from torchpose._core.files import atomic_path
 from torchpose.errors import OutputError
-from torchpose.io.files import atomic_path
 
 __all__ = ["COLUMNS", "Outcome", "check_summary", "count_outcomes", "write_summary"]
 

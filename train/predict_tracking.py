@@ -16,16 +16,15 @@ import torch
 from jsonargparse import Namespace
 
 import torchpose
+from torchpose._core.files import atomic_path
 from torchpose.cli.camera_option import resolve_camera
 from torchpose.cli.common import positive
 from torchpose.cli.track import tracker_options
 from torchpose.cli.track_keypoints import joint_names, kind_of_neck
 from torchpose.errors import DegenerateFilterWarning, InputError, OutputError
 from torchpose.io import read_keypoints
-from torchpose.io.files import atomic_path
-from torchpose.pose_track import PoseTrack
 from torchpose.priors import UpperBodyPrior, load_prior
-from torchpose.tracking import UpperBodyTracker
+from torchpose.upper_body import PoseTrack, UpperBodyTracker
 from train.predict_recordings import Recording, content_of
 
 __all__ = [

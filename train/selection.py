@@ -8,7 +8,7 @@ from lightning.pytorch import LightningDataModule, LightningModule, Trainer
 
 from torchpose.cli.common import show_progress
 from torchpose.errors import InputError
-from torchpose.priors.selection import select_n_components
+from torchpose.learning.selection import select_n_components
 from train.blocks import Key
 from train.data import RecordingsDataModule
 

@@ -8,8 +8,8 @@ from typing import Any
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.strategies import DDPStrategy, StrategyRegistry
 
+from torchpose._core.files import atomic_path
 from torchpose.errors import FileFormatError
-from torchpose.io.files import atomic_path
 
 __all__ = ["AtomicCheckpoints", "Processes", "register"]
 

@@ -3,10 +3,9 @@ import math
 import torch
 
 from torchpose.body import BODY_15, Body, body_joints
-from torchpose.priors.action_bank import ActionBank
-from torchpose.priors.action_space import ActionSpace
-from torchpose.priors.postures import posture_angles, posture_to_state
-from torchpose.priors.repetitions import repetition_axis, split_repetitions
+from torchpose.priors import ActionBank, ActionSpace
+from torchpose.priors.actions.postures import posture_angles, posture_to_state
+from torchpose.priors.actions.repetitions import repetition_axis, split_repetitions
 
 
 def somebody(

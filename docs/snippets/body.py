@@ -1,9 +1,8 @@
 import torch
 
-from torchpose.body import BODY_15, Body, render
-from torchpose.camera import PinholeCamera
-from torchpose.camera_rig import CameraRig
-from torchpose.filters import AnnealedParticleFilter
+from torchpose.body import BODY_15, Body
+from torchpose.camera import CameraRig, PinholeCamera
+from torchpose.whole_body import AnnealedParticleFilter, render
 
 body = Body.of_height(BODY_15, 1.75)
 front = PinholeCamera(150, 150, 79.5, 59.5, 160, 120, "front", rotation=(torch.pi, 0, 0),

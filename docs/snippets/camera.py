@@ -1,6 +1,7 @@
 import torch
 
-from torchpose.camera import PinholeCamera, euler_to_matrix, lift, map_pixels, project
+from torchpose.camera import PinholeCamera, lift, map_pixels, project
+from torchpose.math import euler_to_matrix
 
 camera = PinholeCamera(fx=525, fy=525, cx=319.5, cy=239.5, width=640, height=480)
 R = euler_to_matrix(torch.tensor([0.02, -0.05, 0.03], dtype=torch.float64), order="zxy")

@@ -2,12 +2,11 @@ import math
 
 import torch
 
-from torchpose.body import BODY_15, Body, render
+from torchpose.body import BODY_15, Body
 from torchpose.camera import PinholeCamera
-from torchpose.filters.constrained import ConstrainedParticleFilter
-from torchpose.filters.first_order import constant_velocity_std
-from torchpose.priors.action_space import ActionSpace
-from torchpose.priors.postures import state_postures
+from torchpose.priors import ActionSpace
+from torchpose.priors.actions.postures import state_postures
+from torchpose.whole_body import ConstrainedParticleFilter, constant_velocity_std, render
 
 body = Body.of_height(BODY_15, 1.75)
 torso, thigh = 3 + 3 * body.skeleton.part("torso"), 3 + 3 * body.skeleton.part("left_thigh")

@@ -3,9 +3,8 @@ import math
 import torch
 
 from torchpose.body import BODY_15, Body, fit_body, fit_state
-from torchpose.priors.gplvm import BackConstrainedGPLVM
-from torchpose.priors.manifold_file import ManifoldInfo
-from torchpose.priors.pose_sequences import thin
+from torchpose.priors import BackConstrainedGPLVM, ManifoldInfo
+from torchpose.priors.manifold.pose_sequences import thin
 
 # recordings of one person; here legs that walk, in yours joints [T, 15, 3] of `read_mocap`
 body = Body.of_height(BODY_15, 1.75)

@@ -1,7 +1,8 @@
 import torch
 
 from torchpose.body import BODY_15, Body
-from torchpose.filters.silhouette_filter import SilhouetteParticleFilter, reweight
+from torchpose.whole_body import SilhouetteParticleFilter
+from torchpose.whole_body.filters.body_particles import reweight
 
 
 class SwingingParticleFilter(SilhouetteParticleFilter):

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchpose.filters import RecursiveFilter, StepOutput
 from torchpose.filters.transition import make_transition
-from torchpose.gaussian import kalman_predict, kalman_update
+from torchpose.math import kalman_predict, kalman_update
 from torchpose.priors import GaussianMixture
 
 

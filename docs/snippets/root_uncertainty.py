@@ -2,11 +2,10 @@ import math
 
 import torch
 
-from torchpose.body import BODY_15, Body, render
-from torchpose.camera import PinholeCamera
-from torchpose.camera_rig import CameraRig
-from torchpose.filters import RootUncertaintyTracker
+from torchpose.body import BODY_15, Body
+from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
+from torchpose.whole_body import RootUncertaintyTracker, render
 
 # recorded states of a person; here legs that walk, in yours `fit_state` of `read_mocap`
 person = Body.of_height(BODY_15, 1.75)

@@ -1,8 +1,12 @@
 import torch
 
-from torchpose.body.quaternion_vectors import compose, conjugate, quaternion_vector_to_matrix
-from torchpose.rotation_gaussians import gaussian_rotate
-from torchpose.unscented import unscented_update
+from torchpose.math import (
+    compose,
+    conjugate,
+    gaussian_rotate,
+    quaternion_vector_to_matrix,
+    unscented_update,
+)
 
 # a device that tumbles: a gyroscope, and the directions of gravity and of north as it sees them
 generator = torch.Generator().manual_seed(0)

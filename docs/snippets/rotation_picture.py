@@ -1,7 +1,6 @@
 import torch
 
-from torchpose.body.quaternion_vectors import compose
-from torchpose.rotation_gaussians import gaussian_rotate, rotate_gaussian
+from torchpose.math import compose, gaussian_rotate, rotate_gaussian
 from torchpose.viz import save_figure
 from torchpose.viz.rotation_picture import plot_rotations
 

@@ -1,8 +1,8 @@
 import torch
 
-from torchpose.body.quaternion_vectors import compose
-from torchpose.rotation_gaussians import (
+from torchpose.math import (
     angle_to_edge,
+    compose,
     fit_gaussian,
     gaussian_rotate,
     rotate_gaussian,

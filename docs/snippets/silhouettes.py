@@ -1,9 +1,8 @@
 import torch
 
-from torchpose.body import BODY_15, Body, count_pixels, render
-from torchpose.body.silhouette_likelihood import bidirectional
-from torchpose.camera import PinholeCamera
-from torchpose.camera_rig import CameraRig
+from torchpose.body import BODY_15, Body
+from torchpose.camera import CameraRig, PinholeCamera
+from torchpose.whole_body import bidirectional, count_pixels, render
 
 body = Body.of_height(BODY_15, 1.75)
 camera = PinholeCamera(

@@ -1,8 +1,8 @@
 import torchpose
-from torchpose.io.bvh import write_bvh
-from torchpose.report import write_report
+from torchpose.upper_body.bvh import write_bvh
 from torchpose.video import VideoWriter, open_video, prefetch
 from torchpose.video.overlay import draw_overlay
+from torchpose.viz.report import write_report
 
 prior = torchpose.load_prior("kinect-upper-body")
 with open_video("clip.mp4") as video:

@@ -5,9 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchpose.body.skeleton import BODY_15, TaperedCylinder, Tip, body_joints, tree_levels
+from torchpose.body import BODY_15, TaperedCylinder, Tip, body_joints
+from torchpose.body.skeleton import tree_levels
 from torchpose.errors import InputError, ShapeError, SkeletonError
-from torchpose.joint_sets import SKELETONS
+from torchpose.skeleton import SKELETONS
 
 WHOLE = [
     "humaneva-15",

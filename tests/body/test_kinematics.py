@@ -8,8 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from torchpose.body import BODY_15, Body, TaperedCylinder, centres_of
-from torchpose.body.quaternion_vectors import quaternion_vector_to_matrix
 from torchpose.errors import InputError, ShapeError, SkeletonError
+from torchpose.math import quaternion_vector_to_matrix
 
 
 def random_states(body, *lead, scale=0.35, seed=0):

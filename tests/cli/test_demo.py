@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from torchpose.camera import euler_to_matrix, lift
+from torchpose.camera import lift
 from torchpose.cli import demo_keypoints, demo_scores
 from torchpose.io import read_keypoints
-from torchpose.pose_track import PoseTrack
+from torchpose.math import euler_to_matrix
 from torchpose.priors import load_prior
 from torchpose.skeleton import LEFT_ARM, RIGHT_ARM, UPPER_BODY
+from torchpose.upper_body import PoseTrack
 
 
 @pytest.fixture

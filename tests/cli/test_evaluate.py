@@ -39,9 +39,9 @@ def calls(monkeypatch):
         made.append({k: v for k, v in locals().items() if k != "made"})
         return SimpleNamespace(summary=lambda: "error 5.0 cm")
 
-    module = ModuleType("torchpose.protocols.ub_people")
+    module = ModuleType("benchmarks.ub_people")
     module.run = run
-    monkeypatch.setitem(sys.modules, "torchpose.protocols.ub_people", module)
+    monkeypatch.setitem(sys.modules, "benchmarks.ub_people", module)
     return made
 
 

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from torchpose.cli.fit import build, command_line
-from torchpose.curation import curate
 from torchpose.io import read_recordings
+from torchpose.learning.curation import curate
+from torchpose.learning.recipes import UpperBodyRecipe
 from torchpose.priors import UpperBodyPrior, fit_upper_body_prior, load_prior
-from torchpose.recipes import UpperBodyRecipe
 
 QUICK = ("--components", 2, "--samples", 500, "--noise", "none", "--pictures", "false")
 

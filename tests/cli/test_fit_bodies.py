@@ -11,13 +11,13 @@ import torch
 
 from tests.priors.motions import motion
 from tests.priors.performances import performances
+from torchpose._core.tensor_file import format_of
 from torchpose.body import BODY_15, Body
 from torchpose.cli.fit_bodies import KINDS, build, command_line
 from torchpose.priors import ActionBank, ActionSpace, BackConstrainedGPLVM
-from torchpose.priors.gplvm_fit import GPLVMFit
+from torchpose.priors.actions.postures import posture_angles, posture_to_state
 from torchpose.priors.limb_conditionals import LimbConditionals
-from torchpose.priors.postures import posture_angles, posture_to_state
-from torchpose.priors.tensor_file import format_of
+from torchpose.priors.manifold.fit import GPLVMFit
 
 LOADERS = {
     "manifold": BackConstrainedGPLVM.load,

@@ -8,17 +8,11 @@ import torch
 
 from tests.cli.conftest import keypoints
 from torchpose.body import BODY_15, Body
-from torchpose.body_poses import BodyPoses
 from torchpose.camera import PinholeCamera
 from torchpose.io import write_keypoints
-from torchpose.priors import (
-    ActionBank,
-    ActionInfo,
-    ActionSpace,
-    BackConstrainedGPLVM,
-    ManifoldInfo,
-)
+from torchpose.priors import ActionBank, ActionInfo, ActionSpace, BackConstrainedGPLVM, ManifoldInfo
 from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
+from torchpose.whole_body import BodyPoses
 
 
 def test_installation(torchpose):

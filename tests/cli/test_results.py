@@ -9,18 +9,18 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from torchpose.evaluation import Report
+from torchpose.evaluation.common import add_picture
 from torchpose.io import ResultsFolder
-from torchpose.pose_track import PoseTrack
-from torchpose.protocols.common import add_picture
-from torchpose.protocols.report import Report
+from torchpose.upper_body import PoseTrack
 from torchpose.video import VideoWriter
 
 POSES = ("poses.npz", "poses.csv", "poses.bvh")
 LIST = ".torchpose-track.json"
 KILLED = """
 import os, signal, sys
-import torchpose.io.bvh
-torchpose.io.bvh.write_bvh = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+import torchpose.upper_body.bvh
+torchpose.upper_body.bvh.write_bvh = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
 from torchpose.cli import main
 main(sys.argv[1:])
 """
@@ -206,9 +206,9 @@ def protocol(monkeypatch):
         report.save(out)
         return report
 
-    module = ModuleType("torchpose.protocols.ub_people")
+    module = ModuleType("benchmarks.ub_people")
     module.run = run
-    monkeypatch.setitem(sys.modules, "torchpose.protocols.ub_people", module)
+    monkeypatch.setitem(sys.modules, "benchmarks.ub_people", module)
 
 
 def test_an_evaluation_spares_other_reports_and_moves_other_pictures(torchpose, protocol, tmp_path):

@@ -11,10 +11,9 @@ from tests.cli.conftest import GAP, N_FRAMES, keypoints
 from torchpose.camera import PinholeCamera, save_cameras
 from torchpose.cli import track_output
 from torchpose.io import read_keypoints, write_keypoints
-from torchpose.pose_track import PoseTrack
 from torchpose.priors import load_prior
 from torchpose.skeleton import UPPER_BODY
-from torchpose.tracking import METHODS, UpperBodyTracker
+from torchpose.upper_body import METHODS, PoseTrack, UpperBodyTracker
 
 SMALL = "kinect-upper-body-small"  # a prior with windows
 KEYS = ("joints2d", "joints3d", "covariance3d", "observed", "log_evidence")

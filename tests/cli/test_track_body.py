@@ -7,18 +7,16 @@ import pytest
 import torch
 
 from torchpose.body import BODY_15, Body
-from torchpose.body.silhouette import render
-from torchpose.body_poses import BodyPoses
-from torchpose.camera import PinholeCamera, save_cameras
-from torchpose.camera_rig import CameraRig
+from torchpose.camera import CameraRig, PinholeCamera, save_cameras
 from torchpose.cli import main
 from torchpose.cli.track_body import _initial_state, build
 from torchpose.cli.track_body_models import BodyModel, check_method, load_model
 from torchpose.cli.track_body_output import action_text, gate_notes
 from torchpose.priors import ActionBank, ActionSpace, BackConstrainedGPLVM, ManifoldInfo
+from torchpose.priors.actions.postures import state_postures
 from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
-from torchpose.priors.postures import state_postures
 from torchpose.video import VideoWriter
+from torchpose.whole_body import BodyPoses, render
 
 HEIGHT, WIDTH, N = 120, 160, 8
 
@@ -320,7 +318,7 @@ def test_a_pose_is_found_on_an_upright_body(recorded, tmp_path, monkeypatch):
         asked.append(upright)
         return SimpleNamespace(state=states[0])
 
-    monkeypatch.setattr("torchpose.filters.first_pose.find_first_pose", find)
+    monkeypatch.setattr("torchpose.whole_body.find_first_pose", find)
     line = [
         "--conditionals",
         str(tmp_path / "limbs.safetensors"),

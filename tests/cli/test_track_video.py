@@ -12,8 +12,8 @@ import torch
 from torchpose import demo
 from torchpose.cli.common import UntilInterrupted
 from torchpose.errors import OutputError
-from torchpose.pose_track import PoseTrack
 from torchpose.skeleton import UPPER_BODY
+from torchpose.upper_body import PoseTrack
 from torchpose.video import CameraSource, VideoWriter, open_video
 
 N = 45
@@ -29,7 +29,7 @@ def _no_space(*_, **__):
 def clip(tmp_path_factory):
     """1.5 s of a rendered performer, and where the joints are in it."""
     pytest.importorskip("matplotlib", reason="the performer's face comes from matplotlib")
-    from torchpose.rendering import render_video
+    from torchpose.demo.rendering import render_video
 
     folder = tmp_path_factory.mktemp("clip")
     truth = render_video(folder / "clip.mp4", demo.performer(N), demo.demo_camera())[0]
@@ -226,7 +226,7 @@ def test_a_full_disk_is_told_and_leaves_nothing_half_written(clip, track, monkey
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("torchpose.pose_spool._array", full)
+    monkeypatch.setattr("torchpose.video.pose_spool._array", full)
     done, out = track(clip[0])
     assert done.code == 2 and "No space left" in done.err
     assert list(out.iterdir()) == []

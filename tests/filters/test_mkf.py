@@ -14,16 +14,12 @@ from tests.filters.oracles import (
     tensor,
 )
 from tests.filters.small_problem import DIM, OBSERVED, Problem
-from torchpose.errors import (
-    CovarianceError,
-    DegenerateFilterWarning,
-    InputError,
-    ShapeError,
-)
-from torchpose.filters import MixtureKalmanFilter, RecursiveFilter, SilhouetteParticleFilter
+from torchpose.errors import CovarianceError, DegenerateFilterWarning, InputError, ShapeError
+from torchpose.filters import MixtureKalmanFilter, RecursiveFilter
 from torchpose.filters.mkf import TRACK_OPTIONS
 from torchpose.filters.transition import make_transition
 from torchpose.priors import GaussianMixture
+from torchpose.whole_body import SilhouetteParticleFilter
 
 DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
 

@@ -16,12 +16,12 @@ from tests.filters.oracles import (
     tensor,
 )
 from torchpose.errors import CovarianceError, DegenerateFilterWarning, InputError, ShapeError
-from torchpose.filters.base import RecursiveFilter
-from torchpose.filters.particle import PROPOSALS, BootstrapParticleFilter
+from torchpose.filters import BootstrapParticleFilter, RecursiveFilter
+from torchpose.filters.particle_options import PROPOSALS
 from torchpose.filters.transition import make_transition
 from torchpose.filters.walk import MixtureWalk, Moves, grouped_affine
-from torchpose.gaussian import log_prob, mixture_moments, safe_cholesky
-from torchpose.priors.gmm import GaussianMixture
+from torchpose.math import log_prob, mixture_moments, safe_cholesky
+from torchpose.priors import GaussianMixture
 
 WIDE = torch.float64
 EXACT_PROPOSALS = ("mixture", "random-walk")

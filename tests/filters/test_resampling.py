@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchpose.errors import InputError, ShapeError
-from torchpose.filters.resampling import RESAMPLING, resample
+from torchpose.filters import resample
+from torchpose.filters.resampling import RESAMPLING
 
 METHODS = sorted(RESAMPLING)
 

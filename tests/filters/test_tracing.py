@@ -22,9 +22,9 @@ from tests.filters.traced_steps import (
     make,
     seeded,
 )
+from torchpose._core.value_checks import values_visible
 from torchpose.errors import CovarianceError, InputError, ShapeError, check_covariance
-from torchpose.gaussian import mended_cholesky
-from torchpose.value_checks import values_visible
+from torchpose.math import mended_cholesky
 
 FILTERS = (*KALMAN, *PARTICLES)
 TRACED = (

@@ -12,11 +12,10 @@ from torch import Tensor
 from tests.fuzz.readers import SilentError
 from tests.fuzz.samples import prior
 from torchpose import metrics
-from torchpose.camera import PinholeCamera
-from torchpose.camera_rig import CameraRig
+from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.filters import BootstrapParticleFilter, MixtureKalmanFilter
 from torchpose.priors import GaussianMixture
-from torchpose.tracking import UpperBodyTracker
+from torchpose.upper_body import UpperBodyTracker
 
 __all__ = ["odd_call"]
 

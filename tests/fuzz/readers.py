@@ -11,19 +11,15 @@ import torch
 from torch import Tensor
 
 import torchpose.cli
-from torchpose.body_poses import BodyPoses
-from torchpose.camera import load_cameras
-from torchpose.camera_rig import CameraRig
+from torchpose.camera import CameraRig, load_cameras
 from torchpose.io import read_keypoints, read_recording
 from torchpose.io.humaneva import read_calibration, read_stream_offset
-from torchpose.pose_track import PoseTrack
-from torchpose.priors.action_bank import ActionBank
-from torchpose.priors.action_space import ActionSpace
-from torchpose.priors.gplvm import BackConstrainedGPLVM
+from torchpose.priors import ActionBank, ActionSpace, BackConstrainedGPLVM, UpperBodyPrior
 from torchpose.priors.limb_conditionals import LimbConditionals
-from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.skeleton import UPPER_BODY
+from torchpose.upper_body import PoseTrack
 from torchpose.video import open_video
+from torchpose.whole_body import BodyPoses
 
 __all__ = ["READERS", "SilentError", "info"]
 

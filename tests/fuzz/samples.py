@@ -24,19 +24,20 @@ from tests.priors.mixtures import random_mixture
 from tests.priors.motions import motion
 from tests.priors.performances import performances
 from torchpose.body import BODY_15, Body, centres_of
-from torchpose.body_poses import BodyPoses
 from torchpose.camera import PinholeCamera, save_cameras
-from torchpose.io.bvh import write_bvh
-from torchpose.joint_sets import SKELETONS
-from torchpose.pose_track import PoseTrack
-from torchpose.priors.action_bank import ActionBank
-from torchpose.priors.action_space import ActionSpace
-from torchpose.priors.gplvm import BackConstrainedGPLVM
+from torchpose.priors import (
+    ActionBank,
+    ActionSpace,
+    BackConstrainedGPLVM,
+    ManifoldInfo,
+    PriorInfo,
+    UpperBodyPrior,
+)
 from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
-from torchpose.priors.manifold_file import ManifoldInfo
-from torchpose.priors.prior_file import PriorInfo
-from torchpose.priors.upper_body import UpperBodyPrior
-from torchpose.skeleton import UPPER_BODY
+from torchpose.skeleton import SKELETONS, UPPER_BODY
+from torchpose.upper_body import PoseTrack
+from torchpose.upper_body.bvh import write_bvh
+from torchpose.whole_body import BodyPoses
 
 __all__ = ["SAMPLES", "Content"]
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from tests.protocols.walkers import NAMES, walker
-from torchpose.body.skeleton import body_joints
+from benchmarks.silhouette.data import place_cameras
+from tests.benchmarks.walkers import NAMES, walker
+from torchpose.body import body_joints
+from torchpose.demo.rendering.clothed_body import TrueShape, true_silhouettes
 from torchpose.io.mocap import MocapClip
-from torchpose.protocols.silhouette_data import place_cameras
-from torchpose.protocols.silhouette_truth import TrueShape, true_silhouettes
 
 WIDTH, HEIGHT = 640, 480
 CAMERAS = ("C1", "C2", "C3")

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from tests.io import bvh_reader
 from tests.io.skeleton_files import person
-from tests.io.test_bvh import track_of
+from tests.upper_body import bvh_reader
+from tests.upper_body.test_bvh import track_of
 from torchpose.demo import performer
 from torchpose.errors import FileFormatError, MissingDependencyError, SkeletonError
 from torchpose.io import find_recordings, read_recording
-from torchpose.io.bvh import write_bvh
-from torchpose.io.bvh_recordings import bvh_joint_names
-from torchpose.joint_sets import UPPER_BODY
+from torchpose.io.formats.bvh_recordings import bvh_joint_names
+from torchpose.skeleton import UPPER_BODY
+from torchpose.upper_body.bvh import write_bvh
 
 # Someone in a T pose who faces +z: offsets in centimetres, arms along ±x.
 ARM = """

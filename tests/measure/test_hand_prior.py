@@ -6,9 +6,9 @@ import torch
 
 import torchpose
 from torchpose.errors import InputError
-from torchpose.measure.hand_prior import FACE_HEIGHT, HandPrior
-from torchpose.priors import PriorInfo, UpperBodyPrior
-from torchpose.priors.gmm import GaussianMixture
+from torchpose.measure import HandPrior
+from torchpose.measure.hand_prior import FACE_HEIGHT
+from torchpose.priors import GaussianMixture, PriorInfo, UpperBodyPrior
 
 
 @pytest.fixture(scope="module")

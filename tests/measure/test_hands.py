@@ -7,11 +7,9 @@ import torch
 import torchpose
 from tests.data import data_dir_or_skip
 from torchpose.errors import InputError, ShapeError
+from torchpose.measure import HandPrior, HandSettings, HandState, HandTracker
 from torchpose.measure.body_window import CELLS, cell_centres
 from torchpose.measure.hand_likelihood import HandLikelihood
-from torchpose.measure.hand_prior import HandPrior
-from torchpose.measure.hand_settings import HandSettings
-from torchpose.measure.hands import HandState, HandTracker
 
 cv2 = pytest.importorskip("cv2")
 SKIN, CLOTH, WALL = (205, 152, 128), (40, 50, 115), (190, 190, 180)

@@ -9,9 +9,7 @@ import torch
 from tests.data import data_dir_or_skip
 from torchpose import load_prior
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure import FaceTracker
-from torchpose.measure.hand_prior import HandPrior
-from torchpose.measure.mean_shift_hands import MeanShiftHandTracker
+from torchpose.measure import FaceTracker, HandPrior, MeanShiftHandTracker
 
 cv2 = pytest.importorskip("cv2")
 

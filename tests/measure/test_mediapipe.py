@@ -8,9 +8,14 @@ import pytest
 import torch
 
 from torchpose.errors import InputError, MissingDependencyError
-from torchpose.io.landmarks import LANDMARKS
-from torchpose.measure import FaceDetector, FaceTracker, Region
-from torchpose.measure.mediapipe import MediaPipeFaceDetector, MediaPipePose
+from torchpose.measure import (
+    FaceDetector,
+    FaceTracker,
+    MediaPipeFaceDetector,
+    MediaPipePose,
+    Region,
+)
+from torchpose.skeleton.mediapipe_landmarks import LANDMARKS
 
 
 class Stand:

@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure import rgb_to_lab
-from torchpose.measure.skin_mixture import SkinMixtureModel
-from torchpose.priors.em import MixtureParameters, expectation_maximisation
+from torchpose.math import MixtureParameters, expectation_maximisation
+from torchpose.measure import SkinMixtureModel, rgb_to_lab
 
 FACE = torch.tensor([[80.0, 40.0, 32.0]])
 SKIN, DARK, CLOTH, WALL = (

@@ -9,9 +9,9 @@ import torch
 
 from tests.priors.performances import performances
 from torchpose.errors import FileFormatError, InputError, ShapeError
-from torchpose.priors.action_bank import ActionBank
-from torchpose.priors.action_recognition import Performed, recognition_of_unseen
-from torchpose.priors.action_space import ActionSpace, match_postures
+from torchpose.learning.action_recognition import Performed, recognition_of_unseen
+from torchpose.priors import ActionBank, ActionSpace
+from torchpose.priors.actions.gate import match_postures
 
 SIZES = (6, 4, 5)
 

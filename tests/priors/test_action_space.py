@@ -10,14 +10,11 @@ from tests.data import data_dir_or_skip
 from tests.priors.performances import performances
 from torchpose.body import BODY_15, Body
 from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError, SkeletonError
-from torchpose.priors.action_space import ActionInfo, ActionSpace, match_postures
-from torchpose.priors.postures import (
-    LIMBS_12,
-    normalise_postures,
-    recorded_postures,
-    state_postures,
-)
-from torchpose.priors.repetitions import repetition_axis, split_repetitions
+from torchpose.priors import ActionInfo, ActionSpace
+from torchpose.priors.actions.gate import match_postures
+from torchpose.priors.actions.polar_limbs import LIMBS_12
+from torchpose.priors.actions.postures import normalise_postures, recorded_postures, state_postures
+from torchpose.priors.actions.repetitions import repetition_axis, split_repetitions
 
 
 @pytest.fixture(scope="module")

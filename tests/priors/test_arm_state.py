@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from tests.priors.poses import REST, poses
 from torchpose.camera import Viewpoints, sample_viewpoints
 from torchpose.errors import InputError, PriorError, ShapeError
+from torchpose.learning import TRAINING_VIEWS
 from torchpose.priors import (
-    TRAINING_VIEWS,
     GaussianMixture,
     arm_state,
     arm_states,

@@ -16,11 +16,10 @@ from tests.data import data_dir_or_skip
 from tests.priors.motions import CYCLE, NOISE, motion
 from torchpose.body import BODY_15, Body, body_joints, fit_body, fit_state
 from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError
-from torchpose.priors.gplvm import BackConstrainedGPLVM
-from torchpose.priors.gplvm_fit import GPLVMFit, median_gamma, run_fit
-from torchpose.priors.gplvm_kernel import KernelParameters
-from torchpose.priors.manifold_file import ManifoldInfo
-from torchpose.priors.pose_sequences import thin
+from torchpose.priors import BackConstrainedGPLVM, ManifoldInfo
+from torchpose.priors.manifold.fit import GPLVMFit, median_gamma, run_fit
+from torchpose.priors.manifold.kernel import KernelParameters
+from torchpose.priors.manifold.pose_sequences import thin
 
 FACTS = {"name": "walk", "fps": 60.0, "persons": ("a#1",), "sequences": ("one", "two")}
 

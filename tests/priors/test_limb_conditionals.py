@@ -9,11 +9,16 @@ from scipy.spatial.transform import Rotation
 
 from tests.data import data_dir_or_skip
 from torchpose.body import BODY_15, Body, centres_of, fit_body, fit_state
-from torchpose.body.quaternion_vectors import compose, within_unit_ball
 from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError, SkeletonError
-from torchpose.filters.tree_messages import propagate
+from torchpose.math import (
+    compose,
+    gaussian_rotate,
+    rotate_gaussian,
+    turn_gaussian,
+    within_unit_ball,
+)
+from torchpose.math.tree_messages import propagate
 from torchpose.priors.limb_conditionals import PART_TREE, LimbConditionals, in_body_frame
-from torchpose.rotation_gaussians import gaussian_rotate, rotate_gaussian, turn_gaussian
 
 N_PARTS = len(BODY_15.parts)
 

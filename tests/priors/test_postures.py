@@ -5,14 +5,11 @@ import math
 import pytest
 import torch
 
-from torchpose.body import BODY_15, Body
-from torchpose.body.skeleton import BodySkeleton
+from torchpose.body import BODY_15, Body, BodySkeleton
 from torchpose.errors import InputError, ShapeError, SkeletonError
-from torchpose.joint_sets import SKELETONS
-from torchpose.priors.postures import (
-    ANGLE_NAMES,
-    LIMBS_12,
-    check_limbs,
+from torchpose.math import rotvec_to_matrix
+from torchpose.priors.actions.polar_limbs import ANGLE_NAMES, LIMBS_12, check_limbs
+from torchpose.priors.actions.postures import (
     normalise_postures,
     posture_angles,
     posture_directions,
@@ -21,7 +18,7 @@ from torchpose.priors.postures import (
     recorded_postures,
     state_postures,
 )
-from torchpose.rotations import rotvec_to_matrix
+from torchpose.skeleton import SKELETONS
 
 
 def angle(postures, limb):

@@ -15,13 +15,15 @@ from torchpose.errors import (
     PriorError,
     TorchposeError,
 )
-from torchpose.priors import load_prior
-from torchpose.priors.action_bank import ActionBank
-from torchpose.priors.action_space import ActionSpace
-from torchpose.priors.gplvm import BackConstrainedGPLVM
+from torchpose.priors import (
+    ActionBank,
+    ActionSpace,
+    BackConstrainedGPLVM,
+    UpperBodyPrior,
+    load_prior,
+)
 from torchpose.priors.limb_conditionals import LimbConditionals
 from torchpose.priors.prior_noise import check_noise
-from torchpose.priors.upper_body import UpperBodyPrior
 
 KINDS = {
     "prior": UpperBodyPrior, "manifold": BackConstrainedGPLVM, "limbs": LimbConditionals,

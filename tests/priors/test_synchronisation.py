@@ -8,8 +8,8 @@ import torch
 
 from tests.priors.performances import performances
 from torchpose.errors import InputError, ShapeError
-from torchpose.priors.repetitions import repetition_axis, split_repetitions
-from torchpose.priors.synchronisation import (
+from torchpose.priors.actions.repetitions import repetition_axis, split_repetitions
+from torchpose.priors.actions.synchronisation import (
     find_key_frames,
     match_key_frames,
     natural_spline,

@@ -19,20 +19,17 @@ from torchpose.errors import (
     OverlapError,
     PriorError,
 )
+from torchpose.learning import arm_sources, collect_poses, model_card, write_model_card
+from torchpose.learning.samplers import all_samples
 from torchpose.priors import (
     GaussianMixture,
     PriorInfo,
     UpperBodyPrior,
-    arm_sources,
-    collect_poses,
     fit_upper_body_prior,
     known_priors,
     load_prior,
-    model_card,
-    write_model_card,
 )
 from torchpose.priors import upper_body as module
-from torchpose.priors.samplers import all_samples
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +140,7 @@ def test_a_failed_save_keeps_the_old_file(saved, prior, monkeypatch):
     def full(*_args, **_options):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("torchpose.priors.tensor_file.save_file", full)
+    monkeypatch.setattr("torchpose._core.tensor_file.save_file", full)
     with pytest.raises(OutputError, match="No space left"):
         prior.save(saved)
     assert saved.read_bytes() == before
@@ -282,7 +279,8 @@ def test_released_prior(tmp_path):
 @pytest.mark.data
 def test_released_prior_is_centred_on_the_head_with_its_neck_between_the_shoulders():
     """What `from_released` says about conventions, read off the component means."""
-    from torchpose.camera import euler_to_matrix, lift
+    from torchpose.camera import lift
+    from torchpose.math import euler_to_matrix
 
     path = data_dir_or_skip("signer") / "released_prior_Training20_02.npz"
     prior = UpperBodyPrior.from_released(path)

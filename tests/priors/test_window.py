@@ -4,18 +4,12 @@ import pytest
 import torch
 
 from tests.priors.poses import poses
-from torchpose.body_view import BodyPath
 from torchpose.camera import ViewRange
+from torchpose.camera.virtual_camera import BodyPath
 from torchpose.errors import PriorError
-from torchpose.priors import GaussianMixture
-from torchpose.priors.arm_state import mirror_arm_state
-from torchpose.priors.samplers import PoseFrames, WindowSource, all_samples
-from torchpose.priors.window import (
-    WindowLayout,
-    WindowPrior,
-    augment_bodies,
-    window_measurements,
-)
+from torchpose.learning.samplers import PoseFrames, WindowSource, all_samples
+from torchpose.priors import GaussianMixture, mirror_arm_state
+from torchpose.priors.window import WindowLayout, WindowPrior, augment_bodies, window_measurements
 
 MATRIX = torch.tensor([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]], dtype=torch.float64)
 FRONT = ViewRange(roll=0, pitch=0, yaw=0, tx=(0, 0), ty=(0, 0), tz=(2, 2))

@@ -5,16 +5,16 @@ import torch
 
 from tests.priors.mixtures import random_mixture
 from tests.priors.poses import recording
+from torchpose.camera import lift
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
+from torchpose.learning.recipes import UpperBodyRecipe
+from torchpose.learning.samplers import all_samples
+from torchpose.math import euler_to_matrix
 from torchpose.metrics import joint_errors_3d
 from torchpose.priors import UpperBodyPrior
-from torchpose.priors.samplers import all_samples
 from torchpose.priors.window import WindowLayout, WindowPrior
-from torchpose.projection import lift
-from torchpose.recipes import UpperBodyRecipe
-from torchpose.rotations import euler_to_matrix
-from torchpose.torso import in_torso_axes
-from torchpose.tracking import UpperBodyTracker
+from torchpose.skeleton.torso import in_torso_axes
+from torchpose.upper_body import UpperBodyTracker
 
 NAMES = list(KEYPOINT_NAMES)
 LAYOUT = WindowLayout((2, 5), (0,), torso=True)

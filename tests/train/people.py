@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 from lightning.pytorch import Callback
 
-from tests.protocols.recordings import write_people
+from tests.evaluation.recordings import write_people
 
 PERSONS = ("s1", "s2", "s3")
 FRAMES = 30  # each; curation wants more by default

@@ -11,10 +11,9 @@ pytest.importorskip("lightning", reason="lightning is not installed; training ne
 
 from tests.priors.performances import performances
 from torchpose.body import BODY_15, Body
-from torchpose.priors.action_bank import ActionBank
-from torchpose.priors.action_space import ActionSpace
-from torchpose.priors.postures import posture_angles, posture_to_state
-from torchpose.recipes import Performances
+from torchpose.learning.recipes import Performances
+from torchpose.priors import ActionBank, ActionSpace
+from torchpose.priors.actions.postures import posture_angles, posture_to_state
 from train.cli import main
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,10 +10,10 @@ pytest.importorskip("lightning", reason="training needs the extra `train`")
 pytest.importorskip("tensorboard", reason="training needs the extra `train`")
 
 from tests.train.people import RECIPE, WINDOWS, settings, write_recordings, write_settings
-from torchpose.curation import CurationSettings, curate
 from torchpose.io import read_recordings
+from torchpose.learning.curation import CurationSettings, curate
+from torchpose.learning.recipes import UpperBodyRecipe
 from torchpose.priors import load_prior
-from torchpose.recipes import UpperBodyRecipe
 from train.cli import main
 
 

@@ -11,8 +11,9 @@ import torch
 pytest.importorskip("lightning", reason="lightning is not installed; training needs it")
 
 from torchpose.body import BODY_15, Body
+from torchpose.learning.recipes import LimbStates
+from torchpose.learning.recipes.limbs import held_out_spread
 from torchpose.priors.limb_conditionals import LimbConditionals
-from torchpose.recipes.limbs import LimbStates, held_out_spread
 from train.cli import main
 
 ROOT = Path(__file__).resolve().parents[2]

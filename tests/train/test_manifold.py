@@ -12,9 +12,9 @@ pytest.importorskip("lightning", reason="lightning is not installed; training ne
 
 from tests.priors.motions import motion
 from torchpose.body import BODY_15, Body
-from torchpose.priors.gplvm import BackConstrainedGPLVM
-from torchpose.priors.gplvm_fit import GPLVMFit, median_gamma, run_fit
-from torchpose.recipes import ManifoldFitting
+from torchpose.learning.recipes import ManifoldFitting
+from torchpose.priors import BackConstrainedGPLVM
+from torchpose.priors.manifold.fit import GPLVMFit, median_gamma, run_fit
 from train.cli import main
 from train.manifold import ManifoldData
 

@@ -9,11 +9,11 @@ pytest.importorskip("lightning", reason="training needs the extra `train`")
 
 from torchpose.errors import FileFormatError, InputError, OverlapError
 from torchpose.io import Recording
-from torchpose.priors import SufficientStatistics
-from torchpose.priors.samplers import BLOCK, TensorSource
-from torchpose.priors.streamed_em import StreamedEM, fit_streamed
-from torchpose.recipes import MixtureTask
-from torchpose.recipes.choosing import expand_path, fingerprint
+from torchpose.learning.recipes import MixtureTask
+from torchpose.learning.recipes.choosing import expand_path, fingerprint
+from torchpose.learning.samplers import BLOCK, TensorSource
+from torchpose.learning.streamed_em import StreamedEM, fit_streamed
+from torchpose.math import SufficientStatistics
 from torchpose.skeleton import UPPER_BODY
 from train.blocks import Key, SweepLoader
 from train.data import RecordingsDataModule, split

@@ -16,12 +16,12 @@ import pytest
 import torch
 
 from tests.priors.poses import poses, recording
+from torchpose._core.files import atomic_path
 from torchpose.cli.track import build as track_parser
 from torchpose.cli.track import run as track
 from torchpose.errors import InputError, OutputError, PriorError
-from torchpose.io import atomic_path
-from torchpose.pose_track import PoseTrack
 from torchpose.priors import fit_upper_body_prior
+from torchpose.upper_body import PoseTrack
 from train import predict as module
 from train.predict import build, main, predict, process_rank
 from train.predict_claims import Claims

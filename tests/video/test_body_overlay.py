@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchpose.body.skeleton import BODY_15
+from torchpose.body import BODY_15
 from torchpose.errors import InputError, ShapeError
 from torchpose.video.body_overlay import draw_body
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchpose.errors import InputError, ShapeError
-from torchpose.joint_sets import UPPER_BODY
+from torchpose.skeleton import UPPER_BODY
 from torchpose.video.overlay import PERSON_TINTS, draw_overlay
 from torchpose.viz.style import LEFT, RIGHT
 

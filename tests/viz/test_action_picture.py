@@ -7,7 +7,7 @@ pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 
 from tests.priors.performances import performances
 from torchpose.errors import InputError, ShapeError
-from torchpose.priors.action_space import ActionSpace
+from torchpose.priors import ActionSpace
 from torchpose.viz import plot_action_space, save_figure
 
 

@@ -9,10 +9,8 @@ pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 from tests.priors.motions import motion
 from torchpose.body import BODY_15, Body
 from torchpose.errors import InputError, PriorError, ShapeError
-from torchpose.priors.gplvm import BackConstrainedGPLVM
-from torchpose.priors.manifold_file import ManifoldInfo
-from torchpose.viz import save_figure
-from torchpose.viz.manifold_picture import plot_manifold
+from torchpose.priors import BackConstrainedGPLVM, ManifoldInfo
+from torchpose.viz import plot_manifold, save_figure
 
 
 @pytest.fixture(scope="module")

@@ -12,11 +12,7 @@ from torchpose.camera import Viewpoints
 from torchpose.errors import InputError
 from torchpose.priors import GaussianMixture, PriorInfo, UpperBodyPrior, arm_states, mirror_mixture
 from torchpose.priors.window import WindowLayout, WindowPrior
-from torchpose.viz.prior_pictures import (
-    plot_log_likelihood,
-    plot_prior_components,
-    plot_prior_samples,
-)
+from torchpose.viz import plot_log_likelihood, plot_prior_components, plot_prior_samples
 
 WEIGHTS = torch.tensor([0.2, 0.5, 0.3], dtype=torch.float64)
 RAISED = REST.clone()

@@ -19,13 +19,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.body.kinematics import Body, Frame
-from torchpose.body.quaternion_vectors import (
+from torchpose.body.skeleton import BODY_15, BodySkeleton
+from torchpose.errors import InputError, SkeletonError, check_shape
+from torchpose.math.quaternion_vectors import (
     cross_matrix,
     minimal_rotation,
     quaternion_vector_to_matrix,
 )
-from torchpose.body.skeleton import BODY_15, BodySkeleton
-from torchpose.errors import InputError, SkeletonError, check_shape
 
 __all__ = ["fit_body", "fit_state", "joint_errors", "swing_parts"]
 

@@ -2,7 +2,7 @@
 
 A state x [..., D] is the root's position (metres, in any right-handed world axes), the root part's
 orientation, then the rotation of every other part in the order of the skeleton's parts, each as a
-quaternion vector (`torchpose.body.quaternion_vectors`). Every function takes any leading shape.
+quaternion vector (`torchpose.math.quaternion_vectors`). Every function takes any leading shape.
 """
 
 import math
@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from torchpose._core.module_state import derived, register_given
 from torchpose.body.body_parameters import (
     check_limb_lengths,
     checked_directions,
@@ -22,7 +23,9 @@ from torchpose.body.body_parameters import (
     point_weights,
 )
 from torchpose.body.limbs import Limbs
-from torchpose.body.quaternion_vectors import (
+from torchpose.body.skeleton import BodySkeleton
+from torchpose.errors import InputError, ShapeError, SkeletonError, check_finite, check_shape
+from torchpose.math.quaternion_vectors import (
     compose,
     conjugate,
     matrix_to_quaternion_vector,
@@ -30,9 +33,6 @@ from torchpose.body.quaternion_vectors import (
     quaternion_vector_to_matrix,
     within_unit_ball,
 )
-from torchpose.body.skeleton import BodySkeleton
-from torchpose.errors import InputError, ShapeError, SkeletonError, check_finite, check_shape
-from torchpose.module_state import derived, register_given
 
 __all__ = ["FRAMES", "Body", "Frame", "centres_of"]
 

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from torchpose.body.quaternion_vectors import within_unit_ball
 from torchpose.errors import InputError, ShapeError, check_finite, check_shape
+from torchpose.math.quaternion_vectors import within_unit_ball
 
 __all__ = ["JointLimits"]
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.errors import InputError, SkeletonError, check_shape
-from torchpose.joint_sets import canonical_names
+from torchpose.skeleton.joint_sets import canonical_names
 
 __all__ = [
     "BODY_15",

@@ -27,7 +27,7 @@ examples:
   torchpose track keypoints.npz --out result
   torchpose track keypoints.csv --out result --camera 525,525,319.5,239.5 --smoothing full
   torchpose fit recordings/ --out prior.safetensors --components 30 --seed 0
-  torchpose evaluate ub-people --data data/ --out result
+  python -m benchmarks.ub_people --data data/ --out result
   torchpose info kinect-upper-body"""
 
 

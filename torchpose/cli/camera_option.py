@@ -4,7 +4,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from torchpose.camera import PinholeCamera
+from torchpose.camera.pinhole import PinholeCamera
 from torchpose.errors import CameraError
 
 __all__ = ["resolve_camera"]

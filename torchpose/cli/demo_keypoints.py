@@ -16,10 +16,11 @@ from torchpose.cli.demo_scores import (
 from torchpose.cli.track_output import track_pictures, write_track
 
 if TYPE_CHECKING:
-    from torchpose.demo import Performance
-    from torchpose.io import Keypoints, ResultsFolder
-    from torchpose.pose_track import PoseTrack
-    from torchpose.priors import UpperBodyPrior
+    from torchpose.demo.performer import Performance
+    from torchpose.io.keypoints import Keypoints
+    from torchpose.io.results import ResultsFolder
+    from torchpose.priors.upper_body import UpperBodyPrior
+    from torchpose.upper_body.pose_track import PoseTrack
 
 __all__ = ["demo_keypoints", "perform", "track_clip"]
 
@@ -32,7 +33,7 @@ def demo_keypoints(
     prior: "UpperBodyPrior", results: "ResultsFolder", seconds: float, seed: int, pictures: bool
 ) -> int:
     """Perform, track, score, draw; exit code 1 if the mean pose is not beaten."""
-    from torchpose.io import write_keypoints
+    from torchpose.io.keypoints import write_keypoints
 
     performance, clip, gap = perform(seconds, seed)
     tracks = {
@@ -63,9 +64,9 @@ def perform(seconds: float, seed: int) -> tuple["Performance", "Keypoints", slic
 
     The gap takes one second out of the wave; in short performances it is earlier and shorter.
     """
-    from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
-    from torchpose.io import Keypoints
-    from torchpose.skeleton import measure_neck_kind
+    from torchpose.demo.performer import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
+    from torchpose.io.keypoints import Keypoints
+    from torchpose.skeleton.upper_body import measure_neck_kind
 
     n_frames = round(seconds * _FPS)
     performance = performer(n_frames, _FPS, seed)
@@ -88,8 +89,8 @@ def perform(seconds: float, seed: int) -> tuple["Performance", "Keypoints", slic
 
 def track_clip(prior: "UpperBodyPrior", clip: "Keypoints", smoothing: str | None) -> "PoseTrack":
     """Poses from the keypoints by the mixture Kalman filter with fixed tracks."""
-    from torchpose.camera import PinholeCamera
-    from torchpose.tracking import UpperBodyTracker
+    from torchpose.camera.pinhole import PinholeCamera
+    from torchpose.upper_body.tracker import UpperBodyTracker
 
     camera = PinholeCamera.from_matrix(clip.K)
     tracker = UpperBodyTracker(prior, camera, fps=clip.fps, smoothing=smoothing, neck=clip.neck)

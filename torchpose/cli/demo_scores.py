@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchpose.pose_track import PoseTrack
-    from torchpose.priors import UpperBodyPrior
+    from torchpose.priors.upper_body import UpperBodyPrior
+    from torchpose.upper_body.pose_track import PoseTrack
 
 __all__ = [
     "MEAN_POSE",
@@ -46,7 +46,7 @@ class Hidden(NamedTuple):
 
 def mean_pose(prior: "UpperBodyPrior") -> "Tensor":
     """Mean of the prior over poses, [8, 3] in the body frame, metres: the least one has to beat."""
-    from torchpose.lifting import arm_in_body_frame, join_arms
+    from torchpose.camera.lifting import arm_in_body_frame, join_arms
 
     order: Any = prior.info.rotation_order
     arms = []
@@ -58,8 +58,9 @@ def mean_pose(prior: "UpperBodyPrior") -> "Tensor":
 
 def score(track: "PoseTrack", truth: "Tensor") -> Scores:
     """Errors and coverage of a track of true joints [T, 8, 3] before `demo_camera`."""
-    from torchpose.demo import demo_camera
-    from torchpose.metrics import align, coverage, joint_errors_2d, joint_errors_3d
+    from torchpose.demo.performer import demo_camera
+    from torchpose.metrics.calibration import coverage
+    from torchpose.metrics.poses import align, joint_errors_2d, joint_errors_3d
 
     points = demo_camera()(truth)[..., :2]
     points3d, covariance, _ = align(track.joints3d[0], truth, covariance=track.covariance3d[0])
@@ -73,14 +74,14 @@ def score(track: "PoseTrack", truth: "Tensor") -> Scores:
 
 def score_mean_pose(prior: "UpperBodyPrior", truth: "Tensor") -> Scores:
     """Errors of the mean pose of the prior, which does not move."""
-    from torchpose.metrics import joint_errors_3d
+    from torchpose.metrics.poses import joint_errors_3d
 
     return Scores(joint_errors_3d(mean_pose(prior).expand_as(truth), truth))
 
 
 def report(scores: dict[str, Scores], measured: str, hidden: Hidden | None = None) -> str:
     """Table of errors per joint, pixel errors and coverage, one column for each estimate."""
-    from torchpose.skeleton import UPPER_BODY
+    from torchpose.skeleton.joint_sets import UPPER_BODY
     from torchpose.viz.style import readable
 
     n_frames = next(iter(scores.values())).errors3d.shape[0]

@@ -11,12 +11,12 @@ from torchpose.cli.track_output import camera_text, track_pictures
 from torchpose.cli.track_video import write_overlay, write_people
 
 if TYPE_CHECKING:
-    from torchpose.demo import Performance
-    from torchpose.io import ResultsFolder
-    from torchpose.pose_track import PoseTrack
-    from torchpose.priors import UpperBodyPrior
-    from torchpose.recording import TrackedPerson
-    from torchpose.video_tracker import VideoTracker
+    from torchpose.demo.performer import Performance
+    from torchpose.io.results import ResultsFolder
+    from torchpose.priors.upper_body import UpperBodyPrior
+    from torchpose.upper_body.pose_track import PoseTrack
+    from torchpose.video.recording import TrackedPerson
+    from torchpose.video.tracker import VideoTracker
 
 __all__ = ["demo_video"]
 
@@ -28,9 +28,9 @@ def demo_video(
     prior: "UpperBodyPrior", results: "ResultsFolder", seconds: float, seed: int, pictures: bool
 ) -> int:
     """Render, track, score, draw; exit code 1 if the mean pose is not beaten."""
-    from torchpose import VideoTracker
-    from torchpose.demo import demo_camera, performer
-    from torchpose.video import open_video
+    from torchpose.demo.performer import demo_camera, performer
+    from torchpose.video.source import open_video
+    from torchpose.video.tracker import VideoTracker
 
     share_cores()
     performance, camera = (
@@ -74,8 +74,8 @@ def demo_video(
 
 
 def _render(clip: Path, performance: "Performance", seed: int) -> None:
-    from torchpose.demo import demo_camera
-    from torchpose.rendering import render_video
+    from torchpose.demo.performer import demo_camera
+    from torchpose.demo.rendering.truth import render_video
 
     print(f"rendering {len(performance.joints)} frames ...", flush=True)
     render_video(clip, performance, demo_camera(), seed=seed)
@@ -83,8 +83,8 @@ def _render(clip: Path, performance: "Performance", seed: int) -> None:
 
 def _smoothed(tracker: "VideoTracker", person: "TrackedPerson") -> "PoseTrack":
     """The poses from the same measurements, all frames together."""
-    from torchpose import UpperBodyTracker
-    from torchpose.recording import smoothed
+    from torchpose.upper_body.tracker import UpperBodyTracker
+    from torchpose.video.recording import smoothed
 
     smoother = UpperBodyTracker(
         tracker.tracker.prior, tracker.tracker.camera, fps=_FPS, smoothing="full", max_gap=None
@@ -102,7 +102,7 @@ def _seen(person: "TrackedPerson") -> str:
 def _write_report(
     out: Path, people: "list[TrackedPerson]", performance: "Performance", camera: str
 ) -> Path:
-    from torchpose.report import write_report
+    from torchpose.viz.report.page import write_report
 
     first = people[0].first_frame
     return write_report(

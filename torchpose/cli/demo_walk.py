@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchpose.rendering.gait import Walk
+    from torchpose.demo.rendering.gait import Walk
 
 __all__ = ["demo_walk"]
 
@@ -21,16 +21,16 @@ _SAID = """\
 Somebody walks past three cameras. The walk is animated by hand, from joint angles of textbooks on gait: it
 is neither recorded nor drawn from the manifold, which was fitted to other people's walks. The body that is
 rendered is not the tracker's, which has average proportions and {height:g} m. It is a smoke test, and no
-measure of how well the tracker does on people: see `torchpose evaluate body-models`.
+measure of how well the tracker does on people: see `python -m benchmarks.body_models`.
 """
 _PARTS = ("neck", "elbow", "wrist", "hip", "knee", "ankle")
 
 
 def demo_walk(folder: str, seconds: float, seed: int, pictures: bool) -> int:
     """Render, track by `torchpose track-body`, score; exit code 1 if standing still is not beaten."""
-    from torchpose.body_poses import BodyPoses
     from torchpose.cli import track_body
-    from torchpose.rendering.gait import walk
+    from torchpose.demo.rendering.gait import walk
+    from torchpose.whole_body.poses import BodyPoses
 
     print(_SAID.format(height=_HEIGHT))
     walker, out = walk(seconds, _FPS, _HEIGHT, seed), Path(folder)
@@ -67,10 +67,10 @@ def demo_walk(folder: str, seconds: float, seed: int, pictures: bool) -> int:
 
 def _render(walker: "Walk", out: Path, seed: int) -> tuple[list[Path], list[Path]]:
     """Write videos, pictures of the empty scenes, cameras and truth; returns videos and pictures."""
-    from torchpose.camera import save_cameras
-    from torchpose.io import ResultsFolder
-    from torchpose.protocols.silhouette_data import cameras_around
-    from torchpose.rendering.body_video import render_body_video, walk_clip
+    from benchmarks.silhouette.data import cameras_around
+    from torchpose.camera.pinhole import save_cameras
+    from torchpose.demo.rendering.body_video import render_body_video, walk_clip
+    from torchpose.io.results import ResultsFolder
 
     cameras = cameras_around(walk_clip(walker))
     expected = ["cameras.toml", "truth.npz"]
@@ -115,7 +115,7 @@ def _write_truth(path: Path, walker: "Walk") -> None:
     """The true joints as a recording, which `torchpose info` reads."""
     import numpy as np
 
-    from torchpose.io import write_npz
+    from torchpose._core.files import write_npz
 
     write_npz(
         path,

@@ -102,7 +102,7 @@ def build(name: str | None) -> ArgumentParser:
 
 def run(name: str, args: Namespace) -> int:
     """Run a protocol after checking its folders, and print its summary."""
-    from torchpose.io import check_output_folder
+    from torchpose._core.files import check_output_folder
 
     data: Any = _folders(args) if name in _SEVERAL else Path(args.data)
     if name in _MOCAP and not data.exists():
@@ -113,7 +113,7 @@ def run(name: str, args: Namespace) -> int:
     given = {key: getattr(args, key) for key in _own_options(function)}
     own = {key: tuple(v) if isinstance(v, list) else v for key, v in given.items()}
     if getattr(args, "prior", None) is not None:
-        from torchpose.priors import load_prior
+        from torchpose.priors.upper_body import load_prior
 
         own["prior"] = load_prior(args.prior)
     out = check_output_folder(args.out)
@@ -128,8 +128,8 @@ def run(name: str, args: Namespace) -> int:
 
 def _refuse_other_reports(out: Path) -> None:
     """See that the report will be written over none but an earlier one."""
+    from torchpose.evaluation.report import RESULTS
     from torchpose.io.results import refuse_stranger
-    from torchpose.protocols.report import RESULTS
 
     earlier = _is_report(out / "report.json")
     for name in ("report.json", "report.md"):
@@ -171,7 +171,7 @@ def _protocol_name(arguments: list[str]) -> str | None:
 
 
 def _runner(name: str) -> Callable[..., Any]:
-    module = import_module(f"torchpose.protocols.{PROTOCOLS[name][0]}")
+    module = import_module(f"torchpose.evaluation.{PROTOCOLS[name][0]}")
     return module.run
 
 

@@ -19,12 +19,13 @@ from torchpose.cli.common import (
 )
 from torchpose.cli.fit_bodies import KINDS
 from torchpose.cli.fit_bodies import main as fit_bodies
-from torchpose.cli.prior_files import prior_results
 from torchpose.errors import InputError, OutputError
+from torchpose.learning.prior_files import prior_results
 
 if TYPE_CHECKING:
-    from torchpose.io import Recording, ResultsFolder
-    from torchpose.priors import UpperBodyPrior
+    from torchpose.io.recordings import Recording
+    from torchpose.io.results import ResultsFolder
+    from torchpose.priors.upper_body import UpperBodyPrior
 
 _EXAMPLES = """
 torchpose fit recordings/ --out prior.safetensors
@@ -124,7 +125,7 @@ def build() -> ArgumentParser:
 
 def run(args: Namespace) -> int:
     """Read, curate, fit, write and report; every check of an option comes before any work."""
-    from torchpose.io import find_recordings, read_recordings
+    from torchpose.io.recordings import find_recordings, read_recordings
 
     _check_options(args)
     out = output_file(args.out)
@@ -146,7 +147,7 @@ def write_prior(
     prior: "UpperBodyPrior", results: "ResultsFolder", name: str, pictures: bool
 ) -> list[Path]:
     """Write the prior, its model card and, if asked for, the picture of its mean poses."""
-    from torchpose.priors import write_model_card
+    from torchpose.learning.model_card import write_model_card
 
     out = results.stage / name
     card = out.with_suffix(".md")
@@ -202,15 +203,15 @@ def _fit(recordings: list["Recording"], args: Namespace, name: str) -> "UpperBod
     facts = {"name": name, "licence": args.licence, "command": command_line(args)}
     own = {"neck": args.neck} | ({"n_samples": args.samples} if args.samples else {})
     if args.noise == "none":
-        from torchpose.priors import fit_upper_body_prior
+        from torchpose.priors.upper_body import fit_upper_body_prior
 
         settings: dict[str, Any] = facts | own | {"progress": show_progress()}
         return fit_upper_body_prior(recordings, args.components, args.seed, **settings)
-    from torchpose.recipes import UpperBodyRecipe
+    from torchpose.learning.recipes.upper_body import UpperBodyRecipe
 
     if args.noise_of is not None:
-        from torchpose.priors import load_prior
-        from torchpose.recipes.renewal import renew_noise
+        from torchpose.learning.recipes.renewal import renew_noise
+        from torchpose.priors.upper_body import load_prior
 
         before = load_prior(args.noise_of)
         return renew_noise(
@@ -234,7 +235,8 @@ def _curated(
     """Recordings without what is no body, what was dropped in words, and as facts for the card."""
     if not args.curate:
         return recordings, {"said": f"read     {_count(recordings)}", "facts": {}}
-    from torchpose.curation import CurationSettings, curate
+    from torchpose.learning.curation import curate
+    from torchpose.learning.curation.curate import CurationSettings
 
     curated = curate(recordings, CurationSettings(harmonise=args.harmonise))
     report = curated.report
@@ -243,15 +245,15 @@ def _curated(
 
 def _without(recordings: list["Recording"], persons: list[str]) -> list["Recording"]:
     """Recordings of everybody else."""
-    from torchpose.curation import pick_persons
+    from torchpose.learning.curation.splits import pick_persons
 
     out = pick_persons(persons, sorted({r.person_id for r in recordings}))
     return [r for r in recordings if r.person_id not in out]
 
 
 def _check_options(args: Namespace) -> None:
-    from torchpose.io import AXES
-    from torchpose.skeleton import NECK_KINDS
+    from torchpose.io.formats.axes import AXES
+    from torchpose.skeleton.upper_body import NECK_KINDS
 
     for option, value, known in (
         ("--axes", args.axes, AXES),

@@ -10,7 +10,7 @@ from torchpose.cli.common import add_seed, input_files, new_parser, pictures_pos
 from torchpose.errors import InputError
 
 if TYPE_CHECKING:
-    from torchpose.io import ResultsFolder
+    from torchpose.io.results import ResultsFolder
 
 __all__ = ["KINDS", "build", "main"]
 
@@ -79,8 +79,8 @@ def build(kind: str) -> ArgumentParser:
 def run(kind: str, args: Namespace) -> int:
     """Read, fit, write and report; every check of an option comes before any work."""
     from torchpose.cli.fit import output_file
-    from torchpose.cli.prior_files import prior_results
-    from torchpose.io import AXES
+    from torchpose.io.formats.axes import AXES
+    from torchpose.learning.prior_files import prior_results
 
     if args.axes is not None and args.axes not in AXES:
         raise InputError(f"--axes must be one of {', '.join(AXES)}, got {args.axes!r}")
@@ -140,9 +140,9 @@ def _manifold_options(parser: ArgumentParser) -> None:
 def _fit_manifold(
     args: Namespace, results: "ResultsFolder", out: Path, facts: dict[str, str]
 ) -> str:
-    from torchpose.recipes.files import write_manifold_files
-    from torchpose.recipes.manifold import ManifoldFitting, ManifoldPoses, ManifoldRecipe
-    from torchpose.recipes.resuming import run_to_end, taken_up
+    from torchpose.learning.recipes.files import write_manifold_files
+    from torchpose.learning.recipes.manifold import ManifoldFitting, ManifoldPoses, ManifoldRecipe
+    from torchpose.learning.recipes.resuming import run_to_end, taken_up
 
     names = ("latent_dim", "steps", "patience", "start", "smoothness", "standardise", "seed")
     recipe = ManifoldRecipe(**{name: getattr(args, name) for name in names})
@@ -169,8 +169,8 @@ def _limb_options(parser: ArgumentParser) -> None:
 
 
 def _fit_limbs(args: Namespace, results: "ResultsFolder", out: Path, facts: dict[str, str]) -> str:
-    from torchpose.recipes.files import write_limb_files
-    from torchpose.recipes.limbs import LimbStates, check_least_std
+    from torchpose.learning.recipes.files import write_limb_files
+    from torchpose.learning.recipes.limbs import LimbStates, check_least_std
 
     check_least_std(args.least_std)
     states = LimbStates.gather(args.recordings, without=args.without_files, **_chosen(args))
@@ -210,8 +210,8 @@ def _action_options(parser: ArgumentParser) -> None:
 def _fit_actions(
     args: Namespace, results: "ResultsFolder", out: Path, facts: dict[str, str]
 ) -> str:
-    from torchpose.recipes.actions import ActionRecipe, Performances, fit_actions
-    from torchpose.recipes.files import write_action_files
+    from torchpose.learning.recipes.actions import ActionRecipe, Performances, fit_actions
+    from torchpose.learning.recipes.files import write_action_files
 
     names = ("n_dimensions", "n_postures", "prominence", "stay", "spread", "background",
              "evidence_rate", "gate_dimensions", "seed")  # fmt: skip

@@ -12,8 +12,8 @@ from torchpose.errors import InputError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchpose.io import Keypoints
-    from torchpose.priors import UpperBodyPrior
+    from torchpose.io.keypoints import Keypoints
+    from torchpose.priors.upper_body import UpperBodyPrior
 
 _EXAMPLES = """
 torchpose info
@@ -64,8 +64,8 @@ def _installation() -> str:
     import torch
 
     import torchpose
-    from torchpose.priors import known_priors
     from torchpose.priors.shipped import KINDS, known_models
+    from torchpose.priors.upper_body import known_priors
 
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     return _table(
@@ -81,15 +81,15 @@ def _installation() -> str:
 
 
 def _describe(what: str) -> str:
-    from torchpose.priors import known_priors, load_prior
+    from torchpose.priors.upper_body import known_priors, load_prior
 
     path = Path(what)
     files = _models_of(what) or (
         [path] if path.suffix == ".safetensors" and os.path.isfile(path) else []
     )
     if files and what not in known_priors():
+        from torchpose._core.tensor_file import format_of
         from torchpose.cli.info_models import DESCRIBED
-        from torchpose.priors.tensor_file import format_of
 
         found = [(DESCRIBED.get(format_of(file) or ""), file) for file in files]
         tables = [_table(describe(file)) for describe, file in found if describe is not None]
@@ -107,7 +107,7 @@ def _describe(what: str) -> str:
         return _describe_recordings(path)
     if path.suffix == ".csv" and not _starts_as_keypoints(path):
         return _describe_recordings(path)
-    from torchpose.io import read_keypoints
+    from torchpose.io.keypoints import read_keypoints
 
     return describe_keypoints(read_keypoints(path))
 
@@ -121,8 +121,8 @@ def _models_of(name: str) -> list[Path]:
 
 def _describe_npz(path: Path) -> str:
     """Poses, recordings or keypoints, by the keys."""
-    from torchpose.io import read_keypoints
-    from torchpose.io.npz import npz_keys
+    from torchpose._core.npz import npz_keys
+    from torchpose.io.keypoints import read_keypoints
 
     keys = set(npz_keys(path))
     if {"state", "body_frame"} <= keys:
@@ -173,7 +173,7 @@ def describe_prior(prior: "UpperBodyPrior") -> str:
 
 def describe_poses(path: Path) -> str:
     """Frames, shares, uncertainty and notes of a file of poses."""
-    from torchpose.pose_track import PoseTrack
+    from torchpose.upper_body.pose_track import PoseTrack
 
     track = PoseTrack.load(path)
     std = track.covariance3d.diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(0).sqrt()
@@ -209,9 +209,10 @@ def _sample_sizes(size: "Tensor") -> str:
 
 def describe_keypoints(keypoints: "Keypoints") -> str:
     """Frames, joints, camera of a file of keypoints."""
-    from torchpose.camera import PinholeCamera
+    from torchpose.camera.pinhole import PinholeCamera
     from torchpose.cli.track_output import camera_text, percent
-    from torchpose.skeleton import UPPER_BODY, upper_body_indices
+    from torchpose.skeleton.joint_sets import UPPER_BODY
+    from torchpose.skeleton.upper_body import upper_body_indices
 
     found = upper_body_indices(keypoints.names)
     shares = keypoints.measured.double().mean(0).tolist()
@@ -237,7 +238,7 @@ def describe_keypoints(keypoints: "Keypoints") -> str:
 
 
 def _describe_recordings(path: Path) -> str:
-    from torchpose.io import read_recordings
+    from torchpose.io.recordings import read_recordings
 
     recordings = read_recordings(path)
     frames = sum(len(r) for r in recordings)
@@ -255,7 +256,7 @@ def _describe_recordings(path: Path) -> str:
 
 
 def _describe_cameras(path: Path) -> str:
-    from torchpose.camera import load_cameras
+    from torchpose.camera.pinhole import load_cameras
     from torchpose.cli.track_output import camera_text
 
     return _table({name: camera_text(camera) for name, camera in load_cameras(path).items()})
@@ -263,7 +264,7 @@ def _describe_cameras(path: Path) -> str:
 
 def _starts_as_keypoints(path: Path) -> bool:
     """Whether the first line that is no comment is a header, as keypoints have and Kinect has not."""
-    from torchpose.io.reading import reading, require_file
+    from torchpose._core.reading import reading, require_file
 
     path = require_file(path)
     with reading(path, "a table"), path.open(encoding="utf-8-sig", errors="replace") as stream:

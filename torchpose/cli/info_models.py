@@ -13,7 +13,7 @@ _LISTED, _SOURCES = 12, 3  # persons or actions that are named, and sources
 
 def describe_manifold(path: Path) -> Facts:
     """A manifold of poses."""
-    from torchpose.priors.gplvm import BackConstrainedGPLVM
+    from torchpose.priors.manifold.gplvm import BackConstrainedGPLVM
 
     manifold = BackConstrainedGPLVM.load(path)
     info = manifold.info
@@ -61,7 +61,7 @@ def describe_limbs(path: Path) -> Facts:
 
 def describe_action(path: Path) -> Facts:
     """The postures of one action."""
-    from torchpose.priors.action_space import ActionSpace
+    from torchpose.priors.actions.space import ActionSpace
 
     space = ActionSpace.load(path)
     info = space.info
@@ -85,7 +85,7 @@ def describe_action(path: Path) -> Facts:
 
 def describe_bank(path: Path) -> Facts:
     """The postures of several actions."""
-    from torchpose.priors.action_bank import ActionBank
+    from torchpose.priors.actions.bank import ActionBank
 
     bank = ActionBank.load(path)
     info = bank.info
@@ -116,13 +116,13 @@ DESCRIBED: dict[str, Callable[[Path], Facts]] = {
     "torchpose-action-space": describe_action,
     "torchpose-action-bank": describe_bank,
 }
-"""What describes a file, by `torchpose.priors.tensor_file.format_of`."""
+"""What describes a file, by `torchpose._core.tensor_file.format_of`."""
 
 
 def describe_body_poses(path: Path) -> Facts:
     """Poses of a whole body, from `torchpose track-body`."""
-    from torchpose.body_poses import BodyPoses
     from torchpose.cli.track_body_output import action_text
+    from torchpose.whole_body.poses import BodyPoses
 
     poses = BodyPoses.load(path)
     spread = poses.covariance3d.diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(0).sqrt().mean(0)

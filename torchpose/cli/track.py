@@ -255,7 +255,7 @@ def tracker_options(args: Namespace) -> dict[str, Any]:
     Raises:
         InputError: an option that the method does not have.
     """
-    from torchpose.methods import METHODS, WINDOWS, method_options, options_of_before
+    from torchpose.upper_body.methods import METHODS, WINDOWS, method_options, options_of_before
 
     method, steady = args.method, args.steady
     if args.window is not None:

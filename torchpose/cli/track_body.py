@@ -34,9 +34,9 @@ from torchpose.errors import CameraError, DegenerateFilterWarning, InputError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchpose.body_poses import BodyPoses
-    from torchpose.camera import PinholeCamera
-    from torchpose.camera_rig import CameraRig
+    from torchpose.camera.pinhole import PinholeCamera
+    from torchpose.camera.rig import CameraRig
+    from torchpose.whole_body.poses import BodyPoses
 
 _EXAMPLES = """
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 cam3.mp4 --out result
@@ -163,7 +163,7 @@ def _check(args: Namespace) -> None:
 
 
 def _cameras(args: Namespace) -> "list[PinholeCamera]":
-    from torchpose.camera import load_cameras
+    from torchpose.camera.pinhole import load_cameras
 
     found = load_cameras(args.cameras)
     names = list(found) if args.camera_names is None else args.camera_names
@@ -180,7 +180,7 @@ def _track(args: Namespace, recordings: "Recordings", model: BodyModel) -> "Body
     """Find the person, then track; None if there is nobody."""
     import torch
 
-    from torchpose.body_tracking import track_body
+    from torchpose.whole_body.live import track_body
 
     frames = recordings.silhouettes()
     first = next((masks for masks in frames if _all_see(masks)), None)
@@ -224,8 +224,8 @@ def _initial_state(
     import torch
 
     from torchpose.body.fitting import fit_state
-    from torchpose.body_poses import BodyPoses
-    from torchpose.filters.first_pose import find_first_pose
+    from torchpose.whole_body.filters.first_pose import find_first_pose
+    from torchpose.whole_body.poses import BodyPoses
 
     if args.initial_pose:
         recorded = BodyPoses.load(args.initial_pose)

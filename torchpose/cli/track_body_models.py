@@ -11,11 +11,11 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchpose.body.kinematics import Body
-    from torchpose.filters.silhouette_filter import SilhouetteParticleFilter
-    from torchpose.priors.action_bank import ActionBank
-    from torchpose.priors.action_space import ActionSpace
-    from torchpose.priors.gplvm import BackConstrainedGPLVM
+    from torchpose.priors.actions.bank import ActionBank
+    from torchpose.priors.actions.space import ActionSpace
     from torchpose.priors.limb_conditionals import LimbConditionals
+    from torchpose.priors.manifold.gplvm import BackConstrainedGPLVM
+    from torchpose.whole_body.filters.silhouette_filter import SilhouetteParticleFilter
 
 __all__ = [
     "METHODS",
@@ -138,7 +138,7 @@ class BodyModel:
             fps: frames per second.
         """
         import torchpose.filters as filters
-        from torchpose.filters.first_order import rescale_std
+        from torchpose.whole_body.filters.first_order import rescale_std
 
         body, step = self.body, filters.default_step_std(self.body) * (_RATE / fps) ** 0.5
         if self.conditionals is not None:
@@ -195,7 +195,8 @@ class BodyModel:
 
     def _posture_body(self) -> "Body | None":
         """The body on which the performances were put, if it is not the tracked one."""
-        from torchpose.body import BODY_15, Body
+        from torchpose.body.kinematics import Body
+        from torchpose.body.skeleton import BODY_15
 
         known = self.action.info.extra.get("postures", "body" if self.action_names else "joints")  # type: ignore[union-attr]
         common = known == "body"
@@ -258,8 +259,9 @@ def model_of(
 
 
 def _person(args: Namespace) -> "Body":
-    from torchpose.body import BODY_15, Body
-    from torchpose.body_poses import load_body
+    from torchpose.body.kinematics import Body
+    from torchpose.body.skeleton import BODY_15
+    from torchpose.whole_body.poses import load_body
 
     return load_body(args.body) if args.body else Body.of_height(BODY_15, args.height)
 

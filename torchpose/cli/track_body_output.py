@@ -12,11 +12,11 @@ from torchpose.cli.common import input_files
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchpose.body_poses import BodyPoses
-    from torchpose.camera import PinholeCamera
+    from torchpose.camera.pinhole import PinholeCamera
     from torchpose.cli.track_body_videos import Recordings
-    from torchpose.io import ResultsFolder
-    from torchpose.measure.silhouettes import SilhouetteView
+    from torchpose.io.results import ResultsFolder
+    from torchpose.video.silhouettes import SilhouetteView
+    from torchpose.whole_body.poses import BodyPoses
 
 __all__ = [
     "action_text",
@@ -39,8 +39,7 @@ def body_results(
     args: Namespace, cameras: "Sequence[PinholeCamera]", pictures: bool
 ) -> "ResultsFolder":
     """The folder of `--out`, for poses of a body and what shows them."""
-    from torchpose.io import ResultsFolder
-    from torchpose.io.results import holds_arrays
+    from torchpose.io.results import ResultsFolder, holds_arrays
 
     videos = [_overlay_name(camera.name) for camera in cameras] if args.overlay else []
     return ResultsFolder(
@@ -67,7 +66,7 @@ def write_poses(out: Path, poses: "BodyPoses") -> list[Path]:
 
 def _write_csv(path: Path, poses: "BodyPoses") -> None:
     """One row per frame: x, y, z of every joint in metres, and its standard deviation."""
-    from torchpose.io.files import atomic_path
+    from torchpose._core.files import atomic_path
 
     columns = [f"{n}_{axis}" for n in poses.names for axis in ("x", "y", "z", "std")]
     spread = poses.covariance3d.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True).div(3).sqrt()
@@ -87,7 +86,7 @@ def draw(
     """The body drawn into the frames of every camera: videos, and some frames as one picture."""
     from contextlib import ExitStack
 
-    from torchpose.video import VideoWriter
+    from torchpose.video.writer import VideoWriter
 
     names = recordings.rig.names
     files = [out / _overlay_name(name) for name in names] if videos else []
@@ -116,8 +115,8 @@ def draw(
 def _drawn(
     recordings: "Recordings", poses: "BodyPoses", t: int, images: Iterable[Any]
 ) -> list[Any]:
-    from torchpose.body.silhouette import render
     from torchpose.video.body_overlay import draw_body
+    from torchpose.whole_body.silhouettes.rendering import render
 
     k, rig = t - poses.first_frame, recordings.rig
     height, width = rig.sizes[0]  # type: ignore[misc]  # views have sizes
@@ -160,7 +159,7 @@ def _write_strip(path: Path, strip: list[list[Any]]) -> Path:
     import cv2
     import numpy as np
 
-    from torchpose.io.files import atomic_path
+    from torchpose._core.files import atomic_path
 
     height = 320
 
@@ -243,7 +242,7 @@ def gate_notes(poses: "BodyPoses") -> tuple[str, ...]:
 def write_page(
     recordings: "Recordings", poses: "BodyPoses", facts: dict[str, str], out: Path
 ) -> list[Path]:
-    from torchpose.report import write_report
+    from torchpose.viz.report.page import write_report
 
     camera = recordings.views[0].source
     overlay = out / _overlay_name(recordings.rig.names[0])

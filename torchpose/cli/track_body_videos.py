@@ -9,10 +9,10 @@ from jsonargparse import Namespace
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchpose.camera import PinholeCamera
-    from torchpose.camera_rig import CameraRig
-    from torchpose.measure.silhouettes import SilhouetteMeasurer
-    from torchpose.video import VideoSource
+    from torchpose.camera.pinhole import PinholeCamera
+    from torchpose.camera.rig import CameraRig
+    from torchpose.video.base import VideoSource
+    from torchpose.video.silhouettes import SilhouetteMeasurer
 
 __all__ = ["Recordings"]
 
@@ -21,7 +21,7 @@ class Recordings:
     """The videos, how each becomes silhouettes, and the silhouettes that were seen so far."""
 
     def __init__(self, args: Namespace, cameras: "Sequence[PinholeCamera]") -> None:
-        from torchpose.measure.silhouettes import fit_views
+        from torchpose.video.silhouettes import fit_views
 
         self._args = args
         self.sources = self._open()
@@ -39,7 +39,7 @@ class Recordings:
     @cached_property
     def rig(self) -> "CameraRig":
         """The cameras of the silhouettes."""
-        from torchpose.camera_rig import CameraRig
+        from torchpose.camera.rig import CameraRig
 
         return CameraRig([view.camera for view in self.views])
 
@@ -58,7 +58,7 @@ class Recordings:
         """Silhouettes [C, H, W] of one frame after the other, which are kept, a bit per pixel."""
         import numpy as np
 
-        from torchpose.measure.silhouettes import read_silhouettes
+        from torchpose.video.silhouettes import read_silhouettes
 
         measurers = self._measurers()
         for masks in read_silhouettes(self.sources, measurers, self._args.delays):
@@ -76,7 +76,7 @@ class Recordings:
 
     def images(self) -> Iterator[tuple[Any, ...]]:
         """The frames of all cameras once more."""
-        from torchpose.measure.silhouettes import frames_in_step
+        from torchpose.video.silhouettes import frames_in_step
 
         sources = self._open()
         try:
@@ -87,17 +87,17 @@ class Recordings:
                 source.close()
 
     def _open(self) -> "list[VideoSource]":
-        from torchpose.video import open_video
+        from torchpose.video.source import open_video
 
         return [open_video(path, fps=self._args.fps) for path in self._args.videos]
 
     def _measurers(self) -> "list[SilhouetteMeasurer]":
-        from torchpose.measure.silhouettes import (
+        from torchpose.video.silhouettes import (
             SilhouetteMeasurer,
             learning_frames,
             read_empty_scene,
         )
-        from torchpose.video import open_video
+        from torchpose.video.source import open_video
 
         print("learning the background ...", flush=True)
         empty = [read_empty_scene(path) for path in self._args.background or []]

@@ -19,7 +19,7 @@ from torchpose.cli.track_output import (
 from torchpose.errors import DegenerateFilterWarning, InputError
 
 if TYPE_CHECKING:
-    from torchpose.io import Keypoints
+    from torchpose.io.keypoints import Keypoints
 
 __all__ = ["track_keypoints"]
 
@@ -30,9 +30,9 @@ def track_keypoints(args: Namespace) -> int:
 
     from torchpose.cli.camera_option import resolve_camera
     from torchpose.cli.track import tracker_options
-    from torchpose.io import read_keypoints
-    from torchpose.priors import load_prior
-    from torchpose.tracking import UpperBodyTracker
+    from torchpose.io.keypoints import read_keypoints
+    from torchpose.priors.upper_body import load_prior
+    from torchpose.upper_body.tracker import UpperBodyTracker
 
     keypoints = read_keypoints(args.input)
     for option, value in (("--fps", args.fps), ("--max-gap", args.max_gap)):
@@ -84,7 +84,7 @@ def joint_names(
     keypoints: "Keypoints", nose_as_head: bool
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names for the tracker, with the nose as head if asked for, and notes."""
-    from torchpose.skeleton import canonical_names
+    from torchpose.skeleton.joint_sets import canonical_names
 
     canonical = canonical_names(keypoints.names)
     if "head" in canonical:
@@ -101,7 +101,7 @@ def joint_names(
 
 
 def kind_of_neck(given: str | None, keypoints: "Keypoints") -> str | None:
-    from torchpose.skeleton import NECK_KINDS
+    from torchpose.skeleton.upper_body import NECK_KINDS
 
     if given is not None and given not in NECK_KINDS:
         raise InputError(f"--neck must be one of {', '.join(NECK_KINDS)}, got {given!r}")

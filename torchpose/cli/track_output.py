@@ -10,8 +10,8 @@ from jsonargparse import Namespace
 from torchpose.cli.common import input_files, save_pictures
 
 if TYPE_CHECKING:
-    from torchpose.io import ResultsFolder
-    from torchpose.pose_track import PoseTrack
+    from torchpose.io.results import ResultsFolder
+    from torchpose.upper_body.pose_track import PoseTrack
 
 _POSES = ("poses.npz", "poses.csv", "poses.bvh")
 _PICTURES = ("pose_strip.png", "joint_curves.png")
@@ -40,8 +40,7 @@ def track_results(
         args: of the command. pictures, video: whether they are going to be written.
         more: further names that are. own: pattern of further names that a run may write.
     """
-    from torchpose.io import ResultsFolder
-    from torchpose.io.results import holds_arrays
+    from torchpose.io.results import ResultsFolder, holds_arrays
 
     return ResultsFolder(
         args.out,
@@ -59,8 +58,8 @@ def write_track(track: "PoseTrack", out: Path, suffix: str = "") -> list[Path]:
     Args:
         suffix: of the names, such as "_p02".
     """
-    from torchpose.cli.pose_csv import write_pose_csv
-    from torchpose.io.bvh import write_bvh
+    from torchpose.upper_body.bvh import write_bvh
+    from torchpose.upper_body.csv import write_pose_csv
 
     written = [out / f"poses{suffix}.{kind}" for kind in ("npz", "csv", "bvh")]
     track.save(written[0])

@@ -29,10 +29,10 @@ from torchpose.cli.track_output import (
 from torchpose.errors import FileFormatError, InputError, OutputError
 
 if TYPE_CHECKING:
-    from torchpose.camera import PinholeCamera
-    from torchpose.recording import TrackedPerson
-    from torchpose.video import VideoSource
-    from torchpose.video_tracker import VideoTracker
+    from torchpose.camera.pinhole import PinholeCamera
+    from torchpose.video.base import VideoSource
+    from torchpose.video.recording import TrackedPerson
+    from torchpose.video.tracker import VideoTracker
 
 _OVERLAY = "overlay.mp4"
 _KEYPOINTS = "keypoints are expected as .npz, .csv or a folder of OpenPose JSON files"
@@ -43,7 +43,7 @@ __all__ = ["track_video", "write_overlay", "write_people"]
 def track_video(args: Namespace) -> int:
     """Track everybody, write and report; exit code 1 if there is nobody."""
     from torchpose.cli.camera_option import resolve_camera
-    from torchpose.priors import load_prior
+    from torchpose.priors.upper_body import load_prior
 
     for option, value in (("--fps", args.fps), ("--max-gap", args.max_gap)):
         positive(option, value)
@@ -92,7 +92,7 @@ def track_video(args: Namespace) -> int:
 
 
 def _open(where: str, fps: float | None) -> "VideoSource":
-    from torchpose.video import open_video
+    from torchpose.video.source import open_video
 
     try:
         return open_video(where, fps=fps)
@@ -114,8 +114,8 @@ def _refuse_keypoint_options(args: Namespace) -> None:
 
 def _tracker(args: Namespace, prior: Any, camera: "PinholeCamera", fps: float) -> "VideoTracker":
     from torchpose.cli.track import tracker_options
-    from torchpose.measure import MediaPipeFaceDetector
-    from torchpose.video_tracker import VideoTracker
+    from torchpose.measure.mediapipe import MediaPipeFaceDetector
+    from torchpose.video.tracker import VideoTracker
 
     detector = None if args.face_model is None else MediaPipeFaceDetector(args.face_model)
     return VideoTracker(
@@ -148,8 +148,8 @@ def _track_camera(
     tracker: "VideoTracker", source: "VideoSource", out: Path, overlay: bool
 ) -> tuple[list["TrackedPerson"], int]:
     """Everybody before a camera, shown on a page while it runs, until q, stop or Ctrl-C."""
-    from torchpose.video import VideoWriter
     from torchpose.video.live import LiveView
+    from torchpose.video.writer import VideoWriter
 
     with contextlib.ExitStack() as stack:
         view = stack.enter_context(LiveView())
@@ -189,7 +189,8 @@ def write_overlay(
     """
     from tqdm.auto import tqdm
 
-    from torchpose.video import VideoWriter, prefetch
+    from torchpose.video import prefetch
+    from torchpose.video.writer import VideoWriter
 
     with source, VideoWriter(path, source.fps, source.size) as writer:
         bar = tqdm(total=n_frames, disable=not show_progress(), unit="frame", desc="overlay")
@@ -247,7 +248,7 @@ def _write_report(
     notes: tuple[str, ...],
     title: str,
 ) -> list[Path]:
-    from torchpose.report import write_report
+    from torchpose.viz.report.page import write_report
 
     overlay = out / _OVERLAY
     written = [overlay] if overlay.exists() else []

@@ -13,6 +13,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
+from torchpose._core.module_state import (
+    WideModule,
+    derived,
+    one_run,
+    register_given,
+    working_precision,
+)
+from torchpose._core.value_checks import values_visible
 from torchpose.errors import (
     InputError,
     ShapeError,
@@ -21,20 +29,7 @@ from torchpose.errors import (
     check_floating,
     check_shape,
 )
-from torchpose.filters.outputs import (
-    FilterOutput,
-    StepOutput,
-    collect,
-    effective_sample_size,
-)
-from torchpose.module_state import (
-    WideModule,
-    derived,
-    one_run,
-    register_given,
-    working_precision,
-)
-from torchpose.value_checks import values_visible
+from torchpose.filters.outputs import FilterOutput, StepOutput, collect, effective_sample_size
 
 __all__ = [
     "FilterOutput",

@@ -11,12 +11,12 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose.filters.base import FilterOutput, Measurements
+from torchpose.filters.base import Measurements
 from torchpose.filters.gains import Edge
 from torchpose.filters.mending import mending_of_edges
-from torchpose.filters.outputs import finish_output
+from torchpose.filters.outputs import FilterOutput, finish_output
 from torchpose.filters.weights import indicator_mixing, steps_between_rescaling
-from torchpose.gaussian import least_exponent
+from torchpose.math.gaussian import least_exponent
 
 if TYPE_CHECKING:
     from torchpose.filters.mkf import MixtureKalmanFilter

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.module_state import derived
 from torchpose.errors import InputError, check_shape
-from torchpose.gaussian import kalman_gain, safe_cholesky, symmetrise
-from torchpose.module_state import derived
+from torchpose.math.gaussian import kalman_gain, safe_cholesky, symmetrise
 
 __all__ = ["ConstantVelocityFilter", "ConstantVelocityState"]
 

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose.filters.base import FilterOutput, Measurements, StepOutput
+from torchpose._core.value_checks import values_visible
+from torchpose.filters.base import Measurements
 from torchpose.filters.columns import run_columns, suits_columns
 from torchpose.filters.frame_weights import (
     advance_memoryless,
@@ -20,7 +21,7 @@ from torchpose.filters.frame_weights import (
     run_memoryless,
 )
 from torchpose.filters.mending import mending
-from torchpose.filters.outputs import collect
+from torchpose.filters.outputs import FilterOutput, StepOutput, collect
 from torchpose.filters.recompute import recomputed, wants_gradient
 from torchpose.filters.shared_gains import (
     RECOMPUTED_FRAMES,
@@ -31,8 +32,7 @@ from torchpose.filters.shared_gains import (
 from torchpose.filters.tracks import MKFState, estimate_of
 from torchpose.filters.transition import Transition
 from torchpose.filters.weights import mix_uniform, step_weights
-from torchpose.gaussian import Gain, kalman_correct, kalman_gain, symmetrise
-from torchpose.value_checks import values_visible
+from torchpose.math.gaussian import Gain, kalman_correct, kalman_gain, symmetrise
 
 if TYPE_CHECKING:
     from torchpose.filters.mkf import MixtureKalmanFilter

@@ -14,16 +14,16 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose.filters.base import FilterOutput, Measurements, StepOutput
-from torchpose.filters.geometric_median import median_estimate
+from torchpose._core.module_state import outside_inference
+from torchpose._core.value_checks import values_visible
+from torchpose.filters.base import Measurements
 from torchpose.filters.mending import Mending, mending
-from torchpose.filters.outputs import finish_output
+from torchpose.filters.outputs import FilterOutput, StepOutput, finish_output
 from torchpose.filters.recompute import recomputed, wants_gradient
 from torchpose.filters.tracks import MKFState, estimate_of
 from torchpose.filters.weights import normalise
-from torchpose.gaussian import Gain, kalman_gain
-from torchpose.module_state import outside_inference
-from torchpose.value_checks import values_visible
+from torchpose.math.gaussian import Gain, kalman_gain
+from torchpose.math.geometric_median import median_estimate
 
 if TYPE_CHECKING:
     from torchpose.filters.mkf import MixtureKalmanFilter

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchpose._core.module_state import outside_inference
 from torchpose.filters.scan import BlockModel, block_model
 from torchpose.filters.transition import Transition
-from torchpose.gaussian import kalman_gain, symmetrise
-from torchpose.module_state import outside_inference
+from torchpose.math.gaussian import kalman_gain, symmetrise
 
 __all__ = ["Edge", "GainGraph"]
 

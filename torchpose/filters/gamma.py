@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchpose.errors import InputError, check_finite, check_shape
 from torchpose.filters.weights import normalise
-from torchpose.priors.gmm import GaussianMixture
+from torchpose.priors.gaussian_mixture import GaussianMixture
 
 __all__ = ["fit_gamma"]
 

@@ -8,14 +8,20 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose._core.module_state import (
+    derived,
+    one_run,
+    outside_inference,
+    register_given,
+    wide_or_parameter,
+)
+from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
 from torchpose.filters import fixed_tracks, sampled_tracks, split_tracks
 from torchpose.filters.base import (
-    FilterOutput,
     Generators,
     Measurements,
     RecursiveFilter,
-    StepOutput,
     as_covariance,
     given_covariance,
     given_initial_cov,
@@ -23,6 +29,7 @@ from torchpose.filters.base import (
 )
 from torchpose.filters.frame_weights import FrameGains
 from torchpose.filters.gains import GainGraph
+from torchpose.filters.outputs import FilterOutput, StepOutput
 from torchpose.filters.smoothing import smooth_fixed_tracks
 from torchpose.filters.tracks import MKFState
 from torchpose.filters.transition import (
@@ -32,15 +39,7 @@ from torchpose.filters.transition import (
     make_transition,
 )
 from torchpose.filters.weights import normalise
-from torchpose.module_state import (
-    derived,
-    one_run,
-    outside_inference,
-    register_given,
-    wide_or_parameter,
-)
-from torchpose.priors.gmm import GaussianMixture
-from torchpose.value_checks import values_visible
+from torchpose.priors.gaussian_mixture import GaussianMixture
 
 __all__ = ["MKFState", "MixtureKalmanFilter"]
 

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose._core.value_checks import values_visible
 from torchpose.errors import DegenerateFilterWarning
 from torchpose.filters.mending import Mending, mending, stacked
-from torchpose.value_checks import values_visible
 
 __all__ = [
     "FilterOutput",
@@ -50,7 +50,7 @@ class FilterOutput(NamedTuple):
         failed_at: [B], the first frame at which an element degenerated, -1 where it did not. From
             that frame on the element's estimates are NaN.
         mended: number of covariances of the frame's tracks that rounding had made indefinite and
-            that were mended (`torchpose.gaussian.mended_cholesky`), [B, T]; 0 as a rule and past the
+            that were mended (`torchpose.math.mended_cholesky`), [B, T]; 0 as a rule and past the
             length.
         jitter: the largest share by which their variances grew, [B, T], float64; at most 1e-6.
     """

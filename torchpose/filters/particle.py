@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from torchpose._core.module_state import derived, register_given, wide_or_parameter
+from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
 from torchpose.filters.base import (
     Generators,
     Measurements,
     RecursiveFilter,
-    StepOutput,
     as_covariance,
-    effective_sample_size,
     given_covariance,
     given_initial_cov,
     require_state,
@@ -23,19 +23,14 @@ from torchpose.filters.base import (
     uniform,
 )
 from torchpose.filters.mending import Mending, mending
+from torchpose.filters.outputs import StepOutput, effective_sample_size
 from torchpose.filters.particle_options import PROPOSALS, check_model, check_options
 from torchpose.filters.resampling import resample
-from torchpose.filters.transition import (
-    BURN_IN_SCALE,
-    check_transition_options,
-    make_transition,
-)
+from torchpose.filters.transition import BURN_IN_SCALE, check_transition_options, make_transition
 from torchpose.filters.walk import MixtureWalk, Moves, grouped_affine
-from torchpose.gaussian import LOG_2PI, mended_cholesky, mended_update, safe_cholesky
-from torchpose.module_state import derived, register_given, wide_or_parameter
-from torchpose.priors.em import MixtureParameters
-from torchpose.priors.gmm import GaussianMixture
-from torchpose.value_checks import values_visible
+from torchpose.math.gaussian import LOG_2PI, mended_cholesky, mended_update, safe_cholesky
+from torchpose.math.mixture_em import MixtureParameters
+from torchpose.priors.gaussian_mixture import GaussianMixture
 
 __all__ = ["PROPOSALS", "BootstrapParticleFilter", "ParticleState"]
 

@@ -5,19 +5,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchpose.filters.base import (
-    Generators,
-    Measurements,
-    StepOutput,
-    effective_sample_size,
-    uniform,
-)
+from torchpose._core.value_checks import values_visible
+from torchpose.filters.base import Generators, Measurements, uniform
 from torchpose.filters.mending import mending
+from torchpose.filters.outputs import StepOutput, effective_sample_size
 from torchpose.filters.resampling import systematic
 from torchpose.filters.tracks import MKFState, estimate_of
 from torchpose.filters.weights import normalise
-from torchpose.gaussian import kalman_predict, mended_update
-from torchpose.value_checks import values_visible
+from torchpose.math.gaussian import kalman_predict, mended_update
 
 if TYPE_CHECKING:
     from torchpose.filters.mkf import MixtureKalmanFilter

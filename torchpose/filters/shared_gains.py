@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose.filters.base import FilterOutput, Measurements, StepOutput
+from torchpose.filters.base import Measurements
 from torchpose.filters.frame_weights import frame_log_likelihood, frame_weights
 from torchpose.filters.gains import MAX_EDGES, Edge, GainGraph
 from torchpose.filters.mending import mending_of_edges
-from torchpose.filters.outputs import finish_output
+from torchpose.filters.outputs import FilterOutput, StepOutput, finish_output
 from torchpose.filters.recompute import recomputed
 from torchpose.filters.scan import Workspace, scan_blocks
 from torchpose.filters.tracks import within_and_between

@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 from torchpose.errors import InputError
-from torchpose.filters.base import FilterOutput, Measurements
+from torchpose.filters.base import Measurements
 from torchpose.filters.fixed_tracks import step_fixed_weights, step_tracks
 from torchpose.filters.frame_weights import run_memoryless
 from torchpose.filters.mending import Mending, mending, stacked
-from torchpose.filters.outputs import finish_output
+from torchpose.filters.outputs import FilterOutput, finish_output
 from torchpose.filters.tracks import MKFState, within_and_between
 from torchpose.filters.weights import mix_uniform, normalise
-from torchpose.gaussian import mended_cholesky, symmetrise
+from torchpose.math.gaussian import mended_cholesky, symmetrise
 
 if TYPE_CHECKING:
     from torchpose.filters.mkf import MixtureKalmanFilter

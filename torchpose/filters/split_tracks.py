@@ -5,11 +5,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchpose.filters.base import Measurements, StepOutput
+from torchpose.filters.base import Measurements
 from torchpose.filters.mending import mending
+from torchpose.filters.outputs import StepOutput
 from torchpose.filters.tracks import MKFState, estimate_of
 from torchpose.filters.weights import normalise
-from torchpose.gaussian import kalman_correct, kalman_gain, symmetrise
+from torchpose.math.gaussian import kalman_correct, kalman_gain, symmetrise
 
 if TYPE_CHECKING:
     from torchpose.filters.mkf import MixtureKalmanFilter

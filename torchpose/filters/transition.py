@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
-from torchpose.gaussian import safe_cholesky, symmetrise
-from torchpose.value_checks import values_visible
+from torchpose.math.gaussian import safe_cholesky, symmetrise
 
 __all__ = [
     "BURN_IN_SCALE",

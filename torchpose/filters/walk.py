@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.gaussian import LOG_2PI, mended_cholesky, safe_cholesky
-from torchpose.priors.em import MixtureParameters
-from torchpose.value_checks import values_visible
+from torchpose._core.value_checks import values_visible
+from torchpose.math.gaussian import LOG_2PI, mended_cholesky, safe_cholesky
+from torchpose.math.mixture_em import MixtureParameters
 
 __all__ = ["MixtureWalk", "Moves", "grouped_affine"]
 

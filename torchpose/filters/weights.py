@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.gaussian import least_exponent
+from torchpose.math.gaussian import least_exponent
 
 __all__ = [
     "indicator_mixing",

@@ -22,16 +22,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.reading import read_text, reading, require_file
 from torchpose.body.skeleton import body_joints
-from torchpose.camera import PinholeCamera
-from torchpose.camera_rig import CameraRig
+from torchpose.camera.pinhole import PinholeCamera
+from torchpose.camera.rig import CameraRig
 from torchpose.errors import FileFormatError, InputError, MissingDependencyError
-from torchpose.io.c3d_recordings import read_c3d_points
-from torchpose.io.files import require_file
-from torchpose.io.humaneva_joints import SHOULDER_OFFSETS, joint_centres
+from torchpose.io.formats.c3d_recordings import read_c3d_points
+from torchpose.io.formats.humaneva_joints import SHOULDER_OFFSETS, joint_centres
 from torchpose.io.mocap import MocapClip
-from torchpose.io.reading import read_text, reading
-from torchpose.joint_sets import SKELETONS
+from torchpose.skeleton.joint_sets import SKELETONS
 
 __all__ = [
     "PARTITIONS",

@@ -14,17 +14,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpose._core.fields import one_number, one_text, texts
+from torchpose._core.files import atomic_path, write_npz
+from torchpose._core.npz import npz_keys, read_npz
+from torchpose._core.reading import check_span, read_text, reading, require_file
+from torchpose.camera.projection import check_intrinsics
 from torchpose.errors import CameraError, FileFormatError, InputError, SkeletonError, check_rate
-from torchpose.io.fields import one_number, one_text, texts
-from torchpose.io.files import atomic_path, require_file, write_npz
-from torchpose.io.landmarks import derive_joints, lacks_joints
-from torchpose.io.npz import npz_keys, read_npz
-from torchpose.io.openpose import read_openpose
-from torchpose.io.raw_recording import numbers
-from torchpose.io.reading import check_span, read_text, reading
-from torchpose.joint_sets import canonical_names, identify_skeleton
-from torchpose.projection import check_intrinsics
-from torchpose.skeleton import NECK_KINDS
+from torchpose.io.formats.openpose import read_openpose
+from torchpose.io.formats.raw_recording import numbers
+from torchpose.skeleton.joint_sets import canonical_names, identify_skeleton
+from torchpose.skeleton.mediapipe_landmarks import derive_joints, lacks_joints
+from torchpose.skeleton.upper_body import NECK_KINDS
 
 __all__ = ["Keypoints", "read_keypoints", "write_keypoints"]
 
@@ -87,14 +87,14 @@ def read_keypoints(path: str | Path) -> Keypoints:
     ``.npz``: `keypoints` [T, J, 2] and `names` [J]; optionally `confidence` [T, J], `fps`, `K`
     [3, 3], `image_size` (width, height) and `neck` (its kind). MediaPipe files with `joints2d` and
     `visibility` in their place are read alike, and head, neck and hands are appended to the landmarks
-    as priors have them (`torchpose.io.landmarks`).
+    as priors have them (`torchpose.skeleton.mediapipe_landmarks`).
 
     ``.csv``: a header ``frame,NAME_x,NAME_y[,NAME_confidence],...`` and a row per frame, or the
     long form ``frame,name,x,y[,confidence]`` with a row per keypoint. Empty cells and absent frames
     are missing. Lines ``# fps = 30`` and ``# image_size = 640,480`` may stand above the header.
 
     A folder: OpenPose's ``*_keypoints.json``, one per frame, BODY_25 or COCO 18. Of several people,
-    the most confident one is followed; see `torchpose.io.openpose`.
+    the most confident one is followed; see `torchpose.io.formats.openpose`.
 
     Args:
         path: file or folder.

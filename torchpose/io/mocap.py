@@ -62,7 +62,7 @@ def read_mocap(
 ) -> list[MocapClip]:
     """Read files and folders of 3D joints as clips of one rate.
 
-    Whatever `torchpose.io.recordings.read_recording` reads, among them the common ``.npz`` with the
+    Whatever `torchpose.io.read_recording` reads, among them the common ``.npz`` with the
     15 joints of HumanEva, the 16 of Berkeley MHAD, the 31 and 23 of CMU and the 21 of Pose2Sim.
 
     Args:

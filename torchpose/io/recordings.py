@@ -1,6 +1,6 @@
 """Recordings of 3D joints, whatever sensor or software wrote them.
 
-Joints come back in camera axes and metres; see `torchpose.io.axes` and `torchpose.io.units` for how.
+Joints come back in camera axes and metres; see `torchpose.io.formats.axes` and `torchpose.io.formats.units` for how.
 One file per format reads what a file holds; here it is checked and converted.
 """
 
@@ -13,22 +13,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpose._core.npz import npz_keys
+from torchpose._core.reading import reading, require_file
 from torchpose.errors import FileFormatError, InputError, SkeletonError, check_rate
-from torchpose.io.axes import axes_rotation, check_upright, default_axes
-from torchpose.io.azure_json import read_azure_json
-from torchpose.io.bvh_recordings import read_bvh
-from torchpose.io.c3d_recordings import read_c3d
-from torchpose.io.files import require_file
-from torchpose.io.kinect_csv import ROW_LENGTHS, header_joints, read_kinect_csv, split_row
-from torchpose.io.kinect_v1 import read_kinect_v1
-from torchpose.io.npz import npz_keys
-from torchpose.io.npz_recordings import read_npz_recording, read_opencv_recording
-from torchpose.io.ntu_skeleton import read_ntu_skeleton
-from torchpose.io.raw_recording import RawRecording, frame_ranges
-from torchpose.io.reading import reading
-from torchpose.io.units import body_unit
-from torchpose.joint_sets import canonical_names, identify_skeleton
-from torchpose.skeleton import UpperBody, to_upper_body
+from torchpose.io.formats.axes import axes_rotation, check_upright, default_axes
+from torchpose.io.formats.azure_json import read_azure_json
+from torchpose.io.formats.bvh_recordings import read_bvh
+from torchpose.io.formats.c3d_recordings import read_c3d
+from torchpose.io.formats.kinect_csv import ROW_LENGTHS, header_joints, read_kinect_csv, split_row
+from torchpose.io.formats.kinect_v1 import read_kinect_v1
+from torchpose.io.formats.npz_recordings import read_npz_recording, read_opencv_recording
+from torchpose.io.formats.ntu_skeleton import read_ntu_skeleton
+from torchpose.io.formats.raw_recording import RawRecording, frame_ranges
+from torchpose.io.formats.units import body_unit
+from torchpose.skeleton.joint_sets import canonical_names, identify_skeleton
+from torchpose.skeleton.upper_body import UpperBody, to_upper_body
 
 __all__ = ["Recording", "find_recordings", "read_recording", "read_recordings"]
 
@@ -109,8 +108,8 @@ def read_recording(path: str | Path, axes: str | None = None) -> list[Recording]
 
     ``.npz``: `joints` [T, J, 3] and `names` [J]; optionally `fps`, `subject`, `action`, `source`,
     `axes`, `weights` [T, J]. ``.yaml``: the authors' OpenCV matrix. ``.csv``: rows of Kinect v1 or v2,
-    or any joint set with a header (`torchpose.io.kinect_csv`). ``.txt``: Kinect v1
-    (`torchpose.io.kinect_v1`). ``.skeleton``: NTU RGB+D. ``.json``: Azure Kinect. ``.bvh``, ``.c3d``:
+    or any joint set with a header (`torchpose.io.formats.kinect_csv`). ``.txt``: Kinect v1
+    (`torchpose.io.formats.kinect_v1`). ``.skeleton``: NTU RGB+D. ``.json``: Azure Kinect. ``.bvh``, ``.c3d``:
     motion capture, with the extra ``mocap``.
 
     Millimetres and centimetres are recognised by the size of the body and converted; joints exactly

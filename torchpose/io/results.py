@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+from torchpose._core.files import atomic_path, check_output_folder
+from torchpose._core.leftovers import hold
+from torchpose._core.npz import npz_keys
 from torchpose.errors import OutputError, TorchposeError
-from torchpose.io.files import atomic_path, check_output_folder
-from torchpose.io.leftovers import hold
-from torchpose.io.npz import npz_keys
 
 __all__ = ["ResultsFolder", "holds_arrays", "refuse_stranger", "replace_own"]
 

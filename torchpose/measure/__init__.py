@@ -4,23 +4,16 @@ from torchpose.measure.association import AssociationState, HandAssociation
 from torchpose.measure.background import BackgroundModel
 from torchpose.measure.brightness_background import BrightnessBackground, PixelKind
 from torchpose.measure.edges import Segments, edge_map, find_segments, limb_votes
-from torchpose.measure.face import (
-    FaceDetector,
-    FaceTracker,
-    FaceTracks,
-    HaarFaceDetector,
-    Region,
-)
+from torchpose.measure.face import FaceDetector, FaceTracker, FaceTracks, HaarFaceDetector, Region
 from torchpose.measure.hand_measurements import HandMeasurements
 from torchpose.measure.hand_prior import HandPrior
 from torchpose.measure.hand_settings import HandSettings
 from torchpose.measure.hands import HandState, HandTracker
 from torchpose.measure.head_neck import FACE_OFFSETS, FaceOffsets, HeadNeck
-from torchpose.measure.mean_shift import MeanShift, mean_shift
+from torchpose.measure.mean_shift import MeanShift
 from torchpose.measure.mean_shift_hands import MeanShiftHandState, MeanShiftHandTracker
 from torchpose.measure.mediapipe import MediaPipeFaceDetector, MediaPipePose, PoseLandmarks
 from torchpose.measure.persons import PersonRegister, Persons
-from torchpose.measure.silhouettes import SilhouetteMeasurer, fit_view, read_silhouettes
 from torchpose.measure.skin import SkinModel, SkinState, rgb_to_lab
 from torchpose.measure.skin_mixture import SkinMixtureModel, SkinMixtureState
 from torchpose.measure.torso import TorsoElbows, clothes_likelihood, elbows_from_torso
@@ -62,7 +55,6 @@ __all__ = [
     "PoseLandmarks",
     "Region",
     "Segments",
-    "SilhouetteMeasurer",
     "SkinMixtureModel",
     "SkinMixtureState",
     "SkinModel",
@@ -73,9 +65,6 @@ __all__ = [
     "edge_map",
     "elbows_from_torso",
     "find_segments",
-    "fit_view",
     "limb_votes",
-    "mean_shift",
-    "read_silhouettes",
     "rgb_to_lab",
 ]

@@ -11,7 +11,7 @@ from torchpose.measure.edges import ARM_LIMBS, Segments, limb_votes, segments_of
 from torchpose.measure.face import Image
 from torchpose.measure.hand_prior import HandPrior
 from torchpose.measure.persons import match_rows
-from torchpose.skeleton import UPPER_BODY
+from torchpose.skeleton.joint_sets import UPPER_BODY
 
 __all__ = ["AssociationState", "HandAssociation", "arm_hypotheses"]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpose.errors import InputError, check_shape
-from torchpose.skeleton import UPPER_BODY
+from torchpose.skeleton.joint_sets import UPPER_BODY
 
 __all__ = ["ARM_LIMBS", "Segments", "edge_map", "find_segments", "limb_votes", "segments_of_arms"]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from torchpose.errors import InputError, check_finite, check_grey, check_shape
-from torchpose.gaussian import kalman_predict, kalman_update
+from torchpose.math.gaussian import kalman_predict, kalman_update
 
 __all__ = ["FaceDetector", "FaceTracker", "FaceTracks", "HaarFaceDetector", "Region"]
 

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from torchpose.errors import InputError, check_shape
-from torchpose.priors import UpperBodyPrior
-from torchpose.priors.gmm import GaussianMixture
+from torchpose.priors.gaussian_mixture import GaussianMixture
+from torchpose.priors.upper_body import UpperBodyPrior
 
 __all__ = ["FACE_HEIGHT", "HandPrior"]
 

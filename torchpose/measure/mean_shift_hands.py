@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from torchpose.errors import InputError
-from torchpose.gaussian import kalman_predict, kalman_update
+from torchpose.math.gaussian import kalman_predict, kalman_update
 from torchpose.measure.hand_measurements import HandMeasurements, check_frame
 from torchpose.measure.hand_prior import HandPrior
 from torchpose.measure.mean_shift import mean_shift

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpose.errors import InputError, MissingDependencyError, check_grey, check_rgb
-from torchpose.io.landmarks import DERIVED_JOINTS, LANDMARKS, derive_joints
 from torchpose.measure.face import Region
+from torchpose.skeleton.mediapipe_landmarks import DERIVED_JOINTS, LANDMARKS, derive_joints
 
 __all__ = ["MediaPipeFaceDetector", "MediaPipePose", "PoseLandmarks"]
 
@@ -154,7 +154,7 @@ class PoseLandmarks(NamedTuple):
 
     Attributes:
         points: pixels, [N, 37, 2]: the 33 landmarks and the head, neck and hands that
-            `torchpose.io.landmarks.derive_joints` makes of them. Those outside of the image are
+            `torchpose.skeleton.mediapipe_landmarks.derive_joints` makes of them. Those outside of the image are
             MediaPipe's guesses, of low visibility.
         visibility: 0 to 1, [N, 37].
         joints3d: of the 33 landmarks, [N, 33, 3], metres, camera axes, from the middle of the hips:

@@ -10,8 +10,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchpose.errors import InputError, check_shape
+from torchpose.math.mixture_em import MixtureParameters, natural_parameters
 from torchpose.measure.face import check_faces
-from torchpose.priors.em import MixtureParameters, natural_parameters
 
 __all__ = ["SkinMixtureModel", "SkinMixtureState"]
 

@@ -10,10 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.camera import ROTATION_ORDERS, RotationOrder, Viewpoints, euler_to_matrix, project
+from torchpose.camera.projection import project
+from torchpose.camera.viewpoints import Viewpoints
 from torchpose.errors import InputError, PriorError, check_finite, check_shape
-from torchpose.priors.gmm import GaussianMixture
-from torchpose.skeleton import LEFT_ARM, RIGHT_ARM
+from torchpose.math.rotations import ROTATION_ORDERS, RotationOrder, euler_to_matrix
+from torchpose.priors.gaussian_mixture import GaussianMixture
+from torchpose.skeleton.upper_body import LEFT_ARM, RIGHT_ARM
 
 __all__ = [
     "ANGLES",

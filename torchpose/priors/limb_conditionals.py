@@ -2,7 +2,7 @@
 
 A limb conditional is a Gaussian over the rotation q_ij = q_i^-1 q_j from a part i to the part j that
 hangs on it; temporal diffusion is one over the rotation of a part from one frame to the next. Both
-are what `torchpose.filters.tree_messages` passes messages with.
+are what `torchpose.math.tree_messages` passes messages with.
 """
 
 import math
@@ -15,14 +15,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.module_state import derived, register_given
+from torchpose._core.reading import reading
+from torchpose._core.tensor_file import FileKind, read_tensors, write_tensors
 from torchpose.body.kinematics import Body, centres_of
-from torchpose.body.quaternion_vectors import compose, conjugate, vector_to_quaternion
 from torchpose.body.skeleton import BodySkeleton
 from torchpose.errors import InputError, PriorError, check_finite, check_rate, check_shape
-from torchpose.io.reading import reading
-from torchpose.module_state import derived, register_given
-from torchpose.priors.tensor_file import FileKind, read_tensors, write_tensors
-from torchpose.rotation_gaussians import (
+from torchpose.math.quaternion_vectors import compose, conjugate, vector_to_quaternion
+from torchpose.math.rotation_gaussians import (
     fit_gaussian,
     left_matrix,
     quaternion_moments,
@@ -31,7 +31,7 @@ from torchpose.rotation_gaussians import (
     sigma_quaternions,
     turn_gaussian,
 )
-from torchpose.unscented import Directions, floor_eigenvalues
+from torchpose.math.unscented import Directions, floor_eigenvalues
 
 __all__ = ["PART_TREE", "LimbConditionals", "LimbInfo", "in_body_frame"]
 
@@ -410,7 +410,7 @@ def in_body_frame(
 
 def _tree(edges: Tensor, n_parts: int) -> Any:
     """The message tree over the parts that are not the root."""
-    from torchpose.filters.tree_messages import message_tree  # the filters import this module
+    from torchpose.math.tree_messages import message_tree  # the filters import this module
 
     return message_tree(edges.long() - 1, n_parts - 1)
 

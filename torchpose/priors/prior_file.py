@@ -11,16 +11,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpose.camera import PinholeCamera
-from torchpose.errors import FileFormatError, PriorError
-from torchpose.priors.arm_state import check_rotation_order
-from torchpose.priors.tensor_file import (
+from torchpose._core.tensor_file import (
     FileKind,
     info_from_json,
     info_to_json,
     read_tensors,
     write_tensors,
 )
+from torchpose.camera.pinhole import PinholeCamera
+from torchpose.errors import FileFormatError, PriorError
+from torchpose.priors.arm_state import check_rotation_order
 
 __all__ = ["SKELETON", "PriorInfo", "read_prior", "write_prior"]
 

@@ -6,12 +6,12 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
+from torchpose._core.tensor_file import format_of
 from torchpose.errors import OverlapError, PriorError
-from torchpose.priors.action_bank import ActionBank
-from torchpose.priors.action_space import ActionSpace
-from torchpose.priors.gplvm import BackConstrainedGPLVM
+from torchpose.priors.actions.bank import ActionBank
+from torchpose.priors.actions.space import ActionSpace
 from torchpose.priors.limb_conditionals import LimbConditionals
-from torchpose.priors.tensor_file import format_of
+from torchpose.priors.manifold.gplvm import BackConstrainedGPLVM
 
 __all__ = [
     "KINDS",

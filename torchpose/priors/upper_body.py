@@ -11,7 +11,12 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from torchpose.camera import PinholeCamera, ViewRange
+from torchpose._core.module_state import register_given
+from torchpose._core.npz import read_npz
+from torchpose._core.reading import reading
+from torchpose._core.tensor_file import require_tensor
+from torchpose.camera.pinhole import PinholeCamera
+from torchpose.camera.viewpoints import ViewRange
 from torchpose.errors import (
     FileFormatError,
     InputError,
@@ -21,9 +26,8 @@ from torchpose.errors import (
     check_covariance,
     check_finite,
 )
-from torchpose.io.npz import read_npz
-from torchpose.io.reading import reading
-from torchpose.module_state import register_given
+from torchpose.learning.samplers import ArmSource, all_samples
+from torchpose.learning.training import TRAINING_VIEWS, RecordingLike, arm_sources, collect_poses
 from torchpose.priors.arm_state import (
     STATE_DIM,
     arm_states,
@@ -32,12 +36,9 @@ from torchpose.priors.arm_state import (
     mirror_covariance,
     mirror_mixture,
 )
-from torchpose.priors.gmm import GaussianMixture
+from torchpose.priors.gaussian_mixture import GaussianMixture
 from torchpose.priors.prior_file import PriorInfo, read_prior, write_prior
 from torchpose.priors.prior_noise import check_noise
-from torchpose.priors.samplers import ArmSource, all_samples
-from torchpose.priors.tensor_file import require_tensor
-from torchpose.priors.training import TRAINING_VIEWS, RecordingLike, arm_sources, collect_poses
 from torchpose.priors.window import WindowPrior
 
 __all__ = [

@@ -13,15 +13,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from torchpose.body_view import BodyPath
-from torchpose.camera import Viewpoints
+from torchpose.camera.projection import project
+from torchpose.camera.viewpoints import Viewpoints
+from torchpose.camera.virtual_camera import BodyPath
 from torchpose.errors import PriorError
+from torchpose.math.rotations import euler_to_matrix
 from torchpose.priors.arm_state import STATE_DIM, mirror_arm_state
-from torchpose.priors.gmm import GaussianMixture
-from torchpose.projection import project
-from torchpose.rotations import euler_to_matrix
-from torchpose.skeleton import LEFT_ARM, RIGHT_ARM, mirror_pose, scale_bones
-from torchpose.torso import in_torso_axes
+from torchpose.priors.gaussian_mixture import GaussianMixture
+from torchpose.skeleton.torso import in_torso_axes
+from torchpose.skeleton.upper_body import LEFT_ARM, RIGHT_ARM, mirror_pose, scale_bones
 
 __all__ = [
     "WindowLayout",
@@ -46,7 +46,7 @@ class WindowLayout:
     Attributes:
         own: lags of the arm's own hand, frames; positive is the past. other: lags of the other hand.
         fps: the frame rate that the lags count at.
-        torso: whether the joints of the arm in the axes of the torso follow (`torchpose.torso`).
+        torso: whether the joints of the arm in the axes of the torso follow (`torchpose.skeleton.torso`).
     """
 
     own: tuple[int, ...]
@@ -71,7 +71,7 @@ class WindowLayout:
 
     @property
     def deciding(self) -> list[int]:
-        """Dimensions that decide which component a window belongs to (`torchpose.priors.completion`).
+        """Dimensions that decide which component a window belongs to (`torchpose.learning.completion`).
 
         What is measured, and with `torso` what is wanted of it; without, all of them.
         """
@@ -108,7 +108,7 @@ class WindowPrior(nn.Module):
     Args:
         left, right: mixtures over `layout.dim` dimensions. layout: the hands in a window.
         settings: numbers by name: hand_std (pixels, of the window's hands), likelihood_power, and
-            joint_ratio, pixel_ratio and placement_ratio (1/s^3, of `torchpose.read_out.MotionStage`).
+            joint_ratio, pixel_ratio and placement_ratio (1/s^3, of `torchpose.upper_body.fusion.MotionStage`).
 
     Raises:
         PriorError: mixtures of another size.

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from torchpose._core.reading import require_file
 from torchpose.errors import FileFormatError, check_rate
-from torchpose.io.files import require_file
 from torchpose.video.base import Image, VideoFrame, VideoSource
 from torchpose.video.probe import Scan, is_cover, open_container, scan_packets
 from torchpose.video.timing import Rate, Tally, to_constant_rate

@@ -14,10 +14,10 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpose.calibration import chi2_quantile
 from torchpose.errors import InputError, check_rgb, check_shape
-from torchpose.joint_sets import UPPER_BODY
-from torchpose.skeleton import LIMBS
+from torchpose.metrics.calibration import chi2_quantile
+from torchpose.skeleton.joint_sets import UPPER_BODY
+from torchpose.skeleton.upper_body import LIMBS
 from torchpose.video.pen import Color, Pen, rgb
 from torchpose.viz.style import LEFT, RIGHT
 

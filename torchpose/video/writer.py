@@ -8,8 +8,8 @@ from typing import Any, Self
 
 import numpy as np
 
+from torchpose._core.files import atomic_path
 from torchpose.errors import InputError, MissingDependencyError, OutputError, ShapeError
-from torchpose.io.files import atomic_path
 from torchpose.video.base import Image
 
 __all__ = ["VideoWriter"]

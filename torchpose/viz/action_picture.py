@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from torchpose.priors.action_space import ActionSpace
-    from torchpose.priors.synchronisation import Synchronised
+    from torchpose.priors.actions.space import ActionSpace
+    from torchpose.priors.actions.synchronisation import Synchronised
 else:
     Axes = Figure = ActionSpace = Synchronised = Any
 

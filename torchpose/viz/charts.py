@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.calibration import Coverage, chi2_quantile
 from torchpose.errors import InputError, check_shape
-from torchpose.joint_sets import UPPER_BODY
-from torchpose.metrics import PCP
+from torchpose.metrics.calibration import Coverage, chi2_quantile
+from torchpose.metrics.poses import PCP
+from torchpose.skeleton.joint_sets import UPPER_BODY
 from torchpose.viz.style import (
     INK,
     MUTED,

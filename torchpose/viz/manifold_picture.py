@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from torchpose.body import Body
-    from torchpose.priors.gplvm import BackConstrainedGPLVM
+    from torchpose.body.kinematics import Body
+    from torchpose.priors.manifold.gplvm import BackConstrainedGPLVM
 else:
     Axes = Figure = Body = BackConstrainedGPLVM = Any
 

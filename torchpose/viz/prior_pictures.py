@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose.camera.projection import lift
 from torchpose.errors import InputError
-from torchpose.projection import lift
-from torchpose.rotations import RotationOrder, euler_to_matrix
+from torchpose.math.rotations import RotationOrder, euler_to_matrix
 from torchpose.viz.skeletons import ARM_LIMBS, _limits, _set_view, draw_skeleton
 from torchpose.viz.style import (
     INK,
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
-    from torchpose.priors import UpperBodyPrior
+    from torchpose.priors.upper_body import UpperBodyPrior
 else:
     Axes = Figure = SubFigure = UpperBodyPrior = Any
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchpose.body.quaternion_vectors import compose, quaternion_vector_to_matrix
 from torchpose.errors import InputError, check_shape
-from torchpose.unscented import sigma_points
+from torchpose.math.quaternion_vectors import compose, quaternion_vector_to_matrix
+from torchpose.math.unscented import sigma_points
 from torchpose.viz.style import (
     GRID,
     INK,

@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.calibration import chi2_quantile
 from torchpose.errors import InputError, ShapeError, check_shape
-from torchpose.joint_sets import UPPER_BODY
-from torchpose.skeleton import LIMBS
+from torchpose.metrics.calibration import chi2_quantile
+from torchpose.skeleton.joint_sets import UPPER_BODY
+from torchpose.skeleton.upper_body import LIMBS
 from torchpose.viz.style import (
     INK,
     LARGE,

@@ -158,7 +158,7 @@ def save_figure(figure: Figure, path: str | Path, dpi: int = 150) -> Path:
         InputError: a suffix that matplotlib cannot write.
         OutputError: the folder is missing or not writable.
     """
-    from torchpose.io import atomic_path
+    from torchpose._core.files import atomic_path
 
     path = Path(path)
     kinds = figure.canvas.get_supported_filetypes()

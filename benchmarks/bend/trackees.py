@@ -1,0 +1,203 @@
+"""What a person of the protocol Bend is tracked with: body, action model of the others, noise, views."""
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from benchmarks.silhouette.data import Split
+from benchmarks.silhouette.trackees import Conditions, Setting, Tracked, body_of, view_of
+from torchpose.body.fitting import fit_body, fit_state
+from torchpose.body.kinematics import Body, centres_of
+from torchpose.body.skeleton import BODY_15
+from torchpose.io.mocap import MocapClip
+from torchpose.priors.actions.file import ActionInfo
+from torchpose.priors.actions.gate import Acceptance
+from torchpose.priors.actions.polar_limbs import LIMBS_12
+from torchpose.priors.actions.postures import posture_angles, state_postures
+from torchpose.priors.actions.space import ActionSpace
+from torchpose.priors.actions.synchronisation import Synchronised
+from torchpose.whole_body.filters.constrained import ConstrainedParticleFilter
+from torchpose.whole_body.filters.first_order import constant_velocity_std
+
+__all__ = [
+    "BendTrackee",
+    "Performed",
+    "Variant",
+    "arm_centres",
+    "fit_space",
+    "known_angles",
+    "make_filter",
+    "perform",
+    "prepare",
+    "synchronised_space",
+    "true_acceptance",
+]
+
+SHARPNESS = (30.0, 1.0, 10.0, 100.0, 300.0)
+"""Exponents of the intersection over union that validation chooses among, 1 as published; the first
+is the one with which the diffusion is chosen."""
+
+DIMENSIONS = 13
+"""Of the action space, as published."""
+
+MOST_DIMENSIONS = 25
+
+REDRAWS = 8
+"""How often a rejected prediction is drawn again; then it is moved to the gate."""
+
+
+class Variant(NamedTuple):
+    """One tracker of the comparison.
+
+    Attributes:
+        constrained: predictions by the action model, else of the first order alone.
+        particles: N. dimensions: D of the action space; what it is without constraint counts for
+            nothing. limb_shape: cylinders or rectangles.
+    """
+
+    constrained: bool
+    particles: int
+    dimensions: int = DIMENSIONS
+    limb_shape: str = "cylinders"
+
+    @property
+    def label(self) -> str:
+        """What it is called in tables."""
+        return "constrained" if self.constrained else "first order"
+
+
+Performed = tuple[Tensor, ...]
+"""States [T, D] of one person's performances of an action."""
+
+
+@dataclass(frozen=True)
+class BendTrackee(Tracked):
+    """A person with an action model of the others.
+
+    Args:
+        space: of the performances of everybody else, with as many dimensions as they have.
+        truth: angles of the body fitted to the recorded joints [T, 36], degrees, of every test.
+        recorded_gap: mean squared difference of these from the angles of the recorded joints,
+            degrees^2, of every test.
+        known: [36], False for the angles of limbs that the recordings lack.
+        own, trained: all postures [T, 36] of this person, and of one who trained.
+    """
+
+    space: ActionSpace
+    truth: tuple[Tensor, ...]
+    recorded_gap: tuple[float, ...]
+    known: Tensor
+    own: Tensor
+    trained: Tensor
+
+
+def perform(clips: Sequence[MocapClip], centres: Float[Tensor, "P 3"] | None = None) -> Performed:
+    """States [T, D] of one person's performances, of a body with constant bone lengths.
+
+    Args:
+        clips: of the person, one performance each. centres: of the parts; none if None.
+    """
+    joints = torch.cat([clip.joints for clip in clips])
+    states = fit_state(fit_body(joints, centres=centres), joints)
+    return states.split([len(clip) for clip in clips])
+
+
+def arm_centres(clips: Sequence[MocapClip]) -> Float[Tensor, "P 3"]:
+    """Centres of the parts (DX 1): arms above the head are half a turn away from hanging ones, where
+    the vectors of their rotations would jump."""
+    joints = torch.cat([clip.joints for clip in clips])
+    body = fit_body(joints)
+    return centres_of(body, fit_state(body, joints))
+
+
+def prepare(
+    split: Split,
+    performed: Mapping[str, Performed],
+    conditions: Conditions,
+    name: str = "bend",
+    centres: Float[Tensor, "P 3"] | None = None,
+) -> BendTrackee:
+    """Fit body, action space and noise, and render what the camera sees.
+
+    Args:
+        split: of `leave_one_out`. performed: of everybody, of whom the person is left out.
+        conditions: of the silhouettes. name: of the action. centres: those of `performed`.
+    """
+    body = body_of(split.body, conditions)
+    if centres is not None:
+        body = body.altered(centres=centres)
+    others = [one for person, one in performed.items() if person != split.person]
+    space = fit_space(body, others, name, split.test[0].fps)
+    step_std = constant_velocity_std(body, [s for one in others for s in one])
+    tests = tuple(view_of(body, clip, conditions) for clip in split.test)
+    truth = tuple(state_postures(body, fit_state(body, clip.joints)) for clip in split.test)
+    known = known_angles(split.test[0])
+    gaps = [
+        (found - posture_angles(clip.joints))[:, known].square().mean()
+        for found, clip in zip(truth, split.test, strict=True)
+    ]
+    own, trained = performed[split.person], others[0]
+    return BendTrackee(
+        split, body, step_std, tests, (), space, truth, tuple(map(float, gaps)), known,
+        state_postures(body, torch.cat(own)), state_postures(body, torch.cat(trained)),
+    )  # fmt: skip
+
+
+def fit_space(body: Body, performed: Sequence[Performed], name: str, fps: float) -> ActionSpace:
+    """The action space of some persons' performances, put on the body that is to be tracked.
+
+    With the same rotations, where somebody's shoulders and hips are makes no difference. It has as
+    many dimensions as are ever asked for.
+    """
+    space, _ = synchronised_space(body, performed, ActionInfo(name=name, fps=fps))
+    return space
+
+
+def synchronised_space(
+    body: Body, performed: Sequence[Performed], info: ActionInfo
+) -> tuple[ActionSpace, Synchronised]:
+    """The same, and the performances in it before and after they are put in step."""
+    postures = [state_postures(body, states) for one in performed for states in one]
+    rank = min(MOST_DIMENSIONS, int(torch.linalg.matrix_rank(torch.cat(postures), rtol=1e-4)))
+    return ActionSpace.fit_synchronised(postures, rank, name=info.name, fps=info.fps, info=info)
+
+
+def known_angles(clip: MocapClip) -> Bool[Tensor, "36"]:
+    """Angles of limbs whose joints are recorded."""
+    there = dict(zip(BODY_15.names, clip.joints.isfinite().all(-1).all(0).tolist(), strict=True))
+    return torch.tensor([there[limb.start] and there[limb.end] for limb in LIMBS_12 for _ in "xyz"])
+
+
+def make_filter(
+    variant: Variant, trackee: BendTrackee, setting: Setting, action: Any = None
+) -> ConstrainedParticleFilter:
+    """The tracker of a variant, in single precision.
+
+    Args:
+        variant: which. trackee: whose body and action space. setting: sharpness, and factor of the
+            noise. action: a bank, or another space, instead of the trackee's.
+    """
+    if action is None and variant.constrained:
+        action = trackee.space.with_dimensions(min(variant.dimensions, trackee.space.n_dimensions))
+    tracker = ConstrainedParticleFilter(
+        trackee.body, action if variant.constrained else None, variant.particles,
+        step_std=setting.scale * trackee.step_std, likelihood="overlap",
+        sharpness=setting.value, limb_shape=variant.limb_shape, max_redraws=REDRAWS,
+    )  # fmt: skip
+    return copy.deepcopy(tracker).float()
+
+
+def true_acceptance(trackee: BendTrackee, dimensions: int) -> tuple[Acceptance, Acceptance]:
+    """Share of recorded postures that pass the gates: of the person who is left out, of a trainer."""
+    space = trackee.space.with_dimensions(dimensions)
+    generators = [torch.Generator().manual_seed(seed) for seed in (0, 1)]
+    unseen, trained = (
+        space.acceptance(postures, generator=generator)
+        for postures, generator in zip((trackee.own, trackee.trained), generators, strict=True)
+    )
+    return unseen, trained

@@ -1,0 +1,267 @@
+"""Protocol Body models: what fitted models bring to the trackers of `torchpose track-body`.
+
+Persons whom the models do not know are rendered as silhouettes of another body than the tracker's, and
+tracked with each model by the filter, and the settings, that the command has. Beside them are the filters
+without a model, and two estimates that do not look: standing still, and the mean pose carried along at
+the true place. Errors are distances of joints.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from benchmarks.silhouette.data import Split, take_frames
+from benchmarks.silhouette.protocol import image_size
+from benchmarks.silhouette.runs import (
+    Run,
+    Runs,
+    generators_of,
+    sequence_name,
+    track_view,
+    view_errors,
+)
+from benchmarks.silhouette.tables import mean_of, part_errors, pooled_std, write_csv
+from benchmarks.silhouette.trackees import Conditions, Tracked, View, body_of, view_of
+from torchpose._core.files import check_output_folder
+from torchpose.body.fitting import fit_state
+from torchpose.body.kinematics import Body
+from torchpose.errors import InputError
+from torchpose.evaluation.report import Report
+from torchpose.io.mocap import MocapClip, read_mocap, select_persons
+from torchpose.priors.shipped import (
+    load_action,
+    load_limb_conditionals,
+    load_manifold,
+    persons_of_model,
+    refuse_seen,
+)
+
+__all__ = ["MEAN_POSE", "STILL", "run"]
+
+STILL, MEAN_POSE = "standing still", "mean pose at the true place"
+
+SPACED = ("actions", "persons")
+"""Options that a command line takes as words with blanks between them."""
+
+_BODY_FRAMES = 350
+_PLAIN = ("sir", "apf")
+
+
+def run(
+    data: str | Path,
+    out: str | Path,
+    *,
+    seed: int = 0,
+    progress: bool = True,
+    quick: bool = False,
+    manifold: str | None = None,
+    conditionals: str | None = None,
+    action: str | None = None,
+    persons: tuple[str, ...] = (),
+    actions: tuple[str, ...] = (),
+    clips: int = 1,
+    frames: int = 120,
+    fps: float = 60.0,
+    seeds: int = 2,
+    particles: int = 500,
+    cameras_used: int = 3,
+    faults: float = 1.0,
+    size: str = "160x120",
+) -> Report:
+    """Run the protocol; writes report.json, report.md and runs.csv to `out`.
+
+    Args:
+        data: folder or file of motion capture. out: folder for the results.
+        seed: of shapes, faults and the first run. progress: whether to show a bar.
+        quick: few frames and particles, one run, to see that all of it works.
+        manifold: name or file of a manifold. conditionals: of limb conditionals. action: of an action
+            space or bank.
+        persons: who is tracked; everybody whom no model knows if nobody is named.
+        actions: only recordings of these; all if none is named.
+        clips: recordings tracked of each person and action; others tell bone lengths and radii.
+        frames: of each, from its first. fps: rate of the frames.
+        seeds: runs of every tracker. particles: likelihoods a frame.
+        cameras_used: the first 1, 2 or 3 of three cameras, 3.8 m around every clip.
+        faults: severity of holes, ragged edges, shadows and missing limbs; 0 for none.
+        size: of the silhouettes, width x height.
+
+    Raises:
+        OverlapError: a model was fitted on a person who is to be tracked. InputError: no model, unknown
+            persons or actions, nobody whom the models do not know, one recording alone of a person.
+            PriorError: unknown models. OutputError: `out` cannot be written.
+    """
+    out = check_output_folder(out)
+    if min(clips, seeds, particles) < 1 or frames < 2 or not 1 <= cameras_used <= 3:
+        raise InputError(
+            "clips, seeds and particles must be at least 1, frames at least 2 and cameras_used from 1 "
+            f"to 3, got {clips}, {seeds}, {particles}, {frames} and {cameras_used}"
+        )
+    models = _load(manifold, conditionals, action)
+    if quick:
+        frames, particles, seeds = min(frames, 6), min(particles, 35), 1
+    recorded = read_mocap(data, fps, actions)
+    chosen = _unseen(recorded, models, persons)
+    conditions = Conditions(image_size(size), faults, cameras_used, None, seed)
+    tracked = [
+        _prepare(own, clips, frames, conditions)
+        for person in chosen.values()
+        for own in _by_action(person).values()
+    ]
+    numbers = list(range(seed, seed + seeds))
+    runs = _run_all(tracked, models, fps, particles, numbers, progress)
+    names = {"manifold": manifold, "conditionals": conditionals, "action": action}
+    report = Report("Body models: persons whom they do not know", {
+        "quick": quick, "seed": seed, "seeds": seeds, "persons": list(chosen),
+        "actions": sorted({clip.action for group in chosen.values() for clip in group}),
+        **{name: value for name, value in names.items() if value},
+        "frames": frames, "fps": fps, "particles": particles, "cameras used": cameras_used,
+        "faults": faults, "size": size, "initial pose": "given",
+    })  # fmt: skip
+    _add_errors(report, runs, tracked)
+    write_csv(out / "runs.csv", runs, fps, seed)
+    report.save(out)
+    return report
+
+
+# --- models and persons ---------------------------------------------------------------------------
+
+
+def _load(manifold: str | None, conditionals: str | None, action: str | None) -> dict[str, Any]:
+    """Models by the method that tracks with them."""
+    found: dict[str, Any] = {}
+    if manifold is not None:
+        found["mrpf"] = load_manifold(manifold)
+    if conditionals is not None:
+        found["root"] = load_limb_conditionals(conditionals)
+    if action is not None:
+        found["constrained"] = load_action(action)
+    if not found:
+        raise InputError("name a model: --manifold, --conditionals or --action, NAME or FILE")
+    return found
+
+
+def _unseen(
+    clips: Sequence[MocapClip], models: Mapping[str, Any], persons: Sequence[str]
+) -> dict[str, list[MocapClip]]:
+    """Clips of who is tracked, by person; whoever is named must be unknown to all models."""
+    everybody = select_persons(clips, persons)
+    if persons:
+        for model in models.values():
+            refuse_seen(model, {clip.person_id for group in everybody.values() for clip in group})
+        return everybody
+    known = {p for model in models.values() for p in persons_of_model(model)}
+    found = {
+        name: group
+        for name, group in everybody.items()
+        if not known & {clip.person_id for clip in group}
+    }
+    if not found:
+        raise InputError(
+            f"all persons of the recordings are known to the models: {', '.join(everybody)}; a model is "
+            "scored on others"
+        )
+    return found
+
+
+def _by_action(clips: Sequence[MocapClip]) -> dict[str, list[MocapClip]]:
+    found: dict[str, list[MocapClip]] = {}
+    for clip in clips:
+        found.setdefault(clip.action, []).append(clip)
+    return found
+
+
+def _prepare(
+    own: Sequence[MocapClip], n_clips: int, n_frames: int, conditions: Conditions
+) -> Tracked:
+    """Body of a person's other recordings, and what cameras see of those that are tracked."""
+    if len(own) <= n_clips:
+        raise InputError(
+            f"person {own[0].person}: expected more than {n_clips} recordings of {own[0].action}, of which "
+            f"one tells the bone lengths, got {len(own)}; leave the person out, or track fewer"
+        )
+    others = take_frames(own[n_clips:], _BODY_FRAMES)
+    body = body_of(others, conditions)
+    tests = tuple(view_of(body, clip.cut(0, n_frames), conditions) for clip in own[:n_clips])
+    split = Split(own[0].person, tuple(own[:n_clips]), (), (), others, seen=False)
+    return Tracked(split, body, torch.zeros(body.dim, dtype=torch.float64), tests, ())
+
+
+# --- runs -----------------------------------------------------------------------------------------
+
+
+def _run_all(
+    tracked: Sequence[Tracked], models: Mapping[str, Any], fps: float, particles: int,
+    seeds: Sequence[int], progress: bool,
+) -> Runs:  # fmt: skip
+    methods = [*_PLAIN, *models]
+    runs: Runs = {name: {} for name in (STILL, MEAN_POSE, *methods)}
+    total = sum(len(view.clip) for t in tracked for view in t.tests) * len(methods) * len(seeds)
+    with tqdm(total=total, disable=not progress, unit="frame", desc="tracking") as bar:
+        for one in tracked:
+            for view in one.tests:
+                name = f"{sequence_name(one, view)}"
+                still, mean = _blind(one, view)
+                runs[STILL][name], runs[MEAN_POSE][name] = [still], [mean]
+                for method in methods:
+                    found = _tracked(one, view, method, models, fps, particles, seeds)
+                    runs[method][name] = found
+                    bar.update(len(seeds) * len(view.clip))
+    return runs
+
+
+def _tracked(
+    one: Tracked, view: View, method: str, models: Mapping[str, Any], fps: float, particles: int,
+    seeds: Sequence[int],
+) -> list[Run]:  # fmt: skip
+    from torchpose.cli.track_body_models import default_sharpness, model_of
+
+    model = model_of(method, one.body, models.get(method)).at_rate(fps)
+    tracker = model.make_filter(particles, default_sharpness(method), fps)
+    start = fit_state(model.body, view.clip.joints[:1]).expand(len(seeds), -1)
+    return track_view(tracker, model.body, view, start, generators_of(seeds))
+
+
+def _blind(one: Tracked, view: View) -> tuple[Run, Run]:
+    """The first pose held, and the mean pose of the person's other recordings at the true root."""
+    body = one.body
+    truth = fit_state(body, view.clip.joints)
+    still = truth[:1].expand_as(truth)
+    others = fit_state(body, torch.cat([clip.joints for clip in one.split.body]))
+    mean = body.with_relative(truth, body.relative(others).mean(0))
+    return _as_run(body, view, still), _as_run(body, view, mean)
+
+
+def _as_run(body: Body, view: View, states: Float[Tensor, "T D"]) -> Run:
+    never = torch.zeros(len(states), dtype=torch.bool)
+    errors = view_errors(body, view, states).float()
+    zero = torch.zeros(1, dtype=torch.float64)
+    return Run(errors, states.float(), torch.zeros_like(states).float(), never, never, zero)
+
+
+# --- tables ---------------------------------------------------------------------------------------
+
+
+def _add_errors(report: Report, runs: Runs, tracked: Sequence[Tracked]) -> None:
+    """Mean errors of every tracker, by part of the body and by person."""
+    parts = {"whole body": "", "torso": "torso", "legs": "legs", "arms": "arms"}
+    table = report.table(
+        "errors", "Error (mm) of the joints, mean over joints, frames, sequences and runs",
+        ["whole body", "± runs", "torso", "legs", "arms"],
+        note="± runs: standard deviation over runs, pooled over sequences.",
+    )  # fmt: skip
+    for method in runs:
+        values = {name: part_errors(runs, method, part) for name, part in parts.items()}
+        whole = values["whole body"]
+        spread = float(pooled_std(whole)) if whole.shape[1] > 1 else float("nan")
+        means = [float(mean_of(errors)) for errors in values.values()]
+        table.add(method, [means[0], spread, *means[1:]])
+    by_person = report.table(
+        "sequences", "Error (mm) of the joints by sequence", list(runs),
+    )  # fmt: skip
+    for i, name in enumerate(next(iter(runs.values()))):
+        by_person.add(name, [float(part_errors(runs, method)[i].mean()) for method in runs])

@@ -1,0 +1,297 @@
+"""Clips of the protocol Silhouette: who trains, who is tracked, and where the cameras stand."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from torchpose.body.skeleton import BODY_15
+from torchpose.camera.pinhole import PinholeCamera
+from torchpose.camera.rig import CameraRig
+from torchpose.errors import InputError
+from torchpose.io.mocap import MocapClip, select_persons
+
+__all__ = [
+    "Split",
+    "cameras_around",
+    "in_view",
+    "looped",
+    "place_cameras",
+    "split_clips",
+    "take_frames",
+    "whole_frames",
+]
+
+AZIMUTHS = (30.0, 150.0, 270.0)
+"""Where the cameras stand, degrees from the direction of the walk, to the walker's left."""
+
+LEAST_FRAMES = 110
+"""A test trial should have as many; a shorter one is taken where there is no other."""
+
+_PELVIS = BODY_15.joint("pelvis")
+
+
+class Split(NamedTuple):
+    """What one tracked person is tracked with.
+
+    Attributes:
+        person: who. test: trials to track. manifold: clips for the manifold.
+        validation: clips for noise and sharpness, of the manifold's action. body: clips for bone
+            lengths and radii, never of a test trial.
+        seen: whether the manifold is made of other trials of the same person.
+    """
+
+    person: str
+    test: tuple[MocapClip, ...]
+    manifold: tuple[MocapClip, ...]
+    validation: tuple[MocapClip, ...]
+    body: tuple[MocapClip, ...]
+    seen: bool
+
+
+def split_clips(
+    clips: Sequence[MocapClip],
+    train_persons: Sequence[str] = (),
+    test_persons: Sequence[str] = (),
+    n_clips: int = 1,
+    manifold_frames: int = 350,
+    validation_frames: int = 300,
+    tracked: Sequence[MocapClip] = (),
+) -> list[Split]:
+    """Who is tracked with what.
+
+    A person who trains as well is tracked in the first trials, and the manifold and the validation
+    have the following ones. Somebody else is tracked with a manifold of the others; bone lengths and
+    radii come from their own remaining trials.
+
+    Args:
+        clips: of one action. train_persons, test_persons: names; all persons if empty.
+        n_clips: trials tracked of each person. manifold_frames, validation_frames: at most so many.
+        tracked: clips of another action, to be tracked instead of `clips`, which still make the
+            manifold and choose noise and sharpness.
+
+    Raises:
+        InputError: no such person, or one with too few trials.
+    """
+    testers = select_persons(tracked or clips, test_persons)
+    trainers = select_persons(clips, train_persons)
+    found = []
+    for person, group in testers.items():
+        test = _test_trials(group, n_clips)
+        tested = {clip.trial for clip in test}
+        # of the manifold's action first, then other trials of the tracked one
+        own = [c for c in (*clips, *tracked) if c.person == person and c.trial not in tested]
+        seen = person in trainers
+        if seen:
+            pool = [clip for clip in trainers[person] if clip.trial not in tested]
+        else:
+            pool = [clip for group in trainers.values() for clip in group]
+        if len(pool) < 2 or not own:
+            raise InputError(
+                f"person {person}: expected two trials or more beside the {len(test)} tracked ones "
+                f"for manifold and validation, and one of their own for the body, got {len(pool)} "
+                f"and {len(own)}; give --clips fewer or other persons"
+            )
+        manifold, rest = _share(pool, manifold_frames, seen)
+        validation = take_frames(rest, validation_frames)
+        found.append(Split(person, test, manifold, validation, take_frames(own, 350), seen))
+    return found
+
+
+def take_frames(clips: Sequence[MocapClip], n_frames: int) -> tuple[MocapClip, ...]:
+    """Clips from the first on until there are so many frames; the last one is cut."""
+    taken: list[MocapClip] = []
+    left = n_frames
+    for clip in clips:
+        if left < 2:
+            break
+        taken.append(clip.cut(0, left))
+        left -= len(taken[-1])
+    return tuple(taken)
+
+
+def whole_frames(clip: MocapClip) -> Bool[Tensor, " T"]:
+    """Frames in which no joint was lost; one that the joint set lacks altogether does not count."""
+    missing = clip.joints.isnan().any(-1)
+    return ~(missing & ~missing.all(0)).any(-1) & ~missing.all(-1)
+
+
+def _test_trials(group: Sequence[MocapClip], n_clips: int) -> tuple[MocapClip, ...]:
+    long = [clip for clip in group if len(clip) >= LEAST_FRAMES]
+    return tuple((long or list(group))[:n_clips])
+
+
+def _share(
+    pool: Sequence[MocapClip], n_frames: int, seen: bool
+) -> tuple[tuple[MocapClip, ...], list[MocapClip]]:
+    """Clips for the manifold, and what is left for the validation: at least one.
+
+    Of several persons everybody gives the same number of frames.
+    """
+    if not seen:
+        by_person: dict[str, list[MocapClip]] = {}
+        for clip in pool:
+            by_person.setdefault(clip.person, []).append(clip)
+        share = math.ceil(n_frames / len(by_person))
+        taken = [
+            take_frames(group[: max(1, len(group) - 1)], share) for group in by_person.values()
+        ]
+        rest = [clip for group in by_person.values() for clip in group[-1:]]
+        return tuple(clip for part in taken for clip in part), rest
+    taken_clips = take_frames(pool[:-1], n_frames)
+    used = {clip.trial for clip in taken_clips}
+    return taken_clips, [clip for clip in pool if clip.trial not in used]
+
+
+# --- cameras --------------------------------------------------------------------------------------
+
+
+def place_cameras(
+    clip: MocapClip, azimuths: Sequence[float] = AZIMUTHS, **options: float
+) -> CameraRig:
+    """The rig of `cameras_around` a clip, which takes the options."""
+    return CameraRig(cameras_around(clip, azimuths, **options))
+
+
+def cameras_around(
+    clip: MocapClip,
+    azimuths: Sequence[float] = AZIMUTHS,
+    distance: float = 3.8,
+    height: float = 1.5,
+    focal: float = 450.0,
+) -> list[PinholeCamera]:
+    """Cameras of 640 x 480 pixels around the middle of the way, which they look at.
+
+    They stand at `azimuths` from the direction of the walk, none of them in its line, so that the
+    person stays in view for four metres of it.
+
+    Args:
+        clip: whose way it is. azimuths: degrees, one camera each. distance: from the middle, metres.
+        height: above the lowest joint, metres. focal: length, pixels.
+    """
+    up = clip.up.double()
+    forward, left = _way(clip)
+    points = clip.joints[:, _PELVIS]
+    low, high = points.amin(0), points.amax(0)
+    floor = float((clip.joints @ up).nan_to_num(math.inf).min())
+    middle = (low + high) / 2
+    middle = middle - (middle @ up) * up
+    target = middle + (floor + 0.95) * up
+    cameras = []
+    for i, azimuth in enumerate(azimuths, start=1):
+        angle = math.radians(azimuth)
+        place = middle + distance * (math.cos(angle) * forward + math.sin(angle) * left)
+        place = place + (floor + height) * up
+        cameras.append(_looking(place, target, up, focal, f"cam_{i:02d}"))
+    return cameras
+
+
+def _way(clip: MocapClip) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Horizontal direction of the walk, or of the chest where nobody walks, and its left."""
+    up = clip.up.double()
+    pelvis = clip.joints[:, _PELVIS].double()
+    way = pelvis[-1] - pelvis[0]
+    way = way - (way @ up) * up
+    if float(way.norm()) < 0.5:
+        sides = (BODY_15.joint("left_shoulder"), BODY_15.joint("right_shoulder"))
+        across = (clip.joints[:, sides[0]] - clip.joints[:, sides[1]]).double().nanmean(0)
+        way = torch.linalg.cross(across, up)
+    forward = normalize(way, dim=-1)
+    return forward, torch.linalg.cross(up, forward)
+
+
+def _looking(
+    place: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"], focal: float,
+    name: str,
+) -> PinholeCamera:  # fmt: skip
+    """A camera at `place` with `target` in the middle of the image, upright."""
+    import cv2
+
+    z = normalize(target - place, dim=-1)
+    x = normalize(torch.linalg.cross(z, up), dim=-1)
+    R = torch.stack([x, torch.linalg.cross(z, x), z])
+    return PinholeCamera(
+        focal, focal, 319.5, 239.5, 640, 480, name,
+        rotation=cv2.Rodrigues(R.numpy())[0].ravel().tolist(), translation=(-R @ place).tolist(),
+    )  # fmt: skip
+
+
+def in_view(clip: MocapClip, cameras: CameraRig) -> Float[Tensor, " C"]:
+    """Share of the joints that lie in each camera's image."""
+    known = clip.joints.isfinite().all(-1)
+    view = cameras(clip.joints.nan_to_num().double())
+    height, width = cameras.size or (480, 640)
+    limit = view.pixels.new_tensor([width - 0.5, height - 0.5])
+    inside = (view.pixels > -0.5).all(-1) & (view.pixels < limit).all(-1) & (view.depth > 0)
+    counted = known.unsqueeze(-2).expand(inside.shape)
+    return (inside & counted).double().sum((0, 2)) / counted.double().sum((0, 2))
+
+
+# --- a walk without end ---------------------------------------------------------------------------
+
+
+def looped(clip: MocapClip, times: int, blend: int = 8) -> MocapClip:
+    """One cycle of a walk, on the spot, so many times, its end blended into its start.
+
+    The mean velocity is taken out of the clip; the cycle is that whose last pose is nearest to its
+    first, in places and steps.
+
+    Args:
+        clip: two cycles or more are best. times: how often. blend: frames that are blended.
+
+    Raises:
+        InputError: the clip is too short for a cycle, or joints are missing.
+    """
+    if times < 1:
+        raise InputError(f"a walk is looped once or more, got {times}")
+    start, length = _cycle(clip, blend)
+    joints, recorded = _on_the_spot(clip)
+
+    def repeat(points: Tensor) -> Tensor:
+        cycle = points[start : start + length].clone()
+        share = (torch.arange(1, blend + 1) / (blend + 1)).to(points)[:, None, None]
+        before = points[start - blend : start]
+        cycle[-blend:] = (1 - share) * cycle[-blend:] + share * before
+        return cycle.repeat(times, 1, 1)
+
+    return replace(
+        clip, joints=repeat(joints), recorded=repeat(recorded),
+        trial=f"{clip.trial} looped {times} times",
+    )  # fmt: skip
+
+
+def _on_the_spot(clip: MocapClip) -> tuple[Tensor, Tensor]:
+    pelvis = clip.joints[:, _PELVIS]
+    t = torch.arange(len(clip), dtype=pelvis.dtype)
+    t = t - t.mean()
+    velocity = (t[:, None] * (pelvis - pelvis.mean(0))).sum(0) / (t * t).sum()
+    velocity = velocity - (velocity @ clip.up) * clip.up
+    drift = (t[:, None] * velocity)[:, None]
+    return clip.joints - drift, clip.recorded - drift
+
+
+def _cycle(clip: MocapClip, blend: int, shortest: int = 40, longest: int = 110) -> tuple[int, int]:
+    """First frame and length of the cycle whose ends are nearest to each other."""
+    joints, _ = _on_the_spot(clip)
+    points = joints.nan_to_num().flatten(1)
+    step = 5 * (points[1:] - points[:-1])
+    both = torch.cat([points[1:], step], -1)
+    last = len(both) - 1
+    if last < shortest + blend:
+        raise InputError(
+            f"{clip.trial}: a cycle needs {shortest + blend + 2} frames, got {len(clip)}"
+        )
+    apart = torch.cdist(both, both)
+    lag = torch.arange(len(both)) - torch.arange(len(both))[:, None]
+    allowed = (lag >= shortest) & (lag <= longest)
+    allowed[:blend] = False
+    if not bool(allowed.any()):
+        raise InputError(f"{clip.trial}: a cycle needs more frames than {len(clip)}")
+    best = int(torch.where(allowed, apart, torch.inf).argmin())
+    first, end = divmod(best, len(both))
+    return first + 1, end - first

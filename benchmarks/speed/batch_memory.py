@@ -1,0 +1,111 @@
+"""How much memory does a large batch of sequences need beyond its inputs and outputs?
+
+    python -m benchmarks.speed.batch_memory --threads 2
+
+1,000 sequences of 1,000 frames through the fixed-track filter, and a smaller batch with covariances.
+Each case runs in a process of its own and reports the peak of its resident memory while the filter
+works; gains and libraries are loaded before, by a short run.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from benchmarks.speed._memory import MB, forget_peak, peak_resident, resident, return_free_memory
+from benchmarks.speed._timing import Report, limit_threads, machine_line, number, parser
+
+TOLERANCE = 1e-10
+HEADER = ("case", "B", "T", "inputs MB", "outputs MB", "beyond MB", "beyond/outputs", "frames/s")
+
+
+class Size(NamedTuple):
+    """Sequences, frames, and whether covariances are returned."""
+
+    batch: int
+    frames: int
+    covariances: bool
+
+
+def main() -> None:
+    args = parse_args()
+    limit_threads(args.threads)
+    if args.worker:
+        print(json.dumps(measure(Size(*args.worker))))
+        return
+    report = Report("Memory of a batch of sequences", args.out)
+    sizes = [Size(1000, 1000, False), Size(100, 1000, False), Size(100, 1000, True)]
+    if args.quick:
+        sizes = [Size(8, 200, True)]
+    found = [in_a_process(size, args.threads) for size in sizes]
+    report.table(HEADER, table_rows(sizes, found))
+    worst = max(result["error"] for result in found)
+    report.add(
+        "Agreement of a sequence in the batch with the same sequence alone: largest |difference| of the "
+        f"means / max(|mean|, 1) {worst:.1e}, at most {TOLERANCE:g} allowed."
+    )
+    report.add(
+        "Outputs: means, weights, evidence and covariances as returned. Beyond: the peak of resident "
+        "memory while the filter works, less what was resident before and less the outputs."
+    )
+    report.add(machine_line(args.threads))
+    report.close()
+    if not worst < TOLERANCE:
+        sys.exit("a sequence comes out differently in a batch")
+
+
+def parse_args() -> argparse.Namespace:
+    made = parser(__doc__.split("\n")[0], runs=1)
+    made.add_argument("--worker", type=int, nargs=3, help=argparse.SUPPRESS)
+    return made.parse_args()
+
+
+def in_a_process(size: Size, threads: int) -> dict[str, Any]:
+    """`measure` in a new process, so that the peak is that of one case."""
+    command = [sys.executable, __file__, "--threads", str(threads)]
+    command += ["--worker", *(str(int(value)) for value in size)]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def measure(size: Size) -> dict[str, Any]:
+    """Filter once; bytes of inputs, outputs and the peak beyond both."""
+    import torch
+
+    from benchmarks.speed._arm import draw_sequences, make_filter, make_problem
+
+    problem = make_problem()
+    tracker = make_filter(problem)
+    z = draw_sequences(problem, size.batch, size.frames)
+    with torch.inference_mode():
+        tracker(z[:2], return_cov=size.covariances)
+        return_free_memory()
+        before = resident()
+        forget_peak()
+        start = time.perf_counter()
+        out = tracker(z, return_cov=size.covariances)
+        seconds, peak = time.perf_counter() - start, peak_resident()
+        parts = [out.mean, out.log_weights, out.log_evidence, out.failed_at]
+        parts += [] if out.cov is None else [out.cov]
+        outputs = sum(part.numel() * part.element_size() for part in parts)
+        alone, inside = tracker(z[-1:]).mean[0], out.mean[-1]
+        error = float(((inside - alone).abs() / alone.abs().clamp_min(1)).max())
+    beyond = peak - before - outputs
+    numbers = {"inputs": z.nbytes, "outputs": outputs, "beyond": beyond}
+    return {**numbers, "seconds": seconds, "error": error}
+
+
+def table_rows(sizes: list[Size], found: list[dict[str, Any]]) -> Iterator[list[str]]:
+    for size, result in zip(sizes, found, strict=True):
+        name = "fixed tracks, covariances too" if size.covariances else "fixed tracks"
+        cells = [f"{result[key] / MB:.1f}" for key in ("inputs", "outputs", "beyond")]
+        rate = number(size.batch * size.frames / result["seconds"])
+        share = number(result["beyond"] / result["outputs"])
+        yield [name, str(size.batch), str(size.frames), *cells, share, rate]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,411 @@
+"""How long does EM over 10 million states take that no memory holds, and what do two processes give?
+
+    python -m benchmarks.speed.streamed_em --threads 2
+
+20 steps over 10 million states of an arm (21 dimensions, 30 components), which are drawn anew in every
+step from recorded poses (`--data DIR`) or made-up ones. Then one process of one thread and two of one
+thread each take turns, and scikit-learn, torchgmm and the fit in memory take 20 steps over 100,000
+states that they can hold, all from one start.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from statistics import median
+from typing import Any, NamedTuple
+
+import torch
+
+from benchmarks.speed._timing import (
+    Case,
+    Report,
+    Timing,
+    limit_threads,
+    limits_line,
+    machine_line,
+    measure_limits,
+    number,
+    parser,
+    ratio,
+    take_turns,
+)
+from benchmarks.speed.batch_memory import forget_peak, peak_resident, resident, return_free_memory
+from benchmarks.speed.expectation_maximisation import (
+    PACKAGES,
+    TOLERANCE,
+    Method,
+    Problem,
+    make_problem,
+    mean_log_likelihood,
+    scikit_learn_fit,
+    torchgmm_fit,
+    torchpose_fit,
+    wide,
+)
+from torchpose.learning.samplers import ArmSource, SampleSource, TensorSource
+from torchpose.learning.share import Share
+from torchpose.learning.streamed_em import StreamedEM, run_streamed
+from torchpose.math import MixtureParameters
+
+MB, MILLION = 2**20, 1_000_000
+STEPS, COMPONENTS, POSES = 20, 30, 60_000
+SAME = 1e-8  # of the log-likelihoods of one process and of two
+AIM = 1.7
+CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+IDLE = 0.9  # share of both cores that has to be free for the two processes to mean anything
+STREAMED = (
+    "states", "processes x threads", "start s", "s/step", "s for 20 steps", "CPU s/step",
+    "resident before MB", "peak MB", "log-likelihood",
+)  # fmt: skip
+SCALING = ("processes x threads", "states", "s/step", "min s/step", "CPU s/step", "x one process")
+PEERS = (
+    "method",
+    "s",
+    "s/(step, million states)",
+    "CPU s",
+    "x streamed",
+    "CPU x",
+    "log-likelihood",
+)
+
+
+class Job(NamedTuple):
+    """What a worker has to do: some steps over some states, as process `rank` of `size`."""
+
+    samples: int
+    components: int
+    steps: int
+    data: str | None = None
+    threads: int = 1
+    rank: int = 0
+    size: int = 1
+    store: str = ""
+
+
+class Run(NamedTuple):
+    """Results of all processes of a job."""
+
+    job: Job
+    found: list[dict[str, Any]]
+
+    @property
+    def step(self) -> float:
+        """Median time of a step; all processes end it together."""
+        return median(self.found[0]["steps"])
+
+    @property
+    def best(self) -> float:
+        """Smallest time of a step."""
+        return min(self.found[0]["steps"])
+
+    @property
+    def cpu(self) -> float:
+        """CPU time of a step, over all processes."""
+        return sum(result["cpu"] for result in self.found) / self.job.steps
+
+    @property
+    def peak(self) -> float:
+        """Peak of the resident memory of the largest process, MB."""
+        return max(result["peak"] for result in self.found) / MB
+
+    @property
+    def log_likelihood(self) -> float:
+        """Mean, before the last step."""
+        return self.found[0]["log_likelihood"]
+
+    @property
+    def name(self) -> str:
+        """Processes and threads of each."""
+        return f"{self.job.size} x {self.job.threads}"
+
+
+def main() -> None:
+    args = parse_args()
+    if args.worker:
+        print(json.dumps(work(Job(**json.loads(args.worker)))))
+        return
+    limit_threads(args.threads)
+    report = Report("EM over states that are not held in memory", args.out)
+    limits = measure_limits(args.quick)
+    failed = report_scaling(report, args)
+    failed |= report_streamed(report, args)
+    failed |= report_peers(report, args)
+    report.add(limits_line(limits))
+    report.add(machine_line(args.threads, PACKAGES))
+    report.close()
+    if failed:
+        sys.exit("results that should be the same are not")
+
+
+def parse_args() -> argparse.Namespace:
+    made = parser(__doc__.split("\n")[0], runs=3)
+    made.add_argument("--samples", type=int, default=10 * MILLION, help="of the longest fit")
+    made.add_argument("--data", help="folder of recordings, such as kinect_utd_mhad")
+    made.add_argument("--worker", help=argparse.SUPPRESS)
+    return made.parse_args()
+
+
+# --- one process
+
+
+def work(job: Job) -> dict[str, Any]:
+    """Take the steps of a job; seconds of each, memory, and the log-likelihood before the last."""
+    limit_threads(job.threads)
+    share = join(job)
+    began, source = time.perf_counter(), make_source(job)
+    em = StreamedEM.start(source, job.components)
+    started = time.perf_counter() - began
+    em.accumulate(TensorSource(source.block(0).states))  # loads libraries
+    return_free_memory()
+    before = resident()
+    forget_peak()
+    share.total(torch.zeros(1))
+    steps, cpu = [], time.process_time()
+    for _ in range(job.steps):
+        began = time.perf_counter()
+        value = em.maximise(em.accumulate(source, share))
+        steps.append(time.perf_counter() - began)
+    cpu = time.process_time() - cpu
+    peak = peak_resident()
+    drawing = time.process_time()
+    blocks = min(source.n_blocks, 400)
+    count = sum(len(source.block(block).states) for block in range(blocks))
+    drawing = (time.process_time() - drawing) * source.n_samples / count
+    times = {"start": started, "steps": steps, "cpu": cpu, "drawing": drawing}
+    return {**times, "before": before, "peak": peak, "log_likelihood": value}
+
+
+def join(job: Job) -> Share:
+    """The group of processes, each on a core of its own."""
+    if job.size == 1:
+        return Share()
+    torch.distributed.init_process_group(
+        "gloo", init_method=f"file://{job.store}", rank=job.rank, world_size=job.size
+    )
+    return Share.of_processes()
+
+
+def make_source(job: Job) -> SampleSource:
+    """States of left arms from random viewpoints, drawn whenever they are asked for."""
+    from torchpose.learning import TRAINING_VIEWS
+
+    matrix = torch.tensor([[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]])
+    if job.data is not None:
+        from torchpose.io import read_recordings
+        from torchpose.learning import arm_sources, collect_poses
+
+        poses = collect_poses(read_recordings([job.data]))
+        return arm_sources(poses, matrix.double(), n_samples=job.samples).left
+    arms = made_up_arms()
+    return ArmSource(
+        matrix=matrix.double(), views=TRAINING_VIEWS, rotation_order="zxy", n_samples=job.samples,
+        seed=0, fresh=False, arms=arms, weight=torch.ones(len(arms), dtype=torch.float64),
+    )  # fmt: skip
+
+
+def made_up_arms() -> torch.Tensor:
+    """Hand, elbow, shoulder, head and neck of arms that go from one of 40 gestures to the next."""
+    g = torch.Generator().manual_seed(0)
+    gestures = torch.randn(40, 2, 3, generator=g, dtype=torch.float64)
+    gestures = gestures / gestures.norm(dim=-1, keepdim=True)
+    way = torch.linspace(0, 39, POSES, dtype=torch.float64)
+    low, between = way.long().clamp_max(38), (way % 1)[:, None, None]
+    limbs = (1 - between) * gestures[low] + between * gestures[low + 1]
+    limbs = limbs + 0.1 * torch.randn(limbs.shape, generator=g, dtype=torch.float64)
+    limbs = limbs / limbs.norm(dim=-1, keepdim=True)
+    trunk = torch.tensor([[0.18, 0.08, 0.0], [0.0, -0.2, 0.02], [0.0, 0.0, 0.0]]).double()
+    trunk = trunk + 0.01 * torch.randn(POSES, 3, 3, generator=g, dtype=torch.float64)
+    elbow = trunk[:, 0] + 0.28 * limbs[:, 0]
+    hand = elbow + 0.26 * limbs[:, 1]
+    return torch.cat([torch.stack([hand, elbow], 1), trunk], 1)
+
+
+def in_processes(job: Job) -> Run:
+    """`work` in `job.size` new processes, each with cores of its own where there are enough."""
+    with tempfile.TemporaryDirectory() as folder:
+        started = []
+        for rank in range(job.size):
+            own = job._replace(rank=rank, store=f"{folder}/store")
+            command = [sys.executable, __file__, "--worker", json.dumps(own._asdict())]
+            started.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+            if len(CORES) >= job.size * job.threads:
+                own_cores = CORES[rank * job.threads : (rank + 1) * job.threads]
+                os.sched_setaffinity(started[-1].pid, own_cores)
+        outputs = [process.communicate()[0] for process in started]
+    if any(process.returncode for process in started):
+        raise RuntimeError(f"a process of {job} failed, see above")
+    return Run(job, [json.loads(output.splitlines()[-1]) for output in outputs])
+
+
+# --- tables
+
+
+def report_scaling(report: Report, args: argparse.Namespace) -> bool:
+    """One process of one thread and two of one thread each, in turn; True if they disagree."""
+    samples, components = (20_000, 4) if args.quick else (2 * MILLION, COMPONENTS)
+    job = Job(samples, components, 3, args.data)
+    idle = report_load(report)
+    runs: dict[int, list[Run]] = {1: [], 2: []}
+    for _ in range(args.runs):
+        for size, found in runs.items():
+            found.append(in_processes(job._replace(size=size)))
+    gain = median(r.step for r in runs[1]) / median(r.step for r in runs[2])
+    rows = []
+    for found in runs.values():
+        times = (
+            median(r.step for r in found),
+            min(r.best for r in found),
+            median(r.cpu for r in found),
+        )
+        factor = gain if found[0].job.size == 2 else 1.0
+        cells = [number(value) for value in (*times, factor)]
+        rows.append([found[0].name, f"{samples:,}", *cells])
+    report.table(SCALING, rows)
+    text = f"Two processes of one thread are {gain:.2f} times as fast as one (aim {AIM})."
+    if idle < IDLE:
+        text += " The machine was busy, so this says little: repeat it when two cores are free."
+    report.add(text)
+    difference = abs(runs[1][0].log_likelihood - runs[2][0].log_likelihood)
+    report.add(
+        f"Agreement of one process and two after {job.steps - 1} steps: mean log-likelihoods differ by "
+        f"{difference:.1e}, at most {SAME:g} allowed."
+    )
+    return not difference < SAME
+
+
+def report_load(report: Report) -> float:
+    """Say how busy the machine is before anything is measured; the share of it that is free."""
+    before = _cpu_ticks()
+    time.sleep(2)
+    spent = [after - first for after, first in zip(_cpu_ticks(), before, strict=True)]
+    idle = spent[0] / spent[1] if spent[1] else 1.0
+    load = f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
+    report.add(
+        f"Before the runs: load {load}, {100 * idle:.0f} % of {os.cpu_count()} cores idle over 2 s"
+        f"{'' if idle >= IDLE else ' (BUSY)'}."
+    )
+    return idle
+
+
+def _cpu_ticks() -> tuple[float, float]:
+    """Idle and all ticks of all cores so far."""
+    try:
+        fields = Path("/proc/stat").read_text().splitlines()[0].split()[1:]
+    except OSError:
+        return 0.0, 0.0
+    ticks = [float(field) for field in fields]
+    return ticks[3] + ticks[4], sum(ticks)
+
+
+def report_streamed(report: Report, args: argparse.Namespace) -> bool:
+    """20 steps over few and over many states; True if one process and two disagree."""
+    samples, components, steps = (20_000, 4, 3) if args.quick else (args.samples, COMPONENTS, STEPS)
+    threads = args.threads
+    jobs = [
+        Job(samples // 10, components, steps, args.data, threads),
+        Job(samples, components, steps, args.data, threads),
+    ]
+    if threads > 1:
+        jobs.append(jobs[-1]._replace(threads=1, size=threads))
+    report_load(report)
+    runs = [in_processes(job) for job in jobs]
+    report.table(STREAMED, (streamed_row(run) for run in runs))
+    small, large = runs[0], runs[1]
+    share = large.found[0]["drawing"] / large.cpu
+    held = 8 * samples * 22 / MB
+    report.add(
+        f"Ten times the states take {large.peak - small.peak:+.0f} MB at the peak; in memory they would "
+        f"be {held:,.0f} MB. Drawing the states is {100 * share:.0f} % of a step's CPU time."
+    )
+    if len(runs) < 3:
+        return False
+    difference = abs(runs[1].log_likelihood - runs[2].log_likelihood)
+    report.add(
+        f"Agreement of one process and {threads} after {steps - 1} steps: mean log-likelihoods differ "
+        f"by {difference:.1e}, at most {SAME:g} allowed."
+    )
+    return not difference < SAME
+
+
+def streamed_row(run: Run) -> list[str]:
+    first = run.found[0]
+    return [
+        f"{run.job.samples:,}", run.name, number(first["start"]), number(run.step),
+        number(sum(first["steps"]) * STEPS / run.job.steps), number(run.cpu),
+        f"{max(r['before'] for r in run.found) / MB:.0f}", f"{run.peak:.0f}",
+        f"{run.log_likelihood:.6f}",
+    ]  # fmt: skip
+
+
+# --- peers
+
+
+def report_peers(report: Report, args: argparse.Namespace) -> bool:
+    """Steps from one start over states that everyone can hold; True if scikit-learn differs."""
+    points, n_components, steps = (2000, 4, 3) if args.quick else (100_000, COMPONENTS, STEPS)
+    problem = make_problem(points, n_components, steps)
+    report.add(
+        f"{points:,} states, {n_components} components, {steps} steps from one start, "
+        f"{args.threads} threads. Nothing is extrapolated: the others hold states and "
+        "responsibilities in memory."
+    )
+    methods = list(peer_methods(problem, report))
+    found = {m.name: mean_log_likelihood(problem.x, wide(m.call())) for m in methods}
+    timings = take_turns([Case(m.name, m.call) for m in methods], args.runs, warm=0)
+    report.table(PEERS, peer_rows(timings, found, problem))
+    ours, theirs = found[methods[0].name], found.get("scikit-learn, float64")
+    if theirs is None:
+        report.add("Agreement: scikit-learn cannot be imported, nothing to compare with.")
+        return False
+    report.add(
+        f"Agreement of the streamed fit and scikit-learn: mean log-likelihoods differ by "
+        f"{abs(ours - theirs):.1e}, at most {TOLERANCE:g} allowed."
+    )
+    return not abs(ours - theirs) < TOLERANCE
+
+
+def peer_methods(problem: Problem, report: Report) -> Iterator[Method]:
+    """The streamed fit, the fit in memory, and every peer that can be imported."""
+    for dtype in (torch.float64, torch.float32):
+        yield streamed_fit(problem, dtype)
+    in_memory = torchpose_fit(problem, torch.float64)
+    yield in_memory._replace(name="in memory, float64")
+    peers: dict[str, Callable[[Problem], Method]] = {
+        "scikit-learn": scikit_learn_fit, "torchgmm": torchgmm_fit
+    }  # fmt: skip
+    for name, make in peers.items():
+        try:
+            yield make(problem)
+        except ImportError as error:
+            report.add(f"{name} cannot be imported ({error}): its row is left out.")
+
+
+def streamed_fit(problem: Problem, dtype: torch.dtype) -> Method:
+    source, n_components = TensorSource(problem.x), len(problem.start.weights)
+
+    def call() -> MixtureParameters:
+        em = StreamedEM.start(source, n_components, init=problem.start, dtype=dtype)
+        run_streamed(em, source, max_iter=problem.iterations, tol=0.0)
+        return em.mixture().parameters_tuple()
+
+    return Method(f"streamed, {str(dtype).split('.')[1]}", call)
+
+
+def peer_rows(
+    timings: list[Timing], found: dict[str, float], problem: Problem
+) -> Iterator[list[str]]:
+    for timing in timings:
+        each = timing.median / problem.iterations / len(problem.x) * MILLION
+        cells = (timing.median, each, timing.median_cpu, *ratio(timing, timings[0]))
+        likelihood = f"{found[timing.case.name]:.6f}"
+        yield [timing.case.name, *(number(cell) for cell in cells), likelihood]
+
+
+if __name__ == "__main__":
+    main()

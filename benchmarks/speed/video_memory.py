@@ -1,0 +1,96 @@
+"""Does the memory of the video pipeline grow with the length of the video?
+
+    python -m benchmarks.speed.video_memory --data DIR --minutes 60
+
+A clip of video_asl is read over and over as one recording at 30 frames a second, tracked as
+`torchpose track` does, and the resident memory is looked at after every minute of video. At the end
+the poses of the whole recording are written.
+"""
+
+import argparse
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from benchmarks.speed._timing import Report, limit_threads, machine_line, parser
+
+FPS = 30.0
+PAGE = 4096
+
+
+def main() -> None:
+    """Track, and print how memory went."""
+    made = parser(__doc__.split("\n")[0], runs=1)
+    made.add_argument("--data", type=Path, required=True, help="folder with video_asl/")
+    made.add_argument("--minutes", type=float, default=60.0, help="of video")
+    args = made.parse_args()
+    limit_threads(args.threads)
+    n_frames = 300 if args.quick else round(60 * FPS * args.minutes)
+    report = Report("Memory over a long video", args.out)
+    with tempfile.TemporaryDirectory() as folder:
+        measure(report, args, n_frames, Path(folder))
+    report.add(machine_line(args.threads, ("opencv-python-headless", "av")))
+    report.close()
+
+
+def measure(report: Report, args: argparse.Namespace, n_frames: int, folder: Path) -> None:
+    """Resident memory at some minutes, and while the result is written."""
+    from tqdm.auto import tqdm
+
+    from torchpose import PinholeCamera, VideoTracker, load_prior
+
+    tracker = VideoTracker(
+        load_prior("kinect-upper-body"), PinholeCamera.from_image_size(640, 480), fps=FPS
+    )
+    seen: list[tuple[float, float]] = []
+
+    def frames() -> Iterator[Any]:
+        every = max(1, min(n_frames // 6, round(60 * FPS)))
+        for index, frame in enumerate(loop(args.data / "video_asl" / "book.mkv", n_frames)):
+            if index % every == every - 1:
+                seen.append(((index + 1) / FPS / 60, resident()))
+                tqdm.write(f"minute {seen[-1][0]:.1f}: {seen[-1][1]:.0f} MB")
+            yield frame
+
+    start = time.perf_counter()
+    people = tracker(tqdm(frames(), total=n_frames, unit="frame"), folder=folder)
+    seconds = time.perf_counter() - start
+    before = resident()
+    for number, person in enumerate(people):
+        person.track.save(folder / f"poses{number}.npz")
+    shown = seen if len(seen) <= 8 else [seen[round(i * (len(seen) - 1) / 7)] for i in range(8)]
+    rows = [(f"{minute:.1f}", f"{memory:.0f}") for minute, memory in shown]
+    report.table(("minute of the video", "resident (MB)"), rows)
+    later = [memory for minute, memory in seen if minute >= 0.2 * seen[-1][0]]
+    size = sum(path.stat().st_size for path in folder.glob("*.npz")) / 2**20
+    report.add(
+        f"{n_frames} frames in {seconds:.0f} s; {len(people)} person, "
+        f"{len(people[0]) if people else 0} poses. Largest less smallest after the first fifth: "
+        f"{max(later) - min(later):.0f} MB. Writing poses.npz ({size:.0f} MB) took it from "
+        f"{before:.0f} to {resident():.0f} MB."
+    )
+
+
+def loop(path: Path, n_frames: int) -> Iterator[Any]:
+    """A clip over and over, decoded anew each time."""
+    from torchpose.video import open_video
+
+    count = 0
+    while True:
+        with open_video(path, fps=FPS) as source:
+            for frame in source:
+                if count == n_frames:
+                    return
+                count += 1
+                yield frame
+
+
+def resident() -> float:
+    """Resident memory of this process, MB."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE / 2**20
+
+
+if __name__ == "__main__":
+    main()

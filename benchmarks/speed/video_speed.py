@@ -1,0 +1,189 @@
+"""How many frames a second from video to poses, and where the time goes.
+
+    python -m benchmarks.speed.video_speed --data DIR --threads 2 [--mediapipe PYTHON]
+
+The seven clips of video_asl, 640 x 480, one after the other as one H.264 file, decoding included and
+drawing not. `--mediapipe` is the interpreter of an environment with mediapipe 0.10.21 (see
+`mediapipe_landmarks.py`); its full pose model then reads the same file in the same run.
+
+Stages are timed by the clock of the thread that they run in, in a run of their own.
+"""
+
+import argparse
+import functools
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from benchmarks.speed._timing import (
+    Case,
+    Report,
+    Timing,
+    limit_threads,
+    machine_line,
+    parser,
+    take_turns,
+)
+
+CLIPS = ("again", "brother", "help", "bird", "milk", "book", "learn")
+FPS = 30.0
+
+
+def main() -> None:
+    """Print both tables."""
+    made = parser(__doc__.split("\n")[0], runs=3)
+    made.add_argument("--data", type=Path, required=True, help="folder with video_asl/")
+    made.add_argument("--mediapipe", type=Path, help="Python of an environment with mediapipe")
+    made.add_argument("--repeat", type=int, default=2, help="how often the clips follow each other")
+    args = made.parse_args()
+    limit_threads(args.threads)
+    from torchpose.cli.common import share_cores
+
+    share_cores()  # as the command does
+    with tempfile.TemporaryDirectory() as folder:
+        clip = Path(folder) / "clips.mp4"
+        names = CLIPS[:1] if args.quick else CLIPS * args.repeat
+        n_frames = join([args.data / "video_asl" / f"{name}.mkv" for name in names], clip)
+        report = Report("Speed of the video pipeline", args.out)
+        report.add(f"{n_frames} frames of 640 x 480, H.264.")
+        whole(report, clip, n_frames, args)
+        stages(report, clip, n_frames)
+    report.add(machine_line(args.threads, ("opencv-python-headless", "av")))
+    report.close()
+
+
+def join(clips: list[Path], path: Path) -> int:
+    """One file of several clips; returns the number of its frames."""
+    from torchpose.video import VideoWriter, open_video
+
+    count = 0
+    with VideoWriter(path, FPS, (640, 480)) as writer:
+        for clip in clips:
+            with open_video(clip, fps=FPS) as source:
+                for frame in source:
+                    writer.write(frame.image)
+                    count += 1
+    return count
+
+
+def make_tracker(**options: Any) -> Any:
+    """The tracker with its defaults."""
+    from torchpose import PinholeCamera, VideoTracker, load_prior
+
+    camera = PinholeCamera.from_image_size(640, 480)
+    return VideoTracker(load_prior("kinect-upper-body"), camera, fps=FPS, **options)
+
+
+def whole(report: Report, clip: Path, n_frames: int, args: argparse.Namespace) -> None:
+    """Frames per second of the whole way, beside MediaPipe."""
+    from torchpose.video import open_video
+
+    def track(tracker: Any, **options: Any) -> None:
+        with open_video(clip) as source:
+            tracker(source, **options)
+
+    def decode() -> None:
+        with open_video(clip) as source:
+            for _ in source:
+                pass
+
+    recorder, camera = make_tracker(), make_tracker()
+    paper, parted = make_tracker(hands="mean-shift"), make_tracker(background=True)
+    cases = [
+        Case("a recording", lambda: track(recorder), n_frames),
+        Case(
+            "frame by frame, as a camera is",
+            lambda: track(camera, watch=lambda *_: None),
+            n_frames,
+        ),
+        Case("hands by mean shift (the paper)", lambda: track(paper), n_frames),
+        Case("with the background model", lambda: track(parted), n_frames),
+        Case("decoding alone", decode, n_frames),
+    ]
+    timings = take_turns(cases, args.runs)
+    rows = [row(timing) for timing in timings]
+    if args.mediapipe:
+        rows.append(mediapipe_row(args.mediapipe, clip, args))
+    report.table(("", "frames/s", "ms a frame", "CPU ms a frame"), rows)
+
+
+def row(timing: Timing) -> tuple[str, ...]:
+    """Medians."""
+    return (
+        timing.case.name,
+        f"{1 / timing.median:.0f}",
+        f"{1e3 * timing.median:.1f}",
+        f"{1e3 * timing.median_cpu:.1f}",
+    )
+
+
+def mediapipe_row(python: Path, clip: Path, args: argparse.Namespace) -> tuple[str, ...]:
+    """The full pose model of MediaPipe on the same file and cores."""
+    script = Path(__file__).with_name("mediapipe_landmarks.py")
+    command = [str(python), str(script), str(clip), "--time", "--threads", str(args.threads)]
+    command += ["--repeat", str(args.runs)]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    found = re.search(r"together ([\d.]+) ms", done.stdout)
+    if found is None:
+        sys.exit(f"no time in what MediaPipe's script printed: {done.stdout!r}")
+    ms = float(found[1])
+    return "MediaPipe pose, full, decoding included", f"{1e3 / ms:.0f}", f"{ms:.1f}", "-"
+
+
+def stages(report: Report, clip: Path, n_frames: int) -> None:
+    """Time of each part, by the clock of its thread."""
+    from torchpose.video import open_video
+
+    tracker = make_tracker()
+    measurer = tracker.measurer
+    hands = measurer.hand_tracker
+    spent: dict[str, float] = {}
+    parts = [
+        ("faces: detection and tracks", measurer, "follow_faces"),
+        ("hands: all", hands, "step"),
+        ("- skin", hands.skin, "learn"),
+        ("- skin", hands.skin, "find"),
+        ("- face memory", hands.memory, "step"),
+        ("- motion and optical flow", hands.motion, "step"),
+        ("- likelihood", hands.likelihood, "forward"),
+        ("who is who", measurer.register, "step"),
+        ("head and neck", measurer.head_neck, "forward"),
+        ("poses, 32 frames at a time", tracker.tracker, "advance"),
+    ]
+    for name, owner, method in parts:
+        object.__setattr__(owner, method, timed(getattr(owner, method), name, spent))
+    with open_video(clip) as source:
+        tracker(source)
+    start = time.thread_time()
+    with open_video(clip) as source:
+        for _ in source:
+            pass
+    spent["decoding"] = time.thread_time() - start
+    order = dict.fromkeys(["decoding", *(name for name, _, _ in parts)])
+    rows = [(name, f"{1e3 * spent.get(name, 0.0) / n_frames:.2f}") for name in order]
+    total = sum(value for name, value in spent.items() if not name.startswith("-"))
+    rows.append(("sum", f"{1e3 * total / n_frames:.2f}"))
+    report.table(("stage", "ms a frame"), rows)
+    report.add("Decoding and faces run in one thread, hands in another, poses in a third.")
+
+
+def timed(call: Any, name: str, spent: dict[str, float]) -> Any:
+    """`call`, whose time is added up."""
+
+    @functools.wraps(call)
+    def wrapped(*args: Any, **kwargs: Any) -> Any:
+        start = time.thread_time()
+        try:
+            return call(*args, **kwargs)
+        finally:
+            spent[name] = spent.get(name, 0.0) + time.thread_time() - start
+
+    return wrapped
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,519 @@
+"""The protocol Silhouette: splits, cameras, true outlines, statistics, and a whole small run."""
+
+import csv
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.silhouette import data as silhouette_data
+from benchmarks.silhouette import protocol as silhouette
+from benchmarks.silhouette import runs as silhouette_runs
+from benchmarks.silhouette import tables as silhouette_tables
+from benchmarks.silhouette.trackees import (
+    METHODS,
+    SCALES,
+    Conditions,
+    Setting,
+    make_filter,
+    prepare,
+)
+from tests.benchmarks.walkers import write_walkers
+from torchpose.body import BODY_15
+from torchpose.camera import save_cameras
+from torchpose.demo.rendering.clothed_body import TrueShape, true_limbs, true_silhouettes
+from torchpose.errors import FileFormatError, InputError
+from torchpose.io.mocap import read_mocap
+from torchpose.whole_body import AnnealedParticleFilter, SIRParticleFilter
+from torchpose.whole_body.filters.sharpness import SharpnessFit
+
+SMALL = {
+    "progress": False, "frames": 8, "particles": (20,), "seeds": 2, "size": ("64x48",), "faults": 0.5,
+    "sharpness": 100.0,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_walkers(tmp_path_factory.mktemp("mocap"))
+
+
+@pytest.fixture(scope="module")
+def clips(folder):
+    return read_mocap(folder)
+
+
+@pytest.fixture(scope="module")
+def trackee(clips):
+    (split,) = silhouette_data.split_clips(clips, ["p1"], ["p1"], 1, 60, 60)
+    return prepare(split, Conditions((48, 64), faults=0.0), 12, 10)
+
+
+# --- who is tracked with what ---------------------------------------------------------------------
+
+
+def test_own_trials_train_but_never_the_tracked_one(clips):
+    for split in silhouette_data.split_clips(clips, n_clips=2, manifold_frames=60):
+        assert split.seen and [c.trial[-1] for c in split.test] == ["0", "1"]
+        for part in (split.manifold, split.validation, split.body):
+            assert part and {c.person for c in part} == {split.person}
+            assert not {c.trial for c in part} & {c.trial for c in split.test}
+        assert not {c.trial for c in split.manifold} & {c.trial for c in split.validation}
+        assert sum(map(len, split.manifold)) == 60
+
+
+def test_others_train_for_someone_unseen(clips):
+    (split,) = silhouette_data.split_clips(clips, ["p1"], ["p2"])
+    assert not split.seen and split.person == "p2"
+    for part in (split.manifold, split.validation):
+        assert {c.person for c in part} == {"p1"}
+    assert {c.person for c in split.body} == {"p2"}
+    assert not {c.trial for c in split.body} & {c.trial for c in split.test}
+
+
+def test_too_few_trials_are_refused(clips):
+    with pytest.raises(InputError, match="person p1: expected two trials or more"):
+        silhouette_data.split_clips(clips, ["p1"], ["p1"], n_clips=3)
+
+
+def renamed(clips, action):
+    """The same motion under another action's name."""
+    return [
+        replace(clip, action=action, trial=clip.trial.replace("_", f"_{action}_")) for clip in clips
+    ]
+
+
+def test_an_unseen_action_is_tracked_with_a_manifold_of_another(clips):
+    (split,) = silhouette_data.split_clips(
+        clips, ["p1"], ["p1"], manifold_frames=60, tracked=renamed(clips, "run")
+    )
+    assert split.seen and [c.trial for c in split.test] == ["p1_run_0"]
+    for part in (split.manifold, split.validation):
+        assert {(c.person, c.action) for c in part} == {("p1", "walk")}
+    assert split.body[0].action == "walk"
+    assert "p1_run_0" not in {c.trial for c in split.body}
+    (split,) = silhouette_data.split_clips(
+        [c for c in clips if c.person == "p1"], ["p1"], ["p2"], tracked=renamed(clips, "run")
+    )
+    assert not split.seen and {c.person for c in split.manifold} == {"p1"}
+    assert {(c.person, c.action) for c in split.body} == {("p2", "run")}
+    assert not {c.trial for c in split.body} & {c.trial for c in split.test}
+
+
+# --- cameras and truth ----------------------------------------------------------------------------
+
+
+def test_cameras_stand_around_the_way_and_see_all_of_it(clips):
+    clip = clips[0]
+    rig = silhouette_data.place_cameras(clip)
+    assert len(rig) == 3 and rig.size == (480, 640)
+    assert silhouette_data.in_view(clip, rig).tolist() == [1.0, 1.0, 1.0]
+    places = -(rig.rotation.mT @ rig.translation[..., None]).squeeze(-1)
+    middle = clip.joints[:, 0, [0, 2]]
+    middle = (middle.amin(0) + middle.amax(0)) / 2
+    gap = places[:, [0, 2]] - middle
+    np.testing.assert_allclose(gap.norm(dim=-1).numpy(), 3.8)
+    bearing = torch.atan2(gap[:, 0], gap[:, 1]).rad2deg().remainder(360)  # +x is to the left of +z
+    np.testing.assert_allclose(bearing.numpy(), silhouette_data.AZIMUTHS, atol=1e-6)
+    up = rig.rotation @ clip.up
+    assert bool((up[:, 1] < -0.9).all()) and bool((up[:, 0].abs() < 1e-9).all())  # upright
+    centre = rig(torch.stack([middle[0], torch.tensor(0.95 + 0.1), middle[1]])[None]).pixels
+    assert bool(((centre[:, 0] - torch.tensor([319.5, 239.5])).abs() < 25).all())
+
+
+def test_someone_who_leaves_the_image_is_counted(clips):
+    clip = clips[0]
+    rig = silhouette_data.place_cameras(clip, focal=1500.0)
+    view = rig(clip.joints)
+    inside = (view.pixels >= -0.5).all(-1) & (view.pixels < torch.tensor([639.5, 479.5])).all(-1)
+    expected = inside.double().mean((0, 2))
+    torch.testing.assert_close(silhouette_data.in_view(clip, rig), expected)
+    assert bool((expected < 0.9).any())
+
+
+def test_true_silhouettes_cover_the_recorded_joints(clips):
+    clip = clips[5].cut(0, 8)
+    rig = silhouette_data.place_cameras(clip)
+    seen = true_silhouettes(clip, TrueShape.draw(1), rig)
+    pixels = rig(clip.joints).pixels.round().long()
+    t = torch.arange(8)[:, None, None]
+    c = torch.arange(3)[None, :, None]
+    assert bool(seen[t, c, pixels[..., 1], pixels[..., 0]].all())
+    height = clip.joints[..., 1].amax() - clip.joints[..., 1].amin()
+    limbs = true_limbs(clip, TrueShape.draw(1))
+    top = (limbs.start[..., 1] + limbs.radii[:, 0]).amax(1)
+    assert bool((top - clip.joints[..., 1].amax(1) < 0.25 * height).all())
+
+
+def test_true_bodies_differ_from_each_other_and_stay_the_same():
+    one, again, other = TrueShape.draw(1), TrueShape.draw(1), TrueShape.draw(2)
+    assert one == again and one != other
+    factors = torch.tensor([list(TrueShape.draw(s).radii.values()) for s in range(200)]).log()
+    assert float(factors.std()) == pytest.approx(0.12, abs=0.01)
+    assert abs(float(factors.mean())) < 0.01
+
+
+def test_faults_come_from_the_generator(clips):
+    clip = clips[0].cut(0, 4)
+    rig = silhouette_data.place_cameras(clip).scaled(48, 64)
+    clean, first, second, third = (
+        true_silhouettes(clip, TrueShape.draw(1), rig, faults, torch.Generator().manual_seed(seed))
+        for faults, seed in ((0.0, 0), (1.0, 0), (1.0, 0), (1.0, 1))
+    )
+    assert bool((first == second).all())
+    assert not bool((first == third).all()) and not bool((first == clean).all())
+
+
+def test_a_looped_walk_goes_on_without_a_jump(clips):
+    clip = clips[0]
+    looped = silhouette_data.looped(clip, 3)
+    assert len(looped) % 3 == 0 and "looped 3 times" in looped.trial
+    length = len(looped) // 3
+    assert length == pytest.approx(60, abs=2)  # the period of the first trial
+    torch.testing.assert_close(looped.joints[:length], looped.joints[length : 2 * length])
+    steps = (looped.joints[1:] - looped.joints[:-1]).norm(dim=-1).amax(1)
+    assert float(steps.max()) < 1.3 * float(steps[10 : length - 10].max())
+    pelvis = looped.joints[:, 0]
+    assert float((pelvis - pelvis.mean(0)).norm(dim=-1).max()) < 0.05  # on the spot
+    with pytest.raises(InputError, match="once or more"):
+        silhouette_data.looped(clip, 0)
+    with pytest.raises(InputError, match="a cycle needs"):
+        silhouette_data.looped(clip.cut(0, 30), 2)
+
+
+# --- filters --------------------------------------------------------------------------------------
+
+
+def test_every_filter_evaluates_the_same_number_of_likelihoods(trackee):
+    for name, method in METHODS.items():
+        tracker = make_filter(name, trackee, Setting(0.5, 2.0), 100)
+        layers = tracker.n_layers if isinstance(tracker, AnnealedParticleFilter) else 1
+        assert layers * tracker.n_particles == 100
+        torch.testing.assert_close(tracker.step_std, 2 * trackee.step_std)
+        for key, value in method.options.items():
+            assert getattr(tracker, key) == value
+    assert isinstance(make_filter("sir", trackee, Setting(30.0)), SIRParticleFilter)
+    with pytest.raises(InputError, match="method must be among sir"):
+        make_filter("kalman", trackee, Setting(1.0))
+
+
+def test_what_a_person_is_tracked_with(trackee):
+    (view,) = trackee.tests
+    assert view.silhouettes.shape == (12, 3, 48, 64) and view.floor < 15
+    assert 0.5 < view.overlap < 1 and view.in_view == 1.0
+    at_start = 1000 * (trackee.body.joints(view.initial_state) - view.clip.joints[0]).norm(dim=-1)
+    assert float(at_start.mean()) < 15
+    level = trackee.step_std[[0, 2]]
+    assert float(level[0]) == pytest.approx(float(level[1]))  # no heading is known beforehand
+    assert trackee.manifold.info.fps == 60 and trackee.manifold.info.persons == ("p1",)
+    (_, validation) = trackee.validation[0]
+    assert validation.clip.trial not in {view.clip.trial, *trackee.manifold.info.sequences}
+
+
+def test_validation_chooses_the_scale_first_and_then_the_exponent(trackee, tmp_path, monkeypatch):
+    """Errors of a known landscape are put in place of those of filters."""
+    tried = []
+
+    def fit(make_filter, sequences, values, seeds):
+        tracker = make_filter(values[0])
+        scale = float((tracker.step_std / trackee.step_std)[0])
+        tried.append((tracker.sharpness, round(scale, 6)))
+        error = abs(math.log(scale / 1.4)) + 0.1 * abs(math.log(tracker.sharpness / 30))
+        return SharpnessFit(values[0], tuple(values), (error,))
+
+    monkeypatch.setattr(silhouette_runs, "fit_sharpness", fit)
+    found = silhouette_runs.tune([trackee], "sir", 20, "bidirectional", tmp_path)
+    assert found.setting == Setting(30.0, 1.4) and found.error == pytest.approx(0.0, abs=1e-6)
+    assert tried[: len(SCALES)] == [(100.0, scale) for scale in SCALES]
+    assert {scale for _, scale in tried[len(SCALES) :]} == {1.4}
+    assert len(tried) == len(set(tried)) == len(found.tried)
+    count = len(tried)
+    again = silhouette_runs.tune([trackee], "sir", 20, "bidirectional", tmp_path)
+    assert len(tried) == count and again == found  # kept
+    budgets = {len({*SCALES}) + len(m.values) - (m.first in m.values) for m in METHODS.values()}
+    assert len(budgets) == 1
+
+
+# --- statistics -----------------------------------------------------------------------------------
+
+
+def made_up(seed, n_frames=(30, 40), n_seeds=4, offset=50.0):
+    """Runs with errors of which everything is known."""
+    rng = np.random.default_rng(seed)
+    found = {}
+    for q, n in enumerate(n_frames):
+        runs = []
+        for _ in range(n_seeds):
+            errors = offset + 10 * q + rng.normal(0, 5, (n, 15)) + rng.normal(0, 3)
+            errors += 0.5 * np.arange(n)[:, None]
+            errors[:, BODY_15.joint("head")] = np.nan
+            state = torch.zeros(n, 36)
+            flags = torch.zeros(n, dtype=torch.bool)
+            runs.append(silhouette_runs.Run(
+                torch.from_numpy(errors), state, state, flags, flags, torch.ones(1)
+            ))  # fmt: skip
+        found[f"sequence {q}"] = runs
+    return found
+
+
+def test_statistics_are_numpy_s():
+    runs = {"sir": made_up(0), "mrpf": made_up(1, offset=40.0)}
+    every = [[run.errors.numpy().copy() for run in seeds] for seeds in runs["sir"].values()]
+    whole = silhouette_tables.part_errors(runs, "sir")
+    expected = [[np.nanmean(e) for e in seeds] for seeds in every]
+    np.testing.assert_allclose(whole.numpy(), expected)
+    legs = [BODY_15.joint(f"{s}_{j}") for s in ("left", "right") for j in ("knee", "ankle")]
+    np.testing.assert_allclose(
+        silhouette_tables.part_errors(runs, "sir", "legs").numpy(),
+        [[e[:, legs].mean() for e in seeds] for seeds in every],
+    )
+    assert bool(silhouette_tables.part_errors(runs, "sir", "head").isnan().all())
+    slopes = [
+        [np.polyfit(np.arange(len(e)) / 60, np.nanmean(e, 1), 1)[0] for e in seeds]
+        for seeds in every
+    ]
+    np.testing.assert_allclose(silhouette_tables.drift(runs, "sir", 60.0).numpy(), slopes)
+    runs["sir"]["sequence 0"][0].errors[5:8] = torch.nan  # the truth was lost for three frames
+    kept = np.delete(every[0][0], slice(5, 8), 0)
+    slope = np.polyfit(np.delete(np.arange(30), slice(5, 8)) / 60, np.nanmean(kept, 1), 1)[0]
+    assert float(silhouette_tables.drift(runs, "sir", 60.0)[0, 0]) == pytest.approx(slope)
+    spread = math.sqrt(np.mean([np.var(row, ddof=1) for row in expected]))
+    assert float(silhouette_tables.pooled_std(whole)) == pytest.approx(spread)
+    joints = [name for names in silhouette_tables.PARTS.values() for name in names]
+    assert sorted(joints) == sorted(BODY_15.names)
+
+
+def test_bootstrap_intervals_hold_what_they_say():
+    """Intervals of the difference of two means cover the true one, and of spreads as well."""
+    generator = torch.Generator().manual_seed(0)
+    covered = 0
+    for trial in range(60):
+        draw = torch.randn(2, 6, 8, generator=generator, dtype=torch.float64)
+        value, low, high = silhouette_tables.bootstrap(
+            silhouette_tables.mean_of, draw[0] + 1, draw[1], seed=trial, draws=400
+        )
+        assert low <= value <= high
+        covered += low <= 1.0 <= high
+    assert covered >= 50
+    wide = 3 * torch.randn(6, 8, generator=generator, dtype=torch.float64)
+    narrow = torch.randn(6, 8, generator=generator, dtype=torch.float64)
+    _, _, high = silhouette_tables.bootstrap(silhouette_tables.pooled_std, narrow, wide)
+    assert high < 0
+
+
+# --- the whole of it ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def done(folder, tmp_path_factory):
+    out = tmp_path_factory.mktemp("result")
+    options = {"test_persons": ("p1",), "train_persons": ("p1",), **SMALL}
+    return out, options, silhouette.run(folder, out, **options)
+
+
+def test_a_run_writes_tables_pictures_and_lines(done):
+    out, _, report = done
+    assert list(report["errors"].rows) == ["p1 p1_0", "all"]
+    assert {"errors", "parts", "pooled", "differences", "tuning", "sequences"} <= set(report)
+    assert report["tuning"]["APF", "chosen"] == 0.5 and report["tuning"]["SIR", "chosen"] == 100
+    for name in (*report.pictures, "report.json", "report.md", "runs.csv"):
+        assert (out / name).stat().st_size > 300
+    json.loads((out / "report.json").read_text())
+    with (out / "runs.csv").open() as stream:
+        lines = list(csv.DictReader(stream))
+    assert len(lines) == 6 and {line["method"] for line in lines} == {"sir", "apf", "mrpf"}
+    sir = [float(line["error_mm"]) for line in lines if line["method"] == "sir"]
+    assert report["errors"]["all", "SIR"] == pytest.approx(np.mean(sir), abs=1e-3)
+    assert report["errors"]["all", "± SIR"] == pytest.approx(np.std(sir, ddof=1), abs=2e-3)
+    assert all(float(v) < 200 for v in sir)
+    assert any("paper's order" in line for line in report.findings)
+
+
+def test_a_killed_run_goes_on_with_the_same_numbers(done, folder, monkeypatch):
+    out, options, report = done
+    for path in sorted(out.glob("run-*.npz"))[:2]:
+        path.write_bytes(path.read_bytes()[:50])  # damaged
+    kept = {p: p.stat().st_mtime_ns for p in sorted(out.glob("run-*.npz"))[2:]}
+    repaired, filtered = [], silhouette_runs._filtered
+
+    def watched(*arguments):
+        repaired.extend(arguments[-1])
+        return filtered(*arguments)
+
+    monkeypatch.setattr(silhouette_runs, "_filtered", watched)
+    again = silhouette.run(folder, out, **options)
+    for table in ("errors", "parts", "differences"):
+        assert again[table].rows == report[table].rows
+    assert len(repaired) == 2
+    assert {p: p.stat().st_mtime_ns for p in kept} == kept
+
+
+def test_other_conditions(folder, tmp_path, clips):
+    """Cameras of a file, one camera, a published exponent, a looped walk, a found first pose."""
+    rig = silhouette_data.place_cameras(clips[4])  # p2's first trial
+    from torchpose.camera import PinholeCamera
+
+    save_cameras(
+        [
+            PinholeCamera(
+                450.0, 450.0, 319.5, 239.5, 640, 480, rig.names[i],
+                rotation=_rotvec(rig.rotation[i]), translation=rig.translation[i].tolist(),
+            )
+            for i in range(3)
+        ],
+        tmp_path / "cameras.toml",
+    )  # fmt: skip
+    report = silhouette.run(
+        folder, tmp_path / "out", cameras=str(tmp_path / "cameras.toml"), cameras_used=1,
+        train_persons=("p1",), test_persons=("p2",), method=("sir",),
+        **{**SMALL, "seeds": 1, "faults": 0.0, "sharpness": 1.0},
+    )  # fmt: skip
+    assert report["sequences"]["p2 p2_0", "own manifold"] == "no"
+    assert report["sequences"]["p2 p2_0", "in view (%)"] > 99
+    assert report["tuning"]["SIR", "chosen"] == 1.0
+    report = silhouette.run(
+        folder, tmp_path / "loop", loop=1, train_persons=("p1",), test_persons=("p1",),
+        method=("mrpf",), initial="found", **{**SMALL, "seeds": 1},
+    )  # fmt: skip
+    assert report["sequences"].rows["p1 p1_0 looped 1 times"][0] > 50
+
+
+def test_several_conditions_with_the_settings_of_an_earlier_run(done, folder, tmp_path):
+    """One table over particles and sizes; a row of it is the run of that condition alone."""
+    earlier, _, _ = done
+    options = {"train_persons": ("p1",), "test_persons": ("p1",), "method": ("sir", "mrpf")}
+    options |= {**SMALL, "sharpness": None, "settings": str(earlier), "faults": 0.0, "frames": 3}
+    several = {**options, "particles": (20, 40), "size": ("64x48", "80x60")}
+    report = silhouette.run(folder, tmp_path / "out", **several)
+    names = [f"{n} likelihoods, {size}" for size in ("64x48", "80x60") for n in (20, 40)]
+    assert list(report["conditions"].rows) == names
+    assert report["tuning"]["MRPF", "chosen"] == 100 and len(report["tuning"].rows) == 2
+    assert {f"errors, {name}" for name in names} | {"sequences, 80x60"} <= set(report)
+    assert (tmp_path / "out" / "runs-40-80x60.csv").is_file()
+    alone = silhouette.run(folder, tmp_path / "one", **{**options, "particles": (40,)})
+    row = report["conditions"].rows["40 likelihoods, 64x48"]
+    assert row[0] == alone["errors"]["all", "SIR"] and row[5] == alone["errors"]["all", "± MRPF"]
+    expected = alone["differences"].rows["MRPF - SIR"]
+    assert report["differences"].rows["40 likelihoods, 64x48: MRPF - SIR"] == expected
+    settings = json.loads((tmp_path / "out" / "report.json").read_text())["settings"]
+    assert settings["settings"] == {m: {"value": 100.0, "scale": 1.0} for m in ("sir", "mrpf")}
+    assert settings["particles"] == [20, 40]
+    with pytest.raises(InputError, match="none of apf, only of sir, mrpf"):
+        silhouette_runs.read_settings(tmp_path / "out", ["sir", "apf"])
+
+
+def test_settings_are_those_of_the_report(tmp_path):
+    path = tmp_path / "report.json"
+    with pytest.raises(InputError, match="no such file"):
+        silhouette_runs.read_settings(path, ["sir"])
+    chosen = {"sir": {"value": 30.0, "scale": 1.4}, "apf": {"value": 0.7, "scale": 2.0}}
+    path.write_text(json.dumps({"settings": {"settings": chosen}}))
+    for given in (path, tmp_path, str(tmp_path)):
+        assert silhouette_runs.read_settings(given, ["apf"]) == {"apf": Setting(0.7, 2.0)}
+    for damaged in ("no json", "[]", '{"settings": {"settings": {"500 at 160x120": {"sir": 1}}}}'):
+        path.write_text(damaged)
+        with pytest.raises(FileFormatError, match=r"expected the report\.json"):
+            silhouette_runs.read_settings(tmp_path, ["sir"])
+
+
+def test_the_settings_of_each_condition_where_validation_chose_them(folder, tmp_path, monkeypatch):
+    """Sharpness 30 is put in place of what validation chooses with 20 particles, else 300."""
+
+    def tune(trackees, method, n, likelihood, out):
+        found = Setting(30.0 if n == 20 else 300.0, 1.4)
+        return silhouette_runs.Tuning(found, (found,), (50.0,))
+
+    monkeypatch.setattr(silhouette, "tune", tune)
+    report = silhouette.run(
+        folder, tmp_path, train_persons=("p1",), test_persons=("p1",), method=("sir",),
+        **{**SMALL, "sharpness": None, "particles": (20, 25), "seeds": 1, "frames": 3},
+    )  # fmt: skip
+    assert report["tuning"]["20 likelihoods: SIR", "chosen"] == 30.0
+    assert report["tuning"]["25 likelihoods: SIR", "chosen"] == 300.0
+    assert report.settings["settings"]["25 at 64x48"]["sir"]["value"] == 300.0
+    assert "differences" not in report  # nothing to compare with
+
+
+def test_an_unseen_action_by_name(tmp_path):
+    folder = write_walkers(tmp_path / "mocap", ("p1",), 4, 30)
+    path = folder / "p1_3.npz"
+    with np.load(path) as archive:
+        content = dict(archive)
+    np.savez(path, **{**content, "action": "run"})
+    options = {**SMALL, "seeds": 1, "frames": 4, "method": ("mrpf",), "actions": ("walk",)}
+    options |= {"train_persons": ("p1",)}
+    report = silhouette.run(folder, tmp_path / "out", test_actions=("run",), **options)
+    assert report["sequences"]["p1 p1_3", "own manifold"] == "yes, of walk"
+    assert report.settings["tracked actions"] == ["run"] and report.settings["actions"] == ["walk"]
+    assert "one seed" in report.findings[0]
+    with pytest.raises(InputError, match="the manifold is of this action as well"):
+        silhouette.run(folder, tmp_path / "out", test_actions=("walk",), **options)
+
+
+def _rotvec(R):
+    import cv2
+
+    return cv2.Rodrigues(R.numpy())[0].ravel().tolist()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": ("kalman",)}, "--method takes sir, apf, mrpf"),
+        ({"seeds": 0}, "--seeds must be at least 1"),
+        ({"size": ("large",)}, "--size must be width x height"),
+        ({"initial": "guessed"}, "--initial must be given or found"),
+        ({"test_persons": ("p9",)}, "expected recordings of person p9"),
+        ({"actions": ("run",)}, "there are walk"),
+        ({"cameras_used": 4}, "4 cameras are asked for"),
+        ({"settings": "x"}, "leave --sharpness out"),
+        ({"particles": (20, 0)}, "--particles must be 1 or more"),
+        ({"particles": (20, 20)}, "--particles takes each value once"),
+    ],
+)
+def test_refusals(folder, tmp_path, options, message):
+    with pytest.raises(InputError, match=message):
+        silhouette.run(folder, tmp_path, **{**SMALL, **options})
+
+
+def test_cameras_of_another_room_are_refused(clips):
+    rig = silhouette_data.place_cameras(clips[0])
+    rig.translation[:, 2] -= 1000.0  # behind them all
+    split = silhouette_data.split_clips(clips, ["p1"], ["p1"])[0]
+    with pytest.raises(InputError, match="no camera sees the person"):
+        prepare(split, Conditions((48, 64), rig=rig), 8, 8)
+
+
+def test_several_actions_are_refused(tmp_path):
+    write_walkers(tmp_path / "a", ("p1",), 2, 20)
+    path = tmp_path / "a" / "p1_1.npz"
+    with np.load(path) as archive:
+        content = dict(archive)
+    np.savez(path, **{**content, "action": "run"})
+    with pytest.raises(InputError, match="of run, walk: choose with --actions"):
+        silhouette.run(tmp_path / "a", tmp_path / "out")
+
+
+def test_the_command(torchpose_command, folder, tmp_path):
+    line = ["evaluate", "silhouette", "--mocap", str(folder), "--out", str(tmp_path / "out")]
+    line += ["--method", "sir", "mrpf", "--test-persons", "p1", "--train-persons", "p1"]
+    line += ["--size", "64x48", "--particles", "10", "20", "--sharpness", "100", "--frames", "5"]
+    code, text = torchpose_command([*line, "--quick", "true"])
+    assert code == 0 and "20 likelihoods: MRPF - SIR" in text
+    code, text = torchpose_command(["evaluate", "silhouette", "--mocap", "none", "--out", "o"])
+    assert code == 2 and "--mocap none: no such folder" in text
+
+
+@pytest.fixture
+def torchpose_command(capsys):
+    from torchpose.cli import main
+
+    def call(arguments):
+        code = main(arguments)
+        captured = capsys.readouterr()
+        return code, captured.out + captured.err
+
+    return call

@@ -1,0 +1,278 @@
+"""The protocols over persons, on tiny data sets, and on a few real sequences where they are there."""
+
+import json
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks import uncommon_poses
+from tests.data import data_dir_or_skip
+from tests.evaluation.recordings import V1, poses, small_recipe, write_one, write_people
+from torchpose.cli import evaluate
+from torchpose.errors import InputError, OutputError
+from torchpose.evaluation import cross_dataset, learning_curve, leave_one_person_out, unseen
+from torchpose.evaluation import persons as persons_module
+from torchpose.evaluation.learning_curve import cyclic_subsets, halves
+from torchpose.evaluation.person_tables import mean_error
+from torchpose.evaluation.persons import POSE_CLASSES
+from torchpose.io import read_recordings
+from torchpose.skeleton import SKELETONS
+
+MHAD = SKELETONS["mhad-16"].joints
+
+
+def recipe(recordings, n_components=2, calibration_folds=0, **options):
+    """`small_recipe` that takes the sizes of windows, which it has none of."""
+    for name in ("window_components", "window_samples"):
+        options.pop(name, None)
+    return small_recipe(recordings, n_components, **options)
+
+
+def write_mocap(folder, persons, n_frames=40):
+    """MHAD's joints: y up, wrists, a low neck and no head."""
+    folder.mkdir(parents=True)
+    for number, person in enumerate(persons):
+        (people,) = [write_people(folder / "v1" / person, (person,), n_frames)]
+        with np.load(next(people.glob("*.npz"))) as arrays:
+            named = dict(zip(V1, np.moveaxis(arrays["joints"], 1, 0), strict=True))
+        middle = (named["left_shoulder"] + named["right_shoulder"]) / 2
+        named["neck"] = middle + 0.4 * (named["shoulder_center"] - middle)
+        named |= {f"{side}_toe": named[f"{side}_foot"] for side in ("left", "right")}
+        joints = np.stack([named[name] for name in MHAD], 1) * (-1.0, 1.0, -1.0)
+        np.savez(
+            folder / f"{person}_a01_r{number}.npz", joints=joints.astype(np.float32),
+            names=np.array(MHAD), fps=30.0, subject=person, action="demo",
+            source="example/mocap@0:x",
+        )  # fmt: skip
+        shutil.rmtree(folder / "v1")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """UTD, burke and MHAD in small."""
+    folder = tmp_path_factory.mktemp("data")
+    names = ("s1", "s2", "s7", "s8")
+    write_people(folder / "kinect_utd_mhad", names, n_frames=40, n_sequences=2)
+    write_one(folder / "burke_kinect", 40)
+    write_mocap(folder / "mocap_berkeley_mhad", ("s1", "s9", "s10"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def left_out(data, tmp_path_factory):
+    out = tmp_path_factory.mktemp("loo")
+    report = leave_one_person_out.run(
+        [data / "kinect_utd_mhad", data / "burke_kinect"], out, progress=False, recipe=recipe,
+        n_components=2,
+    )  # fmt: skip
+    return report, out
+
+
+def test_one_line_for_each_person(left_out):
+    report, out = left_out
+    table = report["persons"]
+    persons = ["one", "s1", "s2", "s7", "s8"]
+    assert list(table.rows) == [*persons, "mean", "standard deviation", "all frames"]
+    errors = [table[name, "filtered"] for name in persons]
+    assert table["mean", "filtered"] == pytest.approx(np.mean(errors))
+    assert table["standard deviation", "filtered"] == pytest.approx(np.std(errors, ddof=1))
+    frames = [table[name, "frames"] for name in persons]
+    assert frames == [40, 80, 80, 80, 80] and table["all frames", "frames"] == 360
+    pooled = np.average(errors, weights=frames)
+    assert table["all frames", "filtered"] == pytest.approx(pooled, rel=1e-5)
+    for name in persons:
+        assert 0 <= table[name, "in 50 %"] <= table[name, "in 90 %"] <= 100
+        assert math.isfinite(table[name, "log-lik."])
+    classes = report["pose_classes"]
+    shares = [classes[name, "arm-frames (%)"] for name in POSE_CLASSES]
+    assert sum(shares) == pytest.approx(100)
+    assert json.loads((out / "report.json").read_text())["tables"]["persons"]["rows"]["s1"]
+    assert (out / "persons.png").stat().st_size > 1000
+    assert len(list(out.glob("prior-*.safetensors"))) == 5
+
+
+def test_a_killed_run_goes_on(left_out, data):
+    report, out = left_out
+    kept = sorted(out.glob("*-*.*"))
+    next(out.glob("scores-*.npz")).unlink()
+    again = leave_one_person_out.run(
+        [data / "kinect_utd_mhad", data / "burke_kinect"], out, progress=False, recipe=recipe,
+        n_components=2,
+    )  # fmt: skip
+    assert sorted(out.glob("*-*.*")) == kept
+    assert again["persons"].rows == report["persons"].rows
+
+
+def test_leaving_out_needs_two_persons(data, tmp_path):
+    with pytest.raises(InputError, match="two persons or more"):
+        leave_one_person_out.run(data / "burke_kinect", tmp_path, progress=False)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError):
+        leave_one_person_out.run(data, tmp_path / "file", progress=False)
+
+
+def test_subsets_are_balanced():
+    names = [f"s{i}" for i in range(8)]
+    for count in (1, 2, 4, 7):
+        subsets = cyclic_subsets(names, count, 8)
+        assert len({frozenset(s) for s in subsets}) == 8
+        assert all(len(set(s)) == count for s in subsets)
+        trained = [sum(name in s for s in subsets) for name in names]
+        assert trained == [count] * 8
+    assert [len(s) for s in cyclic_subsets(names, 9, 8)] == [7] * 8
+    assert cyclic_subsets(names, 2, 4) == [["s0", "s1"], ["s2", "s3"], ["s4", "s5"], ["s6", "s7"]]
+
+
+def test_halves_by_trial(data):
+    recordings = persons_module.by_person(read_recordings(data / "kinect_utd_mhad"))["s1"]
+    first, second = halves(recordings)
+    assert (first, second) == ([recordings[0]], [recordings[1]])
+    other = [replace(r, action="other") for r in recordings]
+    first, second = halves([*recordings, *other, other[0]])
+    assert len(first) == 3 and len(second) == 2
+    assert not {id(r) for r in first[:1]} & {id(r) for r in second[:1]}
+
+
+def second_recipe(recordings, **options):
+    """Another recipe: more components."""
+    return recipe(recordings, **(options | {"n_components": 3}))
+
+
+def test_learning_curve(data, tmp_path):
+    report = learning_curve.run(
+        data, tmp_path, progress=False, counts=(1, 3, 4), n_own=1, n_subsets=2, every=2,
+        recipes=[("new", recipe), ("first", second_recipe)],
+    )  # fmt: skip
+    curve = report["curve"]
+    assert len(curve.rows) == 6
+    assert curve["new, 1 person", "fits"] == 2 and curve["new, 1 person", "tests"] == 6
+    assert curve["new, 3 persons", "tests"] == 2
+    assert math.isnan(curve["new, 3 persons", "± drawn"])  # each is tracked by one fit only
+    assert curve["new, 1 person", "± drawn"] > 0 and curve["new, 4 persons", "filtered"] > 0
+    assert report.settings["further training persons"] == ["one"]
+    own = report["own"]
+    assert len(own.rows) == 8
+    assert all(row[0] > 0 for row in own.rows.values())
+    assert own["new: the person's first half, on others", "tests"] == 3
+    assert any("'new' against 'first'" in line for line in report.findings)
+    assert (tmp_path / "learning-curve.png").stat().st_size > 1000
+
+
+def test_a_point_of_the_curve():
+    def scored(error):
+        values = torch.full((3, 8), error / 100)
+        return unseen.Scored(values, values, values, values[:, 0], values[:, :2].long())
+
+    results = [
+        {"b": scored(4.0), "c": scored(8.0)},
+        {"a": scored(5.0), "c": scored(6.0)},
+        {"a": scored(7.0), "b": scored(4.0)},
+    ]
+    mean, drawn, tested = learning_curve._point(results, False)
+    assert mean == pytest.approx((6 + 4 + 7) / 3)
+    assert drawn == pytest.approx(math.sqrt((2 + 0 + 2) / 3))
+    assert tested == pytest.approx(np.std([6, 4, 7], ddof=1))
+    assert mean_error(results[0]["b"]) == pytest.approx(4.0)
+
+
+def test_recipes_by_name(data, tmp_path):
+    name, function = learning_curve._imported("x=torchpose.learning.recipes.fit_kinect_prior")
+    assert name == "x" and function.__name__ == "fit_kinect_prior"
+    for text in ("fit_kinect_prior", "x=torchpose.none.f", "x=torchpose.learning.recipes.none"):
+        with pytest.raises(InputError, match="--compare"):
+            learning_curve._imported(text)
+    with pytest.raises(InputError, match="9 training persons"):
+        learning_curve.run(data, tmp_path, progress=False, counts=(1, 9))
+
+
+def test_across_data_sets(data, tmp_path):
+    report = cross_dataset.run(data, tmp_path, progress=False, part="cross", recipe=recipe)
+    cross = report["cross"]
+    for name in ("UTD → UTD (s7, s8)", "UTD → MHAD (s9, s10)", "MHAD → UTD (s7, s8)",
+                 "MHAD → MHAD (s9, s10)", "UTD → MHAD, all persons"):  # fmt: skip
+        assert cross[name, "filtered"] > 0
+        assert math.isnan(cross[name, "head"])
+    assert cross["UTD → MHAD, all persons", "persons"] == 3
+    assert cross["UTD → UTD (s7, s8)", "frames"] == 160
+    assert (tmp_path / "cross-dataset.png").stat().st_size > 1000
+    with pytest.raises(InputError, match="part must be"):
+        cross_dataset.run(data, tmp_path, part="all")
+    with pytest.raises(InputError, match="expected the folder"):
+        cross_dataset.run(data / "burke_kinect", tmp_path, part="cross")
+
+
+def test_no_head_of_a_tested_person_is_learnt_from(data):
+    sets = cross_dataset._wrists(data, 1, 0)
+    assert not set(sets.completion.persons) & {
+        r.person_id for g in sets.utd.tested.values() for r in g
+    }
+    # the mean head is for tests; training recordings have residuals, and nothing else differs
+    mean, drawn = sets.mean.train["s1"][0].joints, sets.drawn.train["s1"][0].joints
+    assert bool((mean[:, [0, 1, 2, 5, 6, 7]] == drawn[:, [0, 1, 2, 5, 6, 7]]).all())
+
+
+def test_motion_capture_is_thinned_to_a_share(data):
+    (recording, *_) = read_recordings(data / "kinect_utd_mhad")
+    fast = replace(recording, fps=120.0)
+    assert len(cross_dataset._at_most([recording] * 10, 200)) == 5
+    assert len(cross_dataset._at_most([fast] * 10, 200)) == 10  # a quarter of the seconds
+    assert cross_dataset._at_most([recording] * 3, 10_000) == [recording] * 3
+
+
+def test_uncommon_poses(data, tmp_path, monkeypatch):
+    monkeypatch.setattr("benchmarks.ub_people.TRAIN_PERSONS", ("s1", "s2"))
+    shares = [
+        persons_module.raised_share(r)
+        for person in ("s1", "s2")
+        for r in persons_module.by_person(read_recordings(data / "kinect_utd_mhad"))[person]
+    ]
+    report = uncommon_poses.run(
+        data, tmp_path, progress=False, raised=float(np.median(shares)), recipe=recipe
+    )
+    errors = report["errors"]
+    kept = errors["no raised arms", "recordings"]
+    assert 0 < kept < 4 == errors["all recordings", "recordings"]
+    assert errors["as many at random", "frames"] >= errors["no raised arms", "frames"]
+    assert len(report["pose_classes"].rows) == 12
+    with pytest.raises(InputError, match="choose another --raised"):
+        uncommon_poses.run(data, tmp_path, progress=False, raised=1.0)
+
+
+def test_raised_share_counts_frames_of_either_hand(data):
+    (recording, *_) = read_recordings(data / "kinect_utd_mhad")
+    body = torch.stack([poses(1, 0)[0]] * 4)
+    body[:, [0, 7], 1] = body[:, [2, 5], 1] + 0.4
+    body[0, 0, 1] -= 0.8
+    body[1, 7, 1] -= 0.8
+    names = ("hand_left", "elbow_left", "shoulder_left", "head", "neck", "shoulder_right",
+             "elbow_right", "hand_right")  # fmt: skip
+    assert persons_module.raised_share(replace(recording, joints=body, names=names)) == 0.5
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_real_data_sets(tmp_path):
+    folder = data_dir_or_skip("kinect_utd_mhad").parent
+    data_dir_or_skip("mocap_berkeley_mhad")
+    report = cross_dataset.run(
+        folder, tmp_path, progress=False, quick=True, part="cross", recipe=recipe
+    )
+    cross = report["cross"]
+    own, far = (cross[f"{name} → UTD (s7, s8)", "filtered"] for name in ("UTD", "MHAD"))
+    assert 2 < own < far < 30
+
+
+def test_folders_on_the_command_line():
+    parser = evaluate.build("leave-one-person-out")
+    line = ["a", "b", "--out", "o", "--workers", "2"]
+    args = parser.parse_args(line)
+    assert evaluate._folders(args) == [Path("a"), Path("b")] and args.workers == 2
+    assert evaluate._folders(parser.parse_args([*line, "--data", "c"]))[-1] == Path("c")
+    with pytest.raises(InputError, match="got none"):
+        evaluate._folders(parser.parse_args(["--out", "o"]))

@@ -1,0 +1,142 @@
+"""Training states: which frames are used, how often, from where, with which neck."""
+
+import math
+from collections import namedtuple
+
+import pytest
+import torch
+
+from tests.priors.poses import lowered_neck, poses, recording
+from torchpose.camera import ViewRange, lift
+from torchpose.errors import InputError, PriorError
+from torchpose.learning import TRAINING_VIEWS, arm_sources, collect_poses
+from torchpose.learning.samplers import all_samples
+from torchpose.math import euler_to_matrix as rotate
+from torchpose.skeleton import UPPER_BODY
+
+Fitted = namedtuple("Fitted", "left right facts")
+MATRIX = torch.tensor([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]], dtype=torch.float64)
+
+
+def states(*recordings, seed=0, **options):
+    sources = arm_sources(collect_poses(recordings), MATRIX, seed, **options)
+    right = None if sources.right is None else all_samples(sources.right).states
+    return Fitted(all_samples(sources.left).states, right, sources.facts)
+
+
+def body_of(state):
+    """Joints [N, 5, 3] that the states were made from."""
+    rotation = rotate(state[:, 15:18])
+    return lift(state[:, :15].reshape(-1, 5, 3), MATRIX, rotation, state[:, 18:])
+
+
+def test_states_hold_the_poses_centred_on_the_neck():
+    joints = poses(50)
+    fitted = states(recording(joints), mirror=False, views_per_pose=1)
+    expected = (joints - joints[:, 4:5]).sort(0).values
+    torch.testing.assert_close(body_of(fitted.left).sort(0).values, expected[:, :5])
+    torch.testing.assert_close(body_of(fitted.right).sort(0).values, expected[:, [7, 6, 5, 3, 4]])
+
+
+def test_mirrored_arms_are_pooled():
+    fitted = states(recording(poses(50)), views_per_pose=2)
+    assert fitted.right is None and len(fitted.left) == 200
+    assert fitted.facts["mirrored"] and fitted.facts["n_samples"] == 200
+    assert float(body_of(fitted.left)[:, 2, 0].min()) > 0  # all shoulders are left shoulders
+
+
+def test_views_lie_within_their_limits_and_fill_them():
+    fitted = states(recording(), n_samples=5000)
+    view = fitted.left[:, 15:]
+    limit = torch.tensor([math.radians(15)] * 3, dtype=torch.float64)
+    assert bool((view[:, :3].abs() <= limit).all())
+    low, high = view[:, 3:].min(0).values, view[:, 3:].max(0).values
+    for axis, (least, most) in enumerate((TRAINING_VIEWS.tx, TRAINING_VIEWS.ty, TRAINING_VIEWS.tz)):
+        assert least <= float(low[axis]) < least + 0.01
+        assert most - 0.01 < float(high[axis]) <= most
+
+
+def test_every_pose_is_used_as_often_as_any_other():
+    fitted = states(recording(poses(7)), mirror=False, n_samples=24)
+    hands = body_of(fitted.left)[:, 0].round(decimals=6)
+    counts = hands.unique(dim=0, return_counts=True)[1]
+    assert len(counts) == 7 and set(counts.tolist()) == {3, 4}
+
+
+def test_frames_with_missing_joints_are_left_out_and_counted():
+    joints = poses(20)
+    joints[:5, 0] = torch.nan  # left hand
+    joints[3:10, 7] = torch.nan  # right hand
+    fitted = states(recording(joints), views_per_pose=1)
+    assert len(fitted.left) == 15 + 13
+    assert fitted.facts["extra"]["frames_left_out"] == {"left": 5, "right": 7}
+    assert fitted.facts["n_frames"] == 18
+    joints[:, 3] = torch.nan
+    with pytest.raises(InputError, match="left arm"):
+        states(recording(joints))
+
+
+def test_facts_name_persons_sources_and_frame_rate():
+    parts = [recording(poses(10), "b", fps=30.0), recording(poses(30), "a", fps=25.0),
+             recording(poses(5), "b", source="")]  # fmt: skip
+    facts = collect_poses(parts).facts
+    assert facts["persons"] == ("#b", "site:set#a", "site:set#b") or len(facts["persons"]) == 3
+    assert "site:set@1" in facts["sources"]
+    assert facts["fps"] == 25.0 and facts["neck"] == "neck" and facts["hand"] == "hand"
+
+
+def test_low_necks_are_converted():
+    joints = poses()
+    high, low = recording(joints), recording(lowered_neck(joints))
+    together = collect_poses([high, low])
+    assert together.facts["neck"] == "neck"
+    assert together.facts["extra"]["frames_with_converted_neck"] == 300
+    whole, converted = together.joints.split(300)
+    residual = together.facts["extra"]["neck_offset"]["residual"]
+    # hands relative to the neck differ by no more than the necks do
+    gap = (whole - converted)[:, 0].norm(dim=-1).square().mean().sqrt()
+    assert float(gap) == pytest.approx(residual, rel=1e-6) and residual < 0.03
+
+
+def test_one_kind_of_neck_stays_and_an_unknown_one_is_refused():
+    low = recording(lowered_neck(poses()))
+    alone = collect_poses([low])
+    assert alone.facts["neck"] == "mid-shoulder" and "neck_offset" not in alone.facts["extra"]
+    with pytest.raises(PriorError, match="neck offset"):
+        collect_poses([low], neck="neck")
+    with pytest.raises(PriorError, match="throat"):
+        collect_poses([low], neck="throat")
+
+
+def test_missing_necks_are_placed():
+    without = [n for n in UPPER_BODY if n != "neck"]
+    index = [UPPER_BODY.index(n) for n in without]
+    part = recording(poses(40)[:, index], names=without)
+    together = collect_poses([recording(), part])
+    assert bool(torch.isfinite(together.joints).all())
+
+
+def test_hands_and_wrists_are_not_mixed():
+    wrists = [n.replace("hand", "wrist") for n in UPPER_BODY]
+    with pytest.raises(PriorError, match="hand and wrist"):
+        collect_poses([recording(), recording(names=wrists)])
+
+
+@pytest.mark.parametrize("centre", ["neck", "head", "sequence"])
+def test_centre(centre):
+    joints = collect_poses([recording(poses(40))], centre=centre).joints
+    at = joints[:, 3 if centre == "head" else 4]
+    assert float((at.mean(0) if centre == "sequence" else at).abs().max()) < 1e-12
+
+
+def test_bad_settings_are_refused():
+    with pytest.raises(InputError, match="at least one recording"):
+        collect_poses([])
+    with pytest.raises(PriorError, match="centre"):
+        collect_poses([recording()], centre="hip")
+    with pytest.raises(InputError, match="not both"):
+        states(recording(), n_samples=10, views_per_pose=1)
+    with pytest.raises(InputError, match="at least 1"):
+        states(recording(), n_samples=0)
+    with pytest.raises(InputError, match="tx"):
+        states(recording(), view_range=ViewRange(tx=(0.0, 0.5)))

@@ -1,0 +1,184 @@
+"""Frame by frame the tracker says what it says about whole sequences."""
+
+import pytest
+import torch
+
+from tests.priors.poses import recording
+from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
+from torchpose.errors import InputError, ShapeError, SkeletonError
+from torchpose.learning.recipes import fit_kinect_prior
+from torchpose.upper_body import METHODS, UpperBodyTracker
+
+NAMES = list(KEYPOINT_NAMES)
+FIELDS = ("joints2d", "joints3d", "covariance2d", "covariance3d", "log_evidence")
+
+
+@pytest.fixture(scope="module")
+def prior():
+    """As small as it may be: only the arithmetic is of interest."""
+    people = [recording(performer(120, seed=1).body, person="p", fps=30.0)]
+    return fit_kinect_prior(
+        people, 3, window_components=4, window_samples=1000, n_samples=2000, pose_steps=5
+    )
+
+
+@pytest.fixture(scope="module")
+def keypoints():
+    """Three performers who move about, with hidden hands, a hidden body and a late start."""
+    frames = torch.stack(
+        [noisy_keypoints(performer(60, seed=s).joints, std_px=3.0) for s in range(3)]
+    )
+    walk = torch.linspace(0, 150, 60, dtype=torch.float64)
+    frames[0, ..., 0] += walk[:, None]
+    frames[2] = 300 + (frames[2] - 300) * (1 + walk / 300)[:, None, None]
+    frames[0, 40:46] = torch.nan
+    frames[1, :4] = torch.nan
+    frames[1, 20:50, 2] = torch.nan
+    frames[2, 5:50, NAMES.index("head")] = torch.nan
+    return frames
+
+
+def stream(tracker, keypoints, generator=None, confidence=None, mask=None, names=NAMES):
+    state = tracker.init(len(keypoints), names=names, generator=generator)
+    poses = []
+    for t in range(keypoints.shape[1]):
+        given = (None if x is None else x[:, t] for x in (confidence, mask))
+        state, pose = tracker.step(state, keypoints[:, t], *given)
+        poses.append(pose)
+    return state, poses
+
+
+def in_units_of(whole, cov):
+    """Covariances over the standard deviations of the whole track, whatever their unit."""
+    std = whole.diagonal(dim1=-2, dim2=-1).sqrt()
+    return cov / (std[..., :, None] * std[..., None, :])
+
+
+def check_equal(poses, track, fields=FIELDS):
+    for name in fields:
+        live = torch.stack([getattr(pose, name) for pose in poses], 1)
+        whole = getattr(track, name)
+        if name.startswith("covariance"):
+            live, whole = in_units_of(whole, live), in_units_of(whole, whole)
+            # `forward` takes covariances as settled once a step changes them by less than 4e-13;
+            # a camera that hardly moves comes to rest over a thousand such steps.
+            torch.testing.assert_close(live, whole, rtol=0, atol=2e-9, equal_nan=True)
+            continue
+        torch.testing.assert_close(live, whole, rtol=1e-10, atol=1e-10, equal_nan=True)
+    assert torch.equal(torch.stack([pose.observed for pose in poses], 1), track.observed)
+
+
+@pytest.mark.parametrize("uncertain", [False, True])
+@pytest.mark.parametrize("method", METHODS)
+def test_steps_are_the_frames_of_forward(prior, keypoints, method, uncertain):
+    options = {"n_particles": 100} if method.startswith("pf") else {}
+    tracker = UpperBodyTracker(prior, demo_camera(), method=method, max_gap=None, **options)
+    confidence = mask = None
+    if uncertain:
+        g = torch.Generator().manual_seed(3)
+        confidence = torch.rand(keypoints.shape[:3], generator=g, dtype=torch.float64)
+        mask = torch.rand(keypoints.shape[:3], generator=g) < 0.9
+    generators = [[torch.Generator().manual_seed(b) for b in range(3)] for _ in range(2)]
+    track = tracker(keypoints, confidence, NAMES, mask, generators[0])
+    _, poses = stream(tracker, keypoints, generators[1], confidence, mask)
+    check_equal(poses, track)
+
+
+@pytest.mark.parametrize("options", [{}, {"method": "mkf-fixed"}, {"method": "mkf-sampled"}])
+def test_blocks_of_frames_are_those_of_forward(prior, keypoints, options):
+    tracker = UpperBodyTracker(prior, demo_camera(), max_gap=None, **options)
+    generators = [[torch.Generator().manual_seed(b) for b in range(3)] for _ in range(2)]
+    noise = torch.tensor([2.0, 5.0], dtype=torch.float64)[
+        torch.randint(0, 2, keypoints.shape[:3], generator=torch.Generator().manual_seed(4))
+    ]
+    cov = noise.square()[..., None, None] * torch.eye(2, dtype=torch.float64)
+    track = tracker(keypoints, names=NAMES, generator=generators[0], covariance=cov)
+    state = tracker.init(3, names=NAMES, generator=generators[1])
+    parts, start = [], 0
+    for length in (1, 7, 32, 20):
+        rows = slice(start, start + length)
+        state, part = tracker.advance(state, keypoints[:, rows], covariance=cov[:, rows])
+        parts.append(part)
+        start += length
+    for name in (*FIELDS, "observed"):
+        joined = torch.cat([getattr(part, name) for part in parts], 1)
+        torch.testing.assert_close(joined, getattr(track, name), rtol=1e-9, atol=1e-9)
+    assert state.unseen.tolist() == [0, 0, 0]
+    state, _ = tracker.advance(state, torch.full((3, 4, 4, 2), torch.nan))
+    state, _ = tracker.advance(state, torch.full((3, 3, 4, 2), torch.nan))
+    assert state.unseen.tolist() == [7, 7, 7]
+
+
+def test_one_generator_for_all_streams(prior, keypoints):
+    tracker = UpperBodyTracker(prior, demo_camera(), "pf-mixture", n_particles=50, max_gap=None)
+    track = tracker(keypoints, names=NAMES, generator=torch.Generator().manual_seed(1))
+    check_equal(stream(tracker, keypoints, torch.Generator().manual_seed(1))[1], track)
+
+
+@pytest.mark.parametrize("frame", ["body", "static"])
+def test_settings_of_the_tracker_count_here_too(prior, keypoints, frame):
+    options = {"static_camera": True} if frame == "static" else {"frame": "body"}
+    tracker = UpperBodyTracker(prior, demo_camera(), fps=15.0, max_gap=None, **options)
+    check_equal(stream(tracker, keypoints)[1], tracker(keypoints, names=NAMES))
+
+
+def test_names_that_are_never_measured_change_nothing(prior, keypoints):
+    tracker = UpperBodyTracker(prior, demo_camera(), max_gap=None)
+    empty = torch.full_like(keypoints[:, :, :2], torch.nan)
+    wide = torch.cat([empty, keypoints], 2)
+    names = ["elbow_left", "shoulder_right", *NAMES]
+    check_equal(stream(tracker, wide, names=names)[1], tracker(keypoints, names=NAMES))
+
+
+def test_a_neck_of_another_kind_is_converted_here_too(prior, keypoints):
+    tracker = UpperBodyTracker(prior, demo_camera(), neck="mid-shoulder", max_gap=None)
+    track = tracker(keypoints, names=NAMES)
+    state, poses = stream(tracker, keypoints)
+    check_equal(poses, track)
+    assert state.stream.picked.notes == track.notes != ()
+
+
+def test_a_stream_goes_on_while_nothing_is_seen_and_says_for_how_long(prior, keypoints):
+    tracker = UpperBodyTracker(prior, demo_camera(), fps=15.0, max_gap=1.0)
+    state, poses = stream(tracker, keypoints[:1, :30])
+    assert float(poses[-1].unseen) == 0
+    hidden = torch.full((1, 4, 2), torch.nan, dtype=torch.float64)
+    for _ in range(30):
+        state, pose = tracker.step(state, hidden)
+    assert float(pose.unseen) == pytest.approx(2.0)  # twice max_gap
+    assert torch.isfinite(pose.joints3d).all() and not bool(pose.failed)
+    spread = pose.covariance3d.diagonal(dim1=-2, dim2=-1).sum()
+    assert spread > poses[-1].covariance3d.diagonal(dim1=-2, dim2=-1).sum()
+    _, pose = tracker.step(state, keypoints[:1, 30])
+    assert float(pose.unseen) == 0
+
+
+def test_a_step_leaves_its_state_as_it_was(prior, keypoints):
+    tracker = UpperBodyTracker(prior, demo_camera(), max_gap=None)
+    state, _ = stream(tracker, keypoints[:, :10])
+    first = tracker.step(state, keypoints[:, 10])[1]
+    tracker.step(state, keypoints[:, 40])
+    again = tracker.step(state, keypoints[:, 10])[1]
+    torch.testing.assert_close(first.joints3d, again.joints3d, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"batch_size": 0}, InputError, "at least 1"),
+        ({"names": None, "n": 4}, ShapeError, "keypoints"),
+        ({"names": [*NAMES[:3], "tail"]}, SkeletonError, "tail"),
+        ({"smoothing": "full"}, InputError, "smoothing=None"),
+        ({"n": 3}, ShapeError, "keypoints"),
+        ({"value": float("inf")}, InputError, "finite"),
+        ({"confidence": torch.ones(2, 3)}, ShapeError, "confidence"),
+        ({"mask": torch.ones(2, 3, dtype=torch.bool)}, ShapeError, "mask"),
+        ({"rows": 1}, ShapeError, "keypoints"),
+    ],
+)
+def test_bad_streams_are_refused(prior, change, error, message):
+    tracker = UpperBodyTracker(prior, demo_camera(), smoothing=change.get("smoothing"))
+    frame = torch.full((change.get("rows", 2), change.get("n", 4), 2), change.get("value", 240.0))
+    with pytest.raises(error, match=message):
+        state = tracker.init(change.get("batch_size", 2), change.get("names", NAMES))
+        tracker.step(state, frame, change.get("confidence"), change.get("mask"))

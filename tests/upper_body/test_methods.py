@@ -1,0 +1,169 @@
+"""Which estimator runs, which options it has, and what older programs meant."""
+
+import warnings
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.priors.poses import recording
+from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
+from torchpose.errors import InputError
+from torchpose.learning.recipes import fit_kinect_prior
+from torchpose.priors import UpperBodyPrior
+from torchpose.upper_body import METHODS, UpperBodyTracker
+from torchpose.upper_body.methods import method_options
+
+NAMES = list(KEYPOINT_NAMES)
+
+
+@pytest.fixture(scope="module")
+def prior():
+    people = [recording(performer(120, seed=1).body, person="p", fps=30.0)]
+    return fit_kinect_prior(
+        people, 3, window_components=4, window_samples=1000, n_samples=2000, pose_steps=5
+    )
+
+
+@pytest.fixture(scope="module")
+def keypoints():
+    return noisy_keypoints(performer(40, seed=0).joints, std_px=3.0)[None]
+
+
+def poses(tracker, keypoints):
+    draws = torch.Generator().manual_seed(0)
+    return tracker(keypoints, names=NAMES, generator=draws)
+
+
+def without_windows(prior):
+    return UpperBodyPrior(prior.left, prior.right, prior.info, prior.noise)
+
+
+def test_windows_are_the_default_where_the_prior_has_them(prior, keypoints):
+    track = poses(UpperBodyTracker(prior, demo_camera()), keypoints)
+    assert track.method == "window-mixture" and track.notes == ()
+    named = poses(UpperBodyTracker(prior, demo_camera(), "window-mixture"), keypoints)
+    assert torch.equal(track.joints3d, named.joints3d)
+
+
+@pytest.mark.parametrize("smoothing", [None, 3, "full"])
+def test_single_poses_are_the_default_without_windows(prior, keypoints, smoothing):
+    bare = without_windows(prior)
+    track = poses(UpperBodyTracker(bare, demo_camera(), smoothing=smoothing), keypoints)
+    assert track.method == "mkf-fixed" and track.notes == ()
+    named = poses(
+        UpperBodyTracker(bare, demo_camera(), "mkf-fixed", smoothing=smoothing), keypoints
+    )
+    assert torch.equal(track.joints3d, named.joints3d) and named.notes == ()
+    with pytest.raises(InputError, match=r"brings no mixtures .* use method 'mkf-fixed'"):
+        UpperBodyTracker(bare, demo_camera(), "window-mixture", smoothing=smoothing)
+
+
+def test_a_prior_without_the_window_that_is_needed_says_so(prior, keypoints):
+    causal = {"causal": prior.windows["causal"]}
+    own = UpperBodyPrior(prior.left, prior.right, prior.info, prior.noise, causal)
+    assert UpperBodyTracker(own, demo_camera()).method == "window-mixture"
+    track = poses(UpperBodyTracker(own, demo_camera(), smoothing="full"), keypoints)
+    assert track.method == "mkf-fixed"
+    assert "brings no mixtures over windows for smoothing" in track.notes[0]
+
+
+def test_a_lag_that_ends_before_the_window_does_leaves_single_poses(prior, keypoints):
+    ahead = prior.windows["full"].layout.at_rate(30.0).ahead
+    for lag, method in ((ahead - 1, "mkf-fixed"), (ahead, "window-mixture")):
+        track = poses(UpperBodyTracker(prior, demo_camera(), smoothing=lag), keypoints)
+        assert track.method == method
+        assert any(f"look {ahead} frames ahead" in n for n in track.notes) == (lag < ahead)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_says_its_own_name(prior, keypoints, method):
+    options = {"n_particles": 20} if method.startswith("pf-") else {}
+    tracker = UpperBodyTracker(prior, demo_camera(), method, **options)
+    assert tracker.method == poses(tracker, keypoints).method == method
+
+
+VALUES = {
+    "process_cov": 50 * torch.ones(21), "n_tracks": 2, "uniform_weight": 0.2, "subspace": 3,
+    "initial_cov": 1e3 * torch.ones(21), "transition": "stationary", "gamma": 0.5, "burn_in": 20,
+    "resample_threshold": 1.0, "burn_in_scale": 7.0, "likelihood_power": 0.01, "weighting": "frame",
+    "reset_below": 1e6, "dtype": torch.float32, "n_particles": 30, "resampling": "multinomial",
+    "start": "prior",
+}  # fmt: skip
+BESIDE = {
+    "subspace": {"transition": "ou", "gamma": 0.5},
+    "gamma": {"transition": "ou", "gamma": 0.9},
+    "burn_in_scale": {"burn_in": 20},
+}
+WALKS = ("pf-walk", "pf-walk-unscaled")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_an_option_changes_the_poses_or_is_refused(prior, keypoints, method):
+    few = {"n_particles": 40} if method.startswith("pf-") else {}
+
+    def joints(**options):
+        tracker = UpperBodyTracker(prior, demo_camera(), method, **(few | options))
+        return poses(tracker, keypoints[:, :8]).joints3d.double()
+
+    plain = joints()
+
+    for name, value in VALUES.items():
+        beside = BESIDE.get(name, {})
+        if name not in method_options(method):
+            with pytest.raises(InputError, match=f"{name}|{next(iter(beside), name)}"):
+                joints(**(beside | {name: value}))
+        elif method in WALKS and name in ("transition", "gamma", "subspace"):
+            with pytest.raises(InputError, match="'paper'"):  # (BL 26) holds for no other
+                joints(**(beside | {name: value}))
+        else:
+            change = joints(**(beside | {name: value})) - (joints(**beside) if beside else plain)
+            assert change.abs().max() > 1e-9, name
+    assert set(method_options(method)) <= set(VALUES)
+
+
+def test_a_gamma_that_the_prior_brings_is_left_out_with_another_transition(prior, keypoints):
+    noise = prior.noise | {"gamma": torch.tensor(0.9, dtype=torch.float64)}
+    info = replace(prior.info, transition="ou")
+    brings = UpperBodyPrior(prior.left, prior.right, info, noise)
+    paper = UpperBodyTracker(brings, demo_camera(), "mkf-fixed", transition="paper")
+    plain = UpperBodyTracker(prior, demo_camera(), "mkf-fixed")
+    assert torch.equal(poses(paper, keypoints).joints3d, poses(plain, keypoints).joints3d)
+
+
+@pytest.mark.parametrize("method", [None, "mkf-fixed", "mkf-split"])
+@pytest.mark.parametrize("window", [True, False])
+def test_window_means_what_it_meant(prior, keypoints, method, window):
+    with pytest.warns(DeprecationWarning, match="mkf-fixed"):
+        older = UpperBodyTracker(prior, demo_camera(), method, window=window, steady=True)
+    single = "mkf-fixed" if method != "mkf-split" else "mkf-split"
+    name = "window-mixture" if window and method != "mkf-split" else single
+    assert older.method == name
+    newer = UpperBodyTracker(prior, demo_camera(), name)
+    assert torch.equal(poses(older, keypoints).joints3d, poses(newer, keypoints).joints3d)
+
+
+def test_options_of_single_poses_without_a_method_still_mean_single_poses(prior, keypoints):
+    with pytest.warns(DeprecationWarning, match="pass method='mkf-fixed'"):
+        older = UpperBodyTracker(prior, demo_camera(), transition="ou", gamma=0.9)
+    options = {"transition": "ou", "gamma": 0.9}
+    newer = UpperBodyTracker(prior, demo_camera(), "mkf-fixed", **options)
+    assert torch.equal(poses(older, keypoints).joints3d, poses(newer, keypoints).joints3d)
+
+
+def test_windows_that_are_named_and_denied_are_refused(prior):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        with pytest.raises(InputError, match="contradict"):
+            UpperBodyTracker(prior, demo_camera(), "window-mixture", window=False)
+
+
+def test_a_window_without_a_motion_stage_cannot_be_steadied(prior):
+    ratios = ("joint_ratio", "pixel_ratio", "placement_ratio")
+    window = prior.windows["causal"]
+    kept = {k: v for k, v in window.settings.items() if k not in ratios}
+    bare = type(window)(window.left, window.right, window.layout, kept)
+    own = UpperBodyPrior(prior.left, prior.right, prior.info, prior.noise, {"causal": bare})
+    assert not UpperBodyTracker(own, demo_camera()).steady
+    with pytest.raises(InputError, match="steady=True needs"):
+        UpperBodyTracker(own, demo_camera(), steady=True)

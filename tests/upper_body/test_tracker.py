@@ -1,0 +1,465 @@
+"""From keypoints to poses: the tracker on the animated performer, whom its small prior has not seen."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.priors.poses import recording
+from torchpose.camera import (
+    PinholeCamera,
+    arm_in_body_frame,
+    arm_in_camera_frame,
+    map_pixels,
+    project,
+)
+from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
+from torchpose.errors import (
+    CameraError,
+    CovarianceError,
+    FileFormatError,
+    InputError,
+    OutputError,
+    PriorError,
+    ShapeError,
+    SkeletonError,
+)
+from torchpose.learning.recipes import fit_calibration, fit_kinect_prior
+from torchpose.math import euler_to_matrix
+from torchpose.metrics import joint_errors_3d
+from torchpose.priors import UpperBodyPrior, fit_upper_body_prior
+from torchpose.skeleton import UPPER_BODY
+from torchpose.skeleton.neck import KINECT_NECK
+from torchpose.upper_body import METHODS, PoseTrack, UpperBodyTracker
+from torchpose.upper_body.process_noise import default_process_cov
+
+NAMES = list(KEYPOINT_NAMES)
+
+
+@pytest.fixture(scope="module")
+def prior():
+    """A small prior with windows, fitted on two performers of other sizes."""
+    recordings = [recording(performer(400, seed=s).body, person=f"p{s}", fps=30.0) for s in (1, 2)]
+    return fit_kinect_prior(
+        recordings, 6, window_components=8, window_samples=4000, n_samples=8000, pose_steps=20
+    )
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Truth in camera axes, and noisy keypoints with a gap of one second."""
+    truth = performer(150, seed=0).joints
+    return truth, noisy_keypoints(truth, std_px=3.0, gap=("hand_right", 2.0, 1.0))
+
+
+def mean_error(track, truth):
+    return float(joint_errors_3d(track.joints3d[0], truth).mean())
+
+
+@pytest.mark.parametrize("smoothing", [None, "full", 3, 20])
+@pytest.mark.parametrize("method", [None, "mkf-fixed"])
+def test_the_performer_is_tracked_better_than_by_the_mean_pose(prior, scene, method, smoothing):
+    truth, keypoints = scene
+    tracker = UpperBodyTracker(prior, demo_camera(), method, smoothing=smoothing)
+    track = tracker(keypoints[None], names=NAMES)
+    joints = prior.left.moments()[0][:15].view(5, 3), prior.right.moments()[0][:15].view(5, 3)
+    uvl = torch.cat([joints[0], joints[1][:3].flip(0)])
+    still = torch.stack([uvl[:, 0] - 319.5, uvl[:, 1] - 239.5, torch.full((8,), 525.0)], 1)
+    still = (still * uvl[:, 2:] / 525.0).expand(len(truth), 8, 3)
+    baseline = float(joint_errors_3d(still, truth).mean())
+    assert mean_error(track, truth) < 0.8 * baseline
+    assert track.joints2d.shape == (1, 150, 8, 2)
+    assert (track.observed[0, 60:90, 7] == 0).all() and track.observed[0, :60, 7].all()
+    assert (torch.linalg.eigvalsh(track.covariance3d) > 0).all()
+    pixels = project(truth, tracker.camera.matrix, torch.eye(3).double(), torch.zeros(3).double())
+    measured = (track.joints2d[0, :, [0, 3, 4]] - pixels[:, [0, 3, 4], :2]).norm(dim=-1)
+    assert measured.mean() < 8
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_runs_and_honours_generators(prior, scene, method):
+    _, keypoints = scene
+    options = {"n_particles": 200} if method.startswith("pf") else {}
+    tracker = UpperBodyTracker(prior, demo_camera(), method=method, **options)
+    batch = keypoints[None, :20].expand(2, -1, -1, -1)
+    lengths = torch.tensor([20, 12])
+    generators = [torch.Generator().manual_seed(b) for b in range(2)]
+    track = tracker(batch, names=NAMES, generator=generators, lengths=lengths)
+    assert track.joints3d.shape == (2, 20, 8, 3)
+    assert torch.isfinite(track.joints3d).all()
+    alone = tracker(batch[1:, :12], names=NAMES, generator=[torch.Generator().manual_seed(1)])
+    tolerance = 1e-2 if method.startswith("pf") else 1e-9  # particles are float32
+    torch.testing.assert_close(
+        track.joints3d[1, :12], alone.joints3d[0], rtol=tolerance, atol=tolerance
+    )
+
+
+def test_names_may_come_in_any_order_and_subset(prior, scene):
+    _, keypoints = scene
+    tracker = UpperBodyTracker(prior, demo_camera())
+    expected = tracker(keypoints[None], names=NAMES).joints3d
+    eight = torch.full((1, 150, 8, 2), float("nan"), dtype=torch.float64)
+    eight[0][:, [UPPER_BODY.index(n) for n in NAMES]] = keypoints
+    torch.testing.assert_close(tracker(eight).joints3d, expected)
+    order = [2, 0, 3, 1]
+    spelled = ["LeftHand", "head", "rhand", "neck"]
+    shuffled = tracker(keypoints[None][:, :, order], names=spelled).joints3d
+    torch.testing.assert_close(shuffled, expected)
+    hands = tracker(keypoints[None][:, :, 2:], names=NAMES[2:])
+    assert torch.isfinite(hands.joints3d).all()
+    assert not hands.observed[..., 3].any()
+
+
+def test_elbows_are_measured_where_they_are_given(prior, scene):
+    truth, _ = scene
+    eight = project(truth, demo_camera().matrix, torch.eye(3).double(), torch.zeros(3).double())
+    tracker = UpperBodyTracker(prior, demo_camera(), method="mkf-fixed")
+    few = eight[None, ..., :2].clone()
+    few[:, :, [1, 2, 5, 6]] = torch.nan
+    assert mean_error(tracker(eight[None, ..., :2]), truth) < mean_error(tracker(few), truth)
+
+
+def test_another_camera_is_mapped_to_the_priors(prior, scene):
+    _, keypoints = scene
+    near = demo_camera()
+    other = PinholeCamera(1000.0, 990.0, 640.0, 360.0)
+    moved = map_pixels(keypoints, near.matrix, other.matrix)
+    first = UpperBodyTracker(prior, near, measurement_std=3.0)(keypoints[None], names=NAMES)
+    scale = 1000.0 / 525.0
+    second = UpperBodyTracker(prior, other, measurement_std=3.0 * scale)(moved[None], names=NAMES)
+    torch.testing.assert_close(first.joints3d, second.joints3d, rtol=1e-2, atol=5e-3)
+    mapped = map_pixels(first.joints2d, near.matrix, other.matrix)
+    torch.testing.assert_close(mapped, second.joints2d, rtol=1e-2, atol=2.0)
+
+
+def test_confidence_zero_is_missing_and_low_confidence_counts_less(prior, scene):
+    _, keypoints = scene
+    tracker = UpperBodyTracker(prior, demo_camera(), method="mkf-fixed")
+    ones = torch.ones(1, 150, 4, dtype=torch.float64)
+    plain = tracker(keypoints[None], names=NAMES)
+    torch.testing.assert_close(tracker(keypoints[None], ones, NAMES).joints3d, plain.joints3d)
+    hidden = ones.clone()
+    hidden[:, 20:40, 2] = 0
+    track = tracker(keypoints[None], hidden, NAMES)
+    assert not track.observed[0, 20:40, 0].any()
+    hidden[:, 20:40, 2] = torch.nan
+    torch.testing.assert_close(tracker(keypoints[None], hidden, NAMES).joints3d, track.joints3d)
+    low = ones.clone()
+    low[:, :, 2] = 0.1
+    wide = tracker(keypoints[None], low, NAMES)
+    assert (wide.covariance2d[0, :, 0, 0, 0] > plain.covariance2d[0, :, 0, 0, 0]).all()
+
+
+@pytest.mark.parametrize("method", ["window-mixture", "mkf-fixed"])
+def test_the_same_covariance_everywhere_is_a_measurement_std(prior, scene, method):
+    camera, keypoints = demo_camera(), scene[1]
+    points = keypoints[None, :30]
+    std = torch.tensor([4.0, 3.0, 3.0, 2.0, 5.0])
+    usual = UpperBodyTracker(prior, camera, method, measurement_std=std)
+    each = UpperBodyTracker(prior, camera, method)
+    by_name = {"head": 2.0, "neck": 5.0, "hand": 4.0}
+    own = torch.tensor([by_name[name.split("_")[0]] for name in NAMES], dtype=torch.float64)
+    cov = (own.square()[:, None, None] * torch.eye(2)).expand(1, 30, 4, 2, 2)
+    one, other = usual(points, names=NAMES), each(points, names=NAMES, covariance=cov)
+    if method == "mkf-fixed":
+        torch.testing.assert_close(one.joints3d, other.joints3d, rtol=1e-9, atol=1e-9)
+        return
+    # the hands of earlier frames keep the tracker's own noise
+    assert (one.joints3d - other.joints3d).abs().max() < 0.02
+
+
+def test_a_doubtful_hand_pulls_less(prior, scene):
+    camera, keypoints = demo_camera(), scene[1]
+    points = keypoints[None, :20].clone()
+    points[:, 10, NAMES.index("hand_left")] += 60
+    tracker = UpperBodyTracker(prior, camera)
+    cov = torch.eye(2, dtype=torch.float64).repeat(1, 20, 4, 1, 1) * 9
+    sure = tracker(points, names=NAMES, covariance=cov)
+    cov[:, 10, NAMES.index("hand_left")] *= 100
+    doubtful = tracker(points, names=NAMES, covariance=cov)
+    hand = UPPER_BODY.index("hand_left")
+    at = points[0, 10, NAMES.index("hand_left")]
+    near = (sure.joints2d[0, 10, hand] - at).norm()
+    assert (doubtful.joints2d[0, 10, hand] - at).norm() > near + 5
+
+
+def test_a_covariance_that_is_none_is_refused(prior, scene):
+    camera, keypoints = demo_camera(), scene[1]
+    tracker = UpperBodyTracker(prior, camera)
+    cov = -torch.eye(2, dtype=torch.float64).expand(1, 5, 4, 2, 2)
+    with pytest.raises(CovarianceError, match="covariance"):
+        tracker(keypoints[None, :5], names=NAMES, covariance=cov)
+    with pytest.raises(ShapeError, match="covariance"):
+        tracker(keypoints[None, :5], names=NAMES, covariance=cov[:, :4])
+
+
+def test_covariances_grow_in_the_gap(prior, scene):
+    _, keypoints = scene
+    for method in ("window-mixture", "mkf-fixed"):
+        track = UpperBodyTracker(prior, demo_camera(), method)(keypoints[None], names=NAMES)
+        spread = track.covariance3d[0, :, 7].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+        assert spread[70:85].mean() > spread[30:55].mean()
+
+
+def test_frames_and_the_static_camera(prior, scene):
+    truth, keypoints = scene
+    body = UpperBodyTracker(prior, demo_camera(), frame="body")(keypoints[None], names=NAMES)
+    still = UpperBodyTracker(prior, demo_camera(), static_camera=True)(keypoints[None], names=NAMES)
+    camera = UpperBodyTracker(prior, demo_camera())(keypoints[None], names=NAMES)
+    assert abs(float(body.joints3d[0, :, 4].norm(dim=-1).mean())) < 0.1  # centred on the neck
+    for other in (body, still):
+        a, b = mean_error(other, truth), mean_error(camera, truth)
+        assert math.isclose(a, b, rel_tol=1e-6)  # the same pose, put elsewhere
+    assert (camera.joints3d[0, :, 4, 2] - truth[:, 4, 2]).abs().mean() < 0.5
+    assert still.joints3d[0, :, 4].std(0).max() < camera.joints3d[0, :, 4].std(0).max()
+
+
+def test_process_noise_follows_the_frame_rate(prior):
+    slow = UpperBodyTracker(prior, demo_camera(), fps=15.0, method="mkf-fixed")
+    fast = UpperBodyTracker(prior, demo_camera(), fps=60.0, method="mkf-fixed")
+    a, b = (t._filter("left", ("hand", "head", "neck")).process_cov for t in (slow, fast))
+    torch.testing.assert_close(a, 4 * b)
+
+
+def test_evidence_is_that_of_each_frame_and_zero_without_measurements(prior, scene):
+    _, keypoints = scene
+    eight = keypoints[None].clone()
+    eight[:, 30:40] = torch.nan
+    for method in ("window-mixture", "mkf-fixed"):
+        track = UpperBodyTracker(prior, demo_camera(), method)(eight, names=NAMES)
+        assert (track.log_evidence[:, 30:40] == 0).all()
+        assert (track.log_evidence[:, :30] != 0).all()
+
+
+def test_results_are_saved_and_loaded(prior, scene, tmp_path):
+    _, keypoints = scene
+    tracker = UpperBodyTracker(prior, demo_camera())
+    single = tracker(keypoints[None], names=NAMES)
+    single.save(tmp_path / "poses.npz")
+    back = PoseTrack.load(tmp_path / "poses.npz")
+    for name in ("joints2d", "joints3d", "covariance3d", "observed", "log_evidence", "lengths"):
+        torch.testing.assert_close(getattr(back, name), getattr(single, name))
+    assert back.names == UPPER_BODY and back.fps == single.fps and back.notes == single.notes
+    assert back.method == single.method == "window-mixture"
+    double = tracker(
+        keypoints[None].expand(2, -1, -1, -1), names=NAMES, lengths=torch.tensor([150, 90])
+    )
+    double.save(tmp_path / "two.npz")
+    assert len(PoseTrack.load(tmp_path / "two.npz")) == 2
+    assert double.sequence(1).joints3d.shape == (1, 90, 8, 3)
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "poses.npz").read_bytes()[:500])
+    with pytest.raises(FileFormatError, match="truncated"):
+        PoseTrack.load(tmp_path / "cut.npz")
+    with pytest.raises(OutputError):
+        single.save(tmp_path / "poses.npz" / "inside.npz")
+
+
+def test_files_of_older_releases_do_not_say_what_ran(prior, scene, tmp_path):
+    track = UpperBodyTracker(prior, demo_camera())(scene[1][None, :20], names=NAMES)
+    track.save(tmp_path / "poses.npz")
+    arrays = dict(np.load(tmp_path / "poses.npz"))
+    del arrays["method"]
+    np.savez(tmp_path / "older.npz", **arrays)
+    assert PoseTrack.load(tmp_path / "older.npz").method == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"camera": None}, CameraError, "a camera is needed"),
+        ({"method": "mkf"}, InputError, "mkf-fixed"),
+        ({"smoothing": "half"}, InputError, "smoothing"),
+        ({"smoothing": -1}, InputError, "smoothing"),
+        ({"smoothing": 3, "method": "mkf-split"}, InputError, "mkf-fixed"),
+        ({"smoothing": 3, "method": "window-mixture"}, InputError, "look 16 frames ahead"),
+        ({"frame": "body", "static_camera": True}, InputError, "static_camera"),
+        ({"method": "mkf-fixed", "steady": True}, InputError, "steady=True needs"),
+        ({"frame": "world"}, InputError, "camera"),
+        ({"fps": 0.0}, InputError, "fps"),
+        ({"measurement_std": 0.0}, InputError, "positive"),
+        ({"measurement_std": [1.0, 2.0]}, ShapeError, "measurement_std"),
+        ({"n_particles": 10}, InputError, "pf-mixture, pf-walk, pf-walk-unscaled"),
+        ({"uniform_weight": 0.1}, InputError, "is of mkf-fixed"),
+        ({"burn_in": 5}, InputError, "is of mkf-fixed, mkf-sampled, mkf-split"),
+        ({"reset_below": -9.0}, InputError, "is of mkf-fixed"),
+        ({"tracks": "split"}, InputError, "of no method"),
+        ({"method": "mkf-sampled", "likelihood_power": 0.5}, InputError, "does not apply"),
+        ({"method": "mkf-split", "reset_below": -9.0}, InputError, "does not apply"),
+        ({"method": "mkf-fixed", "gamma": 0.9}, InputError, "transition 'paper'"),
+        (
+            {
+                "method": "mkf-fixed",
+                "transition": "ou",
+                "gamma": 0.9,
+                "process_cov": torch.ones(21),
+            },
+            InputError,
+            "process_cov does not apply",
+        ),
+    ],
+)
+def test_bad_settings_are_refused(prior, options, error, message):
+    with pytest.raises(error, match=message):
+        UpperBodyTracker(prior, **{"camera": demo_camera(), **options})
+
+
+def test_a_prior_of_another_kind_is_refused(prior):
+    with pytest.raises(PriorError, match="UpperBodyPrior"):
+        UpperBodyTracker(prior.left, demo_camera())
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"keypoints": torch.zeros(10, 4, 2)}, ShapeError, "keypoints"),
+        ({"keypoints": torch.zeros(1, 0, 4, 2)}, InputError, "at least one"),
+        ({"keypoints": torch.full((1, 10, 4, 2), float("inf"))}, InputError, "finite"),
+        (
+            {"keypoints": torch.full((1, 10, 4, 2), float("nan"))},
+            InputError,
+            "no joint is measured",
+        ),
+        ({"names": ["head", "neck", "tail", "hand_left"]}, SkeletonError, "tail"),
+        ({"names": ["head"]}, InputError, "4 keypoints"),
+        ({"names": None}, InputError, "names may be left out"),
+        ({"confidence": torch.ones(1, 10, 3)}, ShapeError, "confidence"),
+        ({"confidence": torch.full((1, 10, 4), 7.0)}, InputError, r"\[0, 1\]"),
+        ({"confidence": torch.full((1, 10, 4), -0.1)}, InputError, r"\[0, 1\]"),
+        ({"mask": torch.ones(1, 9, 4, dtype=torch.bool)}, ShapeError, "mask"),
+    ],
+)
+def test_bad_keypoints_are_refused(prior, change, error, message):
+    arguments = {"keypoints": torch.full((1, 10, 4, 2), 240.0), "names": NAMES}
+    with pytest.raises(error, match=message):
+        UpperBodyTracker(prior, demo_camera())(**{**arguments, **change})
+
+
+def test_a_stretch_without_any_measurement_is_bounded(prior):
+    keypoints = torch.full((1, 300, 4, 2), 240.0)
+    keypoints[:, 50:220] = torch.nan
+    tracker = UpperBodyTracker(prior, demo_camera())
+    with pytest.raises(InputError, match="170 frames, from frame 50 of sequence 0"):
+        tracker(keypoints, names=NAMES)
+    filled = UpperBodyTracker(prior, demo_camera(), max_gap=None)(keypoints, names=NAMES)
+    assert torch.isfinite(filled.joints3d).all()
+
+
+def test_a_neck_of_another_kind_is_left_out_and_said(prior):
+    keypoints = torch.full((1, 10, 4, 2), 240.0)
+    track = UpperBodyTracker(prior, demo_camera(), neck="low-neck")(keypoints, names=NAMES)
+    assert not track.observed[..., 4].any()
+    assert any("low-neck" in note and "not measured" in note for note in track.notes)
+
+
+def test_a_neck_between_the_shoulders_is_put_where_the_prior_has_it(prior, scene):
+    truth, keypoints = scene
+    lower = keypoints.clone()
+    head, neck = NAMES.index("head"), NAMES.index("neck")
+    share = KINECT_NECK.fraction
+    lower[:, neck] = (keypoints[:, neck] - share * keypoints[:, head]) / (1 - share)
+    tracker = UpperBodyTracker(prior, demo_camera(), neck="mid-shoulder")
+    track = tracker(lower[None], names=NAMES)
+    assert any("mid-shoulder" in note and "37 %" in note for note in track.notes)
+    plain = UpperBodyTracker(prior, demo_camera())(keypoints[None], names=NAMES)
+    assert track.observed[0, :, 4].all()
+    # The same places, measured less surely.
+    assert mean_error(track, truth) == pytest.approx(mean_error(plain, truth), rel=0.15)
+    assert (track.covariance2d[0, 30:, 4] - plain.covariance2d[0, 30:, 4]).diagonal(
+        dim1=-2, dim2=-1
+    ).mean() > 0
+    hidden = lower.clone()
+    hidden[:, head] = torch.nan
+    assert not tracker(hidden[None], names=NAMES).observed[..., 4].any()
+
+
+def test_shoulders_stand_for_a_neck_that_is_not_there(prior, scene):
+    truth, keypoints = scene
+    eye, zeros = torch.eye(3).double(), torch.zeros(3).double()
+    shoulders = project(truth, demo_camera().matrix, eye, zeros)[:, [2, 5], :2]
+    wide = torch.cat([keypoints, shoulders], 1)[None]
+    names = [*NAMES, "shoulder_left", "shoulder_right"]
+    keep = [i for i, name in enumerate(names) if name != "neck"]
+    tracker = UpperBodyTracker(prior, demo_camera())
+    track = tracker(wide[:, :, keep], names=[names[i] for i in keep])
+    assert track.observed[0, :, 4].all()
+    assert any("no neck among the keypoints" in note for note in track.notes)
+    own = UpperBodyTracker(prior, demo_camera(), neck="low-neck")(wide, names=names)
+    torch.testing.assert_close(own.joints3d, track.joints3d)
+    torch.testing.assert_close(tracker(wide, names=names).notes, ())
+
+
+def test_a_prior_without_noise_gets_a_default(prior):
+    bare = UpperBodyPrior(prior.left, prior.right, replace(prior.info, extra={}))
+    assert default_process_cov(bare).shape == (21,)
+    track = UpperBodyTracker(bare, demo_camera())(torch.full((1, 5, 4, 2), 240.0), names=NAMES)
+    assert torch.isfinite(track.joints3d).all()
+
+
+def test_lifting_agrees_with_monte_carlo(prior):
+    mean = prior.left.means[0]
+    cov = prior.left.covariances[0] * 0.05
+    matrix = prior.info.matrix
+    draws = torch.distributions.MultivariateNormal(mean, cov).sample((40_000,))
+    uvl = draws[:, :15].view(-1, 5, 3)
+    camera = torch.cat([uvl[..., :2], torch.ones_like(uvl[..., :1])], -1)
+    camera = (torch.linalg.inv(matrix) @ camera[..., None])[..., 0] * uvl[..., 2:]
+    rotation = euler_to_matrix(draws[:, 15:18], "zxy")
+    body = (rotation.mT[:, None] @ (camera - draws[:, None, 18:])[..., None])[..., 0]
+    for points, (middle, spread) in (
+        (camera, arm_in_camera_frame(mean, cov, matrix)),
+        (body, arm_in_body_frame(mean, cov, matrix, "zxy")),
+    ):
+        scale = points.std(0)
+        assert ((middle - points.mean(0)).abs() < 0.1 * scale + 5 * scale / 200).all()
+        sampled = torch.stack([torch.cov(points[:, j].T) for j in range(5)])
+        size = scale[:, :, None] * scale[:, None, :]
+        # The neck is the origin of the body frame: hardly any variance is left to compare.
+        assert ((spread - sampled).abs() < 0.2 * size + 1e-7)[:4].all()
+
+
+def test_calibration_finds_scale_and_floor():
+    g = torch.Generator().manual_seed(0)
+    covs = torch.diag_embed(torch.rand(6000, 2, 3, generator=g, dtype=torch.float64) * 1e-3 + 1e-4)
+    noise = torch.randn(6000, 2, 3, generator=g, dtype=torch.float64)
+    true = torch.stack([2.0 * covs[:, 0], 0.5 * covs[:, 1]], 1)
+    true = true + torch.eye(3) * torch.tensor([0.0, 4e-4])[:, None, None]
+    errors = (torch.linalg.cholesky(true) @ noise[..., None])[..., 0]
+    scale, floor = fit_calibration(errors, covs)
+    fitted = scale[:, None, None] * covs + floor[:, None, None] * torch.eye(3)
+    squared = (errors[..., None, :] @ torch.linalg.solve(fitted, errors[..., None])).squeeze()
+    for level, bound in ((0.5, 2.366), (0.9, 6.251)):
+        share = (squared < bound).double().mean(0)
+        assert ((share - level).abs() < 0.03).all()
+    with pytest.raises(InputError, match="at least one"):
+        fit_calibration(errors[:0], covs[:0])
+
+
+def test_the_recipe_is_repeatable_and_saved(prior, tmp_path):
+    prior.save(tmp_path / "prior.safetensors")
+    back = UpperBodyPrior.load(tmp_path / "prior.safetensors")
+    assert set(back.windows) == {"causal", "full"}
+    assert {f"calibration_scale_{m}" for m in ("pose", "causal", "full")} <= set(back.noise)
+    torch.testing.assert_close(back.windows["full"].left.means, prior.windows["full"].left.means)
+    recordings = [recording(performer(400, seed=s).body, person=f"p{s}") for s in (1, 2)]
+    again = fit_kinect_prior(
+        recordings, 6, window_components=8, window_samples=4000, n_samples=8000, pose_steps=20
+    )
+    again.save(tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == (
+        tmp_path / "prior.safetensors"
+    ).read_bytes()
+
+
+def test_one_person_gives_a_prior_without_calibration():
+    single = fit_kinect_prior(
+        [recording(performer(120, seed=1).body)], 3, window_components=3, window_samples=1000,
+        n_samples=1000, pose_steps=5,
+    )  # fmt: skip
+    assert not any(name.startswith("calibration") for name in single.noise)
+
+
+def test_fitting_poses_alone_is_still_possible():
+    bare = fit_upper_body_prior([recording(performer(120, seed=1).body)], 3, n_samples=1000)
+    assert not bare.windows

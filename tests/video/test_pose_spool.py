@@ -1,0 +1,73 @@
+"""Blocks of poses on disk are the poses."""
+
+import pytest
+import torch
+
+from torchpose.errors import InputError, OutputError
+from torchpose.upper_body import PoseTrack
+from torchpose.video.pose_spool import PoseSpool
+
+FIELDS = ("joints2d", "joints3d", "covariance2d", "covariance3d", "observed", "log_evidence")
+
+
+def poses(n_frames, seed=0, failed_at=-1):
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape):
+        return torch.randn(1, n_frames, *shape, generator=generator, dtype=torch.float64)
+
+    def spread(dim):
+        factor = draw(8, dim, dim)
+        return factor @ factor.mT
+
+    return PoseTrack(
+        draw(8, 2),
+        draw(8, 3),
+        spread(2),
+        spread(3),
+        draw(8) > 0,
+        draw(2),
+        torch.tensor([n_frames]),
+        torch.eye(3, dtype=torch.float64),
+        torch.tensor([failed_at]),
+        fps=25.0,
+        notes=("a note",),
+        method="pf-walk",
+    )
+
+
+def test_blocks_come_back_as_one_track_that_can_be_cut_saved_and_outlives_the_spool(tmp_path):
+    blocks = [poses(3, 1), poses(1, 2), poses(32, 3)]
+    spool = PoseSpool(tmp_path)
+    for block in blocks:
+        spool.append(block)
+    assert len(spool) == 36
+    track, part = spool.track(), spool.track(5)
+    del spool
+    assert list(tmp_path.iterdir()) == []
+    for name in FIELDS:
+        whole = torch.cat([getattr(block, name) for block in blocks], 1)
+        assert torch.equal(getattr(track, name), whole)
+        assert torch.equal(getattr(part, name), whole[:, :5])
+    assert (track.fps, track.notes, int(track.lengths)) == (25.0, ("a note",), 36)
+    assert track.method == "pf-walk"
+    track.save(tmp_path / "poses.npz")
+    assert torch.equal(PoseTrack.load(tmp_path / "poses.npz").joints3d, track.joints3d)
+
+
+def test_the_first_failure_is_known():
+    spool = PoseSpool()
+    for block in (poses(4), poses(4, failed_at=2), poses(4, failed_at=0)):
+        spool.append(block)
+    assert spool.track().failed_at.tolist() == [6]
+
+
+def test_misuse_is_refused(tmp_path):
+    spool = PoseSpool()
+    with pytest.raises(InputError, match="poses"):
+        spool.track()
+    spool.append(poses(2))
+    with pytest.raises(InputError, match="1 to 2"):
+        spool.track(3)
+    with pytest.raises(OutputError, match="cannot be kept"):
+        PoseSpool(tmp_path / "missing")

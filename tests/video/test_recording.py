@@ -1,0 +1,118 @@
+"""Persons of a recording: who comes, goes and returns, from scripted measurements."""
+
+import pytest
+import torch
+
+from tests.priors.poses import recording
+from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
+from torchpose.learning.recipes import fit_kinect_prior
+from torchpose.measure import MEASURED, FrameMeasurements, HandMeasurements
+from torchpose.measure.upper_body import rounded_covariance
+from torchpose.upper_body import UpperBodyTracker
+from torchpose.video.person_stream import PersonStream
+from torchpose.video.recording import Recording
+
+FIELDS = ("joints2d", "joints3d", "covariance3d")
+GAP = 20
+
+
+@pytest.fixture(scope="module")
+def tracker():
+    people = [recording(performer(120, seed=1).body, person="p", fps=30.0)]
+    prior = fit_kinect_prior(
+        people, 3, window_components=4, window_samples=1000, n_samples=2000, pose_steps=5
+    )
+    return UpperBodyTracker(prior, demo_camera(), fps=30.0, max_gap=None)
+
+
+@pytest.fixture(scope="module")
+def keypoints():
+    order = [KEYPOINT_NAMES.index(name) for name in MEASURED]
+    return noisy_keypoints(performer(120).joints, std_px=2.0)[:, order]
+
+
+COV = torch.full((4,), 9.0, dtype=torch.float64)[:, None, None] * torch.eye(2)
+
+
+def frames(keypoints, present):
+    """Measurements of each frame; `present` [T] holds the numbers of who is there."""
+    found = []
+    for t, numbers in enumerate(present):
+        person = torch.tensor(numbers, dtype=torch.long)
+        points = keypoints[t].expand(len(numbers), -1, -1) + 5.0 * person[:, None, None]
+        nothing = HandMeasurements(
+            points[:, 2:],
+            COV[:2].expand(len(numbers), -1, -1, -1),
+            torch.ones(len(numbers), 2),
+            torch.ones(len(numbers), 2, dtype=torch.bool),
+        )
+        cov = COV.double().expand(len(numbers), -1, -1, -1)
+        found.append(FrameMeasurements(person, points, cov, torch.zeros(len(numbers), 3), nothing))
+    return found
+
+
+def record(tracker, found, size, smoother=None):
+    kept = Recording(PersonStream(tracker, MEASURED), GAP)
+    for start in range(0, len(found), size):
+        kept.append(found[start : start + size])
+    return kept.finish(smoother)
+
+
+@pytest.mark.parametrize("size", [1, 7, 32, 200])
+def test_one_person_is_tracked_as_from_keypoints(tracker, keypoints, size):
+    found = frames(keypoints, [[0]] * 60)
+    (person,) = record(tracker, found, size)
+    assert (person.number, person.first_frame, len(person)) == (0, 0, 60)
+    whole = tracker(
+        keypoints[None, :60], names=MEASURED, covariance=COV.double().expand(1, 60, -1, -1, -1)
+    )
+    for name in FIELDS:
+        torch.testing.assert_close(
+            getattr(person.track, name), getattr(whole, name), rtol=1e-9, atol=1e-9
+        )
+
+
+@pytest.mark.parametrize("size", [1, 9, 32])
+def test_poses_end_when_somebody_is_away_for_too_long_and_begin_anew(tracker, keypoints, size):
+    present = [[]] * 5 + [[0]] * 30 + [[]] * 35 + [[0]] * 20 + [[]] * 30
+    (person,) = record(tracker, frames(keypoints, present), size)
+    assert (person.first_frame, len(person)) == (5, 85)
+    there = person.track.joints3d[0].isfinite().all(-1).all(-1)
+    assert torch.nonzero(~there).flatten().tolist() == list(range(30 + GAP, 65))
+    assert not person.track.observed[0, 30:65].any() and person.track.observed[0, 65:, 3:5].all()
+    anew = tracker(
+        keypoints[None, 70:90], names=MEASURED, covariance=COV.double().expand(1, 20, -1, -1, -1)
+    )
+    torch.testing.assert_close(
+        person.track.joints3d[0, 65:], anew.joints3d[0], rtol=1e-9, atol=1e-9
+    )
+    assert person.track.failed_at.tolist() == [-1]
+
+
+def test_persons_do_not_mix_and_the_one_seen_longest_is_first(tracker, keypoints):
+    present = [[0, 1]] * 25 + [[1, 2]] * 10 + [[1]] * 20
+    people = record(tracker, frames(keypoints, present), 16)
+    assert [(p.number, p.first_frame, len(p)) for p in people] == [(1, 0, 55), (0, 0, 25)]
+    alone = record(tracker, frames(keypoints, [[1]] * 55), 16)[0]
+    torch.testing.assert_close(people[0].track.joints3d, alone.track.joints3d)
+    assert torch.equal(people[0].keypoints, alone.keypoints)
+
+
+def test_smoothed_poses_respect_long_gaps_too(tracker, keypoints):
+    present = [[0]] * 30 + [[]] * 30 + [[0]] * 20
+    smoother = UpperBodyTracker(
+        tracker.prior, demo_camera(), fps=30.0, max_gap=None, smoothing="full"
+    )
+    (person,) = record(tracker, frames(keypoints, present), 32, smoother)
+    there = person.track.joints3d[0].isfinite().all(-1).all(-1)
+    assert torch.nonzero(~there).flatten().tolist() == list(range(30 + GAP, 60))
+    (filtered,) = record(tracker, frames(keypoints, present), 32)
+    assert not torch.allclose(person.track.joints3d[0, :30], filtered.track.joints3d[0, :30])
+
+
+def test_covariances_are_rounded_to_few_levels_of_the_same_size():
+    std = torch.linspace(1, 40, 400, dtype=torch.float64)
+    rounded = rounded_covariance(std.square()[:, None, None] * torch.eye(2))
+    ratio = rounded[:, 0, 0].sqrt() / std
+    assert ratio.min() > 2**-0.26 and ratio.max() < 2**0.26
+    assert len(rounded[:, 0, 0].unique()) <= 12 and bool((rounded[:, 0, 1] == 0).all())

@@ -1,0 +1,115 @@
+"""Persons of a video who leave, return and cross, rendered."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.priors.poses import recording
+from torchpose import VideoTracker
+from torchpose.demo import demo_camera, performer
+from torchpose.errors import InputError
+from torchpose.learning.recipes import fit_kinect_prior
+
+pytest.importorskip("matplotlib", reason="the performer's face comes from matplotlib")
+FACE = 3  # the head, in `UPPER_BODY`
+
+
+@pytest.fixture(scope="module")
+def prior():
+    people = [recording(performer(120, seed=1).body, person="p", fps=30.0)]
+    return fit_kinect_prior(
+        people, 3, window_components=4, window_samples=1000, n_samples=2000, pose_steps=5
+    )
+
+
+def rendered(*performances):
+    from torchpose.demo.rendering import Scene, render_performance
+
+    return list(
+        render_performance(performances, demo_camera(), scene=Scene(clutter=False, exposure=0.0))
+    )
+
+
+def test_somebody_who_leaves_and_comes_back_is_the_same_person(prior):
+    shown = rendered(performer(60, distance=1.6))
+    nobody = [np.full_like(shown[0], 120)] * 80
+    tracker = VideoTracker(prior, demo_camera(), max_gap=1.0)
+    (person,) = tracker(shown[:30] + nobody + shown[30:])
+    there = person.track.joints3d[0].isfinite().all(-1).all(-1)
+    away = torch.nonzero(~there).flatten() + person.first_frame
+    # for a second the face is followed blindly, for another one poses are inferred
+    assert 85 <= int(away[0]) <= 92 and 108 <= int(away[-1]) <= 116
+    assert len(away) == int(away[-1]) - int(away[0]) + 1
+    assert person.first_frame + len(person) == 140
+    assert person.track.failed_at.tolist() == [-1]
+
+
+def test_two_who_cross_stay_who_they_are(prior):
+    from torchpose.demo.rendering import crossing
+
+    pair = crossing(100, seconds=3.0)
+    tracker = VideoTracker(prior, demo_camera())
+    people = tracker(rendered(*pair))
+    assert len(people) == 2
+    camera = demo_camera()
+    heads = [camera(walker.joints[:, FACE])[:, :2] for walker in pair]
+    sides = torch.stack([heads[0][:, 0] > heads[1][:, 0]])
+    assert bool(sides.any()) and not bool(sides.all())  # they do cross
+    for person in people:
+        rows = slice(person.first_frame, person.first_frame + len(person))
+        found = person.keypoints[:, 0]
+        apart = torch.stack([(found - head[rows]).norm(dim=1) for head in heads])
+        seen = apart.isfinite().all(0)
+        nearest = apart[:, seen].argmin(0)
+        assert float((nearest == nearest.mode().values).double().mean()) > 0.95
+    assert people[0].number != people[1].number
+
+
+def test_only_the_largest_face_is_followed_if_asked_for(prior):
+    from torchpose.demo.rendering import crossing
+
+    tracker = VideoTracker(prior, demo_camera(), max_persons=1)
+    people = tracker(rendered(*crossing(30)))
+    assert len(people) == 1
+
+
+def test_candidates_of_the_last_pose_reach_the_hands_live_and_offline(prior):
+    shown = rendered(performer(30, distance=1.6))
+    tracker = VideoTracker(prior, demo_camera(), candidates=True)
+    asked = []
+    step = tracker.measurer.hand_tracker.step
+
+    def spy(*arguments):
+        asked.append(arguments[5])
+        return step(*arguments)
+
+    tracker.measurer.hand_tracker.__dict__["step"] = spy
+    (person,) = tracker(shown)
+    given = [e for e in asked if len(e.mean) and bool(e.mean.isfinite().all())]
+    assert len(given) >= 25
+    last = person.track.joints2d[0, -2, [0, 7]]
+    torch.testing.assert_close(given[-1].mean[0], last)
+    state, live = tracker.init(), []
+    for image in shown:
+        state, people = tracker.step(state, image)
+        live += [found.pose.joints3d[0, 0] for found in people]
+    whole = person.track.joints3d[0]
+    torch.testing.assert_close(torch.stack(live[: len(whole)]), whole, rtol=1e-9, atol=1e-9)
+
+
+def test_bad_use_is_refused(prior):
+    with pytest.raises(InputError, match="hands must be one of"):
+        VideoTracker(prior, demo_camera(), hands="feet")
+    with pytest.raises(InputError, match="candidates"):
+        VideoTracker(prior, demo_camera(), hands="mean-shift", candidates=True)
+    with pytest.raises(InputError, match="max_gap"):
+        VideoTracker(prior, demo_camera(), max_gap=0.0)
+    tracker = VideoTracker(prior, demo_camera())
+    with pytest.raises(InputError, match="uint8"):
+        tracker([np.zeros((20, 20, 3))])
+    with pytest.raises(InputError, match="RGB tensor"):
+        tracker(torch.zeros(1, 20, 20, 3, dtype=torch.uint8))
+    smoother = VideoTracker(prior, demo_camera(), smoothing="full")
+    with pytest.raises(InputError, match="smoothing"):
+        smoother.step(smoother.init(), np.zeros((20, 20, 3), np.uint8))
+    assert tracker([]) == []

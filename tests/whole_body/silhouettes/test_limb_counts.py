@@ -1,0 +1,108 @@
+"""Weights of single limbs against images of them."""
+
+import pytest
+import torch
+
+from tests.whole_body.silhouettes.test_rendering import HEIGHT, WIDTH, make_rig, random_limbs
+from torchpose.body import Limbs
+from torchpose.errors import ShapeError
+from torchpose.whole_body import render_limbs
+from torchpose.whole_body.silhouettes.limb_counts import PartCounts, count_limbs, count_parts
+
+
+def weight_by_pixels(limbs, opposing, rig, silhouettes):
+    """(DX 4): a copy of the silhouette that is 1/2 under the opposing limb, summed under each limb."""
+    image = silhouettes.double().expand(*limbs.start.shape[:-2], -1, -1, -1)
+    if opposing is not None:
+        union = render_limbs(opposing, rig, HEIGHT, WIDTH)
+        image = image * torch.where(union, 0.5, 1.0)
+    single = Limbs(*(x.unsqueeze(-2) for x in limbs))
+    covered = render_limbs(single, rig, HEIGHT, WIDTH)
+    return (covered * image.unsqueeze(-4)).sum((-2, -1))
+
+
+@pytest.mark.parametrize("own_radii", [False, True])
+@pytest.mark.parametrize("chunk", [None, 2])
+def test_weights_are_sums_over_the_halved_silhouette(own_radii, chunk):
+    rig = make_rig(2)
+    limbs = random_limbs(3, 2, n_limbs=7, seed=1, spread=0.3, own_radii=own_radii)
+    opposing = random_limbs(3, 2, n_limbs=5, seed=2, spread=0.3)
+    silhouettes = torch.rand(2, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0)) < 0.6
+    result = count_limbs(limbs, opposing, rig, silhouettes, chunk=chunk)
+    expected = weight_by_pixels(limbs, opposing, rig, silhouettes)
+    assert result.shape == (3, 2, 7, 2)
+    assert torch.equal(result, expected)
+    assert bool((result < count_limbs(limbs, None, rig, silhouettes)).any())
+
+
+def test_without_an_opposing_limb_and_with_a_silhouette_for_each():
+    rig = make_rig(2)
+    limbs = random_limbs(3, n_limbs=4, seed=3)
+    silhouettes = torch.rand(3, 2, HEIGHT, WIDTH) < 0.5
+    result = count_limbs(limbs, None, rig, silhouettes)
+    assert torch.equal(result, weight_by_pixels(limbs, None, rig, silhouettes))
+
+
+def parts_of(*shape, seed, own_radii=True):
+    """Random parts [*shape[:-1], K] of several limbs, none far from the middle of the view."""
+    return random_limbs(*shape[:-1], n_limbs=shape[-1], seed=seed, spread=0.3, own_radii=own_radii)
+
+
+def counts_by_pixels(parts, opposing, rig, silhouettes):
+    """(DX 4) and the area, part by part and pixel by pixel in plain loops."""
+    found = render_limbs(parts, rig, HEIGHT, WIDTH)  # the union of K limbs
+    weight = torch.zeros(found.shape[:-2], dtype=torch.float64)
+    area = torch.zeros(found.shape[:-2], dtype=torch.int64)
+    shape = found.shape[:-4]
+    for index in torch.cartesian_prod(*(torch.arange(n) for n in shape)).reshape(-1, len(shape)):
+        item = tuple(index.tolist())
+        image = silhouettes[item[: silhouettes.ndim - 3]].double().clone()
+        if opposing is not None:
+            taken = [x[item].flatten(0, 1) for x in opposing]
+            image[render_limbs(Limbs(*taken), rig, HEIGHT, WIDTH)] *= 0.5
+        for position in range(found.shape[-4]):
+            for camera in range(found.shape[-3]):
+                covered = found[(*item, position, camera)]
+                weight[(*item, position, camera)] = image[camera][covered].sum()
+                area[(*item, position, camera)] = covered.sum()
+    return PartCounts(weight, area)
+
+
+@pytest.mark.parametrize("chunk", [None, 1])
+@pytest.mark.parametrize("batch_of_silhouettes", [False, True])
+def test_parts_of_several_limbs_weigh_as_their_union(chunk, batch_of_silhouettes):
+    rig, generator = make_rig(2), torch.Generator().manual_seed(4)
+    parts, opposing = parts_of(2, 3, 7, 2, seed=5), parts_of(2, 3, 4, 3, seed=6)
+    shape = (2, 2, HEIGHT, WIDTH) if batch_of_silhouettes else (2, HEIGHT, WIDTH)
+    silhouettes = torch.rand(shape, generator=generator) < 0.6
+    result = count_parts(parts, opposing, rig, silhouettes, chunk=chunk)
+    expected = counts_by_pixels(parts, opposing, rig, silhouettes)
+    assert torch.equal(result.weight, expected.weight)
+    assert torch.equal(result.area, expected.area)
+    plain = count_parts(parts, None, rig, silhouettes)
+    assert torch.equal(plain.weight, counts_by_pixels(parts, None, rig, silhouettes).weight)
+    assert bool((result.weight < plain.weight).any())
+
+
+def test_shares_are_of_the_pixels_within_the_image():
+    rig = make_rig(1)
+    parts = parts_of(1, 3, 2, seed=7)
+    everywhere = torch.ones(1, HEIGHT, WIDTH, dtype=torch.bool)
+    counts = count_parts(parts, None, rig, everywhere)
+    assert torch.equal(counts.share(), (counts.area > 0).double())
+    behind = Limbs(parts.start - 100 * rig.rotation[0, 2], parts.end - 100 * rig.rotation[0, 2],
+                   parts.radii)  # fmt: skip
+    unseen = count_parts(behind, None, rig, everywhere)
+    assert not bool(unseen.area.any()) and not bool(unseen.share().any())
+
+
+def test_shapes_must_fit():
+    rig, silhouettes = make_rig(1), torch.ones(1, HEIGHT, WIDTH, dtype=torch.bool)
+    with pytest.raises(ShapeError, match=r"\[..., S, K, 3\]"):
+        count_parts(random_limbs(3), None, rig, silhouettes)
+    with pytest.raises(ShapeError, match="or the first of them"):
+        count_parts(parts_of(2, 7, 1, seed=1), None, rig, silhouettes.expand(3, 1, -1, -1))
+    with pytest.raises(ShapeError, match="leading dimensions"):
+        count_limbs(
+            random_limbs(3), random_limbs(2), make_rig(1), torch.ones(1, HEIGHT, WIDTH).bool()
+        )

@@ -1,0 +1,100 @@
+import numpy as np
+import pytest
+import torch
+
+from torchpose.body import BODY_15, Body, centres_of
+from torchpose.camera import PinholeCamera
+from torchpose.errors import FileFormatError, InputError, SkeletonError
+from torchpose.whole_body import BodyPoses, load_body
+
+FIELDS = ("state", "state_std", "joints3d", "covariance3d", "log_evidence",
+          "effective_sample_size", "coasting", "respread")  # fmt: skip
+
+
+def poses(frames=4, frame="parent", seed=0):
+    """Poses of a body with bones, limbs and centres of its own."""
+    g = torch.Generator().manual_seed(seed)
+    body = Body.of_height(BODY_15, 1.62, frame)
+    states = 0.2 * torch.randn(frames, body.dim, generator=g, dtype=torch.float64)
+    body = body.altered(radii=1.1 * body.radii, centres=centres_of(body, states))
+    factor = torch.randn(frames, 15, 3, 3, generator=g, dtype=torch.float64)
+    return BodyPoses(
+        body, states, states.abs(), body.joints(states), factor @ factor.mT,
+        torch.randn(frames, generator=g), torch.rand(frames, generator=g),
+        torch.tensor([i == 1 for i in range(frames)]), torch.zeros(frames, dtype=torch.bool),
+        50.0, ("a note",), 7,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("frame", ["parent", "body"])
+def test_what_is_saved_is_loaded(tmp_path, frame):
+    before = poses(frame=frame)
+    before.save(tmp_path / "body.npz")
+    after = BodyPoses.load(tmp_path / "body.npz")
+    for name in FIELDS:
+        assert torch.equal(getattr(after, name), getattr(before, name)), name
+    assert (after.fps, after.notes, after.first_frame) == (50.0, ("a note",), 7)
+    torch.testing.assert_close(after.body.joints(after.state), before.joints3d)
+    torch.testing.assert_close(
+        after.body.limbs(after.state).start, before.body.limbs(before.state).start
+    )
+    torch.testing.assert_close(after.body.radii, before.body.radii)
+    assert after.body.frame == frame
+
+
+def test_details_are_saved_by_their_names(tmp_path):
+    before = poses()
+    before.details = {"actions": torch.rand(4, 3), "released": torch.tensor([True, False] * 2)}
+    before.action_names = ("bend", "wave", "none")
+    before.save(tmp_path / "body.npz")
+    with np.load(tmp_path / "body.npz") as file:
+        assert file["detail_released"].tolist() == [True, False, True, False]
+        arrays = dict(file)
+    after = BodyPoses.load(tmp_path / "body.npz")
+    assert after.action_names == before.action_names
+    assert after.details.keys() == before.details.keys()
+    for name, value in before.details.items():
+        assert torch.equal(after.details[name], value)
+    np.savez(tmp_path / "short.npz", **(arrays | {"detail_released": np.zeros(3, dtype=bool)}))
+    with pytest.raises(FileFormatError, match="detail_released of 4 frames"):
+        BodyPoses.load(tmp_path / "short.npz")
+    # files of before there were details
+    old = {k: v for k, v in arrays.items() if not k.startswith(("detail_", "action_names"))}
+    np.savez(tmp_path / "old.npz", **old)
+    assert BodyPoses.load(tmp_path / "old.npz").details == {}
+
+
+def test_joints_in_the_axes_of_a_camera():
+    before = poses()
+    camera = PinholeCamera(
+        500, 500, 320, 240, 640, 480, rotation=(0.3, -0.2, 0.9), translation=(0.1, 0.2, 3)
+    )
+    seen = before.seen_by(camera)
+    K = camera.matrix
+    uvl = camera(before.joints3d)
+    pixels = seen.joints3d[0] @ K.T
+    torch.testing.assert_close(pixels[..., :2] / pixels[..., 2:], uvl[..., :2])
+    torch.testing.assert_close(seen.joints3d[0, ..., 2], uvl[..., 2])
+    R = camera.rotation_matrix.numpy()
+    expected = R @ before.covariance3d[2, 5].numpy() @ R.T
+    np.testing.assert_allclose(seen.covariance3d[0, 2, 5].numpy(), expected, atol=1e-12)
+    assert seen.observed.shape == (1, 4, 15)
+    assert not seen.observed[0, 1].any()
+    assert seen.observed[0, 0].all()
+
+
+def test_other_files_are_refused(tmp_path):
+    with pytest.raises(InputError):
+        BodyPoses.load(tmp_path / "none.npz")
+    np.savez(tmp_path / "other.npz", joints=np.zeros((2, 15, 3)))
+    with pytest.raises(FileFormatError, match="state"):
+        BodyPoses.load(tmp_path / "other.npz")
+    poses().save(tmp_path / "body.npz")
+    with np.load(tmp_path / "body.npz") as z:
+        arrays = dict(z)
+    np.savez(tmp_path / "skeleton.npz", **(arrays | {"body_skeleton": np.array("body-99")}))
+    with pytest.raises(SkeletonError, match="body-15"):
+        load_body(tmp_path / "skeleton.npz")
+    np.savez(tmp_path / "frame.npz", **(arrays | {"body_frame": np.array("moon")}))
+    with pytest.raises(FileFormatError, match="moon"):
+        load_body(tmp_path / "frame.npz")

@@ -1,0 +1,92 @@
+"""Reading and writing files safely: whole files or none, typed errors, no pickles."""
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchpose._core.leftovers import clear_leftovers, make_temporary_file
+from torchpose._core.npz import read_npz
+from torchpose._core.reading import require_file
+from torchpose.errors import OutputError
+
+__all__ = ["atomic_path", "check_output_folder", "read_npz", "require_file", "write_npz"]
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """A temporary file in the same folder that becomes `path` when the block succeeds.
+
+    The temporary file keeps the suffix of `path` (`numpy.savez` and picture writers look at it).
+    When the block fails it is removed, and what stood at `path` before is untouched. What a killed
+    process left is removed by the next `check_output_folder`.
+
+    Args:
+        path: where the file is to appear; its folder must exist.
+
+    Yields:
+        Path of the temporary file, for the block to write to.
+
+    Raises:
+        OutputError: the folder is missing or not writable, the disk is full, or `path` is a folder.
+
+    >>> import tempfile
+    >>> target = Path(tempfile.mkdtemp()) / "note.txt"
+    >>> with atomic_path(target) as temporary:
+    ...     _ = temporary.write_text("whole or not at all")
+    >>> target.read_text()
+    'whole or not at all'
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise OutputError(f"{path}: is a folder; give the name of a file")
+    try:
+        handle, temporary = make_temporary_file(path.parent, path.suffix)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot write here ({error.strerror or error})") from error
+    if os.name == "nt":  # an open file cannot be renamed there
+        os.close(handle)
+    try:
+        yield temporary
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)  # mkstemp makes files that only their owner can read
+        temporary.replace(path)
+    except OSError as error:
+        if isinstance(error, OutputError):
+            raise
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+        if os.name != "nt":
+            os.close(handle)
+
+
+def check_output_folder(folder: str | Path) -> Path:
+    """Make the folder if need be, see that files can be written there, clear what killed runs left.
+
+    Raises:
+        OutputError: it is a file, cannot be made, or is not writable.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+        clear_leftovers(folder)
+    except OSError as error:
+        raise OutputError(
+            f"{folder}: results cannot be written to this folder ({error.strerror or error}); "
+            "choose another with --out"
+        ) from error
+    return folder
+
+
+def write_npz(path: str | Path, arrays: dict[str, Any]) -> None:
+    """Write arrays as a compressed .npz; the file appears whole or not at all."""
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, **arrays)

@@ -1,0 +1,232 @@
+"""State of modules: what is registered, what is derived from it, and in which precision it is kept."""
+
+import threading
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NamedTuple, Self, TypeVar, overload
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor, nn
+
+from torchpose._core.value_checks import values_visible
+from torchpose.errors import InputError
+
+__all__ = [
+    "WideModule",
+    "derived",
+    "one_run",
+    "outside_inference",
+    "register_given",
+    "wide_or_parameter",
+    "working_precision",
+]
+
+T = TypeVar("T")
+
+
+def register_given(module: nn.Module, name: str, value: Tensor | None) -> None:
+    """Register a tensor that the caller gave, so that the module owns what it depends on.
+
+    A parameter stays that very parameter, which an optimiser may hold. A tensor with a graph is kept
+    as it is, since gradients are to flow through it; it lasts for one backward pass. Anything else is
+    copied: state shares no memory with the caller's tensors or with other entries.
+
+    Args:
+        module: where to. name: of the entry. value: None is registered as an empty entry.
+    """
+    if isinstance(value, nn.Parameter):
+        module.register_parameter(name, value)
+    elif value is None or value.requires_grad:
+        module.register_buffer(name, value)
+    else:
+        module.register_buffer(name, value.detach().clone(memory_format=torch.contiguous_format))
+
+
+@overload
+def wide_or_parameter(value: Tensor | float | Sequence[float]) -> Tensor: ...
+@overload
+def wide_or_parameter(value: None) -> None: ...
+def wide_or_parameter(value: Tensor | float | Sequence[float] | None) -> Tensor | None:
+    """Return a float64 tensor; a parameter stays that parameter, and None is None."""
+    if value is None or isinstance(value, nn.Parameter):
+        return value
+    return torch.as_tensor(value, dtype=torch.float64)
+
+
+class _Mark(NamedTuple):
+    """How a tensor looked when something was derived from it; any change of values changes it."""
+
+    tensor: Tensor
+    version: int
+    address: int
+    dtype: torch.dtype
+
+    @classmethod
+    def of(cls, tensor: Tensor) -> Self:
+        return cls(tensor, tensor._version, tensor.data_ptr(), tensor.dtype)
+
+    def holds(self, tensor: Tensor) -> bool:
+        return self.tensor is tensor and self[1:] == (
+            tensor._version,
+            tensor.data_ptr(),
+            tensor.dtype,
+        )
+
+
+class _Entry(NamedTuple):
+    marks: tuple[_Mark, ...]
+    value: Any
+
+
+# Outside the modules: not part of their state, and neither copied nor pickled with them.
+_KEPT: "WeakKeyDictionary[nn.Module, dict[Hashable, _Entry]]" = WeakKeyDictionary()
+
+
+class _Graphs(threading.local):
+    """What was derived with a graph while a run goes on in this thread."""
+
+    def __init__(self) -> None:
+        self.depth = 0
+        self.kept: dict[Hashable, _Entry] = {}
+        self.traced: dict[Hashable, tuple[tuple[Tensor, ...], Any]] = {}
+
+
+_GRAPHS = _Graphs()
+
+
+@contextmanager
+def one_run(device: torch.device) -> Iterator[None]:
+    """Set what holds within one run of a filter: full precision, and graphs that are shared.
+
+    Autocast is off, since covariances do not survive half precision. What is derived with gradients is
+    kept while the run lasts and not beyond: its graph is freed by the backward pass, and the next run
+    has to build its own.
+    """
+    with torch.autocast(device.type, enabled=False):
+        if torch.compiler.is_dynamo_compiling():
+            yield
+            return
+        _GRAPHS.depth += 1
+        try:
+            yield
+        finally:
+            _GRAPHS.depth -= 1
+            if _GRAPHS.depth == 0:
+                _GRAPHS.kept.clear()
+                _GRAPHS.traced.clear()
+
+
+def derived(
+    module: nn.Module, name: Hashable, sources: tuple[Tensor | None, ...], make: Callable[[], T]
+) -> T:
+    """Return `make()`, or what it returned before while its sources have not changed.
+
+    A source has changed if it is another tensor, or was written to in place: by an optimiser, by
+    `load_state_dict`, by hand. (Writing through `tensor.data` hides from PyTorch, and so from here.)
+    Under `torch.compile` nothing is kept, and inside `torch.export` and `torch.func` transforms
+    nothing beyond the run.
+
+    Args:
+        module: whose value it is; when it goes, so does the value. name: among those of the module.
+        sources: tensors that the value depends on. make: computes it from these alone.
+    """
+    given = tuple(source for source in sources if source is not None)
+    name = (name, values_visible())  # what was made without checks is not for those with
+    if torch.compiler.is_dynamo_compiling():
+        return make()
+    if torch.compiler.is_compiling() or any(map(_is_opaque, given)):
+        return _kept_in_this_run((id(module), name), given, make) if _GRAPHS.depth else make()
+    if torch.is_grad_enabled() and any(source.requires_grad for source in given):
+        if not _GRAPHS.depth:
+            return make()
+        return _kept_in(_GRAPHS.kept, (id(module), name), given, make)
+    return _kept_in(_KEPT.setdefault(module, {}), name, given, lambda: _without_graph(make))
+
+
+def _without_graph(make: Callable[[], T]) -> T:
+    """`make()` for use anywhere."""
+    with torch.inference_mode(False), torch.no_grad():
+        return make()
+
+
+@contextmanager
+def outside_inference() -> Iterator[None]:
+    """Make tensors that may be kept: those of inference mode could not be used for gradients later."""
+    if not torch.is_inference_mode_enabled():
+        yield
+        return
+    with torch.inference_mode(False), torch.no_grad():
+        yield
+
+
+def _kept_in(
+    kept: dict[Hashable, _Entry], key: Hashable, given: tuple[Tensor, ...], make: Callable[[], T]
+) -> T:
+    entry = kept.get(key)
+    same = entry is not None and len(entry.marks) == len(given)
+    if entry is None or not (
+        same and all(m.holds(s) for m, s in zip(entry.marks, given, strict=True))
+    ):
+        marks = tuple(_Mark.of(source) for source in given)
+        entry = _Entry(marks, make())
+        kept[key] = entry
+    return entry.value
+
+
+def _kept_in_this_run(key: Hashable, given: tuple[Tensor, ...], make: Callable[[], T]) -> T:
+    """`make()`, or what it returned before in this run for the very same tensors."""
+    found = _GRAPHS.traced.get(key)
+    if found is None or [*map(id, found[0])] != [*map(id, given)]:
+        found = _GRAPHS.traced[key] = (given, make())
+    return found[1]
+
+
+def _is_opaque(tensor: Tensor) -> bool:
+    """Whether a tensor has no version or no memory to be told by: of inference mode or a transform."""
+    if tensor.is_inference():
+        return True
+    try:
+        tensor.data_ptr()
+    except RuntimeError:
+        return True
+    return False
+
+
+class WideModule(nn.Module):
+    """A module whose tensors keep their precision, whatever `.float()` or `.to(dtype)` ask for.
+
+    Covariances whose scales span ten orders of magnitude do not survive single precision. What such a
+    call changes is `dtype`, the precision of what goes in and comes out; `.to(device)` moves
+    everything.
+
+    Attributes:
+        dtype: torch.float32 or torch.float64.
+    """
+
+    dtype: torch.dtype
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        wanted = fn(torch.zeros(1, dtype=self.dtype)).dtype
+        self.dtype = working_precision("dtype", wanted)
+
+        def moved(tensor: Tensor) -> Tensor:
+            result = fn(tensor)
+            changed = tensor.is_floating_point() and result.dtype != tensor.dtype
+            return tensor.to(result.device) if changed else result
+
+        return super()._apply(moved, recurse)
+
+
+def working_precision(name: str, dtype: torch.dtype) -> torch.dtype:
+    """Return a dtype that filters work in.
+
+    Raises:
+        InputError: neither torch.float32 nor torch.float64.
+    """
+    if dtype not in (torch.float32, torch.float64):
+        raise InputError(
+            f"{name} must be torch.float32 or torch.float64, got {dtype}; half precision does not hold "
+            "covariances of pixels, metres and radians"
+        )
+    return dtype

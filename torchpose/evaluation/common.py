@@ -1,0 +1,328 @@
+"""What the protocols share: the camera, test sequences, cached priors, tracking and scores."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from torchpose.camera.pinhole import PinholeCamera
+from torchpose.camera.projection import project
+from torchpose.camera.viewpoints import sample_viewpoints
+from torchpose.errors import InputError, TorchposeError
+from torchpose.evaluation.report import RESULTS, Report
+from torchpose.filters.base import Generators
+from torchpose.io.recordings import Recording
+from torchpose.io.results import replace_own
+from torchpose.learning.training import TRAINING_VIEWS, collect_poses
+from torchpose.math.rotations import euler_to_matrix
+from torchpose.metrics.calibration import Coverage, coverage, reliability
+from torchpose.metrics.poses import PCP, align, jitter, joint_errors_2d, joint_errors_3d, pcp
+from torchpose.priors.upper_body import UpperBodyPrior
+from torchpose.skeleton.joint_sets import UPPER_BODY
+from torchpose.skeleton.upper_body import mirror_pose
+from torchpose.upper_body.process_noise import default_process_cov
+from torchpose.upper_body.tracker import UpperBodyTracker
+
+__all__ = [
+    "HANDS",
+    "MEASURED",
+    "TEST_ANGLES",
+    "TEST_TRANSLATION",
+    "Estimate",
+    "Recipe",
+    "Scores",
+    "Trials",
+    "add_picture",
+    "cached_prior",
+    "centred_on_neck",
+    "data_folder",
+    "make_test_set",
+    "plain_prior",
+    "projected_training_poses",
+    "score",
+    "settings_hash",
+    "track",
+]
+
+TEST_ANGLES = (0.02, -0.05, 0.03)
+"""Roll, pitch and yaw of the test camera, radians, R = Rz Rx Ry (BL 3)."""
+
+TEST_TRANSLATION = (0.05, -0.2, 2.0)
+"""Translation of the test camera, metres."""
+
+MEASURED = ("head", "neck", "hand_left", "hand_right")
+HANDS = (UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right"))
+_MEASURED_AT = tuple(UPPER_BODY.index(name) for name in MEASURED)
+_NECK = UPPER_BODY.index("neck")
+
+Recipe = Callable[..., UpperBodyPrior]
+"""recordings, n_components, seed, progress, name -> prior with its noise and calibration."""
+
+
+def cached_prior(
+    out: Path, recordings: Sequence[Recording], recipe: Recipe, progress: bool, **settings: Any
+) -> UpperBodyPrior:
+    """Fit a prior, or read it from `out` if the same one was fitted there before.
+
+    The file's name holds a hash of the recipe's name and version (`VERSION` of its module, else that
+    of torchpose), of the settings and of every recorded number.
+
+    Args:
+        out: folder. recordings: to fit to. recipe: see `Recipe`. progress: whether to show bars.
+        settings: handed to the recipe.
+    """
+    module = import_module(recipe.__module__)
+    version = getattr(module, "VERSION", "") or _package_version()
+    facts: list[Any] = [recipe.__module__, recipe.__qualname__, str(version), settings]
+    facts += [fact for r in recordings for fact in (r.person_id, r.joints)]
+    path = out / f"prior-{settings_hash(facts)}.safetensors"
+    if path.is_file():
+        try:
+            return UpperBodyPrior.load(path)
+        except TorchposeError:
+            path.unlink()  # damaged: fit it again
+    prior = recipe(recordings, progress=progress, **settings)
+    prior.save(path)
+    return prior
+
+
+def settings_hash(facts: Sequence[Any]) -> str:
+    """Sixteen letters that change with any of these values; tensors count with all their numbers."""
+    digest = hashlib.sha256()
+    for fact in facts:
+        if isinstance(fact, Tensor):
+            digest.update(fact.detach().cpu().contiguous().numpy().tobytes())
+        else:
+            digest.update(json.dumps(fact, sort_keys=True, default=str).encode())
+    return digest.hexdigest()[:16]
+
+
+def plain_prior(prior: UpperBodyPrior) -> UpperBodyPrior:
+    """The same mixtures over poses with the paper's transition and `default_process_cov`.
+
+    Without windows, calibration or anything else that a recipe learns.
+    """
+    noise = {"process_cov": default_process_cov(prior)}
+    return UpperBodyPrior(prior.left, prior.right, replace(prior.info, transition="paper"), noise)
+
+
+def projected_training_poses(
+    recordings: Sequence[Recording], camera: PinholeCamera, n: int, seed: int = 0
+) -> tuple[Float[Tensor, "n 8 3"], Float[Tensor, "n 8 2"]]:
+    """Poses and their pixels from random training viewpoints, every second one mirrored.
+
+    Args:
+        recordings: to draw poses from, each as often as any other. camera: whose pixels.
+        n: how many. seed: of viewpoints and order.
+
+    Returns:
+        Joints centred on the neck, metres, and pixels, without noise.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    joints = collect_poses(recordings, centre="neck").joints
+    joints = joints[torch.isfinite(joints).flatten(1).all(1)]
+    rounds = -(-n // len(joints))
+    order = [torch.randperm(len(joints), generator=generator) for _ in range(rounds)]
+    joints = joints[torch.cat(order)[:n]]
+    joints[1::2] = mirror_pose(joints[1::2])
+    views = sample_viewpoints(n, TRAINING_VIEWS, generator)
+    rotation = euler_to_matrix(views.angles, "zxy")
+    return joints, project(joints, camera.matrix, rotation, views.translation)[..., :2]
+
+
+class Trials(NamedTuple):
+    """Sequences seen by the test camera; past the length of a sequence all is NaN.
+
+    Attributes:
+        truth3d: [B, T, 8, 3], camera axes, metres. truth2d: [B, T, 8, 2], pixels.
+        keypoints: of `MEASURED`, with noise, [B, T, 4, 2]. lengths: [B]. fps: frame rate.
+    """
+
+    truth3d: Float[Tensor, "B T 8 3"]
+    truth2d: Float[Tensor, "B T 8 2"]
+    keypoints: Float[Tensor, "B T 4 2"]
+    lengths: Int[Tensor, " B"]
+    fps: float
+
+    @property
+    def inside(self) -> Bool[Tensor, "B T"]:
+        """True up to the length of each sequence."""
+        return torch.arange(self.truth3d.shape[1]) < self.lengths[:, None]
+
+
+def centred_on_neck(joints: Float[Tensor, "T 8 3"]) -> Float[Tensor, "T 8 3"]:
+    """Every frame moved so that its own neck is the origin."""
+    return joints - joints[:, _NECK : _NECK + 1]
+
+
+def make_test_set(
+    poses: Sequence[Float[Tensor, "T 8 3"]],
+    camera: PinholeCamera,
+    fps: float,
+    seed: int = 0,
+    noise_std: float = 3.0,
+    paths: Sequence[Float[Tensor, "T 3"]] | None = None,
+) -> Trials:
+    """Project poses into the test camera and measure head, neck and hands with Gaussian noise.
+
+    Args:
+        poses: one tensor for each sequence, metres, centred, camera axes.
+        camera: of the test. fps: frame rate.
+        seed: of the noise, which is independent over joints, frames and coordinates.
+        noise_std: pixels. paths: translation of the whole body in each frame, metres.
+
+    Raises:
+        InputError: no sequences, or a missing joint.
+    """
+    if not poses:
+        raise InputError("a test needs at least one sequence, got none")
+    lengths = torch.tensor([len(p) for p in poses])
+    joints = torch.nn.utils.rnn.pad_sequence([p.double() for p in poses], True)
+    rotation = euler_to_matrix(torch.tensor(TEST_ANGLES, dtype=torch.float64), "zxy")
+    place = torch.tensor(TEST_TRANSLATION, dtype=torch.float64).expand(*joints.shape[:2], 3)
+    if paths is not None:
+        place = place + torch.nn.utils.rnn.pad_sequence([p.double() for p in paths], True)
+    truth3d = joints @ rotation.mT + place[..., None, :]
+    truth2d = project(joints, camera.matrix, rotation, place)[..., :2]
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.randn(*joints.shape[:2], 4, 2, generator=generator, dtype=torch.float64)
+    keypoints = truth2d[:, :, list(_MEASURED_AT)] + noise_std * noise
+    test = Trials(truth3d, truth2d, keypoints, lengths, fps)
+    outside = ~test.inside
+    if not bool(torch.isfinite(truth3d[~outside]).all()):
+        raise InputError("test sequences must hold all eight joints, got missing ones")
+    for tensor in (truth3d, truth2d, keypoints):
+        tensor[outside] = torch.nan
+    return test
+
+
+class Estimate(NamedTuple):
+    """Poses of a method: joints2d [B, T, 8, 2], joints3d [B, T, 8, 3], covariance3d or None."""
+
+    joints2d: Tensor
+    joints3d: Tensor
+    covariance3d: Tensor | None = None
+
+
+def track(
+    prior: UpperBodyPrior,
+    camera: PinholeCamera,
+    test: Trials,
+    mask: Bool[Tensor, "B T 4"] | None = None,
+    *,
+    chunk: int = 32,
+    progress: bool = False,
+    label: str = "",
+    generator: Generators = None,
+    **options: Any,
+) -> Estimate:
+    """Run `UpperBodyTracker` over a test set, some sequences at a time.
+
+    Args:
+        prior: of the tracker. camera: of the test. mask: [B, T, 4], False = hidden.
+        chunk: sequences at a time. progress, label: of the bar. generator: for methods that draw.
+        options: of the tracker.
+    """
+    tracker = UpperBodyTracker(
+        prior, camera, fps=test.fps, neck=prior.info.neck, max_gap=None, **options
+    )
+    parts = []
+    starts = range(0, len(test.lengths), chunk)
+    for start in tqdm(starts, disable=not progress, desc=label, leave=False):
+        rows = slice(start, start + chunk)
+        longest = int(test.lengths[rows].max())
+        own = generator[rows] if isinstance(generator, Sequence) else generator
+        with torch.inference_mode():
+            poses = tracker(
+                test.keypoints[rows, :longest],
+                names=MEASURED,
+                mask=None if mask is None else mask[rows, :longest],
+                lengths=test.lengths[rows],
+                generator=own,
+            )
+        pad = test.truth3d.shape[1] - longest
+        parts.append(
+            [_padded(x, pad) for x in (poses.joints2d, poses.joints3d, poses.covariance3d)]
+        )
+    return Estimate(*(torch.cat(values) for values in zip(*parts, strict=True)))
+
+
+class Scores(NamedTuple):
+    """How good a method is on a test set; NaN where nothing is to be counted.
+
+    Attributes:
+        errors3d: metres after fixed-scale Procrustes [B, T, 8]. errors2d: pixels [B, T, 8].
+        limbs: curve of correct limbs in the image. jitter: m/s^2 [8], mean over frames.
+        coverage: at 50 and 90 %. reliability: at 5 to 95 %. Both None without covariances.
+    """
+
+    errors3d: Tensor
+    errors2d: Tensor
+    limbs: PCP
+    jitter: Tensor
+    coverage: Coverage | None
+    reliability: Coverage | None
+
+
+def score(estimate: Estimate, test: Trials) -> Scores:
+    """Errors, correct limbs, smoothness and calibration of estimates."""
+    inside = test.inside[..., None].expand(*test.inside.shape, 8)
+    errors3d = joint_errors_3d(estimate.joints3d, test.truth3d, inside)
+    errors2d = joint_errors_2d(estimate.joints2d, test.truth2d, inside)
+    limbs = pcp(estimate.joints2d, test.truth2d, mask=inside)
+    moved = estimate.joints3d.masked_fill(~inside[..., None], torch.nan)
+    triples = (test.lengths - 2).clamp_min(0).double()
+    per_sequence = jitter(moved, test.fps) if moved.shape[1] > 2 else torch.full((1, 8), torch.nan)
+    trembling = (per_sequence.nan_to_num() * triples[:, None]).sum(0) / triples.sum()
+    if estimate.covariance3d is None:
+        return Scores(errors3d, errors2d, limbs, trembling, None, None)
+    aligned = align(estimate.joints3d, test.truth3d, covariance=estimate.covariance3d)
+    turned: Any = aligned.covariance
+    hits = coverage(aligned.points, turned, test.truth3d, mask=inside)
+    curve = reliability(aligned.points, turned, test.truth3d, mask=inside)
+    return Scores(errors3d, errors2d, limbs, trembling, hits, curve)
+
+
+def data_folder(data: str | Path, name: str) -> Path:
+    """`data` itself, or the folder `name` in it.
+
+    Raises:
+        InputError: no such folder.
+    """
+    data = Path(data)
+    folder = data / name if (data / name).is_dir() else data
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; give the one that holds {name} with --data")
+    return folder
+
+
+def add_picture(report: Report, out: Path, name: str, figure: Any) -> None:
+    """Write a matplotlib figure to the folder and list it in the report."""
+    from torchpose.viz.style import save_figure
+
+    with replace_own(out / name, RESULTS) as temporary:
+        save_figure(figure, temporary)
+    report.pictures.append(name)
+
+
+def _padded(value: Tensor, pad: int) -> Tensor:
+    """Repeat the last frame `pad` times."""
+    if pad == 0:
+        return value
+    return torch.cat([value, value[:, -1:].expand(-1, pad, *value.shape[2:])], 1)
+
+
+def _package_version() -> str:
+    import torchpose
+
+    return torchpose.__version__

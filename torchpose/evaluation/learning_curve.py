@@ -1,0 +1,380 @@
+"""Learning curve: error on persons never seen over the number of training persons.
+
+For each number n, priors are fitted to cyclic runs of n persons of UTD-MHAD (s1 s2, s2 s3, ...,
+s8 s1), and each tracks all persons whom it did not see; so few fits serve many test persons, and
+every person is tracked and trained on equally often. Beyond the persons of UTD-MHAD less one, the
+authors' recording and kinect_laban join the training persons. A second part asks what a prior of
+one's own is worth: fitted to half of a person's recordings, and scored on the other half.
+
+Conditions are those of UB-people. Covariances are not calibrated.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from torchpose._core.files import check_output_folder
+from torchpose.errors import InputError
+from torchpose.evaluation.common import Recipe, add_picture, data_folder
+from torchpose.evaluation.person_tables import (
+    Curve,
+    add_pose_classes,
+    mean_error,
+    plot_curves,
+    pooled,
+)
+from torchpose.evaluation.persons import by_person, renamed, spread
+from torchpose.evaluation.report import Report
+from torchpose.evaluation.unseen import Job, Scored, ScoreSettings, fit_settings, run_jobs
+from torchpose.io.recordings import Recording, read_recordings
+from torchpose.learning.recipes.upper_body import fit_kinect_prior
+
+__all__ = ["cyclic_subsets", "halves", "run"]
+
+_DATA = "kinect_utd_mhad"
+_MORE = ("burke_kinect", "kinect_laban")
+STAGES = ("filtered", "smoothed")
+
+
+class _Own(NamedTuple):
+    """Whom a prior is fitted to in the second part, and where to look up its scores."""
+
+    label: str
+    job: Job
+
+
+def run(
+    data: str | Path,
+    out: str | Path,
+    *,
+    seed: int = 0,
+    progress: bool = True,
+    quick: bool = False,
+    counts: tuple[int, ...] = (1, 2, 4, 7, 9),
+    n_subsets: int = 8,
+    n_own: int = 8,
+    n_components: int | None = None,
+    window_components: int | None = None,
+    window_samples: int | None = None,
+    every: int = 1,
+    workers: int = 1,
+    fits: str | None = None,
+    compare: tuple[str, ...] = (),
+    recipes: Sequence[tuple[str, Recipe]] | None = None,
+) -> Report:
+    """Run the protocol; writes report.json, report.md and pictures to `out`.
+
+    Args:
+        data: folder with kinect_utd_mhad and, for counts beyond its persons less one, burke_kinect
+            and kinect_laban. out: folder for the results.
+        seed: of priors and noise. progress: whether to show bars.
+        quick: small priors, few subsets and a tenth of the sequences, to see that all of it works.
+        counts: numbers of training persons. n_subsets: fits for each number, at most one for each
+            person. n_own: persons for whom a prior of their own is fitted; 0 leaves that part out.
+        n_components: Gaussians per arm over poses; this and the next two as the recipe has them if
+            None.
+        window_components: Gaussians per arm over windows. window_samples: training windows.
+        every: only each n-th sequence of a person is tracked. workers: processes.
+        fits: folder of fitted priors, to share them with other protocols; `out` if None.
+        compare: other recipes to draw beside `torchpose.learning.recipes.fit_kinect_prior`, each as
+            NAME=module.function.
+        recipes: names and functions, instead of all that.
+
+    Raises:
+        InputError: no such data, more training persons than there are, an unknown recipe.
+        OutputError: `out` cannot be written.
+    """
+    out = check_output_folder(out)
+    known = list(recipes or [("this recipe", fit_kinect_prior), *map(_imported, compare)])
+    persons = by_person(read_recordings(data_folder(data, _DATA)))
+    if quick:
+        persons = {name: group[::5] for name, group in persons.items()}
+        counts, n_subsets, n_own = tuple(c for c in counts if c in counts[:2]), 2, min(1, n_own)
+    others = _others(data, persons, counts)
+    settings = fit_settings(
+        "learning-curve", seed, quick, n_components, window_components, window_samples, 0
+    )
+    scoring = ScoreSettings(seed=seed, every=max(every, 10) if quick else every)
+    jobs: dict[tuple[str, int, int], Job] = {}
+    own: dict[tuple[str, str, str], Job] = {}
+    for name, recipe in known:
+        for count in counts:
+            for i, subset in enumerate(cyclic_subsets(list(persons), count, n_subsets)):
+                jobs[name, count, i] = _curve_job(
+                    persons, others, subset, count, settings, recipe, scoring
+                )
+        for person in list(persons)[:n_own]:
+            for kind, job in _own_jobs(persons, person, settings, recipe, scoring).items():
+                own[name, person, kind] = job
+    folder = check_output_folder(fits or out)
+    found = run_jobs([*jobs.values(), *own.values()], folder, workers, progress)
+    scores = dict(zip([*jobs, *own], found, strict=True))
+    report = Report("Learning curve over persons", settings | {
+        "quick": quick, "every": scoring.every, "counts": list(counts), "subsets": n_subsets,
+        "recipes": {name: f"{r.__module__}.{r.__qualname__}" for name, r in known},
+        "persons": list(persons), "further training persons": list(others),
+        "threads": torch.get_num_threads(), "workers": workers,
+    })  # fmt: skip
+    curves = _add_curve(report, [name for name, _ in known], counts, jobs, scores, len(persons))
+    if own:
+        _add_own(report, own, scores)
+    _add_classes(report, known[0][0], counts, jobs, scores)
+    _add_findings(report, curves)
+    title = "Persons never seen: error over the number of training persons"
+    add_picture(report, out, "learning-curve.png", plot_curves(curves, title))
+    report.save(out)
+    return report
+
+
+def cyclic_subsets(names: Sequence[str], count: int, n_subsets: int) -> list[list[str]]:
+    """Runs of `count` names, the first following the last, from starts that are evenly spread.
+
+    Never all of the names, so that somebody is left to score: at most all but one.
+
+    >>> cyclic_subsets(["a", "b", "c", "d"], 2, 2)
+    [['a', 'b'], ['c', 'd']]
+    """
+    n = len(names)
+    length = min(count, n - 1)
+    n_subsets = min(n_subsets, n)
+    starts = [(i * n) // n_subsets for i in range(n_subsets)]
+    return [[names[(start + k) % n] for k in range(length)] for start in starts]
+
+
+def halves(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recording]]:
+    """A person's recordings in two halves, each with half of the trials of every action.
+
+    Trials follow each other in the order of their files. Of an odd number the middle one goes to the
+    half that has fewer recordings so far.
+    """
+    actions: dict[str, list[Recording]] = {}
+    for recording in recordings:
+        actions.setdefault(recording.action, []).append(recording)
+    first: list[Recording] = []
+    second: list[Recording] = []
+    for group in actions.values():
+        middle = len(group) // 2
+        if len(group) % 2 and len(first) <= len(second):
+            middle += 1
+        first += group[:middle]
+        second += group[middle:]
+    return first, second
+
+
+def _imported(text: str) -> tuple[str, Recipe]:
+    """NAME=module.function as name and function."""
+    match = re.fullmatch(r"(.+)=([\w.]+)\.(\w+)", text)
+    try:
+        if match is not None:
+            return match[1], getattr(import_module(match[2]), match[3])
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"--compare {text}: there is no such function ({error})") from error
+    raise InputError(f"--compare {text}: expected NAME=module.function")
+
+
+def _others(
+    data: str | Path, persons: Mapping[str, Any], counts: Sequence[int]
+) -> dict[str, list[Recording]]:
+    """Training persons of other data sets, as many as the largest count asks for."""
+    most = len(persons) - 1
+    if most < 1:
+        raise InputError(f"{data}: a learning curve needs two persons or more, got {len(persons)}")
+    missing = max(counts) - most
+    if missing <= 0:
+        return {}
+    folders = [Path(data) / name for name in _MORE if (Path(data) / name).is_dir()]
+    others = by_person(read_recordings(folders)) if folders else {}
+    if missing > len(others):
+        raise InputError(
+            f"{max(counts)} training persons are asked for, and there are {most} of {_DATA} beside "
+            f"the one who is tracked, and {len(others)} in {' and '.join(_MORE)}; give the folder "
+            "that holds all of these, or smaller counts"
+        )
+    return dict(list(others.items())[:missing])
+
+
+def _curve_job(
+    persons: Mapping[str, list[Recording]],
+    others: Mapping[str, list[Recording]],
+    subset: Sequence[str],
+    count: int,
+    settings: Mapping[str, Any],
+    recipe: Recipe,
+    scoring: ScoreSettings,
+) -> Job:
+    further = list(others.values())[: max(0, count - len(subset))]
+    train = [r for name, group in persons.items() if name in subset for r in group]
+    train += [r for group in further for r in group]
+    tests = {name: group for name, group in persons.items() if name not in subset}
+    label = f"{count}: {' '.join(subset)}"
+    return Job(label, train, tests, settings, recipe, scoring)
+
+
+def _own_jobs(
+    persons: Mapping[str, list[Recording]],
+    person: str,
+    settings: Mapping[str, Any],
+    recipe: Recipe,
+    scoring: ScoreSettings,
+) -> dict[str, Job]:
+    """Priors of a person's first half, of all others, and of both; scored on second halves."""
+    first, _ = halves(persons[person])
+    mine = renamed(first, "first half")
+    rest = [r for name, group in persons.items() if name != person for r in group]
+    later = {name: halves(group)[1] for name, group in persons.items()}
+    on = {person: later[person]}
+    return {
+        "one": Job(f"{person} alone", mine, later, settings, recipe, scoring),
+        "others": Job(f"all but {person}", rest, on, settings, recipe, scoring),
+        "both": Job(f"all, half of {person}", rest + mine, on, settings, recipe, scoring),
+    }
+
+
+# --- tables ---------------------------------------------------------------------------------------
+
+
+def _add_curve(
+    report: Report,
+    recipes: Sequence[str],
+    counts: Sequence[int],
+    jobs: Mapping[tuple[str, int, int], Job],
+    scores: Mapping[Any, Mapping[str, Scored]],
+    n_persons: int,
+) -> dict[str, dict[str, Curve]]:
+    """The table of the curve; and the curves by stage and recipe."""
+    table = report.table(
+        "curve",
+        "3D error after Procrustes (cm) on persons never seen, by number of training persons",
+        ["filtered", "± drawn", "± tested", "smoothed", "± drawn ", "± tested ", "log-lik.",
+         "fits", "tests"],
+        digits=(2, 2, 2, 2, 2, 2, 2, 0, 0),
+        note="Mean over test persons of the mean over fits. Drawn: standard deviation over the fits "
+        "that track the same person; tested: over test persons. Beyond "
+        f"{n_persons - 1} persons the further ones are of other data sets.",
+    )  # fmt: skip
+    curves: dict[str, dict[str, Curve]] = {stage: {} for stage in STAGES}
+    for recipe in recipes:
+        points: dict[str, list[tuple[float, float, float]]] = {stage: [] for stage in STAGES}
+        for count in counts:
+            results = [scores[key] for key in jobs if key[:2] == (recipe, count)]
+            for stage in STAGES:
+                points[stage].append(_point(results, stage == "smoothed"))
+            likelihood = [
+                float(s.log_likelihood.mean()) for found in results for s in found.values()
+            ]
+            table.add(f"{recipe}, {_people(count)}" if len(recipes) > 1 else _people(count), [
+                *points["filtered"][-1], *points["smoothed"][-1], spread(likelihood)[0],
+                len(results), sum(map(len, results)),
+            ])  # fmt: skip
+        for stage in STAGES:
+            columns = [list(values) for values in zip(*points[stage], strict=True)]
+            curves[stage][recipe] = Curve(list(counts), *columns)
+    return curves
+
+
+def _people(count: int) -> str:
+    return f"{count} person{'s' if count > 1 else ''}"
+
+
+def _point(results: Sequence[Mapping[str, Scored]], smoothed: bool) -> tuple[float, float, float]:
+    """Mean, spread over fits (root mean of the variance within a person), spread over persons."""
+    by_test: dict[str, list[float]] = {}
+    for found in results:
+        for name, scored in found.items():
+            by_test.setdefault(name, []).append(mean_error(scored, smoothed))
+    means = [spread(values)[0] for values in by_test.values()]
+    variances = [spread(values)[1] ** 2 for values in by_test.values()]
+    middle, tested = spread(means)
+    return middle, spread(variances)[0] ** 0.5, tested
+
+
+def _add_own(
+    report: Report,
+    own: Mapping[tuple[str, str, str], Job],
+    scores: Mapping[Any, Mapping[str, Scored]],
+) -> None:
+    """One person's prior against that of many, on that person and off."""
+    table = report.table(
+        "own",
+        "One person's prior against many (cm): tracked are the second halves of the recordings",
+        ["filtered", "± persons", "smoothed", "± persons ", "log-lik.", "tests"],
+        digits=(2, 2, 2, 2, 2, 0),
+        note="Halves by trial, so that no recording is in both. The spread is over the persons whom "
+        "the prior of one, or all but one, is made of.",
+    )
+    recipes = list(dict.fromkeys(name for name, _, _ in own))
+    rows = (
+        ("the person's first half, on the person", "one", True),
+        ("the person's first half, on others", "one", False),
+        ("all others, on the person", "others", True),
+        ("all others and the first half, on the person", "both", True),
+    )
+    for recipe in recipes:
+        for label, kind, on in rows:
+            found = [
+                [s for name, s in scores[key].items() if (name == key[1]) is on]
+                for key in own
+                if key[0] == recipe and key[2] == kind
+            ]
+            filtered, smoothed = (
+                spread([spread([mean_error(s, late) for s in group])[0] for group in found])
+                for late in (False, True)
+            )
+            likelihood = spread([float(s.log_likelihood.mean()) for g in found for s in g])[0]
+            name = f"{recipe}: {label}" if len(recipes) > 1 else label
+            table.add(name, [*filtered, *smoothed, likelihood, sum(map(len, found))])
+    values = [float(table[name, "filtered"]) for name in list(table.rows)[:4]]
+    report.findings.append(
+        f"A person is tracked with {values[0]:.2f} cm by a prior of other recordings of that person, "
+        f"with {values[2]:.2f} cm by one of all others, and with {values[3]:.2f} cm by one of both; "
+        f"the prior of one person has {values[1]:.2f} cm on others."
+    )
+
+
+def _add_classes(
+    report: Report,
+    recipe: str,
+    counts: Sequence[int],
+    jobs: Mapping[tuple[str, int, int], Job],
+    scores: Mapping[Any, Mapping[str, Scored]],
+) -> None:
+    groups = {
+        _people(count): pooled(
+            [s for key in jobs if key[:2] == (recipe, count) for s in scores[key].values()]
+        )
+        for count in counts
+    }
+    add_pose_classes(report, groups)
+
+
+def _add_findings(report: Report, curves: Mapping[str, Mapping[str, Curve]]) -> None:
+    for recipe, curve in curves["filtered"].items():
+        smooth = curves["smoothed"][recipe]
+        if len(curve.counts) < 2:
+            continue
+        report.findings.append(
+            f"{recipe}: from {curve.counts[0]} to {curve.counts[-1]} training persons the error "
+            f"goes from {curve.mean[0]:.2f} to {curve.mean[-1]:.2f} cm filtered and from "
+            f"{smooth.mean[0]:.2f} to {smooth.mean[-1]:.2f} cm smoothed."
+        )
+    names = list(curves["filtered"])
+    for name in names[1:]:
+        gains = ", ".join(
+            f"{_people(count)} {ours - theirs:+.2f} / {late - theirs_late:+.2f}"
+            for count, ours, theirs, late, theirs_late in zip(
+                curves["filtered"][name].counts,
+                curves["filtered"][names[0]].mean,
+                curves["filtered"][name].mean,
+                curves["smoothed"][names[0]].mean,
+                curves["smoothed"][name].mean,
+                strict=True,
+            )
+        )
+        report.findings.append(
+            f"'{names[0]}' against '{name}' on the same training persons, in cm filtered / smoothed: "
+            f"{gains}."
+        )

@@ -1,0 +1,134 @@
+"""Leave one person out: each person of some recordings, tracked by a prior of all the others.
+
+Camera, noise, measured joints and error are those of UB-people. The recipe is refitted for every
+person, with its calibration, so that the mean over persons says what to expect of the next one.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchpose._core.files import check_output_folder
+from torchpose.errors import InputError
+from torchpose.evaluation.common import Recipe, add_picture
+from torchpose.evaluation.person_tables import (
+    add_persons,
+    add_pose_classes,
+    class_error,
+    plot_persons,
+    pooled,
+)
+from torchpose.evaluation.persons import POSE_CLASSES, by_person, spread
+from torchpose.evaluation.report import Report
+from torchpose.evaluation.unseen import Job, Scored, ScoreSettings, fit_settings, run_jobs
+from torchpose.io.recordings import read_recordings
+from torchpose.learning.recipes.upper_body import fit_kinect_prior
+
+__all__ = ["run"]
+
+
+def run(
+    data: Sequence[str | Path] | str | Path,
+    out: str | Path,
+    *,
+    seed: int = 0,
+    progress: bool = True,
+    quick: bool = False,
+    n_components: int | None = None,
+    window_components: int | None = None,
+    window_samples: int | None = None,
+    calibration_folds: int = 6,
+    every: int = 1,
+    workers: int = 1,
+    fits: str | None = None,
+    recipe: Recipe = fit_kinect_prior,
+) -> Report:
+    """Run the protocol; writes report.json, report.md and a picture to `out`.
+
+    Args:
+        data: folders or files with recordings of two persons or more. out: folder for the results.
+        seed: of priors and noise. progress: whether to show bars.
+        quick: small priors and a tenth of the sequences, to see that all of it works.
+        n_components: Gaussians per arm over poses; this and the next two as the recipe has them if
+            None.
+        window_components: Gaussians per arm over windows. window_samples: training windows.
+        calibration_folds: of the recipe; 0 leaves the covariances uncalibrated.
+        every: only each n-th sequence of a person is tracked. workers: processes.
+        fits: folder of fitted priors, to share them with other protocols; `out` if None.
+        recipe: fits the priors.
+
+    Raises:
+        InputError: no such data, or one person alone. OutputError: `out` cannot be written.
+    """
+    out = check_output_folder(out)
+    recordings = read_recordings(data)
+    persons = by_person(recordings)
+    if len(persons) < 2:
+        raise InputError(
+            f"expected recordings of two persons or more, got {len(recordings)} of "
+            f"{', '.join(persons)}; add a folder with those of others"
+        )
+    settings = fit_settings(
+        "leave-one-person-out", seed, quick, n_components, window_components, window_samples,
+        calibration_folds,
+    )  # fmt: skip
+    scoring = ScoreSettings(seed=seed, every=max(every, 10) if quick else every)
+    thin = 5 if quick else 1
+    jobs = [
+        Job(
+            name,
+            [r for other, group in persons.items() if other != name for r in group[::thin]],
+            {name: group},
+            settings,
+            recipe,
+            scoring,
+        )
+        for name, group in persons.items()
+    ]
+    folder = check_output_folder(fits or out)
+    found = run_jobs(jobs, folder, workers, progress)
+    scored = {name: result[name] for name, result in zip(persons, found, strict=True)}
+    report = Report("Leave one person out", settings | {
+        "quick": quick, "every": scoring.every, "recipe": recipe.__qualname__,
+        "persons": {name: f"{len(group)} recordings" for name, group in persons.items()},
+        "threads": torch.get_num_threads(), "workers": workers,
+    })  # fmt: skip
+    table = add_persons(report, scored)
+    if settings["calibration_folds"] < 2:
+        table.note += " The covariances are not calibrated."
+    add_pose_classes(report, {"all": pooled(list(scored.values()))})
+    _add_findings(report, scored)
+    title = "3D error of each person under a prior of the others"
+    add_picture(report, out, "persons.png", plot_persons(scored, title))
+    report.save(out)
+    return report
+
+
+def _add_findings(report: Report, scored: dict[str, Scored]) -> None:
+    table: Any = report["persons"]
+    names = list(scored)
+
+    def numbers(column: str) -> list[float]:
+        return [float(table[name, column]) for name in names]
+
+    (mean, wide), (late, late_wide) = spread(numbers("filtered")), spread(numbers("smoothed"))
+    worst = max(names, key=lambda name: float(table[name, "filtered"]))
+    best = min(names, key=lambda name: float(table[name, "filtered"]))
+    report.findings.append(
+        f"Over {len(names)} persons: {mean:.2f} ± {wide:.2f} cm filtered, {late:.2f} ± "
+        f"{late_wide:.2f} cm smoothed (standard deviation over persons; that of the mean is "
+        f"{wide / len(names) ** 0.5:.2f}). Best {best} with {table[best, 'filtered']:.2f}, worst "
+        f"{worst} with {table[worst, 'filtered']:.2f}."
+    )
+    parts = [
+        f"{column[3:]}: {spread(numbers(column))[0]:.0f} ± {spread(numbers(column))[1]:.0f} %"
+        for column in ("in 50 %", "in 90 %")
+    ]
+    report.findings.append(f"Inside the ellipsoids, mean and spread over persons: {parts[0]}, "
+                           f"{parts[1]}.")  # fmt: skip
+    everybody = pooled(list(scored.values()))
+    errors = {name: class_error(everybody, name) for name in POSE_CLASSES}
+    costs = ", ".join(f"{name} {error:.1f}" for name, error in errors.items() if error == error)
+    report.findings.append(f"Hand and elbow, in cm by what the arm does: {costs}.")

@@ -1,0 +1,213 @@
+"""Tables and pictures of the protocols over persons."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+
+from torchpose.evaluation.people_tables import SHORT_NAMES
+from torchpose.evaluation.persons import POSE_CLASSES, spread
+from torchpose.evaluation.report import Report, Table
+from torchpose.evaluation.unseen import Scored
+
+__all__ = [
+    "Curve",
+    "add_persons",
+    "add_pose_classes",
+    "class_error",
+    "mean_error",
+    "plot_curves",
+    "plot_persons",
+    "plot_pose_classes",
+    "pooled",
+]
+
+_HANDS, _ELBOWS = (0, 7), (1, 6)
+
+
+def pooled(parts: Sequence[Scored]) -> Scored:
+    """All frames of several persons as one."""
+    return Scored(*(torch.cat(values) for values in zip(*parts, strict=True)))
+
+
+def mean_error(scored: Scored, smoothed: bool = False) -> float:
+    """Mean over all joints and frames, centimetres."""
+    errors = scored.smoothed if smoothed else scored.filtered
+    return 100 * float(errors.double().nanmean())
+
+
+def add_persons(report: Report, persons: Mapping[str, Scored]) -> Table:
+    """One row for each person, then mean and spread over persons, and all frames pooled."""
+    table = report.table(
+        "persons",
+        "3D error after Procrustes (cm), true joints inside the ellipsoids (%), log-likelihood of "
+        "the pose (nats)",
+        ["frames", "filtered", "smoothed", "in 50 %", "in 90 %", "log-lik.", *SHORT_NAMES],
+        digits=(0, 2, 2, 0, 0, 2, *[1] * 8),
+        note="Joints: filtered. Ellipsoids: of the filter. Mean and standard deviation are over "
+        "persons, each counting once; 'all frames' counts every frame once.",
+    )
+    rows = {name: _row(scored) for name, scored in persons.items()}
+    for name, row in rows.items():
+        table.add(name, row)
+    columns = list(zip(*rows.values(), strict=True))
+    for i, name in enumerate(("mean", "standard deviation")):
+        table.add(name, [round(spread(columns[0])[i]) if len(rows) > i else None,
+                         *(spread(column)[i] for column in columns[1:])])  # fmt: skip
+    table.add("all frames", _row(pooled(list(persons.values()))))
+    return table
+
+
+def _row(scored: Scored) -> list[float | int]:
+    low, high = (100 * scored.inside.double().nanmean((0, 2))).tolist()
+    joints = (100 * scored.filtered.double().nanmean(0)).tolist()
+    likelihood = float(scored.log_likelihood.nanmean())
+    errors = mean_error(scored), mean_error(scored, smoothed=True)
+    return [len(scored.filtered), *errors, low, high, likelihood, *joints]
+
+
+def add_pose_classes(
+    report: Report, groups: Mapping[str, Scored], key: str = "pose_classes"
+) -> Table:
+    """Error of hand and elbow by what the arm does, for each group of scored frames."""
+    table = report.table(
+        key,
+        "What uncommon poses cost: error of the arm (cm) by what it does",
+        ["arm-frames (%)", "hand", "elbow", "hand, smoothed", "elbow, smoothed"],
+        digits=1,
+        note="Raised: the hand above its shoulder; crossed: on the other side of the middle of the "
+        "shoulders; near the body: within 20 cm of its shoulder, horizontally.",
+    )
+    for group, scored in groups.items():
+        for number, name in enumerate(POSE_CLASSES):
+            chosen = scored.classes == number
+            row: list[float] = [100 * float(chosen.double().mean())]
+            for errors in (scored.filtered, scored.smoothed):
+                for joints in (_HANDS, _ELBOWS):
+                    row.append(100 * float(errors[:, list(joints)][chosen].double().nanmean()))
+            table.add(f"{group}, {name}" if len(groups) > 1 else name, row)
+    return table
+
+
+def class_error(scored: Scored, name: str, smoothed: bool = False) -> float:
+    """Mean error of hands and elbows (cm) of arms that do this."""
+    errors = scored.smoothed if smoothed else scored.filtered
+    chosen = scored.classes == POSE_CLASSES.index(name)
+    arm = (errors[:, list(_HANDS)] + errors[:, list(_ELBOWS)]) / 2
+    return 100 * float(arm[chosen].double().nanmean())
+
+
+# --- pictures -------------------------------------------------------------------------------------
+
+
+def plot_persons(persons: Mapping[str, Scored], title: str) -> Any:
+    """Error of each person, filtered and smoothed, then the mean and its spread over persons."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    from torchpose.viz.style import INK, add_legend, method_styles, new_figure, style_axes
+
+    figure = new_figure(max(6.4, 0.62 * len(persons) + 2.8), 3.9, title)
+    ax = style_axes(figure.add_subplot(), y="mean 3D error (cm)")
+    ax.grid(False, axis="x")
+    styles = method_styles(["filtered", "smoothed"])
+    entries: list[Any] = []
+    for i, (stage, style) in enumerate(styles.items()):
+        values = [mean_error(scored, stage == "smoothed") for scored in persons.values()]
+        middle, wide = spread(values)
+        place = torch.arange(len(values)).double().numpy() - 0.2 + 0.4 * i
+        ax.bar(place, values, 0.36, color=style["color"], alpha=0.85)
+        last = len(values) + 0.3 + 0.4 * i
+        ax.bar(last, middle, 0.36, color=style["color"], alpha=0.85, edgecolor=INK)
+        ax.vlines(last, middle - wide, middle + wide, color=INK, linewidth=1.1)
+        label = f"{stage}: {middle:.2f} ± {wide:.2f} cm"
+        entries.append(Patch(color=style["color"], alpha=0.85, label=label))
+    entries.append(Line2D([], [], color=INK, linewidth=1.1, label="± SD over persons"))
+    names = [name.replace("_", "\n").replace(" ", "\n") for name in persons]
+    ax.set_xticks([*range(len(persons)), len(persons) + 0.5], [*names, "mean"])
+    ax.set_ylim(bottom=0)
+    add_legend(figure, entries)
+    return figure
+
+
+class Curve(NamedTuple):
+    """Mean error (cm) at each number of persons, with its spread over draws and over test persons."""
+
+    counts: list[int]
+    mean: list[float]
+    drawn: list[float]
+    tested: list[float]
+
+
+def plot_curves(curves: Mapping[str, Mapping[str, Curve]], title: str) -> Any:
+    """Learning curves: a panel for each stage (filtered, smoothed), a line for each recipe.
+
+    The band is one standard deviation over the persons that were tracked. A whisker is one over
+    which persons were drawn to train on; there is none where each person is tracked by one fit only.
+
+    Args:
+        curves: by stage and recipe. title: above the picture.
+    """
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    from torchpose.viz.style import INK, PALE, add_legend, method_styles, new_figure, style_axes
+
+    figure = new_figure(4.6 * len(curves), 4.3, title)
+    panels = figure.subplots(1, len(curves), sharey=True, squeeze=False)[0]
+    styles = method_styles(list(next(iter(curves.values()))))
+    for ax, (stage, by_recipe) in zip(panels, curves.items(), strict=True):
+        style_axes(ax, "training persons", "mean 3D error (cm)" if ax is panels[0] else "", stage)
+        means = torch.tensor([curve.mean for curve in by_recipe.values()])
+        for i, (recipe, curve) in enumerate(by_recipe.items()):
+            color, half = styles[recipe]["color"], torch.tensor(curve.tested).nan_to_num()
+            low, high = means[i] - half, means[i] + half
+            ax.fill_between(curve.counts, low.numpy(), high.numpy(), color=color, alpha=0.13,
+                            linewidth=0)  # fmt: skip
+            place = [count - 0.07 + 0.14 * i for count in curve.counts]
+            drawn = torch.tensor(curve.drawn)
+            ax.vlines(place, (means[i] - drawn).numpy(), (means[i] + drawn).numpy(), color=color,
+                      linewidth=1.4)  # fmt: skip
+            ax.plot(curve.counts, curve.mean, marker="o", markersize=4.5, linewidth=1.9,
+                    **styles[recipe])  # fmt: skip
+            lowest = len(means) > 1 and means.mean(1).argmin() == i
+            for count, value in zip(curve.counts, curve.mean, strict=True):
+                ax.annotate(f"{value:.2f}", (count, value), (4, -12 if lowest else 5), color=color,
+                            fontsize=8, textcoords="offset points")  # fmt: skip
+        ax.set_xticks(next(iter(by_recipe.values())).counts)
+    entries: list[Any] = [
+        Line2D([], [], linewidth=1.9, marker="o", markersize=4.5, label=name, **style)
+        for name, style in styles.items()
+    ]
+    entries.append(Line2D([], [], color=INK, linewidth=1.4, label="± SD over who was trained on"))
+    entries.append(Patch(color=PALE, alpha=0.5, label="± SD over who was tracked"))
+    add_legend(figure, entries)
+    return figure
+
+
+def plot_pose_classes(groups: Mapping[str, Scored], title: str) -> Any:
+    """Error of hands and elbows by what the arm does, a bar for each group."""
+    from matplotlib.patches import Patch
+
+    from torchpose.viz.style import add_legend, method_styles, new_figure, style_axes
+
+    figure = new_figure(7.6, 3.9, title)
+    ax = style_axes(figure.add_subplot(), y="mean error of hand and elbow (cm)")
+    ax.grid(False, axis="x")
+    styles = method_styles(list(groups))
+    width = 0.8 / len(groups)
+    entries = []
+    for i, (group, scored) in enumerate(groups.items()):
+        values = [class_error(scored, name) for name in POSE_CLASSES]
+        place = torch.arange(len(values)).double().numpy() - 0.4 + (i + 0.5) * width
+        ax.bar(place, values, 0.9 * width, color=styles[group]["color"], alpha=0.85)
+        entries.append(Patch(color=styles[group]["color"], alpha=0.85, label=group))
+    shares = [
+        100 * float((next(iter(groups.values())).classes == i).double().mean())
+        for i in range(len(POSE_CLASSES))
+    ]
+    labels = [f"{name}\n{share:.0f} %" for name, share in zip(POSE_CLASSES, shares, strict=True)]
+    ax.set_xticks(range(len(POSE_CLASSES)), labels)
+    ax.set_ylim(bottom=0)
+    add_legend(figure, entries)
+    return figure

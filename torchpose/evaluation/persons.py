@@ -1,0 +1,106 @@
+"""Recordings of persons: who is who, which frames are whole, and what arms do in them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchpose.io.recordings import Recording
+from torchpose.learning.curation.upper import measured, runs
+
+__all__ = [
+    "LEAST_FRAMES",
+    "POSE_CLASSES",
+    "by_person",
+    "complete_pieces",
+    "pose_classes",
+    "raised_share",
+    "renamed",
+    "spread",
+]
+
+LEAST_FRAMES = 10
+"""Of a sequence that is scored."""
+
+POSE_CLASSES = ("raised", "crossed", "near the body", "reaching out")
+"""What an arm does in a frame (`pose_classes`)."""
+
+_HANDS, _SHOULDERS = (0, 7), (2, 5)
+_NEAR = 0.2  # metres
+
+
+def complete_pieces(joints: Float[Tensor, "T 8 3"]) -> list[Float[Tensor, "S 8 3"]]:
+    """Runs of at least ten frames in which no joint is missing."""
+    return [joints[frames] for frames in runs(measured(joints).all(1), LEAST_FRAMES)]
+
+
+def pose_classes(poses: Float[Tensor, "N 8 3"]) -> Int[Tensor, "N 2"]:
+    """What the left and the right arm do: index into `POSE_CLASSES`, the first that applies.
+
+    Raised: the hand is above its shoulder. Crossed: it is on the other side of the middle of the
+    shoulders, along their line. Near the body: within 20 cm of its shoulder, horizontally. Else it
+    reaches out.
+
+    Args:
+        poses: camera axes, y down, metres.
+    """
+    hands, shoulders = poses[:, list(_HANDS)], poses[:, list(_SHOULDERS)]
+    across = shoulders[:, 0] - shoulders[:, 1]
+    across = torch.stack([across, -across], 1)
+    middle = shoulders.mean(1, keepdim=True)
+    raised = hands[..., 1] < shoulders[..., 1]
+    crossed = ((hands - middle) * across).sum(-1) < 0
+    near = (hands - shoulders)[..., [0, 2]].norm(dim=-1) < _NEAR
+    return torch.where(raised, 0, torch.where(crossed, 1, torch.where(near, 2, 3)))
+
+
+def raised_share(recording: Recording) -> float:
+    """Share of the frames in which a hand is above its shoulder."""
+    classes = pose_classes(recording.upper_body().joints.double())
+    return float((classes == POSE_CLASSES.index("raised")).any(1).double().mean())
+
+
+def by_person(recordings: Sequence[Recording]) -> dict[str, list[Recording]]:
+    """Recordings of each person, under a name that no other one has, in order."""
+    groups: dict[str, list[Recording]] = {}
+    for recording in recordings:
+        groups.setdefault(recording.person_id, []).append(recording)
+    short = {key: _short_name(group[0]) for key, group in groups.items()}
+    names = list(short.values())
+    unique = {
+        key: name if names.count(name) == 1 else f"{_folder(groups[key][0])} {name}"
+        for key, name in short.items()
+    }
+    return {unique[key]: groups[key] for key in sorted(groups, key=lambda k: _natural(unique[k]))}
+
+
+def _short_name(recording: Recording) -> str:
+    return recording.person or _folder(recording) or "one"
+
+
+def _folder(recording: Recording) -> str:
+    return recording.path.resolve().parent.name if recording.path is not None else ""
+
+
+def _natural(name: str) -> tuple[Any, ...]:
+    """s2 before s10."""
+    digits = "".join(c if c.isdigit() else " " for c in name).split()
+    return ("".join(c for c in name if not c.isdigit()), *map(int, digits))
+
+
+def renamed(recordings: Sequence[Recording], suffix: str) -> list[Recording]:
+    """The recordings as those of another person, where a test on the same person is the point."""
+    return [replace(r, person=f"{r.person}, {suffix}") for r in recordings]
+
+
+def spread(values: Sequence[float] | Tensor) -> tuple[float, float]:
+    """Mean and standard deviation, NaN left out; NaN for the latter of fewer than two."""
+    known = torch.as_tensor(values, dtype=torch.float64)
+    known = known[torch.isfinite(known)]
+    if not len(known):
+        return math.nan, math.nan
+    return float(known.mean()), float(known.std()) if len(known) > 1 else math.nan

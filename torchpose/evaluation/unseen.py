@@ -1,0 +1,333 @@
+"""What protocols over persons share: priors fitted to some persons and scored on others.
+
+A `Job` is a fit and the persons it is scored on. Priors and scores are kept in a folder by what they
+depend on, so that a killed run goes on where it stopped and protocols do not fit the same twice.
+"""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from torchpose._core.files import write_npz
+from torchpose._core.npz import read_npz
+from torchpose.camera.pinhole import PinholeCamera
+from torchpose.camera.viewpoints import ViewRange, sample_viewpoints
+from torchpose.errors import InputError, PriorError, TorchposeError
+from torchpose.evaluation.common import (
+    MEASURED,
+    Estimate,
+    Recipe,
+    Trials,
+    cached_prior,
+    centred_on_neck,
+    make_test_set,
+    settings_hash,
+    track,
+)
+from torchpose.evaluation.persons import LEAST_FRAMES, complete_pieces, pose_classes
+from torchpose.io.recordings import Recording
+from torchpose.learning.recipes.upper_body import fit_kinect_prior
+from torchpose.metrics.calibration import chi2_quantile, mahalanobis_squared
+from torchpose.metrics.poses import ALIGN_JOINTS, align, joint_errors
+from torchpose.priors.arm_state import arm_states
+from torchpose.priors.upper_body import UpperBodyPrior
+from torchpose.skeleton.joint_sets import UPPER_BODY
+from torchpose.skeleton.neck import NeckOffset, learn_neck_offset, place_neck
+
+__all__ = [
+    "CAMERA",
+    "LEVELS",
+    "QUICK",
+    "Job",
+    "ScoreSettings",
+    "Scored",
+    "fit_settings",
+    "log_likelihood",
+    "poses_to_score",
+    "run_jobs",
+    "score_person",
+    "training_neck",
+]
+
+CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
+LEVELS = (0.5, 0.9)
+"""Of the ellipsoids whose coverage is counted."""
+
+QUICK: dict[str, Any] = {"n_components": 4, "window_components": 8, "window_samples": 3000}
+"""Sizes of the fits of a quick run."""
+
+_STANDS_FOR = {"hand": "wrist", "wrist": "hand"}
+
+
+@dataclass(frozen=True)
+class ScoreSettings:
+    """How persons are tracked and scored.
+
+    Args:
+        seed: of the noise, and of the viewpoints of the likelihood. every: of the sequences of a
+            person only each n-th is tracked. noise_std: pixels.
+        unmeasured: joints among `MEASURED` that the tracker is not given, such as a head that was
+            never recorded. unscored: joints whose errors are not counted, nor aligned on.
+        likelihood: whether the prior's likelihood is asked for; it needs all joints.
+    """
+
+    seed: int = 0
+    every: int = 1
+    noise_std: float = 3.0
+    unmeasured: tuple[str, ...] = ()
+    unscored: tuple[str, ...] = ()
+    likelihood: bool = True
+
+
+class Scored(NamedTuple):
+    """How well a person was tracked, frame by frame.
+
+    Attributes:
+        filtered, smoothed: metres after fixed-scale Procrustes, NaN for joints that do not count.
+        inside: 1 where the true joint is inside the filter's ellipsoid at each of `LEVELS`, 0 where
+            it is not. log_likelihood: of the pose under the prior's mixtures over poses, mean of
+            both arms, nats; NaN if it was not asked for.
+        classes: what the left and the right arm do, index into `persons.POSE_CLASSES`.
+    """
+
+    filtered: Float[Tensor, "N 8"]
+    smoothed: Float[Tensor, "N 8"]
+    inside: Float[Tensor, "N L 8"]
+    log_likelihood: Float[Tensor, " N"]
+    classes: Int[Tensor, "N 2"]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A fit, and whom it is scored on.
+
+    Args:
+        label: for the bar. train: recordings of the fit. tests: recordings of each person by name.
+        settings: of the recipe. recipe: fits the prior. test: how persons are tracked.
+    """
+
+    label: str
+    train: Sequence[Recording]
+    tests: Mapping[str, Sequence[Recording]]
+    settings: Mapping[str, Any]
+    recipe: Recipe = fit_kinect_prior
+    test: ScoreSettings = field(default_factory=ScoreSettings)
+
+
+def fit_settings(
+    name: str,
+    seed: int,
+    quick: bool,
+    n_components: int | None,
+    window_components: int | None,
+    window_samples: int | None,
+    calibration_folds: int,
+) -> dict[str, Any]:
+    """Settings of a recipe: what was asked for, small sizes for a quick run, else its own."""
+    settings: dict[str, Any] = {"name": name, "seed": seed}
+    settings |= QUICK if quick else {}
+    sizes = {
+        "n_components": n_components,
+        "window_components": window_components,
+        "window_samples": window_samples,
+    }
+    settings |= {key: value for key, value in sizes.items() if value is not None}
+    return settings | {"calibration_folds": 0 if quick else calibration_folds}
+
+
+def run_jobs(
+    jobs: Sequence[Job], folder: Path, workers: int = 1, progress: bool = False
+) -> list[dict[str, Scored]]:
+    """Fit and score, in `workers` processes of one thread each (1: in this one).
+
+    Args:
+        jobs: what to do. folder: where priors and scores are kept. progress: whether to show a bar.
+
+    Returns:
+        Scores of each job by person.
+
+    Raises:
+        OverlapError: a person is in the training recordings of a job that scores them.
+    """
+    with tqdm(total=len(jobs), disable=not progress, unit="fit", desc="fits") as bar:
+        if workers <= 1 or len(jobs) < 2:
+            found = []
+            for job in jobs:
+                bar.set_postfix_str(job.label)
+                found.append(_run(job, folder, progress))
+                bar.update(1)
+            return found
+        pool = ProcessPoolExecutor(
+            workers, get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)
+        )
+        with pool:
+            futures = [pool.submit(_run, job, folder, False) for job in jobs]
+            try:
+                for done in as_completed(futures):
+                    done.result()
+                    bar.update(1)
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+            return [future.result() for future in futures]
+
+
+def _run(job: Job, folder: Path, progress: bool) -> dict[str, Scored]:
+    settings = dict(job.settings)
+    cached_prior(folder, job.train, job.recipe, progress, **settings)
+    # Read back, so that a run that goes on works with the same bits.
+    prior = cached_prior(folder, job.train, job.recipe, progress, **settings)
+    return {name: _scored(prior, job, name, folder, progress) for name in job.tests}
+
+
+def _scored(prior: UpperBodyPrior, job: Job, name: str, folder: Path, progress: bool) -> Scored:
+    """Scores of one person, read from the folder if they are there."""
+    recordings = job.tests[name]
+    prior.check_unseen({r.person_id for r in recordings})
+    chosen = recordings[:: job.test.every]
+    poses = poses_to_score(chosen, prior, job.train, name)
+    rates = [float(r.fps or prior.info.fps or 30.0) for r in chosen]
+    fps = float(np.median(rates))
+    facts = ["scores 1", repr(job.test), fps, *prior.state_dict().values(), *poses]
+    path = folder / f"scores-{settings_hash(facts)}.npz"
+    if path.is_file():
+        try:
+            return _read(path)
+        except TorchposeError:
+            path.unlink()  # damaged: score again
+    found = score_person(prior, poses, fps, job.test, progress)
+    write_npz(path, {key: value.numpy() for key, value in found._asdict().items()})
+    return found
+
+
+def _read(path: Path) -> Scored:
+    arrays = read_npz(path, Scored._fields)
+    return Scored(*(torch.from_numpy(arrays[key]) for key in Scored._fields))
+
+
+def score_person(
+    prior: UpperBodyPrior,
+    poses: Sequence[Float[Tensor, "T 8 3"]],
+    fps: float,
+    settings: ScoreSettings,
+    progress: bool = False,
+) -> Scored:
+    """Track sequences from noisy keypoints, filtered and smoothed, and compare with the truth.
+
+    Args:
+        prior: of the tracker. poses: complete, centred on the neck, camera axes, metres.
+        fps: frame rate. settings: see `ScoreSettings`. progress: whether to show bars.
+    """
+    test = make_test_set(poses, CAMERA, fps, settings.seed, settings.noise_std)
+    inside = test.inside
+    mask = torch.tensor([name not in settings.unmeasured for name in MEASURED])
+    mask = mask.expand(*inside.shape, len(MEASURED))
+    scored = torch.tensor([name not in settings.unscored for name in UPPER_BODY])
+    own: dict[str, Any] = {"mask": mask, "progress": progress}
+    filtered = _compare(track(prior, CAMERA, test, label="filter", **own), test, scored)
+    smooth = track(prior, CAMERA, test, label="smoother", smoothing="full", **own)
+    smoothed = _compare(smooth, test, scored)
+    truth = torch.cat(list(poses)).double()
+    likelihood = torch.full((len(truth),), torch.nan, dtype=torch.float64)
+    if settings.likelihood:
+        likelihood = log_likelihood(prior, truth, settings.seed)
+    return Scored(
+        filtered[0].float(), smoothed[0].float(), filtered[1].float(), likelihood,
+        pose_classes(truth),
+    )  # fmt: skip
+
+
+def _compare(found: Estimate, test: Trials, scored: Bool[Tensor, " 8"]) -> tuple[Tensor, Tensor]:
+    """Errors [N, 8], and whether the truth is inside the ellipsoids [N, L, 8]; NaN if unscored."""
+    inside = test.inside
+    truth, estimate = test.truth3d[inside], found.joints3d[inside]
+    on = [joint for joint in ALIGN_JOINTS if bool(scored[joint])]
+    cov = None if found.covariance3d is None else found.covariance3d[inside]
+    aligned = align(estimate, truth, on, covariance=cov)
+    errors = joint_errors(aligned.points, truth).masked_fill(~scored, torch.nan)
+    if aligned.covariance is None:
+        raise RuntimeError("align was given covariances and returned none")
+    squared = mahalanobis_squared(aligned.points, aligned.covariance, truth)
+    radius = chi2_quantile(torch.tensor(LEVELS, dtype=torch.float64))
+    hits = (squared[:, None] <= radius[:, None]).double()
+    return errors, hits.masked_fill(~scored, torch.nan)
+
+
+def log_likelihood(
+    prior: UpperBodyPrior, poses: Float[Tensor, "N 8 3"], seed: int = 0
+) -> Float[Tensor, " N"]:
+    """Log density of poses under the mixtures over poses, mean of both arms, nats.
+
+    Every pose is seen from a random viewpoint of the prior's own, as its training poses were.
+
+    Args:
+        poses: centred on the neck. seed: of the viewpoints.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    views = sample_viewpoints(len(poses), ViewRange(**prior.info.views), generator)
+    left, right = arm_states(poses, views, prior.info.matrix, prior.info.rotation_order)
+    return (prior.left.log_prob(left) + prior.right.log_prob(right)) / 2
+
+
+# --- test sequences -------------------------------------------------------------------------------
+
+
+def poses_to_score(
+    recordings: Sequence[Recording],
+    prior: UpperBodyPrior,
+    train: Sequence[Recording],
+    name: str = "",
+) -> list[Float[Tensor, "T 8 3"]]:
+    """Complete sequences with the prior's neck, centred on it.
+
+    Frames with a missing joint cut a recording in two, and pieces below ten frames are left out. A
+    neck of another kind is put where the training recordings have theirs (`learn_neck_offset`).
+
+    Args:
+        recordings: of a person. prior: that is to track them. train: its training recordings.
+        name: of the person, for errors.
+
+    Raises:
+        PriorError: another kind of hand than the prior's. InputError: no complete frames.
+    """
+    bodies = [r.upper_body() for r in recordings]
+    hands = {body.hand for body in bodies} - {prior.info.hand}
+    if hands:
+        hand = str(next(iter(hands)))
+        raise PriorError(
+            f"{name}: recorded are {hand}s, and the prior has {prior.info.hand}s; score them with a "
+            f"prior of {_STANDS_FOR.get(str(prior.info.hand), 'other')}s, or convert them first"
+        )
+    offset: NeckOffset | None = None
+    found = []
+    for body in bodies:
+        joints = body.joints.double()
+        if body.neck != prior.info.neck:
+            offset = offset or training_neck(train, str(prior.info.neck))
+            joints = place_neck(joints, offset)
+        found += [centred_on_neck(piece) for piece in complete_pieces(joints)]
+    if not found:
+        raise InputError(
+            f"{name}: no {LEAST_FRAMES} frames in a row have all eight joints; a test needs some"
+        )
+    return found
+
+
+def training_neck(train: Sequence[Recording], kind: str) -> NeckOffset:
+    """Where training recordings whose neck is of this kind have it.
+
+    Raises:
+        PriorError: there are fewer than ten such frames.
+    """
+    bodies = (r.upper_body() for r in train)
+    genuine = [body.joints.double() for body in bodies if body.neck == kind]
+    return learn_neck_offset(torch.cat(genuine) if genuine else torch.zeros(0, 8, 3))

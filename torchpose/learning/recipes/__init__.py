@@ -1,0 +1,26 @@
+"""How priors are made: every setting of a fit in one place, and the steps from recordings to a file."""
+
+from torchpose.learning.recipes.actions import ActionRecipe, Performances, fit_actions
+from torchpose.learning.recipes.calibration import fit_calibration
+from torchpose.learning.recipes.earlier import fit_recipe_2
+from torchpose.learning.recipes.limbs import LimbStates, fit_limbs
+from torchpose.learning.recipes.manifold import ManifoldFitting, ManifoldPoses, ManifoldRecipe
+from torchpose.learning.recipes.mixture_task import MixtureTask
+from torchpose.learning.recipes.upper_body import VERSION, UpperBodyRecipe, fit_kinect_prior
+
+__all__ = [
+    "VERSION",
+    "ActionRecipe",
+    "LimbStates",
+    "ManifoldFitting",
+    "ManifoldPoses",
+    "ManifoldRecipe",
+    "MixtureTask",
+    "Performances",
+    "UpperBodyRecipe",
+    "fit_actions",
+    "fit_calibration",
+    "fit_kinect_prior",
+    "fit_limbs",
+    "fit_recipe_2",
+]

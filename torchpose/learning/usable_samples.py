@@ -1,0 +1,86 @@
+"""Samples that a fit can use: finite, and of positive weight."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchpose.errors import InputError
+from torchpose.learning.samplers import BLOCK, Samples, SampleSource
+
+__all__ = ["spread_samples", "usable_block", "usable_samples"]
+
+_START_BLOCKS = 4  # times as many blocks as the samples would fill, for variety
+
+
+def usable_samples(samples: Samples, name: str) -> Samples:
+    """Samples of positive weight.
+
+    Args:
+        samples: states and weights.
+        name: what the samples are called in a message, such as their block.
+
+    Raises:
+        InputError: weights that are negative or not finite, states of positive weight that are not.
+    """
+    states, weight = samples
+    if len(weight) and _all_usable(states, weight):
+        return samples
+    if not bool((weight >= 0).all()) or bool(torch.isinf(weight).any()):
+        bad = ~((weight >= 0) & torch.isfinite(weight))
+        row = int(bad.nonzero()[0])
+        raise InputError(
+            f"{name}: weights must be finite and not negative, got {float(weight[row]):g} in row "
+            f"{row} ({int(bad.sum())} such weights)"
+        )
+    positive = weight > 0
+    if not bool(positive.all()):
+        states, weight = states[positive], weight[positive]
+    if not bool(torch.isfinite(states).all()):
+        bad = ~torch.isfinite(states).all(1)
+        row = int((positive.nonzero()[:, 0])[bad][0])
+        raise InputError(
+            f"{name}: states must be finite, got {int(bad.sum())} of {len(samples.states)} that are "
+            f"not, the first in row {row}; drop frames with missing joints, or give them weight 0"
+        )
+    return Samples(states, weight)
+
+
+def _all_usable(states: Tensor, weight: Tensor) -> bool:
+    """In one pass over each: NaN and infinity show in a sum and in the extremes."""
+    low, high = weight.aminmax()
+    return bool((low > 0) & (high < torch.inf) & torch.isfinite(states.sum()))
+
+
+def spread_samples(source: SampleSource, count: int) -> Samples:
+    """About `count` usable samples, spread evenly over a source; the same for whoever asks.
+
+    Args:
+        source: the states; all of them are taken if there are no more than `count`.
+        count: how many.
+
+    Raises:
+        InputError: samples that are not finite; the block is named.
+    """
+    n_blocks = source.n_blocks
+    if source.n_samples > count:
+        n_blocks = min(n_blocks, _START_BLOCKS * -(-count // BLOCK))
+    each = -(-count // max(n_blocks, 1))
+    parts = []
+    for place in range(n_blocks):
+        index = (place * source.n_blocks + source.n_blocks // 2) // n_blocks
+        samples = usable_block(source, index)
+        n = len(samples.states)
+        if source.n_samples > count and each < n:
+            rows = torch.arange(each) * n // each
+            samples = Samples(*(values[rows] for values in samples))
+        parts.append(samples)
+    if not parts:
+        return Samples(torch.zeros(0, source.dim).double(), torch.zeros(0).double())
+    return Samples(*(torch.cat(values) for values in zip(*parts, strict=True)))
+
+
+def usable_block(source: SampleSource, index: int, epoch: int = 0) -> Samples:
+    """Samples of positive weight of a block, which is named in the error if they are not finite."""
+    name = f"block {index} of {source.n_blocks}"
+    return usable_samples(source.block(index, epoch), name)

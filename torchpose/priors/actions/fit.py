@@ -1,0 +1,104 @@
+"""The fit of an action space to performances of the action (AS 1): axes, mean performance, deviations."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.errors import InputError, check_shape
+from torchpose.priors.actions.file import ActionInfo
+from torchpose.priors.actions.polar_limbs import POSTURE_DIM
+from torchpose.priors.actions.synchronisation import Synchronised, checked_performances, synchronise
+
+__all__ = ["FittedAction", "fit_action"]
+
+_STD_FLOOR = 0.1  # of a dimension's deviation over the whole performance
+_LEAST_STD = 0.1  # degrees
+_SMALLEST_VARIANCE = 1e-10  # of the largest; below it a direction is rounding
+
+
+class FittedAction(NamedTuple):
+    """What `ActionSpace` holds, by the names of its arguments, and what it came from.
+
+    Attributes:
+        tensors: by name. info: of the action. synchronised: the performances in the D dimensions.
+    """
+
+    tensors: dict[str, Tensor]
+    info: ActionInfo
+    synchronised: Synchronised
+
+
+def fit_action(
+    performances: Sequence[Float[Tensor, "_ 36"]],
+    n_dimensions: int,
+    *,
+    name: str,
+    fps: float | None,
+    n_postures: int | None,
+    prominence: float,
+    info: ActionInfo | None,
+) -> FittedAction:
+    """Fit what an action space holds; see `ActionSpace.fit`, which calls it, for everything."""
+    known = info or ActionInfo()
+    name, fps = name or known.name, known.fps if fps is None else fps
+    if fps is not None and not 0 < fps < float("inf"):
+        raise InputError(f"fps must be positive, got {fps:g}")
+    parts = _checked(performances, n_dimensions)
+    postures = torch.cat(parts)
+    mean = postures.mean(0)
+    variances, axes = _principal_axes(postures - mean)
+    rank = int((variances > _SMALLEST_VARIANCE * variances[0]).sum())
+    if n_dimensions > rank:
+        warnings.warn(
+            f"the postures of {name or 'the action'} span {rank} dimensions, fewer than the "
+            f"{n_dimensions} that were asked for: the action space has {rank}",
+            stacklevel=3,  # who called ActionSpace.fit
+        )
+    d = min(n_dimensions, rank)
+    axes = axes[:, :rank]
+    found = synchronise([(part - mean) @ axes for part in parts], n_postures, prominence)
+    found = found._replace(before=found.before[..., :d], after=found.after[..., :d])
+    performance, std = found.after.mean(0), found.after.std(0)
+    match_std = (found.after - performance).square().mean((0, 1)).sqrt().clamp_min(_LEAST_STD)
+    tensors = {
+        "mean": mean, "basis": axes[:, :d].contiguous(), "performance": performance,
+        "std": torch.maximum(std, _STD_FLOOR * match_std), "match_std": match_std,
+        "variances": variances[:d].clone(), "lost_variance": variances[d:].sum(),
+    }  # fmt: skip
+    facts = replace(
+        known, name=name, fps=fps, performances=len(parts), key_frames=found.key_frames,
+        explained=float(variances[:d].sum() / variances.sum()),
+    )  # fmt: skip
+    return FittedAction(tensors, facts, found)
+
+
+def _principal_axes(moves: Float[Tensor, "N 36"]) -> tuple[Tensor, Tensor]:
+    """Variances [36], falling, and axes [36, 36] with their largest entry positive."""
+    variances, axes = torch.linalg.eigh(moves.mT @ moves / len(moves))
+    variances, axes = variances.flip(0).clamp_min(0), axes.flip(1)
+    largest = axes.gather(0, axes.abs().argmax(0, keepdim=True))
+    return variances, axes * largest.sign()
+
+
+def _checked(performances: Sequence[Tensor], n_dimensions: int) -> list[Tensor]:
+    """The performances in double precision, or what is wrong with them."""
+    if n_dimensions < 1:
+        raise InputError(f"n_dimensions must be at least 1, got {n_dimensions}")
+    if len(performances) < 2:
+        raise InputError(
+            f"an action space needs the deviation between performances: expected two or more, got "
+            f"{len(performances)}; add recordings, or cut one with `split_repetitions`"
+        )
+    for number, performance in enumerate(performances):
+        check_shape(f"performance {number}", performance, ["T", POSTURE_DIM])
+    parts = checked_performances(performances)
+    if all(torch.equal(parts[0], part) for part in parts[1:]):
+        raise InputError("all performances are one and the same: there is no deviation to learn")
+    if all(bool((part == parts[0][0]).all()) for part in parts):
+        raise InputError("all postures are one and the same: there is no motion to learn")
+    return parts

@@ -1,0 +1,1 @@
+"""Back-constrained Gaussian process latent variable models of poses."""

@@ -1,0 +1,188 @@
+"""What a manifold was fitted on, whose body its columns are of, and the file that it is kept in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from torchpose._core.tensor_file import (
+    FileKind,
+    info_from_json,
+    info_to_json,
+    read_tensors,
+    write_tensors,
+)
+from torchpose.errors import PriorError
+from torchpose.priors.manifold.pose_sequences import steps_growth
+
+__all__ = ["TENSORS", "ManifoldInfo", "read_manifold", "write_manifold"]
+
+_GROWTH = "noise_growth"  # in `extra`: exponents of standard deviations over time
+_SAME_FRAME_RATE = 0.01  # of it
+_SAME_CENTRE = 1e-6  # of a quaternion vector
+
+
+@dataclass(frozen=True)
+class ManifoldInfo:
+    """What a manifold was fitted on; fields that are not known are empty.
+
+    Attributes:
+        name: of the manifold.
+        skeleton: joints of the body whose states the poses are of.
+        columns: names of the columns of a pose, a part and an axis each.
+        frame: "parent" or "body", what part rotations are relative to.
+        centres: quaternion vector of each part that rotations are centred on (DX 1).
+        fps: frame rate that its standard deviations refer to.
+        persons: ids of the persons. actions: what they did. sources: recordings or data sets.
+        sequences: a name for each sequence, for pictures.
+        licence: of the data. command: that made it.
+        extra: anything else that JSON can hold.
+    """
+
+    name: str = ""
+    skeleton: tuple[str, ...] = ()
+    columns: tuple[str, ...] = ()
+    frame: str = "parent"
+    centres: tuple[tuple[float, ...], ...] = ()
+    fps: float | None = None
+    persons: tuple[str, ...] = ()
+    actions: tuple[str, ...] = ()
+    sources: tuple[str, ...] = ()
+    sequences: tuple[str, ...] = ()
+    licence: str = ""
+    command: str = ""
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of_body(cls, body: Any, **facts: Any) -> ManifoldInfo:
+        """Info with the skeleton, columns, frame and centres of a body, and other facts as given."""
+        return cls(
+            skeleton=tuple(body.skeleton.names),
+            columns=tuple(f"{part} {axis}" for part in body.skeleton.parts[1:] for axis in "xyz"),
+            frame=str(body.frame),
+            centres=_centres(body),
+            **facts,
+        )
+
+    def check_for(self, body: Any, dim: int) -> None:
+        """Raise `PriorError` unless poses of a body, of so many columns, are those of the manifold."""
+        theirs = ManifoldInfo.of_body(body)
+        found = []
+        for name in ("skeleton", "columns", "frame"):
+            mine, other = getattr(self, name), getattr(theirs, name)
+            if mine and mine != other:
+                found.append(f"its {name} is {_short(mine)}, the body's is {_short(other)}")
+        if self.skeleton and not _same_centres(self.centres, theirs.centres):
+            found.append("its part rotations are centred elsewhere than the body's")
+        if len(theirs.columns) != dim:
+            found.append(f"it has {dim} columns, poses of the body have {len(theirs.columns)}")
+        if found:
+            raise PriorError(
+                f"the manifold {self.name!r} is of another body: {'; '.join(found)}; fit one to "
+                "poses of this body with BackConstrainedGPLVM.fit"
+            )
+
+    def check_rate(self, fps: float, known: bool) -> None:
+        """Raise `PriorError` unless the standard deviations are known, and for this frame rate."""
+        if not known:
+            raise PriorError(
+                f"the manifold {self.name!r} has no standard deviations yet; call fit_noise with "
+                "validation poses"
+            )
+        if self.fps is not None and abs(fps / self.fps - 1) > _SAME_FRAME_RATE:
+            raise PriorError(
+                f"the standard deviations of the manifold {self.name!r} are for {self.fps:g} frames "
+                f"per second, got {fps:g}; call fit_noise with validation poses at that rate"
+            )
+
+    def with_noise(
+        self, fps: float, latents: Tensor, poses: Tensor, lengths: Sequence[int]
+    ) -> ManifoldInfo:
+        """The same with the frame rate of the standard deviations, and how they grow with time."""
+        growth = {"latent": steps_growth(latents, lengths), "step": steps_growth(poses, lengths)}
+        return replace(self, fps=float(fps), extra={**self.extra, _GROWTH: growth})
+
+    def noise_factors(self, fps: float, known: bool) -> tuple[float, float]:
+        """Factors of sigma x->z and sigma x->x for another frame rate.
+
+        Raises:
+            PriorError: as `check_rate`, if nothing says how they grow.
+        """
+        growth = self.extra.get(_GROWTH)
+        if not isinstance(growth, Mapping) or self.fps is None or not 0 < fps < math.inf:
+            self.check_rate(fps, known)
+            return 1.0, 1.0
+        ratio = self.fps / fps
+        return float(ratio ** growth["latent"]), float(ratio ** growth["step"])
+
+    def to_json(self) -> str:
+        """Text that `from_json` reads back."""
+        return info_to_json(self)
+
+    @classmethod
+    def from_json(cls, text: str) -> ManifoldInfo:
+        """Read `to_json` back.
+
+        Raises:
+            FileFormatError: not JSON, other fields, or values of another kind.
+        """
+        return info_from_json(cls, text)
+
+
+_KIND = FileKind(
+    "torchpose-manifold",
+    1,
+    ManifoldInfo,
+    tensors={
+        "poses": "T Q", "scale": "Q", "weights": "T d", "bias": "d", "gamma_x": "",
+        "log_kernel": "4", "std_latent": "d", "std_pose": "Q", "std_step": "Q",
+    },
+    indices={"lengths": "S"},
+    positive=("scale", "gamma_x", "std_latent", "std_pose", "std_step"),
+    unknown=("std_latent", "std_pose", "std_step"),
+)  # fmt: skip
+TENSORS = (*_KIND.tensors, *_KIND.indices)  # names of those that a manifold's file holds
+
+
+def write_manifold(path: str | Path, info: ManifoldInfo, tensors: Mapping[str, Tensor]) -> None:
+    """Write info and `TENSORS` as safetensors; the file appears whole or not at all.
+
+    Raises:
+        OutputError: the file cannot be written. PriorError: `info` holds what is not JSON.
+    """
+    write_tensors(path, _KIND, info, tensors)
+
+
+def read_manifold(path: str | Path) -> tuple[ManifoldInfo, dict[str, Tensor]]:
+    """Info and tensors of a manifold's file.
+
+    Raises:
+        InputError: no such file. FileFormatError: truncated, of another kind or version, or tensors
+            are missing or of other sizes.
+    """
+    return read_tensors(path, _KIND)
+
+
+def _centres(body: Any) -> tuple[tuple[float, ...], ...]:
+    centres = getattr(body, "centres", None)
+    return () if centres is None else tuple(tuple(row) for row in centres.detach().cpu().tolist())
+
+
+def _same_centres(mine: Sequence[Sequence[float]], theirs: Sequence[Sequence[float]]) -> bool:
+    """Alike up to rounding; none at all are zeros."""
+    a, b = ([v for row in rows for v in row] for rows in (mine, theirs))
+    size = max(len(a), len(b))
+    a, b = a or [0.0] * size, b or [0.0] * size
+    return len(a) == len(b) and all(
+        math.isclose(x, y, rel_tol=0, abs_tol=_SAME_CENTRE) for x, y in zip(a, b, strict=True)
+    )
+
+
+def _short(value: Any) -> str:
+    text = ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    return text if len(text) <= 60 else f"{text[:40]}... ({len(value)})"

@@ -1,5 +1,0 @@
-"""The report of a tracked video: one self-contained HTML page that needs no network."""
-
-from torchpose.report.page import write_report
-
-__all__ = ["write_report"]

@@ -1,0 +1,300 @@
+"""The particle filter with action-specific posture constraints (aSpace)."""
+
+import warnings
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchpose.body.kinematics import Body
+from torchpose.errors import DegenerateFilterWarning, InputError
+from torchpose.filters.base import Generators, standard_normal
+from torchpose.math.quaternion_vectors import within_unit_ball
+from torchpose.priors.actions.bank import ActionBank
+from torchpose.priors.actions.gate import GATE_WIDTH
+from torchpose.priors.actions.space import ActionSpace
+from torchpose.whole_body.filters.body_frames import Frame
+from torchpose.whole_body.filters.body_particles import (
+    BodyFilterState,
+    BodyTrack,
+    PoseSpace,
+    WeightedParticles,
+    reweight,
+)
+from torchpose.whole_body.filters.first_order import next_velocity
+from torchpose.whole_body.filters.posture_gate import PostureGate
+from torchpose.whole_body.filters.redraw import Redrawn, Rows, all_accepted, redraw_until_accepted
+from torchpose.whole_body.filters.silhouette_filter import SilhouetteParticleFilter
+
+__all__ = ["CONSTRAINED_WEIGHTS", "ConstrainedParticleFilter"]
+
+CONSTRAINED_WEIGHTS = ("published", "normalised")
+_LISTED = 8
+_RELATIVE = slice(6, None)  # the columns of a state that a posture depends on
+
+
+class ConstrainedParticleFilter(SilhouetteParticleFilter):
+    """First-order motion, of which only postures of a known action are let through (aSpace).
+
+    In frame t, for each particle s,
+        phi^_s = phi_s + V_{t-1} + eta(sigma_phi)                                        (AS 3)
+    is drawn again until the action accepts it: with z its projection and j the posture of the mean
+    performance that it matched,
+        p(phi | Gamma) = 1 if |z_d - g_jd| < 2 sigma_jd for all d = 1..D, else 0.        (AS 6)
+    Then particles are weighted by the image (AS 7, `likelihood="overlap"`) and resampled. V is the
+    velocity of the estimate, V_t = a V_{t-1} + (1 - a)(phi_{t-1} - phi_{t-2}). States move by
+    `body.perturb`; the root is outside the gate.
+
+    What is still rejected after `max_redraws` is moved to the gate's border (`details["clamped"]`).
+
+    (AS 5) multiplies p(phi_t | phi_{t-1}) by p(phi_t | Gamma); drawing again divides by the share Z of
+    the draws that are accepted, which differs from ancestor to ancestor. weights="normalised" puts Z
+    back, estimated without bias from the draws of all copies of an ancestor; what was clamped gets no
+    weight then. With Z, particles that are about to leave the action lose.
+
+    With an `ActionBank` every particle has an action of its own, or none: it changes by the bank's
+    matrix, and only its own action's gate counts. Weights are also multiplied by the bank's likelihood of
+    the posture under that action, to the power that a frame counts: a gate alone, which says yes or no,
+    hardly tells actions apart. The sums of weights are a posterior over actions, p(A_t | I_1:t); where
+    none of them has the most, the motion is free, which `details["released"]` says.
+
+    Reported per frame in `BodyTrack.details`: "acceptance", the share of first draws that were accepted;
+    "redraws", how many more were drawn per particle; "clamped", a share; with a bank "actions" [A + 1],
+    none last, and "released".
+
+    Args:
+        body: a `Body` of the joints of `BODY_15`.
+        action: the fitted action, a bank of several, or None for first-order motion without constraint.
+        n_particles: N.
+        step_std: sigma_phi [D], per frame; see `constant_velocity_std`.
+        velocity_rate: a, from 0 to below 1; None for no velocity at all.
+        max_redraws: how often a particle is drawn again at most.
+        weights: "published" or "normalised".
+        gate_width: deviations to either side in (AS 6), 2 as published.
+        posture_body: see `PostureGate`.
+        fps: of the frames to be tracked, to which a bank's transitions are rescaled (`repr` says from
+            which); that of its performances if None. One action is the same at any frame rate.
+        options: as `SilhouetteParticleFilter`; its `likelihood="overlap"` is the published one.
+
+    Raises:
+        InputError, ShapeError: an argument is not as described. SkeletonError: a body of other joints.
+
+    Reference:
+        AS, equations (3)-(7).
+    """
+
+    def __init__(
+        self,
+        body: PoseSpace,
+        action: ActionSpace | ActionBank | None,
+        n_particles: int = 2000,
+        *,
+        step_std: Tensor | float | None = None,
+        velocity_rate: float | None = 0.5,
+        max_redraws: int = 50,
+        weights: str = "published",
+        gate_width: float = GATE_WIDTH,
+        posture_body: Body | None = None,
+        fps: float | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(body, n_particles, step_std=step_std, **options)
+        if velocity_rate is not None and not 0 <= velocity_rate < 1:
+            raise InputError(f"velocity_rate must be from 0 to below 1, got {velocity_rate}")
+        if max_redraws < 0:
+            raise InputError(f"max_redraws must be 0 or more, got {max_redraws}")
+        if weights not in CONSTRAINED_WEIGHTS:
+            raise InputError(
+                f"weights must be one of {', '.join(CONSTRAINED_WEIGHTS)}, got {weights!r}"
+            )
+        if weights == "normalised" and isinstance(action, ActionBank):
+            raise InputError(
+                "a bank compares motions that are normalised under every action, as redrawing does; "
+                "expected weights='published', got 'normalised'"
+            )
+        if fps is not None and not 0 < fps < float("inf"):
+            raise InputError(f"fps must be positive and finite, got {fps}")
+        if isinstance(action, ActionBank):
+            action.frame_rate(fps)  # there is one
+        self.velocity_rate, self.max_redraws, self.weights = velocity_rate, max_redraws, weights
+        self.fps = fps
+        self.gate: PostureGate | None = None
+        if action is not None:
+            self.gate = PostureGate(body, action, posture_body, gate_width)  # type: ignore[arg-type]
+
+    # --- what is remembered
+
+    def first_memory(self, particles: Float[Tensor, "B N D"]) -> Tensor | None:
+        """Of every particle: its action [B, N], or its own number, by which copies are known."""
+        batch, n = particles.shape[:2]
+        if self.gate is not None and self.gate.several:
+            return self.gate.first_actions(batch, n)
+        if self._copies_known:
+            return torch.arange(n, device=particles.device).expand(batch, n)
+        return None
+
+    def first_trend(self, mean: Float[Tensor, "B D"]) -> Tensor:
+        """Velocity, and the estimate before the last: [B, 2, D]."""
+        return torch.stack([torch.zeros_like(mean), mean], 1)
+
+    # --- a frame
+
+    def move(
+        self, state: BodyFilterState, frame: Frame, generator: Generators
+    ) -> WeightedParticles:
+        """Predict within the action, weigh by the image."""
+        trend = self._trend(state)
+        batch, n, dim = state.particles.shape
+        rows = Rows.all(batch, n, generator, state.particles.device)
+        actions = None
+        if self.gate is not None and self.gate.several:
+            actions = self.gate.next_actions(state.memory, self.fps, generator)  # type: ignore[arg-type]
+        found = self._predict(state.particles, trend[:, 0], actions, rows)
+        particles = found.states.view(batch, n, dim)
+        log_prior = state.log_weights + self.log_limits(particles)
+        if self.gate is not None and actions is not None:
+            evidence = self.gate.log_evidence(particles, actions, self.fps)
+            log_prior = log_prior + torch.where(frame.seen[:, None], evidence, 0.0)
+        memory = state.memory if actions is None else actions
+        if self._copies_known:
+            log_prior = log_prior + log_share(found, state.memory)  # type: ignore[arg-type]
+            memory = self.first_memory(particles)
+        moved = reweight(particles, log_prior, frame.score(particles))
+        details = self._details(found, moved.log_weights, actions)
+        return moved._replace(memory=memory, trend=trend, details=details)
+
+    def forward(self, *args: Any, **options: Any) -> BodyTrack:
+        """As `SilhouetteParticleFilter.forward`; warns of frames in which the gate rejected everything."""
+        track = super().forward(*args, **options)
+        clamped = track.details["clamped"]
+        warn_if_rejected(clamped if clamped.ndim == 2 else clamped[None])
+        return track
+
+    def step(self, *args: Any, **options: Any) -> tuple[BodyFilterState, BodyTrack]:
+        """As `SilhouetteParticleFilter.step`; warns if the gate rejected everything."""
+        state, track = super().step(*args, **options)
+        warn_if_rejected(track.details["clamped"][:, None])
+        return state, track
+
+    def extra_repr(self) -> str:
+        said = f"{self.n_particles} particles"
+        if self.gate is None or not self.gate.several:
+            return said
+        fitted, fps = self.gate.action.info.fps, self.gate.action.frame_rate(self.fps)
+        rescaled = "" if fitted in (None, fps) else f", rescaled from {fitted:g}"
+        return f"{said}, transitions at {fps:g} frames per second{rescaled}"
+
+    # --- helpers
+
+    @property
+    def _copies_known(self) -> bool:
+        return self.gate is not None and self.weights == "normalised"
+
+    def _trend(self, state: BodyFilterState) -> Float[Tensor, "B 2 D"]:
+        velocity, before = state.trend.unbind(1)  # type: ignore[union-attr]
+        if self.velocity_rate is not None:
+            velocity = next_velocity(self.body, velocity, state.mean, before, self.velocity_rate)
+        return torch.stack([velocity, state.mean], 1)
+
+    def _predict(
+        self,
+        particles: Float[Tensor, "B N D"],
+        velocity: Float[Tensor, "B D"],
+        actions: Int[Tensor, "B N"] | None,
+        rows: Rows,
+    ) -> Redrawn:
+        """(AS 3), its relative columns until the gate accepts them, or moved to its border."""
+        batch, n, dim = particles.shape
+        noise = standard_normal(batch, (n, dim), rows.generator, particles) * self.step_std
+        moved = self.constrain(self.body.perturb(particles, velocity[:, None] + noise))
+        moved = moved.flatten(0, 1)
+        if self.gate is None:
+            return all_accepted(moved)
+        gate, own = self.gate, None if actions is None else actions.flatten()
+        before, ahead, std = (
+            part[..., _RELATIVE].flatten(0, -2).float()
+            for part in (particles, velocity, self.step_std[None])
+        )
+
+        def draw(rows: Rows) -> Tensor:
+            step = torch.addcmul(ahead[rows.element], rows.normal(len(std[0]), std), std)
+            return self._constrained(before[rows.at] + step)
+
+        def accept(relative: Tensor, rows: Rows) -> Tensor:
+            return gate.accept(relative, rows, own)
+
+        found = redraw_until_accepted(
+            draw, accept, rows, self.max_redraws, estimate_share=self._copies_known
+        )
+        moved = torch.cat([moved[:, : _RELATIVE.start], found.states.to(moved)], -1)
+        left = rows.keep(~found.accepted)
+        if len(left.at):
+            moved[left.at] = gate.clamp(moved[left.at], left, own)
+        moved = self.constrain(moved[None])[0]
+        return found._replace(states=moved)
+
+    def _constrained(self, relative: Float[Tensor, "r Q"]) -> Float[Tensor, "r Q"]:
+        """Within the unit ball, and within the joint limits if they clamp."""
+        relative = within_unit_ball(relative.unflatten(-1, (-1, 3))).flatten(-2)
+        if self.limits is None or self.limit_mode != "clamp":
+            return relative
+        root = relative.new_zeros(len(relative), _RELATIVE.start)
+        return self.limits.clamp(torch.cat([root, relative], -1))[:, _RELATIVE]
+
+    def _details(
+        self, found: Redrawn, log_weights: Float[Tensor, "B N"], actions: Int[Tensor, "B N"] | None
+    ) -> dict[str, Tensor]:
+        shape = log_weights.shape
+
+        def share(per_row: Tensor) -> Tensor:
+            return per_row.view(shape).double().mean(-1)
+
+        details = {
+            "acceptance": share(found.first),
+            "redraws": share(found.draws - 1),
+            "clamped": share(~found.accepted),
+        }
+        if actions is not None:
+            n_states = len(self.gate.action.names)  # type: ignore[union-attr]
+            weights = log_weights.softmax(-1).nan_to_num(1 / shape[1])  # dead: as many of each
+            none = weights.new_zeros(len(weights), n_states)
+            details["actions"] = none.scatter_add(1, actions, weights)
+            details["released"] = details["actions"].argmax(-1) == n_states - 1
+        return details
+
+
+def log_share(found: Redrawn, ancestors: Int[Tensor, "B N"]) -> Float[Tensor, "B N"]:
+    """log Z of particles, estimated from the draws of all copies of an ancestor; -inf where clamped.
+
+    The copies that were accepted share the sum of what all copies estimate, so that the weighted
+    particles stay exact on average. Where everything was clamped all are alike.
+
+    Args:
+        found: of R = B N rows. ancestors: number of the particle that each one is a copy of.
+    """
+    shape = ancestors.shape
+    share, accepted = found.share.view(shape), found.accepted.view(shape)
+    total = torch.zeros_like(share).scatter_add(1, ancestors, share)
+    count = torch.zeros_like(share).scatter_add(1, ancestors, accepted.to(share))
+    log_z = (total / count.clamp_min(1)).log().gather(1, ancestors)
+    log_z = log_z.masked_fill(~accepted, -torch.inf)
+    return torch.where(accepted.any(1, keepdim=True), log_z, 0.0)
+
+
+def warn_if_rejected(clamped: Float[Tensor, "B T"]) -> None:
+    """Warn of the frames in which every particle was rejected as often as it was drawn."""
+    if not bool((clamped == 1).any()):
+        return
+    rows, frames = torch.nonzero(clamped == 1, as_tuple=True)
+    listed = [
+        f"element {b} at frame {t}" for b, t in zip(rows.tolist(), frames.tolist(), strict=True)
+    ]
+    warnings.warn(
+        f"the gate rejected every draw of all particles {len(listed)} times "
+        f"({', '.join(listed[:_LISTED])}), and they were moved to its border; start in a posture of the "
+        "action, use fewer dimensions, a wider gate, more redraws or a larger step_std, or a bank in "
+        "which no action is possible too",
+        DegenerateFilterWarning,
+        stacklevel=3,
+    )

@@ -1,0 +1,401 @@
+"""What the particle filters over body poses share: likelihood, limits, coasting, failure, estimates.
+
+A filter is its `move`: how the particles of one frame become weighted particles of the next. Batches,
+empty silhouettes, dead particles and the loop over time are handled here.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from torchpose.errors import InputError, check_finite, check_shape
+from torchpose.filters.base import Generators, standard_normal
+from torchpose.filters.outputs import effective_sample_size
+from torchpose.filters.resampling import RESAMPLING, resample
+from torchpose.whole_body.filters.body_frames import (
+    Frame,
+    check_frame,
+    check_sequences,
+    is_seen,
+    warn_if_respread,
+)
+from torchpose.whole_body.filters.body_particles import (
+    BodyFilterState,
+    BodyTrack,
+    PoseSpace,
+    Score,
+    WeightedParticles,
+    as_step_std,
+    default_step_std,
+    motion_std,
+    reweight,
+    silhouette_score,
+    stack_tracks,
+    take_particles,
+)
+from torchpose.whole_body.filters.joint_spread import joint_covariance
+from torchpose.whole_body.filters.leg_swap import check_leg_swap, extra_copies, swap_legs
+from torchpose.whole_body.silhouettes.likelihood import LIKELIHOODS
+from torchpose.whole_body.silhouettes.rectangles import check_limb_shape
+from torchpose.whole_body.silhouettes.rendering import prepare_silhouettes
+
+__all__ = [
+    "BodyFilterState",
+    "BodyTrack",
+    "Frame",
+    "PoseSpace",
+    "SilhouetteParticleFilter",
+    "WeightedParticles",
+    "default_step_std",
+    "motion_std",
+    "reweight",
+]
+
+LIMIT_MODES = ("clamp", "discard")
+ESTIMATES = ("mean", "map")
+_MOST_SPREAD = 10  # frames over which the noise of a filter that stays lost keeps growing
+
+Likelihood = Callable[[Tensor, Tensor], Tensor]
+
+
+class SilhouetteParticleFilter(nn.Module, ABC):
+    """Base of the particle filters over body poses; a subclass is its `move`.
+
+    Estimates have no gradients: nothing runs through particles.
+
+    Args:
+        body: whose poses are tracked; anything with the methods of `PoseSpace`.
+        n_particles: N.
+        step_std: standard deviation of the diffusion per frame, [D] or one number (metres for the
+            root, sines of half angles for rotations); `default_step_std` if None. (MR 29)
+        likelihood: "bidirectional" (MR 12), "overlap" (log of AS 7), or a callable
+            (states [B, N, D], frame [B, ...]) -> log-likelihood [B, N] for observations of another
+            kind.
+        sharpness: exponent of the likelihood; 1 is the published form. See `fit_sharpness`.
+        limits: joint limits with `clamp(states)` and `inside(states)` [..., P], or None.
+        limit_mode: "clamp" moves particles to the limits, "discard" gives those outside no weight.
+        resampling: "systematic", "stratified", "multinomial" or "residual".
+        resample_threshold: share of N below which the effective sample size leads to resampling;
+            1 is in every frame, as published.
+        estimate: "mean", weighted before resampling, or "map", the particle of the largest weight.
+        leg_swap: for a person whose legs may have been taken for each other: an extra copy that
+            resampling makes of a particle goes on with its legs exchanged with this probability times
+            the angle between its upper legs over pi (Daubney & Xie, section 8); 0 for never.
+        limb_shape: of the body in silhouettes, "cylinders" or "rectangles" (AS, section 3.2).
+        respread_scale: particles that all died are drawn about the last mean with this many times
+            `step_std`, twice that in the second such frame, and so on.
+
+    Raises:
+        InputError, ShapeError: an argument is not as described.
+    """
+
+    step_std: Tensor
+
+    def __init__(
+        self,
+        body: PoseSpace,
+        n_particles: int = 500,
+        *,
+        step_std: Tensor | float | None = None,
+        likelihood: str | Likelihood = "bidirectional",
+        sharpness: float = 1.0,
+        limits: Any | None = None,
+        limit_mode: str = "clamp",
+        resampling: str = "systematic",
+        resample_threshold: float = 1.0,
+        estimate: str = "mean",
+        leg_swap: float = 0.0,
+        limb_shape: str = "cylinders",
+        respread_scale: float = 5.0,
+    ) -> None:
+        super().__init__()
+        _check_choice("likelihood", likelihood, tuple(LIKELIHOODS))
+        _check_choice("limit_mode", limit_mode, LIMIT_MODES)
+        _check_choice("resampling", resampling, tuple(RESAMPLING))
+        _check_choice("estimate", estimate, ESTIMATES)
+        if n_particles < 1:
+            raise InputError(f"n_particles must be at least 1, got {n_particles}")
+        if not 0 <= resample_threshold <= 1:
+            raise InputError(f"resample_threshold must be from 0 to 1, got {resample_threshold}")
+        check_leg_swap(body, leg_swap)
+        check_limb_shape(limb_shape)
+        for name, value in (("sharpness", sharpness), ("respread_scale", respread_scale)):
+            if not 0 < value < math.inf:
+                raise InputError(f"{name} must be positive and finite, got {value}")
+        self.body, self.limits, self.limit_mode = body, limits, limit_mode
+        self.n_particles, self.sharpness = n_particles, float(sharpness)
+        self.likelihood, self.limb_shape, self.estimate = likelihood, limb_shape, estimate
+        self.resampling, self.resample_threshold = resampling, resample_threshold
+        self.leg_swap, self.respread_scale = leg_swap, respread_scale
+        self.register_buffer("step_std", as_step_std(body, step_std))
+
+    # --- what a subclass adds
+
+    @abstractmethod
+    def move(
+        self, state: BodyFilterState, frame: Frame, generator: Generators
+    ) -> WeightedParticles:
+        """Weighted particles of the next frame from those of the last.
+
+        Args:
+            state: of the last frame, its particles resampled if that was due, with what was remembered
+                of them. frame: what is seen. generator: for what is drawn.
+        """
+
+    def first_memory(self, particles: Float[Tensor, "B N D"]) -> Tensor | None:
+        """What is remembered of new particles, [B, N, ...]; nothing by default."""
+        return None
+
+    def first_trend(self, mean: Float[Tensor, "B D"]) -> Tensor | None:
+        """What is remembered of an element, [B, ...], before the first frame; nothing by default."""
+        return None
+
+    def swap_memory(self, memory: Tensor, swapped: Bool[Tensor, "B N"]) -> Tensor:
+        """What is remembered of particles whose legs have been exchanged; the same by default."""
+        return memory
+
+    def spread(
+        self,
+        particles: Float[Tensor, "B N D"],
+        log_weights: Float[Tensor, "B N"],
+        mean: Float[Tensor, "B D"],
+        memory: Tensor | None,
+    ) -> Float[Tensor, "B D"]:
+        """Standard deviation about the estimate, in the units of a step."""
+        gap = self.body.difference(particles, mean[:, None].expand_as(particles))
+        weights = log_weights.exp().to(gap.dtype)
+        return torch.einsum("bn,bnd->bd", weights, gap.square()).sqrt()
+
+    def joint_covariance(
+        self, state: BodyFilterState, mean: Float[Tensor, "B D"]
+    ) -> Float[Tensor, "B J 3 3"]:
+        """Second moment of the joints of a `Body` about those of an estimate, metres squared."""
+        return joint_covariance(self.body, state, mean)  # type: ignore[arg-type]
+
+    # --- running
+
+    @torch.no_grad()
+    def forward(
+        self,
+        silhouettes: Tensor,
+        cameras: Any,
+        initial_state: Tensor,
+        generator: Generators = None,
+        progress: bool = False,
+        initial_std: Tensor | None = None,
+    ) -> BodyTrack:
+        """Track one person through a sequence, or several through a batch of sequences.
+
+        Args:
+            silhouettes: bool [T, C, H, W] or [B, T, C, H, W], undistorted; with a callable as the
+                likelihood any observations [T, ...], or [B, T, ...] with an initial state [B, D].
+            cameras: the C cameras (`CameraRig`, or what makes one); handed to the likelihood.
+            initial_state: the pose one frame before the first, [D] or [B, D].
+            generator: one generator, or a list of one for each sequence, which makes a sequence's
+                numbers independent of its batch.
+            progress: whether to show a progress bar.
+            initial_std: [D], spread of the first particles; none if None, as published.
+
+        Returns:
+            `BodyTrack`, with the dimension of the batch if there was one.
+
+        Raises:
+            ShapeError: sizes that do not match. InputError: no frames, values that are not finite,
+            silhouettes that are not bool. CameraError: as the likelihood.
+        """
+        frames, start, batched = check_sequences(
+            silhouettes,
+            initial_state,
+            generator,
+            self.body.dim,
+            plain=not callable(self.likelihood),
+        )
+        state = self.init(start, generator, initial_std)
+        steps = []
+        for t in tqdm(range(frames.shape[1]), disable=not progress, unit="frame"):
+            state, out = self._advance(state, frames[:, t], cameras, generator)
+            steps.append(out)
+        track = stack_tracks(steps)
+        warn_if_respread(track.respread)
+        return track if batched else track.element(0)
+
+    @torch.no_grad()
+    def init(
+        self,
+        initial_state: Float[Tensor, "*B D"],
+        generator: Generators = None,
+        initial_std: Tensor | None = None,
+    ) -> BodyFilterState:
+        """N copies of the initial state (MR, Algorithm 1, step 1), spread if `initial_std` [D] is given."""
+        start = initial_state.to(self.step_std).reshape(-1, initial_state.shape[-1])
+        check_shape("initial_state", start, ["B", self.body.dim])
+        check_finite("initial_state", start)
+        particles = start[:, None].expand(-1, self.n_particles, -1).contiguous()
+        if initial_std is not None:
+            spread = torch.as_tensor(initial_std).to(self.step_std)
+            particles = self.diffuse(particles, spread, generator)
+        uniform = torch.full(particles.shape[:2], -math.log(self.n_particles))
+        uniform = uniform.to(start.device, torch.float64)
+        lost = torch.zeros(len(start), dtype=torch.long, device=start.device)
+        memory, trend = self.first_memory(particles), self.first_trend(start)
+        return BodyFilterState(particles, uniform, start, lost, memory, trend)
+
+    @torch.no_grad()
+    def step(
+        self,
+        state: BodyFilterState,
+        silhouettes: Tensor,
+        cameras: Any,
+        generator: Generators = None,
+    ) -> tuple[BodyFilterState, BodyTrack]:
+        """One frame online: the same numbers as the same frame of `forward`.
+
+        Args:
+            state: from `init` or the step before. silhouettes: [B, C, H, W], bool.
+            cameras, generator: as in `forward`.
+
+        Returns:
+            The next state, and a `BodyTrack` without the dimension of time.
+        """
+        check_frame(silhouettes, len(state.mean), plain=not callable(self.likelihood))
+        state, out = self._advance(state, silhouettes, cameras, generator)
+        warn_if_respread(out.respread[:, None])
+        return state, out
+
+    def _advance(
+        self, state: BodyFilterState, silhouettes: Tensor, cameras: Any, generator: Generators
+    ) -> tuple[BodyFilterState, BodyTrack]:
+        frame = self._frame(silhouettes.to(self.step_std.device), cameras)
+        moved = self.move(self._resample(state, generator), frame, generator)
+        dead = ~torch.isfinite(moved.log_weights.amax(-1))
+        lost = torch.where(dead, state.lost + 1, 0)
+        if bool(dead.any()):
+            moved = self._respread(moved, state.mean, lost, generator)
+        particles, log_weights = moved.particles, moved.log_weights
+        mean = self._estimate(particles, log_weights)
+        mean = torch.where(dead[:, None], state.mean, mean)
+        evidence = torch.where(frame.seen, moved.log_evidence, 0.0)  # exactly: without rounding
+        out = BodyTrack(
+            mean,
+            torch.where(dead & ~evidence.isnan(), -torch.inf, evidence),
+            self.spread(particles, log_weights, mean, moved.memory),
+            effective_sample_size(log_weights),
+            ~frame.seen,
+            dead,
+            moved.details or {},
+        )
+        after = BodyFilterState(particles, log_weights, mean, lost, moved.memory, moved.trend)
+        return after, out
+
+    # --- pieces that `move` uses
+
+    def diffuse(
+        self,
+        particles: Float[Tensor, "B N D"],
+        std: Float[Tensor, "*B D"],
+        generator: Generators,
+    ) -> Float[Tensor, "B N D"]:
+        """x + N(0, diag(std^2)) (MR 29): the root's orientation is composed; then the joint limits."""
+        batch, n, dim = particles.shape
+        noise = standard_normal(batch, (n, dim), generator, particles)
+        return self.constrain(self.body.perturb(particles, noise * std))
+
+    def constrain(self, particles: Float[Tensor, "B N D"]) -> Float[Tensor, "B N D"]:
+        """Particles moved to the joint limits, where `limit_mode` says so."""
+        if self.limits is None or self.limit_mode != "clamp":
+            return particles
+        return self.limits.clamp(particles)
+
+    def log_limits(self, particles: Float[Tensor, "B N D"]) -> Float[Tensor, "B N"]:
+        """-inf for particles outside joint limits that discard, else 0; float64."""
+        zero = particles.new_zeros(particles.shape[:2], dtype=torch.float64)
+        if self.limits is None or self.limit_mode != "discard":
+            return zero
+        return zero.masked_fill(~self.limits.inside(particles).all(-1), -torch.inf)
+
+    # --- helpers
+
+    def _frame(self, silhouettes: Tensor, cameras: Any) -> Frame:
+        seen = is_seen(silhouettes)
+        likelihood = self.likelihood
+        observed: Any = silhouettes
+        if callable(likelihood):
+            score: Score = lambda states: likelihood(states, silhouettes)  # noqa: E731
+        else:
+            observed = prepare_silhouettes(silhouettes)
+            score = silhouette_score(self.body, observed, cameras, likelihood, self.limb_shape)
+        return Frame(self._sharpened(score, seen), seen, observed, cameras)
+
+    def _sharpened(self, raw: Score, seen: Bool[Tensor, " B"]) -> Score:
+        """The exponent of the likelihood, and nothing from elements that nobody sees."""
+        nobody = not bool(seen.any())
+
+        def score(states: Tensor) -> Tensor:
+            if nobody:
+                return states.new_zeros(states.shape[:2], dtype=torch.float64)
+            value = self.sharpness * raw(states).double()
+            value = torch.where(torch.isfinite(value), value, -torch.inf)
+            return torch.where(seen[:, None], value, 0.0)
+
+        return score
+
+    def _resample(self, state: BodyFilterState, generator: Generators) -> BodyFilterState:
+        """Resample the elements whose effective sample size is low; the others stay."""
+        n = self.n_particles
+        due = effective_sample_size(state.log_weights) < self.resample_threshold * n
+        # drawn for all: what an element draws must not depend on its neighbours
+        ancestors = resample(state.log_weights, self.resampling, generator)
+        ancestors = torch.where(due[:, None], ancestors, torch.arange(n, device=due.device))
+        particles, memory = take_particles(state.particles, ancestors), state.memory
+        if memory is not None:
+            memory = take_particles(memory, ancestors)
+        if self.leg_swap > 0:
+            extra = extra_copies(ancestors)  # of elements that were not resampled: none
+            particles, swapped = swap_legs(self.body, particles, extra, self.leg_swap, generator)
+            if memory is not None:
+                memory = self.swap_memory(memory, swapped)
+        log_weights = torch.where(due[:, None], -math.log(n), state.log_weights)
+        return state._replace(particles=particles, log_weights=log_weights, memory=memory)
+
+    def _respread(
+        self,
+        moved: WeightedParticles,
+        mean: Float[Tensor, "B D"],
+        lost: Int[Tensor, " B"],
+        generator: Generators,
+    ) -> WeightedParticles:
+        """New particles about the last mean in the elements whose particles died."""
+        rows = torch.nonzero(lost > 0).reshape(-1)
+        if isinstance(generator, Sequence):
+            generator = [generator[i] for i in rows.tolist()]
+        start = mean[rows, None].expand(-1, self.n_particles, -1)
+        growth = lost[rows].clamp_max(_MOST_SPREAD)[:, None, None]
+        particles, log_weights = moved.particles.clone(), moved.log_weights.clone()
+        std = self.respread_scale * growth * self.step_std
+        particles[rows] = self.diffuse(start, std, generator)
+        log_weights[rows] = -math.log(self.n_particles)
+        memory = self.first_memory(particles)
+        if memory is not None and moved.memory is not None:
+            fresh, memory = memory, moved.memory.clone()
+            memory[rows] = fresh[rows]
+        return moved._replace(particles=particles, log_weights=log_weights, memory=memory)
+
+    def _estimate(self, particles: Tensor, log_weights: Tensor) -> Float[Tensor, "B D"]:
+        if self.estimate == "mean":
+            return self.body.mean(particles, log_weights.to(particles.dtype))
+        best = log_weights.argmax(-1, keepdim=True)
+        return take_particles(particles, best)[:, 0]
+
+
+def _check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
+    if isinstance(value, str) and value in choices:
+        return
+    if name == "likelihood" and callable(value):
+        return
+    raise InputError(f"{name} must be one of {', '.join(choices)}, got {value!r}")

@@ -1,0 +1,1 @@
+"""Silhouettes of articulated bodies: rendered, counted against observed ones, weighed."""
