@@ -4,72 +4,61 @@ The names below are imported when they are first used, so `import torchpose` its
 needs neither matplotlib nor Lightning nor OpenCV, and never a network.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from importlib import import_module as _import_module
+from typing import TYPE_CHECKING
+
+from torchpose._core import moved as _moved
 
 if TYPE_CHECKING:
-    from torchpose._core.value_checks import without_value_checks
-    from torchpose.camera.pinhole import PinholeCamera
-    from torchpose.errors import TorchposeError
-    from torchpose.priors.gaussian_mixture import GaussianMixture
-    from torchpose.priors.shipped import load_action, load_limb_conditionals, load_manifold
-    from torchpose.priors.upper_body import UpperBodyPrior, load_prior
-    from torchpose.upper_body.pose_track import PoseTrack
-    from torchpose.upper_body.tracker import UpperBodyTracker
-    from torchpose.video.tracker import VideoTracker
+    from torchpose._core.value_checks import without_value_checks as without_value_checks
+    from torchpose.camera.pinhole import PinholeCamera as PinholeCamera
+    from torchpose.errors import TorchposeError as TorchposeError
+    from torchpose.priors.gaussian_mixture import GaussianMixture as GaussianMixture
+    from torchpose.priors.shipped import load_action as load_action
+    from torchpose.priors.shipped import load_limb_conditionals as load_limb_conditionals
+    from torchpose.priors.shipped import load_manifold as load_manifold
+    from torchpose.priors.upper_body import UpperBodyPrior as UpperBodyPrior
+    from torchpose.priors.upper_body import load_prior as load_prior
+    from torchpose.upper_body.pose_track import PoseTrack as PoseTrack
+    from torchpose.upper_body.tracker import UpperBodyTracker as UpperBodyTracker
+    from torchpose.video.tracker import VideoTracker as VideoTracker
 
     __version__: str
 
-_SUBMODULES = frozenset(
-    {
+_PACKAGES = frozenset(
+    [
         "body",
-        "calibration",
         "camera",
-        "camera_rig",
         "demo",
         "errors",
+        "evaluation",
         "filters",
-        "gaussian",
         "io",
-        "joint_sets",
-        "lifting",
-        "mannequin",
+        "learning",
+        "math",
         "measure",
-        "measurements",
         "metrics",
-        "pose_track",
         "priors",
-        "projection",
-        "protocols",
-        "recipes",
-        "recording",
-        "rendering",
-        "report",
-        "rotation_gaussians",
-        "rotations",
         "skeleton",
-        "torchmetrics_adapters",
-        "tracking",
-        "unscented",
-        "value_checks",
+        "upper_body",
         "video",
-        "video_tracker",
         "viz",
-    }
+        "whole_body",
+    ]
 )
-_HOME = {
-    "GaussianMixture": "torchpose.priors.gaussian_mixture",
-    "PinholeCamera": "torchpose.camera",
-    "PoseTrack": "torchpose.upper_body.pose_track",
-    "TorchposeError": "torchpose.errors",
-    "UpperBodyPrior": "torchpose.priors.upper_body",
-    "UpperBodyTracker": "torchpose.upper_body.tracker",
-    "VideoTracker": "torchpose.video.tracker",
-    "load_action": "torchpose.priors.shipped",
-    "load_limb_conditionals": "torchpose.priors.shipped",
-    "load_manifold": "torchpose.priors.shipped",
-    "load_prior": "torchpose.priors.upper_body",
-    "without_value_checks": "torchpose._core.value_checks",
+_HOMES = {
+    "GaussianMixture": "priors.gaussian_mixture",
+    "PinholeCamera": "camera.pinhole",
+    "PoseTrack": "upper_body.pose_track",
+    "TorchposeError": "errors",
+    "UpperBodyPrior": "priors.upper_body",
+    "UpperBodyTracker": "upper_body.tracker",
+    "VideoTracker": "video.tracker",
+    "load_action": "priors.shipped",
+    "load_limb_conditionals": "priors.shipped",
+    "load_manifold": "priors.shipped",
+    "load_prior": "priors.upper_body",
+    "without_value_checks": "_core.value_checks",
 }
 
 __all__ = [
@@ -87,14 +76,17 @@ __all__ = [
     "without_value_checks",
 ]
 
+_moved.install()
 
-def __getattr__(name: str) -> Any:
+
+def __getattr__(name: str) -> object:
+    value: object
     if name == "__version__":
-        value: Any = _version()
-    elif name in _SUBMODULES:
-        value = import_module(f"torchpose.{name}")
-    elif name in _HOME:
-        value = getattr(import_module(_HOME[name]), name)
+        value = _version()
+    elif name in _HOMES:
+        value = getattr(_import_module(f"torchpose.{_HOMES[name]}"), name)
+    elif name in _PACKAGES or _moved.present_module(f"torchpose.{name}"):
+        value = _import_module(f"torchpose.{name}")
     else:
         raise AttributeError(f"module 'torchpose' has no attribute {name!r}")
     globals()[name] = value
@@ -102,7 +94,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_SUBMODULES, *_HOME, "__version__"})
+    return sorted({*__all__, *_PACKAGES, "__version__", "__doc__", "__file__", "__name__"})
 
 
 def _version() -> str:

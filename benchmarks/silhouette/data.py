@@ -8,17 +8,15 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from torchpose.body.skeleton import BODY_15
-from torchpose.camera.pinhole import PinholeCamera
 from torchpose.camera.rig import CameraRig
+from torchpose.demo.rendering.cameras import AZIMUTHS, cameras_around
 from torchpose.errors import InputError
 from torchpose.io.mocap import MocapClip, select_persons
 
 __all__ = [
     "Split",
-    "cameras_around",
     "in_view",
     "looped",
     "place_cameras",
@@ -27,8 +25,6 @@ __all__ = [
     "whole_frames",
 ]
 
-AZIMUTHS = (30.0, 150.0, 270.0)
-"""Where the cameras stand, degrees from the direction of the walk, to the walker's left."""
 
 LEAST_FRAMES = 110
 """A test trial should have as many; a shorter one is taken where there is no other."""
@@ -156,69 +152,6 @@ def place_cameras(
 ) -> CameraRig:
     """The rig of `cameras_around` a clip, which takes the options."""
     return CameraRig(cameras_around(clip, azimuths, **options))
-
-
-def cameras_around(
-    clip: MocapClip,
-    azimuths: Sequence[float] = AZIMUTHS,
-    distance: float = 3.8,
-    height: float = 1.5,
-    focal: float = 450.0,
-) -> list[PinholeCamera]:
-    """Cameras of 640 x 480 pixels around the middle of the way, which they look at.
-
-    They stand at `azimuths` from the direction of the walk, none of them in its line, so that the
-    person stays in view for four metres of it.
-
-    Args:
-        clip: whose way it is. azimuths: degrees, one camera each. distance: from the middle, metres.
-        height: above the lowest joint, metres. focal: length, pixels.
-    """
-    up = clip.up.double()
-    forward, left = _way(clip)
-    points = clip.joints[:, _PELVIS]
-    low, high = points.amin(0), points.amax(0)
-    floor = float((clip.joints @ up).nan_to_num(math.inf).min())
-    middle = (low + high) / 2
-    middle = middle - (middle @ up) * up
-    target = middle + (floor + 0.95) * up
-    cameras = []
-    for i, azimuth in enumerate(azimuths, start=1):
-        angle = math.radians(azimuth)
-        place = middle + distance * (math.cos(angle) * forward + math.sin(angle) * left)
-        place = place + (floor + height) * up
-        cameras.append(_looking(place, target, up, focal, f"cam_{i:02d}"))
-    return cameras
-
-
-def _way(clip: MocapClip) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Horizontal direction of the walk, or of the chest where nobody walks, and its left."""
-    up = clip.up.double()
-    pelvis = clip.joints[:, _PELVIS].double()
-    way = pelvis[-1] - pelvis[0]
-    way = way - (way @ up) * up
-    if float(way.norm()) < 0.5:
-        sides = (BODY_15.joint("left_shoulder"), BODY_15.joint("right_shoulder"))
-        across = (clip.joints[:, sides[0]] - clip.joints[:, sides[1]]).double().nanmean(0)
-        way = torch.linalg.cross(across, up)
-    forward = normalize(way, dim=-1)
-    return forward, torch.linalg.cross(up, forward)
-
-
-def _looking(
-    place: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"], focal: float,
-    name: str,
-) -> PinholeCamera:  # fmt: skip
-    """A camera at `place` with `target` in the middle of the image, upright."""
-    import cv2
-
-    z = normalize(target - place, dim=-1)
-    x = normalize(torch.linalg.cross(z, up), dim=-1)
-    R = torch.stack([x, torch.linalg.cross(z, x), z])
-    return PinholeCamera(
-        focal, focal, 319.5, 239.5, 640, 480, name,
-        rotation=cv2.Rodrigues(R.numpy())[0].ravel().tolist(), translation=(-R @ place).tolist(),
-    )  # fmt: skip
 
 
 def in_view(clip: MocapClip, cameras: CameraRig) -> Float[Tensor, " C"]:

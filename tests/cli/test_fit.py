@@ -10,7 +10,8 @@ from torchpose.cli.fit import build, command_line
 from torchpose.io import read_recordings
 from torchpose.learning.curation import curate
 from torchpose.learning.recipes import UpperBodyRecipe
-from torchpose.priors import UpperBodyPrior, fit_upper_body_prior, load_prior
+from torchpose.learning.upper_body import fit_upper_body_prior
+from torchpose.priors import UpperBodyPrior, load_prior
 
 QUICK = ("--components", 2, "--samples", 500, "--noise", "none", "--pictures", "false")
 

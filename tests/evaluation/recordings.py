@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from torchpose.demo import performer
-from torchpose.priors import fit_upper_body_prior
+from torchpose.learning.upper_body import fit_upper_body_prior
 from torchpose.skeleton import SKELETONS, UPPER_BODY
 
 V1 = SKELETONS["kinect-v1-20"].joints

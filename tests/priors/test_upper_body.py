@@ -21,14 +21,8 @@ from torchpose.errors import (
 )
 from torchpose.learning import arm_sources, collect_poses, model_card, write_model_card
 from torchpose.learning.samplers import all_samples
-from torchpose.priors import (
-    GaussianMixture,
-    PriorInfo,
-    UpperBodyPrior,
-    fit_upper_body_prior,
-    known_priors,
-    load_prior,
-)
+from torchpose.learning.upper_body import fit_upper_body_prior
+from torchpose.priors import GaussianMixture, PriorInfo, UpperBodyPrior, known_priors, load_prior
 from torchpose.priors import upper_body as module
 
 

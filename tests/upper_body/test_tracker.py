@@ -27,9 +27,10 @@ from torchpose.errors import (
     SkeletonError,
 )
 from torchpose.learning.recipes import fit_calibration, fit_kinect_prior
+from torchpose.learning.upper_body import fit_upper_body_prior
 from torchpose.math import euler_to_matrix
 from torchpose.metrics import joint_errors_3d
-from torchpose.priors import UpperBodyPrior, fit_upper_body_prior
+from torchpose.priors import UpperBodyPrior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.skeleton.neck import KINECT_NECK
 from torchpose.upper_body import METHODS, PoseTrack, UpperBodyTracker

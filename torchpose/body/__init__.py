@@ -1,5 +1,6 @@
 """The articulated body: skeleton, kinematics, fits to recorded joints, limits, silhouettes."""
 
+from torchpose._core.moved import moved_names
 from torchpose.body.fitting import fit_body, fit_state, joint_errors
 from torchpose.body.kinematics import FRAMES, Body, Frame, centres_of
 from torchpose.body.limbs import Limbs
@@ -22,3 +23,5 @@ __all__ = [
     "fit_state",
     "joint_errors",
 ]
+
+__getattr__ = moved_names(__name__)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.errors import InputError, SkeletonError, check_shape
+from torchpose.math.tree_messages import tree_levels
 from torchpose.skeleton.joint_sets import canonical_names
 
 __all__ = [
@@ -23,7 +24,6 @@ __all__ = [
     "Tip",
     "body_joints",
     "other_side",
-    "tree_levels",
 ]
 
 Offset = tuple[float, float, float]
@@ -199,34 +199,6 @@ class BodySkeleton:
 
 
 _LEG_BONE = 0.2  # of the body height: only the bones of the legs are as long
-
-
-def tree_levels(parents: Sequence[int], names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
-    """Nodes of a forest by their depth, the roots (parent -1) first.
-
-    Args:
-        parents: index of every node's parent, -1 for a root.
-        names: of the nodes, for the message.
-
-    Raises:
-        SkeletonError: a parent outside the tree, or parents that form a cycle.
-
-    >>> tree_levels((-1, 0, 0, 2), "abcd")
-    ((0,), (1, 2), (3,))
-    """
-    wrong = [names[i] for i, p in enumerate(parents) if not -1 <= p < len(parents)]
-    if wrong:
-        raise SkeletonError(f"parents must be -1 or an index, not so for {', '.join(wrong)}")
-    levels: list[tuple[int, ...]] = []
-    left, above = set(range(len(parents))), {-1}
-    while left:
-        level = tuple(i for i in sorted(left) if parents[i] in above)
-        if not level:
-            cycle = ", ".join(names[i] for i in sorted(left))
-            raise SkeletonError(f"parents must form a tree; these form a cycle or hang on: {cycle}")
-        levels.append(level)
-        above, left = set(level), left - set(level)
-    return tuple(levels)
 
 
 def _check_lengths(skeleton: BodySkeleton) -> None:

@@ -1,5 +1,6 @@
 """Cameras: pinhole models, rigs, projection and lifting, viewpoints."""
 
+from torchpose._core.moved import moved_names
 from torchpose.camera.lifting import (
     arm_in_body_frame,
     arm_in_camera_frame,
@@ -43,3 +44,5 @@ __all__ = [
     "save_cameras",
     "undistortion_maps",
 ]
+
+__getattr__ = moved_names(__name__)

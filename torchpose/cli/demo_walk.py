@@ -67,9 +67,9 @@ def demo_walk(folder: str, seconds: float, seed: int, pictures: bool) -> int:
 
 def _render(walker: "Walk", out: Path, seed: int) -> tuple[list[Path], list[Path]]:
     """Write videos, pictures of the empty scenes, cameras and truth; returns videos and pictures."""
-    from benchmarks.silhouette.data import cameras_around
     from torchpose.camera.pinhole import save_cameras
     from torchpose.demo.rendering.body_video import render_body_video, walk_clip
+    from torchpose.demo.rendering.cameras import cameras_around
     from torchpose.io.results import ResultsFolder
 
     cameras = cameras_around(walk_clip(walker))

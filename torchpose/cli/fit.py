@@ -203,7 +203,7 @@ def _fit(recordings: list["Recording"], args: Namespace, name: str) -> "UpperBod
     facts = {"name": name, "licence": args.licence, "command": command_line(args)}
     own = {"neck": args.neck} | ({"n_samples": args.samples} if args.samples else {})
     if args.noise == "none":
-        from torchpose.priors.upper_body import fit_upper_body_prior
+        from torchpose.learning.upper_body import fit_upper_body_prior
 
         settings: dict[str, Any] = facts | own | {"progress": show_progress()}
         return fit_upper_body_prior(recordings, args.components, args.seed, **settings)

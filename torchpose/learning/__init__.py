@@ -1,6 +1,14 @@
 """Learn priors from recordings: EM over many samples, fits, recipes, curation, fine-tuning."""
 
-from torchpose.learning.model_card import write_model_card
+from torchpose.learning.model_card import model_card, write_model_card
 from torchpose.learning.training import TRAINING_VIEWS, arm_sources, collect_poses
+from torchpose.learning.upper_body import fit_upper_body_prior
 
-__all__ = ["TRAINING_VIEWS", "arm_sources", "collect_poses", "write_model_card"]
+__all__ = [
+    "TRAINING_VIEWS",
+    "arm_sources",
+    "collect_poses",
+    "fit_upper_body_prior",
+    "model_card",
+    "write_model_card",
+]

@@ -5,18 +5,17 @@ elements of a batch; products of Gaussians are sums in information form (DX 7), 
 h = Sigma^-1 mu, by Cholesky solves.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.body.skeleton import tree_levels
 from torchpose.errors import ShapeError, SkeletonError, check_shape
 from torchpose.math.gaussian import safe_cholesky
 
-__all__ = ["MessageTree", "Transport", "TreeLevel", "message_tree", "propagate"]
+__all__ = ["MessageTree", "Transport", "TreeLevel", "message_tree", "propagate", "tree_levels"]
 
 Transport = Callable[[Tensor, Tensor, Tensor, bool], tuple[Tensor, Tensor]]
 
@@ -170,3 +169,31 @@ def _solved(factor: Tensor, vector: Tensor) -> Tensor:
     sides = torch.cat([eye.expand_as(factor), vector[..., None]], -1)
     white = torch.linalg.solve_triangular(factor, sides, upper=False)
     return white[..., :-1].mT @ white
+
+
+def tree_levels(parents: Sequence[int], names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
+    """Nodes of a forest by their depth, the roots (parent -1) first.
+
+    Args:
+        parents: index of every node's parent, -1 for a root.
+        names: of the nodes, for the message.
+
+    Raises:
+        SkeletonError: a parent outside the tree, or parents that form a cycle.
+
+    >>> tree_levels((-1, 0, 0, 2), "abcd")
+    ((0,), (1, 2), (3,))
+    """
+    wrong = [names[i] for i, p in enumerate(parents) if not -1 <= p < len(parents)]
+    if wrong:
+        raise SkeletonError(f"parents must be -1 or an index, not so for {', '.join(wrong)}")
+    levels: list[tuple[int, ...]] = []
+    left, above = set(range(len(parents))), {-1}
+    while left:
+        level = tuple(i for i in sorted(left) if parents[i] in above)
+        if not level:
+            cycle = ", ".join(names[i] for i in sorted(left))
+            raise SkeletonError(f"parents must form a tree; these form a cycle or hang on: {cycle}")
+        levels.append(level)
+        above, left = set(level), left - set(level)
+    return tuple(levels)

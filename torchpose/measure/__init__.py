@@ -1,5 +1,6 @@
 """Measurements from images: faces, skin, hands, edges, background, silhouettes."""
 
+from torchpose._core.moved import moved_names
 from torchpose.measure.association import AssociationState, HandAssociation
 from torchpose.measure.background import BackgroundModel
 from torchpose.measure.brightness_background import BrightnessBackground, PixelKind
@@ -10,7 +11,7 @@ from torchpose.measure.hand_prior import HandPrior
 from torchpose.measure.hand_settings import HandSettings
 from torchpose.measure.hands import HandState, HandTracker
 from torchpose.measure.head_neck import FACE_OFFSETS, FaceOffsets, HeadNeck
-from torchpose.measure.mean_shift import MeanShift
+from torchpose.measure.mean_shift import MeanShift, mean_shift
 from torchpose.measure.mean_shift_hands import MeanShiftHandState, MeanShiftHandTracker
 from torchpose.measure.mediapipe import MediaPipeFaceDetector, MediaPipePose, PoseLandmarks
 from torchpose.measure.persons import PersonRegister, Persons
@@ -66,5 +67,8 @@ __all__ = [
     "elbows_from_torso",
     "find_segments",
     "limb_votes",
+    "mean_shift",
     "rgb_to_lab",
 ]
+
+__getattr__ = moved_names(__name__)

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose._core.arguments import as_pair, as_values
 from torchpose.errors import InputError, check_shape
 from torchpose.math.gaussian import log_prob, safe_cholesky
-from torchpose.metrics.arguments import as_pair, as_values
 
 __all__ = [
     "Coverage",

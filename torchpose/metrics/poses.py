@@ -16,8 +16,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose._core.arguments import as_pair, as_values
 from torchpose.errors import InputError, check_shape
-from torchpose.metrics.arguments import as_pair, as_values
+from torchpose.math.procrustes import RigidMotion, procrustes
 from torchpose.metrics.calibration import (
     Coverage,
     calibration_error,
@@ -28,6 +29,7 @@ from torchpose.metrics.calibration import (
     predictive_log_likelihood,
     reliability,
 )
+from torchpose.skeleton.torso import ALIGN_JOINTS
 
 __all__ = [
     "ALIGN_JOINTS",
@@ -56,8 +58,6 @@ __all__ = [
     "summarise_errors",
 ]
 
-ALIGN_JOINTS = (3, 4, 2, 5)
-"""Head, neck and both shoulders of the 8-joint upper body: what the paper aligns (BL section 6)."""
 
 ARM_LIMBS = ((2, 1), (1, 0), (5, 6), (6, 7))
 """Left upper arm, left forearm, right upper arm, right forearm of the 8-joint upper body."""
@@ -65,14 +65,7 @@ ARM_LIMBS = ((2, 1), (1, 0), (5, 6), (6, 7))
 PCP_THRESHOLDS = tuple(round(0.05 * i, 2) for i in range(1, 21))
 
 
-# --- fixed-scale Procrustes -----------------------------------------------------------------------
-
-
-class RigidMotion(NamedTuple):
-    """x -> R x + t. rotation [*batch, 3, 3] (det +1), translation [*batch, 3], metres."""
-
-    rotation: Tensor
-    translation: Tensor
+# --- alignment ------------------------------------------------------------------------------------
 
 
 class Alignment(NamedTuple):
@@ -81,52 +74,6 @@ class Alignment(NamedTuple):
     points: Tensor
     covariance: Tensor | None
     motion: RigidMotion
-
-
-def procrustes(
-    source: Float[Tensor, "*batch N 3"],
-    target: Float[Tensor, "*batch N 3"],
-    mask: Bool[Tensor, "*batch N"] | None = None,
-) -> RigidMotion:
-    """Rigid motion without scale or reflection that brings each source closest to its target.
-
-    min over R in SO(3), t of sum_n |R s_n + t - x_n|^2; with the centred cross-covariance
-    U S V^T = sum_n x_n s_n^T, R = U diag(1, 1, det(U V^T)) V^T and t = mean x - R mean s.
-
-    Args:
-        source, target: [*batch, N, 3], metres; a point with a NaN in either is left out.
-        mask: [*batch, N], True = use the point.
-
-    Returns:
-        `RigidMotion`; NaN for an element with fewer than three points. With points on one line the
-        turn about that line is not determined, and one of the best is returned.
-
-    Reference: Schoenemann (1966), DOI 10.1007/BF02289451; Kabsch (1976) for the sign.
-
-    >>> square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    >>> procrustes(square, square + 1).translation
-    tensor([1., 1., 1.])
-    """
-    source, target = as_pair(source, target, mask, ["...", None, 3], ("source", "target"))
-    use = torch.isfinite(source).all(-1) & torch.isfinite(target).all(-1)
-    if mask is not None:
-        use = use & mask
-    weight = use[..., None].to(source.dtype)
-    count = weight.sum(-2, keepdim=True)
-    s = torch.where(use[..., None], source, torch.zeros_like(source))
-    x = torch.where(use[..., None], target, torch.zeros_like(target))
-    s_mean = s.sum(-2, keepdim=True) / count.clamp_min(1)
-    x_mean = x.sum(-2, keepdim=True) / count.clamp_min(1)
-    u, _, vh = torch.linalg.svd(((x - x_mean) * weight).mT @ ((s - s_mean) * weight))
-    sign = torch.linalg.det(u @ vh)
-    last = torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1)
-    rotation = (u * last[..., None, :]) @ vh
-    translation = (x_mean - s_mean @ rotation.mT).squeeze(-2)
-    few = (count < 3).reshape(count.shape[:-2])
-    return RigidMotion(
-        rotation.masked_fill(few[..., None, None], math.nan),
-        translation.masked_fill(few[..., None], math.nan),
-    )
 
 
 def align(

@@ -1,9 +1,10 @@
 """Learned priors over body states: mixtures of both arms, manifolds, postures of actions."""
 
+from torchpose._core.moved import moved_names
 from torchpose.priors.actions.bank import ActionBank
 from torchpose.priors.actions.file import ActionInfo
 from torchpose.priors.actions.space import ActionSpace
-from torchpose.priors.arm_state import arm_states, mirror_arm_state, mirror_mixture
+from torchpose.priors.arm_state import arm_state, arm_states, mirror_arm_state, mirror_mixture
 from torchpose.priors.gaussian_mixture import ConditionedMixture, GaussianMixture
 from torchpose.priors.manifold.file import ManifoldInfo
 from torchpose.priors.manifold.gplvm import BackConstrainedGPLVM
@@ -16,7 +17,6 @@ from torchpose.priors.shipped import (
 )
 from torchpose.priors.upper_body import (
     UpperBodyPrior,
-    fit_upper_body_prior,
     known_priors,
     load_prior,
 )
@@ -31,8 +31,8 @@ __all__ = [
     "ManifoldInfo",
     "PriorInfo",
     "UpperBodyPrior",
+    "arm_state",
     "arm_states",
-    "fit_upper_body_prior",
     "known_models",
     "known_priors",
     "load_action",
@@ -42,3 +42,5 @@ __all__ = [
     "mirror_arm_state",
     "mirror_mixture",
 ]
+
+__getattr__ = moved_names(__name__)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +16,6 @@ from torchpose._core.npz import read_npz
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import require_tensor
 from torchpose.camera.pinhole import PinholeCamera
-from torchpose.camera.viewpoints import ViewRange
 from torchpose.errors import (
     FileFormatError,
     InputError,
@@ -26,12 +25,9 @@ from torchpose.errors import (
     check_covariance,
     check_finite,
 )
-from torchpose.learning.samplers import ArmSource, all_samples
-from torchpose.learning.training import TRAINING_VIEWS, RecordingLike, arm_sources, collect_poses
 from torchpose.priors.arm_state import (
     STATE_DIM,
     arm_states,
-    check_rotation_order,
     mirror_arm_state,
     mirror_covariance,
     mirror_mixture,
@@ -42,11 +38,9 @@ from torchpose.priors.prior_noise import check_noise
 from torchpose.priors.window import WindowPrior
 
 __all__ = [
-    "TRAINING_VIEWS",
     "PriorInfo",
     "UpperBodyPrior",
     "arm_states",
-    "fit_upper_body_prior",
     "known_priors",
     "load_prior",
     "mirror_arm_state",
@@ -283,86 +277,6 @@ def released_process_cov() -> Tensor:
     )
 
 
-def fit_upper_body_prior(
-    recordings: Sequence[RecordingLike],
-    n_components: int = 30,
-    seed: int = 0,
-    views: ViewRange = TRAINING_VIEWS,
-    *,
-    camera: PinholeCamera | None = None,
-    rotation_order: str = "zxy",
-    centre: str = "neck",
-    neck: str | None = None,
-    mirror: bool = True,
-    n_samples: int | None = None,
-    views_per_pose: int | None = None,
-    nose_as_head: bool = False,
-    name: str = "",
-    licence: str = "",
-    command: str = "",
-    progress: bool = False,
-    **fit_options: Any,
-) -> UpperBodyPrior:
-    """Fit a prior to recorded 3D poses seen from random viewpoints (BL section 3.1).
-
-    Args:
-        recordings: in camera axes (`torchpose.io.read_recordings`).
-        n_components: Gaussians per arm.
-        seed: of viewpoints and start.
-        views: limits of the random viewpoints.
-        camera: whose pixels the states are in; Kinect's (f = 525, 640 x 480) if None.
-        rotation_order: "zxy" (paper) or "zyx" (released priors).
-        centre: "neck", "head" or "sequence" (`PriorInfo`).
-        neck: kind of neck; the highest among the recordings if None. Others are converted.
-        mirror: fit one mixture to left arms and mirrored right arms, and mirror it.
-        n_samples, views_per_pose: how many training states (`arm_sources`).
-        nose_as_head: take the nose where a joint set has no head.
-        name, licence, command: for `info`.
-        progress: show bars.
-        fit_options: to `GaussianMixture.fit`: n_init, max_iter, tol, covariance_floor, init.
-
-    Raises:
-        InputError: no recordings or no complete frames. PriorError: kinds of joints that cannot be
-            mixed, unknown rotation order.
-    """
-    check_rotation_order(rotation_order)
-    camera = camera or PinholeCamera(*_KINECT_CAMERA, width=640, height=480)
-    (fx, skew, cx), (_, fy, cy), _ = camera.matrix.tolist()
-    if skew:
-        raise PriorError(f"the camera of a prior must have no skew, got {skew:g} pixels")
-    poses = collect_poses(recordings, neck, centre, nose_as_head)
-    sources = arm_sources(
-        poses, camera.matrix, seed, views, rotation_order, mirror, n_samples, views_per_pose
-    )
-    options: dict[str, Any] = {"n_components": n_components, "seed": seed}
-    options |= {"progress": progress} | fit_options
-    left = _fit_arm(sources.left, options)
-    right = None if sources.right is None else _fit_arm(sources.right, options)
-    info = PriorInfo(
-        name=name, rotation_order=rotation_order, fx=fx, fy=fy, cx=cx, cy=cy, licence=licence,
-        command=command, views=asdict(views), **sources.facts,
-    )  # fmt: skip
-    return prior_of_arms(left, right, info, seed)
-
-
-def _fit_arm(source: ArmSource, options: dict[str, Any]) -> GaussianMixture:
-    states, weight = all_samples(source)
-    return GaussianMixture.fit(states, sample_weight=weight, **options)
-
-
-def prior_of_arms(
-    left: GaussianMixture, right: GaussianMixture | None, info: PriorInfo, seed: int
-) -> UpperBodyPrior:
-    """Prior of fitted mixtures over poses; a right arm of None is the left one's mirror image.
-
-    Args:
-        left, right: mixtures with their `fit_report`, if they were fitted. info: what they were
-            fitted on. seed: of the fit.
-    """
-    info = replace(info, extra=info.extra | _fit_facts(left, seed))
-    return UpperBodyPrior(left, mirror_mixture(left, info.cx) if right is None else right, info)
-
-
 def known_priors() -> list[str]:
     """Names of the priors that come with the package."""
     return sorted(p.stem for p in WEIGHTS.glob("*.safetensors"))
@@ -399,21 +313,6 @@ def _mixture(path: str | Path, side: str, tensors: Mapping[str, Tensor]) -> Gaus
         return GaussianMixture(*parts)
     except TorchposeError as error:
         raise FileFormatError(f"{path}: the {side} mixture is damaged: {error}") from error
-
-
-def _fit_facts(mixture: GaussianMixture, seed: int) -> dict[str, Any]:
-    report = mixture.fit_report
-    if report is None:
-        return {"seed": seed}
-    return {
-        "seed": seed,
-        "fit": {
-            "iterations": report.iterations,
-            "log_likelihood": report.log_likelihood[-1],
-            "converged": report.converged,
-            "reseeded": report.reseeded,
-        },
-    }
 
 
 def _mirrored_noise(value: Tensor) -> Tensor:

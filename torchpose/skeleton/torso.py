@@ -8,9 +8,12 @@ towards the camera, so that estimates from different views and postures may be a
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.metrics.poses import ALIGN_JOINTS, procrustes
+from torchpose.math.procrustes import procrustes
 
-__all__ = ["TORSO", "in_torso_axes", "onto_torso"]
+__all__ = ["ALIGN_JOINTS", "TORSO", "in_torso_axes", "onto_torso"]
+
+ALIGN_JOINTS = (3, 4, 2, 5)
+"""Head, neck and both shoulders of the 8-joint upper body: what the paper aligns (BL section 6)."""
 
 TORSO = ((0.0, -0.20, 0.0), (0.0, -0.01, 0.0), (0.16, 0.10, 0.0), (-0.16, 0.10, 0.0))
 """Head, neck, left and right shoulder, metres: x to the person's left, y down, about their middle."""

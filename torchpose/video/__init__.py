@@ -4,6 +4,7 @@ from torchpose.video.base import Image, VideoFrame, VideoSource
 from torchpose.video.camera import CameraSource
 from torchpose.video.file import FileSource
 from torchpose.video.images import FolderSource
+from torchpose.video.prefetch import prefetch
 from torchpose.video.silhouettes import SilhouetteMeasurer, fit_view, read_silhouettes
 from torchpose.video.source import open_video
 from torchpose.video.writer import VideoWriter
@@ -19,5 +20,6 @@ __all__ = [
     "VideoWriter",
     "fit_view",
     "open_video",
+    "prefetch",
     "read_silhouettes",
 ]

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.silhouette.data import cameras_around
 from torchpose.body import BODY_15, Body
 from torchpose.demo.rendering.body_video import empty_scene, render_body_video, walk_clip
+from torchpose.demo.rendering.cameras import cameras_around
 from torchpose.demo.rendering.gait import gait_angles, walk
 from torchpose.errors import InputError
 from torchpose.video import open_video

@@ -6,7 +6,7 @@ from torchpose.learning.curation.bones import (
     find_wrong_joints,
     person_bones,
 )
-from torchpose.learning.curation.curate import Curated, CurationSettings, complete_runs
+from torchpose.learning.curation.curate import Curated, CurationSettings, complete_runs, curate
 from torchpose.learning.curation.duplicates import Duplicate, find_duplicates
 from torchpose.learning.curation.harmonise import harmonise_bones
 from torchpose.learning.curation.jumps import JUMP_SPEEDS, find_jumps
@@ -35,6 +35,7 @@ __all__ = [
     "bone_lengths",
     "check_kinds",
     "complete_runs",
+    "curate",
     "face_camera",
     "find_duplicates",
     "find_jumps",

@@ -36,10 +36,11 @@ from torchpose.learning.training import (
     arm_sources,
     collect_poses,
 )
+from torchpose.learning.upper_body import prior_of_arms
 from torchpose.priors.arm_state import check_rotation_order
 from torchpose.priors.gaussian_mixture import GaussianMixture
 from torchpose.priors.prior_file import PriorInfo
-from torchpose.priors.upper_body import UpperBodyPrior, prior_of_arms
+from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.priors.window import WindowLayout, WindowPrior
 
 __all__ = ["VERSION", "MixtureTask", "UpperBodyRecipe", "fit_kinect_prior"]

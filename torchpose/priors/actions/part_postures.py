@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from torchpose.body.kinematics import Body
-from torchpose.body.skeleton import tree_levels
 from torchpose.errors import check_shape
+from torchpose.math.tree_messages import tree_levels
 from torchpose.priors.actions.polar_limbs import LIMB_PARENTS, LIMBS_12, POSTURE_DIM
 from torchpose.priors.actions.postures import check_body
 

@@ -23,9 +23,10 @@ from torch import Tensor
 
 from torchpose.body.fitting import swing_parts
 from torchpose.body.kinematics import Body
-from torchpose.body.skeleton import BODY_15, body_joints, tree_levels
+from torchpose.body.skeleton import BODY_15, body_joints
 from torchpose.errors import InputError, ShapeError, SkeletonError, check_finite, check_shape
 from torchpose.math.quaternion_vectors import minimal_rotation, quaternion_vector_to_matrix
+from torchpose.math.tree_messages import tree_levels
 from torchpose.priors.actions.polar_limbs import (
     ANGLE_NAMES,
     LIMB_PARENTS,
