@@ -265,3 +265,13 @@ def _add_errors(report: Report, runs: Runs, tracked: Sequence[Tracked]) -> None:
     )  # fmt: skip
     for i, name in enumerate(next(iter(runs.values()))):
         by_person.add(name, [float(part_errors(runs, method)[i].mean()) for method in runs])
+
+
+if __name__ == "__main__":
+    from benchmarks._command import main
+
+    main(
+        "body_models",
+        "whole bodies of persons whom a manifold, limb conditionals or actions do not know",
+        "mocap",
+    )

@@ -397,3 +397,9 @@ def _rows(videos: Videos, rows: slice) -> Videos:
 def _cut(videos: Videos, n: int, frames: int) -> Videos:
     lengths = videos.lengths[:n].clamp_max(frames)
     return Videos(videos.z[:, :n, : int(lengths.max())], lengths, videos.names[:n])
+
+
+if __name__ == "__main__":
+    from benchmarks._command import main
+
+    main("signer", "the authors' released sign-language tracker", "folder")

@@ -274,3 +274,9 @@ def time_step(
             state, _ = model.step(state, z[:, t % z.shape[1]], generator=generator)
             seconds = [*seconds, time.perf_counter() - start]
     return 1e3 * float(torch.tensor(seconds[n_warm:]).median())
+
+
+if __name__ == "__main__":
+    from benchmarks._command import main
+
+    main("ub_one", "the paper's trackers on the authors' own recording (burke_kinect)", "folder")

@@ -258,3 +258,9 @@ def nearest_neighbour(
     joints2d, joints3d = torch.full_like(test.truth2d, torch.nan), test.truth3d * torch.nan
     joints2d[inside], joints3d[inside] = uv[index], joints[index]
     return Estimate(joints2d, joints3d)
+
+
+if __name__ == "__main__":
+    from benchmarks._command import main
+
+    main("ub_people", "persons whom the prior never saw (kinect_utd_mhad)", "folder")

@@ -132,3 +132,11 @@ def without_raised(
         wanted -= len(recordings[index])
     control = [recordings[index] for index in sorted(chosen)]
     return {"no raised arms": kept, "as many at random": control}
+
+
+if __name__ == "__main__":
+    from benchmarks._command import main
+
+    main(
+        "uncommon_poses", "training recordings of raised arms left out (kinect_utd_mhad)", "folder"
+    )

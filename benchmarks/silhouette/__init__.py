@@ -1,0 +1,1 @@
+"""Protocol Silhouette: whole bodies tracked from silhouettes of several cameras, three filters."""

@@ -129,18 +129,7 @@ MODULES = {
     "priors.usable_samples": "learning.usable_samples",
     "process_noise": "upper_body.process_noise",
     "projection": "camera.projection",
-    "protocols.common": "evaluation.common",
-    "protocols.completion": "evaluation.completion",
-    "protocols.cross_dataset": "evaluation.cross_dataset",
-    "protocols.cross_tables": "evaluation.cross_tables",
-    "protocols.kept_runs": "evaluation.kept_runs",
-    "protocols.learning_curve": "evaluation.learning_curve",
-    "protocols.leave_one_person_out": "evaluation.leave_one_person_out",
-    "protocols.people_tables": "evaluation.people_tables",
-    "protocols.person_tables": "evaluation.person_tables",
-    "protocols.persons": "evaluation.persons",
-    "protocols.report": "evaluation.report",
-    "protocols.unseen": "evaluation.unseen",
+    "protocols": "evaluation",
     "read_out": "upper_body.fusion",
     "recipes": "learning.recipes",
     "recording": "video.recording",
@@ -216,8 +205,6 @@ NAMES = {
 def present_module(old: str) -> str | None:
     """Return the full present name of a module by its old full name, or None if it did not move."""
     parts = old.split(".")[1:]
-    if parts[:1] == ["protocols"] and old not in _PROTOCOL_MODULES:
-        return ".".join(["torchpose", "evaluation", *parts[1:]])
     for length in range(len(parts), 0, -1):
         home = MODULES.get(".".join(parts[:length]))
         if home is not None:
@@ -225,21 +212,18 @@ def present_module(old: str) -> str | None:
     return None
 
 
-_PROTOCOL_MODULES = {f"torchpose.{old}" for old in MODULES if old.startswith("protocols.")}
-
-
 def moved_names(package: str) -> Callable[[str], Any]:
     """Return the `__getattr__` of a package that had names which have moved."""
     homes = {n: home for home, names in NAMES[package].items() for n in names.split()}
 
-    def __getattr__(name: str) -> Any:
+    def attribute(name: str) -> Any:
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         home = f"torchpose.{homes[name]}"
         _warn(f"{package}.{name}", f"{home}.{name}")
         return getattr(import_module(home), name)
 
-    return __getattr__
+    return attribute
 
 
 def install() -> None:
@@ -289,4 +273,3 @@ class _Alias(Loader):
 
     def exec_module(self, module: ModuleType) -> None:
         module.__spec__ = self.spec  # the machinery has put the old name's there
-

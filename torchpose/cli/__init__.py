@@ -8,16 +8,16 @@ not good; 2 refused (input, options, output), with one line on stderr; 130 inter
 import os
 import sys
 from argparse import ArgumentError
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 
-__all__ = ["main"]
+__all__ = ["guarded", "main"]
 
 COMMANDS = {
     "track": "2D keypoints to 2D and 3D poses",
     "track-body": "videos of calibrated cameras to the poses of a whole body",
     "fit": "fit a prior to recorded 3D poses",
-    "evaluate": "run an evaluation protocol: ub-people, signer, silhouette, ...",
+    "evaluate": "score priors on recordings: leave-one-person-out, learning-curve, ...",
     "demo": "track an animated performer; needs no data",
     "info": "version, priors that are there, what a file holds",
 }
@@ -27,7 +27,7 @@ examples:
   torchpose track keypoints.npz --out result
   torchpose track keypoints.csv --out result --camera 525,525,319.5,239.5 --smoothing full
   torchpose fit recordings/ --out prior.safetensors --components 30 --seed 0
-  python -m benchmarks.ub_people --data data/ --out result
+  torchpose evaluate leave-one-person-out recordings/ --out result
   torchpose info kinect-upper-body"""
 
 
@@ -37,11 +37,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: what stands after `torchpose` on the command line; `sys.argv[1:]` if None.
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    return guarded(_dispatch, list(sys.argv[1:] if argv is None else argv))
+
+
+def guarded(command: Callable[[list[str]], int], arguments: list[str]) -> int:
+    """Return the exit code of a command; what it refuses is one line on stderr.
+
+    Args:
+        command: takes arguments, and returns an exit code.
+        arguments: what stands after the program; `--debug` among them shows tracebacks.
+    """
     debug = "--debug" in arguments or os.environ.get("TORCHPOSE_DEBUG", "0") not in ("", "0")
     arguments = [a for a in arguments if a != "--debug"]
     try:
-        return _dispatch(arguments)
+        return command(arguments)
     except SystemExit as stop:  # --help and --print_config
         return stop.code if isinstance(stop.code, int) else 0
     except KeyboardInterrupt:

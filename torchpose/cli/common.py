@@ -38,16 +38,18 @@ exit codes: 0 done; 1 done, but the result is not good; 2 refused, with one line
 _POSITIONALS = {"input": "INPUT", "recordings": "DIR"}
 
 
-def new_parser(command: str, description: str, examples: str) -> ArgumentParser:
+def new_parser(
+    command: str, description: str, examples: str, program: str = "torchpose"
+) -> ArgumentParser:
     """Parser of a command, with --config.
 
     Args:
-        command: name after `torchpose`. description: first paragraph of the help.
-        examples: command lines, one each line, without indentation.
+        command: name after the program. description: first paragraph of the help.
+        examples: command lines, one each line, without indentation. program: what is typed first.
     """
     listed = "\n".join(f"  {line}" for line in examples.strip().splitlines())
     parser = ArgumentParser(
-        prog=f"torchpose {command}",
+        prog=f"{program} {command}".strip(),
         description=textwrap.fill(description, 79),
         epilog=f"examples:\n{listed}\n\n{_COMMON}",
         formatter_class=RawDescriptionHelpFormatter,
