@@ -2,8 +2,9 @@
 
 For each of s1 to s6 a prior is fitted to the other five, without calibration, and tracks that person
 in the test camera. Scale and floor of the covariances then come from the errors of the other five,
-each under the prior that did not know them (`torchpose.learning.recipes.fit_calibration`). The table shows the
-error and the share of true joints inside the 50 % and 90 % ellipsoids, person by person: its spread
+each under the prior that did not know them (`torchpose.learning.recipes.fit_calibration`). The table
+shows the error and the share of true joints inside the 50 % and 90 % ellipsoids, person by person:
+its spread
 is what a calibration on a handful of persons can promise for the next one.
 
     python -m benchmarks.ub_people_by_person --data DIR --out DIR

@@ -3,8 +3,9 @@
     python -m benchmarks.video_rendered --out DIR
 
 Figures 10 and 11 of Burke & Lasenby in kind. They compared with a Kinect's skeleton; here performers are
-rendered (`torchpose.demo.rendering`), 1,000 frames each, H.264, so the truth is exact and everything else made
-up: movements, clothes, room. The shipped prior has seen none of it. Errors are distances in centimetres
+rendered (`torchpose.demo.rendering`), 1,000 frames each, H.264, so the truth is exact and everything
+else made up: movements, clothes, room. The shipped prior has seen none of it. Errors are distances
+in centimetres
 after fixed-scale Procrustes on head, neck and shoulders, frame by frame, in all frames with a pose.
 
 `true 2D` is the same tracker fed with the true pixels of head, neck and hands: what is left is the price of

@@ -35,7 +35,7 @@ def test_import_loads_nothing_heavy():
 
 
 def test_modules_load_no_optional_package():
-    modules = ("camera", "errors", "filters", "metrics", "priors", "skeleton", "tracking")
+    modules = ("camera", "errors", "filters", "metrics", "priors", "skeleton", "upper_body")
     lines = "\n".join(f"torchpose.{name}" for name in modules)
     loaded = loaded_after(f"import torchpose\n{lines}")
     assert {f"torchpose.{name}" for name in modules} <= loaded
@@ -65,7 +65,7 @@ def test_no_filter_loads_a_computer_algebra_system_on_its_way():
     assert "sympy" not in loaded_after(FILTERS)
 
 
-@pytest.mark.parametrize("name", [*torchpose.__all__, *sorted(torchpose._SUBMODULES)])
+@pytest.mark.parametrize("name", [*torchpose.__all__, *sorted(torchpose._PACKAGES)])
 def test_every_public_name_resolves(name):
     assert name in dir(torchpose)
     assert getattr(torchpose, name) is not None

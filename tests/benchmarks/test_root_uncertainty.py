@@ -31,7 +31,7 @@ from benchmarks.silhouette.data import split_clips
 from benchmarks.silhouette.runs import Run, Tuning
 from benchmarks.silhouette.trackees import Conditions, Setting
 from tests.benchmarks.walkers import write_walkers
-from torchpose.cli.evaluate import build
+from torchpose.cli.protocol import Protocol, build
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import settings_hash
@@ -440,6 +440,9 @@ def test_options_that_mean_nothing_are_refused(folder, tmp_path, options, messag
 
 def test_words_of_the_command_line():
     words = "--mocap d --out o --cameras-used 3 2 --fps 60 15 --method sir root --part rates"
-    args = build("root-uncertainty").parse_args(words.split())
+    args = build(
+        "benchmarks.root_uncertainty",
+        Protocol("benchmarks.root_uncertainty.protocol", "whole bodies", "mocap"),
+    ).parse_args(words.split())
     assert args.cameras_used == [3, 2] and args.fps == [60.0, 15.0]
     assert args.method == ["sir", "root"] and args.part == "rates" and args.particles == 800

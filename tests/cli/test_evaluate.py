@@ -7,12 +7,13 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from torchpose.cli import evaluate
+from torchpose.cli.protocol import build
 from torchpose.errors import OverlapError
 
 
 @pytest.fixture
 def calls(monkeypatch):
-    """Calls of a protocol that stands in for ub-people."""
+    """Calls of a protocol that stands in for learning-curve."""
     made = []
 
     def run(
@@ -39,28 +40,28 @@ def calls(monkeypatch):
         made.append({k: v for k, v in locals().items() if k != "made"})
         return SimpleNamespace(summary=lambda: "error 5.0 cm")
 
-    module = ModuleType("benchmarks.ub_people")
+    module = ModuleType("torchpose.evaluation.learning_curve")
     module.run = run
-    monkeypatch.setitem(sys.modules, "benchmarks.ub_people", module)
+    monkeypatch.setitem(sys.modules, "torchpose.evaluation.learning_curve", module)
     return made
 
 
 def test_options_reach_the_protocol(torchpose, calls, tmp_path):
     line = ("--data", tmp_path, "--out", tmp_path / "out", "--seed", 4)
-    done = torchpose("evaluate", "ub-people", *line, "--quick", "true", "--n-views", 3)
+    done = torchpose("evaluate", "learning-curve", *line, "--quick", "true", "--n-views", 3)
     assert done.code == 0, done.err
     assert done.out == "error 5.0 cm\n"
     (call,) = calls
     assert call["data"] == tmp_path and call["out"] == tmp_path / "out"
     assert (call["seed"], call["quick"], call["n_views"], call["prior"]) == (4, True, 3, None)
     assert call["methods"] == ("a",) and call["recipe"] is None
-    done = torchpose("evaluate", *line, "ub-people", "--methods", '["b", "c"]')
+    done = torchpose("evaluate", *line, "learning-curve", "--methods", '["b", "c"]')
     assert done.code == 0, done.err
     assert tuple(calls[-1]["methods"]) == ("b", "c")
 
 
 def test_help_comes_from_the_docstring(torchpose, calls):
-    text = " ".join(torchpose("evaluate", "ub-people", "--help").out.split())
+    text = " ".join(torchpose("evaluate", "learning-curve", "--help").out.split())
     assert "--quick true|false few sequences" in text
     assert "--n-views N how many viewpoints" in text
     assert "--recipe" not in text
@@ -68,15 +69,15 @@ def test_help_comes_from_the_docstring(torchpose, calls):
 
 def test_prior_is_loaded(torchpose, calls, tmp_path, files):
     line = ("--data", tmp_path, "--out", tmp_path / "out", "--prior", files / "prior.safetensors")
-    assert torchpose("evaluate", "ub-people", *line).code == 0
+    assert torchpose("evaluate", "learning-curve", *line).code == 0
     assert calls[0]["prior"].info.name == "tiny"
 
 
 def test_config_file_round_trip(torchpose, calls, tmp_path):
     line = ("--data", tmp_path, "--out", tmp_path / "out", "--n-views", 7)
-    printed = torchpose("evaluate", "ub-people", *line, "--print_config")
+    printed = torchpose("evaluate", "learning-curve", *line, "--print_config")
     (tmp_path / "e.yaml").write_text(printed.out)
-    assert torchpose("evaluate", "ub-people", "--config", tmp_path / "e.yaml").code == 0
+    assert torchpose("evaluate", "learning-curve", "--config", tmp_path / "e.yaml").code == 0
     assert calls[0]["n_views"] == 7
 
 
@@ -84,14 +85,14 @@ def test_refusals(torchpose, calls, tmp_path):
     data, out = ("--data", tmp_path), ("--out", tmp_path / "out")
     (tmp_path / "file").write_text("")
     for arguments, message in (
-        ((), "the protocol is missing; known are ub-people, ub-one, signer"),
+        ((), "the protocol is missing; known are leave-one-person-out, learning-curve"),
         (("ub-two", *data, *out), "unknown protocol 'ub-two'"),
-        (("ub-people", *data), "missing: --out"),
-        (("ub-people", "--data", tmp_path / "none", *out), "no such folder"),
-        (("ub-people", *data, "--out", tmp_path / "file" / "x"), "cannot be written"),
-        (("ub-people", *data, *out, "--n-views", "many"), "argument --n-views"),
-        (("ub-people", *data, *out, "--prior", "nobody"), "name of a prior"),
-        (("ub-people", *data, *out, "--seed", 13), "was fitted on p1"),
+        (("learning-curve", *data), "missing: --out"),
+        (("learning-curve", "--data", tmp_path / "none", *out), "no such folder"),
+        (("learning-curve", *data, "--out", tmp_path / "file" / "x"), "cannot be written"),
+        (("learning-curve", *data, *out, "--n-views", "many"), "argument --n-views"),
+        (("learning-curve", *data, *out, "--prior", "nobody"), "name of a prior"),
+        (("learning-curve", *data, *out, "--seed", 13), "was fitted on p1"),
     ):
         done = torchpose("evaluate", *arguments)
         assert done.code == 2 and message in done.err, done
@@ -101,5 +102,7 @@ def test_refusals(torchpose, calls, tmp_path):
 
 @pytest.mark.parametrize("name", evaluate.PROTOCOLS)
 def test_parsers_of_the_real_ones(name):
-    args = evaluate.build(name).parse_args(["--data", "d", "--out", "o", "--seed", "1"])
+    args = build(name, evaluate.PROTOCOLS[name]).parse_args(
+        ["--data", "d", "--out", "o", "--seed", "1"]
+    )
     assert (args.data, args.out, args.seed) == ("d", "o", 1)

@@ -5,9 +5,8 @@ import math
 
 import pytest
 
-from torchpose.cli import evaluate
 from torchpose.errors import InputError, OutputError
-from torchpose.evaluation import PROTOCOLS, Report, run_protocol
+from torchpose.evaluation import Report
 
 
 @pytest.fixture
@@ -50,9 +49,3 @@ def test_files_are_written_and_read_back(report, tmp_path):
     assert (tmp_path / "report.md").read_text().startswith("# example")
     with pytest.raises(OutputError):
         report.save(tmp_path / "missing")
-
-
-def test_unknown_protocol():
-    with pytest.raises(InputError, match="ub-people"):
-        run_protocol("nothing", "data", "out")
-    assert set(PROTOCOLS) == set(evaluate.PROTOCOLS)

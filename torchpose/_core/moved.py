@@ -183,20 +183,30 @@ LABORATORY = frozenset(
 )
 """Modules of `torchpose.protocols` that are benchmarks of a checkout now, not part of the package."""
 
-NAMES = {
+NAMES: dict[str, dict[str, str]] = {
     "torchpose.body": {
-        "whole_body": "PreparedSilhouettes SilhouetteCounts bidirectional count_pixels fit_radii intersection_over_union prepare_silhouettes render render_limbs",
+        "whole_body": (
+            "PreparedSilhouettes SilhouetteCounts bidirectional count_pixels fit_radii "
+            "intersection_over_union prepare_silhouettes render render_limbs"
+        ),
     },
     "torchpose.camera": {
-        "math.rotations": "ROTATION_ORDERS RotationOrder euler_to_matrix matrix_to_euler rotvec_to_matrix",
+        "math.rotations": (
+            "ROTATION_ORDERS RotationOrder euler_to_matrix matrix_to_euler rotvec_to_matrix"
+        ),
     },
     "torchpose.measure": {
         "video.silhouettes": "SilhouetteMeasurer fit_view read_silhouettes",
     },
     "torchpose.priors": {
-        "math": "FitReport MixtureParameters SufficientStatistics e_step expectation_maximisation m_step",
+        "learning": (
+            "TRAINING_VIEWS arm_sources collect_poses fit_upper_body_prior model_card "
+            "write_model_card"
+        ),
+        "math": (
+            "FitReport MixtureParameters SufficientStatistics e_step expectation_maximisation m_step"
+        ),
         "skeleton": "NeckFraction NeckOffset learn_neck_fraction learn_neck_offset place_neck",
-        "learning": "TRAINING_VIEWS arm_sources collect_poses fit_upper_body_prior model_card write_model_card",
     },
 }
 """Names that a package had: present home (without `torchpose.`) to the names in it."""

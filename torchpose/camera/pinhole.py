@@ -1,8 +1,8 @@
 """Pinhole camera as a module, and its TOML file.
 
 Camera axes: x right, y down, z forward. Metres, pixels, radians. The functions on tensors are in
-`torchpose.camera.projection` and `torchpose.math.rotations`, random viewpoints in `torchpose.camera.viewpoints`; they can be
-imported from here as well.
+`torchpose.camera.projection` and `torchpose.math.rotations`, random viewpoints in
+`torchpose.camera.viewpoints`; they can be imported from here as well.
 """
 
 import re

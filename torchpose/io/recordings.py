@@ -1,7 +1,8 @@
 """Recordings of 3D joints, whatever sensor or software wrote them.
 
-Joints come back in camera axes and metres; see `torchpose.io.formats.axes` and `torchpose.io.formats.units` for how.
-One file per format reads what a file holds; here it is checked and converted.
+Joints come back in camera axes and metres; see `torchpose.io.formats.axes` and
+`torchpose.io.formats.units` for how. One file per format reads what a file holds; here it is
+checked and converted.
 """
 
 import re

@@ -154,8 +154,8 @@ class PoseLandmarks(NamedTuple):
 
     Attributes:
         points: pixels, [N, 37, 2]: the 33 landmarks and the head, neck and hands that
-            `torchpose.skeleton.mediapipe_landmarks.derive_joints` makes of them. Those outside of the image are
-            MediaPipe's guesses, of low visibility.
+            `torchpose.skeleton.mediapipe_landmarks.derive_joints` makes of them. Those outside of the
+            image are MediaPipe's guesses, of low visibility.
         visibility: 0 to 1, [N, 37].
         joints3d: of the 33 landmarks, [N, 33, 3], metres, camera axes, from the middle of the hips:
             MediaPipe's own estimate from a single frame.

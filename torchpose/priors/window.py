@@ -108,7 +108,8 @@ class WindowPrior(nn.Module):
     Args:
         left, right: mixtures over `layout.dim` dimensions. layout: the hands in a window.
         settings: numbers by name: hand_std (pixels, of the window's hands), likelihood_power, and
-            joint_ratio, pixel_ratio and placement_ratio (1/s^3, of `torchpose.upper_body.fusion.MotionStage`).
+            joint_ratio, pixel_ratio and placement_ratio (1/s^3, of
+            `torchpose.upper_body.fusion.MotionStage`).
 
     Raises:
         PriorError: mixtures of another size.

@@ -1,6 +1,7 @@
 """The filter over windows of motion of an arm: what it is given, and what is taken from it.
 
-Mixtures over windows see the body through a virtual camera that follows it (`torchpose.camera.virtual_camera`).
+Mixtures over windows see the body through a virtual camera that follows it
+(`torchpose.camera.virtual_camera`).
 """
 
 from typing import Any, NamedTuple

@@ -1,7 +1,7 @@
 """Silhouettes of many bodies in many cameras: rendered, or only counted against observed ones.
 
-Both rest on intervals of rows (`torchpose.whole_body.silhouettes.row_intervals`): exact, and without a loop over
-particles, cameras or limbs. Counting never forms an image.
+Both rest on intervals of rows (`torchpose.whole_body.silhouettes.row_intervals`): exact, and without a
+loop over particles, cameras or limbs. Counting never forms an image.
 """
 
 import math
