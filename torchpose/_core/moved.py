@@ -5,7 +5,7 @@
 
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -255,7 +255,7 @@ class _OldNames(MetaPathFinder):
     """Finds a module by its old name, and gives the present one in its place."""
 
     def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+        self, fullname: str, path: object = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         if not fullname.startswith("torchpose."):
             return None
