@@ -15,12 +15,14 @@ from tests.filters.traced_steps import (
     KALMAN,
     PARTICLES,
     Run,
+    Smoothing,
     Step,
     begun,
     frames,
     largest_difference,
     make,
     seeded,
+    sequences,
 )
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import CovarianceError, InputError, ShapeError, check_covariance
@@ -28,12 +30,14 @@ from torchpose.math import mended_cholesky
 
 FILTERS = (*KALMAN, *PARTICLES)
 TRACED = (
-    *(f"{way}/{name}" for way in ("eager", "export") for name in ("fixed", "split", "sampled")),
-    "eager/medians",
-    "eager/mixture",
-    "export/mixture",
-    "aot_eager/fixed",
-    "export run/fixed",
+    *(f"eager/step/{name}" for name in ("fixed", "split", "sampled", "medians", *PARTICLES)),
+    *(f"export/step/{name}" for name in ("fixed", "split", "sampled", *PARTICLES)),
+    "aot_eager/step/fixed",
+    "export/run/fixed",
+    *(f"eager/run/{name}" for name in ("fixed", "split", "sampled")),
+    "export/smoothing/fixed",
+    "eager/smoothing/fixed",
+    "eager/smoothing/medians",
 )
 
 
@@ -49,7 +53,7 @@ def differences():
 
 
 @pytest.mark.parametrize("case", TRACED)
-def test_a_traced_step_has_no_break_and_gives_the_numbers_of_the_plain_one(differences, case):
+def test_what_is_traced_has_no_break_and_gives_the_numbers_of_the_plain_one(differences, case):
     assert differences[case] <= 1e-12
 
 
@@ -104,6 +108,23 @@ def test_vmap_of_a_run_is_a_loop(name):
     with torchpose.without_value_checks():
         found = seeded(torch.func.vmap(run, randomness="same"), *many)
     assert largest_difference(found, expected) <= 1e-12
+
+
+@pytest.mark.parametrize("lag", [None, 1])
+@pytest.mark.parametrize(
+    "name", [n for n in KALMAN if make(n).tracks == "fixed" and "reset" not in n]
+)
+def test_unseen_and_vectorised_smoothing_give_the_same_numbers(name, lag):
+    smoothing, (z, mask) = Smoothing(make(name), lag), sequences()
+    lengths = torch.tensor([[4, 2, 4], [1, 3, 2]])
+    many = torch.stack([z, z + 0.5]), torch.stack([mask, ~mask]), lengths
+    looped = [smoothing(*each) for each in zip(*many, strict=True)]
+    expected = [torch.stack(x) for x in zip(*looped, strict=True)]
+    with torchpose.without_value_checks():
+        unseen = smoothing(z, mask, lengths[0])
+        vectorised = torch.func.vmap(smoothing)(*many)
+    assert largest_difference(unseen, looped[0]) <= 1e-12
+    assert largest_difference(vectorised, expected) <= 1e-12
 
 
 def test_values_are_seen_again_after_the_context_and_after_an_error_in_it():

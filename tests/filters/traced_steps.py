@@ -49,6 +49,11 @@ def frames():
     return tensor(p.z).transpose(0, 1), torch.as_tensor(p.mask).transpose(0, 1)
 
 
+def sequences():
+    """z and mask, sequences first."""
+    return [x.transpose(0, 1) for x in frames()]
+
+
 def seeded(function, *arguments):
     torch.manual_seed(SEED)
     return function(*arguments)
@@ -94,31 +99,54 @@ class Run(nn.Module):
         return tuple(self.model(z, mask, return_cov=True))
 
 
-def run_difference(name):
-    """Between all frames that were exported and plain ones."""
-    run, sequences = Run(make(name)), [x.transpose(0, 1) for x in frames()]
-    exported = torch.export.export(run, tuple(sequences)).module()
-    return largest_difference(seeded(exported, *sequences), seeded(run, *sequences))
+class Smoothing(nn.Module):
+    def __init__(self, model, lag=None):
+        super().__init__()
+        self.model, self.lag = model, lag
+
+    def forward(self, z, mask, lengths):
+        return tuple(self.model.smooth(z, mask, lengths=lengths, lag=self.lag, return_cov=True))
 
 
-def difference(way, name):
+def traced(way, module, arguments):
+    """The module after tracing on these arguments."""
+    if way == "export":
+        return torch.export.export(module, arguments).module()
+    torch.compiler.reset()
+    compiled = torch.compile(module, fullgraph=True, backend=way)
+    compiled(*arguments)
+    return compiled
+
+
+def step_difference(way, name):
     """Between a step that was traced on one frame and the plain step, on another frame."""
-    if way == "export run":
-        return run_difference(name)
     model, (z, mask) = make(name), frames()
     state, step = begun(model), Step(model)
-    if way == "export":
-        traced = torch.export.export(step, (state, z[1], mask[1])).module()
-    else:
-        torch.compiler.reset()
-        traced = torch.compile(step, fullgraph=True, backend=way)
-        traced(state, z[1], mask[1])
+    found = seeded(traced(way, step, (state, z[1], mask[1])), state, z[2], mask[2])[1]
     # the plain step gives covariances to histories, not to elements
-    expected = seeded(step, state, z[2], mask[2])[1]
-    return largest_difference(seeded(traced, state, z[2], mask[2])[1], expected)
+    return largest_difference(found, seeded(step, state, z[2], mask[2])[1])
+
+
+def run_difference(way, name):
+    """Between whole sequences that were traced and plain ones, on other measurements."""
+    run, (z, mask) = Run(make(name)), sequences()
+    found = seeded(traced(way, run, (z, mask)), z + 0.5, ~mask)
+    return largest_difference(found, seeded(run, z + 0.5, ~mask))
+
+
+def smoothing_difference(way, name):
+    """Between traced smoothing and plain, on other measurements and lengths."""
+    smoothing, (z, mask) = Smoothing(make(name)), sequences()
+    other = z + 0.5, ~mask, torch.tensor([1, 4, 3])
+    found = traced(way, smoothing, (z, mask, torch.tensor([4, 2, 4])))(*other)
+    return largest_difference(found, smoothing(*other))
+
+
+DIFFERENCES = {"step": step_difference, "run": run_difference, "smoothing": smoothing_difference}
 
 
 if __name__ == "__main__":
     warnings.simplefilter("error")
     for case in sys.argv[1:]:
-        print(json.dumps([case, difference(*case.split("/"))]), flush=True)
+        way, what, name = case.split("/")
+        print(json.dumps([case, DIFFERENCES[what](way, name)]), flush=True)

@@ -280,7 +280,9 @@ class RecursiveFilter(WideModule, ABC):
         batch, n_frames = frames.z.shape[:2]
         state = self.init(batch, generator)
         steps = []
-        for t in tqdm(range(n_frames), disable=not progress, unit="frame"):
+        times = range(n_frames)
+        # a bar that shows nothing would still keep torch.compile out
+        for t in tqdm(times, unit="frame") if progress else times:
             state, out = self.advance(state, frames.frame(t), generator, return_cov)
             steps.append(out)
         return collect(steps, frames.lengths)

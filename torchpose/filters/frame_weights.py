@@ -79,7 +79,8 @@ def run_memoryless(
     batch, n_frames, _ = frames.z.shape
     learning = wants_gradient(frames.z, frames.cov, model.log_prior, model.means, model.covariances)
     parts: list[list[tuple[Tensor, Tensor]]] = [[], [], [], [], [], []]
-    bar = tqdm(total=batch * n_frames, disable=not progress, unit="frame")
+    # a bar that shows nothing would still keep torch.compile out
+    bar = tqdm(total=batch * n_frames, unit="frame") if progress else None
     for group in _groups(frames, _RECOMPUTED_FRAMES if learning else _SHARED_FRAMES):
         # Gains that groups share are not among what a gradient computes anew for one of them.
         gain = _gain(model, group) if group.shares_gain else None
@@ -88,8 +89,10 @@ def run_memoryless(
         for part, value in zip(parts, values, strict=True):
             if value is not None:
                 part.append((group.rows, value))
-        bar.update(len(group.rows))
-    bar.close()
+        if bar is not None:
+            bar.update(len(group.rows))
+    if bar is not None:
+        bar.close()
     mean, log_weights, evidence = (
         _in_order(part).unflatten(0, (batch, n_frames)) for part in parts[:3]
     )

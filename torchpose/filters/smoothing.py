@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
 from torchpose.filters.base import Measurements
 from torchpose.filters.fixed_tracks import step_fixed_weights, step_tracks
@@ -76,8 +77,31 @@ def smooth_fixed_tracks(
         raise InputError(
             f"lag must be at least 0 frames, or None for the whole sequence, got {lag}"
         )
+    if not values_visible():
+        return _smooth_unseen(model, frames, lag, return_cov)
     if model.is_memoryless:
         return run_memoryless(model, frames, return_cov, progress=False)
+    return _smooth_parts(model, frames, lag, return_cov)
+
+
+def _smooth_unseen(
+    model: "MixtureKalmanFilter", frames: Measurements, lag: int | None, return_cov: bool
+) -> FilterOutput:
+    """Smooth while nobody may look whether the rate is 0; without medians it makes no difference."""
+    smoothed = _smooth_parts(model, frames, lag, return_cov)
+    if model.gamma is None or not len(model.medians) or not model.weighs_frames_alone:
+        return smoothed
+    alone = run_memoryless(model, frames, return_cov, progress=False)
+    still = (model.gamma == 0).all()
+    pairs = zip(alone, smoothed, strict=True)
+    chosen = (a if a is None or b is None else torch.where(still, a, b) for a, b in pairs)
+    return FilterOutput(*chosen)  # type: ignore[arg-type]
+
+
+def _smooth_parts(
+    model: "MixtureKalmanFilter", frames: Measurements, lag: int | None, return_cov: bool
+) -> FilterOutput:
+    """Smooth a batch in parts that fit into memory."""
     batch, n_frames, _ = frames.z.shape
     n_tracks, dim = model.means.shape
     per_sequence = n_frames * n_tracks * dim * (3 * dim if return_cov else 4)
@@ -126,7 +150,7 @@ def _smooth(
 def _forward(model: "MixtureKalmanFilter", frames: Measurements, by_length: bool) -> _Pass:
     """Filter, and keep what the backward pass needs."""
     state = model.init(frames.z.shape[0])
-    if by_length:
+    if by_length and values_visible():  # unseen, every element has a history of its own
         # Smoothed covariances depend on where a sequence ends: lengths make histories distinct.
         lengths, group = torch.unique(frames.lengths, return_inverse=True)
         state = state._replace(cov=state.cov.expand(lengths.numel(), -1, -1, -1), group=group)
@@ -161,18 +185,18 @@ def _smoother_gains(
     jitters: list[Tensor | None] = [None]
     for t in range(len(past.cov) - 1):
         matrix = model.transition(t + 1).matrix
-        cov = past.cov[t][_parents(past.group[t], past.group[t + 1])]
+        count = len(past.predicted_cov[t + 1])
+        cov = past.cov[t][_parents(past.group[t], past.group[t + 1], count)]
         factor, jitter = mended_cholesky(past.predicted_cov[t + 1])
         jitters.append(None if jitter is None else jitter[past.group[t + 1]])
         gains.append(torch.cholesky_solve(matrix @ cov, factor).mT)
     return gains, jitters
 
 
-def _parents(group: Tensor, following: Tensor) -> Tensor:
-    """The group of frame t that each group of frame t+1 came from."""
-    parents = torch.zeros(int(following.max()) + 1, dtype=torch.long, device=group.device)
-    parents[following] = group
-    return parents
+def _parents(group: Tensor, following: Tensor, count: int) -> Tensor:
+    """The group of frame t that each of the `count` groups of frame t+1 came from."""
+    parents = torch.zeros(count, dtype=torch.long, device=group.device)
+    return parents.index_put((following,), group)
 
 
 def _mean_corrections(past: _Pass, gains: list[Tensor], later: Tensor, reach: int) -> Tensor:
@@ -237,7 +261,8 @@ def _smoothed_covs(past: _Pass, gains: list[Tensor], later: Tensor, reach: int) 
     """P_t|t+reach in the groups of the last frame, which are the finest, per frame [G, M, D, D]."""
     n_frames = len(past.cov)
     finest = past.group[-1]
-    first = _parents(torch.arange(finest.numel(), device=finest.device), finest)
+    elements = torch.arange(finest.numel(), device=finest.device)
+    first = _parents(elements, finest, len(past.cov[-1]))
     at = [group[first] for group in past.group]
     filtered = [cov[rows] for cov, rows in zip(past.cov, at, strict=True)]
     predicted = [cov[rows] for cov, rows in zip(past.predicted_cov, at, strict=True)]
