@@ -31,6 +31,7 @@ __all__ = [
     "check_floating",
     "check_grey",
     "check_rate",
+    "check_real",
     "check_rgb",
     "check_shape",
     "check_weights",
@@ -170,6 +171,13 @@ def check_floating(name: str, tensor: Any) -> None:
         raise InputError(
             f"{name} must be a floating-point tensor, got {kind}; convert it with .double()"
         )
+
+
+def check_real(name: str, values: Any) -> None:
+    """Raise `InputError` for complex numbers, whose imaginary parts a conversion would drop."""
+    dtype = getattr(values, "dtype", None)
+    if getattr(dtype, "is_complex", False) or getattr(dtype, "kind", "") == "c":
+        raise InputError(f"{name} must be real, got {dtype}")
 
 
 def check_rgb(name: str, image: Any, empty: bool = True) -> None:

@@ -275,8 +275,10 @@ def test_camera_without_focal_length(focal):
 
 
 @pytest.mark.parametrize(
-    "matrix", [np.zeros((3, 3)), np.eye(2), np.ones((3, 3)), "K", [[1], [2, 3]]]
-)
+    "matrix",
+    [np.zeros((3, 3)), np.eye(2), np.ones((3, 3)), "K", [[1], [2, 3]], np.eye(3) + 0j,
+     torch.eye(3, dtype=torch.complex64)],
+)  # fmt: skip
 def test_camera_of_something_else(matrix):
     with pytest.raises(CameraError):
         PinholeCamera.from_matrix(matrix)

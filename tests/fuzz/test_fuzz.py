@@ -37,6 +37,21 @@ def test_a_seed_gives_the_same_damage():
         assert made == again and len(set(made)) > 20
 
 
+def test_damage_reaches_no_later_case():
+    content = json.dumps({"a": [1, 2, {"b": "text"}], "c": {"d": [0.5]}}).encode()
+    first = mutate.damage_content("a.json", content, Random("7"))
+    for i in range(3000):  # values that were put in are damaged too
+        mutate.damage_content("a.json", content, Random(f"other/{i}"))
+    assert mutate.damage_content("a.json", content, Random("7")) == first
+    assert [] in mutate._ODD_VALUES and {} in mutate._ODD_VALUES
+
+
+def test_a_header_that_is_cut_off_can_be_damaged_again():
+    for length in range(12):
+        made = mutate._claiming(b"\x93NUMPY\x01\0\x00\x00{}"[:length], Random(0))
+        assert len(made) == length if length < 10 else b"shape" in made
+
+
 def _raise(error):
     def read(path):
         raise error(f"{path}: x") if error is FileFormatError else error("x")

@@ -33,6 +33,7 @@ class _Slow(BaseException):
 def main(seed: int, kinds: list[str], seconds: float, start: int) -> None:
     """Cases of each kind in turn, until so many seconds of processor time are used."""
     torch.set_num_threads(1)
+    torch.set_warn_always(True)  # else only the first of all cases would be seen to lose values
     with tempfile.TemporaryDirectory() as folder:
         whole = _samples(Path(folder))
         _check_whole(Path(folder), whole)

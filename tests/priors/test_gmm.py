@@ -232,6 +232,10 @@ def test_bad_arguments_are_refused():
         mixture.condition([3], torch.zeros(1))
     with pytest.raises(ShapeError):
         mixture.condition([0, 1], torch.zeros(1))
+    with pytest.raises(InputError, match="x must be real"):
+        mixture.log_prob(torch.zeros(3, dtype=torch.complex64))
+    with pytest.raises(InputError, match="values must be real"):
+        mixture.condition([0], torch.zeros(1, dtype=torch.complex64))
 
 
 def test_rounded_mixtures_stay_positive_definite_and_change_no_more_than_rounding_does():

@@ -26,7 +26,7 @@ from torchpose.camera.projection import (
     project,
 )
 from torchpose.camera.viewpoints import PAPER_VIEWS, Viewpoints, ViewRange, sample_viewpoints
-from torchpose.errors import CameraError, FileFormatError, InputError, check_floating
+from torchpose.errors import CameraError, FileFormatError, InputError, check_floating, check_real
 from torchpose.math.rotations import (
     ROTATION_ORDERS,
     RotationOrder,
@@ -264,6 +264,7 @@ def _numbers(name: str, values: Any, wanted: str = "numbers") -> Tensor:
     try:
         if _holds_bool(values):
             raise TypeError
+        check_real(name, values)
         return torch.as_tensor(values, dtype=torch.float64).detach().cpu().clone()
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise CameraError(f"{name} must be {wanted}, got {values!r:.200}") from error

@@ -27,6 +27,7 @@ from torchpose.errors import (
     check_covariance,
     check_finite,
     check_floating,
+    check_real,
     check_shape,
 )
 from torchpose.filters.outputs import FilterOutput, StepOutput, collect, effective_sample_size
@@ -101,8 +102,7 @@ def as_covariance(name: str, value: Tensor, dim: int, trailing: int = 2) -> Tens
     Raises:
         ShapeError, InputError, CovarianceError.
     """
-    if isinstance(value, Tensor) and value.is_complex():
-        raise InputError(f"{name} must be real, got {value.dtype}")
+    check_real(name, value)
     value = torch.as_tensor(value, dtype=torch.float64)
     if value.ndim == trailing - 1:
         check_shape(name, value, ["...", dim])

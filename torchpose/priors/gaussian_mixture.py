@@ -17,6 +17,7 @@ from torchpose.errors import (
     ShapeError,
     check_covariance,
     check_finite,
+    check_real,
     check_shape,
     check_weights,
 )
@@ -230,9 +231,10 @@ class GaussianMixture(nn.Module):
             x: points, any leading dimensions.
 
         Raises:
-            ShapeError: the last dimension is not D.
+            ShapeError: the last dimension is not D. InputError: complex points.
         """
         check_shape("x", x, ("...", self.dim))
+        check_real("x", x)
         return self.weights.log() + component_log_density(x, self.means, self.cholesky())
 
     def log_prob(self, x: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch"]:
@@ -242,7 +244,7 @@ class GaussianMixture(nn.Module):
             x: points, any leading dimensions.
 
         Raises:
-            ShapeError: the last dimension is not D.
+            ShapeError: the last dimension is not D. InputError: complex points.
         """
         return self.component_log_prob(x).logsumexp(-1)
 
@@ -313,10 +315,12 @@ class GaussianMixture(nn.Module):
             increasing order.
 
         Raises:
-            ShapeError: `values` does not end in S. InputError: bad or repeated indices.
+            ShapeError: `values` does not end in S. InputError: bad or repeated indices,
+            complex values.
         """
         seen = self._indices(indices)
         check_shape("values", values, ("...", len(seen)))
+        check_real("values", values)
         hidden = torch.ones(self.dim, dtype=torch.bool, device=seen.device)
         hidden[seen] = False
         order = torch.cat([seen, hidden.nonzero().squeeze(-1)])
