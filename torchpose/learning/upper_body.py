@@ -16,6 +16,8 @@ from torchpose.priors.upper_body import UpperBodyPrior
 
 __all__ = ["fit_upper_body_prior", "prior_of_arms"]
 
+_KINECT_CAMERA = (525.0, 525.0, 319.5, 239.5)
+
 
 def fit_upper_body_prior(
     recordings: Sequence[RecordingLike],

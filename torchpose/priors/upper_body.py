@@ -48,7 +48,6 @@ __all__ = [
 ]
 
 WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
-_KINECT_CAMERA = (525.0, 525.0, 319.5, 239.5)
 _SIDES = ("left", "right")
 _PARTS = ("weights", "means", "covariances")
 
