@@ -15,7 +15,7 @@ TEST_PROCESSES ?= 2
 help:
 	@echo "make demo       track the animated performer, and a walk in three cameras; see demo-output/"
 	@echo "make test       run the tests"
-	@echo "make lint       ruff and mypy"
+	@echo "make lint       ruff, mypy, and who may import whom"
 	@echo "make docs       build the documentation into site/, warnings are errors"
 	@echo "make docs-serve show the documentation while it is edited"
 	@echo "make format     format the code"
@@ -32,6 +32,7 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .

@@ -1,0 +1,184 @@
+"""Print the import graph between the rooms of torchpose: edges, circles, sizes, public names.
+
+    python -m benchmarks.import_graph                 # this checkout
+    python -m benchmarks.import_graph OTHER_CHECKOUT  # another one, for a comparison
+
+A room is a package or module directly in `torchpose`, or one of the programs beside it (`benchmarks`,
+`train`). Every import statement counts: those that run on import, inside a function, or for type
+checkers only.
+Nothing is imported: the files are parsed.
+"""
+
+import ast
+import sys
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+__all__ = ["Room", "circles", "module_files", "module_imports", "public_names", "room_of", "rooms"]
+
+PROGRAMS = ("benchmarks", "train")
+_ROOT = Path(__file__).parents[1]
+
+
+class Room(NamedTuple):
+    """Size and imports of one room."""
+
+    files: int
+    lines: int
+    public: int
+    """Names in `__all__` of the room itself; those of its subpackages are not counted."""
+    imports: frozenset[str]
+    """Names of the other rooms that it imports."""
+
+
+def module_files(root: Path, packages: Iterable[str] = ("torchpose", *PROGRAMS)) -> dict[str, Path]:
+    """Return the file of every module of some packages, by the module's full name."""
+    files = {}
+    for package in packages:
+        for path in sorted((root / package).rglob("*.py")):
+            name = ".".join(path.relative_to(root).with_suffix("").parts)
+            files[name.removesuffix(".__init__")] = path
+    return files
+
+
+def module_imports(files: Mapping[str, Path]) -> dict[str, set[str]]:
+    """Return, for every module, which of the other modules its import statements name.
+
+    `from package import name` is an import of the submodule where `name` is one, else of the package.
+    """
+    return {
+        module: {found for found in _imported(path, module, files) if found != module}
+        for module, path in files.items()
+    }
+
+
+def _imported(path: Path, module: str, files: Mapping[str, Path]) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in files)
+        elif isinstance(node, ast.ImportFrom):
+            source = _source(node, module, is_package=path.name == "__init__.py")
+            for alias in node.names:
+                submodule = f"{source}.{alias.name}"
+                if submodule in files or source in files:
+                    yield submodule if submodule in files else source
+
+
+def _source(node: ast.ImportFrom, module: str, is_package: bool) -> str:
+    """Return the full name of the module after `from`."""
+    if node.level == 0:
+        return node.module or ""
+    parts = module.split(".")
+    base = parts[: len(parts) - node.level + is_package]
+    return ".".join([*base, *([node.module] if node.module else [])])
+
+
+def circles(imports: Mapping[str, Iterable[str]]) -> list[list[str]]:
+    """Return the strongly connected components of more than one node (Tarjan's algorithm).
+
+    Args:
+        imports: by node, the nodes that it points to; nodes that are no keys are ignored.
+
+    Returns:
+        Each component in alphabetical order.
+
+    >>> circles({"a": ["b"], "b": ["c"], "c": ["a"], "d": ["a"]})
+    [['a', 'b', 'c']]
+    """
+    index: dict[str, int] = {}
+    lowest: dict[str, int] = {}
+    stack: list[str] = []
+    found: list[list[str]] = []
+
+    def visit(node: str) -> None:
+        index[node] = lowest[node] = len(index)
+        stack.append(node)
+        for other in imports[node]:
+            if other not in imports:
+                continue
+            if other not in index:
+                visit(other)
+                lowest[node] = min(lowest[node], lowest[other])
+            elif other in stack:
+                lowest[node] = min(lowest[node], index[other])
+        if lowest[node] == index[node]:
+            at = stack.index(node)
+            component = stack[at:]
+            del stack[at:]
+            if len(component) > 1:
+                found.append(sorted(component))
+
+    for node in imports:
+        if node not in index:
+            visit(node)
+    return sorted(found)
+
+
+def room_of(module: str) -> str:
+    """Return the room of a module: `torchpose.body.limbs` is in `body`, `train.cli` in `train`.
+
+    The module `torchpose` itself, which re-exports from its rooms, is the room `torchpose`.
+    """
+    first, _, rest = module.partition(".")
+    return rest.split(".")[0] if first == "torchpose" and rest else first
+
+
+def public_names(path: Path) -> list[str]:
+    """Return `__all__` of a module as it is written there; empty where there is none."""
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Assign) and any(
+            isinstance(target, ast.Name) and target.id == "__all__" for target in node.targets
+        ):
+            return list(ast.literal_eval(node.value))
+    return []
+
+
+def rooms(root: Path) -> dict[str, Room]:
+    """Return the rooms of a checkout by name."""
+    files = module_files(root)
+    imports = module_imports(files)
+    members: dict[str, list[str]] = defaultdict(list)
+    for module in files:
+        members[room_of(module)].append(module)
+    result = {}
+    for name, modules in sorted(members.items()):
+        head = name if name in files else f"torchpose.{name}"
+        others = {room_of(found) for module in modules for found in imports[module]} - {name}
+        lines = sum(len(files[m].read_text(encoding="utf-8").splitlines()) for m in modules)
+        result[name] = Room(
+            len(modules), lines, len(public_names(files[head])) if head in files else 0,
+            frozenset(others),
+        )  # fmt: skip
+    return result
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Print the table of rooms, the circles and the sums."""
+    arguments = sys.argv[1:] if argv is None else argv
+    root = Path(arguments[0]) if arguments else _ROOT
+    found = rooms(root)
+    inside = {n: room for n, room in found.items() if n not in PROGRAMS}
+    print(f"{'room':<12} {'files':>5} {'lines':>6} {'public':>6}  imports")
+    for name, room in found.items():
+        print(
+            f"{name:<12} {room.files:>5} {room.lines:>6} {room.public:>6}  "
+            f"{' '.join(sorted(room.imports)) or '-'}"
+        )
+    # The root re-exports from its rooms, so it is left out where circles between rooms are sought.
+    graph = {n: room.imports for n, room in inside.items() if n != "torchpose"}
+    files = module_files(root)
+    modules = {m: i for m, i in module_imports(files).items() if m != "torchpose"}
+    print(f"\ncircles between rooms: {circles(graph) or 'none'}")
+    print(f"circles between modules: {circles(modules) or 'none'}")
+    print(
+        f"torchpose: {len(inside)} rooms, {sum(len(r.imports) for r in inside.values())} edges, "
+        f"{sum(r.files for r in inside.values())} files, {sum(r.lines for r in inside.values())} lines, "
+        f"{sum(r.public for r in inside.values())} public names"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
