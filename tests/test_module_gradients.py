@@ -11,7 +11,7 @@ from tests._core import test_module_state as modules
 from tests.gradients import assert_differentiable, assert_without_gradient
 from tests.whole_body.filters.bending_body import BODY
 from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walker
-from torchpose import body, filters, priors
+from torchpose import body, filters, priors, whole_body
 from torchpose.camera import backproject, lift, map_pixels, project
 from torchpose.math import euler_to_matrix, matrix_to_euler
 from torchpose.priors.actions.part_postures import PartPostures
@@ -195,7 +195,7 @@ def test_particles_of_bodies_have_none(name):
     if name == "RootUncertaintyTracker":
         own, known = modules.walks(1)
         first = known[0][0]
-        seen = body.render(own, known[0][:2], rig(2), HEIGHT, WIDTH)
+        seen = whole_body.render(own, known[0][:2], rig(2), HEIGHT, WIDTH)
         cameras = rig(2)
     else:
         seen, cameras = torch.zeros(2, 1), None

@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 import torchpose
 from tests.whole_body.filters.bending_body import BODY, performances, space
 from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walker
-from torchpose import body, filters, measure, priors
+from torchpose import body, filters, measure, priors, whole_body
 from torchpose.body import Body, JointLimits
 from torchpose.camera import PinholeCamera
 from torchpose.priors import ActionBank, BackConstrainedGPLVM
@@ -28,7 +28,10 @@ from torchpose.upper_body.fusion import MotionStage
 from torchpose.whole_body.filters.posture_gate import PostureGate
 
 G = torch.Generator
-PACKAGES = ("torchpose", *(f"torchpose.{p}" for p in ("body", "filters", "measure", "priors")))
+PACKAGES = (
+    "torchpose",
+    *(f"torchpose.{p}" for p in ("body", "filters", "measure", "priors", "whole_body")),
+)
 ELSEWHERE = {
     "RecursiveFilter": "an abstract base",
     "SilhouetteParticleFilter": "an abstract base",
@@ -114,12 +117,12 @@ def root_tracker(seed):
     own, _ = walks(1)
     own = own.altered(radii=own.radii * (1 + 0.1 * seed))
     learnt = LimbConditionals.fit(own, [0.9 * seed * s for s in walks(1)[1]], 60.0)
-    return filters.RootUncertaintyTracker(own, learnt, 10, fps=60.0, step_std=0.01 * seed)
+    return whole_body.RootUncertaintyTracker(own, learnt, 10, fps=60.0, step_std=0.01 * seed)
 
 
 def follow_root(tracker):
     own, states = walks(1)
-    seen = body.render(own, states[0][:3], rig(2), HEIGHT, WIDTH)
+    seen = whole_body.render(own, states[0][:3], rig(2), HEIGHT, WIDTH)
     return tracker(seen, rig(2), states[0][0], generator=G().manual_seed(0)).mean
 
 
@@ -166,11 +169,11 @@ CASES = {
         lambda s: MotionStage(10.0**s, 20.0 * s, 30.0, 30.0),
         lambda m: m.joints(points(7, 2, 9, 3)),
     ),
-    "SIRParticleFilter": (body_filter(filters.SIRParticleFilter), follow),
-    "AnnealedParticleFilter": (body_filter(filters.AnnealedParticleFilter), follow),
-    "ManifoldParticleFilter": (body_filter(filters.ManifoldParticleFilter, manifold), follow),
+    "SIRParticleFilter": (body_filter(whole_body.SIRParticleFilter), follow),
+    "AnnealedParticleFilter": (body_filter(whole_body.AnnealedParticleFilter), follow),
+    "ManifoldParticleFilter": (body_filter(whole_body.ManifoldParticleFilter, manifold), follow),
     "ConstrainedParticleFilter": (
-        body_filter(filters.ConstrainedParticleFilter, actions, lambda: BODY),
+        body_filter(whole_body.ConstrainedParticleFilter, actions, lambda: BODY),
         follow,
     ),
     "RootUncertaintyTracker": (root_tracker, follow_root),

@@ -85,7 +85,8 @@ def test_written_command_lines_parse(line, monkeypatch, tmp_path):
     parsed = []
     for name in COMMANDS:
         module = f"torchpose.cli.{name.replace('-', '_')}"
-        monkeypatch.setattr(f"{module}.run", lambda *args: parsed.append(args) or 0)
+        work = "execute" if name == "evaluate" else "run"
+        monkeypatch.setattr(f"{module}.{work}", lambda *args: parsed.append(args) or 0)
     monkeypatch.setattr("torchpose.cli.fit_bodies.run", lambda *args: parsed.append(args) or 0)
     words = shlex.split(line)[1:]
     if "--config" in words:  # the file has to be there

@@ -137,12 +137,11 @@ class BodyModel:
             sharpness: exponent of the likelihood; None for the method "root", which has none.
             fps: frames per second.
         """
-        import torchpose.filters as filters
         from torchpose.whole_body.filters.first_order import rescale_std
 
-        body, step = self.body, filters.default_step_std(self.body) * (_RATE / fps) ** 0.5
+        body, step = self.body, whole_body.default_step_std(self.body) * (_RATE / fps) ** 0.5
         if self.conditionals is not None:
-            return filters.RootUncertaintyTracker(
+            return whole_body.RootUncertaintyTracker(
                 body, self.conditionals, n_particles // _POINTS, fps=fps, step_std=step,
                 leg_swap=_LEG_SWAP,
             )  # fmt: skip
@@ -150,18 +149,18 @@ class BodyModel:
         if self.action is not None:
             step[:3], step[3:6], step[6:] = _FIRST_ORDER_STD
             common["step_std"] = rescale_std(step, 1 / _RATE, 1 / fps)
-            return filters.ConstrainedParticleFilter(
+            return whole_body.ConstrainedParticleFilter(
                 body, self.action, n_particles, fps=fps, likelihood="overlap",
                 posture_body=self._posture_body(), **common,
             )  # fmt: skip
         if self.method == "mrpf" and self.manifold is not None:
             step[list(body.relative_columns)] = _MANIFOLD_STEP * self.manifold.std_step.to(step)
-            return filters.ManifoldParticleFilter(
+            return whole_body.ManifoldParticleFilter(
                 body, self.manifold, n_particles, fps=fps, **common
             )
         if self.method == "sir":
-            return filters.SIRParticleFilter(body, n_particles, **common)
-        return filters.AnnealedParticleFilter(
+            return whole_body.SIRParticleFilter(body, n_particles, **common)
+        return whole_body.AnnealedParticleFilter(
             body, n_particles // _LAYERS, n_layers=_LAYERS, **common
         )
 
