@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpose.skeleton import UPPER_BODY, canonical_names
+from torchpose.skeleton import UPPER_BODY
+from torchpose.skeleton.joint_sets import canonical_names
 from torchpose.skeleton.mediapipe_landmarks import derive_joints
 
 CLIPS = ("again", "brother", "help", "bird", "milk", "book", "learn")

@@ -29,7 +29,7 @@ from torchpose.learning import TRAINING_VIEWS
 from torchpose.learning.recipes import VERSION, UpperBodyRecipe
 from torchpose.priors import GaussianMixture, UpperBodyPrior
 from torchpose.priors.window import WindowLayout, WindowPrior
-from torchpose.skeleton import ARM_JOINTS
+from torchpose.skeleton.upper_body import ARM_JOINTS
 from torchpose.upper_body import UpperBodyTracker
 from torchpose.upper_body.measurements import pixel_indices
 from torchpose.upper_body.process_noise import process_cov

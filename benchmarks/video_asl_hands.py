@@ -31,7 +31,8 @@ from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, FPS, Clip, read_clip
 from benchmarks.speed._timing import Report, limit_threads, machine_line
-from torchpose.measure import FaceTracker, HandPrior, HandSettings, HandTracker, edge_map
+from torchpose.measure import FaceTracker, HandPrior, HandSettings, HandTracker
+from torchpose.measure.edges import edge_map
 from torchpose.priors import load_prior
 from torchpose.video import open_video
 

@@ -22,7 +22,8 @@ from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, re
 from torchpose._core.files import check_output_folder
 from torchpose.camera import PinholeCamera
 from torchpose.evaluation import Report
-from torchpose.metrics import ARM_LIMBS, PCP, pcp
+from torchpose.metrics import pcp
+from torchpose.metrics.poses import ARM_LIMBS, PCP
 from torchpose.priors import UpperBodyPrior, load_prior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import UpperBodyTracker

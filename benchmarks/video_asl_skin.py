@@ -25,7 +25,8 @@ from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, read_clip
 from benchmarks.speed._timing import markdown_table, processor_model
-from torchpose.measure import FaceTracker, SkinMixtureModel, SkinModel, rgb_to_lab
+from torchpose.measure import FaceTracker, SkinMixtureModel, SkinModel
+from torchpose.measure.skin import rgb_to_lab
 from torchpose.video import open_video
 
 SCALE = 4

@@ -1,10 +1,28 @@
-"""The structure of the package: no circles of imports."""
+"""The structure of the package: what its rooms show, and no circles of imports."""
 
+import warnings
+from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 
+import pytest
+
+import torchpose
 from benchmarks.import_graph import circles, module_files, module_imports
+from torchpose._core.moved import NAMES
 
 ROOT = Path(__file__).parents[1]
+ROOMS = sorted(
+    m.name
+    for m in iter_modules(torchpose.__path__)
+    if not m.name.startswith("_") and m.name != "cli"
+)
+MOVED = [
+    (room, name, home)
+    for room, homes in NAMES.items()
+    for home, names in homes.items()
+    for name in names.split()
+]
 # Circles that are still there; none may be added.
 KNOWN = (
     "torchpose.cli.",
@@ -41,3 +59,35 @@ def test_no_circles_between_modules():
 
 def test_no_circles_in_the_programs_beside_the_package():
     assert circles(module_imports(module_files(ROOT, ["train", "benchmarks"]))) == []
+
+
+def test_the_root_lists_its_rooms():
+    assert set(ROOMS) <= set(dir(torchpose))
+    assert set(ROOMS) == torchpose._PACKAGES
+
+
+@pytest.mark.parametrize("name", ["torchpose", *(f"torchpose.{room}" for room in ROOMS)])
+def test_a_room_shows_public_names_and_subpackages_alone(name):
+    room = import_module(name)
+    packages = {m.name for m in iter_modules(getattr(room, "__path__", [])) if m.ispkg}
+    rooms = torchpose._PACKAGES if room is torchpose else set()
+    plain = {n for n in dir(room) if not (n.startswith("__") and n.endswith("__"))}
+    assert plain - rooms - packages == set(room.__all__)
+    assert not [n for n in plain if n.startswith("_")]
+    assert len(set(room.__all__)) == len(room.__all__)
+    for public in room.__all__:
+        assert getattr(room, public) is not None
+
+
+@pytest.mark.parametrize(("room", "name", "home"), MOVED, ids=lambda value: value)
+def test_a_name_that_left_a_room_is_found_with_a_warning(room, name, home):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        present = getattr(import_module(f"torchpose.{home}"), name)
+    with pytest.warns(DeprecationWarning, match=rf"{room}\.{name} "):
+        assert getattr(import_module(room), name) is present
+
+
+def test_a_name_that_no_room_had_is_refused():
+    with pytest.raises(AttributeError, match=r"torchpose\.math.* no attribute 'no_such_name'"):
+        import_module("torchpose.math").no_such_name  # noqa: B018

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchpose._core.facade import set_up_facade
 from torchpose._core.value_checks import values_visible
 
 __all__ = [
@@ -38,6 +39,8 @@ __all__ = [
     "printable",
     "refuse_export",
 ]
+
+set_up_facade(__name__)
 
 _LONGEST, _TAIL = 1200, 300  # characters of a message, and how many of those are of its end
 _FASTEST = 1000.0  # frames per second

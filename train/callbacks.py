@@ -135,7 +135,8 @@ class FitPictures(Callback):
 def _pictures(
     module: MixtureEM, prior: UpperBodyPrior, n_shown: int
 ) -> dict[str, Callable[[], Any]]:
-    from torchpose.viz import plot_log_likelihood, plot_prior_components, plot_prior_samples
+    from torchpose.viz import plot_prior_components, plot_prior_samples
+    from torchpose.viz.prior_pictures import plot_log_likelihood
 
     found: dict[str, Callable[[], Any]] = {
         "likelihood": lambda: plot_log_likelihood(module.histories, module.held_out_history),

@@ -20,7 +20,7 @@ from torchpose.learning.recipes.calibration import folds
 from torchpose.learning.share import Share
 from torchpose.learning.stepwise_em import stepwise_pass
 from torchpose.learning.streamed_em import StreamedEM
-from torchpose.math import SufficientStatistics
+from torchpose.math.mixture_em import SufficientStatistics
 from torchpose.priors import GaussianMixture, UpperBodyPrior
 from train.blocks import Key, Sweep
 from train.data import RecordingsDataModule

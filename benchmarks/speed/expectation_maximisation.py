@@ -32,7 +32,8 @@ from benchmarks.speed._timing import (
     ratio,
     take_turns,
 )
-from torchpose.math import MixtureParameters, expectation_maximisation
+from torchpose.math import expectation_maximisation
+from torchpose.math.mixture_em import MixtureParameters
 
 DIM, RIDGE = 21, 1e-6
 TOLERANCE = 1e-6  # of the difference of mean log-likelihoods, torchpose - scikit-learn in float64

@@ -51,7 +51,7 @@ from benchmarks.speed.expectation_maximisation import (
 from torchpose.learning.samplers import ArmSource, SampleSource, TensorSource
 from torchpose.learning.share import Share
 from torchpose.learning.streamed_em import StreamedEM, run_streamed
-from torchpose.math import MixtureParameters
+from torchpose.math.mixture_em import MixtureParameters
 
 MB, MILLION = 2**20, 1_000_000
 STEPS, COMPONENTS, POSES = 20, 30, 60_000

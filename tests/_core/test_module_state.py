@@ -21,6 +21,9 @@ from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walk
 from torchpose import body, filters, measure, priors, whole_body
 from torchpose.body import Body, JointLimits
 from torchpose.camera import PinholeCamera
+from torchpose.measure.association import HandAssociation
+from torchpose.measure.brightness_background import BrightnessBackground
+from torchpose.measure.persons import PersonRegister
 from torchpose.priors import ActionBank, BackConstrainedGPLVM
 from torchpose.priors.actions.part_postures import PartPostures
 from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
@@ -139,9 +142,9 @@ def state_of(module):
 
 
 STATE_ONLY = {
-    name: getattr(measure, name)
-    for name in ("FaceTracker", "HandAssociation", "HeadNeck", "MeanShiftHandTracker",
-                 "PersonRegister", "SkinMixtureModel", "SkinModel")
+    kind.__name__: kind
+    for kind in (measure.FaceTracker, HandAssociation, measure.HeadNeck, measure.MeanShiftHandTracker,
+                 PersonRegister, measure.SkinMixtureModel, measure.SkinModel)
 } | {
     "HandTracker": lambda: measure.HandTracker(CASES["HandPrior"][0](1)),
     "UpperBodyMeasurer": lambda: measure.UpperBodyMeasurer(upper_body_prior(1)),
@@ -192,7 +195,7 @@ CASES = {
         lambda m: m.log_prob(points(7, 5, 12).tanh()),
     ),
     "BrightnessBackground": (
-        lambda s: measure.BrightnessBackground().fit(scene(s)),
+        lambda s: BrightnessBackground().fit(scene(s)),
         lambda m: m(scene(7)[0]),
     ),
     "HandPrior": (

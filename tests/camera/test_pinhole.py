@@ -10,19 +10,18 @@ from hypothesis import strategies as st
 
 from tests.data import data_dir_or_skip
 from torchpose.camera import (
-    PAPER_VIEWS,
     PinholeCamera,
     ViewRange,
     backproject,
-    check_intrinsics,
     lift,
     load_cameras,
-    map_pixel_covariance,
     map_pixels,
     project,
     sample_viewpoints,
     save_cameras,
 )
+from torchpose.camera.projection import check_intrinsics, map_pixel_covariance
+from torchpose.camera.viewpoints import PAPER_VIEWS
 from torchpose.errors import CameraError, FileFormatError, InputError, OutputError, ShapeError
 from torchpose.math import euler_to_matrix
 

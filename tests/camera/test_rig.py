@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchpose.camera import CameraRig, PinholeCamera, as_rig, save_cameras
+from torchpose.camera import CameraRig, PinholeCamera, save_cameras
+from torchpose.camera.rig import as_rig
 from torchpose.errors import CameraError, InputError
 
 DISTORTIONS = (-0.25, 0.08, 0.002, -0.001)

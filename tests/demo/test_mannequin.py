@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 
-from torchpose.demo import BodyAngles, BodySize, angles_to_joints
-from torchpose.demo.mannequin import hands_to_arms
+from torchpose.demo.mannequin import BodyAngles, BodySize, angles_to_joints, hands_to_arms
 from torchpose.errors import InputError
 
 

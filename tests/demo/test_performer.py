@@ -9,8 +9,11 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from torchpose import demo
+from torchpose.demo.mannequin import ANGLE_LIMITS, BodyAngles, BodySize, angles_to_joints
+from torchpose.demo.performer import minimum_jerk
 from torchpose.errors import InputError
-from torchpose.skeleton import LIMBS, UPPER_BODY, measure_neck_kind
+from torchpose.skeleton import LIMBS, UPPER_BODY
+from torchpose.skeleton.upper_body import measure_neck_kind
 
 SEEDS = (0, 1, 2)
 
@@ -20,17 +23,17 @@ def bone_lengths(joints: torch.Tensor) -> torch.Tensor:
     return (joints[:, a] - joints[:, b]).norm(dim=-1)
 
 
-def arms(**angles: float) -> demo.BodyAngles:
+def arms(**angles: float) -> BodyAngles:
     """Both arms in one posture, the rest of the body upright; degrees."""
-    four = [math.radians(angles.get(name, 0.0)) for name in demo.ANGLE_LIMITS]
+    four = [math.radians(angles.get(name, 0.0)) for name in ANGLE_LIMITS]
     zero = torch.zeros(1, 3, dtype=torch.float64)
-    return demo.BodyAngles(zero, zero, zero, torch.tensor([[four, four]], dtype=torch.float64))
+    return BodyAngles(zero, zero, zero, torch.tensor([[four, four]], dtype=torch.float64))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_bones_keep_their_length(seed: int) -> None:
     lengths = bone_lengths(demo.performer(seed=seed).joints)
-    size = demo.BodySize()
+    size = BodySize()
     shoulder = math.hypot(size.half_shoulders, size.neck_above_shoulders)
     arm = [size.forearm + size.hand, size.upper_arm, shoulder]
     expected = torch.tensor([*arm, math.hypot(size.head, 0.03), *arm[::-1]], dtype=torch.float64)
@@ -38,12 +41,12 @@ def test_bones_keep_their_length(seed: int) -> None:
 
 
 def test_postures_that_can_be_checked_by_eye() -> None:
-    size = demo.BodySize()
+    size = BodySize()
     reach = size.forearm + size.hand
     hand, elbow, shoulder = (UPPER_BODY.index(f"{n}_left") for n in ("hand", "elbow", "shoulder"))
 
     def vectors(**angles: float) -> tuple[torch.Tensor, torch.Tensor]:
-        joints = demo.angles_to_joints(arms(**angles))[0][0]
+        joints = angles_to_joints(arms(**angles))[0][0]
         return joints[elbow] - joints[shoulder], joints[hand] - joints[elbow]
 
     def close(vector: torch.Tensor, expected: list[float]) -> None:
@@ -61,7 +64,7 @@ def test_postures_that_can_be_checked_by_eye() -> None:
 
 
 def test_the_right_arm_mirrors_the_left() -> None:
-    joints, wrists = demo.angles_to_joints(arms(abduction=40, flexion=30, twist=-20, elbow=70))
+    joints, wrists = angles_to_joints(arms(abduction=40, flexion=30, twist=-20, elbow=70))
     mirror = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
     torch.testing.assert_close(joints[:, [7, 6, 5]], joints[:, [0, 1, 2]] * mirror)
     torch.testing.assert_close(wrists[:, 1], wrists[:, 0] * mirror)
@@ -69,8 +72,8 @@ def test_the_right_arm_mirrors_the_left() -> None:
 
 def test_arm_chain_agrees_with_scipy_rotations() -> None:
     degrees = {"abduction": 50.0, "flexion": 35.0, "twist": 40.0, "elbow": 80.0}
-    joints = demo.angles_to_joints(arms(**degrees))[0][0].numpy()
-    a, f, t, e = (math.radians(degrees[n]) for n in demo.ANGLE_LIMITS)
+    joints = angles_to_joints(arms(**degrees))[0][0].numpy()
+    a, f, t, e = (math.radians(degrees[n]) for n in ANGLE_LIMITS)
     upper = Rotation.from_rotvec([-f, 0, -a]) * Rotation.from_rotvec([0, -t, 0])
     fore = upper * Rotation.from_rotvec([-e, 0, 0])
     np.testing.assert_allclose(joints[1] - joints[2], upper.apply([0, 0.28, 0]), atol=1e-12)
@@ -88,7 +91,7 @@ def test_movement_is_humanly_possible(seed: int) -> None:
     acceleration = joints.diff(n=2, dim=0).norm(dim=-1) * performance.fps**2
     assert acceleration.max() < 40  # m/s^2; fast reaching reaches that
     assert speed[:, [0, 7]].max() > 1.5  # and it does move
-    low, high = torch.deg2rad(torch.tensor(list(demo.ANGLE_LIMITS.values()))).double().unbind(-1)
+    low, high = torch.deg2rad(torch.tensor(list(ANGLE_LIMITS.values()))).double().unbind(-1)
     angles = performance.angles
     assert ((angles.arms >= low) & (angles.arms <= high)).all()
     assert angles.torso.abs().max() < math.radians(20)
@@ -157,13 +160,13 @@ def test_same_seed_same_movement_and_it_starts_over_smoothly() -> None:
 def test_minimum_jerk_is_the_quintic_with_rest_at_both_ends() -> None:
     keys, values = torch.tensor([0.0, 2.0]).double(), torch.tensor([[1.0], [4.0]]).double()
     times = torch.linspace(0, 2, 2001, dtype=torch.float64)
-    x = demo.minimum_jerk(times, keys, values)[:, 0]
+    x = minimum_jerk(times, keys, values)[:, 0]
     spline = CubicSpline(times.numpy(), x.numpy())
     assert x[0] == 1 and x[-1] == 4 and x[1000] == pytest.approx(2.5)
     for order in (1, 2):
         np.testing.assert_allclose(spline([0, 2], order), 0, atol=2e-3)
     assert spline(1.0, 1) == pytest.approx(1.875 * 3 / 2, rel=1e-6)  # known peak speed
-    outside = demo.minimum_jerk(torch.tensor([-1.0, 9.0]).double(), keys, values)
+    outside = minimum_jerk(torch.tensor([-1.0, 9.0]).double(), keys, values)
     assert outside[:, 0].tolist() == [1, 4]
 
 
@@ -188,4 +191,4 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(InputError, match="n_frames >= 1"):
         demo.performer(0)
     with pytest.raises(InputError, match=r"BodySize\.forearm"):
-        demo.BodySize(forearm=-0.2)
+        BodySize(forearm=-0.2)

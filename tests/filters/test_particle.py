@@ -20,7 +20,8 @@ from torchpose.filters import BootstrapParticleFilter, RecursiveFilter
 from torchpose.filters.particle_options import PROPOSALS
 from torchpose.filters.transition import make_transition
 from torchpose.filters.walk import MixtureWalk, Moves, grouped_affine
-from torchpose.math import log_prob, mixture_moments, safe_cholesky
+from torchpose.math import log_prob, mixture_moments
+from torchpose.math.gaussian import safe_cholesky
 from torchpose.priors import GaussianMixture
 
 WIDE = torch.float64

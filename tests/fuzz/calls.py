@@ -14,6 +14,8 @@ from tests.fuzz.samples import prior
 from torchpose import metrics
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.filters import BootstrapParticleFilter, MixtureKalmanFilter
+from torchpose.metrics.calibration import chi2_cdf, chi2_quantile, mahalanobis_squared
+from torchpose.metrics.poses import limb_hits, share_below
 from torchpose.priors import GaussianMixture
 from torchpose.upper_body import UpperBodyTracker
 
@@ -100,15 +102,15 @@ def _calls() -> dict[str, _Call]:
         ),
         "align": _Call(metrics.align, {**spread, "mask": mask}),
         "pcp": _Call(metrics.pcp, flat),
-        "limb_hits": _Call(metrics.limb_hits, {**flat, "thresholds": torch.rand(4).double()}),
+        "limb_hits": _Call(limb_hits, {**flat, "thresholds": torch.rand(4).double()}),
         "jitter": _Call(metrics.jitter, {"points": _randn(6, 8, 3), "fps": 30.0}),
         "summarise_errors": _Call(metrics.summarise_errors, {"errors": _randn(5, 8).abs()}),
-        "share_below": _Call(metrics.share_below, {"errors": _randn(5, 8).abs()}),
+        "share_below": _Call(share_below, {"errors": _randn(5, 8).abs()}),
         "coverage": _Call(metrics.coverage, {**spread, "mask": mask}),
         "reliability": _Call(metrics.reliability, {**spread, "mask": mask}),
-        "mahalanobis_squared": _Call(metrics.mahalanobis_squared, {**spread, "mask": mask}),
-        "chi2_cdf": _Call(metrics.chi2_cdf, {"x": _randn(4).abs()}),
-        "chi2_quantile": _Call(metrics.chi2_quantile, {"p": torch.rand(4).double()}),
+        "mahalanobis_squared": _Call(mahalanobis_squared, {**spread, "mask": mask}),
+        "chi2_cdf": _Call(chi2_cdf, {"x": _randn(4).abs()}),
+        "chi2_quantile": _Call(chi2_quantile, {"p": torch.rand(4).double()}),
         "predictive_log_likelihood": _Call(
             metrics.predictive_log_likelihood,
             {"log_weights": _randn(5, 3), "means": _randn(5, 3, 2), "covariance": _spd(5, 3, 2),

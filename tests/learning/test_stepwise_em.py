@@ -12,7 +12,7 @@ from torchpose.learning.samplers import BLOCK, TensorSource
 from torchpose.learning.share import Share
 from torchpose.learning.stepwise_em import implied_statistics, stepwise_pass
 from torchpose.learning.streamed_em import StreamedEM, run_streamed
-from torchpose.math import MixtureParameters, SufficientStatistics, m_step
+from torchpose.math.mixture_em import MixtureParameters, SufficientStatistics, m_step
 
 N = 12 * BLOCK + 700
 

@@ -14,7 +14,8 @@ from torchpose.learning.samplers import BLOCK, Samples, SampleSource, TensorSour
 from torchpose.learning.share import Share
 from torchpose.learning.streamed_em import StreamedEM, fit_streamed, run_streamed
 from torchpose.learning.usable_samples import spread_samples, usable_samples
-from torchpose.math import MixtureParameters, SufficientStatistics, e_step, expectation_maximisation
+from torchpose.math import expectation_maximisation
+from torchpose.math.mixture_em import MixtureParameters, SufficientStatistics, e_step
 from torchpose.math.mixture_start import floor_variances
 from torchpose.priors import GaussianMixture
 

@@ -10,9 +10,9 @@ from sklearn.mixture import GaussianMixture as Sklearn
 
 from tests.priors.mixtures import random_mixture
 from torchpose.errors import CovarianceError, InputError, ShapeError
-from torchpose.math import MixtureParameters, e_step, expectation_maximisation, m_step
+from torchpose.math import expectation_maximisation
 from torchpose.math import mixture_em as em
-from torchpose.math.mixture_em import natural_parameters
+from torchpose.math.mixture_em import MixtureParameters, e_step, m_step, natural_parameters
 from torchpose.math.mixture_features import CyclicFeatures, cyclic_order
 from torchpose.math.mixture_start import STARTS, floor_variances, k_means, start_mixture
 from torchpose.priors import GaussianMixture

@@ -15,9 +15,11 @@ from torchpose.math import (
     conjugate,
     matrix_to_quaternion_vector,
     mean_rotation,
+    quaternion_vector_to_matrix,
+)
+from torchpose.math.quaternion_vectors import (
     minimal_rotation,
     quaternion_to_vector,
-    quaternion_vector_to_matrix,
     vector_to_quaternion,
     within_unit_ball,
 )

@@ -9,9 +9,9 @@ import torch
 from tests.measure.drawn_arms import drawing, pose
 from torchpose import load_prior
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure import HandAssociation, HandPrior, limb_votes
-from torchpose.measure.association import arm_hypotheses
-from torchpose.measure.edges import segments_of_arms
+from torchpose.measure import HandPrior
+from torchpose.measure.association import HandAssociation, arm_hypotheses
+from torchpose.measure.edges import limb_votes, segments_of_arms
 from torchpose.skeleton import UPPER_BODY
 
 pytest.importorskip("cv2")

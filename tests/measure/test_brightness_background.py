@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure import BrightnessBackground, PixelKind
+from torchpose.measure.brightness_background import BrightnessBackground, PixelKind
 
 
 def noisy_scene(n=30, height=24, width=32, seed=0):

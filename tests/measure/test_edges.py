@@ -10,8 +10,14 @@ from scipy.stats import multivariate_normal
 from tests.data import data_dir_or_skip
 from tests.measure.drawn_arms import drawing, pose
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure import Segments, edge_map, find_segments, limb_votes
-from torchpose.measure.edges import ARM_LIMBS, segments_of_arms
+from torchpose.measure.edges import (
+    ARM_LIMBS,
+    Segments,
+    edge_map,
+    find_segments,
+    limb_votes,
+    segments_of_arms,
+)
 
 cv2 = pytest.importorskip("cv2")
 

@@ -7,9 +7,10 @@ import torch
 import torchpose
 from tests.data import data_dir_or_skip
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure import HandPrior, HandSettings, HandState, HandTracker
+from torchpose.measure import HandPrior, HandSettings, HandTracker
 from torchpose.measure.body_window import CELLS, cell_centres
 from torchpose.measure.hand_likelihood import HandLikelihood
+from torchpose.measure.hands import HandState
 
 cv2 = pytest.importorskip("cv2")
 SKIN, CLOTH, WALL = (205, 152, 128), (40, 50, 115), (190, 190, 180)

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from torchpose.errors import InputError
-from torchpose.measure import FACE_OFFSETS, HeadNeck
+from torchpose.measure import HeadNeck
+from torchpose.measure.head_neck import FACE_OFFSETS
 
 
 def test_offsets_and_covariances_are_those_of_drawn_faces():

@@ -8,13 +8,8 @@ import pytest
 import torch
 
 from torchpose.errors import InputError, MissingDependencyError
-from torchpose.measure import (
-    FaceDetector,
-    FaceTracker,
-    MediaPipeFaceDetector,
-    MediaPipePose,
-    Region,
-)
+from torchpose.measure import FaceDetector, FaceTracker, MediaPipeFaceDetector, MediaPipePose
+from torchpose.measure.face import Region
 from torchpose.skeleton.mediapipe_landmarks import LANDMARKS
 
 

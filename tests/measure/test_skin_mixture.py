@@ -5,8 +5,10 @@ import pytest
 import torch
 
 from torchpose.errors import InputError, ShapeError
-from torchpose.math import MixtureParameters, expectation_maximisation
-from torchpose.measure import SkinMixtureModel, rgb_to_lab
+from torchpose.math import expectation_maximisation
+from torchpose.math.mixture_em import MixtureParameters
+from torchpose.measure import SkinMixtureModel
+from torchpose.measure.skin import rgb_to_lab
 
 FACE = torch.tensor([[80.0, 40.0, 32.0]])
 SKIN, DARK, CLOTH, WALL = (

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tests.priors.poses import REST, poses
-from torchpose.camera import Viewpoints, sample_viewpoints
+from torchpose.camera import sample_viewpoints
+from torchpose.camera.viewpoints import Viewpoints
 from torchpose.errors import InputError, PriorError, ShapeError
 from torchpose.learning import TRAINING_VIEWS
 from torchpose.priors import (

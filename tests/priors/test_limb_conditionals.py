@@ -10,13 +10,8 @@ from scipy.spatial.transform import Rotation
 from tests.data import data_dir_or_skip
 from torchpose.body import BODY_15, Body, centres_of, fit_body, fit_state
 from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError, SkeletonError
-from torchpose.math import (
-    compose,
-    gaussian_rotate,
-    rotate_gaussian,
-    turn_gaussian,
-    within_unit_ball,
-)
+from torchpose.math import compose, gaussian_rotate, rotate_gaussian, turn_gaussian
+from torchpose.math.quaternion_vectors import within_unit_ball
 from torchpose.math.tree_messages import propagate
 from torchpose.priors.limb_conditionals import PART_TREE, LimbConditionals, in_body_frame
 

@@ -9,8 +9,13 @@ from tests.priors.poses import lowered_neck, poses
 from torchpose.errors import PriorError
 from torchpose.io import read_recording
 from torchpose.math import euler_to_matrix
-from torchpose.skeleton import NeckOffset, learn_neck_fraction, learn_neck_offset, place_neck
-from torchpose.skeleton.neck import KINECT_NECK
+from torchpose.skeleton.neck import (
+    KINECT_NECK,
+    NeckOffset,
+    learn_neck_fraction,
+    learn_neck_offset,
+    place_neck,
+)
 
 
 def test_offset_that_was_put_in_comes_out():

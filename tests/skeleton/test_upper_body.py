@@ -11,19 +11,18 @@ from hypothesis import strategies as st
 from tests.data import data_dir_or_skip
 from torchpose.errors import ShapeError, SkeletonError
 from torchpose.skeleton import (
-    ARM_JOINTS,
     LEFT_ARM,
     LIMBS,
     RIGHT_ARM,
     SKELETONS,
     UPPER_BODY,
     canonical_name,
-    canonical_names,
     identify_skeleton,
-    measure_neck_kind,
     to_upper_body,
     upper_body_indices,
 )
+from torchpose.skeleton.joint_sets import canonical_names
+from torchpose.skeleton.upper_body import ARM_JOINTS, measure_neck_kind
 
 SPELLINGS = [
     lambda p, s: f"{s}_{p}",

@@ -13,7 +13,7 @@ from torchpose.learning.recipes import MixtureTask
 from torchpose.learning.recipes.choosing import expand_path, fingerprint
 from torchpose.learning.samplers import BLOCK, TensorSource
 from torchpose.learning.streamed_em import StreamedEM, fit_streamed
-from torchpose.math import SufficientStatistics
+from torchpose.math.mixture_em import SufficientStatistics
 from torchpose.skeleton import UPPER_BODY
 from train.blocks import Key, SweepLoader
 from train.data import RecordingsDataModule, split

@@ -8,13 +8,8 @@ import pytest
 import torch
 
 from tests.priors.poses import recording
-from torchpose.camera import (
-    PinholeCamera,
-    arm_in_body_frame,
-    arm_in_camera_frame,
-    map_pixels,
-    project,
-)
+from torchpose.camera import PinholeCamera, map_pixels, project
+from torchpose.camera.lifting import arm_in_body_frame, arm_in_camera_frame
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.errors import (
     CameraError,

@@ -6,8 +6,8 @@ import torch
 from tests.priors.poses import recording
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.learning.recipes import fit_kinect_prior
-from torchpose.measure import MEASURED, FrameMeasurements, HandMeasurements
-from torchpose.measure.upper_body import rounded_covariance
+from torchpose.measure.hand_measurements import HandMeasurements
+from torchpose.measure.upper_body import MEASURED, FrameMeasurements, rounded_covariance
 from torchpose.upper_body import UpperBodyTracker
 from torchpose.video.person_stream import PersonStream
 from torchpose.video.recording import Recording

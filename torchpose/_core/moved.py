@@ -191,22 +191,95 @@ NAMES: dict[str, dict[str, str]] = {
         ),
     },
     "torchpose.camera": {
+        "camera.lifting": "arm_in_body_frame arm_in_camera_frame join_arms pixel_covariances",
+        "camera.projection": "check_intrinsics intrinsics map_pixel_covariance",
+        "camera.rig": "RigView as_rig undistortion_maps",
+        "camera.viewpoints": "PAPER_VIEWS Viewpoints",
         "math.rotations": (
             "ROTATION_ORDERS RotationOrder euler_to_matrix matrix_to_euler rotvec_to_matrix"
         ),
     },
+    "torchpose.demo": {
+        "demo.mannequin": "ANGLE_LIMITS BodyAngles BodySize angles_to_joints",
+        "demo.performer": "hip_sway minimum_jerk performer_angles stage sway",
+    },
+    "torchpose.filters": {
+        "whole_body": (
+            "AnnealedParticleFilter BodyFilterState BodyTrack ConstrainedParticleFilter "
+            "FirstPose ManifoldParticleFilter RootUncertaintyTracker SIRParticleFilter "
+            "SilhouetteParticleFilter ValidationSequence constant_velocity_std "
+            "default_step_std find_first_pose find_pose fit_sharpness motion_std"
+        ),
+    },
+    "torchpose.io": {
+        "_core.files": "atomic_path check_output_folder read_npz require_file write_npz",
+        "io.formats.axes": "AXES",
+    },
+    "torchpose.math": {
+        "math.gaussian": (
+            "Gain condition kalman_correct kalman_gain least_exponent marginal "
+            "mended_cholesky product safe_cholesky symmetrise"
+        ),
+        "math.mixture_em": "FitReport MixtureParameters SufficientStatistics e_step m_step",
+        "math.quaternion_vectors": (
+            "cross_matrix minimal_rotation quaternion_to_vector vector_to_quaternion "
+            "within_unit_ball"
+        ),
+        "math.rotation_gaussians": (
+            "left_matrix quaternion_moments right_matrix sigma_quaternions"
+        ),
+        "math.rotations": "ROTATION_ORDERS RotationOrder",
+        "math.unscented": "DIRECTIONS Directions floor_eigenvalues moments",
+    },
     "torchpose.measure": {
+        "measure.association": "AssociationState HandAssociation",
+        "measure.background": "BackgroundModel",
+        "measure.brightness_background": "BrightnessBackground PixelKind",
+        "measure.edges": "Segments edge_map find_segments limb_votes",
+        "measure.face": "FaceTracks Region",
+        "measure.hand_measurements": "HandMeasurements",
+        "measure.hands": "HandState",
+        "measure.head_neck": "FACE_OFFSETS",
+        "measure.mean_shift": "MeanShift",
+        "measure.mean_shift_hands": "MeanShiftHandState",
+        "measure.mediapipe": "PoseLandmarks",
+        "measure.persons": "PersonRegister Persons",
+        "measure.skin": "SkinState rgb_to_lab",
+        "measure.skin_mixture": "SkinMixtureState",
+        "measure.torso": "TorsoElbows clothes_likelihood elbows_from_torso",
+        "measure.upper_body": "FrameMeasurements MEASURED MeasurerState",
         "video.silhouettes": "SilhouetteMeasurer fit_view read_silhouettes",
+    },
+    "torchpose.metrics": {
+        "metrics.calibration": "Coverage chi2_cdf chi2_quantile mahalanobis_squared",
+        "metrics.poses": (
+            "ALIGN_JOINTS ARM_LIMBS Alignment ErrorSummary PCP RigidMotion limb_hits share_below"
+        ),
     },
     "torchpose.priors": {
         "learning": (
             "TRAINING_VIEWS arm_sources collect_poses fit_upper_body_prior model_card "
             "write_model_card"
         ),
-        "math": (
-            "FitReport MixtureParameters SufficientStatistics e_step expectation_maximisation m_step"
+        "math.mixture_em": (
+            "FitReport MixtureParameters SufficientStatistics e_step expectation_maximisation "
+            "m_step"
         ),
-        "skeleton": "NeckFraction NeckOffset learn_neck_fraction learn_neck_offset place_neck",
+        "skeleton.neck": (
+            "NeckFraction NeckOffset learn_neck_fraction learn_neck_offset place_neck"
+        ),
+    },
+    "torchpose.skeleton": {
+        "skeleton.joint_sets": "canonical_names",
+        "skeleton.neck": (
+            "NeckFraction NeckOffset learn_neck_fraction learn_neck_offset place_neck"
+        ),
+        "skeleton.upper_body": (
+            "ARM_JOINTS BONES NECK_KINDS OTHER_SIDE UpperBodyMap measure_neck_kind scale_bones"
+        ),
+    },
+    "torchpose.viz": {
+        "viz.prior_pictures": "plot_log_likelihood",
     },
 }
 """Names that a package had: present home (without `torchpose.`) to the names in it."""

@@ -1,6 +1,6 @@
 """The articulated body: skeleton, kinematics, fits to recorded joints, limits, silhouettes."""
 
-from torchpose._core.moved import moved_names
+from torchpose._core.facade import set_up_facade
 from torchpose.body.fitting import fit_body, fit_state, joint_errors
 from torchpose.body.kinematics import FRAMES, Body, Frame, centres_of
 from torchpose.body.limbs import Limbs
@@ -24,4 +24,4 @@ __all__ = [
     "joint_errors",
 ]
 
-__getattr__ = moved_names(__name__)
+set_up_facade(__name__)

@@ -72,7 +72,7 @@ def build(command: str, protocol: Protocol, program: str = "torchpose") -> Argum
 
 def execute(protocol: Protocol, args: Namespace) -> int:
     """Run a protocol after checking its folders, print its summary, and return the exit code."""
-    from torchpose.io import check_output_folder
+    from torchpose._core.files import check_output_folder
 
     data = _checked_data(protocol.data, args)
     given = {key: getattr(args, key) for key in _own_options(protocol.run)}

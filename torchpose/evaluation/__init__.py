@@ -7,6 +7,9 @@
 Every one returns a `Report`, which is also written into the folder ``out``.
 """
 
+from torchpose._core.facade import set_up_facade
 from torchpose.evaluation.report import Report, Table
 
 __all__ = ["Report", "Table"]
+
+set_up_facade(__name__)

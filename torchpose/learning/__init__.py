@@ -1,5 +1,6 @@
 """Learn priors from recordings: EM over many samples, fits, recipes, curation, fine-tuning."""
 
+from torchpose._core.facade import set_up_facade
 from torchpose.learning.model_card import model_card, write_model_card
 from torchpose.learning.training import TRAINING_VIEWS, arm_sources, collect_poses
 from torchpose.learning.upper_body import fit_upper_body_prior
@@ -12,3 +13,5 @@ __all__ = [
     "model_card",
     "write_model_card",
 ]
+
+set_up_facade(__name__)

@@ -1,57 +1,36 @@
 """How good is a pose: Procrustes, joint errors, PCP, calibration of covariances, jitter."""
 
+from torchpose._core.facade import set_up_facade
 from torchpose.metrics.calibration import (
-    Coverage,
     calibration_error,
-    chi2_cdf,
-    chi2_quantile,
     coverage,
-    mahalanobis_squared,
     predictive_log_likelihood,
     reliability,
 )
 from torchpose.metrics.poses import (
-    ALIGN_JOINTS,
-    ARM_LIMBS,
-    PCP,
-    Alignment,
-    ErrorSummary,
-    RigidMotion,
     align,
     jitter,
     joint_errors,
     joint_errors_2d,
     joint_errors_3d,
-    limb_hits,
     pcp,
     procrustes,
-    share_below,
     summarise_errors,
 )
 
 __all__ = [
-    "ALIGN_JOINTS",
-    "ARM_LIMBS",
-    "PCP",
-    "Alignment",
-    "Coverage",
-    "ErrorSummary",
-    "RigidMotion",
     "align",
     "calibration_error",
-    "chi2_cdf",
-    "chi2_quantile",
     "coverage",
     "jitter",
     "joint_errors",
     "joint_errors_2d",
     "joint_errors_3d",
-    "limb_hits",
-    "mahalanobis_squared",
     "pcp",
     "predictive_log_likelihood",
     "procrustes",
     "reliability",
-    "share_below",
     "summarise_errors",
 ]
+
+set_up_facade(__name__)

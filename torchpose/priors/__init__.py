@@ -1,6 +1,6 @@
 """Learned priors over body states: mixtures of both arms, manifolds, postures of actions."""
 
-from torchpose._core.moved import moved_names
+from torchpose._core.facade import set_up_facade
 from torchpose.priors.actions.bank import ActionBank
 from torchpose.priors.actions.file import ActionInfo
 from torchpose.priors.actions.space import ActionSpace
@@ -43,4 +43,4 @@ __all__ = [
     "mirror_mixture",
 ]
 
-__getattr__ = moved_names(__name__)
+set_up_facade(__name__)

@@ -1,61 +1,36 @@
 """Joint sets, their names and trees, and the eight joints of the upper body."""
 
+from torchpose._core.facade import set_up_facade
 from torchpose.skeleton.joint_sets import (
     SKELETONS,
     UPPER_BODY,
     Skeleton,
     canonical_name,
-    canonical_names,
     identify_skeleton,
 )
-from torchpose.skeleton.neck import (
-    NeckFraction,
-    NeckOffset,
-    learn_neck_fraction,
-    learn_neck_offset,
-    place_neck,
-)
 from torchpose.skeleton.upper_body import (
-    ARM_JOINTS,
-    BONES,
     LEFT_ARM,
     LIMBS,
-    NECK_KINDS,
-    OTHER_SIDE,
     RIGHT_ARM,
     UpperBody,
-    UpperBodyMap,
-    measure_neck_kind,
     mirror_pose,
-    scale_bones,
     to_upper_body,
     upper_body_indices,
 )
 
 __all__ = [
-    "ARM_JOINTS",
-    "BONES",
     "LEFT_ARM",
     "LIMBS",
-    "NECK_KINDS",
-    "OTHER_SIDE",
     "RIGHT_ARM",
     "SKELETONS",
     "UPPER_BODY",
-    "NeckFraction",
-    "NeckOffset",
     "Skeleton",
     "UpperBody",
-    "UpperBodyMap",
     "canonical_name",
-    "canonical_names",
     "identify_skeleton",
-    "learn_neck_fraction",
-    "learn_neck_offset",
-    "measure_neck_kind",
     "mirror_pose",
-    "place_neck",
-    "scale_bones",
     "to_upper_body",
     "upper_body_indices",
 ]
+
+set_up_facade(__name__)

@@ -1,5 +1,6 @@
 """Video in and out: files, folders of images and cameras; H.264 files that a browser plays."""
 
+from torchpose._core.facade import set_up_facade
 from torchpose.video.base import Image, VideoFrame, VideoSource
 from torchpose.video.camera import CameraSource
 from torchpose.video.file import FileSource
@@ -23,3 +24,5 @@ __all__ = [
     "prefetch",
     "read_silhouettes",
 ]
+
+set_up_facade(__name__)

@@ -6,6 +6,7 @@ grey; a filled joint was measured, a hollow one was inferred. The colours are th
 which colour-blind readers can tell apart; lines differ in their dashes as well.
 """
 
+from torchpose._core.facade import set_up_facade
 from torchpose.viz.action_picture import plot_action_space
 from torchpose.viz.charts import (
     plot_error_bars,
@@ -15,11 +16,7 @@ from torchpose.viz.charts import (
     plot_reliability,
 )
 from torchpose.viz.manifold_picture import plot_manifold
-from torchpose.viz.prior_pictures import (
-    plot_log_likelihood,
-    plot_prior_components,
-    plot_prior_samples,
-)
+from torchpose.viz.prior_pictures import plot_prior_components, plot_prior_samples
 from torchpose.viz.skeletons import (
     draw_skeleton,
     plot_pose,
@@ -35,7 +32,6 @@ __all__ = [
     "plot_error_bars",
     "plot_errors_over_time",
     "plot_joint_curves",
-    "plot_log_likelihood",
     "plot_manifold",
     "plot_pcp",
     "plot_pose",
@@ -47,3 +43,5 @@ __all__ = [
     "plot_reliability",
     "save_figure",
 ]
+
+set_up_facade(__name__)

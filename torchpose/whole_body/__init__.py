@@ -1,5 +1,6 @@
 """Track the whole body from silhouettes in calibrated cameras."""
 
+from torchpose._core.facade import set_up_facade
 from torchpose.whole_body.filters.annealed import AnnealedParticleFilter
 from torchpose.whole_body.filters.body_particles import (
     BodyFilterState,
@@ -61,3 +62,5 @@ __all__ = [
     "render_limbs",
     "track_body",
 ]
+
+set_up_facade(__name__)

@@ -6,7 +6,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from torchpose.demo import BodyAngles, Performance, demo_camera, stage
+from torchpose.demo import Performance, demo_camera
+from torchpose.demo.mannequin import BodyAngles
+from torchpose.demo.performer import stage
 from torchpose.demo.rendering import LOOKS
 from torchpose.demo.rendering.body import bodies
 from torchpose.demo.rendering.look import wardrobe

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchpose.demo import ANGLE_LIMITS, BodySize
+from torchpose.demo.mannequin import ANGLE_LIMITS, BodySize
 from torchpose.demo.rendering import PERFORMANCES, crossing, performance
 from torchpose.errors import InputError
 from torchpose.math import euler_to_matrix

@@ -15,7 +15,8 @@ from torchpose.learning.curation import (
     torso_rotation,
 )
 from torchpose.math import euler_to_matrix
-from torchpose.skeleton import SKELETONS, scale_bones
+from torchpose.skeleton import SKELETONS
+from torchpose.skeleton.upper_body import scale_bones
 
 
 def turn(joints, roll=0.0, pitch=0.0, yaw=0.0):

@@ -1,5 +1,6 @@
 """Rendered performers: video with known truth, for the demo, the benchmarks and the tests."""
 
+from torchpose._core.facade import set_up_facade
 from torchpose.demo.rendering.look import LOOKS, Look
 from torchpose.demo.rendering.performances import PERFORMANCES, crossing, performance
 from torchpose.demo.rendering.performer import render_performance
@@ -18,3 +19,5 @@ __all__ = [
     "render_performance",
     "render_video",
 ]
+
+set_up_facade(__name__)

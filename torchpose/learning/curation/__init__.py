@@ -1,5 +1,6 @@
 """Recordings made ready for a prior: what is wrong in them found, left out and said; persons kept apart."""
 
+from torchpose._core.facade import set_up_facade
 from torchpose.learning.curation.bones import (
     BONE_RATIOS,
     bone_lengths,
@@ -50,3 +51,5 @@ __all__ = [
     "split_persons",
     "torso_rotation",
 ]
+
+set_up_facade(__name__)

@@ -13,6 +13,7 @@ optimiser takes, covariances stay positive definite and weights positive.
     prior() -> UpperBodyPrior  with what is tuned so far
 """
 
+from torchpose._core.facade import set_up_facade
 from torchpose.learning.fine_tuning.parameters import TunableMixture, parameter_groups, pose_error
 from torchpose.learning.fine_tuning.poses import SequenceBatch, TunableKalman, draw_sequences
 from torchpose.learning.fine_tuning.windows import TunableWindow, WindowBatch, draw_windows
@@ -28,3 +29,5 @@ __all__ = [
     "parameter_groups",
     "pose_error",
 ]
+
+set_up_facade(__name__)

@@ -1,5 +1,6 @@
 """How priors are made: every setting of a fit in one place, and the steps from recordings to a file."""
 
+from torchpose._core.facade import set_up_facade
 from torchpose.learning.recipes.actions import ActionRecipe, Performances, fit_actions
 from torchpose.learning.recipes.calibration import fit_calibration
 from torchpose.learning.recipes.earlier import fit_recipe_2
@@ -24,3 +25,5 @@ __all__ = [
     "fit_limbs",
     "fit_recipe_2",
 ]
+
+set_up_facade(__name__)

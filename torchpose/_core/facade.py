@@ -1,0 +1,37 @@
+"""What a room shows: public names and subpackages, and for one release the names that have left it."""
+
+import sys
+from collections.abc import Callable
+from pkgutil import iter_modules
+
+from torchpose._core.moved import NAMES, moved_names
+
+__all__ = ["list_public", "set_up_facade"]
+
+
+def set_up_facade(module: str) -> None:
+    """Give a room its `__dir__`, and its `__getattr__` for names that have left it.
+
+    Both are set here and not written in the room, so that type checkers go by the imports there and
+    report a name that does not exist.
+
+    Args:
+        module: `__name__` of the room, whose `__all__` is set before the first call of `dir`.
+    """
+    room = sys.modules[module]
+    room.__dir__ = list_public(module)
+    if module in NAMES:
+        room.__getattr__ = moved_names(module)
+
+
+def list_public(module: str) -> Callable[[], list[str]]:
+    """Return the `__dir__` of a room: names in `__all__`, subpackages, and names like `__doc__`."""
+
+    def names() -> list[str]:
+        room = sys.modules[module]
+        packages = [m.name for m in iter_modules(getattr(room, "__path__", [])) if m.ispkg]
+        public = {name for name in packages if not name.startswith("_")}
+        special = {name for name in vars(room) if name.startswith("__") and name.endswith("__")}
+        return sorted({*room.__all__, *public, *special})
+
+    return names
