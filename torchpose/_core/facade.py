@@ -18,10 +18,10 @@ def set_up_facade(module: str) -> None:
     Args:
         module: `__name__` of the room, whose `__all__` is set before the first call of `dir`.
     """
-    room = sys.modules[module]
-    room.__dir__ = list_public(module)
+    names = vars(sys.modules[module])
+    names["__dir__"] = list_public(module)
     if module in NAMES:
-        room.__getattr__ = moved_names(module)
+        names["__getattr__"] = moved_names(module)
 
 
 def list_public(module: str) -> Callable[[], list[str]]:
