@@ -137,6 +137,7 @@ class BodyModel:
             sharpness: exponent of the likelihood; None for the method "root", which has none.
             fps: frames per second.
         """
+        from torchpose import whole_body
         from torchpose.whole_body.filters.first_order import rescale_std
 
         body, step = self.body, whole_body.default_step_std(self.body) * (_RATE / fps) ** 0.5
