@@ -318,7 +318,7 @@ def test_a_pose_is_found_on_an_upright_body(recorded, tmp_path, monkeypatch):
         asked.append(upright)
         return SimpleNamespace(state=states[0])
 
-    monkeypatch.setattr("torchpose.whole_body.find_first_pose", find)
+    monkeypatch.setattr("torchpose.whole_body.filters.first_pose.find_first_pose", find)
     line = [
         "--conditionals",
         str(tmp_path / "limbs.safetensors"),
