@@ -40,6 +40,7 @@ from torchpose.priors.shipped import (
     persons_of_model,
     refuse_seen,
 )
+from torchpose.whole_body import METHODS, BodyTracker
 
 __all__ = ["MEAN_POSE", "STILL", "run"]
 
@@ -218,12 +219,11 @@ def _tracked(
     one: Tracked, view: View, method: str, models: Mapping[str, Any], fps: float, particles: int,
     seeds: Sequence[int],
 ) -> list[Run]:  # fmt: skip
-    from torchpose.cli.track_body_models import default_sharpness, model_of
-
-    model = model_of(method, one.body, models.get(method)).at_rate(fps)
-    tracker = model.make_filter(particles, default_sharpness(method), fps)
-    start = fit_state(model.body, view.clip.joints[:1]).expand(len(seeds), -1)
-    return track_view(tracker, model.body, view, start, generators_of(seeds))
+    needs = METHODS[method].needs
+    learnt = {} if needs is None else {needs: models[method]}
+    tracker = BodyTracker(view.rig, method, body=one.body, n_particles=particles, fps=fps, **learnt)
+    start = fit_state(tracker.body, view.clip.joints[:1]).expand(len(seeds), -1)
+    return track_view(tracker.filter, tracker.body, view, start, generators_of(seeds))
 
 
 def _blind(one: Tracked, view: View) -> tuple[Run, Run]:

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from torchpose.upper_body.pose_track import PoseTrack as PoseTrack
     from torchpose.upper_body.tracker import UpperBodyTracker as UpperBodyTracker
     from torchpose.video.tracker import VideoTracker as VideoTracker
+    from torchpose.whole_body.poses import BodyPoses as BodyPoses
+    from torchpose.whole_body.tracker import BodyTracker as BodyTracker
 
     __version__: str
 
@@ -47,6 +49,8 @@ _PACKAGES = frozenset(
     ]
 )
 _HOMES = {
+    "BodyPoses": "whole_body.poses",
+    "BodyTracker": "whole_body.tracker",
     "GaussianMixture": "priors.gaussian_mixture",
     "PinholeCamera": "camera.pinhole",
     "PoseTrack": "upper_body.pose_track",
@@ -62,6 +66,8 @@ _HOMES = {
 }
 
 __all__ = [
+    "BodyPoses",
+    "BodyTracker",
     "GaussianMixture",
     "PinholeCamera",
     "PoseTrack",

@@ -21,6 +21,7 @@ __all__ = [
     "FileFormatError",
     "InputError",
     "MissingDependencyError",
+    "NobodySeenError",
     "OutputError",
     "OverlapError",
     "PriorError",
@@ -94,6 +95,10 @@ class SkeletonError(InputError):
 
 class PriorError(InputError):
     """A prior does not fit the task: other skeleton, rotation order, neck, or state size."""
+
+
+class NobodySeenError(InputError):
+    """Nobody is seen by all cameras in any frame of some silhouettes."""
 
 
 class OverlapError(InputError):

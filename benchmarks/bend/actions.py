@@ -29,7 +29,7 @@ from torchpose.io.mocap import MocapClip
 from torchpose.priors.actions.bank import ActionBank
 from torchpose.priors.actions.postures import state_postures
 from torchpose.priors.actions.space import ActionSpace
-from torchpose.whole_body.filters.first_order import constant_velocity_std
+from torchpose.whole_body.filters.motion import constant_velocity_std
 
 __all__ = [
     "BANK_SETTINGS",

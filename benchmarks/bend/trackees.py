@@ -22,7 +22,7 @@ from torchpose.priors.actions.postures import posture_angles, state_postures
 from torchpose.priors.actions.space import ActionSpace
 from torchpose.priors.actions.synchronisation import Synchronised
 from torchpose.whole_body.filters.constrained import ConstrainedParticleFilter
-from torchpose.whole_body.filters.first_order import constant_velocity_std
+from torchpose.whole_body.filters.motion import constant_velocity_std
 
 __all__ = [
     "BendTrackee",

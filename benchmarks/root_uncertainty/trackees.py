@@ -35,7 +35,7 @@ from torchpose.filters.survival import survival_rate_per_frame
 from torchpose.io.mocap import MocapClip
 from torchpose.priors.limb_conditionals import LimbConditionals
 from torchpose.whole_body.filters.annealed import AnnealedParticleFilter
-from torchpose.whole_body.filters.body_particles import motion_std
+from torchpose.whole_body.filters.motion import motion_std
 from torchpose.whole_body.filters.root_uncertainty import RootUncertaintyTracker
 from torchpose.whole_body.filters.silhouette_filter import SilhouetteParticleFilter
 from torchpose.whole_body.filters.sir import SIRParticleFilter

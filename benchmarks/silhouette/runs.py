@@ -31,9 +31,9 @@ from torchpose.errors import FileFormatError, InputError
 from torchpose.evaluation.common import settings_hash
 from torchpose.evaluation.kept_runs import keep, kept, read_kept
 from torchpose.whole_body.filters.body_particles import BodyTrack
-from torchpose.whole_body.filters.first_pose import find_first_pose
-from torchpose.whole_body.filters.sharpness import ValidationSequence, fit_sharpness
 from torchpose.whole_body.filters.silhouette_filter import SilhouetteParticleFilter
+from torchpose.whole_body.first_pose import find_first_pose
+from torchpose.whole_body.sharpness import ValidationSequence, fit_sharpness
 
 __all__ = [
     "Run",

@@ -19,8 +19,8 @@ from torchpose.io.mocap import MocapClip
 from torchpose.priors.manifold.file import ManifoldInfo
 from torchpose.priors.manifold.gplvm import BackConstrainedGPLVM
 from torchpose.whole_body.filters.annealed import AnnealedParticleFilter
-from torchpose.whole_body.filters.body_particles import motion_std
 from torchpose.whole_body.filters.manifold import ManifoldParticleFilter
+from torchpose.whole_body.filters.motion import motion_std
 from torchpose.whole_body.filters.silhouette_filter import SilhouetteParticleFilter
 from torchpose.whole_body.filters.sir import SIRParticleFilter
 from torchpose.whole_body.silhouettes.likelihood import intersection_over_union

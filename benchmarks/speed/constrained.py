@@ -34,8 +34,7 @@ from torchpose.whole_body import (
     prepare_silhouettes,
     render,
 )
-from torchpose.whole_body.filters.posture_gate import PostureGate
-from torchpose.whole_body.filters.redraw import Rows
+from torchpose.whole_body.filters.posture_gate import PostureGate, Rows
 
 HEIGHT, WIDTH = 120, 160
 PARTICLES = (100, 300, 1000, 3000, 10_000)

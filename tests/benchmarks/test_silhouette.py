@@ -28,7 +28,7 @@ from torchpose.demo.rendering.clothed_body import TrueShape, true_limbs, true_si
 from torchpose.errors import FileFormatError, InputError
 from torchpose.io.mocap import read_mocap
 from torchpose.whole_body import AnnealedParticleFilter, SIRParticleFilter
-from torchpose.whole_body.filters.sharpness import SharpnessFit
+from torchpose.whole_body.sharpness import SharpnessFit
 
 SMALL = {
     "progress": False, "frames": 8, "particles": (20,), "seeds": 2, "size": ("64x48",), "faults": 0.5,

@@ -1,5 +1,4 @@
 from dataclasses import replace
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -7,16 +6,14 @@ import pytest
 import torch
 
 from torchpose.body import BODY_15, Body
-from torchpose.camera import CameraRig, PinholeCamera, save_cameras
+from torchpose.camera import CameraRig, PinholeCamera, load_cameras, save_cameras
 from torchpose.cli import main
-from torchpose.cli.track_body import _initial_state, build
-from torchpose.cli.track_body_models import BodyModel, check_method, load_model
-from torchpose.cli.track_body_output import action_text, gate_notes
+from torchpose.cli.track_body_output import action_text
 from torchpose.priors import ActionBank, ActionSpace, BackConstrainedGPLVM, ManifoldInfo
 from torchpose.priors.actions.postures import state_postures
 from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
 from torchpose.video import VideoWriter
-from torchpose.whole_body import BodyPoses, render
+from torchpose.whole_body import BodyPoses, BodyTracker, render
 
 HEIGHT, WIDTH, N = 120, 160, 8
 
@@ -132,16 +129,16 @@ def test_nobody_there_is_said(recorded, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (["--method", "mrpf"], "needs --manifold"),
+        (["--method", "mrpf"], "needs manifold"),
         (["--method", "ekf"], "mrpf, apf, sir, root, constrained"),
-        (["--method", "root"], "--method root needs --conditionals NAME|FILE, limb conditionals"),
-        (["--method", "constrained"], "needs --action NAME|FILE, an action space"),
-        (["--method", "sir", "--action", "a"], "leave it out or take --method constrained"),
-        (["--method", "constrained", "--action", "a", "--conditionals", "b"], "take --method root"),
-        (["--manifold", "a", "--conditionals", "b"], "choose by --method mrpf|root"),
-        (["--conditionals", "a", "--sharpness", "9"], "--sharpness does nothing for --method root"),
-        (["--conditionals", "a", "--n-particles", "20"], "must be at least 21 for --method root"),
-        (["--n-particles", "19"], "must be at least 20 for --method apf"),
+        (["--method", "root"], "method root needs conditionals, limb conditionals"),
+        (["--method", "constrained"], "needs action, an action space"),
+        (["--method", "sir", "--action", "a"], "leave it out or take method constrained"),
+        (["--method", "constrained", "--action", "a", "--conditionals", "b"], "take method root"),
+        (["--manifold", "a", "--conditionals", "b"], "choose by method mrpf or root"),
+        (["--conditionals", "a", "--sharpness", "9"], "'sharpness' does nothing for method root"),
+        (["--conditionals", "walk", "--n-particles", "20"], "must be at least 21 for method root"),
+        (["--n-particles", "19"], "must be at least 20 for method apf"),
         (["--conditionals", "nowhere.safetensors"], "nowhere.safetensors: no such file"),
         (["--action", "nowhere.safetensors"], "nowhere.safetensors: no such file"),
         (["--delays", "[1,2]"], "one entry for each"),
@@ -225,14 +222,18 @@ def bank_of_arms(body):
     return ActionBank(spaces)
 
 
+def cameras_of(recorded):
+    return load_cameras(recorded[0] / "cameras.toml")
+
+
 @pytest.mark.parametrize("fps", [60.0, 30.0, 20.0, 15.0])
 @pytest.mark.parametrize("n_particles", [21, 140, 800])
 def test_several_hypotheses_survive_a_frame_at_any_rate(recorded, fps, n_particles):
     body = recorded[1]
-    conditionals = limbs_of_rising_arms(body, 30.0)
-    tracked = body.altered(frame="body", centres=torch.as_tensor(conditionals.centres))
-    model = BodyModel("root", tracked, body, conditionals=conditionals)
-    filter_ = model.make_filter(n_particles, None, fps)
+    filter_ = BodyTracker(
+        cameras_of(recorded), body=body, conditionals=limbs_of_rising_arms(body, 30.0),
+        n_particles=n_particles, fps=fps,
+    ).filter  # fmt: skip
     assert filter_.n_particles == n_particles // 7
     assert filter_.survival_rate * filter_.n_particles >= 2 - 1e-9
 
@@ -257,11 +258,7 @@ def test_hypotheses_of_the_root(recorded, tmp_path, capsys):
     assert poses.notes[-1].endswith("rescaled to 60")
     assert (tmp_path / "out" / "overlay.png").exists()
     # a person whose body is in this frame is tracked by others in theirs
-    args = build().parse_args(
-        arguments(folder, tmp_path, "--body", str(tmp_path / "out" / "body.npz"))[1:]
-    )
-    check_method(args)
-    plain = load_model(args)
+    plain = BodyTracker(cameras_of(recorded), body=tmp_path / "out" / "body.npz")
     assert plain.body.frame == "parent"
     assert not bool(plain.body.centres.any())
 
@@ -288,50 +285,18 @@ def test_the_constraint_of_actions_is_reported(recorded, tmp_path, capsys):
     assert float(errors.mean()) < 0.08
 
 
-def test_what_is_said_of_the_gate():
+def test_the_likeliest_actions_are_told_by_frames():
     states, T = torch.zeros(6, 36).double(), 6
-    posterior = torch.eye(3).double()[[0, 0, 1, 1, 1, 2]]
     poses = BodyPoses(
         Body.of_height(BODY_15, 1.7), states, states, *(torch.zeros(T) for _ in range(6)),
         first_frame=10, action_names=("bend", "wave", "none"),
-        details={"actions": posterior, "released": posterior.argmax(-1) == 2,
-                 "clamped": torch.tensor([0, 0, 0, 1.0, 0.2, 0]),
-                 "acceptance": torch.full((T,), 0.25)},
+        details={"actions": torch.eye(3).double()[[0, 0, 1, 1, 1, 2]]},
     )  # fmt: skip
     assert action_text(poses) == "bend 10-11, wave 12-14, none 15-15"
-    share, shut, released = gate_notes(poses)
-    assert "let 25 % of the first draws through; 20 % of" in share
-    assert "in 1 frames, the first of them 13" in shut
-    assert released.startswith("in 1 frames none of the actions")
     poses.details["actions"] = torch.eye(3).double()[[0, 1] * 5]
     assert action_text(poses).startswith("bend 50 % of the frames, wave 50 %")
     poses.details.clear()
-    assert (action_text(poses), gate_notes(poses)) == ("", ())
-
-
-def test_a_pose_is_found_on_an_upright_body(recorded, tmp_path, monkeypatch):
-    folder, body, states = recorded
-    limbs_of_rising_arms(body).save(tmp_path / "limbs.safetensors")
-    asked = []
-
-    def find(upright, *_, **__):
-        asked.append(upright)
-        return SimpleNamespace(state=states[0])
-
-    monkeypatch.setattr("torchpose.whole_body.filters.first_pose.find_first_pose", find)
-    line = [
-        "--conditionals",
-        str(tmp_path / "limbs.safetensors"),
-        "--body",
-        str(folder / "start.npz"),
-    ]
-    args = build().parse_args(arguments(folder, tmp_path, *line)[1:])
-    check_method(args)
-    model = load_model(args)
-    start = _initial_state(args, model, [torch.ones(3, 4, 4)], None, 60.0, None)
-    assert asked[0].frame == "parent"
-    assert model.body.frame == "body"
-    torch.testing.assert_close(model.body.joints(start), body.joints(states[0]))
+    assert action_text(poses) == ""
 
 
 def test_files_of_something_else_are_refused(recorded, tmp_path, capsys):

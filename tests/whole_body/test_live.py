@@ -18,7 +18,7 @@ from torchpose.whole_body import (
     render,
     track_body,
 )
-from torchpose.whole_body.filters.joint_spread import joint_covariance_with_parts
+from torchpose.whole_body.filters.root_uncertainty import joint_covariance_with_parts
 
 
 @pytest.fixture(scope="module")

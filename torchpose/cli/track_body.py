@@ -5,7 +5,6 @@ import time
 import warnings
 from contextlib import ExitStack
 from dataclasses import replace
-from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
 
 from jsonargparse import ArgumentParser, Namespace
@@ -18,25 +17,21 @@ from torchpose.cli.common import (
     share_cores,
     show_progress,
 )
-from torchpose.cli.track_body_models import METHODS, BodyModel, check_method, load_model
 from torchpose.cli.track_body_output import (
     body_results,
     draw,
     facts_of,
-    gate_notes,
     summary,
     write_page,
     write_poses,
 )
 from torchpose.cli.track_body_videos import Recordings
-from torchpose.errors import CameraError, DegenerateFilterWarning, InputError
+from torchpose.errors import CameraError, DegenerateFilterWarning, InputError, NobodySeenError
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from torchpose.camera.pinhole import PinholeCamera
-    from torchpose.camera.rig import CameraRig
     from torchpose.whole_body.poses import BodyPoses
+    from torchpose.whole_body.tracker import BodyTracker
 
 _EXAMPLES = """
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 cam3.mp4 --out result
@@ -45,8 +40,7 @@ torchpose track-body cameras.toml cam*.mp4 --manifold walk --out result
 torchpose track-body cameras.toml cam*.mp4 --method root --conditionals walk --out result
 torchpose track-body cameras.toml cam1.mp4 --method constrained --action bend.safetensors --out result
 torchpose track-body cameras.toml cam*.mp4 --body result/body.npz --facing [1,0,0] --out again"""
-_LOOK_AHEAD = 0.5  # seconds that decide where the person looks at first
-_SEEN = 0.002  # of the image: fewer pixels are nobody
+_LEARNT = ("manifold", "conditionals", "action")
 
 
 def main(arguments: list[str]) -> int:
@@ -55,7 +49,9 @@ def main(arguments: list[str]) -> int:
 
 
 def build() -> ArgumentParser:
-    """Parser of the command."""
+    """Return the parser of the command."""
+    from torchpose.whole_body.methods import METHODS
+
     parser = new_parser(
         "track-body",
         "Track one person's whole body through the videos of calibrated cameras that stand still, by "
@@ -120,13 +116,14 @@ def run(args: Namespace) -> int:
     _check(args)
     share_cores()
     cameras = _cameras(args)
-    model = load_model(args)
+    learnt = _learnt(args)
     pictures = pictures_possible(args.pictures)
     with ExitStack() as stack:
         results = stack.enter_context(body_results(args, cameras, pictures))
         with Recordings(args, cameras) as recordings:
             start = time.perf_counter()
-            poses = _track(args, recordings, model)
+            tracker = _tracker(args, recordings, learnt)
+            poses = _track(args, recordings, tracker)
             seconds = time.perf_counter() - start
             if poses is None:
                 print(
@@ -138,7 +135,7 @@ def run(args: Namespace) -> int:
             shown = []
             if args.overlay or pictures:
                 shown = draw(recordings, poses, results.stage, args.overlay, pictures)
-        facts = facts_of(args, recordings, poses, seconds)
+        facts = facts_of(args, tracker, recordings, poses, seconds)
         shown += write_page(recordings, poses, facts, results.stage)
         written += results.commit(shown)
     return summary(poses, facts, written, results.notes)
@@ -149,7 +146,6 @@ def _check(args: Namespace) -> None:
                           ("--rows", args.rows), ("--n-particles", args.n_particles),
                           ("--fps", args.fps)):  # fmt: skip
         positive(option, value)
-    check_method(args)
     if args.facing is not None and len(args.facing) != 3:
         raise InputError(f"--facing must be three numbers, got {args.facing}")
     if args.ignore_still and not args.background:
@@ -176,63 +172,55 @@ def _cameras(args: Namespace) -> "list[PinholeCamera]":
     return [found[name] for name in names]
 
 
-def _track(args: Namespace, recordings: "Recordings", model: BodyModel) -> "BodyPoses | None":
+def _learnt(args: Namespace) -> dict[str, Any]:
+    """Return the models that the options name; refuse options that do not go together."""
+    from torchpose.whole_body.methods import LEARNT, METHODS, check_options, choose_method
+
+    given = {kind: getattr(args, kind) for kind in _LEARNT if getattr(args, kind)}
+    method = choose_method(args.method, given)
+    if args.sharpness is not None:
+        check_options(method, ["sharpness"])
+    if args.initial_pose and "manifold" in given and METHODS[method].needs != "manifold":
+        raise InputError(f"--manifold does nothing for --method {method} with an initial pose")
+    return {kind: LEARNT[kind].load(name) for kind, name in given.items()}
+
+
+def _tracker(args: Namespace, recordings: "Recordings", learnt: dict[str, Any]) -> "BodyTracker":
+    from torchpose.whole_body.tracker import BodyTracker
+
+    options = {} if args.sharpness is None else {"sharpness": args.sharpness}
+    return BodyTracker(
+        recordings.rig, args.method, body=args.body, height=args.height, **learnt,
+        n_particles=args.n_particles, fps=recordings.fps, **options,
+    )  # fmt: skip
+
+
+def _track(args: Namespace, recordings: "Recordings", tracker: "BodyTracker") -> "BodyPoses | None":
     """Find the person, then track; None if there is nobody."""
     import torch
 
-    from torchpose.whole_body.live import track_body
+    from torchpose.body.fitting import fit_state
+    from torchpose.whole_body.poses import BodyPoses
 
+    start, facing = None, None
     frames = recordings.silhouettes()
-    first = next((masks for masks in frames if _all_see(masks)), None)
-    if first is None:
-        return None
-    model = model.at_rate(recordings.fps)
-    begun = len(recordings.packed) - 1
+    if args.initial_pose:
+        recorded = BodyPoses.load(args.initial_pose)
+        start = fit_state(tracker.body, recorded.joints3d[:1])[0]
+    else:
+        print("finding the pose of the first frame ...", flush=True)
+    if args.facing is not None:
+        facing = torch.tensor(args.facing, dtype=torch.float64)
     generator = torch.Generator().manual_seed(args.seed)
-    rig = recordings.rig
-    looked_at = 1 if args.initial_pose else max(1, round(_LOOK_AHEAD * recordings.fps))
-    begin = [first, *islice(frames, looked_at - 1)]
-    start = _initial_state(args, model, begin, rig, recordings.fps, generator)
-    tracker = model.make_filter(args.n_particles, args.sharpness, recordings.fps)
-    expected = recordings.n_frames
     with warnings.catch_warnings():
         # said in a note, with the numbers of the frames
         warnings.filterwarnings("ignore", "the gate rejected", DegenerateFilterWarning)
-        poses = track_body(
-            tracker, chain(begin, frames), rig, start, generator,
-            initial_std=model.first_std(tracker), fps=recordings.fps,
-            n_frames=None if expected is None else max(1, expected - begun),
-            progress=show_progress(),
-        )  # fmt: skip
-    poses = replace(poses, first_frame=begun, action_names=model.action_names)
+        try:
+            poses = tracker(
+                frames, start, generator, show_progress(), facing=facing,
+                n_frames=recordings.n_frames,
+            )  # fmt: skip
+        except NobodySeenError:
+            return None
     notes = (*recordings.notes, *(n for s in recordings.sources for n in s.notes))
-    notes += (*model.notes(recordings.fps), *gate_notes(poses))
-    if begun:
-        notes += (f"the first {begun} frames, in which not all cameras saw somebody, have no pose",)
-    return replace(poses, notes=notes)
-
-
-def _all_see(masks: "Tensor") -> bool:
-    return bool((masks.double().mean((-2, -1)) > _SEEN).all())
-
-
-def _initial_state(
-    args: Namespace, model: BodyModel, begin: "list[Tensor]", rig: "CameraRig", fps: float,
-    generator: Any,
-) -> "Tensor":  # fmt: skip
-    """The pose before the first frame, as a state of the body that is tracked."""
-    import torch
-
-    from torchpose.body.fitting import fit_state
-    from torchpose.whole_body.filters.first_pose import find_first_pose
-    from torchpose.whole_body.poses import BodyPoses
-
-    if args.initial_pose:
-        recorded = BodyPoses.load(args.initial_pose)
-        return fit_state(model.body, recorded.joints3d[:1])[0]
-    print("finding the pose of the first frame ...", flush=True)
-    facing = None if args.facing is None else torch.tensor(args.facing, dtype=torch.float64)
-    found = find_first_pose(
-        model.upright, torch.stack(begin), rig, model.manifold, generator, fps=fps, facing=facing
-    ).state
-    return found if model.body is model.upright else model.upright.convert(found, model.body)
+    return replace(poses, notes=(*notes, *poses.notes))

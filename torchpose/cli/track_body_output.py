@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from torchpose.io.results import ResultsFolder
     from torchpose.video.silhouettes import SilhouetteView
     from torchpose.whole_body.poses import BodyPoses
+    from torchpose.whole_body.tracker import BodyTracker
 
 __all__ = [
     "action_text",
     "body_results",
     "draw",
     "facts_of",
-    "gate_notes",
     "project_joints",
     "summary",
     "write_page",
@@ -38,7 +38,7 @@ _MOST_RUNS = 8  # of actions that are listed by their frames
 def body_results(
     args: Namespace, cameras: "Sequence[PinholeCamera]", pictures: bool
 ) -> "ResultsFolder":
-    """The folder of `--out`, for poses of a body and what shows them."""
+    """Return the folder of `--out`, for poses of a body and what shows them."""
     from torchpose.io.results import ResultsFolder, holds_arrays
 
     videos = [_overlay_name(camera.name) for camera in cameras] if args.overlay else []
@@ -57,7 +57,7 @@ def _overlay_name(camera: str) -> str:
 
 
 def write_poses(out: Path, poses: "BodyPoses") -> list[Path]:
-    """The poses as an .npz and as a table."""
+    """Write the poses as an .npz and as a table."""
     written = [out / name for name in _POSES]
     poses.save(written[0])
     _write_csv(written[1], poses)
@@ -65,7 +65,7 @@ def write_poses(out: Path, poses: "BodyPoses") -> list[Path]:
 
 
 def _write_csv(path: Path, poses: "BodyPoses") -> None:
-    """One row per frame: x, y, z of every joint in metres, and its standard deviation."""
+    """Write one row per frame: x, y, z of every joint in metres, and its standard deviation."""
     from torchpose._core.files import atomic_path
 
     columns = [f"{n}_{axis}" for n in poses.names for axis in ("x", "y", "z", "std")]
@@ -83,7 +83,7 @@ def _write_csv(path: Path, poses: "BodyPoses") -> None:
 def draw(
     recordings: "Recordings", poses: "BodyPoses", out: Path, videos: bool, picture: bool
 ) -> list[Path]:
-    """The body drawn into the frames of every camera: videos, and some frames as one picture."""
+    """Draw the body into the frames of every camera: videos, and some frames as one picture."""
     from contextlib import ExitStack
 
     from torchpose.video.writer import VideoWriter
@@ -133,13 +133,13 @@ def _drawn(
 
 
 def _inside(view: "SilhouetteView") -> tuple[slice, slice]:
-    """The part of a silhouette that the frame of the video shows."""
+    """Return the part of a silhouette that the frame of the video shows."""
     (w, h), (right, below), (inner_w, inner_h) = view.size, view.padding, view.inner
     return slice(0, round(inner_h * h / (h + below))), slice(0, round(inner_w * w / (w + right)))
 
 
 def project_joints(joints: "Tensor", camera: "PinholeCamera") -> "Tensor":
-    """Pixels [J, 2] of world points [J, 3] in the images of a camera, its distortions applied."""
+    """Return the pixels [J, 2] of world points [J, 3] in the images of a camera, its distortions applied."""
     import cv2
     import numpy as np
     import torch
@@ -155,7 +155,7 @@ def project_joints(joints: "Tensor", camera: "PinholeCamera") -> "Tensor":
 
 
 def _write_strip(path: Path, strip: list[list[Any]]) -> Path:
-    """Columns are frames, rows are cameras."""
+    """Write frames as columns and cameras as rows."""
     import cv2
     import numpy as np
 
@@ -177,15 +177,21 @@ def _write_strip(path: Path, strip: list[list[Any]]) -> Path:
 
 
 def facts_of(
-    args: Namespace, recordings: "Recordings", poses: "BodyPoses", seconds: float
+    args: Namespace,
+    tracker: "BodyTracker",
+    recordings: "Recordings",
+    poses: "BodyPoses",
+    seconds: float,
 ) -> dict[str, str]:
+    """Return what was tracked, and how, by the name of each fact."""
     height, width = recordings.rig.sizes[0]  # type: ignore[misc]  # views have sizes
-    sharpness = "" if args.sharpness is None else f", sharpness {args.sharpness:g}"
+    matters = "sharpness" not in tracker.filter.unused
+    sharpness = f", sharpness {tracker.filter.sharpness:g}" if matters else ""
     facts = {
         "videos": f"{len(args.videos)} cameras, {recordings.fps:g} fps",
         "silhouettes": f"{width} x {height} pixels, "
         + ("against the empty scene" if args.background else "against what stays"),
-        "method": f"{args.method}, {args.n_particles} particles{sharpness}",
+        "method": f"{tracker.method}, {args.n_particles} particles{sharpness}",
         "learnt": ", ".join(filter(None, (args.manifold, args.conditionals, args.action))),
         "body": args.body or f"average proportions, {args.height:g} m",
         "actions": action_text(poses),
@@ -195,7 +201,7 @@ def facts_of(
 
 
 def action_text(poses: "BodyPoses") -> str:
-    """The likeliest action frame by frame, as runs of frames, or as shares if there are many runs."""
+    """Return the likeliest action frame by frame, as runs of frames, or as shares if there are many runs."""
     import torch
 
     if "actions" not in poses.details or not poses.action_names:
@@ -214,34 +220,10 @@ def action_text(poses: "BodyPoses") -> str:
     )
 
 
-def gate_notes(poses: "BodyPoses") -> tuple[str, ...]:
-    """What the gate of an action let through, and when it was released, in plain words."""
-    if "clamped" not in poses.details:
-        return ()
-    accepted, clamped = poses.details["acceptance"], poses.details["clamped"]
-    found = [
-        f"the gate let {100 * float(accepted.mean()):.0f} % of the first draws through; "
-        f"{100 * float(clamped.mean()):.0f} % of the particles were moved to its border"
-    ]
-    shut = (clamped == 1).nonzero().flatten() + poses.first_frame
-    if len(shut):
-        found.append(
-            f"in {len(shut)} frames, the first of them {int(shut[0])}, the gate rejected every draw: "
-            "the person did something else, or the body is not theirs; a bank of several actions "
-            "lets go there"
-        )
-    released = poses.details.get("released")
-    if released is not None and bool(released.any()):
-        found.append(
-            f"in {int(released.sum())} frames none of the actions was likeliest, and the constraint "
-            "was released"
-        )
-    return tuple(found)
-
-
 def write_page(
     recordings: "Recordings", poses: "BodyPoses", facts: dict[str, str], out: Path
 ) -> list[Path]:
+    """Write the page with the first camera's overlay, the skeleton and curves."""
     from torchpose.viz.report.page import write_report
 
     camera = recordings.views[0].source
@@ -258,7 +240,7 @@ def write_page(
 def summary(
     poses: "BodyPoses", facts: dict[str, str], written: Sequence[Path], notes: Sequence[str] = ()
 ) -> int:
-    """Say what was found; 1 if the filter lost the person in more than half of the frames."""
+    """Say what was found; returns 1 if the filter lost the person in more than half of the frames."""
     for name, fact in facts.items():
         print(f"{name:<12} {fact}")
     print(f"{'frames':<12} {len(poses)} from frame {poses.first_frame}")

@@ -55,18 +55,23 @@ class Recordings:
         return min(counts, default=None)
 
     def silhouettes(self) -> "Iterator[Tensor]":
-        """Silhouettes [C, H, W] of one frame after the other, which are kept, a bit per pixel."""
+        """Learn the background; returns silhouettes [C, H, W] of one frame after the other.
+
+        They are kept, a bit per pixel.
+        """
+        return self._read(self._measurers())
+
+    def _read(self, measurers: "list[SilhouetteMeasurer]") -> "Iterator[Tensor]":
         import numpy as np
 
         from torchpose.video.silhouettes import read_silhouettes
 
-        measurers = self._measurers()
         for masks in read_silhouettes(self.sources, measurers, self._args.delays):
             self.packed.append(np.packbits(masks.numpy(), axis=-1))
             yield masks
 
     def kept(self, frame: int) -> "Tensor":
-        """The silhouettes of a frame that was read."""
+        """Return the silhouettes of a frame that was read."""
         import numpy as np
         import torch
 
@@ -75,7 +80,7 @@ class Recordings:
         return torch.from_numpy(bits.astype(bool))
 
     def images(self) -> Iterator[tuple[Any, ...]]:
-        """The frames of all cameras once more."""
+        """Read the frames of all cameras once more."""
         from torchpose.video.silhouettes import frames_in_step
 
         sources = self._open()

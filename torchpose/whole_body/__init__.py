@@ -5,21 +5,20 @@ from torchpose.whole_body.filters.annealed import AnnealedParticleFilter
 from torchpose.whole_body.filters.body_particles import (
     BodyFilterState,
     BodyTrack,
-    default_step_std,
-    motion_std,
+    joint_covariance,
+    reweight,
 )
 from torchpose.whole_body.filters.constrained import ConstrainedParticleFilter
-from torchpose.whole_body.filters.first_order import constant_velocity_std
-from torchpose.whole_body.filters.first_pose import FirstPose, find_first_pose
-from torchpose.whole_body.filters.joint_spread import joint_covariance
 from torchpose.whole_body.filters.manifold import ManifoldParticleFilter
-from torchpose.whole_body.filters.pose_search import find_pose
+from torchpose.whole_body.filters.motion import constant_velocity_std, default_step_std, motion_std
 from torchpose.whole_body.filters.root_uncertainty import RootUncertaintyTracker
-from torchpose.whole_body.filters.sharpness import ValidationSequence, fit_sharpness
 from torchpose.whole_body.filters.silhouette_filter import SilhouetteParticleFilter
 from torchpose.whole_body.filters.sir import SIRParticleFilter
-from torchpose.whole_body.live import track_body
+from torchpose.whole_body.first_pose import FirstPose, find_first_pose
+from torchpose.whole_body.methods import METHODS, register_body_filter
+from torchpose.whole_body.pose_search import find_pose
 from torchpose.whole_body.poses import BodyPoses, load_body
+from torchpose.whole_body.sharpness import ValidationSequence, fit_sharpness
 from torchpose.whole_body.silhouettes.likelihood import bidirectional, intersection_over_union
 from torchpose.whole_body.silhouettes.rendering import (
     PreparedSilhouettes,
@@ -30,12 +29,16 @@ from torchpose.whole_body.silhouettes.rendering import (
     render_limbs,
 )
 from torchpose.whole_body.silhouettes.shape import fit_radii
+from torchpose.whole_body.tracker import BodyStream, BodyTracker, track_body
 
 __all__ = [
+    "METHODS",
     "AnnealedParticleFilter",
     "BodyFilterState",
     "BodyPoses",
+    "BodyStream",
     "BodyTrack",
+    "BodyTracker",
     "ConstrainedParticleFilter",
     "FirstPose",
     "ManifoldParticleFilter",
@@ -58,8 +61,10 @@ __all__ = [
     "load_body",
     "motion_std",
     "prepare_silhouettes",
+    "register_body_filter",
     "render",
     "render_limbs",
+    "reweight",
     "track_body",
 ]
 

@@ -16,6 +16,7 @@ from torchpose.body.kinematics import Body
 from torchpose.body.skeleton import BODY_15
 from torchpose.camera.pinhole import PinholeCamera
 from torchpose.errors import FileFormatError, InputError, ShapeError, SkeletonError
+from torchpose.whole_body.filters.body_particles import first_true
 
 __all__ = ["BodyPoses", "load_body"]
 
@@ -58,6 +59,8 @@ class BodyPoses:
         details: what only some filters report, by name, [T, ...] each (`BodyTrack.details`): of
             `ConstrainedParticleFilter` "acceptance", "clamped", "actions" and so on.
         action_names: of the columns of ``details["actions"]``.
+        method: the filter that ran, one of `torchpose.whole_body.METHODS`; "unknown" in files of older
+            releases.
     """
 
     body: Body
@@ -74,18 +77,24 @@ class BodyPoses:
     first_frame: int = 0
     details: dict[str, Tensor] = field(default_factory=dict)
     action_names: tuple[str, ...] = field(default_factory=tuple)
+    method: str = "unknown"
 
     def __len__(self) -> int:
         return len(self.state)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the joints."""
+        """Names of the joints."""
         return self.body.skeleton.names
+
+    @property
+    def failed_at(self) -> int:
+        """First frame in which all particles had died, -1 if there is none; tracking went on from it."""
+        return int(first_true(self.respread))
 
     def save(self, path: str | Path) -> None:
         """Write an .npz: what holds for each frame, `names`, `fps` (NaN if unknown), `notes`,
-        `first_frame`, `action_names`, details as `detail_acceptance` and so on, and the body as
+        `first_frame`, `method`, `action_names`, details as `detail_acceptance` and so on, and the body as
         `body_bone_lengths`, `body_radii` and so on.
 
         Raises:
@@ -104,6 +113,7 @@ class BodyPoses:
         arrays["fps"] = np.array(np.nan if self.fps is None else self.fps)
         arrays["notes"] = np.array(self.notes, dtype=str)
         arrays["first_frame"] = np.array(self.first_frame)
+        arrays["method"] = np.array(self.method)
         write_npz(path, arrays)
 
     @classmethod
@@ -118,7 +128,7 @@ class BodyPoses:
         there = npz_keys(path)
         details = [key for key in there if key.startswith(_DETAIL)]
         required = (*_FRAMES, "names", "fps", "notes")
-        arrays = read_npz(path, required, ("first_frame", "action_names", *details))
+        arrays = read_npz(path, required, ("first_frame", "method", "action_names", *details))
         n_frames = check_arrays(path, arrays, _FRAMES)["T"]
         if n_frames == 0:
             raise FileFormatError(f"{path}: expected poses of one frame or more, got none")
@@ -138,6 +148,7 @@ class BodyPoses:
             **frames,
             details={key.removeprefix(_DETAIL): to_tensor(arrays[key]) for key in details},
             action_names=texts(path, "action_names", arrays.get("action_names", np.array(()))),
+            method=one_text(path, "method", arrays.get("method", np.array("unknown"))),
             **frame_facts(path, arrays),
         )
         poses._check(path)
@@ -169,7 +180,7 @@ class BodyPoses:
             )
 
     def seen_by(self, camera: PinholeCamera) -> "CameraPoses":
-        """The joints in a camera's axes, for `torchpose.viz.report.write_report`."""
+        """Return the joints in a camera's axes, for `torchpose.viz.report.write_report`."""
         R, t = (m.to(self.joints3d) for m in (camera.rotation_matrix, camera.translation))
         return CameraPoses(
             joints3d=(self.joints3d @ R.mT + t)[None],
@@ -198,7 +209,7 @@ class CameraPoses:
 
 
 def load_body(path: str | Path) -> Body:
-    """The body of poses that were saved: bone lengths, limbs and centres of a person.
+    """Read the body of poses that were saved: bone lengths, limbs and centres of a person.
 
     Raises:
         InputError: no such file. FileFormatError: not such poses, or no body of a person.

@@ -18,8 +18,7 @@ from torchpose.whole_body import (
     constant_velocity_std,
     render,
 )
-from torchpose.whole_body.filters.posture_gate import PostureGate
-from torchpose.whole_body.filters.redraw import Rows
+from torchpose.whole_body.filters.posture_gate import PostureGate, Rows
 
 BEND, WAVE = space("bend"), space("wave")
 STD = torch.full((36,), 0.03, dtype=torch.float64)

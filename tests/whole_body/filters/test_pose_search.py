@@ -8,7 +8,7 @@ from torchpose.body import Limbs
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.errors import CameraError, InputError, ShapeError
 from torchpose.whole_body import find_pose, render, render_limbs
-from torchpose.whole_body.filters.pose_search import (
+from torchpose.whole_body.pose_search import (
     find_candidates,
     place_from_silhouettes,
     upward_direction,

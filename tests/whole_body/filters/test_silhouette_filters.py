@@ -27,7 +27,7 @@ from torchpose.whole_body import (
 )
 from torchpose.whole_body.filters.annealed import anneal
 from torchpose.whole_body.filters.manifold import MANIFOLD_PROPOSALS, MANIFOLD_WEIGHTS
-from torchpose.whole_body.filters.sharpness import log_grid, mean_joint_error
+from torchpose.whole_body.sharpness import log_grid, mean_joint_error
 
 WIDE = torch.float64
 RUNS = 48

@@ -18,7 +18,7 @@ from torchpose.whole_body import (
     motion_std,
     render,
 )
-from torchpose.whole_body.filters.sharpness import mean_joint_error
+from torchpose.whole_body.sharpness import mean_joint_error
 
 BODY, RIG = walker(), rig()
 

@@ -1,1 +1,1 @@
-"""Particle filters over body poses, and the search for a first pose."""
+"""Particle filters over body poses."""

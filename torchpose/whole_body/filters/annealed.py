@@ -1,8 +1,8 @@
 """The annealed particle filter of Deutscher and Reid."""
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple, Unpack
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,12 +11,17 @@ from torch import Tensor
 from torchpose.errors import InputError
 from torchpose.filters.base import Generators
 from torchpose.filters.resampling import resample
-from torchpose.filters.survival import check_survival_rate, survival_exponent, survival_rate
-from torchpose.whole_body.filters.body_frames import Frame
+from torchpose.filters.survival import (
+    LEAST_SURVIVORS,
+    check_survival_rate,
+    survival_exponent,
+    survival_rate,
+)
+from torchpose.whole_body.filters.body_frames import Frame, Score
 from torchpose.whole_body.filters.body_particles import (
+    BodyFilterOptions,
     BodyFilterState,
     PoseSpace,
-    Score,
     WeightedParticles,
     take_particles,
 )
@@ -24,9 +29,11 @@ from torchpose.whole_body.filters.silhouette_filter import SilhouetteParticleFil
 
 __all__ = ["AnnealedParticleFilter", "Annealing", "anneal"]
 
+_LAYERS, _SURVIVAL = 5, 0.5
+
 
 class Annealing(NamedTuple):
-    """The particles of the last layer, and what every layer did.
+    """The particles of the last layer, and the exponents and survival rates of all.
 
     Attributes:
         particles: [B, N, D]. log_weights: normalised [B, N]; NaN where all particles died.
@@ -49,7 +56,7 @@ def anneal(
     resampling: str = "systematic",
     generator: Generators = None,
 ) -> Annealing:
-    """Layers of diffusion, weights w^beta and resampling, from broad to narrow.
+    """Run layers of diffusion, weights w^beta and resampling, from broad to narrow.
 
     In layer m: diffuse; w_n proportional to p(I | x_n)^beta_m, with beta_m so that alpha of the
     particles survives (`survival_exponent`); resample, but for the last layer.
@@ -114,16 +121,18 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
         Xie, section 8; MR, section 6.1.
     """
 
+    least_particles: ClassVar[int] = round(LEAST_SURVIVORS / _SURVIVAL)
+
     def __init__(
         self,
         body: PoseSpace,
         n_particles: int = 100,
         *,
-        n_layers: int = 5,
-        survival_rate: float = 0.5,
+        n_layers: int = _LAYERS,
+        survival_rate: float = _SURVIVAL,
         schedule: Sequence[float] | None = None,
         noise_decay: float | None = None,
-        **options: Any,
+        **options: Unpack[BodyFilterOptions],
     ) -> None:
         super().__init__(body, n_particles, **options)
         if n_layers < 1:
@@ -143,6 +152,11 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
         self.n_layers, self.survival_rate = n_layers, survival_rate
         self.schedule, self.noise_decay = schedule, decay
 
+    @classmethod
+    def likelihoods_per_particle(cls, options: Mapping[str, Any]) -> int:
+        """Return the number of layers."""
+        return options.get("n_layers", _LAYERS)
+
     def move(
         self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
@@ -158,7 +172,7 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
         seen: Bool[Tensor, " B"],
         generator: Generators,
     ) -> Annealing:
-        """The layers of one frame, with their exponents and survival rates."""
+        """Run the layers of one frame, and return the last with the exponents and survival rates."""
 
         def diffuse(particles: Tensor, layer: int) -> Tensor:
             std = self.step_std * self.noise_decay ** (layer / 2)

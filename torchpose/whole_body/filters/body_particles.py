@@ -1,39 +1,38 @@
-"""Particles over body poses: what a body has to offer, weights, estimates and the noise of a frame."""
+"""Particles over body poses: what a body has to offer, weights, states, and tracks of estimates."""
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+import math
+import warnings
+from collections.abc import Collection, Sequence
+from typing import Any, NamedTuple, Protocol, TypedDict, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int, Shaped
-from torch import Tensor, nn
+from jaxtyping import Bool, Float, Int, Shaped
+from torch import Tensor
 
-from torchpose.errors import InputError, check_finite, check_shape
-from torchpose.whole_body.silhouettes.likelihood import silhouette_log_likelihood
-from torchpose.whole_body.silhouettes.rendering import (
-    PreparedSilhouettes,
-    count_pixels,
-    prepare_silhouettes,
-)
+from torchpose.body.kinematics import Body
+from torchpose.errors import DegenerateFilterWarning, InputError
+from torchpose.filters.base import Generators
+from torchpose.filters.outputs import effective_sample_size
+from torchpose.filters.resampling import resample
+from torchpose.whole_body.filters.body_frames import Likelihood
 
 __all__ = [
+    "BodyFilterOptions",
     "BodyFilterState",
     "BodyTrack",
     "PoseSpace",
-    "Score",
     "WeightedParticles",
-    "as_step_std",
-    "default_step_std",
-    "motion_std",
+    "check_choice",
+    "first_true",
+    "joint_covariance",
+    "resample_state",
     "reweight",
-    "silhouette_score",
     "stack_tracks",
     "take_particles",
+    "warn_of_frames",
 ]
 
-# Per frame at 60 Hz, about twice the motion of a walk: metres, then sines of half angles.
-_POSITION_STD, _HEADING_STD, _PART_STD = 0.015, 0.015, 0.03
-
-Score = Callable[[Tensor], Tensor]
+_LISTED = 8  # frames that a warning names
 
 
 @runtime_checkable
@@ -55,8 +54,26 @@ class PoseSpace(Protocol):
     def mean(self, states: Tensor, log_weights: Tensor) -> Tensor: ...
 
 
+class BodyFilterOptions(TypedDict, total=False):
+    """The options of `SilhouetteParticleFilter`, which every filter over body poses has."""
+
+    step_std: Tensor | float | None
+    likelihood: str | Likelihood
+    sharpness: float
+    limits: Any | None
+    limit_mode: str
+    resampling: str
+    resample_threshold: float
+    estimate: str
+    leg_swap: float
+    limb_shape: str
+    respread_scale: float
+
+
 class BodyTrack(NamedTuple):
     """Estimates of a sequence; [T, ...] from one sequence, [B, T, ...] from a batch, [B, ...] of a step.
+
+    Past the length of a sequence its last estimate is repeated, with log-evidence 0.
 
     Attributes:
         mean: the estimated state [..., D].
@@ -78,8 +95,13 @@ class BodyTrack(NamedTuple):
     respread: Tensor
     details: dict[str, Tensor]
 
+    @property
+    def failed_at(self) -> Int[Tensor, "*batch"]:
+        """First frame in which all particles died, -1 where there is none; tracking went on from it."""
+        return first_true(self.respread)
+
     def element(self, index: int) -> "BodyTrack":
-        """The track of one element of a batch."""
+        """Return the track of one element of a batch."""
         parts: dict[str, Any] = {name: getattr(self, name)[index] for name in self._fields[:-1]}
         return BodyTrack(**parts, details={n: value[index] for n, value in self.details.items()})
 
@@ -103,7 +125,7 @@ class BodyFilterState(NamedTuple):
 
 
 class WeightedParticles(NamedTuple):
-    """What `move` returns.
+    """The particles of a new frame, as `SilhouetteParticleFilter.move` returns them.
 
     Attributes:
         particles: [B, N, D]. log_weights: normalised [B, N], float64; NaN in an element whose particles
@@ -119,33 +141,33 @@ class WeightedParticles(NamedTuple):
     details: dict[str, Tensor] | None = None
 
 
-def stack_tracks(steps: Sequence[BodyTrack]) -> BodyTrack:
-    """Steps [B, ...] as one track [B, T, ...]."""
+def first_true(flags: Bool[Tensor, "*batch T"]) -> Int[Tensor, "*batch"]:
+    """Return the first frame that is True, -1 where none is."""
+    return torch.where(flags.any(-1), flags.int().argmax(-1), -1)
+
+
+def stack_tracks(steps: Sequence[BodyTrack], lengths: Int[Tensor, " B"] | None = None) -> BodyTrack:
+    """Put the steps [B, ...] of a run together as one track [B, T, ...].
+
+    Args:
+        lengths: [B], frames of each sequence; all of them if None.
+    """
     parts: dict[str, Any] = {
         name: torch.stack([getattr(step, name) for step in steps], 1)
         for name in BodyTrack._fields[:-1]
     }
     names = steps[0].details
     details = {name: torch.stack([step.details[name] for step in steps], 1) for name in names}
-    return BodyTrack(**parts, details=details)
-
-
-def silhouette_score(
-    body: Any,
-    silhouettes: Tensor | PreparedSilhouettes,
-    cameras: Any,
-    likelihood: str,
-    limb_shape: str = "cylinders",
-) -> Score:
-    """states [B, N, D] -> log-likelihood [B, N] of the silhouettes [B, C, H, W] of one frame."""
-    if not isinstance(silhouettes, PreparedSilhouettes):
-        silhouettes = prepare_silhouettes(silhouettes)
-
-    def score(states: Tensor) -> Tensor:
-        counts = count_pixels(body, states, cameras, silhouettes, limb_shape=limb_shape)
-        return silhouette_log_likelihood(counts, likelihood)
-
-    return score
+    if lengths is None:
+        return BodyTrack(**parts, details=details)
+    frames = torch.arange(len(steps), device=lengths.device)
+    rows = torch.arange(len(lengths), device=lengths.device)[:, None]
+    held = torch.minimum(frames, lengths[:, None] - 1)
+    inside = frames < lengths[:, None]
+    parts = {name: value[rows, held] for name, value in parts.items()}
+    parts["log_evidence"] = torch.where(inside, parts["log_evidence"], 0.0)
+    parts["respread"] = parts["respread"] & inside
+    return BodyTrack(**parts, details={name: value[rows, held] for name, value in details.items()})
 
 
 def reweight(
@@ -153,7 +175,7 @@ def reweight(
     log_prior: Float[Tensor, "B N"],
     log_likelihood: Float[Tensor, "B N"],
 ) -> WeightedParticles:
-    """Weights of the posterior from those of the prediction, and the log-evidence.
+    """Return particles with the weights of the posterior, and the log-evidence of the frame.
 
     xi_n = pi_n omega_n / sum_j pi_j omega_j,   log p(I_t | I_1:t-1) = log sum_n omega_n pi_n / sum_n omega_n
 
@@ -172,55 +194,64 @@ def reweight(
 def take_particles(
     particles: Shaped[Tensor, "B N *rest"], ancestors: Int[Tensor, "B n"]
 ) -> Shaped[Tensor, "B n *rest"]:
-    """particles[b, ancestors[b, i]]."""
+    """Return particles[b, ancestors[b, i]]."""
     batch, n, *rest = particles.shape
     first = torch.arange(batch, device=ancestors.device)[:, None] * n
     taken = particles.flatten(0, 1).index_select(0, (ancestors + first).reshape(-1))
     return taken.view(batch, ancestors.shape[1], *rest)
 
 
-def default_step_std(body: PoseSpace) -> Float[Tensor, " D"]:
-    """Diffusion per frame at 60 Hz: 15 mm for the root, 1.7 degrees for its orientation, 3.4 for parts."""
-    std = torch.full((body.dim,), _PART_STD, dtype=torch.float64)
-    std[:3], std[3:6] = _POSITION_STD, _HEADING_STD
-    return std
-
-
-def motion_std(
-    body: PoseSpace, states: Float[Tensor, "T D"] | Sequence[Tensor], floor: float = 0.0
-) -> Float[Tensor, " D"]:
-    """Root mean square change of recorded states from one frame to the next, for `step_std`.
+def resample_state(
+    state: BodyFilterState, method: str, threshold: float, generator: Generators
+) -> tuple[BodyFilterState, Int[Tensor, "B N"]]:
+    """Resample the elements whose effective sample size is low; returns the state and the ancestors.
 
     Args:
-        states: one sequence [T, D], or several. Frames with NaN are passed over.
-        floor: no element is smaller. The twist of a limb, which no joint shows, does not vary in
-            recorded states: with 0 it stays as it is.
-
-    Raises:
-        InputError: no two frames that follow each other.
+        method: as `resample`. threshold: share of N below which it is due; the other elements stay.
     """
-    sequences = [states] if isinstance(states, Tensor) else list(states)
-    steps = torch.cat([body.difference(s[1:], s[:-1]) for s in sequences])
-    steps = steps[torch.isfinite(steps).all(-1)]
-    if len(steps) == 0:
-        raise InputError("states must hold two frames that follow each other, got none")
-    return steps.square().mean(0).sqrt().clamp_min(floor)
+    n = state.particles.shape[1]
+    due = effective_sample_size(state.log_weights) < threshold * n
+    # drawn for all: what an element draws must not depend on its neighbours
+    ancestors = resample(state.log_weights, method, generator)
+    ancestors = torch.where(due[:, None], ancestors, torch.arange(n, device=due.device))
+    memory = None if state.memory is None else take_particles(state.memory, ancestors)
+    resampled = state._replace(
+        particles=take_particles(state.particles, ancestors),
+        log_weights=torch.where(due[:, None], -math.log(n), state.log_weights),
+        memory=memory,
+    )
+    return resampled, ancestors
 
 
-def as_step_std(body: PoseSpace, value: Tensor | float | None) -> Float[Tensor, " D"]:
-    """`step_std` of a filter, checked, in the dtype and on the device of the body.
+def joint_covariance(
+    body: Body, state: BodyFilterState, mean: Float[Tensor, "B D"]
+) -> Float[Tensor, "B J 3 3"]:
+    """Return the second moment of the particles' joints about those of an estimate, metres squared."""
+    away = body.joints(state.particles) - body.joints(mean)[:, None]
+    weights = state.log_weights.exp().to(away)
+    return torch.einsum("bn,bnji,bnjk->bjik", weights, away, away)
 
-    Raises:
-        ShapeError: not [D]. InputError: not finite, or negative.
+
+def warn_of_frames(failed: Bool[Tensor, "B T"], text: str) -> None:
+    """Warn of the frames in which a filter degenerated, if there are any.
+
+    Args:
+        failed: True in those frames. text: with {times} and {frames}, and what to do about it.
     """
-    std = default_step_std(body) if value is None else torch.as_tensor(value).detach()
-    std = std if std.is_floating_point() else std.double()
-    if std.ndim == 0:
-        std = std.double().expand(body.dim)
-    check_shape("step_std", std, [body.dim])
-    check_finite("step_std", std)
-    if bool((std < 0).any()):
-        raise InputError(f"step_std must not be negative, got {float(std.min()):g}")
-    if isinstance(body, nn.Module):
-        std = std.to(next((b for b in body.buffers() if b.is_floating_point()), std))
-    return std.clone()
+    if not bool(failed.any()):
+        return
+    rows, frames = torch.nonzero(failed, as_tuple=True)
+    listed = [
+        f"element {b} at frame {t}" for b, t in zip(rows.tolist(), frames.tolist(), strict=True)
+    ]
+    warnings.warn(
+        text.format(times=len(listed), frames=", ".join(listed[:_LISTED])),
+        DegenerateFilterWarning,
+        stacklevel=4,
+    )
+
+
+def check_choice(name: str, value: object, choices: Collection[str]) -> None:
+    """Raise `InputError` unless an option is one of these words."""
+    if not (isinstance(value, str) and value in choices):
+        raise InputError(f"{name} must be one of {', '.join(choices)}, got {value!r}")

@@ -1,14 +1,14 @@
 """The particle filter with action-specific posture constraints (aSpace)."""
 
-import warnings
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.body.kinematics import Body
-from torchpose.errors import DegenerateFilterWarning, InputError
+from torchpose.body.skeleton import BODY_15
+from torchpose.errors import InputError
 from torchpose.filters.base import Generators, standard_normal
 from torchpose.math.quaternion_vectors import within_unit_ball
 from torchpose.priors.actions.bank import ActionBank
@@ -16,22 +16,39 @@ from torchpose.priors.actions.gate import GATE_WIDTH
 from torchpose.priors.actions.space import ActionSpace
 from torchpose.whole_body.filters.body_frames import Frame
 from torchpose.whole_body.filters.body_particles import (
+    BodyFilterOptions,
     BodyFilterState,
     BodyTrack,
     PoseSpace,
     WeightedParticles,
+    check_choice,
     reweight,
+    warn_of_frames,
 )
-from torchpose.whole_body.filters.first_order import next_velocity
-from torchpose.whole_body.filters.posture_gate import PostureGate
-from torchpose.whole_body.filters.redraw import Redrawn, Rows, all_accepted, redraw_until_accepted
+from torchpose.whole_body.filters.motion import next_velocity, rescale_std
+from torchpose.whole_body.filters.posture_gate import (
+    PostureGate,
+    Redrawn,
+    Rows,
+    all_accepted,
+    redraw_until_accepted,
+)
 from torchpose.whole_body.filters.silhouette_filter import SilhouetteParticleFilter
 
 __all__ = ["CONSTRAINED_WEIGHTS", "ConstrainedParticleFilter"]
 
 CONSTRAINED_WEIGHTS = ("published", "normalised")
-_LISTED = 8
 _RELATIVE = slice(6, None)  # the columns of a state that a posture depends on
+_COMMON_HEIGHT = 1.75  # metres, of the body on which the postures of actions are told
+# What a constant velocity misses, at 60 Hz, about twice that of walks and exercises: metres for the
+# root, sines of half angles for its orientation and for parts.
+_TRACKING_STD, _TRACKING_RATE = (0.004, 0.006, 0.01), 60.0
+_TRACKING_SHARPNESS = 30.0  # of the overlap
+_REJECTED = (
+    "the gate rejected every draw of all particles {times} times ({frames}), and they were moved to its "
+    "border; start in a posture of the action, use fewer dimensions, a wider gate, more redraws or a "
+    "larger step_std, or a bank in which no action is possible too"
+)
 
 
 class ConstrainedParticleFilter(SilhouetteParticleFilter):
@@ -67,7 +84,6 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         body: a `Body` of the joints of `BODY_15`.
         action: the fitted action, a bank of several, or None for first-order motion without constraint.
         n_particles: N.
-        step_std: sigma_phi [D], per frame; see `constant_velocity_std`.
         velocity_rate: a, from 0 to below 1; None for no velocity at all.
         max_redraws: how often a particle is drawn again at most.
         weights: "published" or "normalised".
@@ -75,7 +91,8 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         posture_body: see `PostureGate`.
         fps: of the frames to be tracked, to which a bank's transitions are rescaled (`repr` says from
             which); that of its performances if None. One action is the same at any frame rate.
-        options: as `SilhouetteParticleFilter`; its `likelihood="overlap"` is the published one.
+        options: as `SilhouetteParticleFilter`; `step_std` is sigma_phi (see `constant_velocity_std`), and
+            ``likelihood="overlap"`` the published one.
 
     Raises:
         InputError, ShapeError: an argument is not as described. SkeletonError: a body of other joints.
@@ -90,24 +107,20 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         action: ActionSpace | ActionBank | None,
         n_particles: int = 2000,
         *,
-        step_std: Tensor | float | None = None,
         velocity_rate: float | None = 0.5,
         max_redraws: int = 50,
         weights: str = "published",
         gate_width: float = GATE_WIDTH,
         posture_body: Body | None = None,
         fps: float | None = None,
-        **options: Any,
+        **options: Unpack[BodyFilterOptions],
     ) -> None:
-        super().__init__(body, n_particles, step_std=step_std, **options)
+        super().__init__(body, n_particles, **options)
         if velocity_rate is not None and not 0 <= velocity_rate < 1:
             raise InputError(f"velocity_rate must be from 0 to below 1, got {velocity_rate}")
         if max_redraws < 0:
             raise InputError(f"max_redraws must be 0 or more, got {max_redraws}")
-        if weights not in CONSTRAINED_WEIGHTS:
-            raise InputError(
-                f"weights must be one of {', '.join(CONSTRAINED_WEIGHTS)}, got {weights!r}"
-            )
+        check_choice("weights", weights, CONSTRAINED_WEIGHTS)
         if weights == "normalised" and isinstance(action, ActionBank):
             raise InputError(
                 "a bank compares motions that are normalised under every action, as redrawing does; "
@@ -126,7 +139,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
     # --- what is remembered
 
     def first_memory(self, particles: Float[Tensor, "B N D"]) -> Tensor | None:
-        """Of every particle: its action [B, N], or its own number, by which copies are known."""
+        """Return the action of every particle [B, N], or its own number, by which copies are known."""
         batch, n = particles.shape[:2]
         if self.gate is not None and self.gate.several:
             return self.gate.first_actions(batch, n)
@@ -135,7 +148,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         return None
 
     def first_trend(self, mean: Float[Tensor, "B D"]) -> Tensor:
-        """Velocity, and the estimate before the last: [B, 2, D]."""
+        """Return the velocity, and the estimate before the last: [B, 2, D]."""
         return torch.stack([torch.zeros_like(mean), mean], 1)
 
     # --- a frame
@@ -164,18 +177,51 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         details = self._details(found, moved.log_weights, actions)
         return moved._replace(memory=memory, trend=trend, details=details)
 
-    def forward(self, *args: Any, **options: Any) -> BodyTrack:
-        """As `SilhouetteParticleFilter.forward`; warns of frames in which the gate rejected everything."""
-        track = super().forward(*args, **options)
-        clamped = track.details["clamped"]
-        warn_if_rejected(clamped if clamped.ndim == 2 else clamped[None])
-        return track
+    def warn(self, track: BodyTrack) -> None:
+        """Warn of the frames in which all particles died, or the gate rejected every draw."""
+        super().warn(track)
+        warn_of_frames(track.details["clamped"] == 1, _REJECTED)
 
-    def step(self, *args: Any, **options: Any) -> tuple[BodyFilterState, BodyTrack]:
-        """As `SilhouetteParticleFilter.step`; warns if the gate rejected everything."""
-        state, track = super().step(*args, **options)
-        warn_if_rejected(track.details["clamped"][:, None])
-        return state, track
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """Names of the bank's actions, none last; empty without a bank."""
+        return () if self.gate is None or not self.gate.several else tuple(self.gate.action.names)
+
+    def notes(self, track: BodyTrack, first_frame: int = 0) -> tuple[str, ...]:
+        """Return what the gate let through, and when it was released, in plain words."""
+        if self.gate is None:
+            return ()
+        accepted, clamped = track.details["acceptance"], track.details["clamped"]
+        found = [
+            f"the gate let {100 * float(accepted.mean()):.0f} % of the first draws through; "
+            f"{100 * float(clamped.mean()):.0f} % of the particles were moved to its border"
+        ]
+        shut = (clamped == 1).nonzero().flatten() + first_frame
+        if len(shut):
+            found.append(
+                f"in {len(shut)} frames, the first of them {int(shut[0])}, the gate rejected every "
+                "draw: the person did something else, or the body is not theirs; a bank of several "
+                "actions lets go there"
+            )
+        released = track.details.get("released")
+        if released is not None and bool(released.any()):
+            found.append(
+                f"in {int(released.sum())} frames none of the actions was likeliest, and the "
+                "constraint was released"
+            )
+        return tuple(found)
+
+    @classmethod
+    def tracking_options(cls, body: Any, fps: float, learnt: Any = None) -> dict[str, Any]:
+        """Return twice the usual error of a constant velocity, and the published likelihood."""
+        step = torch.empty(body.dim, dtype=torch.float64)
+        step[:3], step[3:6], step[6:] = _TRACKING_STD
+        return {
+            "step_std": rescale_std(step, 1 / _TRACKING_RATE, 1 / fps),
+            "sharpness": _TRACKING_SHARPNESS,
+            "likelihood": "overlap",
+            "posture_body": None if learnt is None else _posture_body(learnt),
+        }
 
     def extra_repr(self) -> str:
         said = f"{self.n_particles} particles"
@@ -204,7 +250,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         actions: Int[Tensor, "B N"] | None,
         rows: Rows,
     ) -> Redrawn:
-        """(AS 3), its relative columns until the gate accepts them, or moved to its border."""
+        """Draw by (AS 3), relative columns until the gate accepts them, or moved to its border."""
         batch, n, dim = particles.shape
         noise = standard_normal(batch, (n, dim), rows.generator, particles) * self.step_std
         moved = self.constrain(self.body.perturb(particles, velocity[:, None] + noise))
@@ -235,7 +281,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         return found._replace(states=moved)
 
     def _constrained(self, relative: Float[Tensor, "r Q"]) -> Float[Tensor, "r Q"]:
-        """Within the unit ball, and within the joint limits if they clamp."""
+        """Return columns within the unit ball, and within the joint limits if they clamp."""
         relative = within_unit_ball(relative.unflatten(-1, (-1, 3))).flatten(-2)
         if self.limits is None or self.limit_mode != "clamp":
             return relative
@@ -264,8 +310,15 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         return details
 
 
+def _posture_body(action: ActionSpace | ActionBank) -> Body | None:
+    """Return the body on which the performances were put, None if it is the tracked one."""
+    usual = "body" if isinstance(action, ActionBank) else "joints"
+    common = action.info.extra.get("postures", usual) == "body"
+    return Body.of_height(BODY_15, _COMMON_HEIGHT) if common else None
+
+
 def log_share(found: Redrawn, ancestors: Int[Tensor, "B N"]) -> Float[Tensor, "B N"]:
-    """log Z of particles, estimated from the draws of all copies of an ancestor; -inf where clamped.
+    """Return log Z of particles, from the draws of all copies of an ancestor; -inf where clamped.
 
     The copies that were accepted share the sum of what all copies estimate, so that the weighted
     particles stay exact on average. Where everything was clamped all are alike.
@@ -280,21 +333,3 @@ def log_share(found: Redrawn, ancestors: Int[Tensor, "B N"]) -> Float[Tensor, "B
     log_z = (total / count.clamp_min(1)).log().gather(1, ancestors)
     log_z = log_z.masked_fill(~accepted, -torch.inf)
     return torch.where(accepted.any(1, keepdim=True), log_z, 0.0)
-
-
-def warn_if_rejected(clamped: Float[Tensor, "B T"]) -> None:
-    """Warn of the frames in which every particle was rejected as often as it was drawn."""
-    if not bool((clamped == 1).any()):
-        return
-    rows, frames = torch.nonzero(clamped == 1, as_tuple=True)
-    listed = [
-        f"element {b} at frame {t}" for b, t in zip(rows.tolist(), frames.tolist(), strict=True)
-    ]
-    warnings.warn(
-        f"the gate rejected every draw of all particles {len(listed)} times "
-        f"({', '.join(listed[:_LISTED])}), and they were moved to its border; start in a posture of the "
-        "action, use fewer dimensions, a wider gate, more redraws or a larger step_std, or a bank in "
-        "which no action is possible too",
-        DegenerateFilterWarning,
-        stacklevel=3,
-    )

@@ -26,7 +26,7 @@ _ROOT_COLUMNS = 3  # the position; the vectors of all parts follow
 
 
 def leg_permutation(skeleton: BodySkeleton) -> Int[Tensor, " P"]:
-    """Indices of the parts with those of the left and the right leg exchanged.
+    """Return the indices of the parts with those of the left and the right leg exchanged.
 
     Args:
         skeleton: with the parts left_thigh, left_shank, right_thigh and right_shank.
@@ -46,7 +46,7 @@ def leg_permutation(skeleton: BodySkeleton) -> Int[Tensor, " P"]:
 
 
 def leg_angle(body: Body, states: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch"]:
-    """Angle between the upper legs, theta_legs, radians from 0 to pi.
+    """Return the angle between the upper legs, theta_legs, radians from 0 to pi.
 
     Args:
         states: of `body`, [..., D].
@@ -60,7 +60,7 @@ def leg_angle(body: Body, states: Float[Tensor, "*batch D"]) -> Float[Tensor, "*
 
 
 def exchange_legs(body: Body, states: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D"]:
-    """States whose left leg is turned as the right one was, and the other way round.
+    """Return states whose left leg is turned as the right one was, and the other way round.
 
     C_l R(q_l') = C_r R(q_r),   C_r R(q_r') = C_l R(q_l)
 
@@ -77,7 +77,7 @@ def exchange_legs(body: Body, states: Float[Tensor, "*batch D"]) -> Float[Tensor
 
 
 def extra_copies(ancestors: Int[Tensor, "B N"]) -> Bool[Tensor, "B N"]:
-    """Which particles are copies beside the first one of the same ancestor.
+    """Tell which particles are copies beside the first one of the same ancestor.
 
     Args:
         ancestors: of the resampled particles, in any order.
@@ -146,7 +146,7 @@ def check_leg_swap(body: Any, rate: float) -> None:
 
 
 def _bone(body: Body, part: int) -> Float[Tensor, "3"]:
-    """Offset of the first joint that a part carries."""
+    """Return the offset of the first joint that a part carries."""
     carried = [j for j, p in enumerate(body.skeleton.part_of) if p == part]
     if not carried:
         name = body.skeleton.parts[part]

@@ -1,4 +1,4 @@
-"""What silhouettes say of single parts of the body: Gaussians from seven places of each.
+"""Likelihoods of single parts of the body, and the Gaussians that seven places of each make of them.
 
 Every part is tried at the sigma points of its prediction while the others stay at their means; the
 silhouette pixels under it are the likelihood of each point, and the weighted points make a Gaussian.
@@ -18,6 +18,7 @@ from torchpose.camera.rig import Cameras
 from torchpose.errors import InputError, SkeletonError, check_shape
 from torchpose.math.quaternion_vectors import quaternion_vector_to_matrix
 from torchpose.math.unscented import floor_eigenvalues, moments
+from torchpose.whole_body.filters.body_particles import check_choice
 from torchpose.whole_body.silhouettes.limb_counts import PartCounts, count_parts
 from torchpose.whole_body.silhouettes.rendering import PreparedSilhouettes
 
@@ -52,7 +53,7 @@ class PartGroup(NamedTuple):
 
 
 def part_groups(skeleton: BodySkeleton) -> tuple[PartGroup, ...]:
-    """Which limbs move with each part, for all parts but the root.
+    """Return which limbs move with each part, for all parts but the root.
 
     A limb between two parts belongs to the one farther from the root. Those of the root part alone
     count with the first part that hangs on it.
@@ -90,7 +91,7 @@ def part_positions(
     points: Float[Tensor, "*batch V S 3"],
     group: PartGroup,
 ) -> Limbs:
-    """Limbs of each part of a group at every sigma point, all other parts as in the state.
+    """Return the limbs of each part of a group at every sigma point, all other parts as in the state.
 
     The part turns about its proximal joint, which stays where the state has it.
 
@@ -128,7 +129,7 @@ def count_positions(
     silhouettes: PreparedSilhouettes,
     groups: tuple[PartGroup, ...] | None = None,
 ) -> PartCounts:
-    """Silhouette pixels under every part at every sigma point, 1/2 where the opposing part may be.
+    """Count silhouette pixels under every part at every sigma point, 1/2 where the opposing part may be.
 
     Args:
         body, states, points: as `part_positions`. cameras: C. silhouettes: as `count_parts`.
@@ -163,7 +164,7 @@ def part_log_likelihood(
     cameras: str = "product",
     sharpness: float = 1.0,
 ) -> Float[Tensor, "*batch V S"]:
-    """log p(O_i | sigma_s), of all cameras together.
+    """Return log p(O_i | sigma_s), of all cameras together.
 
     p = (prod_c v_c)^k or (sum_c v_c)^k,   v_c the pixels (DX 4), or their share of the part's own
 
@@ -200,7 +201,7 @@ def observation_gaussians(
     covariance: Float[Tensor, "*batch V 3 3"],
     least_std: float = 0.0,
 ) -> tuple[Float[Tensor, "*batch V 3"], Float[Tensor, "*batch V 3 3"]]:
-    """p(x_i | O_i) = N(x_i; mu_obs, Sigma_obs): moments of the weighted sigma points.
+    """Return the moments of weighted sigma points, p(x_i | O_i) = N(x_i; mu_obs, Sigma_obs).
 
     Equal weights leave the distribution as it was.
 
@@ -223,12 +224,8 @@ def observation_gaussians(
 
 def check_rules(normalisation: str, cameras: str, sharpness: float) -> None:
     """Raise `InputError` unless both rules are known and the sharpness is positive."""
-    for name, value, known in (
-        ("normalisation", normalisation, NORMALISATIONS),
-        ("cameras", cameras, CAMERA_RULES),
-    ):
-        if value not in known:
-            raise InputError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    check_choice("normalisation", normalisation, NORMALISATIONS)
+    check_choice("cameras", cameras, CAMERA_RULES)
     if not 0 < sharpness < math.inf:
         raise InputError(f"sharpness must be positive and finite, got {sharpness}")
 
@@ -237,7 +234,7 @@ def check_rules(normalisation: str, cameras: str, sharpness: float) -> None:
 
 
 def _limbs_of_parts(skeleton: BodySkeleton) -> list[tuple[int, ...]]:
-    """Limbs of every part but the root."""
+    """Return the limbs of every part but the root."""
     carrier = {name: skeleton.part_of[i] for i, name in enumerate(skeleton.names)}
     carrier |= {tip.name: skeleton.part(tip.part) for tip in skeleton.tips}
     depth = {part: d for d, level in enumerate(skeleton.part_levels) for part in level}
@@ -250,7 +247,7 @@ def _limbs_of_parts(skeleton: BodySkeleton) -> list[tuple[int, ...]]:
 
 
 def _opposing_parts(skeleton: BodySkeleton) -> list[int]:
-    """The same part on the other side, without the root; a part in the middle is its own."""
+    """Return the same part on the other side, without the root; a part in the middle is its own."""
     names = list(skeleton.parts)[1:]
     others = [other_side(name) for name in names]
     return [names.index(o) if o in names else i for i, o in enumerate(others)]

@@ -1,27 +1,30 @@
 """The manifold-regularised particle filter."""
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, Unpack, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.errors import InputError, PriorError, check_shape
+from torchpose.errors import PriorError, check_shape
 from torchpose.filters.base import Generators, standard_normal
 from torchpose.whole_body.filters.body_frames import Frame
 from torchpose.whole_body.filters.body_particles import (
+    BodyFilterOptions,
     BodyFilterState,
     PoseSpace,
     WeightedParticles,
-    default_step_std,
+    check_choice,
     reweight,
 )
+from torchpose.whole_body.filters.motion import default_step_std
 from torchpose.whole_body.filters.silhouette_filter import SilhouetteParticleFilter
 
 __all__ = ["MANIFOLD_PROPOSALS", "MANIFOLD_WEIGHTS", "ManifoldParticleFilter", "PoseManifold"]
 
 MANIFOLD_WEIGHTS = ("published", "normalised")
 MANIFOLD_PROPOSALS = ("diffusion", "product")
+_TRACKING_STEP = 2.0  # times sigma x->x, which was learnt from the true poses
 _LEAST_STD = 1e-3  # of sigma z->x: the twist of a limb, which no joint shows, does not vary at all
 
 
@@ -79,11 +82,10 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
         weights: "published" or "normalised". proposal: "diffusion" or "product". The defaults are the
             exact model with the proposal that wastes no particles; on walks at 60 Hz the published
             form holds poses so close to the manifold that they fall behind.
-        step_std: [D], the root's and sigma x->x; the manifold's own `std_step` (and
-            `default_step_std` for the root) if None.
         fps: of the frames to be tracked; the manifold must have its noise for that rate. None if it
             does not matter.
-        options: as `SilhouetteParticleFilter`.
+        options: as `SilhouetteParticleFilter`. `step_std` [D] is the root's and sigma x->x; the
+            manifold's own `std_step` (and `default_step_std` for the root) if None.
 
     Raises:
         PriorError: a manifold of another skeleton or frame rate, or without its noise.
@@ -101,31 +103,35 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
         *,
         weights: str = "normalised",
         proposal: str = "product",
-        step_std: Tensor | float | None = None,
         fps: float | None = None,
-        **options: Any,
+        **options: Unpack[BodyFilterOptions],
     ) -> None:
-        for name, value, choices in (
-            ("weights", weights, MANIFOLD_WEIGHTS),
-            ("proposal", proposal, MANIFOLD_PROPOSALS),
-        ):
-            if value not in choices:
-                raise InputError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
+        check_choice("weights", weights, MANIFOLD_WEIGHTS)
+        check_choice("proposal", proposal, MANIFOLD_PROPOSALS)
         manifold.check_for(body, fps)
         columns = torch.as_tensor(body.relative_columns, dtype=torch.long)  # type: ignore[attr-defined]
         _check_noise(manifold, len(columns))
-        if step_std is None:
-            step_std = default_step_std(body)
-            step_std[columns.to(step_std.device)] = manifold.std_step.detach().to(step_std)
-        super().__init__(body, n_particles, step_std=step_std, **options)
+        if options.get("step_std") is None:
+            options["step_std"] = _step_std(body, manifold)
+        super().__init__(body, n_particles, **options)
         self.manifold, self.weights, self.proposal = manifold, weights, proposal
         self.register_buffer("columns", columns.to(self.step_std.device), persistent=False)
         self.columns: Tensor
 
+    @classmethod
+    def tracking_options(
+        cls, body: Any, fps: float, learnt: PoseManifold | None = None
+    ) -> dict[str, Any]:
+        """Return the usual options, with twice the noise of the manifold."""
+        options = super().tracking_options(body, fps)
+        if learnt is not None:
+            options["step_std"] = _step_std(body, learnt, fps, _TRACKING_STEP)
+        return options
+
     def move(
         self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
-        """Steps 3 to 7 of Algorithm 1."""
+        """Take steps 3 to 7 of Algorithm 1."""
         particles, seen = state.particles, frame.seen
         before = particles.index_select(-1, self.columns)
         target = self.draw_targets(before, generator)
@@ -140,7 +146,7 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
     def draw_targets(
         self, before: Float[Tensor, "B N Q"], generator: Generators
     ) -> Float[Tensor, "B N Q"]:
-        """f(z) of a latent point z of each particle, drawn by (MR 27)."""
+        """Return f(z) of a latent point z of each particle, drawn by (MR 27)."""
         latent = self.manifold.to_latent(before.to(self.manifold.std_latent.dtype))
         noise = standard_normal(len(latent), latent.shape[1:], generator, latent)
         latent = latent + noise * self.manifold.std_latent.to(latent)
@@ -153,7 +159,7 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
         exact: Bool[Tensor, " B"],
         generator: Generators,
     ) -> Float[Tensor, "B N D"]:
-        """(MR 29), or where `exact` the normalised product, with `ahead` = f(z) - x_{t-1}."""
+        """Draw by (MR 29), or where `exact` by the normalised product, with `ahead` = f(z) - x_{t-1}."""
         step = standard_normal(len(particles), particles.shape[1:], generator, particles)
         step = step * self.step_std
         var_step, var_pose = self._variances(particles)
@@ -165,7 +171,7 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
         return self.constrain(self.body.perturb(particles, step))
 
     def _log_omega(self, before: Tensor, after: Tensor, target: Tensor) -> Float[Tensor, "B N"]:
-        """log omega up to a constant that all particles share."""
+        """Return log omega up to a constant that all particles share."""
         var_step, var_pose = self._variances(before)
         log_omega = before.new_zeros(before.shape[:2])
         if self.proposal == "diffusion":
@@ -176,9 +182,19 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
         return log_omega
 
     def _variances(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Diagonals of S_xx and S_zx, [Q]."""
+        """Return the diagonals of S_xx and S_zx, [Q]."""
         pose = self.manifold.std_pose.to(like).clamp_min(_LEAST_STD)
         return self.step_std[self.columns].square(), pose.square()
+
+
+def _step_std(
+    body: PoseSpace, manifold: PoseManifold, fps: float = 60.0, scale: float = 1.0
+) -> Float[Tensor, " D"]:
+    """Return the diffusion of the root by default, and so many times sigma x->x of the parts."""
+    std = default_step_std(body, fps)
+    columns = torch.as_tensor(body.relative_columns, dtype=torch.long)  # type: ignore[attr-defined]
+    std[columns.to(std.device)] = scale * manifold.std_step.detach().to(std)
+    return std
 
 
 def _check_noise(manifold: PoseManifold, n_columns: int) -> None:

@@ -5,7 +5,8 @@ part has a Gaussian, which seven places of the part in the image update in close
 """
 
 import math
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar, Unpack
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchpose.body.kinematics import Body
-from torchpose.errors import InputError
+from torchpose.errors import InputError, check_shape
 from torchpose.filters.base import Generators, standard_normal
 from torchpose.filters.survival import (
     LEAST_SURVIVORS,
@@ -21,13 +22,26 @@ from torchpose.filters.survival import (
     survival_exponent,
     survival_rate_per_frame,
 )
-from torchpose.math.quaternion_vectors import compose, conjugate, cross_matrix, vector_to_quaternion
+from torchpose.math.gaussian import symmetrise
+from torchpose.math.quaternion_vectors import (
+    compose,
+    conjugate,
+    cross_matrix,
+    quaternion_vector_to_matrix,
+    vector_to_quaternion,
+    within_unit_ball,
+)
 from torchpose.math.tree_messages import propagate
 from torchpose.math.unscented import sigma_points
 from torchpose.priors.limb_conditionals import LimbConditionals
 from torchpose.whole_body.filters.body_frames import Frame
-from torchpose.whole_body.filters.body_particles import BodyFilterState, WeightedParticles, reweight
-from torchpose.whole_body.filters.joint_spread import joint_covariance_with_parts
+from torchpose.whole_body.filters.body_particles import (
+    BodyFilterOptions,
+    BodyFilterState,
+    WeightedParticles,
+    check_choice,
+    reweight,
+)
 from torchpose.whole_body.filters.leg_swap import leg_permutation
 from torchpose.whole_body.filters.limb_observations import (
     check_rules,
@@ -36,9 +50,10 @@ from torchpose.whole_body.filters.limb_observations import (
     part_groups,
     part_log_likelihood,
 )
+from torchpose.whole_body.filters.motion import default_step_std
 from torchpose.whole_body.filters.silhouette_filter import SilhouetteParticleFilter
 
-__all__ = ["PUBLISHED", "WEIGHTINGS", "RootUncertaintyTracker"]
+__all__ = ["PUBLISHED", "WEIGHTINGS", "RootUncertaintyTracker", "joint_covariance_with_parts"]
 
 WEIGHTINGS = ("parts", "body")
 PUBLISHED: dict[str, Any] = {
@@ -49,6 +64,8 @@ PUBLISHED: dict[str, Any] = {
 """Options of the tracker as published, where they differ from the defaults."""
 
 _SURVIVAL = 0.1  # a frame
+_POINTS = 7  # places of every part, which together cost as much as so many whole bodies
+_TRACKING_SWAP = 0.02
 _ROOT = 6  # columns of a state: position and orientation of the root
 
 
@@ -89,9 +106,9 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         first_std: of every part at the start, and where all hypotheses died.
         weighting: "parts" (DX 12), or "body": the likelihood of the whole body at the posterior
             means, one more evaluation for each hypothesis.
-        estimate: "map", the means of the hypothesis of the largest weight, or "mean".
-        limit_mode, options: as `SilhouetteParticleFilter`; only the root's part of `step_std` counts,
-            `likelihood` only with ``weighting="body"``, and `sharpness` cancels.
+        options: as `SilhouetteParticleFilter`, but `estimate` is "map" by default, the means of the
+            hypothesis of the largest weight, and `limit_mode` "discard"; only the root's part of
+            `step_std` counts, `likelihood` only with ``weighting="body"``, and `sharpness` cancels.
 
     Attributes:
         conditionals: at `fps`. survival_rate: alpha, per frame.
@@ -102,6 +119,9 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
 
     Reference: Daubney & Xie, Tracking 3D human pose with large root node uncertainty, CVPR 2011.
     """
+
+    least_particles: ClassVar[int] = 3
+    unused: ClassVar[frozenset[str]] = frozenset({"sharpness"})
 
     body: Body
     root_std: Tensor
@@ -121,14 +141,14 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         least_std: float = 0.02,
         first_std: float = 0.05,
         weighting: str = "parts",
-        estimate: str = "map",
-        limit_mode: str = "discard",
-        **options: Any,
+        **options: Unpack[BodyFilterOptions],
     ) -> None:
         _check(body, options.get("likelihood"), weighting, least_std, first_std)
         check_rules(normalisation, camera_rule, observation_sharpness)
         conditionals.check_for(body)
-        super().__init__(body, n_particles, estimate=estimate, limit_mode=limit_mode, **options)
+        options.setdefault("estimate", "map")
+        options.setdefault("limit_mode", "discard")
+        super().__init__(body, n_particles, **options)
         self.survival_rate = _survival(survival_rate, survival_per_second, fps, n_particles)
         self.conditionals = conditionals.at_rate(fps).to(self.step_std)
         self.fps, self.normalisation, self.camera_rule = float(fps), normalisation, camera_rule
@@ -139,8 +159,24 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
 
     # --- what the base asks for
 
+    @classmethod
+    def likelihoods_per_particle(cls, options: Mapping[str, Any]) -> int:
+        """Return those of the places of all parts, and of the whole body where it is weighed."""
+        return _POINTS + (options.get("weighting") == "body")
+
+    @classmethod
+    def tracking_options(cls, body: Any, fps: float, learnt: Any = None) -> dict[str, Any]:
+        """Return the default diffusion of the root, and legs that are exchanged now and then."""
+        return {"step_std": default_step_std(body, fps), "leg_swap": _TRACKING_SWAP}
+
+    def start_std(self) -> Float[Tensor, " D"]:
+        """Return the spread of the root alone: parts have Gaussians of their own."""
+        spread = super().start_std()
+        spread[list(self.body.relative_columns)] = 0.0
+        return spread
+
     def first_memory(self, particles: Float[Tensor, "B N D"]) -> Float[Tensor, "B N V 3 3"]:
-        """Covariances of the parts of new hypotheses."""
+        """Return the covariances of the parts of new hypotheses."""
         eye = torch.eye(3, dtype=particles.dtype, device=particles.device)
         shape = (*particles.shape[:2], self.conditionals.tree.n_nodes, 3, 3)
         return (self.first_std**2 * eye).expand(shape).clone()
@@ -148,7 +184,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
     def move(
         self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
-        """One frame: diffuse, observe, pass messages, weigh."""
+        """Diffuse, observe, pass messages and weigh."""
         roots = self._diffuse_roots(state.particles, generator)
         mean = roots[..., _ROOT:].unflatten(-1, (-1, 3))
         covariance = self.conditionals.diffuse(mean, self._memory(state))[1]
@@ -170,7 +206,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
     def swap_memory(
         self, memory: Float[Tensor, "B N V 3 3"], swapped: Bool[Tensor, "B N"]
     ) -> Float[Tensor, "B N V 3 3"]:
-        """Covariances with those of the legs exchanged; centres of left and right differ a little.
+        """Return covariances with those of the legs exchanged; left and right centres differ a little.
 
         x' = (w I + [v]_x) x + ... to first order, for the rotation (v, w) from one centre to the other.
         """
@@ -188,7 +224,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         mean: Float[Tensor, "B D"],
         memory: Tensor | None,
     ) -> Float[Tensor, "B D"]:
-        """Standard deviation about the estimate: of the hypotheses, and within each of them."""
+        """Return the deviation about the estimate: of the hypotheses, and within each of them."""
         between = super().spread(particles, log_weights, mean, memory)
         if memory is None:
             return between
@@ -200,7 +236,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
     def joint_covariance(
         self, state: BodyFilterState, mean: Float[Tensor, "B D"]
     ) -> Float[Tensor, "B J 3 3"]:
-        """Second moment of the joints about the estimate's: of the hypotheses, and within each."""
+        """Return the second moment about the estimate's joints: of the hypotheses, and within each."""
         return joint_covariance_with_parts(self.body, state, self._memory(state), mean)
 
     # --- one frame
@@ -213,7 +249,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
     def _update(
         self, roots: Tensor, mean: Tensor, covariance: Tensor, frame: Frame
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Hypotheses, covariances, and log-weights before annealing, given an image."""
+        """Return hypotheses, covariances, and log-weights before annealing, given an image."""
         points = sigma_points(mean, covariance, centre=True)
         counts = count_positions(
             self.body, roots, points, frame.cameras, frame.silhouettes, self.groups
@@ -240,6 +276,67 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         )
 
 
+def joint_covariance_with_parts(
+    body: Body,
+    state: BodyFilterState,
+    covariances: Float[Tensor, "B N V 3 3"],
+    mean: Float[Tensor, "B D"],
+) -> Float[Tensor, "B J 3 3"]:
+    """Return the joints' second moment for particles with a Gaussian N(x_i; mu_i, Sigma_i) per part.
+
+    With ``frame="body"`` a joint is a sum over the parts, p_j = p_r + sum_i R_r C_i R(x_i) o_ij, and
+    the parts of a particle are independent of each other, so that with p^ of the estimate
+
+        E[(p_j - p^_j)(p_j - p^_j)^T] = sum_n w_n (sum_i Cov[R_r C_i R(x_i) o_ij] + d_nj d_nj^T),
+        d_nj = E[p_j | n] - p^_j.
+
+    Mean and covariance of the rotations R(x_i) come from six sigma points each (`sigma_points`).
+
+    Args:
+        body: with ``frame="body"``. state: its particles [B, N, D] and their weights.
+        covariances: Sigma of the V = P - 1 parts that are not the root, [B, N, V, 3, 3].
+        mean: the estimate [B, D].
+
+    Returns:
+        [B, J, 3, 3], metres squared, symmetric.
+
+    Raises:
+        InputError: a body of another frame. ShapeError: another number of parts.
+    """
+    if body.frame != "body":
+        raise InputError(
+            "parts add up to joints only in rotations against the root; expected a body with "
+            f"frame='body', got {body.frame!r}"
+        )
+    n_parts = len(body.skeleton.parts) - 1
+    check_shape("covariances", covariances, ["B", "N", n_parts, 3, 3])
+    particles = state.particles
+    points = sigma_points(particles[..., _ROOT:].unflatten(-1, (-1, 3)), covariances)
+    turns = quaternion_vector_to_matrix(within_unit_ball(points))  # [B, N, V, S, 3, 3]
+    root = quaternion_vector_to_matrix(particles[..., None, 3:_ROOT])
+    turns = (root @ body.centre_rotations[1:])[..., None, :, :] @ turns
+    middle = turns.mean(3)
+    expected = _joints(body, particles, torch.cat([root, middle], 2))
+    away = expected - body.joints(mean)[:, None]
+    weights = state.log_weights.exp().to(away)
+    between = torch.einsum("bn,bnji,bnjk->bjik", weights, away, away)
+    share = (weights / points.shape[-2]).sqrt()[..., None, None, None, None]
+    spread = (share * (turns - middle[..., None, :, :])).transpose(1, 2).flatten(2, 3)
+    rows = spread.flatten(-2)  # [B, V, N S, 9]
+    of_parts = (rows.mT @ rows).unflatten(-1, (3, 3)).unflatten(2, (3, 3))
+    offsets = body.joint_weights[3:].unflatten(0, (n_parts, 3))
+    within = torch.einsum("bvxcyd,vcj,vdj->bjxy", of_parts, offsets, offsets)
+    return symmetrise(between + within)
+
+
+def _joints(
+    body: Body, state: Float[Tensor, "*batch D"], rotations: Float[Tensor, "*batch P 3 3"]
+) -> Float[Tensor, "*batch J 3"]:
+    """Return joints for matrices of the parts, which need be no rotations: joints are linear in them."""
+    rows = rotations.transpose(-3, -2).flatten(-2)
+    return (rows @ body.joint_weights).mT + state[..., None, :3]
+
+
 def _survival(rate: float | None, per_second: float | None, fps: float, n_particles: int) -> float:
     if rate is not None and per_second is not None:
         raise InputError(
@@ -262,8 +359,7 @@ def _check(body: Any, likelihood: Any, weighting: str, least_std: float, first_s
             "the tracker counts silhouette pixels under single parts and takes no other likelihood; "
             "leave likelihood out, or name one of a whole body"
         )
-    if weighting not in WEIGHTINGS:
-        raise InputError(f"weighting must be one of {', '.join(WEIGHTINGS)}, got {weighting!r}")
+    check_choice("weighting", weighting, WEIGHTINGS)
     for name, value in (("least_std", least_std), ("first_std", first_std)):
         if not 0 <= value < math.inf:
             raise InputError(f"{name} must be zero or more and finite, got {value}")

@@ -6,8 +6,8 @@ empty silhouettes, dead particles and the loop over time are handled here.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,57 +17,50 @@ from tqdm.auto import tqdm
 from torchpose.errors import InputError, check_finite, check_shape
 from torchpose.filters.base import Generators, standard_normal
 from torchpose.filters.outputs import effective_sample_size
-from torchpose.filters.resampling import RESAMPLING, resample
+from torchpose.filters.resampling import RESAMPLING
 from torchpose.whole_body.filters.body_frames import (
     Frame,
+    Likelihood,
     check_frame,
+    check_lengths,
     check_sequences,
-    is_seen,
-    warn_if_respread,
+    see_frame,
+    seen_until,
 )
 from torchpose.whole_body.filters.body_particles import (
     BodyFilterState,
     BodyTrack,
     PoseSpace,
-    Score,
     WeightedParticles,
-    as_step_std,
-    default_step_std,
-    motion_std,
-    reweight,
-    silhouette_score,
+    check_choice,
+    joint_covariance,
+    resample_state,
     stack_tracks,
     take_particles,
+    warn_of_frames,
 )
-from torchpose.whole_body.filters.joint_spread import joint_covariance
 from torchpose.whole_body.filters.leg_swap import check_leg_swap, extra_copies, swap_legs
+from torchpose.whole_body.filters.motion import as_step_std, default_step_std
 from torchpose.whole_body.silhouettes.likelihood import LIKELIHOODS
 from torchpose.whole_body.silhouettes.rectangles import check_limb_shape
-from torchpose.whole_body.silhouettes.rendering import prepare_silhouettes
 
-__all__ = [
-    "BodyFilterState",
-    "BodyTrack",
-    "Frame",
-    "PoseSpace",
-    "SilhouetteParticleFilter",
-    "WeightedParticles",
-    "default_step_std",
-    "motion_std",
-    "reweight",
-]
+__all__ = ["SilhouetteParticleFilter"]
 
 LIMIT_MODES = ("clamp", "discard")
 ESTIMATES = ("mean", "map")
 _MOST_SPREAD = 10  # frames over which the noise of a filter that stays lost keeps growing
-
-Likelihood = Callable[[Tensor, Tensor], Tensor]
+_SHARPNESS = 100.0  # exponent of a likelihood in [-2, 0] that tells poses apart
+_DIED = (
+    "all particles died {times} times ({frames}) and were spread about the last mean; use more "
+    "particles, a larger step_std, a smaller sharpness or wider joint limits"
+)
 
 
 class SilhouetteParticleFilter(nn.Module, ABC):
     """Base of the particle filters over body poses; a subclass is its `move`.
 
-    Estimates have no gradients: nothing runs through particles.
+    `forward` tracks whole sequences, `init` and `step` frame by frame, with the same numbers. Estimates have
+    no gradients: nothing runs through particles.
 
     Args:
         body: whose poses are tracked; anything with the methods of `PoseSpace`.
@@ -95,6 +88,12 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         InputError, ShapeError: an argument is not as described.
     """
 
+    least_particles: ClassVar[int] = 1
+    """Particles, of a layer if there are several, of which two or more survive a frame."""
+
+    unused: ClassVar[frozenset[str]] = frozenset()
+    """Options that make no difference to the filter."""
+
     step_std: Tensor
 
     def __init__(
@@ -115,10 +114,11 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         respread_scale: float = 5.0,
     ) -> None:
         super().__init__()
-        _check_choice("likelihood", likelihood, tuple(LIKELIHOODS))
-        _check_choice("limit_mode", limit_mode, LIMIT_MODES)
-        _check_choice("resampling", resampling, tuple(RESAMPLING))
-        _check_choice("estimate", estimate, ESTIMATES)
+        if not callable(likelihood):
+            check_choice("likelihood", likelihood, LIKELIHOODS)
+        check_choice("limit_mode", limit_mode, LIMIT_MODES)
+        check_choice("resampling", resampling, RESAMPLING)
+        check_choice("estimate", estimate, ESTIMATES)
         if n_particles < 1:
             raise InputError(f"n_particles must be at least 1, got {n_particles}")
         if not 0 <= resample_threshold <= 1:
@@ -141,7 +141,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
     def move(
         self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
-        """Weighted particles of the next frame from those of the last.
+        """Return weighted particles of the next frame from those of the last.
 
         Args:
             state: of the last frame, its particles resampled if that was due, with what was remembered
@@ -149,15 +149,15 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         """
 
     def first_memory(self, particles: Float[Tensor, "B N D"]) -> Tensor | None:
-        """What is remembered of new particles, [B, N, ...]; nothing by default."""
+        """Return what is remembered of new particles, [B, N, ...]; nothing by default."""
         return None
 
     def first_trend(self, mean: Float[Tensor, "B D"]) -> Tensor | None:
-        """What is remembered of an element, [B, ...], before the first frame; nothing by default."""
+        """Return what is remembered of an element before its first frame, [B, ...]; nothing by default."""
         return None
 
     def swap_memory(self, memory: Tensor, swapped: Bool[Tensor, "B N"]) -> Tensor:
-        """What is remembered of particles whose legs have been exchanged; the same by default."""
+        """Return the memory of particles of which some have exchanged their legs; the same by default."""
         return memory
 
     def spread(
@@ -167,7 +167,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         mean: Float[Tensor, "B D"],
         memory: Tensor | None,
     ) -> Float[Tensor, "B D"]:
-        """Standard deviation about the estimate, in the units of a step."""
+        """Return the standard deviation about the estimate, in the units of a step."""
         gap = self.body.difference(particles, mean[:, None].expand_as(particles))
         weights = log_weights.exp().to(gap.dtype)
         return torch.einsum("bn,bnd->bd", weights, gap.square()).sqrt()
@@ -175,8 +175,41 @@ class SilhouetteParticleFilter(nn.Module, ABC):
     def joint_covariance(
         self, state: BodyFilterState, mean: Float[Tensor, "B D"]
     ) -> Float[Tensor, "B J 3 3"]:
-        """Second moment of the joints of a `Body` about those of an estimate, metres squared."""
+        """Return the second moment of the joints of a `Body` about those of an estimate, metres squared."""
         return joint_covariance(self.body, state, mean)  # type: ignore[arg-type]
+
+    def warn(self, track: BodyTrack) -> None:
+        """Warn of the frames of a track [B, T] in which the filter degenerated."""
+        warn_of_frames(track.respread, _DIED)
+
+    # --- how `BodyTracker` sets a filter up; a subclass may say otherwise
+
+    @classmethod
+    def likelihoods_per_particle(cls, options: Mapping[str, Any]) -> int:
+        """Return how many likelihoods of whole bodies one particle costs in a frame."""
+        return 1
+
+    @classmethod
+    def tracking_options(cls, body: Any, fps: float, learnt: Any = None) -> dict[str, Any]:
+        """Return the options that `BodyTracker` gives the filter where it is given none itself.
+
+        Args:
+            body: that is tracked. fps: frames per second. learnt: what the filter needs, if anything.
+        """
+        return {"step_std": default_step_std(body, fps), "sharpness": _SHARPNESS}
+
+    def start_std(self) -> Float[Tensor, " D"]:
+        """Return the spread of particles about a first pose that was found in images."""
+        return 2 * self.step_std
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """Names of the columns of ``details["actions"]``, of a filter that tells actions apart."""
+        return ()
+
+    def notes(self, track: BodyTrack, first_frame: int = 0) -> tuple[str, ...]:
+        """Return what is to be said of a track [T], whose first frame has this number."""
+        return ()
 
     # --- running
 
@@ -187,6 +220,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         cameras: Any,
         initial_state: Tensor,
         generator: Generators = None,
+        lengths: Tensor | None = None,
         progress: bool = False,
         initial_std: Tensor | None = None,
     ) -> BodyTrack:
@@ -199,6 +233,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
             initial_state: the pose one frame before the first, [D] or [B, D].
             generator: one generator, or a list of one for each sequence, which makes a sequence's
                 numbers independent of its batch.
+            lengths: [B], frames of each sequence; past them its last estimate is repeated.
             progress: whether to show a progress bar.
             initial_std: [D], spread of the first particles; none if None, as published.
 
@@ -207,7 +242,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
 
         Raises:
             ShapeError: sizes that do not match. InputError: no frames, values that are not finite,
-            silhouettes that are not bool. CameraError: as the likelihood.
+            silhouettes that are not bool, lengths outside 1..T. CameraError: as the likelihood.
         """
         frames, start, batched = check_sequences(
             silhouettes,
@@ -216,13 +251,15 @@ class SilhouetteParticleFilter(nn.Module, ABC):
             self.body.dim,
             plain=not callable(self.likelihood),
         )
+        lengths = check_lengths(lengths, *frames.shape[:2])
         state = self.init(start, generator, initial_std)
         steps = []
         for t in tqdm(range(frames.shape[1]), disable=not progress, unit="frame"):
-            state, out = self._advance(state, frames[:, t], cameras, generator)
+            shown = frames[:, t] if lengths is None else seen_until(lengths > t, frames[:, t])
+            state, out = self.advance(state, shown, cameras, generator)
             steps.append(out)
-        track = stack_tracks(steps)
-        warn_if_respread(track.respread)
+        track = stack_tracks(steps, lengths)
+        self.warn(track)
         return track if batched else track.element(0)
 
     @torch.no_grad()
@@ -232,7 +269,10 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         generator: Generators = None,
         initial_std: Tensor | None = None,
     ) -> BodyFilterState:
-        """N copies of the initial state (MR, Algorithm 1, step 1), spread if `initial_std` [D] is given."""
+        """Return N copies of the initial state, spread if `initial_std` [D] is given.
+
+        Reference: MR, Algorithm 1, step 1.
+        """
         start = initial_state.to(self.step_std).reshape(-1, initial_state.shape[-1])
         check_shape("initial_state", start, ["B", self.body.dim])
         check_finite("initial_state", start)
@@ -254,7 +294,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         cameras: Any,
         generator: Generators = None,
     ) -> tuple[BodyFilterState, BodyTrack]:
-        """One frame online: the same numbers as the same frame of `forward`.
+        """Track one more frame: the same numbers as the same frame of `forward`.
 
         Args:
             state: from `init` or the step before. silhouettes: [B, C, H, W], bool.
@@ -264,14 +304,18 @@ class SilhouetteParticleFilter(nn.Module, ABC):
             The next state, and a `BodyTrack` without the dimension of time.
         """
         check_frame(silhouettes, len(state.mean), plain=not callable(self.likelihood))
-        state, out = self._advance(state, silhouettes, cameras, generator)
-        warn_if_respread(out.respread[:, None])
+        state, out = self.advance(state, silhouettes, cameras, generator)
+        self.warn(stack_tracks([out]))
         return state, out
 
-    def _advance(
+    def advance(
         self, state: BodyFilterState, silhouettes: Tensor, cameras: Any, generator: Generators
     ) -> tuple[BodyFilterState, BodyTrack]:
-        frame = self._frame(silhouettes.to(self.step_std.device), cameras)
+        """Track one more frame, as `step`, of silhouettes that were checked; without warnings."""
+        frame = see_frame(
+            self.body, silhouettes.to(self.step_std.device), cameras, self.likelihood,
+            self.sharpness, self.limb_shape,
+        )  # fmt: skip
         moved = self.move(self._resample(state, generator), frame, generator)
         dead = ~torch.isfinite(moved.log_weights.amax(-1))
         lost = torch.where(dead, state.lost + 1, 0)
@@ -301,19 +345,19 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         std: Float[Tensor, "*B D"],
         generator: Generators,
     ) -> Float[Tensor, "B N D"]:
-        """x + N(0, diag(std^2)) (MR 29): the root's orientation is composed; then the joint limits."""
+        """Return x + N(0, diag(std^2)) (MR 29), within the joint limits; orientations are composed."""
         batch, n, dim = particles.shape
         noise = standard_normal(batch, (n, dim), generator, particles)
         return self.constrain(self.body.perturb(particles, noise * std))
 
     def constrain(self, particles: Float[Tensor, "B N D"]) -> Float[Tensor, "B N D"]:
-        """Particles moved to the joint limits, where `limit_mode` says so."""
+        """Return particles moved to the joint limits, where `limit_mode` says so."""
         if self.limits is None or self.limit_mode != "clamp":
             return particles
         return self.limits.clamp(particles)
 
     def log_limits(self, particles: Float[Tensor, "B N D"]) -> Float[Tensor, "B N"]:
-        """-inf for particles outside joint limits that discard, else 0; float64."""
+        """Return -inf for particles outside joint limits that discard, else 0; float64."""
         zero = particles.new_zeros(particles.shape[:2], dtype=torch.float64)
         if self.limits is None or self.limit_mode != "discard":
             return zero
@@ -321,47 +365,17 @@ class SilhouetteParticleFilter(nn.Module, ABC):
 
     # --- helpers
 
-    def _frame(self, silhouettes: Tensor, cameras: Any) -> Frame:
-        seen = is_seen(silhouettes)
-        likelihood = self.likelihood
-        observed: Any = silhouettes
-        if callable(likelihood):
-            score: Score = lambda states: likelihood(states, silhouettes)  # noqa: E731
-        else:
-            observed = prepare_silhouettes(silhouettes)
-            score = silhouette_score(self.body, observed, cameras, likelihood, self.limb_shape)
-        return Frame(self._sharpened(score, seen), seen, observed, cameras)
-
-    def _sharpened(self, raw: Score, seen: Bool[Tensor, " B"]) -> Score:
-        """The exponent of the likelihood, and nothing from elements that nobody sees."""
-        nobody = not bool(seen.any())
-
-        def score(states: Tensor) -> Tensor:
-            if nobody:
-                return states.new_zeros(states.shape[:2], dtype=torch.float64)
-            value = self.sharpness * raw(states).double()
-            value = torch.where(torch.isfinite(value), value, -torch.inf)
-            return torch.where(seen[:, None], value, 0.0)
-
-        return score
-
     def _resample(self, state: BodyFilterState, generator: Generators) -> BodyFilterState:
-        """Resample the elements whose effective sample size is low; the others stay."""
-        n = self.n_particles
-        due = effective_sample_size(state.log_weights) < self.resample_threshold * n
-        # drawn for all: what an element draws must not depend on its neighbours
-        ancestors = resample(state.log_weights, self.resampling, generator)
-        ancestors = torch.where(due[:, None], ancestors, torch.arange(n, device=due.device))
-        particles, memory = take_particles(state.particles, ancestors), state.memory
-        if memory is not None:
-            memory = take_particles(memory, ancestors)
-        if self.leg_swap > 0:
-            extra = extra_copies(ancestors)  # of elements that were not resampled: none
-            particles, swapped = swap_legs(self.body, particles, extra, self.leg_swap, generator)
-            if memory is not None:
-                memory = self.swap_memory(memory, swapped)
-        log_weights = torch.where(due[:, None], -math.log(n), state.log_weights)
-        return state._replace(particles=particles, log_weights=log_weights, memory=memory)
+        """Resample where it is due, and exchange the legs of some extra copies."""
+        state, ancestors = resample_state(
+            state, self.resampling, self.resample_threshold, generator
+        )
+        if self.leg_swap == 0:
+            return state
+        extra = extra_copies(ancestors)  # of elements that were not resampled: none
+        particles, swapped = swap_legs(self.body, state.particles, extra, self.leg_swap, generator)
+        memory = None if state.memory is None else self.swap_memory(state.memory, swapped)
+        return state._replace(particles=particles, memory=memory)
 
     def _respread(
         self,
@@ -370,7 +384,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         lost: Int[Tensor, " B"],
         generator: Generators,
     ) -> WeightedParticles:
-        """New particles about the last mean in the elements whose particles died."""
+        """Draw new particles about the last mean in the elements whose particles died."""
         rows = torch.nonzero(lost > 0).reshape(-1)
         if isinstance(generator, Sequence):
             generator = [generator[i] for i in rows.tolist()]
@@ -391,11 +405,3 @@ class SilhouetteParticleFilter(nn.Module, ABC):
             return self.body.mean(particles, log_weights.to(particles.dtype))
         best = log_weights.argmax(-1, keepdim=True)
         return take_particles(particles, best)[:, 0]
-
-
-def _check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
-    if isinstance(value, str) and value in choices:
-        return
-    if name == "likelihood" and callable(value):
-        return
-    raise InputError(f"{name} must be one of {', '.join(choices)}, got {value!r}")

@@ -1,6 +1,6 @@
 """Sampling importance resampling over body poses, from silhouettes."""
 
-from typing import Any
+from typing import Unpack
 
 import torch
 
@@ -8,6 +8,7 @@ from torchpose.filters.base import Generators
 from torchpose.filters.survival import check_survival_rate, survival_exponent
 from torchpose.whole_body.filters.body_frames import Frame
 from torchpose.whole_body.filters.body_particles import (
+    BodyFilterOptions,
     BodyFilterState,
     PoseSpace,
     WeightedParticles,
@@ -46,7 +47,7 @@ class SIRParticleFilter(SilhouetteParticleFilter):
         n_particles: int = 500,
         *,
         survival_rate: float | None = None,
-        **options: Any,
+        **options: Unpack[BodyFilterOptions],
     ) -> None:
         super().__init__(body, n_particles, **options)
         if survival_rate is not None:

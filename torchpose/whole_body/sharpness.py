@@ -45,7 +45,7 @@ class SharpnessFit(NamedTuple):
 
 
 def log_grid(low: float, high: float, count: int) -> tuple[float, ...]:
-    """Numbers from low to high with equal ratios.
+    """Return numbers from low to high with equal ratios.
 
     >>> log_grid(1, 100, 3)
     (1.0, 10.0, 100.0)
@@ -61,7 +61,7 @@ def log_grid(low: float, high: float, count: int) -> tuple[float, ...]:
 def mean_joint_error(
     body: Any, estimate: Float[Tensor, "*batch T D"], joints: Float[Tensor, "T J 3"]
 ) -> Float[Tensor, "*batch"]:
-    """Mean distance of joints, metres (MR 31); joints that are NaN do not count.
+    """Return the mean distance of joints, metres (MR 31); joints that are NaN do not count.
 
     Args:
         estimate: states [..., T, D]. joints: true positions [T, J, 3], metres.

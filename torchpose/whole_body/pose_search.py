@@ -13,7 +13,7 @@ from torchpose.errors import InputError, check_finite, check_shape
 from torchpose.filters.base import Generators, standard_normal, uniform
 from torchpose.math.quaternion_vectors import compose, minimal_rotation, quaternion_vector_to_matrix
 from torchpose.whole_body.filters.annealed import anneal
-from torchpose.whole_body.filters.body_particles import silhouette_score
+from torchpose.whole_body.filters.body_frames import silhouette_score
 from torchpose.whole_body.silhouettes.likelihood import LIKELIHOODS
 
 __all__ = [
@@ -48,7 +48,7 @@ class SilhouettePlace(NamedTuple):
 
 
 def upward_direction(rig: CameraRig) -> Float[Tensor, "3"]:
-    """The world axis that is nearest to "up" in the images: cameras are mounted upright.
+    """Return the world axis that is nearest to "up" in the images: cameras are mounted upright.
 
     Raises:
         InputError: the cameras do not agree about one, by 45 degrees or more.
@@ -64,7 +64,7 @@ def upward_direction(rig: CameraRig) -> Float[Tensor, "3"]:
 
 
 def world_up(rig: CameraRig, up: Tensor | None) -> Float[Tensor, "3"]:
-    """The direction that was given as up, of length one, or `upward_direction` if it is None.
+    """Return the direction that was given as up, of length one, or `upward_direction` if it is None.
 
     Raises:
         InputError: not a direction, or none can be told. ShapeError: not [3].
@@ -75,7 +75,7 @@ def world_up(rig: CameraRig, up: Tensor | None) -> Float[Tensor, "3"]:
 def place_from_silhouettes(
     silhouettes: Bool[Tensor, "B C H W"], rig: CameraRig, height: float
 ) -> SilhouettePlace:
-    """Meet the rays through the middles of the silhouettes, by least squares.
+    """Return where the rays through the middles of the silhouettes meet, by least squares.
 
     p = (sum_c A_c)^-1 sum_c A_c (o_c + h_c d_c),   A_c = I - (1 - e) d_c d_c^T,
 
@@ -135,7 +135,15 @@ def find_pose(
     cameras: Cameras,
     prior: Any = None,
     generator: Generators = None,
-    **options: Any,
+    *,
+    n_particles: int = 2000,
+    n_layers: int = 12,
+    n_headings: int = 4,
+    survival_rate: float = 0.5,
+    likelihood: str = "bidirectional",
+    limits: Any = None,
+    up: Tensor | None = None,
+    facing: Tensor | None = None,
 ) -> Float[Tensor, "*B D"]:
     """Find the pose in one frame by annealing: all headings, poses of the prior, the rays' position.
 
@@ -147,7 +155,7 @@ def find_pose(
 
     Args:
         silhouettes: bool [C, H, W], or [B, C, H, W] for several persons' frames.
-        body, cameras, prior, generator, options: as `find_candidates`.
+        All others: as `find_candidates`.
 
     Returns:
         State [D] or [B, D].
@@ -157,7 +165,11 @@ def find_pose(
     """
     batched = silhouettes.ndim == 4
     silhouettes = silhouettes if batched else silhouettes[None]
-    found = find_candidates(body, silhouettes, cameras, prior, generator, **options)
+    found = find_candidates(
+        body, silhouettes, cameras, prior, generator, n_particles=n_particles, n_layers=n_layers,
+        n_headings=n_headings, survival_rate=survival_rate, likelihood=likelihood, limits=limits, up=up,
+        facing=facing,
+    )  # fmt: skip
     best = found.log_likelihood.argmax(1)
     states = found.states[torch.arange(len(best), device=best.device), best]
     return states if batched else states[0]
@@ -289,7 +301,7 @@ def _unit(name: str, direction: Tensor) -> Tensor:
 
 
 def _heading_of(up: Tensor, facing: Tensor) -> Tensor:
-    """Angle about `up` that turns the z axis of the upright body to `facing`."""
+    """Return the angle about `up` that turns the z axis of the upright body to `facing`."""
     y = torch.tensor([0.0, 1.0, 0.0]).to(up)
     ahead = quaternion_vector_to_matrix(minimal_rotation(y, up))[:, 2]
     return torch.atan2(torch.linalg.cross(ahead, facing) @ up, ahead @ facing)
@@ -326,7 +338,7 @@ def _draw_poses(
 
 
 def _layer_steps(dim: int, n_layers: int) -> Float[Tensor, "M D"]:
-    """Standard deviations of the diffusion, falling geometrically from the first layer to the last."""
+    """Return standard deviations of the diffusion, which fall geometrically from layer to layer."""
     share = torch.linspace(0, 1, n_layers, dtype=torch.float64)[:, None]
     first, last = (torch.tensor(s, dtype=torch.float64).log() for s in (_FIRST_STEP, _LAST_STEP))
     steps = ((1 - share) * first + share * last).exp()
@@ -336,7 +348,7 @@ def _layer_steps(dim: int, n_layers: int) -> Float[Tensor, "M D"]:
 def _mean_of_best_mode(
     body: Any, particles: Float[Tensor, "B N D"], log_weights: Float[Tensor, "B N"]
 ) -> Float[Tensor, "B D"]:
-    """Weighted mean of the particles that face about the same way as the best one."""
+    """Return the weighted mean of the particles that face about the same way as the best one."""
     log_weights = log_weights.nan_to_num(0.0, neginf=-torch.inf)  # all of them ruled out: alike
     best = log_weights.argmax(1)
     chosen = particles[torch.arange(len(best), device=best.device), best][:, None]

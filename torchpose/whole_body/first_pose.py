@@ -14,9 +14,9 @@ from torchpose.body.skeleton import other_side
 from torchpose.camera.rig import Cameras, as_rig
 from torchpose.errors import InputError, check_shape
 from torchpose.whole_body.filters.annealed import AnnealedParticleFilter
-from torchpose.whole_body.filters.body_frames import is_seen
-from torchpose.whole_body.filters.body_particles import default_step_std, silhouette_score
-from torchpose.whole_body.filters.pose_search import find_candidates, world_up
+from torchpose.whole_body.filters.body_frames import is_seen, silhouette_score
+from torchpose.whole_body.filters.motion import default_step_std
+from torchpose.whole_body.pose_search import find_candidates, world_up
 
 __all__ = ["FirstPose", "facing_evidence", "find_first_pose", "turned_round"]
 
@@ -117,7 +117,7 @@ def find_first_pose(
 
 
 def turned_round(body: Body, states: Float[Tensor, "K D"]) -> Float[Tensor, "K D"]:
-    """The same joints with left and right exchanged: somebody in the same place who faces the other way.
+    """Return states with left and right exchanged: somebody in the same place who faces the other way.
 
     The silhouettes are nearly the same; knees and elbows bend the other way.
     """
@@ -129,7 +129,7 @@ def turned_round(body: Body, states: Float[Tensor, "K D"]) -> Float[Tensor, "K D
 def facing_evidence(
     body: Body, states: Float[Tensor, "*batch T D"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "*batch"]:
-    """Log-evidence of tracks for the way that they face: above 0 for forwards, below for backwards.
+    """Return the log-evidence of tracks for the way they face: above 0 for forwards, below for backwards.
 
     3 tanh(s / 0.1 m) + 3 tanh(b / 0.1 m),
 
@@ -158,6 +158,6 @@ def _both_sides(body: Body, states: Tensor, joint: str) -> Float[Tensor, "*batch
 def _mean_log_likelihood(
     body: Body, track: Tensor, frames: Tensor, rig: Cameras, likelihood: str
 ) -> Float[Tensor, " K"]:
-    """Mean over the frames in which somebody is seen."""
+    """Return the mean over the frames in which somebody is seen."""
     values = silhouette_score(body, frames, rig, likelihood)(track.transpose(0, 1))
     return values[is_seen(frames)].mean(0)
