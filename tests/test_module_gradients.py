@@ -22,6 +22,7 @@ ELSEWHERE = {
     "MixtureKalmanFilter": "tests/filters/test_gradients.py",
     "BootstrapParticleFilter": "tests/filters/test_gradients.py",
     "ConstantVelocityFilter": "tests/filters/test_gradients.py",
+    "BodyTracker": "tests/whole_body/test_tracker.py",
     "UpperBodyTracker": "tests/test_gradients.py",
     "UpperBodyPrior": "holds mixtures",
     "VideoTracker": "takes images",

@@ -1,8 +1,14 @@
 import torch
 
 from torchpose.body import BODY_15, Body
-from torchpose.whole_body import SilhouetteParticleFilter
-from torchpose.whole_body.filters.body_particles import reweight
+from torchpose.camera import PinholeCamera
+from torchpose.whole_body import (
+    BodyTracker,
+    SilhouetteParticleFilter,
+    register_body_filter,
+    render,
+    reweight,
+)
 
 
 class SwingingParticleFilter(SilhouetteParticleFilter):
@@ -18,17 +24,13 @@ class SwingingParticleFilter(SilhouetteParticleFilter):
         return out._replace(memory=self.body.difference(moved, state.particles))
 
 
+register_body_filter("swinging", SwingingParticleFilter)
+
 body = Body.of_height(BODY_15, 1.75)
-wrist = BODY_15.joint("left_wrist")
-frames = torch.tensor([[0.2, 0.8, 0.1], [0.2, 0.82, 0.15], [torch.nan] * 3], dtype=torch.float64)
+standing = torch.zeros(body.dim, dtype=torch.float64)
+camera = PinholeCamera(80, 80, 39.5, 29.5, 80, 60, rotation=(torch.pi, 0, 0), translation=(0, 0, 3))
+silhouettes = render(body, standing.expand(4, -1), camera, 60, 80)  # bool [T, 1, H, W]
 
-
-def likelihood(states, frame):  # of the left wrist, measured to a centimetre
-    apart = body.joints(states)[..., wrist, :] - frame[:, None]
-    return -0.5 * (apart / 0.01).square().sum(-1)
-
-
-tracker = SwingingParticleFilter(body, 500, likelihood=likelihood)
-start = torch.zeros(body.dim, dtype=torch.float64)
-track = tracker(frames, None, start, torch.Generator().manual_seed(0))
-print(track.mean.shape, track.coasting.tolist())
+tracker = BodyTracker(camera, "swinging", body=body, n_particles=100, fps=30.0, leg_swap=0.1)
+poses = tracker(silhouettes, standing, torch.Generator().manual_seed(0))
+print(poses.method, poses.joints3d.shape, poses.coasting.tolist())

@@ -129,6 +129,21 @@ def follow_root(tracker):
     return tracker(seen, rig(2), states[0][0], generator=G().manual_seed(0)).mean
 
 
+def body_tracker(seed):
+    own = Body.of_height(body.BODY_15, 1.6 + 0.1 * seed)
+    noise = torch.full((own.dim,), (0.01 * seed) ** 2, dtype=torch.float64)
+    return torchpose.BodyTracker(
+        rig(2, 3.0 + seed), "root", body=own, manifold=manifold(1), conditionals=limbs(1),
+        n_particles=70, process_cov=noise, initial_cov=2 * noise,
+    )  # fmt: skip
+
+
+def follow_body(tracker):
+    seen = whole_body.render(walker(), walk(walker(), 3), rig(2), HEIGHT, WIDTH)
+    poses = tracker(seen, 0.1 * walk(walker(), 1)[0], G().manual_seed(0))
+    return poses.state, poses.covariance3d, tracker.upright.joints(walk(walker(), 2))
+
+
 def off_centre(by):
     """Centres of all parts but the root, which has none."""
     centres = torch.full_like(BODY.centres, by)
@@ -180,6 +195,7 @@ CASES = {
         follow,
     ),
     "RootUncertaintyTracker": (root_tracker, follow_root),
+    "BodyTracker": (body_tracker, follow_body),
     "PostureGate": (lambda s: PostureGate(BODY, actions(s)), state_of),
     "PinholeCamera": (
         lambda s: PinholeCamera(500 + s, 500, 320, 240, translation=(0, 0, s)),

@@ -201,7 +201,7 @@ def choose_method(method: str | None, given: Collection[str]) -> str:
         if len(wanted) > 1:
             raise InputError(
                 f"{' and '.join(kind for kind in LEARNT if kind in given)} belong to different "
-                f"filters; choose by method {' or '.join(wanted)} and leave out the other"
+                f"filters; choose by method {' or '.join(wanted)}"
             )
         return wanted[0] if wanted else _DEFAULT
     _check_method(method)

@@ -311,7 +311,7 @@ class BodyTracker(nn.Module):
 
 
 def all_see(silhouettes: Bool[Tensor, "C H W"]) -> bool:
-    """Tell whether every camera sees somebody in a frame: 0.2 % of its pixels or more."""
+    """Tell whether every camera sees somebody in a frame: more than 0.2 % of its pixels."""
     return bool((silhouettes.double().mean((-2, -1)) > _SEEN).all())
 
 
