@@ -140,7 +140,8 @@ def body_tracker(seed):
 
 def follow_body(tracker):
     seen = whole_body.render(walker(), walk(walker(), 3), rig(2), HEIGHT, WIDTH)
-    poses = tracker(seen, 0.1 * walk(walker(), 1)[0], G().manual_seed(0))
+    start = walker().convert(walk(walker(), 1)[0], tracker.body)
+    poses = tracker(seen, start, G().manual_seed(0))
     return poses.state, poses.covariance3d, tracker.upright.joints(walk(walker(), 2))
 
 

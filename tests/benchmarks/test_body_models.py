@@ -8,7 +8,6 @@ import torch
 
 from benchmarks import body_models
 from tests.benchmarks.walkers import walker, write_walkers
-from torchpose.cli import main
 from torchpose.errors import InputError, OverlapError, PriorError
 from torchpose.io.mocap import read_mocap
 from torchpose.learning.recipes import (
@@ -35,12 +34,12 @@ def scene(tmp_path_factory):
     return home
 
 
-def test_everybody_unknown_is_tracked(scene, tmp_path, capsys):
-    line = ["evaluate", "body-models", "--mocap", str(scene / "walks"), "--quick", "true", "--out",
-            str(tmp_path), "--manifold", str(scene / "m.safetensors"),
-            "--conditionals", str(scene / "l.safetensors"), "--size", "80x60"]  # fmt: skip
-    assert main(line) == 0
-    said = capsys.readouterr().out
+def test_everybody_unknown_is_tracked(scene, tmp_path):
+    body_models.run(
+        scene / "walks", tmp_path, quick=True, progress=False, size="80x60",
+        manifold=str(scene / "m.safetensors"), conditionals=str(scene / "l.safetensors"),
+    )  # fmt: skip
+    said = (tmp_path / "report.md").read_text()
     assert "standing still" in said and "p3 p3_0" in said and "p1" not in said and "p2" not in said
     table = json.loads((tmp_path / "report.json").read_text())["tables"]["errors"]["rows"]
     assert list(table) == [body_models.STILL, body_models.MEAN_POSE, "sir", "apf", "mrpf", "root"]
