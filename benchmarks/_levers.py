@@ -32,7 +32,7 @@ from torchpose.priors.window import WindowLayout, WindowPrior
 from torchpose.skeleton.upper_body import ARM_JOINTS
 from torchpose.upper_body import UpperBodyTracker
 from torchpose.upper_body.measurements import pixel_indices
-from torchpose.upper_body.process_noise import process_cov
+from torchpose.upper_body.methods import process_cov
 
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 FIT_PERSONS, SCORED_PERSONS = ("s1", "s2", "s4", "s5"), ("s3", "s6")
@@ -186,7 +186,7 @@ class Bench:
         tracker = UpperBodyTracker(prior, CAMERA, **options)
         if lever.start_factor != 1:
             for side in ("left", "right"):
-                model = tracker._filter(side, ("hand", "head", "neck"))
+                model = tracker.estimator.filter(side, ("hand", "head", "neck"))
                 model.initial_cov = lever.start_factor * model.start_cov  # type: ignore[operator]
         return tracker
 

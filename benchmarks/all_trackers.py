@@ -38,7 +38,7 @@ from torchpose.evaluation.kept_runs import keep, read_kept
 from torchpose.io import Recording
 from torchpose.learning.recipes import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
-from torchpose.upper_body import METHODS, UpperBodyTracker
+from torchpose.upper_body import METHODS, UpperBodyTracker, method_options
 
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 RECIPES: dict[str, dict[str, Any]] = {
@@ -63,7 +63,8 @@ def run_method(prior: UpperBodyPrior, test: Trials, method: str, arguments: Any)
     path = arguments.out / f"{method}-{settings_hash(facts)}.npz"
     found = read_kept(path, Run, Run._fields)
     if found is None:
-        particles = {"n_particles": arguments.particles} if method.startswith("pf-") else {}
+        drawn = "n_particles" in method_options(method)
+        particles = {"n_particles": arguments.particles} if drawn else {}
         tracker = UpperBodyTracker(
             prior, CAMERA, method, fps=test.fps, neck=prior.info.neck, max_gap=None, **particles
         )

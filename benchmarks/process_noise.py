@@ -2,7 +2,7 @@
 
 A prior of s1 to s4 of UTD-MHAD tracks every n-th sequence of s5 and s6 in the test camera, with Q = k S
 for the walks and Q = k diag(S) for the others; the shipped factors are
-`torchpose.upper_body.process_noise.INCREMENT_FACTORS`.
+`torchpose.upper_body.METHODS`.
 
     python -m benchmarks.process_noise --data DIR
     python -m benchmarks.process_noise --data DIR --every 5 --methods mkf-fixed mkf-sampled mkf-split
@@ -26,8 +26,11 @@ from torchpose.evaluation.common import (
 )
 from torchpose.learning.recipes import UpperBodyRecipe
 from torchpose.priors import UpperBodyPrior
-from torchpose.upper_body.process_noise import INCREMENT_FACTORS
+from torchpose.upper_body import METHODS, PoseFilter, method_options
 
+FACTORS = {
+    name: method.noise.factor for name, method in METHODS.items() if isinstance(method, PoseFilter)
+}
 SEEN, TRIED = ("s1", "s2", "s3", "s4"), ("s5", "s6")
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 
@@ -37,9 +40,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
     parser.add_argument("--every", type=int, default=24, help="take every n-th sequence")
-    parser.add_argument(
-        "--methods", nargs="+", choices=INCREMENT_FACTORS, default=[*INCREMENT_FACTORS]
-    )
+    parser.add_argument("--methods", nargs="+", choices=FACTORS, default=[*FACTORS])
     parser.add_argument("--factors", nargs="+", type=float, default=[0.3, 1.0, 10.0, 100.0])
     parser.add_argument("--particles", type=int, default=3000)
     arguments = parser.parse_args()
@@ -51,15 +52,17 @@ def main() -> None:
     test = make_test_set(poses, CAMERA, tried[0].fps or 30.0)
     print(f"{len(test.lengths)} sequences, {int(test.lengths.sum())} frames")
     for method in arguments.methods:
-        particles = {"n_particles": arguments.particles} if method.startswith("pf-") else {}
+        particles = (
+            {"n_particles": arguments.particles} if "n_particles" in method_options(method) else {}
+        )
         print(f"{method} released: {error(plain_prior(prior), method, particles, test):.2f} cm")
         for factor in arguments.factors:
-            ratio = factor / INCREMENT_FACTORS[method]
+            ratio = factor / FACTORS[method]
             noise = {name: value for name, value in prior.noise.items() if "increment" in name}
             own = UpperBodyPrior(
                 prior.left, prior.right, prior.info, {n: ratio * v for n, v in noise.items()}
             )
-            shape = "S" if "walk" in method else "diag(S)"
+            shape = "S" if METHODS[method].noise.walks else "diag(S)"
             print(
                 f"{method} {factor:g} {shape}: {error(own, method, particles, test):.2f} cm",
                 flush=True,

@@ -261,7 +261,7 @@ def time_step(
         prior, camera, test, method, options: of the tracker. n_steps: how many to time.
     """
     tracker = UpperBodyTracker(prior, camera, method, neck=prior.info.neck, **options)
-    model = tracker._filter("left", ("hand", "head", "neck"))
+    model = tracker.estimator.filter("left", ("hand", "head", "neck"))
     order = [2, 0, 1]  # hand, head, neck, as the tracker's filters measure them
     z = test.keypoints[:1, :, order].flatten(2)
     generator = torch.Generator().manual_seed(0)

@@ -5,10 +5,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+import torchpose
 from torchpose.filters import RecursiveFilter, StepOutput
 from torchpose.filters.transition import make_transition
 from torchpose.math import kalman_predict, kalman_update
 from torchpose.priors import GaussianMixture
+from torchpose.upper_body import PoseFilter, register_method
 
 
 class OneGaussianState(NamedTuple):
@@ -45,8 +47,18 @@ class OneGaussianFilter(RecursiveFilter):
         return OneGaussianState(mean, cov), estimate
 
 
-prior = GaussianMixture(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])
-tracker = OneGaussianFilter(prior, torch.ones(2), torch.ones(1), observed=[0])
-out = tracker(torch.randn(4, 20, 1), lengths=torch.tensor([20, 5, 9, 1]))
+mixture = GaussianMixture(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])
+one = OneGaussianFilter(mixture, torch.ones(2), torch.ones(1), observed=[0])
+out = one(torch.randn(4, 20, 1), lengths=torch.tensor([20, 5, 9, 1]))
 print(out.mean.shape)
 # > torch.Size([4, 20, 2])
+
+register_method("one-gaussian", PoseFilter(OneGaussianFilter))  # the one line
+
+prior = torchpose.load_prior("kinect-upper-body-small")
+tracker = torchpose.UpperBodyTracker(prior, prior.camera, method="one-gaussian")
+keypoints = torch.full((1, 10, 3, 2), 240.0)
+keypoints[..., 0] = torch.tensor([320.0, 420.0, 220.0])
+track = tracker(keypoints, names=["head", "hand_left", "hand_right"])
+print(track.method, track.joints3d.shape)
+# > one-gaussian torch.Size([1, 10, 8, 3])

@@ -46,6 +46,17 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.fixture(autouse=True)
+def methods():
+    """Take back what a snippet registers."""
+    from torchpose.upper_body import METHODS
+
+    before = dict(METHODS)
+    yield
+    METHODS.clear()
+    METHODS.update(before)
+
+
 @pytest.mark.parametrize("path", SNIPPETS, ids=lambda p: p.stem)
 def test_snippet(path, folder, request, capsys):
     if "clip.mp4" in path.read_text():

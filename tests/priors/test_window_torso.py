@@ -15,6 +15,7 @@ from torchpose.priors import UpperBodyPrior
 from torchpose.priors.window import WindowLayout, WindowPrior
 from torchpose.skeleton.torso import in_torso_axes
 from torchpose.upper_body import UpperBodyTracker
+from torchpose.upper_body.measurements import in_prior_pixels, pick_joints
 
 NAMES = list(KEYPOINT_NAMES)
 LAYOUT = WindowLayout((2, 5), (0,), torso=True)
@@ -82,14 +83,13 @@ def test_the_pose_is_read_from_the_torso(prior):
     keypoints = noisy_keypoints(truth, std_px=3.0)[None]
     tracker = UpperBodyTracker(prior, demo_camera(), steady=False)
     track = tracker(keypoints, names=NAMES)
-    measured, _ = tracker._measure(keypoints, None, NAMES, None, None, None)
-    seen = tracker._look(measured)
-    poses = [
-        tracker._run_arm(side, measured, seen, None, None, False)
-        .mean[..., 21:]
-        .unflatten(-1, (5, 3))
-        for side in ("left", "right")
-    ]
+    picked = pick_joints(len(NAMES), NAMES, None, prior.info.neck, prior.info.hand)
+    measured = in_prior_pixels(
+        keypoints.double(), None, None, None, picked, prior, demo_camera(), tracker.measurement_cov
+    )
+    joints = {side: ("hand", "head", "neck") for side in ("left", "right")}
+    estimates = tracker.estimator.forward(measured, joints, dict.fromkeys(joints))
+    poses = [out.mean[..., 21:].unflatten(-1, (5, 3)) for out in (estimates.left, estimates.right)]
     expected = torch.cat([poses[0][:, :, :3], poses[1][:, :, :3].flip(2)], 2)
     found = in_torso_axes(track.joints3d)[:, :, [0, 1, 2, 5, 6, 7]]
     assert float((found - expected).norm(dim=-1).max()) < 0.05  # two torsos, of about one shape

@@ -82,7 +82,7 @@ def test_sample_size_is_that_of_the_weights(prior, scene):
     _, keypoints = scene
     tracker = UpperBodyTracker(prior, prior.camera, "mkf-split", n_tracks=4)
     track = tracker(keypoints, names=NAMES)
-    left = tracker._filter("left", ("hand", "head", "neck"))
+    left = tracker.estimator.filter("left", ("hand", "head", "neck"))
     weights = left(keypoints[:, :, [2, 0, 1]].flatten(2)).log_weights.double().exp()
     torch.testing.assert_close(track.effective_sample_size[..., 0], 1 / weights.square().sum(-1))
     state = tracker.init(1, NAMES)

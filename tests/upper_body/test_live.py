@@ -7,7 +7,7 @@ from tests.priors.poses import recording
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.errors import InputError, ShapeError, SkeletonError
 from torchpose.learning.recipes import fit_kinect_prior
-from torchpose.upper_body import METHODS, UpperBodyTracker
+from torchpose.upper_body import METHODS, UpperBodyTracker, method_options
 
 NAMES = list(KEYPOINT_NAMES)
 FIELDS = ("joints2d", "joints3d", "covariance2d", "covariance3d", "log_evidence")
@@ -71,7 +71,7 @@ def check_equal(poses, track, fields=FIELDS):
 @pytest.mark.parametrize("uncertain", [False, True])
 @pytest.mark.parametrize("method", METHODS)
 def test_steps_are_the_frames_of_forward(prior, keypoints, method, uncertain):
-    options = {"n_particles": 100} if method.startswith("pf") else {}
+    options = {"n_particles": 100} if "n_particles" in method_options(method) else {}
     tracker = UpperBodyTracker(prior, demo_camera(), method=method, max_gap=None, **options)
     confidence = mask = None
     if uncertain:
@@ -135,7 +135,7 @@ def test_a_neck_of_another_kind_is_converted_here_too(prior, keypoints):
     track = tracker(keypoints, names=NAMES)
     state, poses = stream(tracker, keypoints)
     check_equal(poses, track)
-    assert state.stream.picked.notes == track.notes != ()
+    assert state.picked.notes == track.notes != ()
 
 
 def test_a_stream_goes_on_while_nothing_is_seen_and_says_for_how_long(prior, keypoints):

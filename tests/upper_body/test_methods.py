@@ -9,10 +9,19 @@ import torch
 from tests.priors.poses import recording
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.errors import InputError
+from torchpose.filters import MixtureKalmanFilter
 from torchpose.learning.recipes import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
-from torchpose.upper_body import METHODS, UpperBodyTracker
-from torchpose.upper_body.methods import method_options
+from torchpose.upper_body import (
+    METHODS,
+    PoseFilter,
+    ProcessNoise,
+    UpperBodyTracker,
+    method_options,
+    register_method,
+)
+from torchpose.upper_body.arms import arm_joints
+from torchpose.upper_body.measurements import in_prior_pixels, pick_joints
 
 NAMES = list(KEYPOINT_NAMES)
 
@@ -78,7 +87,7 @@ def test_a_lag_that_ends_before_the_window_does_leaves_single_poses(prior, keypo
 
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_says_its_own_name(prior, keypoints, method):
-    options = {"n_particles": 20} if method.startswith("pf-") else {}
+    options = {"n_particles": 20} if "n_particles" in method_options(method) else {}
     tracker = UpperBodyTracker(prior, demo_camera(), method, **options)
     assert tracker.method == poses(tracker, keypoints).method == method
 
@@ -95,12 +104,13 @@ BESIDE = {
     "gamma": {"transition": "ou", "gamma": 0.9},
     "burn_in_scale": {"burn_in": 20},
 }
+OF_PARTICLES = {"resample_threshold": 0.0}  # so few are resampled in every frame by default
 WALKS = ("pf-walk", "pf-walk-unscaled")
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_an_option_changes_the_poses_or_is_refused(prior, keypoints, method):
-    few = {"n_particles": 40} if method.startswith("pf-") else {}
+    few = {"n_particles": 40} if "n_particles" in method_options(method) else {}
 
     def joints(**options):
         tracker = UpperBodyTracker(prior, demo_camera(), method, **(few | options))
@@ -108,7 +118,7 @@ def test_an_option_changes_the_poses_or_is_refused(prior, keypoints, method):
 
     plain = joints()
 
-    for name, value in VALUES.items():
+    for name, value in (VALUES | (OF_PARTICLES if few else {})).items():
         beside = BESIDE.get(name, {})
         if name not in method_options(method):
             with pytest.raises(InputError, match=f"{name}|{next(iter(beside), name)}"):
@@ -149,6 +159,67 @@ def test_options_of_single_poses_without_a_method_still_mean_single_poses(prior,
     options = {"transition": "ou", "gamma": 0.9}
     newer = UpperBodyTracker(prior, demo_camera(), "mkf-fixed", **options)
     assert torch.equal(poses(older, keypoints).joints3d, poses(newer, keypoints).joints3d)
+
+
+def test_a_method_is_registered_under_a_new_name_only(monkeypatch):
+    monkeypatch.setattr("torchpose.upper_body.methods.METHODS", dict(METHODS))
+    with pytest.raises(InputError, match="'mkf-fixed' exists"):
+        register_method("mkf-fixed", METHODS["mkf-split"])
+
+
+@pytest.mark.parametrize("smoothing", [None, 2])
+def test_a_registered_filter_is_a_method_like_the_others(prior, keypoints, monkeypatch, smoothing):
+    """The bank of fixed tracks under another name, with one option less, and what comes with it."""
+    own = PoseFilter(
+        MixtureKalmanFilter, {"uniform_weight": 1e-3}, defaults={"transition": "stationary"},
+        noise=ProcessNoise(100.0), smooths=True,
+    )  # fmt: skip
+    monkeypatch.setitem(METHODS, "own", own)
+    assert "transition" in method_options("own") and "uniform_weight" not in method_options("own")
+    settings = {"smoothing": smoothing, "burn_in": 3}
+    tracker = UpperBodyTracker(prior, demo_camera(), "own", **settings)
+    same = UpperBodyTracker(
+        prior, demo_camera(), "mkf-fixed", transition="stationary", uniform_weight=1e-3, **settings
+    )
+    found, expected = poses(tracker, keypoints), poses(same, keypoints)
+    assert found.method == "own"
+    assert torch.equal(found.joints3d, expected.joints3d)
+    with pytest.raises(InputError, match=r"'uniform_weight' .* 'own'"):
+        UpperBodyTracker(prior, demo_camera(), "own", uniform_weight=0.1)
+    with pytest.raises(InputError, match=r"one of .*own"):
+        UpperBodyTracker(prior, demo_camera(), "owl")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_forward_of_an_estimator_is_its_advance(prior, keypoints, method):
+    few = {"n_particles": 40} if "n_particles" in method_options(method) else {}
+    tracker = UpperBodyTracker(prior, demo_camera(), method, **few)
+    estimator, cov = tracker.estimator, tracker.measurement_cov
+    picked = pick_joints(len(NAMES), NAMES, None, prior.info.neck, prior.info.hand)
+    measured = in_prior_pixels(
+        keypoints.double(), None, None, None, picked, prior, demo_camera(), cov
+    )
+    joints = arm_joints([i >= 0 for i in picked.indices])
+
+    def draws():
+        return {side: torch.Generator().manual_seed(i) for i, side in enumerate(joints)}
+
+    whole = estimator.forward(measured, joints, draws())
+    state, start = estimator.init(1, joints, draws()), 0
+    for n in (1, 9, 30):
+        rows = slice(start, start + n)
+        part = measured._replace(uv=measured.uv[:, rows], mask=measured.mask[:, rows])
+        state, found = estimator.advance(state, part)
+        for arm, expected in zip(found[:2], whole[:2], strict=True):
+            torch.testing.assert_close(arm.mean, expected.mean[:, rows], rtol=1e-9, atol=1e-9)
+            torch.testing.assert_close(
+                arm.log_evidence,
+                expected.log_evidence[:, rows],
+                rtol=1e-9,
+                atol=1e-9,
+                equal_nan=True,
+            )
+        start += n
 
 
 def test_windows_that_are_named_and_denied_are_refused(prior):

@@ -5,9 +5,12 @@ import torch
 
 from torchpose.priors import UpperBodyPrior, load_prior
 from torchpose.priors.upper_body import released_process_cov
-from torchpose.upper_body import UpperBodyTracker
-from torchpose.upper_body.process_noise import INCREMENT_FACTORS, process_cov
+from torchpose.upper_body import METHODS, PoseFilter, UpperBodyTracker
+from torchpose.upper_body.methods import process_cov
 
+FACTORS = {
+    name: method.noise.factor for name, method in METHODS.items() if isinstance(method, PoseFilter)
+}
 WALKS = ("pf-walk", "pf-walk-unscaled")
 KALMAN = ("mkf-fixed", "mkf-sampled", "mkf-split")
 
@@ -26,21 +29,23 @@ def steps(seed=0):
     return factor @ factor.mT
 
 
-@pytest.mark.parametrize("method", INCREMENT_FACTORS)
+@pytest.mark.parametrize("method", FACTORS)
 def test_recorded_steps_make_the_noise_of_every_method(mixtures, method):
     left, right = steps(0), steps(1)
     prior = with_noise(mixtures, increment_cov_left=left, increment_cov_right=right)
     whole = method in WALKS
     for side, cov in (("left", left), ("right", right)):
-        expected = INCREMENT_FACTORS[method] * (cov if whole else cov.diagonal())
+        expected = FACTORS[method] * (cov if whole else cov.diagonal())
         torch.testing.assert_close(process_cov(prior, side, method), expected)
 
 
-@pytest.mark.parametrize("method", INCREMENT_FACTORS)
+@pytest.mark.parametrize("method", FACTORS)
 def test_noise_is_proportional_to_the_interval_between_frames(mixtures, method):
     prior = with_noise(mixtures, increment_cov_left=steps(0), increment_cov_right=steps(1))
     trackers = [UpperBodyTracker(prior, prior.camera, method, fps=fps) for fps in (30.0, 10.0)]
-    own, slow = (t._filter("right", ("hand", "head", "neck")).process_cov for t in trackers)
+    own, slow = (
+        t.estimator.filter("right", ("hand", "head", "neck")).process_cov for t in trackers
+    )
     torch.testing.assert_close(slow, 3 * own)
 
 

@@ -215,7 +215,7 @@ def test_frames_and_the_static_camera(prior, scene):
 def test_process_noise_follows_the_frame_rate(prior):
     slow = UpperBodyTracker(prior, demo_camera(), fps=15.0, method="mkf-fixed")
     fast = UpperBodyTracker(prior, demo_camera(), fps=60.0, method="mkf-fixed")
-    a, b = (t._filter("left", ("hand", "head", "neck")).process_cov for t in (slow, fast))
+    a, b = (t.estimator.filter("left", ("hand", "head", "neck")).process_cov for t in (slow, fast))
     torch.testing.assert_close(a, 4 * b)
 
 

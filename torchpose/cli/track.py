@@ -31,6 +31,8 @@ def main(arguments: list[str]) -> int:
 
 def build() -> ArgumentParser:
     """Parser of the command."""
+    from torchpose.upper_body.methods import METHODS
+
     parser = new_parser(
         "track",
         "Track everybody in a video, a folder of images or the picture of a camera; or a person from "
@@ -59,8 +61,8 @@ def build() -> ArgumentParser:
         "--method",
         type=str,
         metavar="METHOD",
-        help="window-mixture (default if the prior brings windows that suit), mkf-fixed (default "
-        "otherwise), mkf-sampled, mkf-split, pf-mixture, pf-walk, pf-walk-unscaled",
+        help=f"one of {', '.join(METHODS)}; by default window-mixture if the prior brings windows that "
+        "suit, else mkf-fixed",
     )
     add(
         "--camera",

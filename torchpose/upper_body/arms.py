@@ -11,6 +11,7 @@ from torchpose.skeleton.upper_body import ARM_JOINTS, LEFT_ARM, RIGHT_ARM
 
 __all__ = [
     "ARMS",
+    "arm_joints",
     "first_failure",
     "generators_of_arms",
     "in_double",
@@ -26,7 +27,7 @@ _USUAL = ("hand", "head", "neck")
 
 
 def joints_of_arm(side: str, there: Sequence[bool]) -> tuple[str, ...]:
-    """Hand, head and neck of an arm, and those of its other joints that are there.
+    """Return hand, head and neck of an arm, and those of its other joints that are there.
 
     Args:
         side: "left" or "right". there: whether each of `UPPER_BODY` is.
@@ -38,8 +39,21 @@ def joints_of_arm(side: str, there: Sequence[bool]) -> tuple[str, ...]:
     return tuple(joint for joint, row in rows if joint in _USUAL or there[row])
 
 
-def generators_of_arms(generator: Generators) -> tuple[Generators, Generators]:
-    """A generator for each arm, so that one arm's numbers do not depend on how many the other drew."""
+def arm_joints(there: Sequence[bool]) -> dict[str, tuple[str, ...]]:
+    """Return `joints_of_arm` of both arms.
+
+    Args:
+        there: whether each of `UPPER_BODY` is.
+    """
+    return {side: joints_of_arm(side, there) for side in ARMS}
+
+
+def generators_of_arms(generator: Generators) -> dict[str, Generators]:
+    """Return a generator for each arm, so that neither's numbers depend on how many the other drew."""
+    return dict(zip(ARMS, _pair(generator), strict=True))
+
+
+def _pair(generator: Generators) -> tuple[Generators, Generators]:
     if generator is None:
         return None, None
     if isinstance(generator, torch.Generator):
@@ -49,13 +63,13 @@ def generators_of_arms(generator: Generators) -> tuple[Generators, Generators]:
             torch.Generator(device).manual_seed(int(left)),
             torch.Generator(device).manual_seed(int(right)),
         )
-    pairs = [generators_of_arms(g) for g in generator]
+    pairs = [_pair(g) for g in generator]
     lefts = [left for left, _ in pairs if isinstance(left, torch.Generator)]
     return lefts, [right for _, right in pairs if isinstance(right, torch.Generator)]
 
 
 def first_failure(left: FilterOutput, right: FilterOutput) -> Tensor:
-    """The first frame at which either arm degenerated, -1 where none did, [B]."""
+    """Return the first frame at which either arm degenerated, -1 where none did, [B]."""
     n_frames = left.mean.shape[1]
     failures = torch.stack([left.failed_at, right.failed_at])
     first = failures.where(failures >= 0, n_frames).amin(0)
@@ -69,7 +83,7 @@ def in_double(out: FilterOutput) -> FilterOutput:
 
 
 def mending_notes(left: FilterOutput, right: FilterOutput) -> tuple[str, ...]:
-    """What is worth a note about covariances that were mended; nothing where none was."""
+    """Return a note about covariances that were mended; nothing where none was."""
     outputs = [out for out in (left, right) if out.mended is not None and out.jitter is not None]
     count = sum(int(out.mended.sum()) for out in outputs if out.mended is not None)
     if not count:
@@ -82,6 +96,7 @@ def mending_notes(left: FilterOutput, right: FilterOutput) -> tuple[str, ...]:
 
 
 def require_cov(out: FilterOutput | StepOutput) -> Tensor:
+    """Return the covariances, which the filter was asked for."""
     if out.cov is None:
         raise RuntimeError("the filter was run without return_cov=True")
     return out.cov

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import torch
 
+from torchpose.upper_body.methods import METHODS
 from torchpose.upper_body.pose_track import PoseTrack
 
 __all__ = ["note_collapse"]
@@ -22,7 +23,8 @@ def note_collapse(track: PoseTrack) -> PoseTrack:
     Args:
         track: of any method; frames that failed or do not know their sample size are not counted.
     """
-    if not track.method.startswith("pf-"):
+    method = METHODS.get(track.method)
+    if method is None or not method.particles:
         return track
     size = track.effective_sample_size
     frames = torch.arange(size.shape[1], device=size.device)

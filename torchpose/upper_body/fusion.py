@@ -1,4 +1,4 @@
-"""From the estimates of two arms' filters to a pose, and its motion made steady.
+"""From the estimates of both arms to poses, and their motion made steady.
 
 A filter over windows estimates every frame for itself, so that the noise of keypoints and the change
 from one component to the next show as trembling. `MotionStage` filters (or smooths) what is read out.
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from torchpose.camera.lifting import arm_in_body_frame, join_arms, pixel_covariances
 from torchpose.camera.projection import lift, project
-from torchpose.camera.virtual_camera import BodyView, from_view, view_jacobian
+from torchpose.camera.virtual_camera import from_view, view_jacobian
 from torchpose.filters.constant_velocity import ConstantVelocityFilter, ConstantVelocityState
 from torchpose.filters.outputs import FilterOutput
 from torchpose.math.rotations import RotationOrder, euler_to_matrix, matrix_to_euler
@@ -21,12 +21,14 @@ from torchpose.priors.arm_state import STATE_DIM
 from torchpose.skeleton.joint_sets import UPPER_BODY
 from torchpose.skeleton.torso import onto_torso
 from torchpose.upper_body.arms import require_cov
+from torchpose.upper_body.estimator import Estimates
 
 __all__ = [
     "MotionStage",
     "MotionState",
     "ReadOut",
     "calibration_mode",
+    "in_camera_axes",
     "on_their_rays",
     "read_out",
     "recalibrated",
@@ -60,19 +62,13 @@ class ReadOut(NamedTuple):
     uv_covs: Tensor
 
 
-def read_out(
-    left: FilterOutput,
-    right: FilterOutput,
-    matrix: Float[Tensor, "3 3"],
-    order: RotationOrder,
-    view: BodyView | None,
-) -> ReadOut:
-    """Both arms lifted into the body's frame (BL 5) and joined; what they share is averaged.
+def read_out(estimates: Estimates, matrix: Float[Tensor, "3 3"], order: RotationOrder) -> ReadOut:
+    """Return both arms lifted into the body's frame (BL 5) and joined; what they share is averaged.
 
     Args:
-        left, right: outputs of the arms' filters, with covariances. matrix: K of the states' pixels.
-        order: of roll, pitch and yaw. view: the virtual camera that the states are seen by, if any.
+        estimates: of both arms. matrix: K of the prior's camera. order: of roll, pitch and yaw.
     """
+    left, right, view = estimates
     outputs = left, right
     means = [out.mean[..., :STATE_DIM] for out in outputs]
     covs = [require_cov(out)[..., :STATE_DIM, :STATE_DIM] for out in outputs]
@@ -101,7 +97,7 @@ def read_out(
 def _on_torso(
     left: FilterOutput, right: FilterOutput, matrix: Tensor, order: RotationOrder
 ) -> tuple[Float[Tensor, "B T 8 3"], Float[Tensor, "B T 8 3 3"]]:
-    """Joints that were estimated in the axes of the torso, in those of the body.
+    """Return joints that were estimated in the axes of the torso, in those of the body.
 
     The states say where head, neck and shoulders are there (BL 5), which takes no covariances.
     """
@@ -123,7 +119,7 @@ def on_their_rays(
     order: RotationOrder,
     observed: Bool[Tensor, "B T 8"],
 ) -> ReadOut:
-    """Measured hands and elbows on their rays, and the other joints' pixels where they project to.
+    """Return measured limbs on their rays, and the other joints' pixels where they project to.
 
     Pixels and the joints in space are two readings of one mixture, linear each, and differ where a
     camera is unlike those of the prior: on webcams that look up at somebody near, by 40 pixels for a
@@ -147,6 +143,21 @@ def on_their_rays(
     return reading._replace(joints=joints, uv=uv)
 
 
+def in_camera_axes(
+    reading: ReadOut, order: RotationOrder, place: Float[Tensor, "*batch 3"] | None = None
+) -> ReadOut:
+    """Return the joints and their covariances turned into the camera's axes and put where they are.
+
+    Args:
+        reading: in the body's frame. order: of its angles. place: of every body, metres, in place of
+            the estimated one.
+    """
+    rotation = euler_to_matrix(reading.angles, order)[..., None, :, :]
+    at = reading.place if place is None else place.to(reading.place).expand_as(reading.place)
+    joints = (rotation @ reading.joints[..., None])[..., 0] + at[..., None, :]
+    return reading._replace(joints=joints, covs=rotation @ reading.covs @ rotation.mT)
+
+
 def calibration_mode(method: str) -> str:
     """Return the name under which a prior keeps the calibration of a method over single poses."""
     return "pose" if method == "mkf-fixed" else method.replace("-", "_")
@@ -155,7 +166,7 @@ def calibration_mode(method: str) -> str:
 def recalibrated(
     covs: Float[Tensor, "B T 8 3 3"], noise: Mapping[str, Tensor], mode: str
 ) -> Float[Tensor, "B T 8 3 3"]:
-    """s C + f I for each joint, as a prior's training persons showed; C if it does not say.
+    """Return s C + f I for each joint, as a prior's training persons showed; C if it does not say.
 
     Args:
         covs: C, metres squared. noise: of a prior. mode: name of the window, or `calibration_mode`;
@@ -201,7 +212,7 @@ class MotionStage(nn.Module):
     def forward(
         self, reading: ReadOut, lengths: Int[Tensor, " B"] | None = None, lag: int | None = 0
     ) -> ReadOut:
-        """The steady reading.
+        """Return the steady reading.
 
         Args:
             reading: of whole sequences. lengths: [B]; frames past them are not used.
@@ -215,12 +226,12 @@ class MotionStage(nn.Module):
         )
 
     def init(self, reading: ReadOut) -> MotionState:
-        """The state before the first frame, that of `reading` [B, T, ...]."""
+        """Return the state before the first frame, that of `reading` [B, T, ...]."""
         pairs = zip(self._filters(), _numbers(reading), strict=True)
         return MotionState(*(model.init(values[:, 0]) for model, values in pairs))
 
     def advance(self, state: MotionState, reading: ReadOut) -> tuple[MotionState, ReadOut]:
-        """Some more frames [B, T, ...]: the same numbers as those of `forward` with lag 0."""
+        """Return the next state and some more frames [B, T, ...]: the numbers of `forward` with lag 0."""
         triples = zip(self._filters(), state, _numbers(reading), strict=True)
         advanced = [model.advance(own, values) for model, own, values in triples]
         steady = _with_numbers(reading, *(values for _, values in advanced))

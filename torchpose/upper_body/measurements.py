@@ -1,4 +1,4 @@
-"""From the keypoints that a caller has to the measurements that the arms' filters take."""
+"""From the keypoints that a caller has to the measured joints that estimators take."""
 
 import math
 from collections.abc import Sequence
@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose.camera.pinhole import PinholeCamera
+from torchpose.camera.projection import map_pixel_covariance, map_pixels
 from torchpose.errors import InputError, check_covariance, check_finite, check_floating, check_shape
 from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.skeleton.joint_sets import UPPER_BODY
@@ -20,6 +22,8 @@ __all__ = [
     "append_blocks",
     "arm_measurements",
     "check_gaps",
+    "in_prior_pixels",
+    "joint_covariances",
     "known_covariances",
     "measure_joints",
     "pick_joints",
@@ -28,6 +32,7 @@ __all__ = [
     "place_measured_neck",
 ]
 
+_DEFAULT_STD = 3.0  # pixels
 _LEAST_CONFIDENCE = 0.05
 _LEFT, _HEAD, _NECK, _RIGHT = (
     UPPER_BODY.index(name) for name in ("shoulder_left", "head", "neck", "shoulder_right")
@@ -111,7 +116,7 @@ def pick_joints(
 
 
 def _neck_notes(kind: str | None, wanted: str | None, middle: bool) -> list[str]:
-    """What is done about a neck of another kind, or about one that is missing (None)."""
+    """Return what is done about a neck of another kind, or about one that is missing (None)."""
     if middle:
         own = (
             "there is no neck among the keypoints"
@@ -126,7 +131,7 @@ def _neck_notes(kind: str | None, wanted: str | None, middle: bool) -> list[str]
 
 
 def pixels_per_metre(prior: UpperBodyPrior) -> float:
-    """Of the prior's camera at its mean pose's neck."""
+    """Return the scale of the prior's camera at the neck of its mean pose."""
     depth = float(prior.left.moments()[0][14] + prior.right.moments()[0][14]) / 2
     return math.sqrt(prior.info.fx * prior.info.fy) / depth
 
@@ -170,7 +175,7 @@ def place_measured_neck(
 def known_covariances(
     covariance: Float[Tensor, "B T J 2 2"], keypoints: Float[Tensor, "B T J 2"]
 ) -> Float[Tensor, "B T J 2 2"]:
-    """The covariances of the keypoints that are there, and the identity for the others."""
+    """Return the covariances of the keypoints that are there, and the identity for the others."""
     check_shape("covariance", covariance, [*keypoints.shape, 2])
     eye = torch.eye(2).to(keypoints)
     there = keypoints.isfinite().all(-1)[..., None, None]
@@ -187,7 +192,7 @@ def measure_joints(
     cov: Float[Tensor, "8 2 2"],
     own_cov: Float[Tensor, "B T J 2 2"] | None = None,
 ) -> MeasuredJoints:
-    """The eight joints among the keypoints, in the pixels of the keypoints.
+    """Return the eight joints among the keypoints, in the pixels of the keypoints.
 
     Args:
         keypoints: NaN where missing. confidence: [B, T, J] in 0..1, or None: at 0 or NaN a keypoint is
@@ -222,6 +227,39 @@ def measure_joints(
         if bool((weight < 1).any()):
             cov = cov / weight[..., None, None]
     return MeasuredJoints(uv, measured, cov)
+
+
+def in_prior_pixels(
+    keypoints: Float[Tensor, "B T J 2"],
+    confidence: Float[Tensor, "B T J"] | None,
+    mask: Bool[Tensor, "B T J"] | None,
+    covariance: Float[Tensor, "B T J 2 2"] | None,
+    picked: Picked,
+    prior: UpperBodyPrior,
+    camera: PinholeCamera,
+    measurement_cov: Float[Tensor, "8 2 2"],
+) -> MeasuredJoints:
+    """Return the eight joints among the keypoints, in the pixels of the prior's camera.
+
+    Args:
+        keypoints, confidence, mask, covariance: as in `UpperBodyTracker.forward`.
+        picked: where the joints are among them. prior, camera: whose pixels are wanted and given.
+        measurement_cov: R where `covariance` does not say, in the prior's pixels.
+
+    Raises:
+        ShapeError, InputError: as `measure_joints`. CovarianceError: a covariance that is none.
+    """
+    own, wanted = camera.matrix.to(keypoints), prior.info.matrix.to(keypoints)
+    if covariance is not None:
+        covariance = known_covariances(covariance, keypoints)
+        covariance = map_pixel_covariance(covariance, own, wanted)
+    measured = measure_joints(
+        keypoints, confidence, mask, picked.indices, measurement_cov, covariance
+    )
+    measured = measured._replace(uv=map_pixels(measured.uv, own, wanted))
+    if not picked.middle:
+        return measured
+    return place_measured_neck(measured, pixels_per_metre(prior))
 
 
 def _check_confidence(confidence: Tensor, measured: Bool[Tensor, "B T J"]) -> None:
@@ -276,15 +314,46 @@ def check_gaps(
         )
 
 
+def joint_covariances(
+    prior: UpperBodyPrior,
+    std: float | Sequence[float] | Tensor | None,
+    matrix: Float[Tensor, "3 3"],
+) -> Float[Tensor, "8 2 2"]:
+    """Return R of each of the eight joints in the prior's pixels.
+
+    Args:
+        prior: whose pixels are meant, and whose noise is taken where none is stated.
+        std: of a keypoint, pixels of the camera: None, one number, or one for each of `ARM_JOINTS`.
+        matrix: K of that camera.
+
+    Raises:
+        ShapeError, InputError: another number of deviations, or some that are not positive.
+    """
+    learnt = prior.noise.get("measurement_std") if std is None else None
+    if learnt is None:
+        given = torch.as_tensor(_DEFAULT_STD if std is None else std, dtype=torch.float64)
+    else:
+        given = learnt.double()
+    by_joint = given.expand(5) if given.ndim == 0 else given
+    check_shape("measurement_std", by_joint, [5])
+    check_finite("measurement_std", by_joint)
+    if bool((by_joint <= 0).any()):
+        raise InputError(f"measurement_std must be positive, got {by_joint.tolist()}")
+    cov = torch.diag_embed(by_joint.square()[:, None].expand(5, 2))
+    if learnt is None:
+        cov = map_pixel_covariance(cov, matrix, prior.info.matrix)
+    return cov[[ARM_JOINTS.index(joint.split("_")[0]) for joint in UPPER_BODY]]
+
+
 def pixel_indices(joints: Sequence[str]) -> list[int]:
-    """State dimensions of u and v of these joints of an arm."""
+    """Return the state dimensions of u and v of these joints of an arm."""
     return [3 * ARM_JOINTS.index(joint) + axis for joint in joints for axis in (0, 1)]
 
 
 def arm_measurements(
     arm: tuple[int, ...], joints: tuple[str, ...], measured: MeasuredJoints
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """z, mask and R of an arm's joints; R is [Z, Z], or [B, T, Z, Z] if it changes."""
+    """Return z, mask and R of an arm's joints; R is [Z, Z], or [B, T, Z, Z] if it changes."""
     rows = [arm[ARM_JOINTS.index(joint)] for joint in joints]
     z = measured.uv[:, :, rows].flatten(-2)
     mask = measured.mask[:, :, rows].repeat_interleave(2, -1)
@@ -298,7 +367,7 @@ def _block_diagonal(blocks: Float[Tensor, "*batch N 2 2"]) -> Float[Tensor, "*ba
 
 
 def append_blocks(cov: Float[Tensor, "*batch Z Z"], block: Tensor, count: int) -> Tensor:
-    """R with `count` more diagonal blocks."""
+    """Return R with `count` more diagonal blocks."""
     blocks = torch.block_diag(*[block] * count)
     n, extra = cov.shape[-1], blocks.shape[-1]
     whole = cov.new_zeros(*cov.shape[:-2], n + extra, n + extra)

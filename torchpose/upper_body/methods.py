@@ -1,28 +1,34 @@
-"""The estimators of the upper body by name: which one runs, and which options it has."""
+"""The methods of the upper-body tracker: one table of estimators by name, and which of them runs."""
 
 import inspect
 import warnings
-from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+from torch import Tensor
 
 from torchpose.errors import InputError
-from torchpose.filters.base import RecursiveFilter
 from torchpose.filters.mkf import TRACK_OPTIONS, MixtureKalmanFilter
 from torchpose.filters.particle import BootstrapParticleFilter
 from torchpose.priors.upper_body import UpperBodyPrior
-from torchpose.upper_body.windows import WINDOW_OPTIONS, suitable_window
+from torchpose.upper_body.estimator import Estimator
+from torchpose.upper_body.process_noise import ProcessNoise
+from torchpose.upper_body.single_poses import PoseFilter
+from torchpose.upper_body.windows import WindowMixture, suitable_window
 
 __all__ = [
     "METHODS",
     "SINGLE_POSES",
-    "SMOOTHABLE",
     "WINDOWS",
     "Chosen",
+    "Method",
     "check_options",
     "choose_method",
     "method_options",
+    "noise_options",
     "options_of_before",
-    "pose_model",
+    "process_cov",
+    "register_method",
 ]
 
 WINDOWS = "window-mixture"
@@ -31,35 +37,60 @@ WINDOWS = "window-mixture"
 SINGLE_POSES = "mkf-fixed"
 """The bank of Kalman filters over single poses."""
 
-_PARTICLES = {
-    "pf-mixture": "mixture",
-    "pf-walk": "random-walk",
-    "pf-walk-unscaled": "random-walk-unscaled",
+Method = type[Estimator] | PoseFilter
+"""What makes an estimator from a `TrackerModel` and, by name, the options in its signature."""
+
+
+def _kalman_bank(
+    tracks: str, factor: float, brought: tuple[str, ...], smooths: bool = False
+) -> PoseFilter:
+    return PoseFilter(
+        MixtureKalmanFilter,
+        {"tracks": tracks, "medians": ()},
+        unused=tuple(name for name, kinds in TRACK_OPTIONS.items() if tracks not in kinds),
+        noise=ProcessNoise(factor),
+        brought=brought,
+        smooths=smooths,
+    )
+
+
+def _particles(proposal: str, noise: ProcessNoise) -> PoseFilter:
+    settings, defaults = {"proposal": proposal}, {"start": "measured"}
+    return PoseFilter(BootstrapParticleFilter, settings, defaults, noise=noise, particles=True)
+
+
+METHODS: dict[str, Method] = {
+    WINDOWS: WindowMixture,
+    SINGLE_POSES: _kalman_bank("fixed", 100.0, ("transition", "gamma", "uniform_weight"), True),
+    "mkf-sampled": _kalman_bank("sampled", 10.0, ("transition", "gamma")),
+    "mkf-split": _kalman_bank("split", 10.0, ("transition", "gamma")),
+    "pf-mixture": _particles("mixture", ProcessNoise(10.0, tuned=False)),
+    "pf-walk": _particles("random-walk", ProcessNoise(1.0, walks=True)),
+    "pf-walk-unscaled": _particles("random-walk-unscaled", ProcessNoise(1.0, walks=True)),
 }
-METHODS = (WINDOWS, SINGLE_POSES, "mkf-sampled", "mkf-split", *_PARTICLES)
-SMOOTHABLE = (WINDOWS, SINGLE_POSES)
-# What the tracker gives to a filter by itself.
-_GIVEN = {"self", "gmm", "measurement_cov", "observed", "tracks", "proposal", "medians"}
+"""Every method by its name: `UpperBodyTracker`, the command line and the benchmarks take them from here."""
+
 # Without a method these options mean single poses, as they did before windows had a name.
 _POSE_OPTIONS = {"transition", "gamma", "subspace", "initial_cov", "process_cov"}
 
 
-class Chosen(NamedTuple):
-    """The estimator that runs, and what is to be said about the choice."""
+def register_method(name: str, method: Method) -> None:
+    """Add a method, which `UpperBodyTracker`, the command line and the benchmarks then know.
 
-    method: str
-    notes: tuple[str, ...]
+    Args:
+        name: a new one. method: a subclass of `Estimator`, or a filter over single poses as a
+            `PoseFilter`; its options are those of its signature.
 
-
-def pose_model(method: str) -> tuple[Callable[..., RecursiveFilter], dict[str, str]]:
-    """Return the class of a filter over single poses, and the argument that makes it this method."""
-    if method in _PARTICLES:
-        return BootstrapParticleFilter, {"proposal": _PARTICLES[method]}
-    return MixtureKalmanFilter, {"tracks": method.removeprefix("mkf-")}
+    Raises:
+        InputError: there is a method of that name.
+    """
+    if name in METHODS:
+        raise InputError(f"method {name!r} exists; take another name")
+    METHODS[name] = method
 
 
 def method_options(method: str) -> tuple[str, ...]:
-    """Return the options of the filter that a method uses.
+    """Return the options of a method: the arguments of what makes its estimator.
 
     Args:
         method: one of `METHODS`.
@@ -72,13 +103,40 @@ def method_options(method: str) -> tuple[str, ...]:
     >>> "n_tracks" in method_options("mkf-split"), "n_tracks" in method_options("mkf-fixed")
     (True, False)
     """
-    _check_method(method)
-    if method == WINDOWS:
-        return WINDOW_OPTIONS
-    model, kind = pose_model(method)
-    names = [name for name in inspect.signature(model).parameters if name not in _GIVEN]
-    unused = {n for n, tracks in TRACK_OPTIONS.items() if kind.get("tracks", tracks) not in tracks}
-    return tuple(name for name in names if name not in unused)
+    made_by = _find(method)
+    if isinstance(made_by, PoseFilter):
+        return made_by.options
+    return tuple(inspect.signature(made_by).parameters)[1:]  # without the model
+
+
+def process_cov(prior: UpperBodyPrior, side: str, method: str) -> Tensor:
+    """Return Q of a method, per frame at the prior's own rate; see `ProcessNoise`.
+
+    Args:
+        prior: whose noise is taken. side: "left" or "right". method: over single poses.
+
+    Raises:
+        InputError: no such method, or one that has no process noise.
+    """
+    return _find_filter(method).noise.cov(prior, side)
+
+
+def noise_options(
+    prior: UpperBodyPrior,
+    side: str,
+    method: str,
+    fps: float | None,
+    options: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Return the caller's options, and for the others the noise and transition of the prior.
+
+    Args:
+        method: over single poses. prior, side, fps, options: as in `PoseFilter.arguments`.
+
+    Raises:
+        InputError: as `process_cov`, or process_cov for the transition "ou", which has no Q.
+    """
+    return _find_filter(method).arguments(prior, side, fps, options)
 
 
 def check_options(method: str, options: Iterable[str]) -> None:
@@ -99,6 +157,13 @@ def check_options(method: str, options: Iterable[str]) -> None:
         )
 
 
+class Chosen(NamedTuple):
+    """The estimator that runs, and what is to be said about the choice."""
+
+    method: str
+    notes: tuple[str, ...]
+
+
 def choose_method(
     prior: UpperBodyPrior,
     method: str | None,
@@ -106,22 +171,23 @@ def choose_method(
     fps: float | None,
     options: Iterable[str],
 ) -> Chosen:
-    """Choose the estimator: the one that was named, else windows where the prior's suit.
+    """Return the method that was named, else windows where the prior's suit, else single poses.
 
     Args:
         prior: with its windows. method: one of `METHODS`, or None. smoothing, fps: as in
             `suitable_window`. options: names of those that were given to the filter.
 
     Raises:
-        InputError: no such method, one that cannot do what was asked for, or an option that it does
-            not use.
+        InputError: no such method, one that cannot do what was asked for, an option that it does not
+            use, or a smoothing that is none.
     """
+    wrong_lag = isinstance(smoothing, int) and smoothing < 0
+    if wrong_lag or (isinstance(smoothing, str) and smoothing != "full"):
+        raise InputError(f"smoothing must be None, a number of frames or 'full', got {smoothing!r}")
     chosen = _default(prior, smoothing, fps, options) if method is None else Chosen(method, ())
-    _check_method(chosen.method)
-    if smoothing is not None and chosen.method not in SMOOTHABLE:
-        raise InputError(
-            f"smoothing needs method {' or '.join(map(repr, SMOOTHABLE))}, got {chosen.method!r}"
-        )
+    if smoothing is not None and not _find(chosen.method).smooths:
+        able = [repr(name) for name, other in METHODS.items() if other.smooths]
+        raise InputError(f"smoothing needs method {' or '.join(able)}, got {chosen.method!r}")
     if method == WINDOWS and suitable_window(prior, smoothing, fps or 30.0) is None:
         raise InputError(
             f"method {WINDOWS!r} cannot be used: {_missing(prior, smoothing, fps)}; use method "
@@ -131,15 +197,23 @@ def choose_method(
     return chosen
 
 
-def _check_method(method: str) -> None:
+def _find(method: str) -> Method:
     if method not in METHODS:
         raise InputError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    return METHODS[method]
+
+
+def _find_filter(method: str) -> PoseFilter:
+    found = _find(method)
+    if not isinstance(found, PoseFilter):
+        raise InputError(f"method {method!r} has no process noise: it follows no single poses")
+    return found
 
 
 def _default(
     prior: UpperBodyPrior, smoothing: int | str | None, fps: float | None, options: Iterable[str]
 ) -> Chosen:
-    """The choice where no method was named."""
+    """Return the choice where no method was named."""
     poses = sorted(_POSE_OPTIONS & set(options))
     if poses:
         warnings.warn(
@@ -158,7 +232,7 @@ def _default(
 
 
 def _missing(prior: UpperBodyPrior, smoothing: int | str | None, fps: float | None) -> str:
-    """Why the prior has no window that suits."""
+    """Return why the prior has no window that suits."""
     name = "causal" if smoothing is None else "full"
     if name not in prior.windows:
         use = "filtering" if smoothing is None else "smoothing"

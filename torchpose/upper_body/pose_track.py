@@ -95,8 +95,13 @@ class PoseTrack:
     def __len__(self) -> int:
         return self.joints3d.shape[0]
 
+    @property
+    def failed(self) -> Tensor:
+        """Whether the filter degenerated, [B], as `LivePose.failed`."""
+        return self.failed_at >= 0
+
     def sequence(self, index: int) -> "PoseTrack":
-        """One sequence, cut to its own length, as a batch of one."""
+        """Return one sequence, cut to its own length, as a batch of one."""
         n = int(self.lengths[index])
         rows = slice(index, index + 1) if index != -1 else slice(-1, None)
         cut: dict[str, Any] = {name: getattr(self, name)[rows, :n] for name in FRAME_FIELDS}

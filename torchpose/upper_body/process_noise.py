@@ -1,6 +1,7 @@
 """Process noise Q of the filters over single poses: what a prior brings for each method."""
 
 import math
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -11,55 +12,57 @@ from torchpose.priors.upper_body import UpperBodyPrior, released_process_cov
 from torchpose.skeleton.upper_body import ARM_JOINTS
 from torchpose.upper_body.measurements import pixel_indices
 
-__all__ = ["INCREMENT_FACTORS", "default_process_cov", "default_walk_cov", "process_cov"]
+__all__ = ["ProcessNoise", "default_process_cov", "default_walk_cov"]
 
-INCREMENT_FACTORS = {
-    "mkf-fixed": 100.0,
-    "mkf-sampled": 10.0,
-    "mkf-split": 10.0,
-    "pf-mixture": 10.0,
-    "pf-walk": 1.0,
-    "pf-walk-unscaled": 1.0,
-}
-"""Q of a method in units of the recorded steps' second moment: with the least error on training persons
-that were held out (`benchmarks/process_noise.py`)."""
-
-_WALKS = ("pf-walk", "pf-walk-unscaled")
-_WALK_RATE = 0.9  # of a component's covariance, per second; chosen as the factors were
+_WALK_RATE = 0.9  # of a component's covariance, per second; chosen as the methods' factors were
 
 
-def process_cov(
-    prior: UpperBodyPrior, side: str, method: str
-) -> Float[Tensor, "21 21"] | Float[Tensor, " 21"]:
-    """Return Q of a method, per frame at the prior's own rate.
+class ProcessNoise(NamedTuple):
+    """Q of a method, in terms of the recorded steps that a prior brings.
 
-    With S the second moment of the recorded steps that a prior brings (`increment_covs`) and k the
-    method's factor, Q = k S for a walk, which has to step where the prior has bodies, and Q = k diag(S)
-    for the others, whose transition brings them back there. A prior without S has the Q that it
-    states, and walks `default_walk_cov`; fine-tuned Kalman filters keep the Q that was tuned.
+    With S the second moment of the recorded steps (`increment_covs`) and k the factor, Q = k S for a
+    walk, which has to step where the prior has bodies, and Q = k diag(S) for the others, whose
+    transition brings them back there.
 
-    Args:
-        prior: whose noise is taken. side: "left" or "right". method: over single poses.
+    Attributes:
+        factor: k; that of a method has the least error on training persons that were held out
+            (`benchmarks/process_noise.py`).
+        walks: whether the method walks at random.
+        tuned: whether a Q that the prior states comes first, as fine-tuning states it.
     """
-    noise = prior.noise
-    stated = noise.get(f"process_cov_{side}", noise.get("process_cov"))
-    increments = noise.get(f"increment_cov_{side}")
-    if method in _WALKS:
+
+    factor: float = 10.0
+    walks: bool = False
+    tuned: bool = True
+
+    def cov(
+        self, prior: UpperBodyPrior, side: str
+    ) -> Float[Tensor, "21 21"] | Float[Tensor, " 21"]:
+        """Return Q per frame at the prior's own rate.
+
+        A prior without S has the Q that it states, else `default_process_cov`; walks then have
+        `default_walk_cov`.
+
+        Args:
+            prior: whose noise is taken. side: "left" or "right".
+        """
+        noise = prior.noise
+        stated = noise.get(f"process_cov_{side}", noise.get("process_cov"))
+        increments = noise.get(f"increment_cov_{side}")
+        if self.walks:
+            return default_walk_cov(prior, side) if increments is None else self.factor * increments
+        if stated is not None and (increments is None or self.tuned):
+            return stated
         if increments is None:
-            return default_walk_cov(prior, side)
-        return INCREMENT_FACTORS[method] * increments
-    if stated is not None and (increments is None or method.startswith("mkf-")):
-        return stated
-    if increments is None:
-        return default_process_cov(prior)
-    return INCREMENT_FACTORS[method] * increments.diagonal()
+            return default_process_cov(prior)
+        return self.factor * increments.diagonal()
 
 
 def default_process_cov(prior: UpperBodyPrior) -> Float[Tensor, " 21"]:
-    """Diagonal of Q per frame where a prior brings none: that of the authors' released tracker.
+    """Return the diagonal of Q per frame where a prior brings none: that of the released tracker.
 
-    They set it by hand for f = 1550 pixels, a person 4.5 m away and 25 frames per second; the same
-    movement in metres is f / depth times as many pixels elsewhere.
+    Its authors set it by hand for f = 1550 pixels, a person 4.5 m away and 25 frames per second; the
+    same movement in metres is f / depth times as many pixels elsewhere.
 
     Args:
         prior: whose camera, mean depth and frame rate are used.

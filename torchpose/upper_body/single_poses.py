@@ -1,133 +1,251 @@
-"""The filter over single poses of an arm, and the noise that it takes."""
+"""Estimators over single poses: a recursive filter of each arm, with the noise that the prior brings."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+import inspect
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, cast
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.camera.projection import map_pixel_covariance
-from torchpose.errors import InputError, check_finite, check_shape
-from torchpose.filters.base import RecursiveFilter
+from torchpose._core.module_state import derived
+from torchpose.errors import DegenerateFilterWarning, InputError
+from torchpose.filters.base import Generators, RecursiveFilter
+from torchpose.filters.mkf import MixtureKalmanFilter
+from torchpose.filters.outputs import FilterOutput, collect
+from torchpose.priors.gaussian_mixture import GaussianMixture
 from torchpose.priors.upper_body import UpperBodyPrior
-from torchpose.skeleton.joint_sets import UPPER_BODY
 from torchpose.skeleton.upper_body import ARM_JOINTS
-from torchpose.upper_body.arms import ARMS
-from torchpose.upper_body.measurements import pixel_indices
-from torchpose.upper_body.methods import SINGLE_POSES, check_options, pose_model
-from torchpose.upper_body.process_noise import default_process_cov, process_cov
+from torchpose.upper_body.arms import ARMS, in_double, require_cov
+from torchpose.upper_body.estimator import ArmJoints, Estimates, Estimator, TrackerModel
+from torchpose.upper_body.measurements import MeasuredJoints, arm_measurements, pixel_indices
+from torchpose.upper_body.process_noise import ProcessNoise
 
-__all__ = ["default_process_cov", "joint_covariances", "noise_options", "pose_filter"]
+__all__ = ["PoseFilter", "PoseState", "SinglePoses"]
 
-_DEFAULT_STD = 3.0
+_GIVEN = ("measurement_cov", "observed")  # by the tracker, beside the mixture
 
 
-def pose_filter(
-    prior: UpperBodyPrior,
-    side: str,
-    joints: tuple[str, ...],
-    measurement_cov: Float[Tensor, "8 2 2"],
-    method: str,
-    fps: float | None,
-    options: dict[str, Any],
-) -> RecursiveFilter:
-    """The filter of an arm that measures these joints.
+@dataclass(frozen=True)
+class PoseFilter:
+    """A filter over single poses as a method of the tracker: called, it makes the estimator.
 
     Args:
-        prior: whose mixture and noise it takes. side: "left" or "right". joints: of `ARM_JOINTS`.
-        measurement_cov: R of the eight joints, the prior's pixels. method: one of
-            `torchpose.upper_body.METHODS`. fps: frame rate. options: to the filter; what the prior
-            brings is used for the others.
+        filter: makes the filter of an arm from its mixture, `measurement_cov`, `observed` and
+            options; a `RecursiveFilter`. If it has a `process_cov`, that is the prior's by default.
+        settings: arguments that make it this method, and are no options of it.
+        defaults: of options, in place of the filter's own.
+        unused: options of the filter that do nothing in this method, which refuses them.
+        noise: how the process noise follows from what the prior brings.
+        brought: which of the options "transition", "gamma" and "uniform_weight" the prior sets.
+        smooths, particles: as in `Estimator`.
 
-    Raises:
-        InputError: an option that the method does not use.
+    Example:
+        >>> from torchpose.filters import MixtureKalmanFilter
+        >>> from torchpose.upper_body.single_poses import PoseFilter
+        >>> one = PoseFilter(MixtureKalmanFilter, {"tracks": "split"})
+        >>> "n_tracks" in one.options, "tracks" in one.options
+        (True, False)
     """
-    check_options(method, options)
-    arm = ARMS[side]
-    blocks = [measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
-    arguments = noise_options(prior, side, method, fps, options)
-    model, kind = pose_model(method)
-    return model(
-        getattr(prior, side),
-        measurement_cov=torch.block_diag(*blocks),
-        observed=pixel_indices(joints),
-        **kind,
-        **arguments,
-    )
+
+    filter: Callable[..., RecursiveFilter]
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    unused: tuple[str, ...] = ()
+    noise: ProcessNoise = field(default_factory=ProcessNoise)
+    brought: tuple[str, ...] = ()
+    smooths: bool = False
+    particles: bool = False
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Names of the method's options, by the signature of its filter."""
+        names = [*inspect.signature(self.filter).parameters][1:]  # without the mixture
+        taken = {*_GIVEN, *self.settings, *self.unused}
+        return tuple(name for name in names if name not in taken)
+
+    def __call__(self, model: TrackerModel, **options: Any) -> "SinglePoses":
+        """Return the estimator of a tracker.
+
+        Args:
+            model: of the tracker. options: among `options`.
+        """
+        return SinglePoses(model, self, options)
+
+    def arguments(
+        self,
+        prior: UpperBodyPrior,
+        side: str,
+        fps: float | None,
+        options: Mapping[str, Any] | None = None,
+    ) -> dict[str, Any]:
+        """Return the caller's options, and for the others the noise and transition of the prior.
+
+        Args:
+            prior: what it brings is scaled to the frame rate, and left out where a choice of the
+                caller has no use for it. side: "left" or "right". fps: frame rate. options: of the
+                caller.
+
+        Raises:
+            InputError: process_cov for the transition "ou", which has no Q.
+        """
+        own = dict(options or {})
+        brought = self._brought(prior, side, fps)
+        kind = own.get("transition", brought.get("transition"))
+        if kind == "ou" and "process_cov" in own:
+            raise InputError(
+                "process_cov does not apply to transition 'ou', whose noise is gamma's"
+            )
+        if kind != "ou":
+            brought.pop("gamma", None)
+        if own.get("weighting") == "frame":
+            brought.pop("uniform_weight", None)
+        return brought | own
+
+    def _brought(self, prior: UpperBodyPrior, side: str, fps: float | None) -> dict[str, Any]:
+        noise, info = prior.noise, prior.info
+        ratio = 1.0 if not fps or not info.fps else info.fps / fps
+        options = dict(self.defaults)
+        if "process_cov" in self.options:
+            options["process_cov"] = ratio * self.noise.cov(prior, side)
+        gamma = noise.get(f"gamma_{side}", noise.get("gamma"))
+        epsilon = noise.get("uniform_weight")
+        learnt = {
+            "transition": info.transition,
+            "gamma": None if gamma is None else gamma**ratio,
+            "uniform_weight": None if epsilon is None else float(epsilon),
+        }
+        known = {name: learnt[name] for name in self.brought if learnt[name] is not None}
+        return options | known
 
 
-def noise_options(
-    prior: UpperBodyPrior,
-    side: str,
-    method: str,
-    fps: float | None,
-    options: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
-    """Return the caller's options, and for the others the noise and transition of the prior.
+class PoseState(NamedTuple):
+    """States of the filters of both arms, by "left" and "right", and what stays the same.
+
+    Attributes:
+        filters: states. joints: that each arm's filter measures. generators: of each arm.
+    """
+
+    filters: dict[str, Any]
+    joints: ArmJoints
+    generators: dict[str, Generators]
+
+
+class SinglePoses(Estimator):
+    """Follows single poses from frame to frame with a recursive filter of each arm.
 
     Args:
-        prior: what it brings is scaled to the frame rate, and left out where a choice of the caller
-            has no use for it. side: "left" or "right". method: a filter over single poses. fps: frame
-            rate. options: of the caller.
-
-    Raises:
-        InputError: process_cov for the transition "ou", which has no Q.
+        model: of the tracker. method: which filter, and what it takes from the prior.
+        options: of the method, from the user.
     """
-    own = dict(options or {})
-    brought = _brought_by(prior, side, method, fps)
-    kind = own.get("transition", brought.get("transition"))
-    if kind == "ou" and "process_cov" in own:
-        raise InputError("process_cov does not apply to transition 'ou', whose noise is gamma's")
-    if kind != "ou":
-        brought.pop("gamma", None)
-    if own.get("weighting") == "frame":
-        brought.pop("uniform_weight", None)
-    return brought | own
+
+    def __init__(self, model: TrackerModel, method: PoseFilter, options: Mapping[str, Any]) -> None:
+        self.model, self.method, self.options = model, method, dict(options)
+
+    def filter(self, side: str, joints: tuple[str, ...]) -> RecursiveFilter:
+        """Return the filter of an arm that measures these joints; the same one as long as it holds.
+
+        Args:
+            side: "left" or "right". joints: of `ARM_JOINTS`.
+        """
+        prior, cov = self.model.prior, self.model.measurement_cov
+        tensors = [value for value in self.options.values() if isinstance(value, Tensor)]
+        mixture: GaussianMixture = getattr(prior, side)
+        info = prior.info
+        return derived(
+            self.model.owner,
+            (side, joints, info.fps, info.transition, info.fx, info.fy),
+            (*mixture.parameters_tuple(), *prior.noise.values(), cov, *tensors),
+            lambda: self._make(side, joints),
+        )
+
+    def _make(self, side: str, joints: tuple[str, ...]) -> RecursiveFilter:
+        prior, arm = self.model.prior, ARMS[side]
+        blocks = [self.model.measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
+        return self.method.filter(
+            getattr(prior, side),
+            measurement_cov=torch.block_diag(*blocks),
+            observed=pixel_indices(joints),
+            **self.method.settings,
+            **self.method.arguments(prior, side, self.model.fps, self.options),
+        )
+
+    def check(self) -> None:
+        """Make the filters of hand, head and neck, whose options are checked."""
+        for side in ARMS:
+            self.filter(side, ("hand", "head", "neck"))
+
+    def init(
+        self, batch_size: int, joints: ArmJoints, generators: dict[str, Generators]
+    ) -> PoseState:
+        """Return the state before the first frame; see `Estimator`."""
+        filters = {
+            side: self.filter(side, joints[side]).init(batch_size, generators[side])
+            for side in ARMS
+        }
+        return PoseState(filters, joints, generators)
+
+    def advance(self, state: PoseState, measured: MeasuredJoints) -> tuple[PoseState, Estimates]:
+        """Return the next state and the estimates of T more frames; see `Estimator`."""
+        filters, arms = {}, {}
+        for side, arm in ARMS.items():
+            joints, model = state.joints[side], self.filter(side, state.joints[side])
+            z, mask, cov = arm_measurements(arm, joints, measured)
+            filters[side], arms[side] = _advance(
+                model, state.filters[side], z, mask, cov, state.generators[side]
+            )
+        return state._replace(filters=filters), Estimates(**arms)
+
+    def forward(
+        self,
+        measured: MeasuredJoints,
+        joints: ArmJoints,
+        generators: dict[str, Generators],
+        lengths: Tensor | None = None,
+        progress: bool = False,
+    ) -> Estimates:
+        """Return the estimates of whole sequences; see `Estimator`."""
+        lag, arms = self.model.smoothing, {}
+        for side, arm in ARMS.items():
+            model = self.filter(side, joints[side])
+            z, mask, cov = arm_measurements(arm, joints[side], measured)
+            if lag is not None:
+                later = None if lag == "full" else int(lag)
+                smooth = cast(MixtureKalmanFilter, model).smooth  # or another filter that smooths
+                out = smooth(z, mask, cov, lengths, lag=later, return_cov=True)
+            else:
+                out = model(
+                    z, mask, cov, lengths, generators[side], return_cov=True, progress=progress
+                )
+            arms[side] = in_double(out)
+        return Estimates(**arms)
 
 
-def _brought_by(prior: UpperBodyPrior, side: str, method: str, fps: float | None) -> dict[str, Any]:
-    noise, info = prior.noise, prior.info
-    ratio = 1.0 if not fps or not info.fps else info.fps / fps
-    options: dict[str, Any] = {"process_cov": ratio * process_cov(prior, side, method)}
-    if method.startswith("pf-"):
-        return options | {"start": "measured"}
-    options["transition"] = info.transition
-    gamma = noise.get(f"gamma_{side}", noise.get("gamma"))
-    if gamma is not None:
-        options["gamma"] = gamma**ratio
-    epsilon = noise.get("uniform_weight")
-    if epsilon is not None and method == SINGLE_POSES:
-        options["uniform_weight"] = float(epsilon)
-    return options
+def _advance(
+    model: RecursiveFilter,
+    state: Any,
+    z: Float[Tensor, "B T Z"],
+    mask: Bool[Tensor, "B T Z"],
+    cov: Tensor,
+    generator: Generators,
+) -> tuple[Any, FilterOutput]:
+    """Return the filter's next state and its estimates of some frames, one by one."""
+    if isinstance(model, MixtureKalmanFilter) and model.is_memoryless:
+        out = model(z, mask, cov, return_cov=True)
+        return state._replace(time=state.time + z.shape[1]), _wide(out)
+    steps = []
+    for t in range(z.shape[1]):
+        noise = cov[:, t] if cov.ndim == 4 else cov
+        state, step = model.step(state, z[:, t], mask[:, t], noise, generator, return_cov=True)
+        steps.append(step)
+    lengths = torch.full((len(z),), z.shape[1], device=z.device)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DegenerateFilterWarning)  # told by `failed`
+        return state, _wide(collect(steps, lengths))
 
 
-def joint_covariances(
-    prior: UpperBodyPrior,
-    std: float | Sequence[float] | Tensor | None,
-    matrix: Float[Tensor, "3 3"],
-) -> Float[Tensor, "8 2 2"]:
-    """R of each of the eight joints in the prior's pixels.
-
-    Args:
-        prior: whose pixels are meant, and whose noise is taken where none is stated.
-        std: of a keypoint, pixels of the camera: None, one number, or one for each of `ARM_JOINTS`.
-        matrix: K of that camera.
-
-    Raises:
-        ShapeError, InputError: another number of deviations, or some that are not positive.
-    """
-    learnt = prior.noise.get("measurement_std") if std is None else None
-    if learnt is None:
-        given = torch.as_tensor(_DEFAULT_STD if std is None else std, dtype=torch.float64)
-    else:
-        given = learnt.double()
-    by_joint = given.expand(5) if given.ndim == 0 else given
-    check_shape("measurement_std", by_joint, [5])
-    check_finite("measurement_std", by_joint)
-    if bool((by_joint <= 0).any()):
-        raise InputError(f"measurement_std must be positive, got {by_joint.tolist()}")
-    cov = torch.diag_embed(by_joint.square()[:, None].expand(5, 2))
-    if learnt is None:
-        cov = map_pixel_covariance(cov, matrix, prior.info.matrix)
-    return cov[[ARM_JOINTS.index(joint.split("_")[0]) for joint in UPPER_BODY]]
+def _wide(out: FilterOutput) -> FilterOutput:
+    """Return the estimates in float64, with covariances for sure."""
+    return in_double(out._replace(cov=require_cov(out)))

@@ -30,7 +30,7 @@ from torchpose.priors.window import augment_bodies
 from torchpose.skeleton.upper_body import ARM_JOINTS
 from torchpose.upper_body.arms import ARMS
 from torchpose.upper_body.measurements import pixel_indices
-from torchpose.upper_body.single_poses import noise_options
+from torchpose.upper_body.methods import noise_options
 
 __all__ = ["SequenceBatch", "TunableKalman", "draw_sequences"]
 

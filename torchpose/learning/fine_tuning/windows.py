@@ -28,8 +28,7 @@ from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.priors.window import WindowPrior
 from torchpose.skeleton.upper_body import ARM_JOINTS
 from torchpose.upper_body.arms import ARMS
-from torchpose.upper_body.measurements import pixel_indices
-from torchpose.upper_body.single_poses import joint_covariances
+from torchpose.upper_body.measurements import joint_covariances, pixel_indices
 
 __all__ = ["TunableWindow", "WindowBatch", "draw_windows"]
 
