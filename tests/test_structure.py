@@ -27,7 +27,6 @@ MOVED = [
 KNOWN = (
     "torchpose.cli.",
     "torchpose.filters.",
-    "torchpose.upper_body.",
 )
 
 

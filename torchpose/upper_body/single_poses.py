@@ -196,7 +196,7 @@ class SinglePoses(Estimator):
             filters[side], arms[side] = _advance(
                 model, state.filters[side], z, mask, cov, state.generators[side]
             )
-        return state._replace(filters=filters), Estimates(**arms)
+        return state._replace(filters=filters), Estimates(arms["left"], arms["right"])
 
     def forward(
         self,
@@ -220,7 +220,7 @@ class SinglePoses(Estimator):
                     z, mask, cov, lengths, generators[side], return_cov=True, progress=progress
                 )
             arms[side] = in_double(out)
-        return Estimates(**arms)
+        return Estimates(arms["left"], arms["right"])
 
 
 def _advance(

@@ -1,7 +1,7 @@
 """The main job: 2D keypoints of head, neck and hands to 2D and 3D poses of eight joints."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -194,8 +194,9 @@ class UpperBodyTracker(WideModule):
     @property
     def estimator(self) -> Estimator:
         """The estimator of the method, on prior, noise and options as they are now."""
+        make: Callable[..., Estimator] = METHODS[self.method]
         model = TrackerModel(self, self.prior, self.measurement_cov, self.fps, self.smoothing)
-        return METHODS[self.method](model, **self.given_options)
+        return make(model, **self.given_options)
 
     def forward(
         self,

@@ -260,7 +260,7 @@ class WindowMixture(Estimator):
             out = model(*both, noise, lengths, return_cov=True, progress=progress)
             context = self._filter(side, ())(*hands, None, lengths)
             arms[side] = _pose_of_window(in_double(out), context, seen, arm, self.window.layout)
-        return Estimates(**arms, view=seen.view)
+        return Estimates(arms["left"], arms["right"], seen.view)
 
     def _filter(self, side: str, joints: tuple[str, ...]) -> MixtureKalmanFilter:
         """Return the filter of an arm; the same one as long as it holds."""

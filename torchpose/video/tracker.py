@@ -134,7 +134,7 @@ class VideoTracker(nn.Module):
         if self.smoothing is None:
             return None
         own = self.tracker
-        given = self._options | own._given_options()
+        given = self._options | own.given_options
         given |= {"measurement_std": own.measurement_std, "smoothing": self.smoothing}
         sources = (*own.parameters(), *own.buffers())
         return derived(
