@@ -10,11 +10,13 @@ export NO_MKDOCS_2_WARNING := 1
 TEST_PROCESSES ?= 2
 
 .DELETE_ON_ERROR:
-.PHONY: help demo test lint format docs docs-serve install clean
+.PHONY: help demo test test-quick wheel lint format docs docs-serve install clean
 
 help:
 	@echo "make demo       track the animated performer, and a walk in three cameras; see demo-output/"
 	@echo "make test       run the tests"
+	@echo "make test-quick run those that take less than a minute: foundations, mathematics, structure"
+	@echo "make wheel      build the wheel, and use it in an environment of its own"
 	@echo "make lint       ruff, mypy, and who may import whom"
 	@echo "make docs       build the documentation into site/, warnings are errors"
 	@echo "make docs-serve show the documentation while it is edited"
@@ -27,6 +29,15 @@ demo: $(VENV)/.installed-plots
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) $(PYTEST_ARGS)
+
+# What most changes break first, and nothing that tracks more than a few frames.
+QUICK := tests/_core tests/math tests/skeleton tests/camera tests/metrics tests/docs/test_reference.py \
+         tests/test_import.py tests/test_structure.py
+test-quick: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) -m "not slow and not data" $(PYTEST_ARGS) $(QUICK)
+
+wheel:
+	PYTHON="$(PYTHON)" .ci/wheel
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

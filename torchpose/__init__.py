@@ -8,8 +8,26 @@ from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 
 from torchpose._core import moved as _moved
+from torchpose._core.facade import package_version as _package_version
 
 if TYPE_CHECKING:
+    from torchpose import body as body
+    from torchpose import camera as camera
+    from torchpose import demo as demo
+    from torchpose import errors as errors
+    from torchpose import evaluation as evaluation
+    from torchpose import filters as filters
+    from torchpose import io as io
+    from torchpose import learning as learning
+    from torchpose import math as math
+    from torchpose import measure as measure
+    from torchpose import metrics as metrics
+    from torchpose import priors as priors
+    from torchpose import skeleton as skeleton
+    from torchpose import upper_body as upper_body
+    from torchpose import video as video
+    from torchpose import viz as viz
+    from torchpose import whole_body as whole_body
     from torchpose._core.value_checks import without_value_checks as without_value_checks
     from torchpose.camera.pinhole import PinholeCamera as PinholeCamera
     from torchpose.errors import TorchposeError as TorchposeError
@@ -85,28 +103,21 @@ __all__ = [
 _moved.install()
 
 
-def __getattr__(name: str) -> object:
-    value: object
-    if name == "__version__":
-        value = _version()
-    elif name in _HOMES:
-        value = getattr(_import_module(f"torchpose.{_HOMES[name]}"), name)
-    elif name in _PACKAGES or _moved.present_module(f"torchpose.{name}"):
-        value = _import_module(f"torchpose.{name}")
-    else:
-        raise AttributeError(f"module 'torchpose' has no attribute {name!r}")
-    globals()[name] = value
-    return value
+if not TYPE_CHECKING:  # which would take every name for an object
+
+    def __getattr__(name: str) -> object:
+        value: object
+        if name == "__version__":
+            value = _package_version()
+        elif name in _HOMES:
+            value = getattr(_import_module(f"torchpose.{_HOMES[name]}"), name)
+        elif name in _PACKAGES or _moved.present_module(f"torchpose.{name}"):
+            value = _import_module(f"torchpose.{name}")
+        else:
+            raise AttributeError(f"module 'torchpose' has no attribute {name!r}")
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:
     return sorted({*__all__, *_PACKAGES, "__version__", "__doc__", "__file__", "__name__"})
-
-
-def _version() -> str:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("torchpose")
-    except PackageNotFoundError:  # run from a source tree that is not installed
-        return "0+unknown"

@@ -2,11 +2,12 @@
 
 import sys
 from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
 from pkgutil import iter_modules
 
 from torchpose._core.moved import NAMES, moved_names
 
-__all__ = ["list_public", "set_up_facade"]
+__all__ = ["list_public", "package_version", "set_up_facade"]
 
 
 def set_up_facade(module: str) -> None:
@@ -35,3 +36,11 @@ def list_public(module: str) -> Callable[[], list[str]]:
         return sorted({*room.__all__, *public, *special})
 
     return names
+
+
+def package_version() -> str:
+    """Return the version of the installed package, "0+unknown" in a source tree that is not installed."""
+    try:
+        return version("torchpose")
+    except PackageNotFoundError:
+        return "0+unknown"

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from torchpose._core.facade import package_version
 from torchpose.camera.pinhole import PinholeCamera
 from torchpose.camera.projection import project
 from torchpose.camera.viewpoints import sample_viewpoints
@@ -82,7 +83,7 @@ def cached_prior(
         settings: handed to the recipe.
     """
     module = import_module(recipe.__module__)
-    version = getattr(module, "VERSION", "") or _package_version()
+    version = getattr(module, "VERSION", "") or package_version()
     facts: list[Any] = [recipe.__module__, recipe.__qualname__, str(version), settings]
     facts += [fact for r in recordings for fact in (r.person_id, r.joints)]
     path = out / f"prior-{settings_hash(facts)}.safetensors"
@@ -320,9 +321,3 @@ def _padded(value: Tensor, pad: int) -> Tensor:
     if pad == 0:
         return value
     return torch.cat([value, value[:, -1:].expand(-1, pad, *value.shape[2:])], 1)
-
-
-def _package_version() -> str:
-    import torchpose
-
-    return torchpose.__version__
