@@ -11,7 +11,7 @@ __all__ = ["as_pair", "as_values", "check_mask"]
 
 
 def as_values(name: str, values: Tensor, sizes: Sequence[int | str | None]) -> Tensor:
-    """Real numbers of these sizes, in single precision or double; half precision is widened.
+    """Return real numbers of these sizes, in single precision or double; half precision is widened.
 
     Raises:
         InputError: whole or complex numbers. ShapeError: other sizes, or a point of no dimensions.
@@ -30,7 +30,7 @@ def as_pair(
     sizes: Sequence[int | str | None],
     names: tuple[str, str] = ("estimate", "truth"),
 ) -> tuple[Tensor, Tensor]:
-    """Both in the wider of their precisions; `mask` is of the same frames and joints.
+    """Return both in the wider of their precisions; `mask` is of the same frames and joints.
 
     Raises:
         InputError: whole or complex numbers, a mask that is not bool. ShapeError: other sizes, or sizes

@@ -52,7 +52,7 @@ def check_arrays(
 
 
 def sizes_fit(sizes: str, shape: tuple[int, ...], letters: dict[str, int]) -> bool:
-    """Whether a shape has these sizes; letters that are met for the first time are kept.
+    """Return whether a shape has these sizes; letters that are met for the first time are kept.
 
     >>> letters = {}
     >>> sizes_fit("T 3", (5, 3), letters), sizes_fit("T 2", (6, 2), letters), letters
@@ -66,7 +66,7 @@ def sizes_fit(sizes: str, shape: tuple[int, ...], letters: dict[str, int]) -> bo
 
 
 def one_number(path: str | Path, key: str, array: np.ndarray) -> float:
-    """The one number of an array, in any shape.
+    """Return the one number of an array, in any shape.
 
     Raises:
         FileFormatError: it holds text, several numbers, or none.
@@ -79,7 +79,7 @@ def one_number(path: str | Path, key: str, array: np.ndarray) -> float:
 
 
 def one_text(path: str | Path, key: str, array: np.ndarray) -> str:
-    """The one text of an array.
+    """Return the one text of an array.
 
     Raises:
         FileFormatError: it holds numbers, several texts, or none.
@@ -92,7 +92,7 @@ def one_text(path: str | Path, key: str, array: np.ndarray) -> str:
 
 
 def texts(path: str | Path, key: str, array: np.ndarray) -> tuple[str, ...]:
-    """The texts of an array [N]; an empty one of any type has none.
+    """Return the texts of an array [N]; an empty one of any type has none.
 
     Raises:
         FileFormatError: it holds numbers, or has another number of dimensions.

@@ -19,7 +19,7 @@ __all__ = ["atomic_path", "check_output_folder", "read_npz", "require_file", "wr
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A temporary file in the same folder that becomes `path` when the block succeeds.
+    """Yield a temporary file in the same folder that becomes `path` when the block succeeds.
 
     The temporary file keeps the suffix of `path` (`numpy.savez` and picture writers look at it).
     When the block fails it is removed, and what stood at `path` before is untouched. What a killed

@@ -183,7 +183,7 @@ def _kept_in_this_run(key: Hashable, given: tuple[Tensor, ...], make: Callable[[
 
 
 def _is_opaque(tensor: Tensor) -> bool:
-    """Whether a tensor has no version or no memory to be told by: of inference mode or a transform."""
+    """Return whether a tensor has no version or no memory to be told by: of inference mode or a transform."""
     if tensor.is_inference():
         return True
     try:

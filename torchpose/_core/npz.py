@@ -26,7 +26,7 @@ _FREE, _DENSER = 256 << 20, 100  # bytes; how many times as large as its file wh
 
 
 def npz_keys(path: str | Path) -> tuple[str, ...]:
-    """Names of the arrays in an .npz file, none of which is read.
+    """Return the names of the arrays in an .npz file, none of which is read.
 
     Raises:
         InputError: no such file. FileFormatError: not an .npz file.
@@ -81,7 +81,7 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 
 def _checked_size(path: Path, archive: zipfile.ZipFile, key: str, info: zipfile.ZipInfo) -> int:
-    """Bytes of an array, by its header, which has to agree with the directory."""
+    """Return the size in bytes of an array, by its header, which has to agree with the directory."""
     where = f"{path}: {key}"
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise FileFormatError(

@@ -79,7 +79,7 @@ def reading(path: str | Path, expected: str) -> Iterator[None]:
 
 
 def read_text(path: str | Path, expected: str, encoding: str = "utf-8-sig") -> str:
-    """Text of a file.
+    """Return the text of a file.
 
     Raises:
         InputError: no such file. FileFormatError: not in this encoding.

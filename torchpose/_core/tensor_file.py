@@ -138,7 +138,7 @@ def read_tensors(path: str | Path, kind: FileKind[Info]) -> tuple[Info, dict[str
 
 
 def format_of(path: str | Path) -> str | None:
-    """Name of a file's kind, `FileKind.format`, or None if `write_tensors` did not make it.
+    """Return the name of a file's kind, `FileKind.format`, or None if `write_tensors` did not make it.
 
     Raises:
         InputError: no such file.
@@ -163,7 +163,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def require_tensor(path: str | Path, tensors: Mapping[str, Tensor], key: str) -> Tensor:
-    """A tensor of a file in double precision, or `FileFormatError`."""
+    """Return a tensor of a file in double precision, or `FileFormatError`."""
     if key not in tensors:
         found = ", ".join(sorted(tensors)) or "none"
         raise FileFormatError(f"{path}: expected a tensor {key}, found {found}")
@@ -175,7 +175,7 @@ def require_tensor(path: str | Path, tensors: Mapping[str, Tensor], key: str) ->
 
 
 def info_to_json(info: Any) -> str:
-    """Text of a dataclass that `info_from_json` reads back.
+    """Return the text of a dataclass that `info_from_json` reads back.
 
     Raises:
         PriorError: it holds what is not JSON.
@@ -187,7 +187,7 @@ def info_to_json(info: Any) -> str:
 
 
 def info_from_json(cls: type[Info], text: str) -> Info:
-    """A dataclass from the text of `info_to_json`; lists become tuples where its fields are tuples.
+    """Return a dataclass from the text of `info_to_json`; lists become tuples where its fields are tuples.
 
     Raises:
         FileFormatError: not JSON, other fields, or values of another type. What the dataclass raises.
@@ -214,7 +214,7 @@ def info_from_json(cls: type[Info], text: str) -> Info:
 
 
 def _checked_info(header: Any, kind: FileKind[Any]) -> str:
-    """The facts' JSON in a header, or `FileFormatError`."""
+    """Return the facts' JSON in a header, or `FileFormatError`."""
     found = header.get("format") if isinstance(header, dict) else None
     if found != kind.format:
         named = "" if found is None else f" ({found})"
@@ -271,13 +271,13 @@ def _check_values(tensors: Mapping[str, Tensor], kind: FileKind[Any]) -> None:
 
 
 def _inflated(cov: Tensor) -> Tensor:
-    """A little larger, so that what has no extent in some direction passes for a covariance."""
+    """Return a covariance a little larger, so that what has no extent in some direction passes for a covariance."""
     size = cov.abs().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(torch.float32).tiny)
     return cov + 1e-7 * size * torch.eye(cov.shape[-1], dtype=cov.dtype)
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value from JSON is of a type, with all that it holds."""
+    """Return whether a value from JSON is of a type, with all that it holds."""
     origin, parts = get_origin(hint) or hint, get_args(hint)
     if origin in (Union, UnionType):
         return any(_fits(value, part) for part in parts)

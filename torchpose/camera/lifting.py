@@ -20,7 +20,7 @@ def arm_in_camera_frame(
     cov: Float[Tensor, "... 21 21"],
     matrix: Float[Tensor, "3 3"],
 ) -> tuple[Float[Tensor, "... 5 3"], Float[Tensor, "... 5 3 3"]]:
-    """Joints of an arm in camera axes, X = lambda K^-1 [u, v, 1], by unscented transform.
+    """Return the joints of an arm in camera axes, X = lambda K^-1 [u, v, 1], by unscented transform.
 
     Each joint depends on its own (u, v, lambda) alone, so seven sigma points do. The covariance is
     of where the joint is in space: it includes how far away the whole body is.
@@ -43,7 +43,7 @@ def arm_in_body_frame(
     matrix: Float[Tensor, "3 3"],
     rotation_order: RotationOrder,
 ) -> tuple[Float[Tensor, "... 5 3"], Float[Tensor, "... 5 3 3"]]:
-    """Joints of an arm in the frame of the body, (BL 5), by unscented transform over the state.
+    """Return the joints of an arm in the frame of the body, (BL 5), by unscented transform over the state.
 
     X = [p1 p2 p3]^-1 (lambda [u, v, 1] - p4), P = K [R | t]: the camera's rotation and translation
     are part of the state, so their uncertainty is in the covariance, and what joints and camera have
@@ -82,7 +82,7 @@ def _joint_blocks(mean: Tensor, cov: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def join_arms(left: Float[Tensor, "B T 5 *rest"], right: Float[Tensor, "B T 5 *rest"]) -> Tensor:
-    """Eight joints from hand, elbow, shoulder, head and neck of either arm.
+    """Return the eight joints from hand, elbow, shoulder, head and neck of either arm.
 
     Head and neck are averaged. For covariances the average bounds that of the averaged estimate
     whatever the two errors have in common: Cov((a + b) / 2) <= (Cov a + Cov b) / 2.
@@ -92,6 +92,6 @@ def join_arms(left: Float[Tensor, "B T 5 *rest"], right: Float[Tensor, "B T 5 *r
 
 
 def pixel_covariances(cov: Float[Tensor, "B T 21 21"]) -> Float[Tensor, "B T 5 2 2"]:
-    """Covariances of (u, v) of the five joints of an arm, pixels squared."""
+    """Return the covariances of (u, v) of the five joints of an arm, pixels squared."""
     blocks = cov[..., :15, :15].unflatten(-1, (5, 3)).unflatten(-3, (5, 3))
     return blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)[..., :2, :2]

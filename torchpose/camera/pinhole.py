@@ -128,7 +128,7 @@ class PinholeCamera(nn.Module):
     def from_matrix(
         cls, matrix: Any, width: float | None = None, height: float | None = None, name: str = ""
     ) -> Self:
-        """Camera of a matrix K [3, 3] (tensor, array or nested list).
+        """Return the camera of a matrix K [3, 3] (tensor, array or nested list).
 
         Raises:
             CameraError: wrong shape, singular, or not of the form (BL 4).
@@ -144,7 +144,7 @@ class PinholeCamera(nn.Module):
 
     @classmethod
     def from_image_size(cls, width: float, height: float, name: str = "") -> Self:
-        """A guess from the image size alone: f = 525/640 of the longer side, centre in the middle.
+        """Guess a camera from the image size alone: f = 525/640 of the longer side, centre in the middle.
 
         >>> PinholeCamera.from_image_size(640, 480).matrix[0].tolist()
         [525.0, 0.0, 319.5]
@@ -260,7 +260,7 @@ def _vector(name: str, values: Any, length: int | None) -> Tensor:
 
 
 def _numbers(name: str, values: Any, wanted: str = "numbers") -> Tensor:
-    """A tensor of numbers; true and false are none."""
+    """Return a tensor of numbers; true and false are none."""
     try:
         if _holds_bool(values):
             raise TypeError

@@ -31,7 +31,7 @@ def project(
     R: Float[Tensor, "... 3 3"],
     t: Float[Tensor, "... 3"],
 ) -> Float[Tensor, "... J 3"]:
-    """Pixels and projective depth of body points.
+    """Return the pixels and projective depth of body points.
 
     [u, v, lambda] = K [R | t] [X, Y, Z, 1]   (BL 3), returned as (u/lambda, v/lambda, lambda).
 
@@ -63,7 +63,7 @@ def project(
 def backproject(
     uvl: Float[Tensor, "... J 3"], K: Float[Tensor, "... 3 3"]
 ) -> Float[Tensor, "... J 3"]:
-    """Points in camera axes of pixels and projective depth: K^-1 (u lambda, v lambda, lambda).
+    """Return the points in camera axes of pixels and projective depth: K^-1 (u lambda, v lambda, lambda).
 
     Args:
         uvl: (u, v, lambda) [..., J, 3]: pixels, pixels, metres.
@@ -88,7 +88,7 @@ def lift(
     R: Float[Tensor, "... 3 3"],
     t: Float[Tensor, "... 3"],
 ) -> Float[Tensor, "... J 3"]:
-    """Body points of pixels and projective depth; the inverse of `project`.
+    """Return body points of pixels and projective depth; the inverse of `project`.
 
     [X, Y, Z] = [p1 p2 p3]^-1 ([u, v, lambda] - p4)   (BL 5), here R^T (K^-1 [u, v, lambda] - t).
 
@@ -109,7 +109,7 @@ def lift(
 def map_pixels(
     uv: Float[Tensor, "... 2"], K_from: Float[Tensor, "... 3 3"], K_to: Float[Tensor, "... 3 3"]
 ) -> Float[Tensor, "... 2"]:
-    """Pixels of one camera as another camera in the same place would see them: K_to K_from^-1.
+    """Return the pixels of one camera as another camera in the same place would see them: K_to K_from^-1.
 
     Args:
         uv: [..., 2], pixels of the first camera; NaN stays NaN.
@@ -129,7 +129,7 @@ def map_pixel_covariance(
     K_from: Float[Tensor, "... 3 3"],
     K_to: Float[Tensor, "... 3 3"],
 ) -> Float[Tensor, "... 2 2"]:
-    """Covariance of pixels after `map_pixels`: A C A^T with its Jacobian A (the map is affine).
+    """Return the covariance of pixels after `map_pixels`: A C A^T with its Jacobian A (the map is affine).
 
     Args:
         covariance: [..., 2, 2], squared pixels of the first camera.
@@ -182,7 +182,7 @@ def _check_pose(K: Tensor, R: Tensor, t: Tensor) -> None:
 
 
 def _pixel_slope(K_from: Tensor, K_to: Tensor) -> Tensor:
-    """Linear part [..., 2, 2] of K_to K_from^-1."""
+    """Return the linear part [..., 2, 2] of K_to K_from^-1."""
     check_intrinsics("K_from", K_from)
     check_intrinsics("K_to", K_to)
     fx, fy, skew, *_ = intrinsics(K_from)

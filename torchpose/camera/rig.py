@@ -97,7 +97,7 @@ class CameraRig(nn.Module):
         return self.sizes[0] if len(set(self.sizes)) == 1 else None
 
     def forward(self, points: Float[Tensor, "*batch N 3"]) -> RigView:
-        """Pixels and depth of world points in every camera.
+        """Return the pixels and depth of world points in every camera.
 
         Args:
             points: [..., N, 3], metres, world axes; the result has their dtype.
@@ -115,7 +115,7 @@ class CameraRig(nn.Module):
         return RigView(homogeneous[..., :2] / depth.unsqueeze(-1), depth)
 
     def select(self, index: Sequence[int]) -> "CameraRig":
-        """The rig of some of the cameras, in the given order.
+        """Return the rig of some of the cameras, in the given order.
 
         Raises:
             CameraError: no index, or one that no camera has.
@@ -155,7 +155,7 @@ class CameraRig(nn.Module):
         return rig
 
     def undistort(self, images: Any) -> Any:
-        """Images as cameras without distortion would see them; the matrix K stays.
+        """Return the images as cameras without distortion would see them; the matrix K stays.
 
         Pixels are interpolated linearly, and masks (bool) cut at one half. What lies outside of the
         distorted image is 0.
@@ -206,7 +206,7 @@ class CameraRig(nn.Module):
         )
 
     def _undistorted(self, camera: int, images: np.ndarray) -> np.ndarray:
-        """Images [T, H, W] or [T, H, W, 3] of one camera."""
+        """Return the images [T, H, W] or [T, H, W, 3] of one camera."""
         import cv2
 
         size = images.shape[2], images.shape[1]
@@ -243,7 +243,7 @@ def undistortion_maps(
     matrix: Float[Tensor, "3 3"], distortions: Float[Tensor, " n"], fisheye: bool,
     size: tuple[int, int],
 ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
-    """Where each pixel of an image without distortion is to be looked up, for `cv2.remap`.
+    """Return where each pixel of an image without distortion is to be looked up, for `cv2.remap`.
 
     Args:
         matrix: K, the same before and after. distortions: OpenCV's. size: (width, height).
@@ -270,7 +270,7 @@ Cameras = CameraRig | PinholeCamera | Iterable[PinholeCamera] | Mapping[str, Pin
 
 
 def as_rig(cameras: Cameras) -> CameraRig:
-    """A rig of whatever holds cameras: a rig, one camera, several, or a mapping of names.
+    """Return a rig of whatever holds cameras: a rig, one camera, several, or a mapping of names.
 
     Raises:
         CameraError: it holds no cameras.
@@ -289,7 +289,7 @@ def as_rig(cameras: Cameras) -> CameraRig:
 
 
 def _named(cameras: Mapping[str, Any]) -> list[Any]:
-    """Cameras of a mapping; its keys tell two of the same name apart."""
+    """Return the cameras of a mapping; its keys tell two of the same name apart."""
     named = []
     for key, camera in cameras.items():
         if isinstance(camera, PinholeCamera) and camera.name != key:

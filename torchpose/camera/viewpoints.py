@@ -49,7 +49,7 @@ class ViewRange:
                 )
 
     def scaled(self, factor: float) -> "ViewRange":
-        """Limits of another width about the same middle; 1 changes nothing."""
+        """Return the limits of another width about the same middle; 1 changes nothing."""
 
         def about_middle(limits: tuple[float, float]) -> tuple[float, float]:
             low, high = limits

@@ -68,12 +68,12 @@ class BodyPath(NamedTuple):
     height: Tensor
 
     def at(self, lag: int) -> tuple[Tensor, Tensor]:
-        """Neck and height at one lag, [B, T, 2]."""
+        """Return the neck and height at one lag, [B, T, 2]."""
         i = self.lags.index(lag)
         return self.neck[:, :, i], self.height[:, :, i]
 
     def carried(self, uv: Float[Tensor, "B T 2"], lag: int) -> Float[Tensor, "B T 2"]:
-        """A pixel of the body of `lag` frames ago where it is on the body of now.
+        """Return where pixels on the body of `lag` frames ago lie on the body in the present frame.
 
         It moves along with the neck, and away from it as the body comes nearer:
             u' = n_t + (u - n_{t-lag}) |h_t| / |h_{t-lag}|
@@ -109,7 +109,7 @@ def body_path(
     start: int = 0,
     variance: Float[Tensor, "B T 2"] | None = None,
 ) -> BodyPath:
-    """Neck and head at t - lag, by regression on what was measured from a second ago to `ahead`.
+    """Return the neck and head at t - lag, by regression on what was measured from a second ago to `ahead`.
 
     The neck moves with a velocity that is a random walk, and so, much more slowly, does the height
     of the head above it; the head nods besides:
@@ -145,7 +145,7 @@ def body_path(
 
 
 def memory_frames(lags: tuple[int, ...], fps: float) -> int:
-    """How many frames before the present one `body_path` and windows of these lags go back."""
+    """Return how many frames before the present one `body_path` and windows of these lags go back."""
     return max(round(MEMORY * fps), *lags)
 
 
@@ -158,7 +158,7 @@ class _Regression(NamedTuple):
     def of_frames(
         self, known: Bool[Tensor, "B T N"], more: Float[Tensor, "B T N"], alike: bool
     ) -> Float[Tensor, "B1 T1 Q N"]:
-        """Weights for every frame's measured pixels; [1, 1, Q, N] if they are all the same.
+        """Return the weights for every frame's measured pixels; [1, 1, Q, N] if they are all the same.
 
         Args:
             known: which pixels are measured. more: their variance beyond the usual one.
@@ -175,7 +175,7 @@ class _Regression(NamedTuple):
     def weights(
         self, known: Bool[Tensor, "P N"], more: Float[Tensor, "P N"]
     ) -> Float[Tensor, "P Q N"]:
-        """Weights of the measured pixels where only some are known; zero for the others."""
+        """Return the weights of the measured pixels where only some are known; zero for the others."""
         both = known[:, :, None] & known[:, None, :]
         eye = torch.eye(len(self.measured), dtype=self.measured.dtype, device=known.device)
         cov = torch.where(both, self.measured, eye) + torch.diag_embed(more)
@@ -204,7 +204,7 @@ def _regression(
 
 
 def _walk(times: Tensor, spread: float, speed: float, acceleration: float) -> Tensor:
-    """Covariance of positions whose velocity is a random walk from the first of the times on."""
+    """Return the covariance of positions whose velocity is a random walk from the first of the times on."""
     since = times - times.min()
     first = torch.minimum(since[:, None], since)
     last = torch.maximum(since[:, None], since)
@@ -213,7 +213,7 @@ def _walk(times: Tensor, spread: float, speed: float, acceleration: float) -> Te
 
 
 def _distinct(patterns: Bool[Tensor, "F N"]) -> tuple[Bool[Tensor, "P N"], Tensor]:
-    """The distinct rows, and which of them each row is."""
+    """Return the distinct rows, and which of them each row is."""
     if bool((patterns == patterns[:1]).all()):
         return patterns[:1], torch.zeros(len(patterns), dtype=torch.long, device=patterns.device)
     pieces = patterns.split(62, 1)  # as many bits as fit into a whole number
@@ -231,7 +231,7 @@ def view_body(
     matrix: Float[Tensor, "3 3"],
     reach: Float[Tensor, "*batch"] | None = None,
 ) -> BodyView:
-    """The virtual camera that sees this neck where the prior has it, and a far body larger.
+    """Return the virtual camera that sees this neck where the prior has it, and a far body larger.
 
     The rotation is exact whatever the body does, since a camera that turns about its centre sees no
     other side of it. The zoom takes the head's height above the neck as a measure of distance,
@@ -268,7 +268,7 @@ def _ray(pixel: Float[Tensor, "*batch 2"], matrix: Tensor) -> Float[Tensor, "*ba
 
 
 def _axes(ray: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Axes with z along a ray and x level, as columns."""
+    """Return the axes with z along a ray and x level, as columns."""
     z = torch.nn.functional.normalize(ray, dim=-1)
     down = torch.zeros_like(z)
     down[..., 1] = 1.0
@@ -279,7 +279,7 @@ def _axes(ray: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 def to_view(
     uv: Float[Tensor, "B T J 2"], view: BodyView, matrix: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "B T J 2"]:
-    """Pixels of the camera as the virtual camera sees them."""
+    """Return the pixels of the camera as the virtual camera sees them."""
     turned = _turned(uv, view.rotation, matrix)
     return (
         view.centre[..., None, :]
@@ -290,7 +290,7 @@ def to_view(
 def from_view(
     uv: Float[Tensor, "B T J 2"], view: BodyView, matrix: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "B T J 2"]:
-    """Pixels of the virtual camera as the camera sees them."""
+    """Return the pixels of the virtual camera as the camera sees them."""
     shrunk = (
         view.centre[..., None, :] + (uv - view.centre[..., None, :]) / view.zoom[..., None, None]
     )
@@ -300,7 +300,7 @@ def from_view(
 def view_jacobian(
     uv: Float[Tensor, "B T J 2"], view: BodyView, matrix: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "B T J 2 2"]:
-    """Derivative of `from_view` at these pixels."""
+    """Return the derivative of `from_view` at these pixels."""
     shrunk = (
         view.centre[..., None, :] + (uv - view.centre[..., None, :]) / view.zoom[..., None, None]
     )

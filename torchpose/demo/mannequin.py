@@ -83,7 +83,7 @@ class BodyAngles(NamedTuple):
 def angles_to_joints(
     angles: BodyAngles, size: BodySize | None = None
 ) -> tuple[Float[Tensor, "T 8 3"], Float[Tensor, "T 2 3"]]:
-    """Joints of a body of the given size in the given posture.
+    """Return the joints of a body of the given size in the given posture.
 
     The collar bones rise with the upper arms, as in people: by 0.24 of what the arm is raised
     beyond 30 degrees.
@@ -133,7 +133,7 @@ def angles_to_joints(
 def hands_to_arms(
     hands: Float[Tensor, "T 2 3"], size: BodySize | None = None
 ) -> Float[Tensor, "T 2 4"]:
-    """Angles of the arms that bring the hands to given places (inverse kinematics).
+    """Return the angles of the arms that bring the hands to given places (inverse kinematics).
 
     Upper arm and forearm form a triangle over the line from shoulder to hand; the elbow is on its
     lower, outer side. The shoulder rises with the upper arm, so it is found by iteration.

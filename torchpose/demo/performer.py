@@ -152,7 +152,7 @@ def performer_angles(
     seed: int = 0,
     dtype: torch.dtype = torch.float64,
 ) -> tuple[BodyAngles, tuple[str, ...]]:
-    """Joint angles of the performance, and what the performer does in each frame.
+    """Return the joint angles of the performance, and what the performer does in each frame.
 
     Key frames with minimum-jerk movements between them; the torso starts a little before the arms;
     slow sway, breathing and tremor on top, because nobody stands still. After 20 s it starts over.
@@ -194,7 +194,7 @@ def performer_angles(
 
 
 def hip_sway(clock: Tensor, generator: torch.Generator) -> Float[Tensor, "T 3"]:
-    """How the hips move while one stands and breathes, metres."""
+    """Return how the hips move while one stands and breathes, metres."""
     position = sway(clock, (3,), 0.008, (0.08, 0.3), generator)
     breathing = 0.003 * torch.sin(2 * math.pi * 0.25 * clock)
     position[:, 1] = 0.3 * position[:, 1] + breathing
@@ -208,7 +208,7 @@ def sway(
     band: tuple[float, float],
     generator: torch.Generator,
 ) -> Tensor:
-    """Nobody stands still: four sinusoids of random phase and frequency.
+    """Return a slow sway, since nobody stands still: four sinusoids of random phase and frequency.
 
     Args:
         clock: seconds [T]. shape: of what sways. amplitude: about its root mean square.
@@ -235,7 +235,7 @@ def performer(
     distance: float = 2.0,
     dtype: torch.dtype = torch.float64,
 ) -> Performance:
-    """The animated performer in front of `demo_camera`.
+    """Return the animated performer in front of `demo_camera`.
 
     Args:
         n_frames: T; the performance takes 20 s and then starts over.
@@ -262,7 +262,7 @@ def stage(
     size: BodySize | None = None,
     distance: float = 2.0,
 ) -> Performance:
-    """A movement in front of `demo_camera`.
+    """Return a movement in front of `demo_camera`.
 
     Args:
         angles: the movement, T frames. labels: a word for each frame. fps: frames per second.
@@ -297,7 +297,7 @@ def stage(
 
 
 def demo_camera() -> PinholeCamera:
-    """A camera like Kinect's: 640 x 480 pixels, f = 525 pixels."""
+    """Return a camera like Kinect's: 640 x 480 pixels, f = 525 pixels."""
     return PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480, name="demo")
 
 

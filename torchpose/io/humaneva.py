@@ -122,7 +122,7 @@ class HumanEvaTrial:
 
 
 def is_humaneva(root: str | Path) -> bool:
-    """Whether a folder is laid out as HumanEva-I.
+    """Return whether a folder is laid out as HumanEva-I.
 
     >>> is_humaneva("nowhere")
     False
@@ -187,7 +187,7 @@ def read_humaneva(
 
 
 def read_calibration(path: str | Path) -> PinholeCamera:
-    """A camera of HumanEva: f, c (pixels), skew, five distortions, R by rows, T (mm), 22 numbers.
+    """Read a camera of HumanEva: f, c (pixels), skew, five distortions, R by rows, T (mm), 22 numbers.
 
     x_camera = R x_world + T; distortions are in OpenCV's order.
 
@@ -214,7 +214,7 @@ def read_calibration(path: str | Path) -> PinholeCamera:
 
 
 def read_stream_offset(path: str | Path) -> StreamOffset:
-    """The three numbers of an .ofs file.
+    """Read the three numbers of an .ofs file.
 
     Raises:
         InputError: no such file. FileFormatError: other numbers, or a scale that is not positive.
@@ -227,7 +227,7 @@ def read_stream_offset(path: str | Path) -> StreamOffset:
 
 
 def _videos(folder: Path, name: str) -> tuple[Path, ...]:
-    """Videos of a name, or folders of their frames."""
+    """Return the videos of a name, or folders of their frames."""
     files = [path for path in folder.glob(f"{name}.avi") if path.is_file()]
     return tuple(sorted(files or [path for path in folder.glob(name) if path.is_dir()]))
 
@@ -252,7 +252,7 @@ def _offsets(folder: Path, name: str) -> dict[str, StreamOffset]:
 
 
 def _common_clock(offsets: Mapping[str, StreamOffset]) -> tuple[StreamOffset, dict[str, int]]:
-    """The mocap frame of frame one of the trial, and the image (from zero) that each camera then has.
+    """Return the mocap frame of frame one of the trial, and the image (from zero) that each camera then has.
 
     As the data set's own tools do it: frame one is the earliest image that any camera has; the scale
     is the mean of all; where it lies before the motion capture, all start with that.
@@ -272,7 +272,7 @@ def _common_clock(offsets: Mapping[str, StreamOffset]) -> tuple[StreamOffset, di
 
 
 def _interpolated(joints: Float[np.ndarray, "S 15 3"], clock: StreamOffset) -> np.ndarray:
-    """Joints at the frames of the videos, linear between those of the motion capture."""
+    """Return the joints at the frames of the videos, linear between those of the motion capture."""
     last = len(joints) - 1
     count = int(np.floor((last - (clock.mocap - 1)) / clock.scale + 1e-9)) + 1
     if count < 1:
@@ -291,7 +291,7 @@ def _interpolated(joints: Float[np.ndarray, "S 15 3"], clock: StreamOffset) -> n
 
 
 def _points(folder: Path, name: str) -> dict[str, np.ndarray]:
-    """Points [S, 3] by label, mm, NaN where they were lost: the .c3d, else the .mat."""
+    """Return the points [S, 3] by label, mm, NaN where they were lost: the .c3d, else the .mat."""
     c3d, mat = folder / f"{name}.c3d", folder / f"{name}.mat"
     if c3d.is_file():
         found = read_c3d_points(c3d)

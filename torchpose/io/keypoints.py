@@ -262,7 +262,7 @@ def _cell(path: Path, number: int, cell: str) -> float:
 def _frames(
     path: Path, frames: np.ndarray, rows: list[tuple[int, list[str]]], repeated: bool
 ) -> tuple[np.ndarray, int]:
-    """Row -> index of its frame, counted from the first one, and the number of frames."""
+    """Return the row -> index of its frame, counted from the first one, and the number of frames."""
     with np.errstate(invalid="ignore"):  # of infinite ones
         whole = np.isfinite(frames) & (frames % 1 == 0)
         steps = np.diff(frames, prepend=frames[:1] - (not repeated))

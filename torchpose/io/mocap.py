@@ -49,7 +49,7 @@ class MocapClip:
         return len(self.joints)
 
     def cut(self, start: int, stop: int) -> "MocapClip":
-        """The frames from `start` to before `stop`."""
+        """Return the frames from `start` to before `stop`."""
         rows = slice(start, stop)
         return replace(self, joints=self.joints[rows], recorded=self.recorded[rows])
 
@@ -89,7 +89,7 @@ def read_mocap(
 def select_persons(
     clips: Sequence[MocapClip], persons: Sequence[str]
 ) -> dict[str, list[MocapClip]]:
-    """Clips by person, in the order asked for; ``07``, ``7`` and ``s07`` are the same person.
+    """Return the clips by person, in the order asked for; ``07``, ``7`` and ``s07`` are the same person.
 
     Args:
         persons: their names; all persons if empty.
@@ -113,7 +113,7 @@ def select_persons(
 def resample(
     points: Float[Tensor, "T *rest"], fps: float, target: float
 ) -> Float[Tensor, "S *rest"]:
-    """Points at another rate: every n-th frame where that is enough, else cubic Hermite pieces.
+    """Return the points at another rate: every n-th frame where that is enough, else cubic Hermite pieces.
 
         p(s) = h00 p_k + h10 m_k + h01 p_(k+1) + h11 m_(k+1),   m_k = (p_(k+1) - p_(k-1)) / 2
 
@@ -148,7 +148,7 @@ def resample(
 
 
 def _before(points: Float[Tensor, "T *rest"]) -> Float[Tensor, "1 *rest"]:
-    """The frame before the first, on the parabola through the first three."""
+    """Return the frame before the first, on the parabola through the first three."""
     if len(points) < 3:
         return 2 * points[:1] - points[1:2] if len(points) > 1 else points[:1]
     return 3 * points[:1] - 3 * points[1:2] + points[2:3]
@@ -174,7 +174,7 @@ def _clip(recording: Recording, fps: float | None) -> MocapClip:
 
 
 def _person_key(name: str) -> str:
-    """The number of a person whose name is one, else the name in lower case.
+    """Return the number of a person whose name is one, else the name in lower case.
 
     >>> _person_key("s07") == _person_key("7") == _person_key("07")
     True

@@ -100,7 +100,7 @@ class Recording:
         return f"{origin}#{self.person}{other}"
 
     def upper_body(self, nose_as_head: bool = False) -> UpperBody:
-        """The eight joints [T, 8, 3] with the kinds of neck, hand and head."""
+        """Return the eight joints [T, 8, 3] with the kinds of neck, hand and head."""
         return to_upper_body(self.joints, self.names, nose_as_head)
 
 
@@ -166,7 +166,7 @@ def read_recordings(
 
 
 def find_recordings(paths: str | Path | Iterable[str | Path]) -> list[Path]:
-    """Files with recordings among files and folders.
+    """Return the files with recordings among files and folders.
 
     Folders are searched with their subfolders. A folder's other files are passed over where it holds
     recordings as `.npz`, because they are those in another form. So are files of other content, and
@@ -310,7 +310,7 @@ def _check_shapes(raw: RawRecording) -> None:
 
 
 def _missing(raw: RawRecording, notes: list[str]) -> np.ndarray:
-    """Joints with NaN where one coordinate is missing and where they are exactly zero; says so."""
+    """Return the joints with NaN where one coordinate is missing and where they are exactly zero; says so."""
     joints = np.where(np.isnan(raw.joints).any(-1, keepdims=True), np.nan, raw.joints)
     zero = (joints == 0).all(-1)
     always = np.flatnonzero(zero[~np.isnan(joints).all((1, 2))].all(0))
@@ -331,7 +331,7 @@ def _missing(raw: RawRecording, notes: list[str]) -> np.ndarray:
 
 
 def _is_origin(others: np.ndarray) -> bool:
-    """Whether zero lies within the body that the other joints make, so that it is centred there."""
+    """Return whether zero lies within the body that the other joints make, so that it is centred there."""
     measured = ~np.isnan(others).all((1, 2))
     low = np.where(np.isnan(others), np.inf, others)[measured].min(1)
     high = np.where(np.isnan(others), -np.inf, others)[measured].max(1)

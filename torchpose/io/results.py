@@ -129,7 +129,7 @@ class ResultsFolder:
         return [path for path in self.folder.iterdir() if self._own.fullmatch(path.name)]
 
     def _take_stage(self) -> Path:
-        """A private folder that is empty and locked."""
+        """Make a private folder that is empty and locked."""
         stage = self.folder / f".torchpose-{self._kind}"
         while True:
             stage.mkdir(exist_ok=True)
@@ -224,7 +224,7 @@ def refuse_stranger(path: str | Path, kind: str, earlier: bool = False) -> None:
 
 
 def holds_arrays(path: str | Path, names: Iterable[str]) -> bool:
-    """Whether a file is an .npz with arrays of these names."""
+    """Return whether a file is an .npz with arrays of these names."""
     try:
         return set(names) <= set(npz_keys(path))
     except TorchposeError:
@@ -266,7 +266,7 @@ def _facts(path: Path) -> dict[str, Any]:
 
 
 def _is_listed(path: Path, listed: dict[str, Any]) -> bool:
-    """Whether a file is still what a run has written."""
+    """Return whether a file is still what a run has written."""
     facts = listed.get(path.name)
     if not isinstance(facts, dict) or path.is_symlink() or not path.is_file():
         return False
@@ -302,7 +302,7 @@ def _renamed(moves: Sequence[tuple[Path, Path]]) -> Iterator[None]:
 
 
 def _free_folder(folder: Path, names: Sequence[str]) -> Path:
-    """The first folder `earlier-N` in which none of these names is taken."""
+    """Return the first folder `earlier-N` in which none of these names is taken."""
     number = 1
     while any(os.path.lexists(folder / f"earlier-{number}" / name) for name in names):
         number += 1
@@ -319,7 +319,7 @@ def _same(path: Path, other: Path) -> bool:
 
 
 def _lock_folder(folder: Path) -> tuple[int | None, bool | None]:
-    """A descriptor that holds a lock, and what `hold` says."""
+    """Return a descriptor that holds a lock, and what `hold` says."""
     try:
         handle = os.open(folder, os.O_RDONLY)
     except OSError:  # Windows opens no folders

@@ -114,7 +114,7 @@ def _least_jitter(
 
 
 def least_exponent(dtype: torch.dtype) -> float:
-    """Where to clamp exponents below a largest one of zero: what is lost is nothing beside one.
+    """Return the least exponent worth computing beside a largest one of zero.
 
     Exponentials that underflow are about ten times as slow as others.
     """
@@ -144,7 +144,7 @@ def product(
     mean_b: Float[Tensor, "... D"],
     cov_b: Float[Tensor, "... D D"],
 ) -> tuple[Float[Tensor, "... D"], Float[Tensor, "... D D"], Float[Tensor, "..."]]:
-    """Product of two Gaussian densities over the same variable.
+    """Return the product of two Gaussian densities over the same variable.
 
     N(x|a, A) N(x|b, B) = c N(x|m, C),  C = (A^-1 + B^-1)^-1,  c = N(a|b, A + B)   (BL 9-12)
 
@@ -165,7 +165,7 @@ def product(
 def marginal(
     mean: Float[Tensor, "... D"], cov: Float[Tensor, "... D D"], indices: Int[Tensor, " A"]
 ) -> tuple[Float[Tensor, "... A"], Float[Tensor, "... A A"]]:
-    """Mean and covariance of a subset of the dimensions."""
+    """Return the mean and covariance of a subset of the dimensions."""
     return mean[..., indices], cov[..., indices[:, None], indices]
 
 
@@ -232,7 +232,7 @@ def kalman_predict(
     offset: Float[Tensor, "... D"],
     noise: Float[Tensor, "... D D"],
 ) -> tuple[Float[Tensor, "... D"], Float[Tensor, "... D D"]]:
-    """Time update x' = F x + b + N(0, N) (BL 34, 37).
+    """Predict a Gaussian by x' = F x + b + N(0, N) (BL 34, 37).
 
     The covariance F P F^T + N is symmetric if N is.
 
@@ -258,7 +258,7 @@ def kalman_gain(
     observed: Int[Tensor, " Z"],
     mask: Bool[Tensor, "... Z"] | None = None,
 ) -> tuple[Gain, Float[Tensor, "... D D"]]:
-    """Gain and updated covariance of a measurement of some state dimensions (BL 39-41).
+    """Return the gain and the updated covariance of a measurement of some state dimensions (BL 39-41).
 
     A missing dimension is taken out exactly: its row of H is zero and its row and column of the
     innovation covariance are those of the identity, so it adds nothing to state or likelihood.
@@ -334,7 +334,7 @@ def kalman_correct(
     observed: Int[Tensor, " Z"],
     mask: Bool[Tensor, "... Z"] | None = None,
 ) -> tuple[Float[Tensor, "... D"], Float[Tensor, "..."]]:
-    """Updated mean (BL 40) and log N(z | H x, S) given a gain; values of z off the mask are ignored."""
+    """Return the updated mean (BL 40) and log N(z | H x, S) given a gain; z off the mask is ignored."""
     residual = z - mean.index_select(-1, observed)
     if mask is not None:
         residual = torch.where(mask, residual, torch.zeros_like(residual))
@@ -351,7 +351,7 @@ def kalman_update(
     observed: Int[Tensor, " Z"],
     mask: Bool[Tensor, "... Z"] | None = None,
 ) -> tuple[Float[Tensor, "... D"], Float[Tensor, "... D D"], Float[Tensor, "..."]]:
-    """Measurement update of a Gaussian (BL 38-41).
+    """Update a Gaussian by a measurement of some of its dimensions (BL 38-41).
 
     Returns:
         Mean, covariance and log-likelihood log N(z | H x, H P H^T + R) of what was measured.
@@ -392,7 +392,7 @@ def mixture_moments(
     means: Float[Tensor, "... M D"],
     covs: Float[Tensor, "... M D D"],
 ) -> tuple[Float[Tensor, "... D"], Float[Tensor, "... D D"]]:
-    """Mean and covariance of a Gaussian mixture: within plus between components (BL 48)."""
+    """Return the mean and covariance of a Gaussian mixture: within plus between components (BL 48)."""
     weights = log_weights.softmax(-1)
     mean = (weights[..., None] * means).sum(-2)
     spread = (means - mean[..., None, :]) * weights[..., None].sqrt()

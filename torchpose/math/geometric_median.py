@@ -16,7 +16,7 @@ def geometric_median(
     spread: Float[Tensor, "*batch M P"],
     start: Float[Tensor, "N P 3"],
 ) -> Float[Tensor, "N P 3"]:
-    """The points x of least sum_j w_j sqrt(|x - m_j|^2 + tr C_j), by Weiszfeld's iteration.
+    """Return the points x of least sum_j w_j sqrt(|x - m_j|^2 + tr C_j), by Weiszfeld's iteration.
 
     The root is the expected distance from x to N(m_j, C_j), from above (Jensen). Where the mixture
     has two answers, an arm before or behind, this is near the likelier one and not between them.
@@ -48,7 +48,7 @@ def median_estimate(
     total: Float[Tensor, "N D D"] | None,
     points: Int[Tensor, " P"],
 ) -> tuple[Float[Tensor, "N D"], Float[Tensor, "N D D"] | None]:
-    """An estimate whose points are geometric medians, and its second moment about them.
+    """Return an estimate whose points are geometric medians, and its second moment about them.
 
     Args:
         log_weights, means, covs: of the mixture. mean, total: its mean and covariance.

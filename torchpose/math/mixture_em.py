@@ -59,7 +59,7 @@ class SufficientStatistics(NamedTuple):
     weight: Float[Tensor, ""]
 
     def merge(self, *others: SufficientStatistics) -> SufficientStatistics:
-        """Statistics of all points together."""
+        """Return the statistics of all points together."""
         total = self
         for other in others:
             pairs = zip(total, other, strict=True)
@@ -68,7 +68,7 @@ class SufficientStatistics(NamedTuple):
 
     @classmethod
     def zeros(cls, n_components: int, dim: int, device: Any = None) -> SufficientStatistics:
-        """Statistics of no points."""
+        """Return the statistics of no points."""
         n_features = 1 + dim + dim * (dim + 1) // 2
         table = torch.zeros(n_components, n_features, dtype=torch.float64, device=device)
         return cls(table, table.new_zeros(()), table.new_zeros(()))
@@ -134,7 +134,7 @@ def e_step(
     parameters: MixtureParameters,
     sample_weight: Float[Tensor, " N"] | None = None,
 ) -> SufficientStatistics:
-    """Expectation step: responsibilities, summed up at once (BL 53-56).
+    """Run the expectation step: responsibilities, summed up at once (BL 53-56).
 
     Args:
         x: points; a transposed [D, N] tensor in memory is fastest. Its dtype is that of the
@@ -172,7 +172,7 @@ def e_step(
 
 
 def _chunk_size(device: torch.device) -> int:
-    """Points per product: 2 MB of features for each core, which stay in its cache."""
+    """Return how many points go into one product: 2 MB of features for each core, which stay in its cache."""
     return POINTS * (torch.get_num_threads() if device.type == "cpu" else 64)
 
 
@@ -186,7 +186,7 @@ def _pad_components(theta: Tensor) -> Tensor:
 def m_step(
     statistics: SufficientStatistics, floor: Float[Tensor, "D D"]
 ) -> tuple[MixtureParameters, int]:
-    """Maximisation step, with empty and collapsed components moved (BL 54-56).
+    """Run the maximisation step, with empty and collapsed components moved (BL 54-56).
 
     pi_k = n_k / n,  mu_k = s_k / n_k,  Sigma_k = S_k / n_k - mu_k mu_k' + floor
 
@@ -222,7 +222,7 @@ def m_step(
 
 
 def _collapsed(count: Tensor, spread: Tensor, floor: Tensor) -> Tensor:
-    """Which components [K] are empty, below the floor everywhere, or not positive definite."""
+    """Return which components [K] are empty, below the floor everywhere, or not positive definite."""
     n_components, dim = spread.shape[:2]
     least = min(dim + 1.0, float(count.sum()) / (10 * n_components))
     usable = torch.isfinite(spread).all(-1).all(-1)
@@ -368,7 +368,7 @@ class IterationBar:
 
 
 def map_mixture(state: MixtureParameters, matrix: Float[Tensor, "D D"]) -> MixtureParameters:
-    """Mixture of A x, where `state` is that of x."""
+    """Return the mixture of A x, where `state` is that of x."""
     covariances = symmetrise(matrix @ state.covariances @ matrix.T)
     return MixtureParameters(state.weights, state.means @ matrix.T, covariances)
 
@@ -376,7 +376,7 @@ def map_mixture(state: MixtureParameters, matrix: Float[Tensor, "D D"]) -> Mixtu
 def whitening(
     x: Tensor, sample_weight: Tensor | None, diagonal: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean [D], x less it [D, N], and the factor [D, D] of the covariance of x, made regular."""
+    """Return the mean [D], x less it [D, N], and the factor [D, D] of the covariance of x, made regular."""
     share = None if sample_weight is None else sample_weight / sample_weight.sum()
     mean = x.mean(0) if share is None else share @ x
     centred = torch.sub(x.T, mean.unsqueeze(-1), out=x.new_empty(x.shape[1], len(x)))

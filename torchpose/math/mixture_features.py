@@ -34,7 +34,7 @@ class CyclicFeatures:
             self._products.append((ring[:half], ring[half:dim], self._phi[end:]))
 
     def of(self, points: Float[Tensor, "D n"]) -> Float[Tensor, "F n"]:
-        """Features of a chunk of points."""
+        """Return the features of a chunk of points."""
         dim = len(points)
         if points.shape[1] != self.width:
             return CyclicFeatures(points.T, points.shape[1]).of(points)
@@ -47,7 +47,7 @@ class CyclicFeatures:
 
 
 def cyclic_order(dim: int, device: torch.device) -> Int[Tensor, " F"]:
-    """Where the features of `CyclicFeatures` are in [1, x_i, x_i x_j (i <= j)], i before j."""
+    """Return where the features of `CyclicFeatures` are in [1, x_i, x_i x_j (i <= j)], i before j."""
     i = torch.arange(dim, device=device)
     left = i.repeat(dim // 2 + 1)[: dim * (dim + 1) // 2]
     right = (left + torch.arange(len(left), device=device) // dim) % dim

@@ -20,7 +20,7 @@ CHUNK = 8192
 def floor_variances(
     x: Float[Tensor, "N D"], relative: float, sample_weight: Float[Tensor, " N"] | None = None
 ) -> Float[Tensor, " D"]:
-    """Covariance floor of a fit: a share of the variance of the data in every dimension.
+    """Return the covariance floor of a fit: a share of the variance of the data in every dimension.
 
     Args:
         x: points.
@@ -44,7 +44,7 @@ def start_mixture(
     init: str = "k-means++",
     lloyd_steps: int = 10,
 ) -> MixtureParameters:
-    """A mixture to start EM from.
+    """Return a mixture to start EM from.
 
     Every component gets the covariance of the points around their centres, pooled over all
     components, so that a centre with few points does no harm.
@@ -122,7 +122,7 @@ def k_means(
 def _plus_plus(
     x: Tensor, n_clusters: int, generator: torch.Generator, shares: Tensor
 ) -> Float[Tensor, "K D"]:
-    """Centres at points, each the best of a few drawn in proportion to the squared distance."""
+    """Return the centres at points, each the best of a few drawn in proportion to the squared distance."""
     tries = 2 + int(math.log(n_clusters))
     chosen = [int(_draw(shares, 1, generator))]
     distance = (x - x[chosen[0]]).square().sum(-1)
@@ -140,7 +140,7 @@ def _plus_plus(
 
 
 def _nearest(x: Tensor, centres: Tensor) -> Int[Tensor, " N"]:
-    """Index of the nearest centre of every point."""
+    """Return the index of the nearest centre of every point."""
     offset = 0.5 * centres.square().sum(-1, keepdim=True)
     nearest = [(offset - centres @ chunk.T).argmin(0) for chunk in x.split(CHUNK)]
     return torch.cat(nearest)

@@ -24,7 +24,7 @@ def procrustes(
     target: Float[Tensor, "*batch N 3"],
     mask: Bool[Tensor, "*batch N"] | None = None,
 ) -> RigidMotion:
-    """Rigid motion without scale or reflection that brings each source closest to its target.
+    """Return the rigid motion without scale or reflection that brings each source closest to its target.
 
     min over R in SO(3), t of sum_n |R s_n + t - x_n|^2; with the centred cross-covariance
     U S V^T = sum_n x_n s_n^T, R = U diag(1, 1, det(U V^T)) V^T and t = mean x - R mean s.

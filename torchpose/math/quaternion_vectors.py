@@ -31,7 +31,7 @@ def within_unit_ball(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch
 
 
 def vector_to_quaternion(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
-    """The unit quaternion (x, y, z, w), w >= 0, of a quaternion vector.
+    """Return the unit quaternion (x, y, z, w), w >= 0, of a quaternion vector.
 
     w = sqrt(1 - |v|^2), whose slope is infinite at |v| = 1: within the rounding of the dtype w is 0
     there and has no slope.
@@ -50,13 +50,13 @@ def _squared_length(vector: Tensor) -> Tensor:
 
 
 def quaternion_to_vector(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
-    """The vector part of q or of -q, whichever has w >= 0; q and -q are the same rotation."""
+    """Return the vector part of q or of -q, whichever has w >= 0; q and -q are the same rotation."""
     vector, w = quaternion[..., :3], quaternion[..., 3:]
     return torch.where(w < 0, -vector, vector)
 
 
 def quaternion_vector_to_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrix R = I + 2 w [v]x + 2 [v]x^2 of a quaternion vector.
+    """Return the rotation matrix R = I + 2 w [v]x + 2 [v]x^2 of a quaternion vector.
 
     >>> quaternion_vector_to_matrix(torch.tensor([0.0, 1.0, 0.0])).diagonal()  # by pi about y
     tensor([-1.,  1., -1.])
@@ -77,7 +77,7 @@ def quaternion_vector_to_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tens
 def matrix_to_quaternion_vector(
     rotation: Float[Tensor, "*batch 3 3"],
 ) -> Float[Tensor, "*batch 3"]:
-    """Quaternion vector of a rotation matrix; the inverse of `quaternion_vector_to_matrix`.
+    """Return the quaternion vector of a rotation matrix; the inverse of `quaternion_vector_to_matrix`.
 
     R determines the matrix 4 q q^T; its row with the largest diagonal entry, at least 1, is q up to
     its length, which is stable at every angle, 0 and pi included.
@@ -101,14 +101,14 @@ def matrix_to_quaternion_vector(
 
 
 def conjugate(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """The inverse rotation: -v."""
+    """Return the inverse rotation: -v."""
     return -vector
 
 
 def compose(
     first: Float[Tensor, "*#batch 3"], second: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch 3"]:
-    """Quaternion vector of the product R(first) R(second).
+    """Return the quaternion vector of the product R(first) R(second).
 
     v = w_1 v_2 + w_2 v_1 + v_1 x v_2, with the sign that makes w_1 w_2 - v_1 . v_2 >= 0.
 
@@ -120,7 +120,7 @@ def compose(
 
 
 def cross_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """The matrix of the cross product, [v]x a = v x a."""
+    """Return the matrix of the cross product, [v]x a = v x a."""
     x, y, z = vector.unbind(-1)
     o = torch.zeros_like(x)
     return torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
@@ -136,7 +136,7 @@ def _product(a: Tensor, b: Tensor) -> Tensor:
 def minimal_rotation(
     start: Float[Tensor, "*#batch 3"], end: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch 3"]:
-    """The rotation by the smallest angle that turns one direction into another: swing, no twist.
+    """Return the rotation by the smallest angle that turns one direction into another: swing, no twist.
 
     v = a x h,   h = (a + b) / |a + b|, the direction half way.
 
@@ -155,7 +155,7 @@ def minimal_rotation(
 
 
 def _across(direction: Tensor) -> Tensor:
-    """A direction at right angles to another: across its smallest coordinate's axis."""
+    """Return a direction at right angles to another: across its smallest coordinate's axis."""
     least = direction.detach().abs().argmin(-1, keepdim=True)
     axis = torch.zeros_like(direction).scatter(-1, least, 1.0)
     return torch.linalg.cross(direction, axis)
@@ -164,7 +164,7 @@ def _across(direction: Tensor) -> Tensor:
 def mean_rotation(
     vectors: Float[Tensor, "*batch N 3"], weights: Float[Tensor, "*#batch N"] | None = None
 ) -> Float[Tensor, "*batch 3"]:
-    """Mean of rotations: the quaternion q that maximises sum_n w_n (q . q_n)^2.
+    """Return the mean of rotations: the quaternion q that maximises sum_n w_n (q . q_n)^2.
 
     It is the leading eigenvector of sum_n w_n q_n q_n^T, so that q and -q count alike.
 

@@ -41,7 +41,7 @@ _RIGHT = ((4, 3, -2, 1), (-3, 4, 1, 2), (2, -1, 4, 3), (-1, -2, -3, 4))
 
 
 def safe_centre(vectors: Float[Tensor, "*batch N 3"]) -> Float[Tensor, "*batch 3"]:
-    """The training rotation that all others are nearest to: centre of a safe space for them.
+    """Return the training rotation that all others are nearest to: centre of a safe space for them.
 
     arg max_{q_i} 1/m sum_j (q_i^-1 q_j) . [1, 0, 0, 0]   (DX 1)
 
@@ -77,7 +77,7 @@ def safe_centre(vectors: Float[Tensor, "*batch N 3"]) -> Float[Tensor, "*batch 3
 def angle_to_edge(
     vectors: Float[Tensor, "*batch N 3"], centre: Float[Tensor, "*#batch 3"] | None = None
 ) -> Float[Tensor, "*batch"]:
-    """How far the farthest of the rotations stays from the edge of the space around a centre.
+    """Return how far the farthest of the rotations stays from the edge of the space around a centre.
 
     pi - 2 arcsin(max_n |x_n|): 0 at the edge |x| = 1, pi where all rotations are the centre.
 
@@ -99,7 +99,7 @@ def fit_gaussian(
     centre: Float[Tensor, "*#batch 3"] | None = None,
     log_weights: Float[Tensor, "*#batch N"] | None = None,
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3 3"]]:
-    """Mean and covariance of rotations in the space around a centre.
+    """Return the mean and covariance of rotations in the space around a centre.
 
     Args:
         vectors: rotations as quaternion vectors without a centre, [..., N, 3].
@@ -119,7 +119,7 @@ def rotate_gaussian(
     new_centre: Float[Tensor, "*#batch 3"] | None = None,
     directions: Directions = "eigen",
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3 3"]]:
-    """F(q, N(x)): the Gaussian of q C R(x), a rotation applied after one that is uncertain.
+    """Return F(q, N(x)), the Gaussian of q C R(x): a known rotation applied after one that is uncertain.
 
     N(x'; mu', Sigma') = F(q, N(x; mu, Sigma)),   C' R(x') = q C R(x),   by sigma points (DX 2)
 
@@ -151,7 +151,7 @@ def gaussian_rotate(
     new_centre: Float[Tensor, "*#batch 3"] | None = None,
     directions: Directions = "eigen",
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3 3"]]:
-    """F(N(x), q): the Gaussian of C R(x) q, an uncertain rotation applied after one that is known.
+    """Return F(N(x), q), the Gaussian of C R(x) q: an uncertain rotation applied after one that is known.
 
     N(x'; mu', Sigma') = F(N(x; mu, Sigma), q),   C' R(x') = C R(x) q,   by sigma points (DX 2)
 
@@ -175,7 +175,7 @@ def turn_gaussian(
     right: Float[Tensor, "*#batch 3"] | None = None,
     directions: Directions = "eigen",
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3 3"]]:
-    """The Gaussian of an uncertain rotation between two known ones, R(x') = a R(x) b.
+    """Return the Gaussian of an uncertain rotation between two known ones, R(x') = a R(x) b.
 
     Products of quaternions are linear, so that a and b make one matrix of four rows for all sigma
     points. Each of them comes out as the quaternion of the two, q or -q, that is nearer to the
@@ -202,7 +202,7 @@ def sigma_quaternions(
     covariance: Float[Tensor, "*#batch 3 3"],
     directions: Directions = "eigen",
 ) -> Float[Tensor, "*batch 7 4"]:
-    """The quaternions (x, y, z, w) of the mean and of the six sigma points, in this order."""
+    """Return the quaternions (x, y, z, w) of the mean and of the six sigma points, in this order."""
     points = sigma_points(mean, covariance, directions=directions)
     middle = mean[..., None, :].expand(*points.shape[:-2], 1, 3)
     return vector_to_quaternion(torch.cat([middle, points], -2))
@@ -222,12 +222,12 @@ def quaternion_moments(
 
 
 def left_matrix(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """The matrix that multiplies quaternions by another from the left: L(a) b = a b."""
+    """Return the matrix that multiplies quaternions by another from the left: L(a) b = a b."""
     return _product_matrix(quaternion, _LEFT)
 
 
 def right_matrix(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """The matrix that multiplies quaternions by another from the right: R(a) b = b a."""
+    """Return the matrix that multiplies quaternions by another from the right: R(a) b = b a."""
     return _product_matrix(quaternion, _RIGHT)
 
 

@@ -26,7 +26,7 @@ ROTATION_ORDERS: tuple[RotationOrder, ...] = ("zxy", "zyx")
 def euler_to_matrix(
     angles: Float[Tensor, "*batch 3"], order: RotationOrder = "zxy"
 ) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrix of roll, pitch and yaw.
+    """Return the rotation matrix of roll, pitch and yaw.
 
     ``zxy``: R = Rz(roll) Rx(pitch) Ry(yaw), the paper's (BL 3).
     ``zyx``: R = Rz(roll) Ry(yaw) Rx(pitch), the authors' released code and priors.
@@ -67,7 +67,7 @@ def euler_to_matrix(
 def matrix_to_euler(
     rotation: Float[Tensor, "*batch 3 3"], order: RotationOrder = "zxy"
 ) -> Float[Tensor, "*batch 3"]:
-    """Roll, pitch and yaw of a rotation matrix; the inverse of `euler_to_matrix`.
+    """Return the roll, pitch and yaw of a rotation matrix; the inverse of `euler_to_matrix`.
 
     The middle angle (pitch for ``zxy``, yaw for ``zyx``) comes back in [-pi/2, pi/2]. Where it is
     a right angle the other two are not unique: roll is then 0 and gradients are undefined.
@@ -100,7 +100,7 @@ def matrix_to_euler(
 
 
 def rotvec_to_matrix(rotvec: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrix of a Rodrigues vector (axis times angle, radians), as in camera files.
+    """Return the rotation matrix of a Rodrigues vector (axis times angle, radians), as in camera files.
 
     R = I + (sin a / a) [v]x + ((1 - cos a) / a^2) [v]x^2,   a = |v|, by series near zero.
     """

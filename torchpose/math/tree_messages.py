@@ -42,7 +42,7 @@ class MessageTree(NamedTuple):
 
 
 def message_tree(edges: Int[Tensor, "E 2"], n_nodes: int) -> MessageTree:
-    """The order in which messages pass along the edges of a tree, or of several (a forest).
+    """Return the order in which messages pass along the edges of a tree, or of several (a forest).
 
     Args:
         edges: [E, 2], indices of the node above and the node below. n_nodes: V.
@@ -87,7 +87,7 @@ def propagate(
     tree: MessageTree,
     transport: Transport,
 ) -> tuple[Float[Tensor, "*batch V D"], Float[Tensor, "*batch V D D"]]:
-    """Posterior of every node of a tree, given a Gaussian observation of each (DX 5-8).
+    """Return the posterior of every node of a tree, given a Gaussian observation of each (DX 5-8).
 
     N(x_i; mu_i^ij, S_i^ij) = N(x_i; mu_i^obs, S_i^obs) prod_{k != j} N(x_i; mu_i^ki, S_i^ki)   (DX 8)
     p(x_j | O) = N(x_j; mu_j^obs, S_j^obs) prod_i N(x_j; mu_j^ij, S_j^ij)                       (DX 6)
@@ -145,7 +145,7 @@ def propagate(
 
 
 def _information(mean: Tensor, covariance: Tensor) -> Tensor:
-    """Precision and shift side by side, [P | P mu] of shape [..., D, D + 1]."""
+    """Return the precision and shift side by side, [P | P mu] of shape [..., D, D + 1]."""
     least = torch.finfo(mean.dtype).eps ** (2 / 3)
     scale = covariance.diagonal(dim1=-2, dim2=-1).mean(-1)
     factor, info = torch.linalg.cholesky_ex(covariance)
@@ -158,7 +158,7 @@ def _information(mean: Tensor, covariance: Tensor) -> Tensor:
 
 
 def _moments(information: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and covariance of [P | h]: P^-1 h and P^-1."""
+    """Return the mean and covariance of [P | h]: P^-1 h and P^-1."""
     solved = _solved(safe_cholesky(information[..., :-1]), information[..., -1])
     return solved[..., -1], solved[..., :-1]
 
@@ -172,7 +172,7 @@ def _solved(factor: Tensor, vector: Tensor) -> Tensor:
 
 
 def tree_levels(parents: Sequence[int], names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
-    """Nodes of a forest by their depth, the roots (parent -1) first.
+    """Return the nodes of a forest by their depth, the roots (parent -1) first.
 
     Args:
         parents: index of every node's parent, -1 for a root.

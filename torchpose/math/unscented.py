@@ -38,7 +38,7 @@ def sigma_points(
     centre: bool = False,
     directions: Directions = "eigen",
 ) -> Float[Tensor, "*batch S D"]:
-    """Points of equal weight that have the mean and the covariance of a Gaussian.
+    """Return the points of equal weight that have the mean and the covariance of a Gaussian.
 
     sigma_d = mu + sqrt(k v_d) e_d,   sigma_{D+d} = mu - sqrt(k v_d) e_d   (DX 2)
 
@@ -84,7 +84,7 @@ def sigma_points(
 def moments(
     points: Float[Tensor, "*batch S D"], log_weights: Float[Tensor, "*#batch S"] | None = None
 ) -> tuple[Float[Tensor, "*batch D"], Float[Tensor, "*batch D D"]]:
-    """Mean and covariance of weighted points; the covariance is symmetric by construction.
+    """Return the mean and covariance of weighted points; the covariance is symmetric by construction.
 
     mu = sum_s w_s p_s,   Sigma = sum_s w_s (p_s - mu)(p_s - mu)^T,   sum_s w_s = 1
 
@@ -117,7 +117,7 @@ def unscented_transform(
     centre: bool = False,
     directions: Directions = "eigen",
 ) -> tuple[Tensor, Tensor]:
-    """Mean and covariance of a function of a Gaussian variable, from its sigma points.
+    """Return the mean and covariance of a function of a Gaussian variable, from its sigma points.
 
     Both are exact where the function is linear, the mean where it is quadratic; in general they are
     right up to the second order of the function's Taylor series.
@@ -150,7 +150,7 @@ def unscented_update(
     centre: bool = False,
     directions: Directions = "eigen",
 ) -> tuple[Float[Tensor, "*batch D"], Float[Tensor, "*batch D D"], Float[Tensor, "*batch"]]:
-    """Measurement update of an unscented Kalman filter: z = h(x) + N(0, R).
+    """Compute the measurement update of an unscented Kalman filter: z = h(x) + N(0, R).
 
     K = C S^-1,   mu' = mu + K (z - mu_h),   Sigma' = Sigma - K S K^T,   S = Sigma_h + R
 
@@ -175,7 +175,7 @@ def unscented_update(
 def floor_eigenvalues(
     covariance: Float[Tensor, "*batch D D"], least: float
 ) -> Float[Tensor, "*batch D D"]:
-    """Covariances whose eigenvalues below `least` are raised to it; their eigenvectors stay.
+    """Return the covariances whose eigenvalues below `least` are raised to it; their eigenvectors stay.
 
     What few points measured has no variance across them (two points and five of no weight: rank 1),
     and would outweigh everything else there.

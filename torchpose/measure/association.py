@@ -147,13 +147,13 @@ class HandAssociation(nn.Module):
         return found.sum(-1) / length.clamp_min(1.0)
 
     def exchange(self, state: AssociationState, which: Bool[Tensor, " N"]) -> AssociationState:
-        """The state after somebody has exchanged these persons' hands upstream."""
+        """Return the state after somebody has exchanged these persons' hands upstream."""
         votes = torch.where(which[:, None], state.votes.flip(1), state.votes)
         return state._replace(votes=votes, swapped=state.swapped ^ which)
 
 
 def _matched(state: AssociationState, identity: Tensor) -> AssociationState:
-    """The state's rows in the order of `identity`; newcomers have no votes."""
+    """Return the state's rows in the order of `identity`; newcomers have no votes."""
     rows = match_rows(state.identity, identity)
     votes = torch.cat([state.votes, state.votes.new_zeros(1, 2)])[rows]
     swapped = torch.cat([state.swapped, state.swapped.new_zeros(1)])[rows]

@@ -27,7 +27,7 @@ def person_region(
     scale: float = 1.0,
     widest: tuple[float, float] = _WIDEST,
 ) -> NDArray[np.bool_]:
-    """Where the bodies below these faces may be: generous trapezoids, bool [height, width].
+    """Return where the bodies below these faces may be: generous trapezoids, bool [height, width].
 
     Args:
         faces: centre (x, y) and size, pixels. scale: pixels of the result for one of theirs.
@@ -205,7 +205,7 @@ class BackgroundModel:
 
 
 def _distance(a: Image, b: Image) -> Image:
-    """Largest difference over the channels."""
+    """Return the largest difference over the channels."""
     import cv2
 
     channels = cv2.split(cv2.absdiff(a, b))

@@ -120,7 +120,7 @@ def cut_windows(
 def cut_colours(
     frame: Image, anchors: Float[Tensor, "N 3"], part: tuple[slice, slice]
 ) -> tuple[UInt8[Tensor, "N 3 h w"], Float[Tensor, "N 3 h w"], UInt8[Tensor, "N 3 p q"]]:
-    """Windows in Lab, bytes [N, 3, 160, 192], the same smoothed, and a finer part [N, 3, p, q].
+    """Return the windows in Lab, bytes [N, 3, 160, 192], the same smoothed, and a finer part [N, 3, p, q].
 
     By OpenCV, for one person after the other, as in `cut_windows`.
 
@@ -144,7 +144,7 @@ def cut_colours(
 
 
 def cut_mask(mask: Image, anchors: Float[Tensor, "N 3"]) -> Float[Tensor, "N h w"]:
-    """Windows of a mask of 0 and 255, as shares [N, 160, 192].
+    """Return the windows of a mask of 0 and 255, as shares [N, 160, 192].
 
     Args:
         mask: [H, W]. anchors: from `place_windows`.
@@ -159,7 +159,7 @@ def _halved(maps: Tensor) -> Tensor:
 
 
 def _pixels_to_one(size: Tensor) -> Tensor:
-    """Pixels of the image, along a side, that become about one of the window."""
+    """Return the pixels of the image, along a side, that become about one of the window."""
     step = (size * CELL / COLOURS).round().clamp_min(1)
     return torch.where(step > _FINEST, 2 * (step / 2).round(), step)
 
@@ -167,7 +167,7 @@ def _pixels_to_one(size: Tensor) -> Tensor:
 def _blocks(
     image: Image, left: int, top: int, width: int, height: int, step: int
 ) -> tuple[Image, tuple[int, int, int, int]]:
-    """The part of a smaller image that exists, and how much is missing above, below, left, right."""
+    """Return the part of a smaller image that exists, and how much is missing above, below, left, right."""
     import cv2
 
     rows, columns = max(1, image.shape[0] // step), max(1, image.shape[1] // step)
@@ -191,7 +191,7 @@ def _blocks(
 def inside_image(
     anchors: Float[Tensor, "N 3"], width: int, height: int, per_cell: int = 1
 ) -> Float[Tensor, "N h w"]:
-    """Share of each cell (or of its finer pixels) that lies in the image.
+    """Return the share of each cell (or of its finer pixels) that lies in the image.
 
     Args:
         anchors: (x, y, B), pixels. width, height: of the image. per_cell: finer pixels to a cell.
@@ -214,7 +214,7 @@ def _inside(anchors: tuple[float, ...], width: int, height: int, per_cell: int) 
 
 @cache
 def cell_centres(per_cell: int = 1) -> Float[Tensor, "h w 2"]:
-    """Places (x, y) of the cells (or of their finer pixels), in B from the anchor."""
+    """Return the places (x, y) of the cells (or of their finer pixels), in B from the anchor."""
     rows, columns = CELLS[0] * per_cell, CELLS[1] * per_cell
     x = _LEFT + (torch.arange(columns) + 0.5) * (CELL / per_cell)
     y = _TOP + (torch.arange(rows) + 0.5) * (CELL / per_cell)
@@ -224,7 +224,7 @@ def cell_centres(per_cell: int = 1) -> Float[Tensor, "h w 2"]:
 def pixels_to_cells(
     points: Float[Tensor, "N K 2"], anchors: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N K 2"]:
-    """Places in the image to places in cells, the first cell's centre being 0."""
+    """Convert places in the image to places in cells, the first cell's centre being 0."""
     first = points.new_tensor([_LEFT, _TOP]) + CELL / 2
     return ((points - anchors[:, None, :2]) / anchors[:, None, 2:] - first) / CELL
 
@@ -232,7 +232,7 @@ def pixels_to_cells(
 def cells_to_pixels(
     places: Float[Tensor, "N K 2"], anchors: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N K 2"]:
-    """Places in cells to places in the image."""
+    """Convert places in cells to places in the image."""
     first = places.new_tensor([_LEFT, _TOP]) + CELL / 2
     return anchors[:, None, :2] + (places * CELL + first) * anchors[:, None, 2:]
 
@@ -240,7 +240,7 @@ def cells_to_pixels(
 def faces_in_evidence(
     faces: Float[Tensor, "N 3"], anchors: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N 3"]:
-    """Faces (x, y, B) in pixels of the finer maps, the first pixel's centre being 0."""
+    """Return the faces (x, y, B) in pixels of the finer maps, the first pixel's centre being 0."""
     at = pixels_to_cells(faces[:, None, :2], anchors)[:, 0]
     size = faces[:, 2:] / (anchors[:, 2:] * CELL)
     return torch.cat([(at + 0.5) * EVIDENCE - 0.5, size * EVIDENCE], 1).float()
@@ -269,7 +269,7 @@ def move_maps(
 def gaussian_matrix(
     size: int, sigma: float, shift: Float[Tensor, "*batch"] | None = None
 ) -> Float[Tensor, "*batch size size"]:
-    """Matrix G that blurs a row of `size` cells, and moves it by `shift` cells: out = G in.
+    """Return the matrix G that blurs a row of `size` cells, and moves it by `shift` cells: out = G in.
 
     Two of them blur a map: G_y map G_x^T. Every column sums to one, so no mass is lost at the border.
 

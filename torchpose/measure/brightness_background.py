@@ -136,7 +136,7 @@ class BrightnessBackground(nn.Module):
         return Distortion((alpha - 1) / self.brightness_rms, chroma / self.chromaticity_rms)
 
     def forward(self, images: UInt8[Tensor, "*batch 3 H W"]) -> Int[Tensor, "*batch H W"]:
-        """The `PixelKind` of every pixel.
+        """Return the `PixelKind` of every pixel.
 
         Raises:
             ShapeError: another size than learnt. InputError: nothing was learnt.

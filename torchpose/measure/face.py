@@ -234,11 +234,11 @@ class FaceTracker(nn.Module):
         )
 
     def usable(self, tracks: FaceTracks) -> Bool[Tensor, " N"]:
-        """Which tracks have lasted long enough to be used."""
+        """Return which tracks have lasted long enough to be used."""
         return tracks.hits >= self.min_hits
 
     def step(self, tracks: FaceTracks, image: Image) -> FaceTracks:
-        """The faces of the next frame.
+        """Return the faces of the next frame.
 
         Args:
             tracks: from `init` or the step before. image: grey, [H, W], uint8.

@@ -27,7 +27,7 @@ _PART_ROWS, _PART_COLUMNS = slice(0, 54), slice(24, 72)  # cells of the window w
 
 
 def head_part(per_cell: int) -> tuple[slice, slice]:
-    """Rows and columns of a map of the window in which head and neck lie."""
+    """Return the rows and columns of a map of the window in which head and neck lie."""
     return tuple(  # type: ignore[return-value]
         slice(part.start * per_cell, part.stop * per_cell) for part in (_PART_ROWS, _PART_COLUMNS)
     )
@@ -166,7 +166,7 @@ def head_mask() -> Float[Tensor, "104 72"]:
 
 
 def _box(size: int, width: int) -> Tensor:
-    """Matrix of a mean over `width` neighbours; beyond the ends the row is mirrored."""
+    """Return the matrix of a mean over `width` neighbours; beyond the ends the row is mirrored."""
     place = torch.arange(size)[:, None] + torch.arange(width) - width // 2
     place = place.abs()
     place = torch.where(place >= size, 2 * (size - 1) - place, place)
@@ -181,7 +181,7 @@ def _patch_places() -> Tensor:
 
 
 def _sample(part: Tensor, at: Tensor) -> Tensor:
-    """Patch of head and neck from `head_part` of a map."""
+    """Return the patch of head and neck from `head_part` of a map."""
     places, middle, half = _part_grid()
     centre = (at[:, None, None, :2] - middle) / half
     grid = places * at[:, 2, None, None, None] + centre
@@ -190,14 +190,14 @@ def _sample(part: Tensor, at: Tensor) -> Tensor:
 
 @cache
 def _part_grid() -> tuple[Tensor, Tensor, Tensor]:
-    """Places of the patch in halves of `head_part`, its middle, and its half width and height."""
+    """Return the places of the patch in halves of `head_part`, its middle, and its half width and height."""
     part = cell_centres()[_PART_ROWS, _PART_COLUMNS]
     half = (part[-1, -1] - part[0, 0] + CELL) / 2
     return _patch_places() / half, (part[-1, -1] + part[0, 0]) / 2, half
 
 
 def _best_shift(model: Tensor, patch: Tensor) -> Tensor:
-    """How far the face has moved from the middle of its patch [N, 2], in pixels of it.
+    """Return how far the face has moved from the middle of its patch [N, 2], in pixels of it.
 
     By normalised correlation at every shift, over every second pixel.
     """
@@ -225,7 +225,7 @@ def _to_window(patch: Tensor, at: Tensor) -> Tensor:
 
 @cache
 def _window_grid() -> tuple[Tensor, Tensor, Tensor]:
-    """Places of `head_part` in halves of the patch, its middle, and its half width and height."""
+    """Return the places of `head_part` in halves of the patch, its middle, and its half width and height."""
     half = torch.tensor([_HALF_WIDTH, _HEIGHT / 2])
     places = cell_centres(EVIDENCE)[head_part(EVIDENCE)] / half
     return places, torch.tensor([0.0, _TOP + _HEIGHT / 2]), half

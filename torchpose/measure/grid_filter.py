@@ -32,7 +32,7 @@ class GridEstimate(NamedTuple):
 def blur(
     maps: Float[Tensor, "*batch h w"], sigma: float, shift: Float[Tensor, "*batch 2"] | None = None
 ) -> Float[Tensor, "*batch h w"]:
-    """Gaussian blur by two products with matrices, and a move by `shift` (x, y), in cells."""
+    """Blur by a Gaussian, by two products with matrices, and move by `shift` (x, y), in cells."""
     if sigma == 0 and shift is None:
         return maps
     height, width = maps.shape[-2:]
@@ -45,7 +45,7 @@ def blur(
 def gaussian_bump(
     mean: Float[Tensor, "*batch 2"], cov: Float[Tensor, "*batch 2 2"], size: tuple[int, int]
 ) -> Float[Tensor, "*batch h w"]:
-    """Gaussians over a grid, each of which sums to one.
+    """Return Gaussians over a grid, each of which sums to one.
 
     Args:
         mean: (x, y), in cells. cov: cells squared. size: rows and columns.
@@ -132,7 +132,7 @@ def exclude(
 def _told(
     other: Tensor, hand: int, radius: float, soft: float
 ) -> tuple[Float[Tensor, "N h w"], Float[Tensor, "N 1 w"]]:
-    """Where the other hand is near, and the columns that lie on its wrong side."""
+    """Return where the other hand is near, and the columns that lie on its wrong side."""
     columns = other.sum(1, keepdim=True)
     scale = 1.2 * 2 * math.pi * radius * radius / columns.sum(2, keepdim=True)
     near = (blur(other, radius) * scale).clamp_(0, 1)
@@ -148,7 +148,7 @@ def _side_matrix(size: int, soft: float, hand: int) -> Tensor:
 
 
 def read_out(belief: Float[Tensor, "N 2 h w"], smooth: float, within: float) -> GridEstimate:
-    """Mean, covariance and mass about the highest place of each smoothed belief.
+    """Return the mean, covariance and mass about the highest place of each smoothed belief.
 
     Args:
         belief: sums to one. smooth: standard deviation before the mode is looked for, cells.

@@ -118,7 +118,7 @@ class HandLikelihood(nn.Module):
 
 @cache
 def _grid() -> tuple[Tensor, Tensor, Tensor]:
-    """Places of the cells, the middle of the window, and half its width and height, in B."""
+    """Return the places of the cells, the middle of the window, and half its width and height, in B."""
     places = cell_centres()
     half = (places[-1, -1] - places[0, 0] + CELL) / 2
     return places, (places[-1, -1] + places[0, 0]) / 2, half

@@ -55,7 +55,7 @@ class HandPrior(nn.Module):
 
     @classmethod
     def from_prior(cls, prior: UpperBodyPrior) -> "HandPrior":
-        """The tables of a prior over poses, whatever its camera; kept for the next call.
+        """Return the tables of a prior over poses, whatever its camera; kept for the next call.
 
         The depth of the head is summed over five nodes of Gauss-Hermite quadrature; given it, the
         offsets are Gaussian for every component, so nothing is sampled.
@@ -114,7 +114,7 @@ def _places() -> Float[Tensor, "P 2"]:
 def _offsets(
     mixture: GaussianMixture, focal: tuple[float, float]
 ) -> tuple[Float[Tensor, " M"], Float[Tensor, "M 4"], Float[Tensor, "M 4 4"]]:
-    """Hand and elbow from the head, in B, as a mixture: every component at every depth."""
+    """Return the hand and elbow from the head, in B, as a mixture: every component at every depth."""
     mean, cov = mixture.means.double(), mixture.covariances.double()
     node, share = _hermite(_NODES)
     spread = cov[:, _DEPTH, _DEPTH].sqrt()
@@ -142,7 +142,7 @@ def _offsets(
 
 
 def _hermite(nodes: int) -> tuple[Float[Tensor, " J"], Float[Tensor, " J"]]:
-    """Nodes and weights for expectations under N(0, 1): eigenvalues of the Jacobi matrix."""
+    """Return the nodes and weights for expectations under N(0, 1): eigenvalues of the Jacobi matrix."""
     off = torch.arange(1, nodes, dtype=torch.float64).sqrt()
     place, vectors = torch.linalg.eigh(torch.diag(off, 1) + torch.diag(off, -1))
     return place, vectors[0].square()

@@ -136,7 +136,7 @@ class HandTracker(nn.Module):
         foreground: Image | None = None,
         expected: tuple[Float[Tensor, "N 2 2"], Float[Tensor, "N 2 2 2"]] | None = None,
     ) -> tuple[HandState, HandMeasurements]:
-        """The hands in the next frame.
+        """Return the hands in the next frame.
 
         Args:
             state: from `init` or the step before; its persons are matched by number.
@@ -206,7 +206,7 @@ class HandTracker(nn.Module):
         )  # fmt: skip
 
     def _follow(self, state: HandState, faces: Tensor) -> HandState:
-        """Windows that go with their faces, and belief and images that go with the windows."""
+        """Return the windows that go with their faces, and belief and images that go with the windows."""
         s = self.settings
         anchors, moved = follow_faces(state.anchors, faces, s.stray, s.rescale)
         if not bool(moved.any()):
@@ -266,7 +266,7 @@ class HandTracker(nn.Module):
         anchors: Tensor,
         expected: tuple[Tensor, Tensor] | None,
     ) -> Tensor:
-        """Where a hand may be that was lost: before the face it would be seen to come."""
+        """Return where a hand may be that was lost: before the face it would be seen to come."""
         cost = self.settings.face_rebirth * _before_face(faces, anchors)[:, None]
         born = torch.softmax((log_prior - cost).flatten(2), 2).view_as(log_prior)
         if expected is None:
@@ -356,7 +356,7 @@ def _before_face(faces: Tensor, anchors: Tensor) -> Tensor:
 
 
 def _hands_near(belief: Tensor) -> Tensor:
-    """Probability that a cell belongs to a hand [N, r, c]."""
+    """Return the probability that a cell belongs to a hand [N, r, c]."""
     rows, columns = (_band(n) for n in CELLS)
     return (rows @ belief.sum(1) @ columns).clamp(0, 1)
 
@@ -368,7 +368,7 @@ def _band(size: int) -> Tensor:
 
 
 def _map(function: Any, *states: Any) -> Any:
-    """A NamedTuple of tensors (or of such tuples) from several of its kind."""
+    """Return a NamedTuple of tensors (or of such tuples) from several of its kind."""
     if isinstance(states[0], Tensor):
         return function(*states)
     parts = (_map(function, *part) for part in zip(*states, strict=True))

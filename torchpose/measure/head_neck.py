@@ -69,7 +69,7 @@ class HeadNeck(nn.Module):
     def forward(
         self, faces: Float[Tensor, "N 3"], face_cov: Float[Tensor, "N 3 3"] | None = None
     ) -> tuple[Float[Tensor, "N 2 2"], Float[Tensor, "N 2 2 2"]]:
-        """Head and neck, in this order, and their covariances, pixels.
+        """Return the head and neck, in this order, and their covariances, pixels.
 
         Args:
             faces: centre (x, y) and size B, pixels. face_cov: how well these are known.

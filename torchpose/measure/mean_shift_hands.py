@@ -168,7 +168,7 @@ class MeanShiftHandTracker(nn.Module):
         identity: Int[Tensor, " N"],
         foreground: Image | None = None,
     ) -> tuple[MeanShiftHandState, HandMeasurements]:
-        """The hands in the next frame.
+        """Return the hands in the next frame.
 
         Args:
             state: from `init` or the step before. frame: RGB [H, W, 3], uint8.
@@ -197,7 +197,7 @@ class MeanShiftHandTracker(nn.Module):
         return state, _measurements(state, centre, noise, average, seen)
 
     def _look(self, state: MeanShiftHandState, view: ScaledFrame, rows: Tensor) -> _Look:
-        """The hands of some persons in an image that suits the size of their faces."""
+        """Return the hands of some persons in an image that suits the size of their faces."""
         faces, tracked = view.faces[rows], state.tracked[rows]
         predicted = view.from_frame(state.mean[rows, :, :2])
         colours = SkinState(*(table[rows] for table in state.skin))
@@ -217,7 +217,7 @@ class MeanShiftHandTracker(nn.Module):
         return _Look(colours, view.to_frame(centre), noise, average, seen)
 
     def _matched(self, state: MeanShiftHandState, identity: Tensor) -> MeanShiftHandState:
-        """The state's rows in the order of `identity`; who is new has neither hands nor colours."""
+        """Return the state's rows in the order of `identity`; who is new has neither hands nor colours."""
         identity = identity.to(state.identity)
         rows = match_rows(state.identity, identity)
         new = state.mean.new_zeros(1)
@@ -243,7 +243,7 @@ class MeanShiftHandTracker(nn.Module):
     def _skin(
         self, state: SkinState, bins: Tensor, faces: Tensor, predicted: Tensor, tracked: Tensor
     ) -> tuple[SkinState, Tensor]:
-        """Colours after this frame, and the likelihood of skin [N, H, W]."""
+        """Return the colours after this frame, and the likelihood of skin [N, H, W]."""
         discs = _squared_distance(predicted, bins.shape)
         discs = discs < (_HAND_RADIUS * faces[:, 2]).square()[:, None, None, None]
         hands = (discs & tracked[..., None, None]).any(1).to(faces)
@@ -267,7 +267,7 @@ class MeanShiftHandTracker(nn.Module):
     def _detect(
         self, maps: Tensor, faces: Tensor, rows: Tensor, tracked: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Best window where each hand may begin [N, 2, 2], and whether it is good enough.
+        """Return the best window where each hand may begin [N, 2, 2], and whether it is good enough.
 
         `faces` are those of everybody, and `rows` whose maps these are.
         """
@@ -285,7 +285,7 @@ class MeanShiftHandTracker(nn.Module):
         return start, (best > 0) & (better | ~same[:, None])
 
     def _areas(self, faces: Tensor, rows: Tensor, shape: tuple[int, int]) -> Tensor:
-        """How readily a hand is taken for the left or right one at each place [N, 2, H, W]."""
+        """Return how readily a hand is taken for the left or right one at each place [N, 2, H, W]."""
         x, y, size = faces[..., None].unbind(1)
         of_all = (torch.arange(shape[1]).to(faces) - x) / size
         across = of_all[rows]
@@ -329,19 +329,19 @@ class MeanShiftHandTracker(nn.Module):
 def _measurements(
     state: MeanShiftHandState, centre: Tensor, noise: Tensor, average: Tensor, seen: Tensor
 ) -> HandMeasurements:
-    """Where mean shift came to rest, with its covariance and that of the Kalman filter."""
+    """Return where mean shift came to rest, with its covariance and that of the Kalman filter."""
     points = torch.where(seen[..., None], centre, torch.nan)
     covariance = noise + torch.where(seen[..., None, None], state.cov[..., :2, :2], 0.0)
     return HandMeasurements(points, covariance, average.clamp(0, 1), seen)
 
 
 def _merged(parts: Sequence[tuple[Tensor, ...]], order: Tensor) -> list[Tensor]:
-    """Tensors of all groups of persons, in the order of the persons."""
+    """Return the tensors of all groups of persons, in the order of the persons."""
     return [torch.cat(tensors)[order] for tensors in zip(*parts, strict=True)]
 
 
 def _nothing(faces: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Centres, noise, average likelihood and `seen` of no persons."""
+    """Return the centres, noise, average likelihood and `seen` of no persons."""
     centre = faces.new_zeros(0, 2, 2)
     return centre, faces.new_zeros(0, 2, 2, 2), centre[..., 0], centre[..., 0] > 0
 

@@ -130,7 +130,7 @@ class MediaPipeFaceDetector(_Task):
 
 
 def _squares(width: int, height: int, tiles: int) -> list[tuple[int, int, int, int]]:
-    """Squares that cover an image, overlapping by half or more; none if one would be enough."""
+    """Return the squares that cover an image, overlapping by half or more; none if one would be enough."""
     if tiles == 1:
         return []
     side = -(-min(width, height) // tiles)
@@ -275,7 +275,7 @@ def _require_model(path: str | Path, kind: str) -> Path:
 
 
 def _require_mediapipe() -> ModuleType:
-    """The package, with its Tasks API."""
+    """Return the package, with its Tasks API."""
     try:
         mediapipe = importlib.import_module("mediapipe")
     except ImportError as error:
@@ -294,7 +294,7 @@ def _require_mediapipe() -> ModuleType:
 
 
 def _load(task: Any, options: Any, path: Path, kind: str) -> Any:
-    """The task with its model; MediaPipe's errors depend on its version."""
+    """Return the task with its model; MediaPipe's errors depend on its version."""
     try:
         return task.create_from_options(options)
     except (RuntimeError, ValueError, OSError) as error:

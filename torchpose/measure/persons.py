@@ -31,7 +31,7 @@ class Persons(NamedTuple):
 
 
 def match_rows(known: Int[Tensor, " K"], wanted: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
-    """The row of each wanted person among the known ones, K for a newcomer.
+    """Return the row of each wanted person among the known ones, K for a newcomer.
 
     >>> match_rows(torch.tensor([7, 4]), torch.tensor([4, 9])).tolist()
     [1, 2]
@@ -41,7 +41,7 @@ def match_rows(known: Int[Tensor, " K"], wanted: Int[Tensor, " N"]) -> Int[Tenso
 
 
 def clothes_colours(image: Image, faces: Float[Tensor, "N 3"]) -> Float[Tensor, "N 512"]:
-    """Shares of the colours below each face, 8 x 8 x 8 bins of RGB; zero where nothing is seen."""
+    """Return the shares of the colours below each face, 8 x 8 x 8 bins of RGB; zero where nothing is seen."""
     found = [_histogram(image, face) for face in faces.tolist()]
     return torch.from_numpy(np.stack(found)) if found else torch.zeros(0, _BINS**3).double()
 

@@ -35,17 +35,17 @@ class ScaledFrame(NamedTuple):
     scale: Float[Tensor, " 2"]
 
     def from_frame(self, points: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
-        """Points (x, y) of the frame in pixels of this image."""
+        """Return the points (x, y) of the frame in pixels of this image."""
         # a pixel's centre has whole coordinates, its corner half of one less
         return (points + 0.5) * self.scale - 0.5
 
     def to_frame(self, points: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
-        """Points (x, y) of this image in pixels of the frame."""
+        """Return the points (x, y) of this image in pixels of the frame."""
         return (points + 0.5) / self.scale - 0.5
 
 
 def scales_of_faces(faces: Float[Tensor, "N 3"], frame: Image) -> Int[Tensor, " N"]:
-    """Pixels of the frame for one of the image in which each face has a size of some 19 pixels."""
+    """Return the pixels of the frame for one of the image in which each face has a size of some 19 pixels."""
     least = max(frame.shape[:2]) / _LARGEST_SIDE
     return (faces[:, 2] / _FACE_PIXELS).clamp_min(least).round().clamp_min(1).long()
 

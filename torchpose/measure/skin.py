@@ -152,14 +152,14 @@ class SkinModel(nn.Module):
         return state, self.find(state, bins)
 
     def find(self, state: SkinState, bins: Int[Tensor, "B H W"]) -> Float[Tensor, "B H W"]:
-        """Probability of skin of pixels whose bins are known (`bins`, `byte_bins`)."""
+        """Return the probability of skin of pixels whose bins are known (`bins`, `byte_bins`)."""
         table = self.probability(self.log_ratio(state)).flatten()
         first = torch.arange(len(bins), dtype=bins.dtype, device=bins.device) * int(np.prod(BINS))
         flat = (bins + first[:, None, None]).flatten()
         return table.index_select(0, flat).view(bins.shape)
 
     def byte_bins(self, lab: UInt8[Tensor, "B 3 H W"]) -> Int[Tensor, "B H W"]:
-        """Numbers of the bins of Lab in bytes, as OpenCV has it: 255/100 L, a + 128, b + 128.
+        """Return the numbers of the bins of Lab in bytes, as OpenCV has it: 255/100 L, a + 128, b + 128.
 
         The steps of L are 32 of 255 instead of 12.5 of 100, which is the same to 0.4 %.
         """
@@ -169,7 +169,7 @@ class SkinModel(nn.Module):
         return (((light >> 5) << 10) + (a << 5) + b).int()
 
     def bins(self, lab: Float[Tensor, "B 3 H W"]) -> Int[Tensor, "B H W"]:
-        """Number of each pixel's bin; colours beyond the histogram count to its border."""
+        """Return the number of each pixel's bin; colours beyond the histogram count to its border."""
         place = (lab - self.lowest[:, None, None]) / self.width[:, None, None]
         last = torch.tensor(BINS, device=lab.device)[:, None, None] - 1
         light, a, b = place.floor().long().clamp_min(0).minimum(last).unbind(1)
@@ -218,7 +218,7 @@ class SkinModel(nn.Module):
     def _parts(
         self, bins: Tensor, faces: Tensor, hands: Tensor | None, valid: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Colours of the face and of hands in front of it [B, 2, C], clothes and far [B, C]."""
+        """Return the colours of the face and of hands in front of it [B, 2, C], clothes and far [B, C]."""
         label = _labels(faces, bins.shape[1:])
         if hands is not None:
             label = label + (label == 1) * (hands >= _HAND_IN_FACE)
@@ -229,7 +229,7 @@ class SkinModel(nn.Module):
         return counts[:, 1:3], counts[:, 3], counts[:, 4]
 
     def _counts(self, bins: Tensor, label: Tensor) -> Tensor:
-        """Number of pixels of each label (0 to 4) and bin [B, 5, C]."""
+        """Return the number of pixels of each label (0 to 4) and bin [B, 5, C]."""
         batch, size = len(bins), int(np.prod(BINS))
         first = 5 * torch.arange(batch, dtype=bins.dtype, device=bins.device)
         index = (first[:, None, None] + label.to(bins.dtype)) * size + bins
@@ -237,7 +237,7 @@ class SkinModel(nn.Module):
         return counts.view(batch, 5, size).to(self.lowest)
 
     def _smoothed(self, counts: Tensor) -> Tensor:
-        """Shares of the colours [B, 3, 8, 32, 32], each axis smoothed by a product with a band."""
+        """Return the shares of the colours [B, 3, 8, 32, 32], each axis smoothed by a product with a band."""
         smooth = counts.view(-1, *BINS) @ self.smooth2
         smooth = self.smooth1 @ smooth
         smooth = (self.smooth0 @ smooth.flatten(2)).view(*counts.shape[:2], *BINS)
@@ -245,7 +245,7 @@ class SkinModel(nn.Module):
 
 
 def _band(size: int, kernel: tuple[float, ...]) -> Tensor:
-    """Symmetric matrix of a convolution with a symmetric kernel, zero beyond the ends."""
+    """Return the symmetric matrix of a convolution with a symmetric kernel, zero beyond the ends."""
     middle, eye = len(kernel) // 2, torch.eye(size)
     rows = torch.nn.functional.pad(eye, (middle, middle))
     return sum(  # type: ignore[return-value]

@@ -154,7 +154,7 @@ class SkinMixtureModel(nn.Module):
         return (_features(colours) @ _theta(state).mT).logsumexp(-1)
 
     def _sample(self, lab: Tensor, faces: Tensor, hands: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Colours of the middle of the faces [B, P, 3], and which of them count [B, P]."""
+        """Return the colours of the middle of the faces [B, P, 3], and which of them count [B, P]."""
         place = (faces[:, None, :2] + faces[:, None, 2:] * self.samples).round().long()
         height, width = lab.shape[2:]
         x, y = place.unbind(-1)
@@ -168,7 +168,7 @@ class SkinMixtureModel(nn.Module):
     def _fit(
         self, state: SkinMixtureState, colours: Tensor, weight: Tensor, due: Tensor
     ) -> SkinMixtureState:
-        """A few steps of EM for the faces that are due."""
+        """Run a few steps of EM for the faces that are due."""
         first = (state.frames == 0)[:, None, None]
         features = _features(colours)
         fitted = self._started(state, colours, weight)
@@ -184,7 +184,7 @@ class SkinMixtureModel(nn.Module):
     def _started(
         self, state: SkinMixtureState, colours: Tensor, weight: Tensor
     ) -> SkinMixtureState:
-        """Components of new faces begin at quantiles of the lightness."""
+        """Start the components of new faces at quantiles of the lightness."""
         order = torch.where(weight > 0, colours[..., 0], torch.inf).argsort(1)
         count = weight.sum(1, keepdim=True)
         share = (torch.arange(self.n_components).to(colours) + 0.5) / self.n_components
@@ -225,7 +225,7 @@ def _features(colours: Tensor) -> Tensor:
 
 
 def _theta(state: SkinMixtureState) -> Tensor:
-    """Coefficients of the features in the logarithm of each component [B, K, 10]."""
+    """Return the coefficients of the features in the logarithm of each component [B, K, 10]."""
     flat = (x.flatten(0, 1).double() for x in state[:3])
     return (
         natural_parameters(MixtureParameters(*flat)).view(*state.weights.shape, -1).to(state.means)
@@ -233,6 +233,6 @@ def _theta(state: SkinMixtureState) -> Tensor:
 
 
 def _expected(state: SkinMixtureState, features: Tensor, weight: Tensor) -> Tensor:
-    """Mean of the features under each component, by its responsibility (BL 53) [B, K, 10]."""
+    """Return the mean of the features under each component, by its responsibility (BL 53) [B, K, 10]."""
     share = (features @ _theta(state).mT).softmax(-1) * weight[..., None]
     return share.mT @ features / weight.sum(1).clamp_min(1)[:, None, None]

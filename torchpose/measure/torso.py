@@ -41,7 +41,7 @@ class TorsoElbows(NamedTuple):
 def clothes_likelihood(
     model: SkinModel, state: SkinState, bins: Int[Tensor, "N H W"], skin: bool = True
 ) -> Float[Tensor, "N H W"]:
-    """Probability that a pixel shows the person's clothes, or skin, rather than the background.
+    """Return the probability that a pixel shows the person's clothes, or skin, rather than the background.
 
     p = sigmoid(slope (log (p(c | clothes) + f) / (p(c | far) + f) - bias))
 
@@ -58,7 +58,7 @@ def clothes_likelihood(
 def elbows_from_torso(
     likelihood: Float[Tensor, "N H W"], faces: Float[Tensor, "N 3"], threshold: float = 0.4
 ) -> TorsoElbows:
-    """Elbows where the torso with the sleeves is widest.
+    """Return the elbows where the torso with the sleeves is widest.
 
     In every row below the shoulders the outline is followed from the face's axis to both sides. On
     each side the elbow is at the height at which it reaches farthest,
@@ -120,7 +120,7 @@ def elbows_from_torso(
 
 
 def _outline(body: Tensor, faces: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """How far the torso reaches in every row, and whether it meets the image's border, [N, H].
+    """Return how far the torso reaches in every row, and whether it meets the image's border, [N, H].
 
     Outwards from the axis, until a gap.
     """
@@ -137,7 +137,7 @@ def _outline(body: Tensor, faces: Tensor, side: int) -> tuple[Tensor, Tensor]:
 
 
 def _supported(far: Float[Tensor, "N S H"], size: Float[Tensor, " N"]) -> Float[Tensor, "N S H"]:
-    """The least reach over some rows about each one, as many as the person's own face has."""
+    """Return the least reach over some rows about each one, as many as the person's own face has."""
     rows = (_SUPPORT * size.double() / 2).round().long().clamp_min(1)
     most = int(rows.amax()) if len(rows) else 1
     offsets = torch.arange(-most, most + 1, device=far.device)
@@ -148,7 +148,7 @@ def _supported(far: Float[Tensor, "N S H"], size: Float[Tensor, " N"]) -> Float[
 
 
 def _at_the_end(far: Tensor, searched: Tensor) -> Tensor:
-    """Whether the torso is widest in the last of the searched rows: the elbow is further down."""
+    """Return whether the torso is widest in the last of the searched rows: the elbow is further down."""
     place = torch.arange(far.shape[2], device=far.device)
     last = torch.where(searched, place, -1).amax(2)
     return far.argmax(2) >= last - 1

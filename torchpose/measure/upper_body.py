@@ -196,7 +196,7 @@ class UpperBodyMeasurer(nn.Module):
         return MeasurerState(tracks, persons, hand_state, state.frame + 1), measured
 
     def _elbows(self, image: Image, faces: Tensor, skin: SkinState) -> TorsoElbows:
-        """Elbows from the extent of everybody's clothes, in images in which faces have one size.
+        """Return the elbows from the extent of everybody's clothes, in images in which faces have one size.
 
         A person's image depends on that person's face alone.
         """
@@ -212,7 +212,7 @@ class UpperBodyMeasurer(nn.Module):
         return TorsoElbows(*(torch.cat(parts)[order] for parts in zip(*found, strict=True)))
 
     def _elbows_at(self, image: Image, scale: float, faces: Tensor, skin: SkinState) -> TorsoElbows:
-        """Elbows of persons in an image that is made smaller by this factor."""
+        """Return the elbows of persons in an image that is made smaller by this factor."""
         import cv2
 
         shape = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))

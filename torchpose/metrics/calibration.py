@@ -47,7 +47,7 @@ class Coverage(NamedTuple):
 
 
 def chi2_cdf(x: Float[Tensor, "*batch"], dof: int = 3) -> Float[Tensor, "*batch"]:
-    """Distribution function of chi-square, P(dof/2, x/2) with the lower incomplete gamma function.
+    """Return the distribution function of chi-square, P(dof/2, x/2) with the lower incomplete gamma function.
 
     >>> chi2_cdf(torch.tensor([7.8147]))
     tensor([0.9500])
@@ -58,7 +58,7 @@ def chi2_cdf(x: Float[Tensor, "*batch"], dof: int = 3) -> Float[Tensor, "*batch"
 
 
 def chi2_quantile(p: Float[Tensor, "*batch"], dof: int = 3) -> Float[Tensor, "*batch"]:
-    """Inverse of `chi2_cdf`, by bisection in float64; 0 at p = 0, infinite at p = 1.
+    """Return the inverse of `chi2_cdf`, by bisection in float64; 0 at p = 0, infinite at p = 1.
 
     The squared radius of the ellipsoid that holds probability p of a Gaussian in `dof` dimensions.
 
@@ -88,7 +88,7 @@ def mahalanobis_squared(
     truth: Float[Tensor, "*batch J D"],
     mask: Bool[Tensor, "*batch J"] | None = None,
 ) -> Float[Tensor, "*batch J"]:
-    """Squared distance (x - m)^T C^-1 (x - m) of each true joint from its estimate.
+    """Return the squared distance (x - m)^T C^-1 (x - m) of each true joint from its estimate.
 
     Returns:
         [*batch, J]; NaN where masked, where anything is NaN, and where C is not positive definite.
@@ -114,7 +114,7 @@ def coverage(
     levels: Sequence[float] | Float[Tensor, " L"] = (0.5, 0.9),
     mask: Bool[Tensor, "*batch J"] | None = None,
 ) -> Coverage:
-    """Share of true joints that lie inside the ellipsoids of the given probabilities.
+    """Return the share of true joints that lie inside the ellipsoids of the given probabilities.
 
     Inside at level p: (x - m)^T C^-1 (x - m) <= q_p, q_p the chi-square quantile with D degrees of
     freedom. A calibrated tracker has a share of p. Align first (`align` turns C as well).
@@ -150,7 +150,7 @@ def reliability(
 
 
 def calibration_error(curve: Coverage) -> Float[Tensor, " J"]:
-    """Largest gap |share - nominal| over the levels, per joint (0.05 = 5 points)."""
+    """Return the largest gap |share - nominal| over the levels, per joint (0.05 = 5 points)."""
     return (curve.per_joint - curve.levels[:, None]).abs().amax(0)
 
 

@@ -140,7 +140,7 @@ def joint_errors(
     truth: Float[Tensor, "*batch J D"],
     mask: Bool[Tensor, "*batch J"] | None = None,
 ) -> Float[Tensor, "*batch J"]:
-    """Euclidean distance of every estimated joint from the true one.
+    """Return the Euclidean distance of every estimated joint from the true one.
 
     Args:
         estimate, truth: [*batch, J, D], D = 2 (pixels) or 3 (metres).
@@ -160,7 +160,7 @@ def joint_errors_2d(
     truth: Float[Tensor, "*batch J 2"],
     mask: Bool[Tensor, "*batch J"] | None = None,
 ) -> Float[Tensor, "*batch J"]:
-    """Distance in pixels (BL Figure 3), see `joint_errors`."""
+    """Return the distance in pixels (BL Figure 3), see `joint_errors`."""
     check_shape("estimate", estimate, ["...", None, 2])
     return joint_errors(estimate, truth, mask)
 
@@ -172,7 +172,7 @@ def joint_errors_3d(
     joints: Sequence[int] | None = ALIGN_JOINTS,
     procrustes: bool = True,
 ) -> Float[Tensor, "*batch J"]:
-    """Distance in metres after fixed-scale Procrustes (BL Figure 10), see `joint_errors`.
+    """Return the distance in metres after fixed-scale Procrustes (BL Figure 10), see `joint_errors`.
 
     Args:
         estimate, truth: [*batch, J, 3], metres.
@@ -187,7 +187,7 @@ def joint_errors_3d(
 
 
 def summarise_errors(errors: Float[Tensor, "*batch J"]) -> ErrorSummary:
-    """Mean of all errors pooled and per joint, NaN left out (and NaN where nothing is left)."""
+    """Return the mean of all errors pooled and per joint, NaN left out (and NaN where nothing is left)."""
     errors = as_values("errors", errors, ["...", None])
     flat = errors.reshape(-1, errors.shape[-1])
     flat = flat if len(flat) else flat.new_full((1, errors.shape[-1]), math.nan)
@@ -200,7 +200,7 @@ def summarise_errors(errors: Float[Tensor, "*batch J"]) -> ErrorSummary:
 def share_below(
     errors: Float[Tensor, "*batch J"], bound: float = 0.2
 ) -> tuple[Float[Tensor, " J"], Int[Tensor, " J"]]:
-    """Share of errors below a bound, per joint, and how many there were (NaN left out).
+    """Return the share of errors below a bound, per joint, and how many there were (NaN left out).
 
     The paper says that "for much of the time, the error in hand position remains below 20 cm"
     (BL section 6); this is that share.
@@ -240,7 +240,7 @@ def limb_hits(
     limbs: Sequence[tuple[int, int]] = ARM_LIMBS,
     mask: Bool[Tensor, "*batch J"] | None = None,
 ) -> tuple[Bool[Tensor, "*batch L P"], Bool[Tensor, "*batch L"]]:
-    """Which limbs are correct at which threshold, and which have a known truth; see `pcp`."""
+    """Return which limbs are correct at which threshold, and which have a known truth; see `pcp`."""
     estimate, truth = as_pair(estimate, truth, mask, ["...", None, None])
     thresholds = as_values("thresholds", thresholds, ["P"])
     ends = torch.tensor(limbs, device=estimate.device).reshape(-1, 2)
@@ -266,7 +266,7 @@ def pcp(
     limbs: Sequence[tuple[int, int]] = ARM_LIMBS,
     mask: Bool[Tensor, "*batch J"] | None = None,
 ) -> PCP:
-    """Percentage of correct parts (PCP) over a range of thresholds.
+    """Return the percentage of correct parts (PCP) over a range of thresholds.
 
     A limb is correct when BOTH its end points lie within threshold x true limb length of the true
     end points (Yang & Ramanan's definition; the common figure is the one at 0.5). The limbs are
@@ -301,7 +301,7 @@ def pcp(
 
 
 def jitter(points: Float[Tensor, "*batch T J D"], fps: float) -> Float[Tensor, "*batch J"]:
-    """Mean magnitude of the acceleration of each joint, by second differences.
+    """Return the mean magnitude of the acceleration of each joint, by second differences.
 
     |x_{t+1} - 2 x_t + x_{t-1}| fps^2, averaged over time. Compare it with the truth's own.
 

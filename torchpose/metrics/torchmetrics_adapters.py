@@ -80,7 +80,7 @@ class MeanPerJointError(Metric):
         self.count = self.count + (~errors.isnan()).sum(0)
 
     def compute(self) -> Tensor:
-        """Mean error, [] or [J], in the unit of the joints; NaN where there was nothing."""
+        """Return the mean error, [] or [J], in the unit of the joints; NaN where there was nothing."""
         if self.per_joint:
             return self.total / self.count
         return self.total.sum() / self.count.sum()
@@ -122,7 +122,7 @@ class PercentageOfCorrectParts(Metric):
         self.count = self.count + batch.counts
 
     def compute(self) -> Tensor:
-        """Share of correct limbs at each threshold, [P] or [L, P]."""
+        """Return the share of correct limbs at each threshold, [P] or [L, P]."""
         if self.per_limb:
             return self.correct / self.count[:, None]
         return self.correct.sum(0) / self.count.sum()
@@ -175,7 +175,7 @@ class EllipsoidCoverage(Metric):
         self.count = self.count + batch.counts
 
     def compute(self) -> Tensor:
-        """Share inside at each level, [L] or [L, J]."""
+        """Return the share inside at each level, [L] or [L, J]."""
         if self.per_joint:
             return self.inside / self.count
         return self.inside.sum(-1) / self.count.sum()

@@ -107,7 +107,7 @@ _KNOWN = _known_names()
 
 
 def canonical_name(name: str) -> str:
-    """The one name of a joint: ``part_side`` or ``part``, in lower case.
+    """Return the one name of a joint: ``part_side`` or ``part``, in lower case.
 
     Accepted are left_X, X_left, lX, LX, XLeft, LeftX, X_l and X.L, in any case.
 
@@ -131,7 +131,7 @@ def canonical_name(name: str) -> str:
 
 
 def canonical_names(names: Sequence[str]) -> tuple[str, ...]:
-    """The canonical names of a joint set.
+    """Return the canonical names of a joint set.
 
     In CMU's ASF files a name is a bone that stands for its far end: the clavicle ends at the
     shoulder and the radius at the wrist; the bone called wrist that follows is ``wrist_end`` here.
@@ -325,7 +325,7 @@ _BY_JOINTS = {frozenset(canonical_names(s.joints)): s for s in SKELETONS.values(
 
 
 def identify_skeleton(names: Sequence[str]) -> Skeleton | None:
-    """The known joint set with these joints, in any order and spelling, or None.
+    """Return the known joint set with these joints, in any order and spelling, or None.
 
     Args:
         names: joint names.

@@ -41,7 +41,7 @@ _NEEDED = tuple(f"{part}_{side}" for part in ("ear", "shoulder", "wrist", "index
 
 
 def lacks_joints(names: Sequence[str]) -> bool:
-    """Whether these are landmarks from which `derive_joints` can make head, neck and hands.
+    """Return whether these are landmarks from which `derive_joints` can make head, neck and hands.
 
     >>> lacks_joints(LANDMARKS), lacks_joints(["head", "neck", "left_wrist", "right_wrist"])
     (True, False)

@@ -65,7 +65,7 @@ KINECT_NECK = NeckFraction(0.369, 0.0151, 43314)
 
 
 def learn_neck_fraction(joints: Float[Tensor, "N 8 3"]) -> NeckFraction:
-    """Least-squares place of the neck in the image, from poses that have one.
+    """Return the least-squares place of the neck in the image, from poses that have one.
 
     Seen from afar the image is the plane of x and y, up to scale:
         fraction = sum (neck - middle) . (head - middle) / sum |head - middle|^2.
@@ -93,7 +93,7 @@ def learn_neck_fraction(joints: Float[Tensor, "N 8 3"]) -> NeckFraction:
 
 
 def learn_neck_offset(joints: Float[Tensor, "N 8 3"]) -> NeckOffset:
-    """Least-squares offset of the neck from poses that have one.
+    """Return the least-squares offset of the neck from poses that have one.
 
     Args:
         joints: poses in the order of `UPPER_BODY`, metres; NaN where a joint is missing.
@@ -123,7 +123,7 @@ def learn_neck_offset(joints: Float[Tensor, "N 8 3"]) -> NeckOffset:
 def place_neck(
     joints: Float[Tensor, "*batch 8 3"], offset: NeckOffset
 ) -> Float[Tensor, "*batch 8 3"]:
-    """Poses with the neck put where `offset` says; NaN where head or a shoulder is missing.
+    """Return the poses with the neck put where `offset` says; NaN where head or a shoulder is missing.
 
     Args:
         joints: poses in the order of `UPPER_BODY`, metres.
@@ -137,7 +137,7 @@ def place_neck(
 
 
 def _axes(joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Middle of the shoulders, and upward and forward axis of the length of the head's height."""
+    """Return the middle of the shoulders, and upward and forward axis of the length of the head's height."""
     left, right = joints[..., _LEFT, :], joints[..., _RIGHT, :]
     middle = (left + right) / 2
     up = joints[..., _HEAD, :] - middle

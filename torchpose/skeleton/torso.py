@@ -20,7 +20,7 @@ TORSO = ((0.0, -0.20, 0.0), (0.0, -0.01, 0.0), (0.16, 0.10, 0.0), (-0.16, 0.10, 
 
 
 def in_torso_axes(joints: Float[Tensor, "*batch 8 3"]) -> Float[Tensor, "*batch 8 3"]:
-    """The eight joints, moved so that head, neck and shoulders lie on `TORSO` as well as they can.
+    """Return the eight joints, moved so that head, neck and shoulders lie on `TORSO` as well as they can.
 
     Args:
         joints: any axes, metres.
@@ -36,7 +36,7 @@ def onto_torso(
     covs: Float[Tensor, "*batch 8 3 3"],
     joints: Float[Tensor, "*batch 8 3"],
 ) -> tuple[Float[Tensor, "*batch 8 3"], Float[Tensor, "*batch 8 3 3"]]:
-    """A pose with covariances, moved to where the head, neck and shoulders of another one are.
+    """Return a pose with covariances, moved to where the head, neck and shoulders of another one are.
 
     Args:
         pose, covs: in the axes of the torso. joints: of which only head, neck and shoulders count.

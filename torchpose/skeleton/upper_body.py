@@ -162,7 +162,7 @@ def _hand_kind(canonical: Sequence[str]) -> str | None:
 
 
 def measure_neck_kind(joints: Float[Tensor, "... 8 3"]) -> str | None:
-    """Kind of neck by its median distance from the middle of the shoulders, or None without them.
+    """Return the kind of neck by its median distance from the middle of the shoulders, or None without them.
 
     Args:
         joints: the eight joints [..., 8, 3], metres.
@@ -208,7 +208,7 @@ def to_upper_body(
 
 
 def mirror_pose(joints: Float[Tensor, "... 8 3"]) -> Float[Tensor, "... 8 3"]:
-    """The mirrored person: x changes sign and left becomes right.
+    """Return the mirrored person: x changes sign and left becomes right.
 
     Args:
         joints: the eight joints, camera axes.
@@ -219,7 +219,7 @@ def mirror_pose(joints: Float[Tensor, "... 8 3"]) -> Float[Tensor, "... 8 3"]:
 def scale_bones(
     joints: Float[Tensor, "... 8 3"], factors: Float[Tensor, "... 7"]
 ) -> Float[Tensor, "... 8 3"]:
-    """Bones of other lengths in the same directions, rebuilt from the neck outwards.
+    """Return the bones of other lengths in the same directions, rebuilt from the neck outwards.
 
         x'_neck = x_neck,   x'_b = x'_a + f_ab (x_b - x_a)
 

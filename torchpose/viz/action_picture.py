@@ -41,7 +41,7 @@ def plot_action_space(
     deviations: float = 3.0,
     title: str | None = None,
 ) -> Figure:
-    """The first dimensions over time: above with lengths normalised only, below synchronised.
+    """Return the first dimensions over time: above with lengths normalised only, below synchronised.
 
     Thin lines are performances, the thick one is their mean, dashed lines are so many deviations to
     either side of it; upright lines stand at the key frames.

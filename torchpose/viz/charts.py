@@ -147,7 +147,7 @@ def plot_errors_over_time(
     bound: float | None = None,
     title: str | None = None,
 ) -> Figure:
-    """Error of each joint over time, one line for each method (paper's Figures 5 and 11).
+    """Return the error of each joint over time, one line for each method (paper's Figures 5 and 11).
 
     Args:
         errors: by method, [T, 8], from `torchpose.metrics.joint_errors`; NaN leaves a hole.
@@ -201,7 +201,7 @@ def plot_error_bars(
     scale: float = 100.0,
     title: str | None = None,
 ) -> Figure:
-    """Mean error of each joint, one bar for each method (paper's Figures 3 and 10).
+    """Return the mean error of each joint, one bar for each method (paper's Figures 3 and 10).
 
     The thin line on a bar runs from the first to the third quartile.
 
@@ -241,7 +241,7 @@ def plot_error_bars(
 
 
 def plot_pcp(curves: Mapping[str, PCP], by_limb: bool = False, title: str | None = None) -> Figure:
-    """Percentage of correct parts over the threshold (paper's Figures 4 and 13).
+    """Return the percentage of correct parts over the threshold (paper's Figures 4 and 13).
 
     Args:
         curves: by method, from `torchpose.metrics.pcp`.

@@ -47,7 +47,7 @@ def plot_manifold(
     resolution: int = 160,
     title: str | None = None,
 ) -> Figure:
-    """The first two latent dimensions, the trajectories in them, and the predictive deviation.
+    """Return the first two latent dimensions, the trajectories in them, and the predictive deviation.
 
     White is where the manifold is as sure of a pose as it gets, dark where it falls back on the mean
     pose. A line is a sequence, with arrows in the direction of time and a dot where it starts;
@@ -164,7 +164,7 @@ def _draw_path(ax: Axes, path: Tensor, color: str, dashes: Any, hollow: bool = F
 
 
 def _draw_poses(part: Any, manifold: BackConstrainedGPLVM, body: Body, n_poses: int) -> Tensor:
-    """Poses along the first sequence, beside each other; returns their latent points."""
+    """Return the poses along the first sequence, beside each other; returns their latent points."""
     path = manifold.trajectories()[0]
     cycle = path[: _cycle(path)]
     at = torch.linspace(0, len(cycle) - 1, n_poses + 1)[:-1].round().long()
@@ -199,7 +199,7 @@ def _draw_figure(ax: Axes, body: Body, pose: Tensor, shift: float) -> None:
 
 
 def _cycle(path: Tensor) -> int:
-    """Frames until a trajectory is back where it started; all of them if it never is."""
+    """Return the frames until a trajectory is back where it started; all of them if it never is."""
     distance = (path - path[0]).norm(dim=-1)
     away = int((distance > 0.6 * distance.max()).long().argmax())
     for frame in range(away, len(path) - 1):

@@ -62,7 +62,7 @@ def plot_prior_components(
     seed: int = 0,
     title: str | None = None,
 ) -> Figure:
-    """The components of a prior as bodies from the front and the side, heaviest first.
+    """Return the components of a prior as bodies from the front and the side, heaviest first.
 
     A strong line is a component's mean, turned and moved back from its camera's view to the body
     (BL 5); the thin ones are draws from that component, so that its spread is seen too. The heavier a
@@ -156,12 +156,12 @@ def _components(
 
 
 def _on_one_body(prior: UpperBodyPrior, mixture: str) -> bool:
-    """Whether the k-th components of both arms are mirror images of each other."""
+    """Return whether the k-th components of both arms are mirror images of each other."""
     return prior.info.mirrored and mixture == "pose"
 
 
 def _in_body(prior: UpperBodyPrior, states: Float[Tensor, "*batch 21"]) -> Tensor:
-    """Hand, elbow, shoulder, head and neck of states in body axes, metres, from the neck."""
+    """Return the hand, elbow, shoulder, head and neck of states in body axes, metres, from the neck."""
     order: RotationOrder = prior.info.rotation_order  # type: ignore[assignment]
     rotation = euler_to_matrix(states[..., 15:18], order)
     joints = states[..., :15].unflatten(-1, (5, 3))
@@ -339,7 +339,7 @@ def plot_log_likelihood(
     held_out: Mapping[str, Sequence[float] | Tensor] | None = None,
     title: str | None = "Log-likelihood over EM steps",
 ) -> Figure:
-    """Mean log-likelihood over the steps of EM, a panel for each mixture.
+    """Return the mean log-likelihood over the steps of EM, a panel for each mixture.
 
     The best step of a curve is marked. The scale leaves out the first steps, whose values are far
     below the rest.

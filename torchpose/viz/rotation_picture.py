@@ -44,7 +44,7 @@ def plot_rotations(
     generator: torch.Generator | None = None,
     title: str | None = None,
 ) -> Figure:
-    """Gaussians over rotations as clouds of the direction that they turn, with their sigma points.
+    """Return Gaussians over rotations as clouds of the direction that they turn, with their sigma points.
 
     Each panel is a unit sphere; pale points are draws, arcs lead from the mean to the six sigma
     points (DX 2). What lies behind the sphere is fainter.
@@ -81,7 +81,7 @@ def plot_rotations(
 
 
 def _camera(across: float, above: float) -> Tensor:
-    """Rows: right, up and towards the viewer, in axes whose y points up and z to the front."""
+    """Return the rows: right, up and towards the viewer, in axes whose y points up and z to the front."""
     a, b = torch.tensor([across, above], dtype=torch.float64).deg2rad()
     right = torch.stack([a.cos(), torch.zeros_like(a), -a.sin()])
     near = torch.stack([b.cos() * a.sin(), b.sin(), b.cos() * a.cos()])

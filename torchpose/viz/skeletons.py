@@ -248,7 +248,7 @@ def plot_pose_strip(
     labels: Sequence[str] | None = None,
     title: str | None = None,
 ) -> Figure:
-    """A strip of frames, at one scale; 3D poses get a second row, seen from the side.
+    """Return a strip of frames, at one scale; 3D poses get a second row, seen from the side.
 
     Args:
         joints: [T, 8, 2], pixels, or [T, 8, 3], camera axes, metres.
@@ -310,7 +310,7 @@ def plot_prior_means(
     n_shown: int = 30,
     title: str | None = "Mean poses of the prior's components and their weights",
 ) -> Figure:
-    """The component means of a prior as skeletons, heaviest first, with their weights.
+    """Return the component means of a prior as skeletons, heaviest first, with their weights.
 
     Args:
         mixtures: by name, e.g. ``{"left": prior.left, "right": prior.right}``; the first fifteen

@@ -59,7 +59,7 @@ def require_matplotlib() -> None:
 
 
 def new_figure(width: float, height: float, title: str | None = None) -> Figure:
-    """An empty white figure of the given size in inches, laid out so that nothing overlaps."""
+    """Return an empty white figure of the given size in inches, laid out so that nothing overlaps."""
     require_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -144,7 +144,7 @@ def join_unit(label: str, unit: str) -> str:
 
 
 def to_numpy(tensor: Tensor | Any) -> Any:
-    """A tensor as a NumPy array in float64 (bool stays), on the CPU and out of the graph."""
+    """Return a tensor as a NumPy array in float64 (bool stays), on the CPU and out of the graph."""
     import numpy as np
 
     array = tensor.detach().cpu().numpy() if isinstance(tensor, Tensor) else np.asarray(tensor)

@@ -42,11 +42,11 @@ class Pose(NamedTuple):
         return self.joints[4]
 
     def on_torso(self, points: Array) -> Array:
-        """Points of the torso's axes [..., 3] in camera axes."""
+        """Return the points of the torso's axes [..., 3] in camera axes."""
         return self.neck + np.asarray(points, np.float64) @ self.torso.T
 
     def arm(self, side: int) -> Array:
-        """Shoulder, elbow, wrist and hand [4, 3] of the left (0) or right (1) arm."""
+        """Return the shoulder, elbow, wrist and hand [4, 3] of the left (0) or right (1) arm."""
         hand, elbow, shoulder = ((0, 1, 2), (7, 6, 5))[side]
         return np.stack(
             [self.joints[shoulder], self.joints[elbow], self.wrists[side], self.joints[hand]]
@@ -63,7 +63,7 @@ class Bodies(NamedTuple):
     upright: Array
 
     def at(self, frame: float) -> Pose:
-        """Pose at a time in frames, interpolated; the ends stay."""
+        """Return the pose at a time in frames, interpolated; the ends stay."""
         last = len(self.joints) - 1
         time = min(max(frame, 0.0), float(last))
         before = min(int(time), max(last - 1, 0))

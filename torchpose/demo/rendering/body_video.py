@@ -39,7 +39,7 @@ _NEAR = 0.2  # metres, in front of which nothing is painted
 
 
 def walk_clip(walk: Walk) -> MocapClip:
-    """A walk as the clip of a recording, y up."""
+    """Return a walk as the clip of a recording, y up."""
     up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
     return MocapClip(
         walk.joints, walk.joints, BODY_15.names, up, walk.fps, "walker", "walk", "walk"
@@ -47,7 +47,7 @@ def walk_clip(walk: Walk) -> MocapClip:
 
 
 def empty_scene(camera: PinholeCamera, seed: int = 0) -> Array:
-    """The room without anybody [H, W, 3], 0 to 255: a wall, a floor, a skirting board, plaster.
+    """Return the room without anybody [H, W, 3], 0 to 255: a wall, a floor, a skirting board, plaster.
 
     Args:
         camera: level, with the size of its image. seed: of the plaster and the light.
@@ -75,7 +75,7 @@ def empty_scene(camera: PinholeCamera, seed: int = 0) -> Array:
 def render_body_video(
     folder: str | Path, walk: Walk, cameras: list[PinholeCamera], seed: int = 0
 ) -> tuple[list[Path], list[Path]]:
-    """A video for each camera, NAME.mp4, and a picture of its empty scene, NAME-empty.png.
+    """Write a video for each camera, NAME.mp4, and a picture of its empty scene, NAME-empty.png.
 
     Args:
         folder: that exists. walk: who walks. cameras: with names and sizes, y up.
@@ -126,7 +126,7 @@ def _frames(
 
 
 def _seen(points: Tensor, camera: PinholeCamera) -> NDArray:
-    """Pixels and depth [T, L, 3] of points."""
+    """Return the pixels and depth [T, L, 3] of points."""
     seen = camera(points)
     return np.asarray(seen.double().numpy())
 

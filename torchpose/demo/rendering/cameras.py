@@ -27,7 +27,7 @@ def cameras_around(
     height: float = 1.5,
     focal: float = 450.0,
 ) -> list[PinholeCamera]:
-    """Cameras of 640 x 480 pixels around the middle of the way, which they look at.
+    """Return the cameras of 640 x 480 pixels around the middle of the way, which they look at.
 
     They stand at `azimuths` from the direction of the walk, none of them in its line, so that the
     person stays in view for four metres of it.
@@ -54,7 +54,7 @@ def cameras_around(
 
 
 def _way(clip: MocapClip) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Horizontal direction of the walk, or of the chest where nobody walks, and its left."""
+    """Return the horizontal direction of the walk, or of the chest where nobody walks, and its left."""
     up = clip.up.double()
     pelvis = clip.joints[:, _PELVIS].double()
     way = pelvis[-1] - pelvis[0]
@@ -71,7 +71,7 @@ def _looking(
     place: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"], focal: float,
     name: str,
 ) -> PinholeCamera:  # fmt: skip
-    """A camera at `place` with `target` in the middle of the image, upright."""
+    """Return a camera at `place` with `target` in the middle of the image, upright."""
     import cv2
 
     z = normalize(target - place, dim=-1)

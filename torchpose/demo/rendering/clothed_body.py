@@ -66,7 +66,7 @@ class TrueShape:
 
     @classmethod
     def draw(cls, seed: int, spread: float = 0.12) -> "TrueShape":
-        """A person drawn from a seed: factors exp(spread n), n standard normal.
+        """Return a person drawn from a seed: factors exp(spread n), n standard normal.
 
         Args:
             seed: of the person. spread: standard deviation of the logarithm.
@@ -87,7 +87,7 @@ def true_silhouettes(
     faults: float = 0.0,
     generator: torch.Generator | None = None,
 ) -> Bool[Tensor, "T C H W"]:
-    """Silhouettes of a clip as background subtraction would give them.
+    """Return the silhouettes of a clip as background subtraction would give them.
 
     Args:
         clip: recorded joints. shape: of the person. cameras: with their image sizes.
@@ -103,7 +103,7 @@ def true_silhouettes(
 
 
 def true_limbs(clip: MocapClip, shape: TrueShape) -> Limbs:
-    """Tapered cylinders around the recorded joints, [T, L, 3] and radii [L, 2]."""
+    """Return the tapered cylinders around the recorded joints, [T, L, 3] and radii [L, 2]."""
     points, scale = _points(clip, shape)
     rows = [
         (kind, a.replace("X", side), b.replace("X", side), r, s)
@@ -121,7 +121,7 @@ def true_limbs(clip: MocapClip, shape: TrueShape) -> Limbs:
 
 
 def limb_kinds() -> list[str]:
-    """Kind of each limb of `true_limbs`, such as "forearm"."""
+    """Return the kind of each limb of `true_limbs`, such as "forearm"."""
     sides = [row[0] for row in _LIMBS_OF_SIDES for _ in _SIDES]
     return [*sides, *(row[0] for row in _LIMBS_OF_MIDDLE)]
 
@@ -149,7 +149,7 @@ def _points(clip: MocapClip, shape: TrueShape) -> tuple[dict[str, Tensor], float
 
 
 def _size(joints: Mapping[str, Tensor]) -> float:
-    """Length of a leg, metres."""
+    """Return the length of a leg, metres."""
     bones = [
         (joints[f"{side}_{a}"] - joints[f"{side}_{b}"]).norm(dim=-1)
         for side in _SIDES
@@ -191,7 +191,7 @@ def _head(
     forward: Float[Tensor, "T 3"],
     scale: float,
 ) -> dict[str, Tensor]:
-    """A skull whose middle is 17 cm above the neck on the way to the head, if there is one."""
+    """Return a skull whose middle is 17 cm above the neck on the way to the head, if there is one."""
     measured = normalize(joints["head"] - joints["neck"], dim=-1)
     along = torch.where(measured.isfinite().all(-1, keepdim=True), measured, spine)
     skull = joints["neck"] + 0.17 * scale * along

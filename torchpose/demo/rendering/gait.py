@@ -47,7 +47,7 @@ class Walk(NamedTuple):
 
 
 def gait_angles(phase: Float[Tensor, " T"]) -> dict[str, Float[Tensor, " T"]]:
-    """Flexion of hip, knee, shoulder and elbow of one side, radians.
+    """Return the flexion of hip, knee, shoulder and elbow of one side, radians.
 
     Args:
         phase: share of the cycle since this side's heel strike; whole numbers count for nothing.
@@ -119,7 +119,7 @@ def _walker(height: float) -> Body:
 
 
 def _parts(phase: Tensor, wander: Tensor) -> Float[Tensor, "T 30"]:
-    """Relative rotations of all parts but the pelvis, as quaternion vectors."""
+    """Return the relative rotations of all parts but the pelvis, as quaternion vectors."""
     vectors = torch.zeros(len(phase), len(BODY_15.parts), 3, dtype=torch.float64)
 
     def bend(part: str, flexion: Tensor, sideways: float = 0.0) -> None:
@@ -143,7 +143,7 @@ def _parts(phase: Tensor, wander: Tensor) -> Float[Tensor, "T 30"]:
 
 
 def _about_two_axes(heading: Tensor, tilt: Tensor) -> Float[Tensor, "T 3"]:
-    """Quaternion vector of a turn about y, then to the side about the body's own z."""
+    """Return the quaternion vector of a turn about y, then to the side about the body's own z."""
     (a, b), (c, d) = ((torch.sin(x / 2), torch.cos(x / 2)) for x in (heading, tilt))
     return torch.stack([a * c, a * d, b * c], -1)
 
@@ -173,7 +173,7 @@ def _smooth(values: Float[Tensor, " T"], width: int) -> Float[Tensor, " T"]:
 def _curve(
     phase: Float[Tensor, " T"], keys: tuple[tuple[float, float], ...]
 ) -> Float[Tensor, " T"]:
-    """A smooth periodic curve through key points, by cubic Hermite pieces."""
+    """Return a smooth periodic curve through key points, by cubic Hermite pieces."""
     at = torch.tensor([k[0] for k in keys], dtype=phase.dtype)
     value = torch.tensor([k[1] for k in keys], dtype=phase.dtype)
     at = torch.cat([at[-1:] - 1, at, at[:2] + 1])

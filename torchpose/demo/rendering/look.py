@@ -64,7 +64,7 @@ class Wardrobe(NamedTuple):
 
 @lru_cache(maxsize=8)
 def wardrobe(look: Look) -> Wardrobe:
-    """Textures of a look.
+    """Return the textures of a look.
 
     Raises:
         MissingDependencyError: matplotlib is not installed. InputError: colours that are none.
@@ -84,7 +84,7 @@ def wardrobe(look: Look) -> Wardrobe:
 
 
 def smooth_noise(shape: tuple[int, int], sigma: tuple[float, float], seed: int) -> Array:
-    """Gaussian noise [h, w] of unit variance, smoothed by (vertical, horizontal) pixels."""
+    """Return the Gaussian noise [h, w] of unit variance, smoothed by (vertical, horizontal) pixels."""
     import cv2
 
     white = np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
@@ -110,7 +110,7 @@ def _torso(colour: Array) -> Array:
 
 
 def _neck(portrait: Portrait) -> Array:
-    """The portrait's neck, rounded, in the shadow of the chin."""
+    """Return the portrait's neck, rounded, in the shadow of the chin."""
     import cv2
 
     skin = cv2.resize(portrait.neck, (64, 64), interpolation=cv2.INTER_LINEAR)
@@ -126,7 +126,7 @@ def _neck(portrait: Portrait) -> Array:
 
 
 def _hand(portrait: Portrait, bare: bool) -> Sprite:
-    """A relaxed open hand: palm, four fingers and a thumb, each lit as a round thing."""
+    """Return a relaxed open hand: palm, four fingers and a thumb, each lit as a round thing."""
     import cv2
 
     x0, y0 = _HAND_ORIGIN

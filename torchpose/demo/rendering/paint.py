@@ -35,7 +35,7 @@ class Box(NamedTuple):
 
     @classmethod
     def around(cls, points: NDArray, margin: float, shape: tuple[int, ...]) -> "Box":
-        """Box of points [N, 2] with a margin, cut to an image of shape (height, width, ...)."""
+        """Return the box of points [N, 2] with a margin, cut to an image of shape (height, width, ...)."""
         low, high = points.min(0) - margin, points.max(0) + margin + 1
         left, top = (min(max(math.floor(v), 0), s) for v, s in zip(low, shape[1::-1], strict=True))
         right, bottom = (
@@ -66,12 +66,12 @@ class Capsule(NamedTuple):
     bulge: float | None = None
 
     def box(self, shape: tuple[int, ...]) -> Box:
-        """The part of an image that it may cover."""
+        """Return the part of an image that it may cover."""
         ends = np.array([self.start, self.end])
         return Box.around(ends, max(self.radius_start, self.radius_end) + 1, shape)
 
     def field(self, box: Box) -> tuple[Array, Array, Array]:
-        """Opacity, place along the limb (0 to 1) and across it (-1 to 1) in the box.
+        """Return the opacity, place along the limb (0 to 1) and across it (-1 to 1) in the box.
 
         The opacity falls from 1 to 0 over one pixel about the edge.
         """
@@ -129,7 +129,7 @@ def paint_capsule(
 
 
 def _lit(limb: Capsule, across: Array) -> Array:
-    """Brightness of a cylinder: ambient light and Lambert's law."""
+    """Return the brightness of a cylinder: ambient light and Lambert's law."""
     dx, dy = limb.end[0] - limb.start[0], limb.end[1] - limb.start[1]
     length = max(math.hypot(dx, dy), 1e-2)
     sideways = (-dy * LIGHT[0] + dx * LIGHT[1]) / length
@@ -140,7 +140,7 @@ def _lit(limb: Capsule, across: Array) -> Array:
 
 
 def polygon_box(points: NDArray, shape: tuple[int, ...]) -> Box:
-    """The part of an image that a filled outline may cover."""
+    """Return the part of an image that a filled outline may cover."""
     return Box.around(points, 1, shape)
 
 
@@ -167,7 +167,7 @@ def paint_polygon(canvas: Array, points: NDArray, texture: Array, to_image: NDAr
 
 
 def polygon_alpha(points: NDArray, box: Box) -> Array:
-    """Opacity of a filled outline in a box, edges antialiased."""
+    """Return the opacity of a filled outline in a box, edges antialiased."""
     import cv2
 
     mask = np.zeros((box.bottom - box.top, box.right - box.left), np.uint8)
@@ -195,7 +195,7 @@ def paint_sprite(canvas: Array, sprite: Sprite, place: NDArray, axes: NDArray) -
 def place_sprite(
     shape: tuple[int, ...], sprite: Sprite, place: NDArray, axes: NDArray
 ) -> tuple[Box, Array, NDArray]:
-    """Box in the image, level of the sprite with about as many pixels, map between the two."""
+    """Return the box in the image, level of the sprite with about as many pixels, map between the two."""
     per_pixel = np.asarray(axes, np.float64) * sprite.scale
     size = max(float(np.sqrt(abs(np.linalg.det(per_pixel)))), 1e-6)
     n = min(max(math.floor(math.log2(1 / size) + 0.2), 0), len(sprite.levels) - 1)
@@ -210,7 +210,7 @@ def place_sprite(
 
 
 def warp_sprite(box: Box, level: Array, to_image: NDArray) -> Array:
-    """The sprite as it appears in the box [h, w, 4]."""
+    """Return the sprite as it appears in the box [h, w, 4]."""
     import cv2
 
     shifted = to_image.copy()

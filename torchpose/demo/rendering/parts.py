@@ -34,7 +34,7 @@ class Brush(Protocol):
         ...
 
     def box(self, shape: tuple[int, ...]) -> Box:
-        """The part of an image that it may cover."""
+        """Return the part of an image that it may cover."""
         ...
 
     def alpha(self, box: Box) -> Array:
@@ -143,19 +143,19 @@ class View:
         return homogeneous[..., :2] / np.maximum(homogeneous[..., 2:], 0.05)
 
     def scale(self, point: Points) -> float:
-        """Pixels for a metre at the depth of a point."""
+        """Return the pixels for a metre at the depth of a point."""
         return self.focal / max(float(point[2]), 0.05)
 
     def capsule(
         self, start: Points, end: Points, radii: tuple[float, float], bulge: float | None = None
     ) -> Capsule:
-        """A limb between two points, radii in metres; see `Capsule` for the bulge."""
+        """Return a limb between two points, radii in metres; see `Capsule` for the bulge."""
         (u, v), (x, y) = self(np.stack([start, end])).tolist()
         at_start, at_end = radii[0] * self.scale(start), radii[1] * self.scale(end)
         return Capsule((u, v), (x, y), at_start, at_end, bulge)
 
     def plane(self, origin: Points, axes: Points) -> tuple[NDArray, NDArray]:
-        """Place [2] of the origin and pixels per metre [2, 2] along two axes, seen from afar."""
+        """Return the place [2] of the origin and pixels per metre [2, 2] along two axes, seen from afar."""
         linear = self.K[:2, :2] @ axes[:2] / max(float(origin[2]), 0.05)
         return self(origin), linear
 
@@ -216,7 +216,7 @@ def _torso(pose: Pose, worn: Wardrobe, view: View) -> Part:
 
 
 def _rounded(outline: Points) -> Points:
-    """A closed outline with its corners cut twice (Chaikin)."""
+    """Return a closed outline with its corners cut twice (Chaikin)."""
     for _ in range(2):
         following = np.roll(outline, -1, 0)
         both = (0.75 * outline + 0.25 * following, 0.25 * outline + 0.75 * following)

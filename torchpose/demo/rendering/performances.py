@@ -65,7 +65,7 @@ def performance(
     distance: float = 2.0,
     size: BodySize | None = None,
 ) -> Performance:
-    """A movement by its name, in front of `torchpose.demo.demo_camera`.
+    """Return a movement by its name, in front of `torchpose.demo.demo_camera`.
 
     Args:
         name: one of `PERFORMANCES`.
@@ -138,7 +138,7 @@ def crossing(
 def _animate(
     keys: _Keys, clock: Tensor, seed: int, size: BodySize | None
 ) -> tuple[BodyAngles, tuple[str, ...]]:
-    """Angles between the key frames, and the word of each frame."""
+    """Return the angles between the key frames, and the word of each frame."""
     generator = torch.Generator().manual_seed(seed)
     times = torch.tensor(keys.times, dtype=torch.float64)
     hands = minimum_jerk(clock, times, torch.tensor(keys.hands, dtype=torch.float64))

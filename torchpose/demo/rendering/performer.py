@@ -176,7 +176,7 @@ def check_performances(
 
 
 def choose_looks(look: str | Look | Sequence[str | Look], n: int) -> list[Look]:
-    """A look for each of n performers; see `render_performance`."""
+    """Return a look for each of n performers; see `render_performance`."""
     given = [look] * n if isinstance(look, str | Look) else list(look)
     if len(given) != n:
         raise InputError(f"look must be one, or one for each of {n} performers, got {len(given)}")

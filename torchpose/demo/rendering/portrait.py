@@ -55,7 +55,7 @@ class Sprite(NamedTuple):
     def of(
         cls, rgb: NDArray, alpha: NDArray, origin: tuple[float, float], scale: float
     ) -> "Sprite":
-        """Sprite of a picture [h, w, 3], 0 to 255, and its opacity [h, w], 0 to 1."""
+        """Return the sprite of a picture [h, w, 3], 0 to 255, and its opacity [h, w], 0 to 1."""
         import cv2
 
         alpha = np.asarray(alpha, np.float32)[..., None]
@@ -84,7 +84,7 @@ class Portrait(NamedTuple):
 
 @lru_cache(maxsize=8)
 def load_portrait(mirrored: bool = False, tone: tuple[float, float, float] = (1, 1, 1)) -> Portrait:
-    """The portrait, cut up.
+    """Return the portrait, cut up.
 
     Args:
         mirrored: left and right exchanged, so that two performers are not one and the same.

@@ -44,7 +44,7 @@ class Scene:
 
 
 def room(width: int, height: int, scene: Scene, seed: int = 0) -> Array:
-    """The background [height, width, 3], float32, 0 to 255.
+    """Return the background [height, width, 3], float32, 0 to 255.
 
     Args:
         width, height: pixels. scene: see `Scene`. seed: of the places and shades of the furniture.

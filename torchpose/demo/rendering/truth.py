@@ -48,7 +48,7 @@ def performance_truth(
     camera: PinholeCamera,
     look: str | Look | Sequence[str | Look] = "dark sleeves",
 ) -> tuple[Truth, ...]:
-    """The truth about what `render_performance` shows of the same arguments, one for each performer.
+    """Return the truth about what `render_performance` shows of the same arguments, one for each performer.
 
     A joint is occluded when the nearest part that is painted over its pixel is not its own: its limb,
     for a shoulder the torso too, for the neck torso, neck and head.
@@ -86,7 +86,7 @@ _OWN = tuple(_own_parts(joint) for joint in UPPER_BODY)
 
 
 def _hidden(parts: list[Part], pixels: NDArray, size: tuple[int, int]) -> NDArray:
-    """Which joints of N persons are hidden [N, 8]; the parts come person by person."""
+    """Return which joints of N persons are hidden [N, 8]; the parts come person by person."""
     each = len(parts) // len(pixels)
     shape = (size[1], size[0])
     boxes = [part.brush.box(shape) for part in parts]

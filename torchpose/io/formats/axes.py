@@ -31,7 +31,7 @@ _TO_CAMERA = {
 
 
 def default_axes(where: str, names: Sequence[str]) -> str:
-    """Axes of a file that does not state them, by its joint set.
+    """Return the axes of a file that does not state them, by its joint set.
 
     Raises:
         FileFormatError: the joints are no known set; `where` is named.
@@ -48,7 +48,7 @@ def default_axes(where: str, names: Sequence[str]) -> str:
 def axes_rotation(
     joints: Float[Tensor, "T J 3"], names: Sequence[str], axes: str
 ) -> Float[Tensor, "3 3"]:
-    """Rotation from the axes of a file to camera axes.
+    """Return the rotation from the axes of a file to camera axes.
 
     y-up and z-up rooms have no camera: those are turned about the vertical so that the mean heading
     faces the camera, except for joint sets whose people face it anyway (Berkeley MHAD).
@@ -79,7 +79,7 @@ def axes_rotation(
 
 
 def heading(joints: Float[Tensor, "T J 3"], names: Sequence[str]) -> float | None:
-    """Mean heading about the vertical: 0 faces the camera, positive is to the person's left.
+    """Return the mean heading about the vertical: 0 faces the camera, positive is to the person's left.
 
     The heading of a frame is at a right angle to the horizontal line from the right to the left
     shoulder (or hip); the mean is over unit vectors.

@@ -30,7 +30,7 @@ _NEEDED = ("head", "shoulder_left", "shoulder_right", "elbow_left", "elbow_right
 
 
 def bvh_joint_names(nodes: list[str]) -> dict[str, str]:
-    """Which node of a file stands for which joint.
+    """Return which node of a file stands for which joint.
 
     Nodes may have a prefix up to a colon (``mixamorig:LeftArm``). Where there are nodes for arm and
     forearm, "LeftArm" is the shoulder, "LeftForeArm" the elbow, "LeftHand" the wrist, and
@@ -111,7 +111,7 @@ def read_bvh(path: Path) -> list[RawRecording]:
 
 
 def _split(node: str) -> tuple[str, str]:
-    """A node's name without prefix and side, and the side."""
+    """Return a node's name without prefix and side, and the side."""
     name = node.rsplit(":", 1)[-1]
     name = re.sub(r"^mixamorig\d*_?", "", name)
     sided = (
@@ -129,7 +129,7 @@ def _split(node: str) -> tuple[str, str]:
 
 
 def _head_end(head: Any, posed: Any) -> tuple[Any, str]:
-    """The end of the head's bone in the axes of its node, or None, and a note.
+    """Return the end of the head's bone in the axes of its node, or None, and a note.
 
     Args:
         head: the node as the file has it. posed: the same, at rest, where nothing is turned.

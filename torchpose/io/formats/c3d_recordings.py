@@ -89,7 +89,7 @@ def _text(reader: Any, key: str) -> str:
 
 
 def _joint_columns(path: Path, labels: list[str]) -> dict[str, int]:
-    """Columns by the name of their joint, without those that are none."""
+    """Return the columns by the name of their joint, without those that are none."""
     columns: dict[str, int] = {}
     for column, label in enumerate(labels):
         name = re.sub(r"^.*:", "", label).strip()

@@ -24,7 +24,7 @@ _TINY = 1e-9
 
 
 def joint_centres(points: Mapping[str, np.ndarray], measures: Mapping[str, float]) -> np.ndarray:
-    """The fifteen joints of HumanEva [S, 15, 3], mm; NaN in frames in which a segment is lost.
+    """Return the fifteen joints of HumanEva [S, 15, 3], mm; NaN in frames in which a segment is lost.
 
     Args:
         points: [S, 3] by label, mm, NaN where lost. measures: ``shoulders`` (half the width, mm) and
@@ -53,7 +53,7 @@ def joint_centres(points: Mapping[str, np.ndarray], measures: Mapping[str, float
 
 
 def _axis(points: Mapping[str, np.ndarray], segment: str, axis: str) -> np.ndarray:
-    """Unit vector [S, 3] of a segment's axis: P is z, A is x, L is y."""
+    """Return the unit vector [S, 3] of a segment's axis: P is z, A is x, L is y."""
     vector = points[f"{segment}{axis}"] - points[f"{segment}O"]
     return vector / np.maximum(_length(vector), _TINY)
 
@@ -72,7 +72,7 @@ def _trunk(points: Mapping[str, np.ndarray], shoulders: float) -> tuple[np.ndarr
 
 
 def _arm(points: Mapping[str, np.ndarray], side: str, offset: float) -> list[np.ndarray]:
-    """Shoulder, elbow (the mean of where both bones have it) and wrist."""
+    """Return the shoulder, elbow (the mean of where both bones have it) and wrist."""
     shoulder, elbow, wrist = points[f"{side}CLO"], points[f"{side}HUO"], points[f"{side}RAO"]
     upper, lower = _length(elbow - shoulder), _length(wrist - elbow)
     tilt = np.arctan2(offset / 2, upper)
@@ -86,7 +86,7 @@ def _arm(points: Mapping[str, np.ndarray], side: str, offset: float) -> list[np.
 
 
 def _leg(points: Mapping[str, np.ndarray], side: str) -> list[np.ndarray]:
-    """Hip, knee (the mean of where both bones have it) and ankle."""
+    """Return the hip, knee (the mean of where both bones have it) and ankle."""
     hip, knee, ankle = points[f"{side}FEP"], points[f"{side}FEO"], points[f"{side}TIO"]
     thigh = hip - _length(knee - hip) * _axis(points, f"{side}FE", "P")
     foot = knee - _length(ankle - knee) * _axis(points, f"{side}TI", "P")

@@ -79,7 +79,7 @@ def read_kinect_csv(path: Path) -> list[RawRecording]:
 
 
 def split_row(line: str) -> list[str]:
-    """The cells of a row, at commas, semicolons or tabs, else at blanks."""
+    """Return the cells of a row, at commas, semicolons or tabs, else at blanks."""
     line = line.strip()
     for mark in (",", ";", "\t"):
         if mark in line:
@@ -88,7 +88,7 @@ def split_row(line: str) -> list[str]:
 
 
 def header_joints(line: str) -> dict[str, dict[str, int]]:
-    """Columns by joint and by what they hold; empty unless a joint has x, y and z."""
+    """Return the columns by joint and by what they hold; empty unless a joint has x, y and z."""
     found: dict[str, dict[str, int]] = {}
     for column, cell in enumerate(split_row(line)):
         match = _COLUMN.fullmatch(cell.strip().strip('"'))
@@ -100,7 +100,7 @@ def header_joints(line: str) -> dict[str, dict[str, int]]:
 
 
 def frame_rate(stamps: np.ndarray) -> tuple[float | None, str]:
-    """Frames per second by the median step of the stamps, and what they were taken for.
+    """Return the frames per second by the median step of the stamps, and what they were taken for.
 
     Of seconds, milliseconds, microseconds and 100 ns, the one that comes nearest to 30 frames per
     second; None for steps that are none of them, such as numbers of frames.
@@ -117,7 +117,7 @@ def frame_rate(stamps: np.ndarray) -> tuple[float | None, str]:
 
 
 def dropped_frames(stamps: np.ndarray) -> list[str]:
-    """A note on frames that the sensor left out, by steps of more than 1.5 times the median one."""
+    """Return a note on frames that the sensor left out, by steps of more than 1.5 times the median one."""
     steps = np.diff(stamps)
     if not len(steps):
         return []
@@ -205,7 +205,7 @@ def _table(path: Path, rows: list[tuple[int, str]], layout: _Layout) -> np.ndarr
 
 
 def _state_weights(states: np.ndarray, layout: _Layout, notes: list[str]) -> np.ndarray | None:
-    """Weights of the fourth number of each joint, or None where it is no state."""
+    """Return the weights of the fourth number of each joint, or None where it is no state."""
     found = set(np.unique(states).tolist())
     if found <= {0.0, 1.0, 2.0} and (2.0 in found or layout.skeleton == "kinect-v2-25"):
         return np.array(SENSOR_WEIGHTS)[states.astype(int)]
@@ -286,7 +286,7 @@ def _cells(path: Path, rows: list[tuple[int, str]], width: int) -> list[list[str
 def _to_numbers(
     path: Path, rows: list[tuple[int, str]], cells: list[list[str]], columns: list[int]
 ) -> np.ndarray:
-    """The columns as numbers [T, width], NaN for empty cells and for columns not asked for."""
+    """Return the columns as numbers [T, width], NaN for empty cells and for columns not asked for."""
     table = np.full((len(cells), len(cells[0]) if cells else max(columns) + 1), np.nan)
     for (number, _), row, values in zip(rows, cells, table, strict=True):
         try:

@@ -78,7 +78,7 @@ def _files_by_frame(folder: Path) -> dict[int, Path]:
 
 
 def _people(path: Path) -> list[np.ndarray]:
-    """Keypoints [J, 3] (u, v, confidence) of everybody in one file, without empty ones."""
+    """Return the keypoints [J, 3] (u, v, confidence) of everybody in one file, without empty ones."""
     content = read_json(path, _EXPECTED)
     with reading(path, _EXPECTED):
         listed = content["people"]
@@ -98,7 +98,7 @@ def _people(path: Path) -> list[np.ndarray]:
 
 
 def _pick(people: np.ndarray, followed: np.ndarray | None) -> np.ndarray:
-    """The person [J, 3] to follow among [P, J, 3]."""
+    """Return the person [J, 3] to follow among [P, J, 3]."""
     if followed is not None and len(people) > 1:
         both = (people[..., 2] > 0) & (followed[:, 2] > 0)
         gaps = np.linalg.norm(people[..., :2] - followed[:, :2], axis=-1)

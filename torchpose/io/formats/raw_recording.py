@@ -51,7 +51,7 @@ class RawRecording:
     notes: tuple[str, ...] = ()
 
     def where(self) -> str:
-        """File and person, for messages."""
+        """Return the file and person, for messages."""
         other = f", other body {self.companion}" if self.companion else ""
         return f"{self.path}{f', person {self.person}' if self.person else ''}{other}"
 
@@ -66,14 +66,14 @@ class BodyFrame(NamedTuple):
 
 
 def numbers(name: str, array: np.ndarray) -> np.ndarray:
-    """The array in float64, or an error that names it if it does not hold numbers."""
+    """Return the array in float64, or raise an error that names it if it does not hold numbers."""
     if array.dtype.kind not in "fiub":
         raise FileFormatError(f"{name} must be numbers, got {array.dtype}")
     return array.astype(np.float64)
 
 
 def frame_ranges(frames: Iterable[int], first: int = 0) -> str:
-    """Frame numbers for people, runs joined; `first` is added to each.
+    """Return the frame numbers for people, runs joined; `first` is added to each.
 
     >>> frame_ranges([3, 4, 5, 9])
     '3-5, 9'

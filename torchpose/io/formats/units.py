@@ -29,7 +29,7 @@ class Unit(NamedTuple):
 
 
 def unit_from_text(text: str) -> float | None:
-    """Metres per unit of what a file calls its unit, or None if it is none of the known ones."""
+    """Return the metres per unit of what a file calls its unit, or None if it is none of the known ones."""
     word = text.strip().lower().rstrip("s.")
     known = {"m": 1.0, "metre": 1.0, "meter": 1.0, "cm": 0.01, "centimetre": 0.01,
              "centimeter": 0.01, "mm": 0.001, "millimetre": 0.001, "millimeter": 0.001}  # fmt: skip
@@ -37,7 +37,7 @@ def unit_from_text(text: str) -> float | None:
 
 
 def body_unit(where: str, joints: Float[Tensor, "T J 3"], names: Sequence[str]) -> Unit:
-    """The unit in which these joints make a body.
+    """Return the unit in which these joints make a body.
 
     A body that spans at most 5, with its shoulders at least 0.05 apart, is in metres. Others are in
     centimetres or millimetres, whichever puts the shoulders 15 to 65 cm apart; without shoulders,

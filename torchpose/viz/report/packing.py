@@ -53,7 +53,7 @@ class Thinned(NamedTuple):
 
 
 def pack_array(array: np.ndarray) -> dict[str, Any]:
-    """An array as base64 with its type and shape, for JSON.
+    """Return an array as base64 with its type and shape, for JSON.
 
     >>> pack_array(np.array([[1.0, 2.0]], dtype=np.float32))
     {'type': 'float32', 'shape': [1, 2], 'base64': 'AACAPwAAAEA='}
@@ -118,7 +118,7 @@ def pack_person(
 
 
 def _shares(observed: np.ndarray, there: np.ndarray) -> list[float]:
-    """Share of the frames with a pose in which each joint was measured."""
+    """Return the share of the frames with a pose in which each joint was measured."""
     counted = (observed & there[:, None]).sum(0)
     return (counted / max(1, int(there.sum()))).tolist()
 
