@@ -271,7 +271,7 @@ def _check_values(tensors: Mapping[str, Tensor], kind: FileKind[Any]) -> None:
 
 
 def _inflated(cov: Tensor) -> Tensor:
-    """Return a covariance a little larger, so that what has no extent in some direction passes for a covariance."""
+    """Return the covariance made a little larger, so that it passes where it has no extent in a direction."""
     size = cov.abs().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(torch.float32).tiny)
     return cov + 1e-7 * size * torch.eye(cov.shape[-1], dtype=cov.dtype)
 
