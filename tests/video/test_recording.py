@@ -10,7 +10,7 @@ from torchpose.measure.hand_measurements import HandMeasurements
 from torchpose.measure.upper_body import MEASURED, FrameMeasurements, rounded_covariance
 from torchpose.upper_body import UpperBodyTracker
 from torchpose.video.person_stream import PersonStream
-from torchpose.video.recording import Recording
+from torchpose.video.recording import TrackedRecording
 
 FIELDS = ("joints2d", "joints3d", "covariance3d")
 GAP = 20
@@ -52,7 +52,7 @@ def frames(keypoints, present):
 
 
 def record(tracker, found, size, smoother=None):
-    kept = Recording(PersonStream(tracker, MEASURED), GAP)
+    kept = TrackedRecording(PersonStream(tracker, MEASURED), GAP)
     for start in range(0, len(found), size):
         kept.append(found[start : start + size])
     return kept.finish(smoother)

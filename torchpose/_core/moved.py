@@ -12,7 +12,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
-__all__ = ["MODULES", "NAMES", "install", "moved_names", "present_module"]
+__all__ = ["MODULES", "NAMES", "install", "moved_from", "moved_names", "present_module"]
 
 MODULES = {
     "arm_filters": "upper_body.single_poses",
@@ -281,8 +281,12 @@ NAMES: dict[str, dict[str, str]] = {
     "torchpose.viz": {
         "viz.prior_pictures": "plot_log_likelihood",
     },
+    "torchpose.video.recording": {"video.recording": "Recording=TrackedRecording"},
 }
-"""Names that a package had: present home (without `torchpose.`) to the names in it."""
+"""Names that a package or module had: present home (without `torchpose.`) to the names in it.
+
+A name that has changed is OLD=NEW.
+"""
 
 
 def present_module(old: str) -> str | None:
@@ -297,16 +301,25 @@ def present_module(old: str) -> str | None:
 
 def moved_names(package: str) -> Callable[[str], Any]:
     """Return the `__getattr__` of a package that had names which have moved."""
-    homes = {n: home for home, names in NAMES[package].items() for n in names.split()}
+    homes = {old: (home, new) for home, old, new in moved_from(package)}
 
     def attribute(name: str) -> Any:
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        home = f"torchpose.{homes[name]}"
-        _warn(f"{package}.{name}", f"{home}.{name}")
-        return getattr(import_module(home), name)
+        home, present = homes[name]
+        _warn(f"{package}.{name}", f"torchpose.{home}.{present}")
+        return getattr(import_module(f"torchpose.{home}"), present)
 
     return attribute
+
+
+def moved_from(package: str) -> list[tuple[str, str, str]]:
+    """Return present home, old name and present name of everything that has left a package."""
+    return [
+        (home, old, new or old)
+        for home, names in NAMES[package].items()
+        for old, _, new in (name.partition("=") for name in names.split())
+    ]
 
 
 def install() -> None:

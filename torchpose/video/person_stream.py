@@ -32,12 +32,12 @@ class Measured(NamedTuple):
     size: Float[Tensor, " T"]
 
     def frames(self, rows: slice) -> "Measured":
-        """Some of the frames."""
+        """Return some of the frames."""
         return Measured(*(x[rows] for x in self))
 
 
 def measured_of(block: Sequence[FrameMeasurements], number: int, n_joints: int) -> Measured:
-    """What was measured of one person in each frame of a block."""
+    """Return what was measured of one person in each frame of a block."""
     keypoints, cov, size = found = unmeasured(len(block), n_joints)
     for t, frame in enumerate(block):
         row = torch.nonzero(frame.person == number).flatten()
@@ -48,7 +48,7 @@ def measured_of(block: Sequence[FrameMeasurements], number: int, n_joints: int) 
 
 
 def unmeasured(n_frames: int, n_joints: int) -> Measured:
-    """Frames in which nothing is measured."""
+    """Return frames in which nothing is measured."""
     return Measured(
         torch.full((n_frames, n_joints, 2), torch.nan, dtype=torch.float64),
         torch.eye(2, dtype=torch.float64).repeat(n_frames, n_joints, 1, 1),
@@ -96,7 +96,7 @@ class PersonStream(nn.Module):
         self.exchanged = [self.names.index(_other_side(name)) for name in self.names]
 
     def init(self, number: int) -> PersonStreamState:
-        """Before the first frame of the person of this number."""
+        """Return the state before the first frame of the person of this number."""
         generator = torch.Generator().manual_seed(self.seed + number)
         batch = 1 if self.association is None else 2
         stream = self.tracker.init(batch, self.names, generator)
@@ -107,7 +107,7 @@ class PersonStream(nn.Module):
     def advance(
         self, state: PersonStreamState, measured: Measured, images: Sequence[Image] = ()
     ) -> tuple[PersonStreamState, PoseTrack, Measured]:
-        """Some more frames.
+        """Track some more frames.
 
         Args:
             state: from `init` or the call before. measured: in these frames.
@@ -143,7 +143,7 @@ def _vote(
     images: Sequence[Image],
     hands: list[int],
 ) -> tuple[AssociationState, Tensor]:
-    """Which hypothesis holds in each frame, 0 or 1 [T]."""
+    """Return which hypothesis holds in each frame, 0 or 1 [T]."""
     import cv2
 
     number = torch.zeros(1, dtype=torch.long)
@@ -159,7 +159,7 @@ def _vote(
 
 
 def _choose(poses: PoseTrack, which: Tensor) -> PoseTrack:
-    """One sequence of two, frame by frame."""
+    """Return one sequence of two, chosen frame by frame."""
     frames = torch.arange(len(which))
     fields = {name: getattr(poses, name)[which, frames][None] for name in FRAME_FIELDS}
     failed = poses.failed_at[which]

@@ -67,7 +67,7 @@ class PoseSpool:
         self._n_frames += block.joints3d.shape[1]
 
     def track(self, n_frames: int | None = None) -> PoseTrack:
-        """The poses so far, or the first of them, read from the files as they are used.
+        """Return the poses so far, or the first of them, read from the files as they are used.
 
         Raises:
             InputError: there are none.

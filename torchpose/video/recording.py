@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from torchpose._core.facade import set_up_facade
 from torchpose.measure.face import Image
 from torchpose.measure.upper_body import FrameMeasurements
 from torchpose.upper_body.pose_track import PoseTrack
@@ -21,7 +22,9 @@ from torchpose.video.person_stream import (
 )
 from torchpose.video.pose_spool import PoseSpool
 
-__all__ = ["Recording", "TrackedPerson", "smoothed"]
+__all__ = ["TrackedPerson", "TrackedRecording", "smoothed"]
+
+set_up_facade(__name__)
 
 _LEAST_SECONDS = 0.5  # for which somebody has to be seen to be reported
 
@@ -66,7 +69,7 @@ class _Person:
     n_seen: int = 0
 
 
-class Recording:
+class TrackedRecording:
     """Tracks everybody whose measurements are appended, each with a stream of its own.
 
     Args:
@@ -84,7 +87,7 @@ class Recording:
     def append(
         self, block: Sequence[FrameMeasurements], images: Sequence[Image] = ()
     ) -> dict[int, PoseTrack]:
-        """The next frames, and their images if the stream looks at them.
+        """Track the next frames, with their images if the stream looks at them.
 
         Returns:
             The poses of everybody who was there before the block or is in it, by number: those of
@@ -135,7 +138,7 @@ class Recording:
         return poses
 
     def finish(self, smoother: UpperBodyTracker | None = None) -> list[TrackedPerson]:
-        """Everybody who was seen for half a second, the one seen longest first.
+        """Return everybody who was seen for half a second, the one seen longest first.
 
         Args:
             smoother: gives the poses anew, from all frames.
@@ -146,7 +149,7 @@ class Recording:
         return [self._finish(person, smoother) for person in lasting]
 
     def _finish(self, person: _Person, smoother: UpperBodyTracker | None) -> TrackedPerson:
-        """The poses until the person was last seen."""
+        """Return the poses until the person was last seen."""
         count = person.last_seen + 1
         keypoints = torch.cat([part.keypoints for part in person.measured])[:count]
         cov = torch.cat([part.covariance for part in person.measured])[:count]
@@ -161,7 +164,7 @@ class Recording:
 def smoothed(
     person: TrackedPerson, smoother: UpperBodyTracker, names: Sequence[str], gap: int
 ) -> PoseTrack:
-    """The poses of a person anew, from all measurements together.
+    """Return the poses of a person anew, from all measurements together.
 
     Args:
         names: of the measured joints. gap: frames after which there is no pose.
@@ -180,7 +183,11 @@ def _seen(measured: Measured) -> Bool[Tensor, " T"]:
 def _without_long_gaps(
     poses: PoseTrack, seen: Bool[Tensor, " T"], unseen: int, gap: int
 ) -> PoseTrack:
-    """NaN where nothing was seen for more than `gap` frames; `unseen` of them came before."""
+    """Return the poses, NaN where nothing was seen for more than `gap` frames.
+
+    Args:
+        unseen: number of frames without measurements before these.
+    """
     frames = torch.arange(len(seen))
     last = torch.where(seen, frames, torch.full_like(frames, -1 - unseen)).cummax(0).values
     away = frames - last > gap
@@ -195,7 +202,7 @@ def _without_long_gaps(
 
 
 def _nobody(n_frames: int, tracker: UpperBodyTracker) -> PoseTrack:
-    """Frames in which somebody has no pose."""
+    """Return frames in which somebody has no pose."""
 
     def nothing(*shape: int) -> Tensor:
         return torch.full((1, n_frames, *shape), torch.nan, dtype=torch.float64)

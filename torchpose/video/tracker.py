@@ -28,7 +28,7 @@ from torchpose.upper_body.pose_track import PoseTrack
 from torchpose.upper_body.tracker import UpperBodyTracker
 from torchpose.video.person_stream import Measured, PersonStream, PersonStreamState, measured_of
 from torchpose.video.prefetch import prefetch
-from torchpose.video.recording import Recording, TrackedPerson
+from torchpose.video.recording import TrackedPerson, TrackedRecording
 
 __all__ = ["LivePerson", "TrackedPerson", "VideoState", "VideoTracker", "Watcher"]
 
@@ -142,7 +142,7 @@ class VideoTracker(nn.Module):
         )
 
     def init(self) -> VideoState:
-        """Nobody was seen yet."""
+        """Return the state before the first frame, when nobody was seen yet."""
         return VideoState(self.measurer.init(), {}, {})
 
     def step(self, state: VideoState, image: Image | Tensor) -> tuple[VideoState, list[LivePerson]]:
@@ -197,7 +197,7 @@ class VideoTracker(nn.Module):
         Raises:
             InputError: another kind of image. OutputError: the disk is full.
         """
-        recording = Recording(self.stream, self.gap, folder)
+        recording = TrackedRecording(self.stream, self.gap, folder)
         size = _BLOCK if watch is None and not self.candidates else 1
         last: dict[int, PoseTrack] = {}
         block: list[FrameMeasurements] = []
@@ -223,7 +223,7 @@ class VideoTracker(nn.Module):
     def _measure(
         self, frames: Iterable[Any] | Tensor, last: dict[int, PoseTrack]
     ) -> Iterator[tuple[Image, FrameMeasurements]]:
-        """Frames and what is measured in them; faces are found ahead, in another thread.
+        """Yield frames and what is measured in them; faces are found ahead, in another thread.
 
         `last` holds the poses of the frame before, for candidates.
         """
@@ -246,7 +246,7 @@ class VideoTracker(nn.Module):
 
 
 def as_image(image: Any) -> Image:
-    """A frame as an array [H, W, 3]; tensors are [3, H, W]."""
+    """Return a frame as an array [H, W, 3]; tensors are [3, H, W]."""
     if isinstance(image, Tensor):
         if image.ndim != 3 or image.shape[0] != 3 or image.dtype != torch.uint8:
             raise InputError(
@@ -259,7 +259,7 @@ def as_image(image: Any) -> Image:
 
 
 def _candidates(poses: dict[int, PoseTrack]) -> dict[int, Candidates]:
-    """Where the poses of a frame have the hands, by person."""
+    """Return where the poses of a frame have the hands, by person."""
     return {
         n: Candidates(pose.joints2d[0, -1, _HANDS], pose.covariance2d[0, -1, _HANDS])
         for n, pose in poses.items()
