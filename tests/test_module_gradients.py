@@ -20,6 +20,9 @@ from torchpose.upper_body.fusion import MotionStage, ReadOut
 POINTS = modules.points
 ELSEWHERE = {
     "MixtureKalmanFilter": "tests/filters/test_gradients.py",
+    "FixedTrackFilter": "tests/filters/test_gradients.py",
+    "SampledTrackFilter": "tests/filters/test_gradients.py",
+    "SplitTrackFilter": "tests/filters/test_gradients.py",
     "BootstrapParticleFilter": "tests/filters/test_gradients.py",
     "ConstantVelocityFilter": "tests/filters/test_gradients.py",
     "BodyTracker": "tests/whole_body/test_tracker.py",

@@ -37,7 +37,7 @@ class OneGaussianFilter(RecursiveFilter):
             self.prior_mean.expand(batch_size, dim), self.prior_cov.expand(batch_size, dim, dim)
         )
 
-    def advance(self, state, frame, generator, return_cov):
+    def filter_frame(self, state, frame, generator, return_cov):
         predicted = kalman_predict(*state, self.matrix, self.offset, self.noise)
         mean, cov, log_evidence = kalman_update(
             *predicted, frame.z, frame.cov, self.observed, frame.mask

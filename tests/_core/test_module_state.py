@@ -39,6 +39,9 @@ ELSEWHERE = {
     "RecursiveFilter": "an abstract base",
     "SilhouetteParticleFilter": "an abstract base",
     "MixtureKalmanFilter": "tests/filters/test_filter_state.py",
+    "FixedTrackFilter": "tests/filters/test_filter_state.py",
+    "SampledTrackFilter": "tests/filters/test_filter_state.py",
+    "SplitTrackFilter": "tests/filters/test_filter_state.py",
     "BootstrapParticleFilter": "tests/filters/test_filter_state.py",
     "UpperBodyTracker": "tests/upper_body/test_tracker_state.py",
 }

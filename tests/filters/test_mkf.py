@@ -1,5 +1,7 @@
 """The mixture Kalman filter against dense joint Gaussians and enumeration."""
 
+import copyreg
+import inspect
 import itertools
 
 import numpy as np
@@ -15,12 +17,19 @@ from tests.filters.oracles import (
 )
 from tests.filters.small_problem import DIM, OBSERVED, Problem
 from torchpose.errors import CovarianceError, DegenerateFilterWarning, InputError, ShapeError
-from torchpose.filters import MixtureKalmanFilter, RecursiveFilter
-from torchpose.filters.mkf import TRACK_OPTIONS
+from torchpose.filters import (
+    FixedTrackFilter,
+    MixtureKalmanFilter,
+    RecursiveFilter,
+    SampledTrackFilter,
+    SplitTrackFilter,
+    StepOutput,
+)
 from torchpose.filters.transition import make_transition
 from torchpose.priors import GaussianMixture
 from torchpose.whole_body import SilhouetteParticleFilter
 
+KINDS = {"fixed": FixedTrackFilter, "sampled": SampledTrackFilter, "split": SplitTrackFilter}
 DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
 
 
@@ -123,6 +132,34 @@ def test_online_and_offline_give_the_same_numbers(batch, gaps):
     step = online(model, z, mask)
     torch.testing.assert_close(offline.log_evidence, step[2], rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(offline.cov, step[3], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("tracks", KINDS)
+def test_some_more_frames_are_those_of_steps(tracks):
+    p = Problem(n_frames=20, batch=3)
+    z, mask, model = tensor(p.z), torch.tensor(p.mask), p.filter(tracks=tracks)
+    steps = online(model, z, mask, generator=torch.Generator().manual_seed(0))
+    draws, parts = torch.Generator().manual_seed(0), []
+    state = model.init(3, draws)
+    for rows in (slice(0, 1), slice(1, 12), slice(12, 20)):
+        options = {"generator": draws, "return_cov": True}
+        state, out = model.advance(state, z[:, rows], mask[:, rows], **options)
+        parts.append(out)
+    assert state.time == 20
+    for ours, expected in zip(zip(*(out[:4] for out in parts), strict=True), steps, strict=False):
+        torch.testing.assert_close(torch.cat(ours, 1), expected, rtol=0, atol=0)
+    with pytest.raises(ShapeError, match="state"):
+        model.advance(state, z[:2], mask[:2])
+
+
+def test_more_frames_without_memory_are_those_of_the_whole_sequence():
+    p = Problem(n_frames=12, batch=2)
+    z, mask = tensor(p.z), torch.tensor(p.mask)
+    model = p.filter(transition="ou", gamma=0.0, weighting="frame", medians=[1])
+    state, first = model.advance(model.init(2), z[:, :5], mask[:, :5])
+    state, second = model.advance(state, z[:, 5:], mask[:, 5:])
+    assert state.time == 12
+    torch.testing.assert_close(torch.cat([first.mean, second.mean], 1), model(z, mask).mean)
 
 
 def test_many_mask_histories_fall_back_to_the_plain_loop_with_the_same_numbers():
@@ -311,7 +348,7 @@ def test_every_option_changes_what_it_is_said_to_change():
     for tracks in ("fixed", "sampled", "split"):
         plain = estimate(tracks)
         for name, value in values.items():
-            if tracks in TRACK_OPTIONS.get(name, (tracks,)):
+            if name in inspect.signature(KINDS[tracks]).parameters:
                 assert (estimate(tracks, **{name: value}) - plain).abs().max() > 1e-6, (
                     tracks,
                     name,
@@ -319,6 +356,65 @@ def test_every_option_changes_what_it_is_said_to_change():
             else:
                 with pytest.raises(InputError, match=name):
                     estimate(tracks, **{name: value})
+
+
+@pytest.mark.parametrize("tracks", KINDS)
+def test_the_class_of_the_tracks_is_what_the_name_of_the_tracks_makes(tracks):
+    p = Problem(n_frames=9, batch=2)
+    arguments = p.mixture(), tensor(p.process), tensor(p.noise), OBSERVED
+    named, made = (
+        MixtureKalmanFilter(*arguments, tracks, burn_in=2),
+        KINDS[tracks](*arguments, burn_in=2),
+    )
+    assert type(named) is type(made) is KINDS[tracks]
+    assert isinstance(made, MixtureKalmanFilter) and made.tracks == tracks
+    options = {"generator": torch.Generator().manual_seed(2)}
+    torch.testing.assert_close(
+        made(tensor(p.z), **options).mean,
+        named(tensor(p.z), generator=torch.Generator().manual_seed(2)).mean,
+        rtol=0, atol=0,
+    )  # fmt: skip
+    others = {"fixed": "n_tracks", "sampled": "uniform_weight", "split": "resample_threshold"}
+    with pytest.raises(TypeError, match=others[tracks]):
+        KINDS[tracks](*arguments, **{others[tracks]: 0.5})
+
+
+def test_fixed_tracks_may_be_counted_and_one_class_derives_from_that_of_its_tracks():
+    arguments = good_arguments()
+    assert MixtureKalmanFilter(**arguments, n_tracks=3).n_tracks == 3
+    derived = type("Mine", (FixedTrackFilter,), {})
+    assert derived(**arguments)(torch.zeros(1, 2, 2)).mean.shape == (1, 2, DIM)
+    with pytest.raises(InputError, match="FixedTrackFilter, SampledTrackFilter, SplitTrackFilter"):
+        type("Mine", (MixtureKalmanFilter,), {})(**arguments)
+
+
+@pytest.mark.parametrize("tracks", KINDS)
+def test_filters_pickled_as_the_one_class_that_there_was_become_those_of_their_tracks(tracks):
+    p = Problem()
+    model = p.filter(tracks=tracks)
+    older = copyreg.__newobj__(MixtureKalmanFilter)  # what pickle calls
+    older.__setstate__(model.__dict__ | {"tracks": tracks})
+    assert type(older) is KINDS[tracks]
+    draws = [torch.Generator().manual_seed(4) for _ in range(2)]
+    outs = [f(tensor(p.z), generator=g).mean for f, g in zip((older, model), draws, strict=True)]
+    torch.testing.assert_close(*outs, rtol=0, atol=0)
+
+
+def test_a_tracker_written_for_the_former_name_of_its_step_runs_with_a_warning():
+    class Former(RecursiveFilter):
+        def init(self, batch_size, generator=None):
+            return 0
+
+    with pytest.warns(DeprecationWarning, match="filter_frame"):
+
+        class Older(Former):
+            def advance(self, state, frame, generator, return_cov):
+                mean = frame.z.cumsum(-1)
+                return state + 1, StepOutput(mean, mean[:, :1], mean[:, 0])
+
+    model, z = Older(torch.ones(2), [0, 1], 2, torch.float64), torch.ones(3, 4, 2)
+    assert (model(z).mean[..., 1] == 2).all()
+    assert model.advance(model.init(3), z)[0] == 4 and model.step(0, z[:, 0])[0] == 1
 
 
 def test_smoothing_refuses_settings_of_the_filter_alone():
@@ -355,7 +451,7 @@ def good_arguments():
         ({"observed": [1, 1]}, InputError, "distinct"),
         ({"observed": []}, InputError, "distinct"),
         ({"tracks": "frozen"}, InputError, "fixed, sampled, split"),
-        ({"n_tracks": 7}, InputError, "fixed tracks are one for each"),
+        ({"n_tracks": 7}, InputError, "tracks='sampled' or 'split'"),
         ({"uniform_weight": -1.0}, InputError, "at least 0"),
         ({"tracks": "sampled", "resample_threshold": 7}, InputError, "from 0 to 1"),
         ({"tracks": "sampled", "resample_threshold": -1}, InputError, "from 0 to 1"),

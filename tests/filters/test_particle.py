@@ -17,7 +17,7 @@ from tests.filters.oracles import (
 )
 from torchpose.errors import CovarianceError, DegenerateFilterWarning, InputError, ShapeError
 from torchpose.filters import BootstrapParticleFilter, RecursiveFilter
-from torchpose.filters.particle_options import PROPOSALS
+from torchpose.filters.particle import PROPOSALS
 from torchpose.filters.transition import make_transition
 from torchpose.filters.walk import MixtureWalk, Moves, grouped_affine
 from torchpose.math import log_prob, mixture_moments

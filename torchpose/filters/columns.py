@@ -4,22 +4,19 @@ A step of all tracks is one product of the gains with the measurements and one w
 over columns that are sequences; a few frames at a time stay in the cache until their weights are in.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose.filters.base import Measurements
-from torchpose.filters.gains import Edge
-from torchpose.filters.mending import mending_of_edges
+from torchpose.filters.gain_graph import Edge, mending_of_edges
+from torchpose.filters.measurements import Measurements
+from torchpose.filters.mkf import MixtureKalmanFilter
 from torchpose.filters.outputs import FilterOutput, finish_output
-from torchpose.filters.weights import indicator_mixing, steps_between_rescaling
+from torchpose.filters.weights import WeightRule, indicator_mixing, steps_between_rescaling
 from torchpose.math.gaussian import least_exponent
-
-if TYPE_CHECKING:
-    from torchpose.filters.mkf import MixtureKalmanFilter
 
 __all__ = ["run_columns", "suits_columns"]
 
@@ -41,22 +38,27 @@ class _Step(NamedTuple):
     log_norm: Tensor
 
 
-def suits_columns(model: "MixtureKalmanFilter", frames: Measurements, shared: bool) -> bool:
-    """Whether `run_columns` may run: many sequences of one history, and weights as published."""
-    published = (
-        model.likelihood_power == 1 and model.reset_below is None and model.weighting == "sequence"
-    )
-    mixed = model.uniform_weight > 0
-    safe = (
-        mixed and steps_between_rescaling(model.log_prior.to(model.dtype), model.uniform_weight) > 0
-    )
-    return shared and published and safe and frames.z.shape[0] >= _LEAST_BATCH
+def suits_columns(rule: WeightRule, batch: int) -> bool:
+    """Return whether `run_columns` may run: many sequences, and weights as published."""
+    published = rule.power == 1 and rule.reset_below is None and not rule.by_frame
+    mixed = rule.uniform_weight > 0
+    safe = mixed and steps_between_rescaling(rule.log_prior, rule.uniform_weight) > 0
+    return published and safe and batch >= _LEAST_BATCH
 
 
 def run_columns(
-    model: "MixtureKalmanFilter", frames: Measurements, edges: list[Edge], progress: bool
+    model: MixtureKalmanFilter,
+    rule: WeightRule,
+    frames: Measurements,
+    edges: list[Edge],
+    progress: bool,
 ) -> FilterOutput:
-    """All frames of a batch; `edges` has the gains of each frame."""
+    """Filter all frames of a batch.
+
+    Args:
+        model: with fixed tracks. rule: of their weights. frames: all that is measured, in sequences of
+            one history. edges: the gains of each frame. progress: whether to show a progress bar.
+    """
     batch, n_frames, _ = frames.z.shape
     steps = _steps(model, edges)
     options = {"dtype": model.dtype, "device": frames.z.device}
@@ -68,7 +70,7 @@ def run_columns(
     for rows in torch.arange(batch).tensor_split(n_parts):
         part = slice(int(rows[0]), int(rows[-1]) + 1)
         out = means[:, part], log_weights[:, part], evidence[:, part]
-        _run_part(model, frames.z[part], steps, out, bar)
+        _run_part(model, rule, frames.z[part], steps, out, bar)
     bar.close()
     evidence = torch.where(frames.mask.any(-1), evidence.mT, torch.zeros_like(evidence.mT))
     shared = torch.zeros(batch, dtype=torch.long, device=frames.z.device)
@@ -78,7 +80,7 @@ def run_columns(
     )
 
 
-def _steps(model: "MixtureKalmanFilter", edges: list[Edge]) -> list[_Step]:
+def _steps(model: MixtureKalmanFilter, edges: list[Edge]) -> list[_Step]:
     made: dict[int, _Step] = {}
     for edge in edges:
         if id(edge) not in made:
@@ -86,7 +88,7 @@ def _steps(model: "MixtureKalmanFilter", edges: list[Edge]) -> list[_Step]:
     return [made[id(edge)] for edge in edges]
 
 
-def _step(model: "MixtureKalmanFilter", edge: Edge) -> _Step:
+def _step(model: MixtureKalmanFilter, edge: Edge) -> _Step:
     matrix, observed = model.transition(model.burn_in).matrix, model.observed
     whiten = edge.inverse_factor
     gain = edge.white.mT @ whiten
@@ -102,7 +104,8 @@ def _step(model: "MixtureKalmanFilter", edge: Edge) -> _Step:
 
 
 def _run_part(
-    model: "MixtureKalmanFilter",
+    model: MixtureKalmanFilter,
+    rule: WeightRule,
     z: Float[Tensor, "B T Z"],
     steps: list[_Step],
     out: tuple[Tensor, Tensor, Tensor],
@@ -115,7 +118,7 @@ def _run_part(
     slabs = z.new_empty(_FRAMES, n_tracks, n_obs + dim, batch)
     squares = z.new_empty(_FRAMES, n_tracks, n_obs, batch)
     log_likelihood = z.new_empty(_FRAMES, n_tracks, batch)
-    weights = _LinearWeights(model, batch, z)
+    weights = _LinearWeights(rule, batch)
     centres = model.means.to(z.dtype).T.contiguous()
     state = z.new_zeros(n_tracks, dim, batch)
     for start in range(0, n_frames, _FRAMES):
@@ -142,16 +145,16 @@ def _run_part(
 class _LinearWeights:
     """The recursion of `sequence_weights` with epsilon, on scaled linear numbers [S, M, B]."""
 
-    def __init__(self, model: "MixtureKalmanFilter", batch: int, like: Tensor) -> None:
-        log_prior = model.log_prior.to(like.dtype)
+    def __init__(self, rule: WeightRule, batch: int) -> None:
+        log_prior = rule.log_prior
         prior = log_prior.exp()[:, None]
-        self._transition = indicator_mixing(log_prior, model.uniform_weight).mT.contiguous()
-        self._rescale = steps_between_rescaling(log_prior, model.uniform_weight)
+        self._transition = indicator_mixing(log_prior, rule.uniform_weight).mT.contiguous()
+        self._rescale = steps_between_rescaling(log_prior, rule.uniform_weight)
         self._predicted = (prior / prior.sum() * prior).expand(-1, batch)
         self._count = 0
 
     def update(self, log_likelihood: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Weights, log-weights [S, M, B] and log-evidence [S, B] of the next S frames."""
+        """Return weights, log-weights [S, M, B] and log-evidence [S, B] of the next S frames."""
         top = log_likelihood.amax(1, keepdim=True)
         likelihood = (log_likelihood - top).clamp_min_(least_exponent(log_likelihood.dtype)).exp_()
         predicted = torch.empty_like(likelihood)

@@ -37,7 +37,7 @@ class _Gains(NamedTuple):
 
 
 class ConstantVelocityFilter(nn.Module):
-    """Takes the noise out of numbers that are measured in every frame and move smoothly.
+    """Kalman filter of numbers that are measured in every frame and move at nearly constant velocity.
 
     Each number by itself, at all times with the same gains:
         (x, v)_t = [1 dt; 0 1] (x, v)_{t-1} + N(0, q [dt^3/3 dt^2/2; dt^2/2 dt]),   z_t = x_t + N(0, r).
@@ -84,27 +84,27 @@ class ConstantVelocityFilter(nn.Module):
         return _Gains(*(part.to(self.ratio.device) for part in (matrix, *gains)))
 
     def init(self, z: Float[Tensor, "B N"]) -> ConstantVelocityState:
-        """The state before the first frame, whose values are `z`."""
+        """Return the state before the first frame, whose values are `z`."""
         return ConstantVelocityState(torch.stack([z, torch.zeros_like(z)], 1), 0)
 
     def step(
         self, state: ConstantVelocityState, z: Float[Tensor, "B N"]
     ) -> tuple[ConstantVelocityState, Float[Tensor, "B N"]]:
-        """One frame: the same numbers as the same frame of `forward`."""
+        """Filter one frame: the same numbers as the same frame of `forward`."""
         state, _ = self._advance(state, z)
         return state, state.mean[:, 0]
 
     def advance(
         self, state: ConstantVelocityState, z: Float[Tensor, "B T N"]
     ) -> tuple[ConstantVelocityState, Float[Tensor, "B T N"]]:
-        """Some more frames: the same numbers as `step` for one after the other."""
+        """Filter some more frames: the same numbers as `step` for one after the other."""
         state, means, _ = self._run(state, z)
         return state, means[:, :, 0]
 
     def _advance(
         self, state: ConstantVelocityState, z: Tensor
     ) -> tuple[ConstantVelocityState, Tensor]:
-        """The next state, and by how much it differs from its prediction [B, 2, N]."""
+        """Return the next state, and by how much it differs from its prediction [B, 2, N]."""
         known = self._gains()
         predicted = state.mean if state.time == 0 else known.matrix.to(state.mean) @ state.mean
         gain = known.filter[min(state.time, len(known.filter) - 1)].to(z)
@@ -112,14 +112,14 @@ class ConstantVelocityFilter(nn.Module):
         return ConstantVelocityState(predicted + correction, state.time + 1), correction
 
     def forward(self, z: Float[Tensor, "B T N"]) -> Float[Tensor, "B T N"]:
-        """Filtered numbers: each uses its own frame and those before."""
+        """Return filtered numbers: each uses its own frame and those before."""
         check_shape("z", z, ["B", "T", "N"])
         return self.advance(self.init(z[:, 0]), z)[1]
 
     def _run(
         self, state: ConstantVelocityState, z: Tensor
     ) -> tuple[ConstantVelocityState, Tensor, Tensor]:
-        """The state after all frames, filtered means, and filtered minus predicted, [B, T, 2, N]."""
+        """Return the state after all frames, filtered means, and these minus predicted, [B, T, 2, N]."""
         means, corrections = [], []
         for frame in z.unbind(1):
             state, correction = self._advance(state, frame)
@@ -133,7 +133,7 @@ class ConstantVelocityFilter(nn.Module):
         lengths: Int[Tensor, " B"] | None = None,
         lag: int | None = None,
     ) -> Float[Tensor, "B T N"]:
-        """Numbers that use later frames too.
+        """Return numbers that use later frames too.
 
         Args:
             z: [B, T, N]. lengths: frames of each sequence [B]; those after are not used.
@@ -167,12 +167,12 @@ class ConstantVelocityFilter(nn.Module):
         return (means + change)[:, :, 0]
 
     def extra_repr(self) -> str:
-        """Settings, for printing."""
+        """Return the settings, for printing."""
         return f"ratio={float(self.ratio):g}, fps={float(self.fps):g}"
 
 
 def _riccati(matrix: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Kalman gains [S, 2] and smoother gains [S, 2, 2], frame by frame until they settle; r = 1."""
+    """Return Kalman gains [S, 2] and smoother gains [S, 2, 2], until they settle; r = 1."""
     observed, unit = torch.tensor([0]), torch.ones(1, 1, dtype=matrix.dtype)
     predicted = torch.diag(torch.tensor([1.0, _VELOCITY_VARIANCE], dtype=matrix.dtype))
     gains, smoothers = [], []

@@ -1,255 +1,251 @@
-"""Mixture Kalman filter with fixed tracks: one step, and whole batches of sequences.
+"""The mixture Kalman filter with fixed tracks: one Kalman filter for each component (BL 49)."""
 
-A track never changes its component, so its covariances depend only on which joints were measured.
-`run` shares the gains of all sequences with one history of masks, and falls back to the plain recursion
-for noise that changes in each frame, for burn-in, and where gradients of model or noise are wanted.
-"""
-
-from typing import TYPE_CHECKING, NamedTuple
+import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from torchpose._core.value_checks import values_visible
-from torchpose.filters.base import Measurements
+from torchpose.errors import InputError
+from torchpose.filters.base import Generators
 from torchpose.filters.columns import run_columns, suits_columns
-from torchpose.filters.frame_weights import (
-    advance_memoryless,
-    frame_log_likelihood,
-    frame_weights,
-    run_memoryless,
-)
-from torchpose.filters.mending import mending
-from torchpose.filters.outputs import FilterOutput, StepOutput, collect
-from torchpose.filters.recompute import recomputed, wants_gradient
-from torchpose.filters.shared_gains import (
-    RECOMPUTED_FRAMES,
-    find_history,
-    run_for_gradients,
-    run_shared,
-)
-from torchpose.filters.tracks import MKFState, estimate_of
-from torchpose.filters.transition import Transition
-from torchpose.filters.weights import mix_uniform, step_weights
-from torchpose.math.gaussian import Gain, kalman_correct, kalman_gain, symmetrise
+from torchpose.filters.gain_graph import find_history
+from torchpose.filters.measurements import Measurements
+from torchpose.filters.memoryless import frame_log_likelihood, run_memoryless, step_memoryless
+from torchpose.filters.mkf import MixtureKalmanFilter, MKFState
+from torchpose.filters.outputs import FilterOutput, StepOutput
+from torchpose.filters.recompute import wants_gradient
+from torchpose.filters.shared_gains import run_for_gradients, run_shared
+from torchpose.filters.smoothing import smooth_fixed_tracks
+from torchpose.filters.track_steps import run_steps, step_estimate
+from torchpose.filters.weights import WeightRule
+from torchpose.priors.gaussian_mixture import GaussianMixture
 
-if TYPE_CHECKING:
-    from torchpose.filters.mkf import MixtureKalmanFilter
+__all__ = ["FixedTrackFilter"]
+
+_WEIGHTINGS = ("sequence", "frame")
+_UNIFORM_WEIGHT = 1e-3
 
 
-class TrackStep(NamedTuple):
-    """All tracks after one step, before their weights.
+class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
+    """Mixture Kalman filter with one track for each component, which it keeps for ever (BL 49).
 
-    Attributes:
-        predicted, mean: track means before and after the measurement [B, M, D].
-        log_likelihood: [B, M]. predicted_cov, cov: before and after, [G, M, D, D].
-        group: row of the covariances for each element [B].
-        jitter: of the innovation covariances [B, M], or None; see `mended_cholesky`.
+    Each track j is a Kalman filter; with a_j prop. to pi_j w_{t-1,j}, its weight and the evidence are
+        w_j prop. to a_j N_j^power,  log p(z_t | z_1:t-1) = logsumexp_j(log a_j + log N_j),
+    and then w <- (w + epsilon) / (1 + M epsilon), so that no component is lost.
+
+    Covariances depend on which joints were measured, never on where they were: sequences that measure
+    the same share their gains, and constant stretches need no loop over time.
+
+    Args:
+        gmm, process_cov, measurement_cov, observed, initial_cov, transition, gamma, subspace, burn_in,
+            burn_in_scale, dtype: as `MixtureKalmanFilter`.
+        uniform_weight: epsilon, 1e-3 by default; only where weighting is "sequence".
+        likelihood_power: exponent of the likelihood in the weights; 1 as published, below 1 where the
+            components are surer of themselves than they should be.
+        weighting: "sequence" as published, or "frame": the weights of a frame are those that the mixture
+            gives to its measurement alone, w_j prop. to pi_j N(z_t; H mu_j, H Sigma_j H^T + R)^power.
+            For mixtures whose state holds the past already.
+        reset_below: weights go back to pi where logsumexp_j(log pi_j + log w_j + log N_j) is below this,
+            as in the authors' released code, whose linear weights are then all zero. None is never.
+        medians: first of three dimensions each, points whose estimate is the geometric median of the
+            mixture instead of its mean (BL 48); only where frames do not depend on each other.
+
+    Raises:
+        InputError, ShapeError, CovarianceError: for what does not fit, before any work.
+
+    Reference:
+        M. Burke, J. Lasenby, "Single camera pose estimation using Bayesian filtering and Kinect
+        motion priors", eqs 34-42, 48-49.
     """
 
-    predicted: Tensor
-    mean: Tensor
-    log_likelihood: Tensor
-    predicted_cov: Tensor
-    cov: Tensor
-    group: Tensor
-    jitter: Tensor | None
+    medians: Tensor
 
+    def __init__(
+        self,
+        gmm: GaussianMixture,
+        process_cov: Tensor,
+        measurement_cov: Tensor,
+        observed: Sequence[int] | Tensor,
+        *,
+        uniform_weight: float | None = None,
+        initial_cov: Tensor | None = None,
+        transition: str = "paper",
+        gamma: Tensor | float | None = None,
+        subspace: int | None = None,
+        burn_in: int = 0,
+        burn_in_scale: float | None = None,
+        likelihood_power: float = 1.0,
+        weighting: str = "sequence",
+        reset_below: float | None = None,
+        dtype: torch.dtype = torch.float64,
+        medians: Sequence[int] = (),
+    ) -> None:
+        _check_weighting(weighting, uniform_weight, reset_below)
+        uniform_weight = _UNIFORM_WEIGHT if uniform_weight is None else uniform_weight
+        _check_ranges(uniform_weight, likelihood_power)
+        if len(medians):
+            _check_memoryless(weighting, transition, gamma)
+        self._register_model(
+            gmm, process_cov, measurement_cov, observed,
+            n_tracks=None, initial_cov=initial_cov, transition=transition, gamma=gamma,
+            subspace=subspace, burn_in=burn_in, burn_in_scale=burn_in_scale, dtype=dtype,
+        )  # fmt: skip
+        self.uniform_weight = float(uniform_weight)
+        self.likelihood_power = float(likelihood_power)
+        self.weighting = weighting
+        self.reset_below = reset_below
+        points = torch.tensor(list(medians), dtype=torch.long, device=gmm.means.device)
+        self.register_buffer("medians", points, persistent=False)  # a setting, no state
 
-def step_tracks(
-    model: "MixtureKalmanFilter", state: MKFState, frame: Measurements, transition: Transition
-) -> TrackStep:
-    """Predict and correct every track (BL 34-41); elements of one history share their gains."""
-    matrix, offset, noise = transition
-    cov, group, mask, noise_cov = distinct_histories(state, frame)
-    predicted_cov = symmetrise(matrix @ cov @ matrix.mT + noise)
-    gain, cov = kalman_gain(predicted_cov, noise_cov, model.observed, mask)
-    gain = gain.to(model.dtype)
-    moving = matrix.to(model.dtype), offset.to(model.dtype)
-    if cov.shape[0] == 1:
-        means = _correct_shared(model, state.mean, moving, gain, frame)
-    else:
-        predicted = (moving[0] @ state.mean[..., None])[..., 0] + moving[1]
-        own = gain.of(group)
-        z, seen = frame.z[:, None], frame.mask[:, None]
-        means = predicted, *kalman_correct(predicted, z, own, model.observed, seen)
-    jitter = None if gain.jitter is None else gain.jitter[group]
-    return TrackStep(*means, predicted_cov, cov, group, jitter)
-
-
-def step_fixed_weights(
-    model: "MixtureKalmanFilter", state: MKFState, log_likelihood: Tensor, frame: Measurements
-) -> tuple[Tensor, Tensor]:
-    """Log-weights of the estimate [B, M] and log-evidence, 0 where nothing is measured [B]."""
-    marginal = None
-    if model.weighting == "frame":
-        marginal = frame_log_likelihood(model, frame.as_sequences())[:, 0]
-    return _weigh(model, state.log_weights, log_likelihood, marginal, frame)
-
-
-def _weigh(
-    model: "MixtureKalmanFilter",
-    log_weights: Tensor,
-    log_likelihood: Tensor,
-    marginal: Tensor | None,
-    frame: Measurements,
-) -> tuple[Tensor, Tensor]:
-    log_prior, power = model.log_prior.to(model.dtype), model.likelihood_power
-    if marginal is not None:
-        log_weights, log_evidence = frame_weights(log_prior, marginal, log_likelihood, power)
-    else:
-        log_weights, log_evidence = step_weights(
-            log_weights, log_prior, log_likelihood, power, model.reset_below
+    @property
+    def weight_rule(self) -> WeightRule:
+        """How the tracks are weighted."""
+        log_prior, by_frame = self.log_prior.to(self.dtype), self.weighting == "frame"
+        return WeightRule(
+            log_prior, self.uniform_weight, self.likelihood_power, self.reset_below, by_frame
         )
-    measured = frame.mask.any(-1)
-    return log_weights, torch.where(measured, log_evidence, torch.zeros_like(log_evidence))
 
+    @property
+    def is_memoryless(self) -> bool:
+        """Whether frames do not depend on each other: neither the weights nor the states do."""
+        still = self.gamma is not None and bool((self.gamma == 0).all())
+        return self._weighs_frames_alone and still
 
-def advance(
-    model: "MixtureKalmanFilter", state: MKFState, frame: Measurements, return_cov: bool
-) -> tuple[MKFState, StepOutput]:
-    """One step (BL 34-41, 48-49)."""
-    if not values_visible():
-        return _advance_unseen(model, state, frame, return_cov)
-    if model.is_memoryless:
-        return advance_memoryless(model, state, frame, return_cov)
-    return _advance_tracks(model, state, frame, return_cov)
+    @property
+    def _weighs_frames_alone(self) -> bool:
+        """Whether neither weights nor, at a rate of 0, states depend on the frames before."""
+        return self.weighting == "frame" and self.transition_kind == "ou"
 
+    def filter_frame(
+        self, state: MKFState, frame: Measurements, generator: Generators, return_cov: bool
+    ) -> tuple[MKFState, StepOutput]:
+        """Return the next state and the estimate, given checked measurements of one frame."""
+        rule = self.weight_rule
+        if not values_visible():
+            return self._filter_unseen(rule, state, frame, return_cov)
+        if self.is_memoryless:
+            return step_memoryless(self, rule, self.medians, state, frame, return_cov)
+        return self._filter_tracks(rule, state, frame, return_cov)
 
-def _advance_unseen(
-    model: "MixtureKalmanFilter", state: MKFState, frame: Measurements, return_cov: bool
-) -> tuple[MKFState, StepOutput]:
-    """One step while nobody may look whether the rate is 0; without medians it makes no difference."""
-    new_state, out = _advance_tracks(model, state, frame, return_cov)
-    if model.gamma is None or not len(model.medians) or not model.weighs_frames_alone:
-        return new_state, out
-    _, alone = advance_memoryless(model, state, frame, return_cov)
-    still = (model.gamma == 0).all()
-    pairs = zip(alone, out, strict=True)
-    chosen = (a if a is None or b is None else torch.where(still, a, b) for a, b in pairs)
-    return new_state, StepOutput(*chosen)  # type: ignore[arg-type]
+    def _filter_tracks(
+        self, rule: WeightRule, state: MKFState, frame: Measurements, return_cov: bool
+    ) -> tuple[MKFState, StepOutput]:
+        marginal = frame_log_likelihood(self, rule, frame.as_sequences())
+        own = None if marginal is None else marginal[:, 0]
+        transition = self.transition(state.time)
+        return step_estimate(self, rule, state, frame, transition, own, return_cov)
 
+    def _filter_unseen(
+        self, rule: WeightRule, state: MKFState, frame: Measurements, return_cov: bool
+    ) -> tuple[MKFState, StepOutput]:
+        """One step while nobody may look whether the rate is 0; it matters to medians alone."""
+        new_state, out = self._filter_tracks(rule, state, frame, return_cov)
+        if not self._may_have_medians:
+            return new_state, out
+        _, alone = step_memoryless(self, rule, self.medians, state, frame, return_cov)
+        return new_state, StepOutput(*self._choose_unseen(alone, out))  # type: ignore[arg-type]
 
-def _advance_tracks(
-    model: "MixtureKalmanFilter", state: MKFState, frame: Measurements, return_cov: bool
-) -> tuple[MKFState, StepOutput]:
-    step = step_tracks(model, state, frame, model.transition(state.time))
-    weights = step_fixed_weights(model, state, step.log_likelihood, frame)
-    return _estimate(model, state, step, *weights, return_cov)
+    @property
+    def _may_have_medians(self) -> bool:
+        """Whether there are medians to estimate if the rate is 0, which nobody may look at."""
+        return self.gamma is not None and len(self.medians) > 0 and self._weighs_frames_alone
 
+    def _choose_unseen(
+        self, alone: Sequence[Tensor | None], tracked: Sequence[Tensor | None]
+    ) -> list[Tensor | None]:
+        """Return the values of frames alone if the rate is 0, else those of the tracks."""
+        still = torch.as_tensor(self.gamma == 0).all()
+        pairs = zip(alone, tracked, strict=True)
+        return [a if a is None or b is None else torch.where(still, a, b) for a, b in pairs]
 
-def _estimate(
-    model: "MixtureKalmanFilter",
-    state: MKFState,
-    step: TrackStep,
-    log_weights: Tensor,
-    log_evidence: Tensor,
-    return_cov: bool,
-) -> tuple[MKFState, StepOutput]:
-    covs = step.cov[step.group] if return_cov else None
-    estimate, total = estimate_of(log_weights, step.mean, covs)
-    carried = mix_uniform(log_weights, model.uniform_weight)
-    new_state = MKFState(carried, step.mean, step.cov, step.group, state.time + 1)
-    work = mending(estimate, step.jitter)
-    return new_state, StepOutput(estimate, log_weights, log_evidence, total, *work)
+    def filter_frames(
+        self, frames: Measurements, generator: Generators, return_cov: bool, progress: bool
+    ) -> FilterOutput:
+        """Return the estimates of whole sequences, given checked measurements, by the fastest way.
 
+        The plain recursion is left to noise that changes in each frame, to burn-in, and to gradients of
+        model or noise.
+        """
+        if not values_visible() or self.is_memoryless:
+            return super().filter_frames(frames, generator, return_cov, progress)
+        rule, given = self.weight_rule, (frames, return_cov, progress)
+        model_learns = wants_gradient(frames.cov, *self.sources)
+        if model_learns or frames.cov.ndim == 4 or self.burn_in > 0:
+            return run_steps(self, rule, *given)
+        history = find_history(self, frames)
+        if history is None:
+            return run_steps(self, rule, *given)
+        if wants_gradient(frames.z):
+            return run_for_gradients(self, rule, frames, history, return_cov, progress)
+        shared = all(len(edges) == 1 for edges in history.edges)
+        if shared and not return_cov and suits_columns(rule, len(frames.z)):
+            edges = [edges[0] for edges in history.edges]
+            return run_columns(self, rule, frames, edges, progress)
+        return run_shared(self, rule, frames, history, return_cov, progress)
 
-def _correct_shared(
-    model: "MixtureKalmanFilter",
-    mean: Tensor,
-    moving: tuple[Tensor, Tensor],
-    gain: Gain,
-    frame: Measurements,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Predicted and corrected means and likelihoods of elements that share one gain."""
-    matrix, offset = moving
-    predicted = torch.baddbmm(offset[:, None], mean.transpose(0, 1), matrix.mT)
-    residual = frame.z - predicted.index_select(-1, model.observed)
-    residual = torch.where(frame.mask[0], residual, torch.zeros_like(residual))
-    white = torch.linalg.solve_triangular(gain.factor[0], residual.mT, upper=False)
-    corrected = torch.baddbmm(predicted, white.mT, gain.white[0])
-    log_likelihood = gain.log_norm[0] - 0.5 * white.square().sum(1).mT
-    return predicted.transpose(0, 1), corrected.transpose(0, 1), log_likelihood
+    def continue_frames(
+        self,
+        state: MKFState,
+        frames: Measurements,
+        generator: Generators,
+        return_cov: bool,
+        progress: bool = False,
+    ) -> tuple[MKFState, FilterOutput]:
+        """Return the state after some frames, and their estimates; without memory, all at once."""
+        if not values_visible() or not self.is_memoryless:
+            return super().continue_frames(state, frames, generator, return_cov, progress)
+        rule, n_frames = self.weight_rule, frames.z.shape[1]
+        out = run_memoryless(self, rule, self.medians, frames, return_cov, progress)
+        return state._replace(time=state.time + n_frames), out
 
+    def smooth_frames(
+        self, frames: Measurements, lag: int | None, return_cov: bool
+    ) -> FilterOutput:
+        """Return smoothed estimates of whole sequences, given checked measurements.
 
-def distinct_histories(
-    state: MKFState, frame: Measurements
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Covariances, groups, masks and noise for the distinct histories of this frame."""
-    if frame.cov.ndim == 3 or not values_visible():
-        own = torch.arange(frame.z.shape[0], device=frame.z.device)
-        noise = frame.cov if frame.cov.ndim == 2 else frame.cov[:, None]
-        return state.cov[state.group], own, frame.mask[:, None], noise
-    if state.cov.shape[0] == 1 and bool((frame.mask == frame.mask[:1]).all()):
-        return state.cov, state.group, frame.mask[:1, None], frame.cov
-    bits = 2 ** torch.arange(frame.mask.shape[1], device=frame.mask.device)
-    code = state.group * 2 ** frame.mask.shape[1] + (frame.mask * bits).sum(-1)
-    _, group = torch.unique(code, return_inverse=True)
-    n_groups = int(group.max()) + 1
-    first = torch.zeros(n_groups, dtype=torch.long, device=group.device)
-    first[group] = torch.arange(group.numel(), device=group.device)
-    return state.cov[state.group[first]], group, frame.mask[first, None], frame.cov
-
-
-def run(
-    model: "MixtureKalmanFilter", frames: Measurements, return_cov: bool, progress: bool
-) -> FilterOutput:
-    """All frames of a batch."""
-    if model.is_memoryless:
-        return run_memoryless(model, frames, return_cov, progress)
-    model_learns = wants_gradient(frames.cov, *model.sources)
-    if model_learns or frames.cov.ndim == 4 or model.burn_in > 0:
-        return _run_steps(model, frames, return_cov, progress)
-    history = find_history(model, frames)
-    if history is None:
-        return _run_steps(model, frames, return_cov, progress)
-    if wants_gradient(frames.z):
-        return run_for_gradients(model, frames, history, return_cov, progress)
-    shared = all(len(edges) == 1 for edges in history.edges)
-    if not return_cov and suits_columns(model, frames, shared):
-        return run_columns(model, frames, [edges[0] for edges in history.edges], progress)
-    return run_shared(model, frames, history, return_cov, progress)
-
-
-def _run_steps(
-    model: "MixtureKalmanFilter", frames: Measurements, return_cov: bool, progress: bool
-) -> FilterOutput:
-    """All frames one after the other; for gradients, some are computed anew at a time."""
-    batch, n_frames = frames.z.shape[:2]
-    # What all frames share, here: it is not among what a gradient computes anew for some of them.
-    steady = model.transition(model.burn_in)
-    marginal = frame_log_likelihood(model, frames) if model.weighting == "frame" else None
-    learning = wants_gradient(frames.z, frames.cov, *model.sources)
-    state, steps = model.init(batch), []
-    with tqdm(total=n_frames, disable=not progress, unit="frame") as bar:
-        for start in range(0, n_frames, RECOMPUTED_FRAMES):
-            span = range(start, min(start + RECOMPUTED_FRAMES, n_frames))
-            arguments = model, state, frames, steady, marginal, span, return_cov
-            state, some = (
-                recomputed(_some_steps, *arguments) if learning else _some_steps(*arguments)
+        Filters whose frames do not depend on each other have nothing to smooth: their estimates are
+        those of `forward`.
+        """
+        if self.reset_below is not None:
+            raise InputError(
+                "smoothing goes back along the weights, which a reset cuts off, got "
+                f"reset_below={self.reset_below}; leave it out"
             )
-            steps += some
-            bar.update(len(span))
-    return collect(steps, frames.lengths)
+        rule = self.weight_rule
+        if values_visible() and self.is_memoryless:
+            return run_memoryless(self, rule, self.medians, frames, return_cov)
+        smoothed = smooth_fixed_tracks(self, rule, frames, lag, return_cov)
+        if values_visible() or not self._may_have_medians:
+            return smoothed
+        alone = run_memoryless(self, rule, self.medians, frames, return_cov)
+        return FilterOutput(*self._choose_unseen(alone, smoothed))  # type: ignore[arg-type]
 
 
-def _some_steps(
-    model: "MixtureKalmanFilter",
-    state: MKFState,
-    frames: Measurements,
-    steady: Transition,
-    marginal: Tensor | None,
-    span: range,
-    return_cov: bool,
-) -> tuple[MKFState, list[StepOutput]]:
-    steps = []
-    for t in span:
-        frame = frames.frame(t)
-        transition = steady if t >= model.burn_in else model.transition(t)
-        step = step_tracks(model, state, frame, transition)
-        own = None if marginal is None else marginal[:, t]
-        weights = _weigh(model, state.log_weights, step.log_likelihood, own, frame)
-        state, out = _estimate(model, state, step, *weights, return_cov)
-        steps.append(out)
-    return state, steps
+def _check_weighting(
+    weighting: str, uniform_weight: float | None, reset_below: float | None
+) -> None:
+    if weighting not in _WEIGHTINGS:
+        raise InputError(f"weighting must be one of {', '.join(_WEIGHTINGS)}, got {weighting!r}")
+    if weighting == "frame" and not (reset_below is None and uniform_weight is None):
+        raise InputError(
+            "weighting 'frame' takes every frame's weights from that frame alone: uniform_weight and "
+            f"reset_below are of 'sequence', got {uniform_weight} and {reset_below}"
+        )
+
+
+def _check_memoryless(weighting: str, transition: str, gamma: Tensor | float | None) -> None:
+    still = gamma is not None and bool((torch.as_tensor(gamma) == 0).all())
+    if not (still and transition == "ou" and weighting == "frame"):
+        raise InputError(
+            "medians are of frames that do not depend on each other: they need weighting='frame', "
+            f"transition='ou' and gamma=0, got {weighting!r}, {transition!r} and gamma={gamma}"
+        )
+
+
+def _check_ranges(uniform_weight: float, power: float) -> None:
+    if not (uniform_weight >= 0 and math.isfinite(uniform_weight)):
+        raise InputError(f"uniform_weight must be at least 0, got {uniform_weight}")
+    if not 0 < power <= 1:
+        raise InputError(f"likelihood_power must lie in (0, 1], got {power}")

@@ -104,7 +104,7 @@ def fit_gamma(
 def _consecutive(
     states: Tensor | Sequence[Tensor], lengths: Tensor | None, gmm: GaussianMixture
 ) -> tuple[Tensor, Tensor]:
-    """All pairs of consecutive frames, [N, D] each."""
+    """Return all pairs of consecutive frames, [N, D] each."""
     if isinstance(states, Tensor):
         check_shape("states", states, ["B", "T", gmm.dim])
         count = states.shape[1]
@@ -129,7 +129,7 @@ def _consecutive(
 
 
 def _statistics(gmm: GaussianMixture, earlier: Tensor, later: Tensor, moved: int) -> _Pairs:
-    """The pairs in the whitened principal directions of every component."""
+    """Return the pairs in the whitened principal directions of every component."""
     weights, means, covariances = (x.double() for x in gmm.parameters_tuple())
     variances, directions = torch.linalg.eigh(covariances)
     whitener = directions / variances.clamp_min(torch.finfo(torch.float64).tiny).sqrt()[:, None]
@@ -153,14 +153,14 @@ def _statistics(gmm: GaussianMixture, earlier: Tensor, later: Tensor, moved: int
 
 
 def _log_terms(pairs: _Pairs, gamma: Tensor, moved: int) -> Tensor:
-    """log of pi_i N(x_{t-1}; i) N(x_t | x_{t-1}, i) up to a constant, [N, K]."""
+    """Return log of pi_i N(x_{t-1}; i) N(x_t | x_{t-1}, i) up to a constant, [N, K]."""
     free = 1 - gamma.square()
     squared = pairs.later - 2 * gamma * pairs.both + gamma.square() * pairs.earlier
     return pairs.rest - 0.5 * (moved * free.log() + squared / free)
 
 
 def _best_rate(pairs: _Pairs, log_terms: Tensor, moved: int, shared: bool) -> Tensor:
-    """The likeliest gamma given the responsibilities, [K], or [] for all components together."""
+    """Return the likeliest gamma given the responsibilities, [K], or [] for all components together."""
     share = normalise(log_terms).exp()
     values = (torch.ones_like(share), pairs.later, pairs.both, pairs.earlier)
     sums = tuple((share * value).sum(0) for value in values)
@@ -172,7 +172,7 @@ def _best_rate(pairs: _Pairs, log_terms: Tensor, moved: int, shared: bool) -> Te
 
 
 def _likeliest(sums: tuple[Tensor, ...], moved: int) -> Tensor:
-    """The best of 0 and the real roots in [0, 1) of the likelihood's derivative."""
+    """Return the best of 0 and the real roots in [0, 1) of the likelihood's derivative."""
     count, later, both, earlier = sums
     size = (count * moved).clamp_min(torch.finfo(torch.float64).tiny)
     companion = torch.zeros(*count.shape, 3, 3, dtype=count.dtype, device=count.device)

@@ -1,41 +1,31 @@
-"""The mixture Kalman filter: fixed, sampled and split tracks (paper section 3.4)."""
+"""The mixture Kalman filter: its model, its state, and the choice of tracks (paper section 3.4).
 
-import math
-from collections.abc import Sequence
-from typing import Any
+`FixedTrackFilter`, `SampledTrackFilter` and `SplitTrackFilter` are the three kinds of it.
+"""
+
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose._core.module_state import (
-    derived,
-    one_run,
-    outside_inference,
-    register_given,
-    wide_or_parameter,
-)
-from torchpose._core.value_checks import values_visible
+from torchpose._core.module_state import derived, one_run, register_given, wide_or_parameter
 from torchpose.errors import InputError
-from torchpose.filters import fixed_tracks, sampled_tracks, split_tracks
-from torchpose.filters.base import (
-    Generators,
+from torchpose.filters.base import Generators, RecursiveFilter, require_state
+from torchpose.filters.measurements import (
     Measurements,
-    RecursiveFilter,
     as_covariance,
     given_covariance,
     given_initial_cov,
-    require_state,
 )
-from torchpose.filters.frame_weights import FrameGains
-from torchpose.filters.gains import GainGraph
 from torchpose.filters.outputs import FilterOutput, StepOutput
-from torchpose.filters.smoothing import smooth_fixed_tracks
-from torchpose.filters.tracks import MKFState
 from torchpose.filters.transition import (
     BURN_IN_SCALE,
     Transition,
     check_transition_options,
+    inflation,
     make_transition,
 )
 from torchpose.filters.weights import normalise
@@ -43,19 +33,23 @@ from torchpose.priors.gaussian_mixture import GaussianMixture
 
 __all__ = ["MKFState", "MixtureKalmanFilter"]
 
-TRACKS = ("fixed", "sampled", "split")
-WEIGHTINGS = ("sequence", "frame")
-_UNIFORM_WEIGHT = 1e-3
-TRACK_OPTIONS = {
-    "n_tracks": ("sampled", "split"),
-    "resample_threshold": ("sampled",),
-    "uniform_weight": ("fixed",),
-    "likelihood_power": ("fixed",),
-    "weighting": ("fixed",),
-    "reset_below": ("fixed",),
-    "medians": ("fixed",),
-}
-"""Options that only some kinds of tracks use, and which."""
+
+class MKFState(NamedTuple):
+    """Weighted Kalman tracks.
+
+    Attributes:
+        log_weights: log w that the next step starts from (epsilon mixed in), [B, M].
+        mean: track means [B, M, D]. cov: track covariances [G, M, D, D], float64.
+        group: which row of `cov` each element has, [B]; elements whose histories of masks and
+            noise are the same share one row.
+        time: number of frames seen.
+    """
+
+    log_weights: Tensor
+    mean: Tensor
+    cov: Tensor
+    group: Tensor
+    time: int
 
 
 class MixtureKalmanFilter(RecursiveFilter):
@@ -66,12 +60,13 @@ class MixtureKalmanFilter(RecursiveFilter):
     and is measured through z_t = H x_t + N(0, R) (BL 33). Each track is one history of indicators
     with a Kalman filter of its own (BL 34-42); the estimate is the weighted mean (BL 48).
 
-    - ``fixed``: track j keeps indicator j for ever (BL 49); w_j prop. to pi_j N_j w_{t-1,j}, then
-      w <- (w + epsilon) / (1 + M epsilon), so that no component is lost.
-    - ``sampled``: indicators are drawn from pi (BL 47) and tracks are resampled when the effective
-      sample size falls below `resample_threshold` M.
-    - ``split``: every track is continued by every component, and the M likeliest are kept
-      (Smith & Winter).
+    There are three kinds of tracks, each a class of its own with its own options. A call of this class
+    makes a filter of the kind that `tracks` names:
+
+    - "fixed", `FixedTrackFilter`: track j keeps indicator j for ever (BL 49).
+    - "sampled", `SampledTrackFilter`: indicators are drawn from pi (BL 47), and tracks are resampled.
+    - "split", `SplitTrackFilter`: every track is continued by every component, and the M likeliest are
+      kept (Smith & Winter).
 
     Args:
         gmm: the mixture prior (BL 7), K components over D dimensions.
@@ -79,25 +74,20 @@ class MixtureKalmanFilter(RecursiveFilter):
         measurement_cov: R, [Z, Z] or its diagonal [Z].
         observed: the Z state indices that are measured.
         tracks: "fixed", "sampled" or "split".
-        n_tracks: M; K by default, and always K for fixed tracks.
-        uniform_weight: epsilon, 1e-3 by default; only for fixed tracks whose weighting is "sequence".
         initial_cov: covariance of every track before the first prediction, [D, D], [D] or [K, D, D];
             by default that of its component.
         transition: "paper", "stationary" or "ou", see `make_transition`. gamma, subspace: of "ou".
-        resample_threshold: share of M, 0 (never) to 1 (always), 0.5 by default; only for sampled tracks.
         burn_in: number of frames over which Q starts inflated by `burn_in_scale` (100 by default) and
             decays to itself geometrically (paper section 3.3, after BL 26). 0 is no burn-in, as it has
             to be for "ou", which has no Q.
-        likelihood_power: exponent of the likelihood in the weights of fixed tracks; 1 as published,
-            below 1 where the components are surer of themselves than they should be.
-        weighting: "sequence" as published, or "frame" (fixed tracks only): the weights of a frame are
-            those that the mixture gives to its measurement alone, w_j prop. to
-            pi_j N(z_t; H mu_j, H Sigma_j H^T + R), see `frame_weights`. For mixtures whose state
-            holds the past already.
-        reset_below: fixed tracks only; see `step_weights`.
         dtype: of means and measurements; covariances are always float64.
-        medians: first of three dimensions each, points whose estimate is the geometric median of the
-            mixture instead of its mean (BL 48); only where frames do not depend on each other.
+        n_tracks: see `SampledTrackFilter`, `SplitTrackFilter`.
+        resample_threshold: see `SampledTrackFilter`.
+        uniform_weight, likelihood_power, weighting, reset_below, medians: see `FixedTrackFilter`.
+
+    Attributes:
+        tracks: the kind. n_tracks: M. dim: D.
+        means, covariances: of the components, [K, D] and [K, D, D]. log_prior: log pi [K].
 
     Raises:
         InputError, ShapeError, CovarianceError: for what does not fit, before any work; InputError also
@@ -105,8 +95,7 @@ class MixtureKalmanFilter(RecursiveFilter):
 
     Reference:
         M. Burke, J. Lasenby, "Single camera pose estimation using Bayesian filtering and Kinect
-        motion priors", eqs 27-49. H. Smith, P. Winter, "On-line outlier detection and correction
-        with a split-track filter" (1978), as cited there.
+        motion priors", eqs 27-49. R. Chen, J. S. Liu, "Mixture Kalman filters" (2000).
 
     Example:
         >>> import torch
@@ -120,6 +109,22 @@ class MixtureKalmanFilter(RecursiveFilter):
         >>> bool((out.mean[0, -1] > 3).all())
         True
     """
+
+    tracks: ClassVar[str]
+    log_prior: Tensor
+    means: Tensor
+    covariances: Tensor
+    process_cov: Tensor
+    initial_cov: Tensor | None
+    gamma: Tensor | None
+
+    _kinds: ClassVar[dict[str, type["MixtureKalmanFilter"]]] = {}
+
+    def __init_subclass__(cls, tracks: str | None = None, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if tracks is not None:
+            cls.tracks = tracks
+            cls._kinds[tracks] = cls
 
     def __init__(
         self,
@@ -143,58 +148,63 @@ class MixtureKalmanFilter(RecursiveFilter):
         dtype: torch.dtype = torch.float64,
         medians: Sequence[int] = (),
     ) -> None:
-        super().__init__(measurement_cov, observed, gmm.means.shape[-1], dtype)
-        n_components = gmm.means.shape[0]
-        _check_tracks(tracks, n_tracks, n_components)
-        unlike_default = {
-            "resample_threshold": resample_threshold is not None,
-            "uniform_weight": uniform_weight is not None,
-            "likelihood_power": likelihood_power != 1,
-            "weighting": weighting != "sequence",
-            "reset_below": reset_below is not None,
-            "medians": len(medians) > 0,
-        }
-        _refuse_unused(tracks, [name for name, given in unlike_default.items() if given])
-        _check_weighting(weighting, uniform_weight, reset_below)
+        if type(self) is not MixtureKalmanFilter:
+            raise InputError(
+                f"{type(self).__name__} must be derived from the class of its tracks: "
+                f"{', '.join(kind.__name__ for kind in self._kinds.values())}"
+            )
+        if tracks == "fixed" and n_tracks == gmm.n_components:
+            n_tracks = None  # which fixed tracks always are
+        kind = _kind_of(tracks)
+        options = _options_of(kind, {
+            "n_tracks": n_tracks, "uniform_weight": uniform_weight, "initial_cov": initial_cov,
+            "transition": transition, "gamma": gamma, "subspace": subspace,
+            "resample_threshold": resample_threshold, "burn_in": burn_in,
+            "burn_in_scale": burn_in_scale, "likelihood_power": likelihood_power,
+            "weighting": weighting, "reset_below": reset_below, "dtype": dtype, "medians": medians,
+        })  # fmt: skip
+        self.__class__ = kind
+        kind.__init__(self, gmm, process_cov, measurement_cov, observed, **options)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        if type(self) is MixtureKalmanFilter:  # pickled before the kinds had classes of their own
+            self.__class__ = self._kinds[state["tracks"]]
+        super().__setstate__(state)
+
+    def _register_model(
+        self,
+        gmm: GaussianMixture,
+        process_cov: Tensor,
+        measurement_cov: Tensor,
+        observed: Sequence[int] | Tensor,
+        *,
+        n_tracks: int | None,
+        initial_cov: Tensor | None,
+        transition: str,
+        gamma: Tensor | float | None,
+        subspace: int | None,
+        burn_in: int,
+        burn_in_scale: float | None,
+        dtype: torch.dtype,
+    ) -> None:
+        """Register what filters of every kind have; the first call of their constructors."""
+        RecursiveFilter.__init__(self, measurement_cov, observed, gmm.dim, dtype)
         check_transition_options(transition, gamma, subspace, burn_in, burn_in_scale)
-        uniform_weight = _UNIFORM_WEIGHT if uniform_weight is None else uniform_weight
-        resample_threshold = 0.5 if resample_threshold is None else resample_threshold
-        _check_ranges(uniform_weight, resample_threshold, likelihood_power)
-        if len(medians):
-            _check_memoryless(weighting, transition, gamma)
-        self.tracks = tracks
-        self.n_tracks = n_tracks or n_components
-        self.uniform_weight = float(uniform_weight) if tracks == "fixed" else 0.0
-        self.transition_kind = transition
-        self.subspace = subspace
-        self.resample_threshold = resample_threshold
+        if n_tracks is not None and n_tracks < 1:
+            raise InputError(f"n_tracks must be at least 1, got {n_tracks}")
+        self.n_tracks = n_tracks or gmm.n_components
+        self.transition_kind, self.subspace = transition, subspace
         self.burn_in = burn_in
         self.burn_in_scale = BURN_IN_SCALE if burn_in_scale is None else float(burn_in_scale)
-        self.likelihood_power = float(likelihood_power)
-        self.weighting = weighting
-        self.reset_below = reset_below
-        points = torch.tensor(list(medians), dtype=torch.long)
-        self.register_buffer("medians", points, persistent=False)  # a setting, as `tracks` is
-        self._register_mixture(gmm)
+        weights = gmm.weights.to(torch.float64)
+        register_given(self, "log_prior", (weights / weights.sum()).log())
+        register_given(self, "means", wide_or_parameter(gmm.means))
+        register_given(self, "covariances", wide_or_parameter(gmm.covariances))
         register_given(self, "process_cov", given_covariance("process_cov", process_cov, self.dim))
         register_given(self, "gamma", wide_or_parameter(gamma))
         register_given(self, "initial_cov", given_initial_cov(initial_cov, self.covariances))
         self.to(gmm.means.device)
         self.transition(self.burn_in)  # raises what does not fit before any work
-
-    medians: Tensor
-    log_prior: Tensor
-    means: Tensor
-    covariances: Tensor
-    process_cov: Tensor
-    initial_cov: Tensor | None
-    gamma: Tensor | None
-
-    def _register_mixture(self, prior: GaussianMixture) -> None:
-        weights = prior.weights.to(torch.float64)
-        register_given(self, "log_prior", (weights / weights.sum()).log())
-        register_given(self, "means", wide_or_parameter(prior.means))
-        register_given(self, "covariances", wide_or_parameter(prior.covariances))
 
     @property
     def sources(self) -> tuple[Tensor, ...]:
@@ -210,63 +220,57 @@ class MixtureKalmanFilter(RecursiveFilter):
         cov = as_covariance("initial_cov", self.initial_cov, self.dim, self.initial_cov.ndim)
         return cov.expand(self.means.shape[0], -1, -1)
 
+    @property
+    def is_memoryless(self) -> bool:
+        """Whether frames do not depend on each other: neither the weights nor the states do."""
+        return False
+
     def transition(self, time: int) -> Transition:
-        """The transition into frame `time` (0-based), with the inflated Q of the burn-in."""
+        """Return the transition into frame `time` (0-based), with the inflated Q of the burn-in."""
         if time < self.burn_in:
-            return self._make_transition(self.burn_in_scale ** (1 - time / self.burn_in))
+            return self._make_transition(inflation(time, self.burn_in, self.burn_in_scale))
         sources = (self.means, self.covariances, self.process_cov, self.gamma)
         return derived(self, "transition", sources, lambda: self._make_transition(1.0))
 
-    def _make_transition(self, inflation: float) -> Transition:
+    def _make_transition(self, inflated: float) -> Transition:
         wide = torch.float64
         return make_transition(
             self.transition_kind,
             self.means.to(wide),
             self.covariances.to(wide),
-            inflation * as_covariance("process_cov", self.process_cov, self.dim),
+            inflated * as_covariance("process_cov", self.process_cov, self.dim),
             None if self.gamma is None else self.gamma.to(wide),
             self.subspace,
         )
 
     def init(self, batch_size: int, generator: Generators = None) -> MKFState:
-        """Tracks at the component means, weighted by pi; sampled tracks draw their component."""
+        """Return the state before the first frame: tracks at the component means, weighted by pi.
+
+        Args:
+            batch_size: B. generator: for sampled tracks, which draw their components.
+
+        Raises:
+            InputError: batch_size below 1.
+        """
         if batch_size < 1:
             raise InputError(f"batch_size must be at least 1, got {batch_size}")
-        if self.tracks == "sampled":
-            return sampled_tracks.init(self, batch_size, generator)
-        device = self.means.device
         return MKFState(
             normalise(self.log_prior).to(self.dtype).expand(batch_size, -1),
             self.means.to(self.dtype).expand(batch_size, -1, -1),
             self.start_cov[None],
-            torch.zeros(batch_size, dtype=torch.long, device=device),
+            torch.zeros(batch_size, dtype=torch.long, device=self.means.device),
             0,
         )
 
     def check_state(self, state: Any, batch: int) -> None:
-        """Raise unless a state is one of this filter's, of so many elements."""
-        tracks = (
-            None if self.tracks == "split" else self.n_tracks
-        )  # which are first one per component
-        require_state(state, MKFState, "mean", (batch, tracks, self.dim))
+        """Raise unless a state is one of this filter's with so many elements."""
+        require_state(state, MKFState, "mean", (batch, self.n_tracks, self.dim))
 
-    def advance(
+    def filter_frame(
         self, state: MKFState, frame: Measurements, generator: Generators, return_cov: bool
     ) -> tuple[MKFState, StepOutput]:
-        """One step; see `RecursiveFilter.step`."""
-        if self.tracks == "sampled":
-            return sampled_tracks.advance(self, state, frame, generator, return_cov)
-        if self.tracks == "split":
-            return split_tracks.advance(self, state, frame, return_cov)
-        return fixed_tracks.advance(self, state, frame, return_cov)
-
-    def run(
-        self, frames: Measurements, generator: Generators, return_cov: bool, progress: bool
-    ) -> FilterOutput:
-        """All frames: fixed tracks share their gains and need no loop where those are constant."""
-        if self.tracks == "fixed" and values_visible():
-            return fixed_tracks.run(self, frames, return_cov, progress)
-        return super().run(frames, generator, return_cov, progress)
+        """Return the next state and the estimate, given checked measurements of one frame."""
+        raise NotImplementedError(f"{type(self).__name__} has no tracks")
 
     def smooth(
         self,
@@ -277,7 +281,7 @@ class MixtureKalmanFilter(RecursiveFilter):
         lag: int | None = None,
         return_cov: bool = False,
     ) -> FilterOutput:
-        """Estimates that use later measurements too; fixed tracks only.
+        """Return estimates that use later measurements too; fixed tracks only.
 
         Args:
             z, mask, measurement_cov, lengths, return_cov: as `forward`.
@@ -293,103 +297,57 @@ class MixtureKalmanFilter(RecursiveFilter):
         Reference:
             H. Rauch, F. Tung, C. Striebel (1965); see `smooth_fixed_tracks`.
         """
-        if self.tracks != "fixed":
+        if lag is not None and lag < 0:
             raise InputError(
-                f"smoothing needs tracks='fixed', whose tracks have a past each, got {self.tracks!r}"
-            )
-        if self.reset_below is not None:
-            raise InputError(
-                "smoothing goes back along the weights, which a reset cuts off, got "
-                f"reset_below={self.reset_below}; leave it out"
+                f"lag must be at least 0 frames, or None for the whole sequence, got {lag}"
             )
         with one_run(self.observed.device):
             frames = self.check(z, mask, measurement_cov, lengths, None)
-            return smooth_fixed_tracks(self, frames, lag, return_cov)
+            return self.smooth_frames(frames, lag, return_cov)
 
-    @property
-    def is_memoryless(self) -> bool:
-        """Whether frames do not depend on each other: neither the weights nor the states do."""
-        still = self.gamma is not None and bool((self.gamma == 0).all())
-        return self.weighs_frames_alone and still
-
-    @property
-    def weighs_frames_alone(self) -> bool:
-        """Whether neither weights nor, at a rate of 0, states depend on the frames before."""
-        return self.weighting == "frame" and self.transition_kind == "ou"
-
-    def gain_graph(self, measurement_cov: Tensor) -> GainGraph:
-        """The graph of gains for constant R, kept while model and R stay as they are."""
-        kept: dict[str, GainGraph] = derived(self, f"gains {self.dtype}", self.sources, dict)
-        graph = kept.get("graph")
-        if graph is None or graph.full() or not torch.equal(graph.measurement_cov, measurement_cov):
-            steady = self.transition(self.burn_in)
-            with outside_inference():
-                graph = GainGraph(steady, self.observed, measurement_cov.clone(), self.start_cov)
-            kept["graph"] = graph
-        return graph
-
-    @property
-    def frame_gains(self) -> FrameGains:
-        """Gains of components by pattern of measured dimensions, kept while the mixture stays."""
-        sources = (self.means, self.covariances)
-        return derived(self, f"frame gains {self.dtype}", sources, FrameGains)
+    def smooth_frames(
+        self, frames: Measurements, lag: int | None, return_cov: bool
+    ) -> FilterOutput:
+        """Return smoothed estimates of whole sequences, given checked measurements."""
+        raise InputError(
+            f"smoothing needs tracks='fixed', whose tracks have a past each, got {self.tracks!r}"
+        )
 
     def extra_repr(self) -> str:
-        """Main settings, for printing."""
+        """Return the main settings, for printing."""
         return (
-            f"tracks={self.tracks}, n_tracks={self.n_tracks}, dim={self.dim}, "
+            f"n_tracks={self.n_tracks}, dim={self.dim}, "
             f"observed={self.observed.tolist()}, transition={self.transition_kind}"
         )
 
 
-def _check_tracks(tracks: str, n_tracks: int | None, n_components: int) -> None:
-    if tracks not in TRACKS:
-        raise InputError(f"tracks must be one of {', '.join(TRACKS)}, got {tracks!r}")
-    if n_tracks is not None and n_tracks < 1:
-        raise InputError(f"n_tracks must be at least 1, got {n_tracks}")
-    if tracks == "fixed" and n_tracks not in (None, n_components):
-        raise InputError(
-            f"fixed tracks are one for each of the {n_components} components, got "
-            f"n_tracks={n_tracks}; leave it out, or use tracks='sampled'"
-        )
+def __getattr__(name: str) -> Any:
+    if name != "TRACK_OPTIONS":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    own = {k: inspect.signature(c).parameters for k, c in MixtureKalmanFilter._kinds.items()}
+    names = {name for options in own.values() for name in options}
+    of = {name: tuple(k for k in own if name in own[k]) for name in names}
+    return {name: kinds for name, kinds in of.items() if len(kinds) < len(own)}
 
 
-def _refuse_unused(tracks: str, given: Sequence[str]) -> None:
-    for name in given:
-        if tracks not in TRACK_OPTIONS[name]:
+def _kind_of(tracks: str) -> type[MixtureKalmanFilter]:
+    """Return the class of these tracks."""
+    kinds = MixtureKalmanFilter._kinds
+    if tracks not in kinds:
+        raise InputError(f"tracks must be one of {', '.join(kinds)}, got {tracks!r}")
+    return kinds[tracks]
+
+
+def _options_of(kind: type[MixtureKalmanFilter], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those of the given options that a kind has; refuse others that are not at default."""
+    defaults = inspect.signature(MixtureKalmanFilter).parameters
+    own = inspect.signature(kind).parameters
+    for name in [name for name in given if name not in own]:
+        value, default = given[name], defaults[name].default
+        if value != default and not (default == () and len(value) == 0):
+            of = [k for k, c in kind._kinds.items() if name in inspect.signature(c).parameters]
             raise InputError(
-                f"{name} does not apply to tracks={tracks!r}; it is of tracks="
-                f"{' or '.join(map(repr, TRACK_OPTIONS[name]))}"
+                f"{name} does not apply to tracks={kind.tracks!r}; it is of tracks="
+                f"{' or '.join(map(repr, of))}"
             )
-
-
-def _check_weighting(
-    weighting: str, uniform_weight: float | None, reset_below: float | None
-) -> None:
-    if weighting not in WEIGHTINGS:
-        raise InputError(f"weighting must be one of {', '.join(WEIGHTINGS)}, got {weighting!r}")
-    if weighting == "frame" and not (reset_below is None and uniform_weight is None):
-        raise InputError(
-            "weighting 'frame' takes every frame's weights from that frame alone: uniform_weight and "
-            f"reset_below are of 'sequence', got {uniform_weight} and {reset_below}"
-        )
-
-
-def _check_memoryless(weighting: str, transition: str, gamma: Tensor | float | None) -> None:
-    still = gamma is not None and bool((torch.as_tensor(gamma) == 0).all())
-    if not (still and transition == "ou" and weighting == "frame"):
-        raise InputError(
-            "medians are of frames that do not depend on each other: they need weighting='frame', "
-            f"transition='ou' and gamma=0, got {weighting!r}, {transition!r} and gamma={gamma}"
-        )
-
-
-def _check_ranges(uniform_weight: float, resample_threshold: float, power: float) -> None:
-    if not (uniform_weight >= 0 and math.isfinite(uniform_weight)):
-        raise InputError(f"uniform_weight must be at least 0, got {uniform_weight}")
-    if not 0 <= resample_threshold <= 1:
-        raise InputError(
-            f"resample_threshold must be a share from 0 to 1, got {resample_threshold}"
-        )
-    if not 0 < power <= 1:
-        raise InputError(f"likelihood_power must lie in (0, 1], got {power}")
+    return {name: value for name, value in given.items() if name in own}

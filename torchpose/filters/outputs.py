@@ -1,4 +1,4 @@
-"""What filters return, and how the steps of a run are put together."""
+"""Results of filters: estimates, failures, mended covariances, and how steps become a run."""
 
 import warnings
 from collections.abc import Sequence
@@ -10,14 +10,16 @@ from torch import Tensor
 
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import DegenerateFilterWarning
-from torchpose.filters.mending import Mending, mending, stacked
 
 __all__ = [
     "FilterOutput",
+    "Mending",
     "StepOutput",
     "collect",
     "effective_sample_size",
     "finish_output",
+    "mending",
+    "stacked_mending",
 ]
 
 
@@ -65,13 +67,46 @@ class FilterOutput(NamedTuple):
 
     @property
     def effective_sample_size(self) -> Tensor:
-        """1 / sum_j w_j^2 (BL 25), [B, T]."""
+        """Return 1 / sum_j w_j^2 (BL 25), [B, T]."""
         return effective_sample_size(self.log_weights)
 
 
 def effective_sample_size(log_weights: Float[Tensor, "*batch M"]) -> Float[Tensor, "*batch"]:
-    """N_eff = 1 / sum_j w_j^2 for normalised log-weights (BL 25)."""
+    """Return N_eff = 1 / sum_j w_j^2 of normalised log-weights (BL 25)."""
     return torch.exp(-torch.logsumexp(2 * log_weights, -1))
+
+
+class Mending(NamedTuple):
+    """What `mended_cholesky` had to do.
+
+    Attributes:
+        mended: number of covariances that got a jitter, [B] or [B, T].
+        jitter: the largest of them, as a share of each variance, [B] or [B, T], float64.
+    """
+
+    mended: Tensor
+    jitter: Tensor
+
+
+def mending(like: Float[Tensor, "B *rest"], *jitters: Tensor | None) -> Mending:
+    """Sum up the covariances of one frame that were mended.
+
+    Args:
+        like: tells the number of elements and the device.
+        jitters: of its covariances, [B, ...] each; None where all factorised as they were.
+    """
+    found = [jitter.reshape(len(like), -1) for jitter in jitters if jitter is not None]
+    if not found:
+        mended = torch.zeros(len(like), dtype=torch.long, device=like.device)
+        return Mending(mended, mended.double())
+    joint = torch.cat(found, 1)
+    return Mending((joint > 0).sum(1), joint.double().amax(1))
+
+
+def stacked_mending(frames: Sequence[Mending]) -> Mending:
+    """Return the sums of several frames [B] as one [B, T]."""
+    mended = torch.stack([frame.mended for frame in frames], 1)
+    return Mending(mended, torch.stack([frame.jitter for frame in frames], 1))
 
 
 def collect(steps: Sequence[StepOutput], lengths: Int[Tensor, " B"]) -> FilterOutput:
@@ -89,7 +124,7 @@ def collect(steps: Sequence[StepOutput], lengths: Int[Tensor, " B"]) -> FilterOu
         torch.stack([s.log_evidence for s in steps], 1),
         cov,
         lengths,
-        stacked(work),
+        stacked_mending(work),
     )
 
 

@@ -13,26 +13,34 @@ from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
 from torchpose.filters.base import (
     Generators,
-    Measurements,
     RecursiveFilter,
-    as_covariance,
-    given_covariance,
-    given_initial_cov,
     require_state,
     standard_normal,
     uniform,
 )
-from torchpose.filters.mending import Mending, mending
-from torchpose.filters.outputs import StepOutput, effective_sample_size
-from torchpose.filters.particle_options import PROPOSALS, check_model, check_options
-from torchpose.filters.resampling import resample
-from torchpose.filters.transition import BURN_IN_SCALE, check_transition_options, make_transition
+from torchpose.filters.measurements import (
+    Measurements,
+    as_covariance,
+    given_covariance,
+    given_initial_cov,
+)
+from torchpose.filters.outputs import Mending, StepOutput, effective_sample_size, mending
+from torchpose.filters.resampling import RESAMPLING, resample
+from torchpose.filters.transition import (
+    BURN_IN_SCALE,
+    check_transition_options,
+    inflation,
+    make_transition,
+)
 from torchpose.filters.walk import MixtureWalk, Moves, grouped_affine
-from torchpose.math.gaussian import LOG_2PI, mended_cholesky, mended_update, safe_cholesky
+from torchpose.math.gaussian import mended_update, safe_cholesky
 from torchpose.math.mixture_em import MixtureParameters
 from torchpose.priors.gaussian_mixture import GaussianMixture
 
 __all__ = ["PROPOSALS", "BootstrapParticleFilter", "ParticleState"]
+
+PROPOSALS = ("mixture", "random-walk", "random-walk-unscaled")
+_STARTS = ("prior", "measured")
 
 
 class ParticleState(NamedTuple):
@@ -153,9 +161,8 @@ class BootstrapParticleFilter(RecursiveFilter):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__(measurement_cov, observed, gmm.dim, dtype)
-        check_options(proposal, n_particles, resample_threshold, resampling, start, dtype)
+        _check_options(proposal, n_particles, resample_threshold, resampling, start, transition)
         check_transition_options(transition, gamma, subspace, burn_in, burn_in_scale)
-        check_model(proposal, transition)
         self.proposal, self.transition, self.subspace = proposal, transition, subspace
         self.n_particles, self.resample_threshold = n_particles, resample_threshold
         self.resampling, self.start = resampling, start
@@ -208,14 +215,12 @@ class BootstrapParticleFilter(RecursiveFilter):
         return walk.moves(*parts)
 
     def inflation(self, time: int) -> float:
-        """Factor of Q in frame `time` (0-based): from `burn_in_scale` geometrically to 1."""
-        if time >= self.burn_in:
-            return 1.0
-        return self.burn_in_scale ** (1 - time / self.burn_in)
+        """Return the factor of Q in frame `time` (0-based), as `torchpose.filters.transition`."""
+        return inflation(time, self.burn_in, self.burn_in_scale)
 
     @torch.no_grad()
     def init(self, batch_size: int, generator: Generators = None) -> ParticleState:
-        """Draw the particles before the first frame.
+        """Return the state before the first frame, with particles drawn from the prior.
 
         Args:
             batch_size: B. generator: one generator, or a list of one for each element.
@@ -227,7 +232,7 @@ class BootstrapParticleFilter(RecursiveFilter):
         return self._evenly(white, 0)
 
     def check_state(self, state: Any, batch: int) -> None:
-        """Raise unless a state is one of this filter's, of so many elements."""
+        """Raise unless a state is one of this filter's with so many elements."""
         require_state(state, ParticleState, "white", (batch, self.n_particles, self.dim))
 
     def _draw(
@@ -247,7 +252,7 @@ class BootstrapParticleFilter(RecursiveFilter):
         return white.view_as(noise)
 
     def _evenly(self, white: Float[Tensor, "B N D"], time: int) -> ParticleState:
-        """The state of particles that all weigh the same."""
+        """Return the state of particles that all weigh the same."""
         log_weights = white.new_full(white.shape[:2], -math.log(self.n_particles)).double()
         scaling = (
             self._prior_and_scaling(white, time)[1] if self.proposal == "random-walk" else None
@@ -257,7 +262,7 @@ class BootstrapParticleFilter(RecursiveFilter):
     def _draw_measured(
         self, frame: Measurements, generator: Generators
     ) -> tuple[Float[Tensor, "B N D"], Float[Tensor, " B"], Mending]:
-        """Draw particles of p(x | z), proportional to p(x) N(z | H x, R); also return log p(z)."""
+        """Draw particles of p(x | z), prop. to p(x) N(z | H x, R); return them with log p(z)."""
         constants = self._constants()
         cov = frame.cov if frame.cov.ndim == 2 else frame.cov[:, None]
         means, covs, log_likelihood, jitter = mended_update(
@@ -270,14 +275,14 @@ class BootstrapParticleFilter(RecursiveFilter):
         return white, torch.logsumexp(log_weights, 1), mending(white, jitter, moves.jitter)
 
     def particles(self, state: ParticleState) -> Float[Tensor, "B N D"]:
-        """The particles in the units of the state (pixels, metres, radians), float64."""
+        """Return the particles in the units of the state (pixels, metres, radians), float64."""
         return self.walk.unwhiten(state.white)
 
     @torch.no_grad()
-    def advance(
+    def filter_frame(
         self, state: ParticleState, frame: Measurements, generator: Generators, return_cov: bool
     ) -> tuple[ParticleState, StepOutput]:
-        """Resample if due, propose, weigh, and estimate."""
+        """Resample if due, propose, weigh, and return the next state and its estimate."""
         if state.time == 0 and self.start == "measured":
             white, evidence, work = self._draw_measured(frame, generator)
             return self._output(self._evenly(white, 1), evidence, frame.mask, return_cov, work)
@@ -291,25 +296,28 @@ class BootstrapParticleFilter(RecursiveFilter):
             if state.log_scaling is not None:
                 predicted = predicted - state.log_scaling
             predicted = predicted - torch.logsumexp(predicted, -1, keepdim=True)
-        log_likelihood, work = self._log_likelihood(white, frame)
+        log_likelihood, jitter = self.walk.log_likelihood(
+            white, frame.z, frame.mask, frame.cov, self.observed
+        )
         log_weights = predicted + log_likelihood
         evidence = torch.logsumexp(log_weights, -1)
         # An element whose weights all vanished, or hold NaN, is NaN from here on.
         evidence = torch.where(torch.isfinite(evidence), evidence, torch.nan)
         log_weights = log_weights - evidence[:, None]
         new_state = ParticleState(white, log_weights, state.time + 1, scaling)
+        work = mending(white, jitter)
         return self._output(new_state, evidence, frame.mask, return_cov, work)
 
     def _output(
         self, state: ParticleState, evidence: Tensor, mask: Tensor, return_cov: bool, work: Mending
     ) -> tuple[ParticleState, StepOutput]:
-        mean, cov = self._moments(state.white, state.log_weights, return_cov)
+        mean, cov = self.walk.moments(state.white, state.log_weights, return_cov)
         evidence = self._reported(evidence, mask)
         # kept for every frame by `forward`, so no wider than the particles
         return state, StepOutput(mean, state.log_weights.to(self.dtype), evidence, cov, *work)
 
     def _resample(self, state: ParticleState, generator: Generators) -> ParticleState:
-        """Resample the elements whose effective sample size is low (BL 25); the others stay."""
+        """Resample the elements whose effective sample size is low (BL 25), and leave the others."""
         n = self.n_particles
         due = effective_sample_size(state.log_weights) < self.resample_threshold * n
         # drawn for all: what an element draws must not depend on its neighbours
@@ -344,28 +352,10 @@ class BootstrapParticleFilter(RecursiveFilter):
         return grouped_affine(rows, component, moves).view_as(noise)
 
     def _prior_and_scaling(self, white: Tensor, time: int) -> tuple[Tensor, Tensor | None]:
-        """log Phi and, where it is used, the log evidence (BL 13) for the step from these points."""
+        """Return log Phi and, where used, the log evidence (BL 13) for the step from these points."""
         if self.proposal == "random-walk-unscaled":
             return self.walk.log_prior(white), None
         return self.walk.log_prior_and_evidence(white, self.inflation(time))
-
-    def _log_likelihood(
-        self, white: Float[Tensor, "B N D"], frame: Measurements
-    ) -> tuple[Float[Tensor, "B N"], Mending]:
-        """log N(z | H x, R) (BL 15) over the measured dimensions, zero where there are none."""
-        mask, z = frame.mask, frame.z.double()
-        eye = torch.eye(z.shape[1], dtype=z.dtype, device=z.device)
-        both = mask[:, :, None] & mask[:, None, :]
-        factor, jitter = mended_cholesky(torch.where(both, frame.cov, eye))
-        rows = self.walk.scale[self.observed] * mask[..., None]
-        target = torch.where(mask, z - self.walk.mean[self.observed], 0.0)
-        joint = torch.cat([rows, target[..., None]], -1)
-        joint = torch.linalg.solve_triangular(factor, joint, upper=False).to(white.dtype)
-        residual = torch.baddbmm(joint[:, None, :, -1], white, joint[..., :-1].mT, alpha=-1)
-        log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        log_norm = -log_det - 0.5 * LOG_2PI * mask.sum(-1)
-        log_likelihood = log_norm[:, None] - 0.5 * residual.square().sum(-1)
-        return log_likelihood, mending(white, jitter)
 
     def _reported(
         self, evidence: Float[Tensor, " B"], mask: Bool[Tensor, "B Z"]
@@ -375,15 +365,29 @@ class BootstrapParticleFilter(RecursiveFilter):
         # without a measurement it is 0 up to rounding
         return torch.where(mask.any(-1) | torch.isnan(evidence), evidence, 0.0)
 
-    def _moments(
-        self, white: Tensor, log_weights: Tensor, return_cov: bool
-    ) -> tuple[Float[Tensor, "B D"], Float[Tensor, "B D D"] | None]:
-        weights = log_weights.exp()[:, None].to(white.dtype)
-        white_mean = weights @ white
-        mean = self.walk.unwhiten(white_mean[:, 0])
-        if not return_cov:
-            return mean, None
-        # float32 sums of ten thousand products can come out indefinite
-        spread = ((white - white_mean) * weights.mT.sqrt()).double()
-        cov = spread.mT @ spread
-        return mean, self.walk.scale @ cov @ self.walk.scale.mT
+
+def _check_options(
+    proposal: str,
+    n_particles: int,
+    threshold: float,
+    resampling: str,
+    start: str,
+    transition: str,
+) -> None:
+    chosen = {
+        "proposal": (proposal, PROPOSALS),
+        "resampling": (resampling, tuple(RESAMPLING)),
+        "start": (start, _STARTS),
+    }
+    for name, (value, known) in chosen.items():
+        if value not in known:
+            raise InputError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    if isinstance(n_particles, bool) or not isinstance(n_particles, int) or n_particles < 1:
+        raise InputError(f"n_particles must be a whole number of at least 1, got {n_particles!r}")
+    if not 0 <= threshold <= 1:
+        raise InputError(f"resample_threshold must be a share from 0 to 1, got {threshold}")
+    if proposal != "mixture" and transition != "paper":
+        raise InputError(
+            f"proposal {proposal!r} weighs by (BL 26), which holds for transition 'paper' only, "
+            f"got {transition!r}; use proposal 'mixture'"
+        )

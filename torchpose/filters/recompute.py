@@ -1,4 +1,4 @@
-"""Results whose gradients are computed from their arguments anew, so that little is kept for them."""
+"""Functions that are called again for their gradients, so that little is kept for these."""
 
 import threading
 import weakref
@@ -9,7 +9,10 @@ import torch
 from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
 
-__all__ = ["recomputed", "wants_gradient"]
+__all__ = ["RECOMPUTED_FRAMES", "recomputed", "wants_gradient"]
+
+RECOMPUTED_FRAMES = 16
+"""Frames at a time that filters compute anew for gradients."""
 
 _Result = TypeVar("_Result")
 # What was computed anew last, in each thread. Outputs that the gradient does not ask for leave some of

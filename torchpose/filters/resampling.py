@@ -19,7 +19,7 @@ BELOW_ONE = 1.0 - 2.0**-53  # the largest float64 under 1: (n - 1 + u) / n may r
 def systematic(
     log_weights: Float[Tensor, "B N"], generator: Generators = None, n_samples: int | None = None
 ) -> Int[Tensor, "B n"]:
-    """Ancestors at the positions (i + u) / n of the cumulative weights, one u per element.
+    """Return ancestors at the positions (i + u) / n of the cumulative weights, one u per element.
 
     A particle of weight w is taken floor(n w) or ceil(n w) times. Ancestors are in rising order,
     which keeps the gather that follows in cache.
@@ -43,7 +43,7 @@ def systematic(
 def stratified(
     log_weights: Float[Tensor, "B N"], generator: Generators = None, n_samples: int | None = None
 ) -> Int[Tensor, "B n"]:
-    """Ancestors at the positions (i + u_i) / n, with an own u_i in each of the n strata.
+    """Return ancestors at the positions (i + u_i) / n, with an own u_i in each of the n strata.
 
     Args, Returns, Reference: as `systematic`.
     """
@@ -55,7 +55,7 @@ def stratified(
 def multinomial(
     log_weights: Float[Tensor, "B N"], generator: Generators = None, n_samples: int | None = None
 ) -> Int[Tensor, "B n"]:
-    """Ancestors drawn independently of each other, with the weights as probabilities.
+    """Return ancestors drawn independently of each other, with the weights as probabilities.
 
     Args, Returns: as `systematic`. Its variance is the largest of the four.
 
@@ -69,7 +69,7 @@ def multinomial(
 def residual(
     log_weights: Float[Tensor, "B N"], generator: Generators = None, n_samples: int | None = None
 ) -> Int[Tensor, "B n"]:
-    """floor(n w) copies of each particle; the rest is drawn from the fractions n w - floor(n w).
+    """Return floor(n w) copies of each particle, and draw the rest from the fractions n w - floor(n w).
 
     Args, Returns: as `systematic`.
 
@@ -105,7 +105,7 @@ def resample(
     generator: Generators = None,
     n_samples: int | None = None,
 ) -> Int[Tensor, "B n"]:
-    """Ancestor indices by the named method.
+    """Return ancestor indices by the named method.
 
     All four are unbiased: particle j is taken n w_j times on average.
 
@@ -150,7 +150,7 @@ def _steps(log_weights: Tensor, n: int) -> Tensor:
 
 
 def _search(weights: Float[Tensor, "B N"], positions: Float[Tensor, "B n"]) -> Int[Tensor, "B n"]:
-    """The particle whose share of the cumulative weights holds each position in [0, 1)."""
+    """Return the particle whose share of the cumulative weights holds each position in [0, 1)."""
     edges = weights.cumsum(-1)
     # Divided by its own end, the last edge is exactly 1, and right=True steps over zero weights.
     edges = edges / edges[:, -1:]

@@ -1,106 +1,69 @@
 """Fixed tracks whose gains are shared by all sequences of one history of masks.
 
-Gains come from a graph of mask histories. Constant stretches are solved in blocks and in place; where
-the measurements want gradients, step by step.
+Gains come from the graph of mask histories. Where the measurements want gradients, frames are stepped
+through; else constant stretches are solved in blocks and in place. Under constant gains the means are a
+linear recursion over time,
+
+d_t = A d_{t-1} + K (z_t - H mu),  v_t = L^-1 (z_t - H mu) - L^-1 H F d_{t-1},  d = m - mu.
+
+Within a block of n frames everything is a matrix product of the state at its start and the block's
+measurements; only those starts form a sequence, n times shorter than the frames.
 """
 
+import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose.filters.base import Measurements
-from torchpose.filters.frame_weights import frame_log_likelihood, frame_weights
-from torchpose.filters.gains import MAX_EDGES, Edge, GainGraph
-from torchpose.filters.mending import mending_of_edges
+from torchpose.filters.gain_graph import BlockModel, History, mending_of_edges
+from torchpose.filters.measurements import Measurements
+from torchpose.filters.memoryless import frame_log_likelihood
+from torchpose.filters.mkf import MixtureKalmanFilter
 from torchpose.filters.outputs import FilterOutput, StepOutput, finish_output
-from torchpose.filters.recompute import recomputed
-from torchpose.filters.scan import Workspace, scan_blocks
-from torchpose.filters.tracks import within_and_between
-from torchpose.filters.weights import sequence_weights
+from torchpose.filters.recompute import RECOMPUTED_FRAMES, recomputed
+from torchpose.filters.weights import WeightRule, sequence_weights, within_and_between
 
-if TYPE_CHECKING:
-    from torchpose.filters.mkf import MixtureKalmanFilter
-
-__all__ = ["RECOMPUTED_FRAMES", "History", "find_history", "run_for_gradients", "run_shared"]
-
-RECOMPUTED_FRAMES = 16
-"""Frames at a time that are computed anew for gradients."""
+__all__ = ["run_for_gradients", "run_shared"]
 
 _BUFFER_NUMBERS = 1 << 18  # track means held at a time: 4 MB, which stay in the cache
 
 
-class History(NamedTuple):
-    """Steps through the gain graph for H distinct histories of masks.
-
-    Attributes:
-        graph: the graph. edges: per frame, one edge for each history, or a single one for all.
-        steady: per frame, the steady node that all elements stay at, or -1.
-        group: the history of each element, [B].
-    """
-
-    graph: GainGraph
-    edges: list[list[Edge]]
-    steady: list[int]
-    group: Tensor
-
-
-def find_history(model: "MixtureKalmanFilter", frames: Measurements) -> History | None:
-    """Walk the gain graph; None if the masks have too many histories to be worth sharing."""
-    graph = model.gain_graph(frames.cov)
-    patterns = _patterns(frames)
-    distinct, group = torch.unique(patterns, dim=0, return_inverse=True)
-    nodes = [0] * distinct.shape[0]
-    edges, steady = [], []
-    for row in distinct.T.tolist():
-        keys = set(zip(nodes, row, strict=True))
-        found = {key: graph.edge(*key) for key in keys}
-        if len(graph.edges) > MAX_EDGES:
-            return None
-        first = (nodes[0], row[0])
-        same = len(keys) == 1
-        steady.append(nodes[0] if same and graph.is_steady(*first) else -1)
-        taken = [found[key] for key in zip(nodes, row, strict=True)]
-        edges.append(taken[:1] if same else taken)
-        nodes = [edge.target for edge in taken]
-    return History(graph, edges, steady, group)
-
-
-def _patterns(frames: Measurements) -> Tensor:
-    """The measured dimensions as bits [B, T]; finished sequences share those of the longest."""
-    n_frames, n_obs = frames.z.shape[1:]
-    bits = 2 ** torch.arange(n_obs, device=frames.z.device)
-    patterns = (frames.mask * bits).sum(-1)
-    over = torch.arange(n_frames, device=frames.z.device) >= frames.lengths[:, None]
-    return torch.where(over, patterns[frames.lengths.argmax()], patterns)
-
-
 def run_shared(
-    model: "MixtureKalmanFilter",
+    model: MixtureKalmanFilter,
+    rule: WeightRule,
     frames: Measurements,
     history: History,
     return_cov: bool,
     progress: bool,
 ) -> FilterOutput:
-    """All frames of a batch, in place and in blocks; no gradient runs through it."""
+    """Filter all frames of a batch, in place and in blocks; no gradient runs through it.
+
+    Args:
+        model: with fixed tracks. rule: of their weights. frames: all that is measured. history: of their
+            masks. return_cov: whether to return covariances. progress: whether to show a progress bar.
+    """
     batch, n_frames = frames.z.shape[:2]
-    means, marginal = model.means.to(model.dtype), _marginal(model, frames)
+    means, marginal = model.means.to(model.dtype), _marginal(model, rule, frames)
     carried = model.init(batch).log_weights
     # Results are written in place, time first: gathering them afterwards would copy all of them.
     estimates = means.new_empty(n_frames, batch, model.dim)
     posteriors = means.new_empty(n_frames, batch, model.n_tracks)
     evidences = means.new_empty(n_frames, batch)
     covs = means.new_empty(n_frames, batch, model.dim, model.dim) if return_cov else None
-    workspace = Workspace()
+    workspace = _Workspace()
     bar = tqdm(total=n_frames, disable=not progress, unit="frame")
     done = 0
     for tracks in _stretches(model, frames, history, workspace):
         log_likelihood = tracks.log_likelihood.permute(1, 3, 2, 0).flatten(0, 1)
         span = slice(done, done + len(log_likelihood))
         own = None if marginal is None else marginal[span]
-        posteriors[span], evidences[span], carried = _weigh(model, own, carried, log_likelihood)
+        posteriors[span], evidences[span], carried = sequence_weights(
+            rule, carried, log_likelihood, own
+        )
         mixed = posteriors[span].exp()
         shares = mixed.view(*tracks.deviation.shape[1:4:2], batch, -1).permute(3, 0, 2, 1)
         weighted = workspace.take("weighted", tuple(tracks.deviation.shape), means)
@@ -121,13 +84,14 @@ def run_shared(
 
 
 def run_for_gradients(
-    model: "MixtureKalmanFilter",
+    model: MixtureKalmanFilter,
+    rule: WeightRule,
     frames: Measurements,
     history: History,
     return_cov: bool,
     progress: bool,
 ) -> FilterOutput:
-    """`run_shared` for measurements that want gradients, up to rounding.
+    """Filter all frames as `run_shared` does, up to rounding, for measurements that want gradients.
 
     Gains do not depend on what is measured, so nothing runs through covariances; what lies between
     states is computed anew for the gradient, some frames at a time.
@@ -136,12 +100,12 @@ def run_for_gradients(
     carry = _Carry(
         frames.z.new_zeros(model.n_tracks, batch, model.dim), model.init(batch).log_weights
     )
-    marginal = _marginal(model, frames)
+    marginal = _marginal(model, rule, frames)
     steps = []
     with tqdm(total=n_frames, disable=not progress, unit="frame") as bar:
         for start in range(0, n_frames, RECOMPUTED_FRAMES):
             span = range(start, min(start + RECOMPUTED_FRAMES, n_frames))
-            arguments = model, frames, history, marginal, span, return_cov
+            arguments = model, rule, frames, history, marginal, span, return_cov
             carry, step = recomputed(_estimate, carry, *arguments)
             steps.append(step)
             bar.update(len(span))
@@ -163,18 +127,19 @@ class _Carry(NamedTuple):
 
 def _estimate(
     carry: _Carry,
-    model: "MixtureKalmanFilter",
+    model: MixtureKalmanFilter,
+    rule: WeightRule,
     frames: Measurements,
     history: History,
     marginal: Tensor | None,
     span: range,
     return_cov: bool,
 ) -> tuple[_Carry, StepOutput]:
-    """Estimates of some frames, batch first."""
+    """Return what some frames leave to the next, and their estimates, batch first."""
     tracks, deviation = _stepped_stretch(model, frames, history, carry.deviation, span)
     log_likelihood = tracks.log_likelihood.permute(1, 3, 2, 0).flatten(0, 1)
     own = None if marginal is None else marginal[span.start : span.stop]
-    log_weights, evidence, carried = _weigh(model, own, carry.log_weights, log_likelihood)
+    log_weights, evidence, carried = sequence_weights(rule, carry.log_weights, log_likelihood, own)
     means, mixed = model.means.to(model.dtype), log_weights.exp()
     centred = (mixed[..., None, :] @ tracks.deviation.permute(1, 3, 2, 0, 4).flatten(0, 1))[
         ..., 0, :
@@ -187,28 +152,26 @@ def _estimate(
     return _Carry(deviation, carried), step
 
 
-def _marginal(model: "MixtureKalmanFilter", frames: Measurements) -> Tensor | None:
-    """For weights by frame, log-likelihoods of the components, time first [T, B, M]."""
-    if model.weighting != "frame":
-        return None
-    return frame_log_likelihood(model, frames).transpose(0, 1)
+def _marginal(model: MixtureKalmanFilter, rule: WeightRule, frames: Measurements) -> Tensor | None:
+    """Return log-likelihoods of the components for weights by frame, time first [T, B, M]."""
+    found = frame_log_likelihood(model, rule, frames)
+    return None if found is None else found.transpose(0, 1)
 
 
-def _weigh(
-    model: "MixtureKalmanFilter", marginal: Tensor | None, carried: Tensor, log_likelihood: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Log-weights and log-evidence of frames that come next, and the log-weights to go on from.
+class _Workspace:
+    """Memory that all stretches of a run share: fresh pages cost more than the products in them."""
 
-    Args:
-        marginal: of these frames [T, B, M], for weights by frame. carried: log-weights [B, M].
-        log_likelihood: of the tracks [T, B, M].
-    """
-    log_prior, power = model.log_prior.to(model.dtype), model.likelihood_power
-    if marginal is not None:
-        return *frame_weights(log_prior, marginal, log_likelihood, power), carried
-    return sequence_weights(
-        carried, log_prior, log_likelihood, model.uniform_weight, power, model.reset_below
-    )
+    def __init__(self) -> None:
+        self._held: dict[str, Tensor] = {}
+
+    def take(self, name: str, shape: tuple[int, ...], like: Tensor) -> Tensor:
+        """Return a tensor of this shape with arbitrary contents, valid until the name is taken again."""
+        size = math.prod(shape)
+        held = self._held.get(name)
+        if held is None or held.numel() < size:
+            held = like.new_empty(size)
+            self._held[name] = held
+        return held[:size].view(shape)
 
 
 class _Stretch(NamedTuple):
@@ -227,9 +190,9 @@ class _Stretch(NamedTuple):
 
 
 def _stretches(
-    model: "MixtureKalmanFilter", frames: Measurements, history: History, workspace: Workspace
+    model: MixtureKalmanFilter, frames: Measurements, history: History, workspace: _Workspace
 ) -> Iterator[_Stretch]:
-    """Track means and likelihoods, a bounded stretch of frames at a time."""
+    """Yield track means and likelihoods, a bounded stretch of frames at a time."""
     batch, n_frames, _ = frames.z.shape
     n_tracks, dim = model.means.shape
     state = torch.zeros(n_tracks, batch, dim, dtype=model.dtype, device=frames.z.device)
@@ -255,25 +218,64 @@ def _block_length(batch: int) -> int:
 
 
 def _block_stretch(
-    model: "MixtureKalmanFilter",
+    model: MixtureKalmanFilter,
     frames: Measurements,
     history: History,
     state: Tensor,
     span: tuple[int, int],
-    workspace: Workspace,
+    workspace: _Workspace,
 ) -> tuple[_Stretch, Tensor]:
     start, end = span
     edge, node = history.edges[start][0], history.steady[start]
     length = _block_length(frames.z.shape[0])
     blocks = history.graph.blocks(node, model.means, length, model.dtype)
-    deviation, squared, state = scan_blocks(blocks, state, frames.z[:, start:end], workspace)
+    deviation, squared, state = _scan_blocks(blocks, state, frames.z[:, start:end], workspace)
     log_norm = edge.log_norm.to(model.dtype)[:, None, None, None]
     cov = [history.graph.nodes[node][None]] * (end - start)
     return _Stretch(deviation, log_norm - 0.5 * squared, cov, history.group), state
 
 
+def _scan_blocks(
+    model: BlockModel,
+    start: Float[Tensor, "M B D"],
+    z: Float[Tensor, "B T Z"],
+    workspace: _Workspace,
+) -> tuple[Float[Tensor, "M N B L D"], Float[Tensor, "M N B L"], Float[Tensor, "M B D"]]:
+    """Run T = N L frames, N blocks of L.
+
+    Args:
+        start: deviations d_0 from the component means. z: measurements. workspace: for the results.
+
+    Returns:
+        Deviations [M, N, B, L, D], squared whitened innovations ||v||^2 [M, N, B, L], and the
+        deviations after the last frame [M, B, D]. The first two lie in the workspace.
+    """
+    n_tracks, batch, dim = start.shape
+    n_obs, length = z.shape[2], model.length
+    n_blocks = z.shape[1] // length
+    n_rows, width = n_blocks * batch, dim + length * n_obs + 1
+    rows = workspace.take("rows", (n_tracks, n_blocks, batch, width), start)
+    rows[..., dim:-1] = z.reshape(batch, n_blocks, -1).transpose(0, 1)
+    rows[..., -1] = 1
+    ends = workspace.take("ends", (n_tracks, n_rows, dim), start)
+    torch.bmm(rows[..., dim:].flatten(1, 2), model.inputs_to_end, out=ends)
+    ends = ends.view(n_tracks, n_blocks, batch, dim)
+    state = start
+    for block, end in zip(rows.unbind(1), ends.unbind(1), strict=True):
+        block[..., :dim] = state
+        state = torch.baddbmm(end, state, model.carry)
+    out = workspace.take("out", (n_tracks, n_rows, length * (dim + n_obs)), start)
+    torch.bmm(rows.flatten(1, 2), model.outputs, out=out)
+    out = out.view(n_tracks, n_blocks, batch, -1)
+    split = length * dim
+    whitened = out[..., split:].unflatten(-1, (length, n_obs))
+    squared = workspace.take("squared", tuple(whitened.shape), start)
+    torch.mul(whitened, whitened, out=squared)
+    return out[..., :split].unflatten(-1, (length, dim)), squared.sum(-1), state
+
+
 def _stepped_stretch(
-    model: "MixtureKalmanFilter",
+    model: MixtureKalmanFilter,
     frames: Measurements,
     history: History,
     state: Tensor,
@@ -301,9 +303,9 @@ def _stepped_stretch(
 
 
 def _frame_gains(
-    model: "MixtureKalmanFilter", history: History, t: int
+    model: MixtureKalmanFilter, history: History, t: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """L^-1, W and the likelihood's constant of frame t: [M, ...], or [M, B, ...] if they differ."""
+    """Return L^-1, W and the likelihood's constant of frame t: [M, ...], or [M, B, ...] if they differ."""
     edges, dtype = history.edges[t], model.dtype
     if len(edges) == 1:
         edge = edges[0]

@@ -5,24 +5,25 @@ whose forward pass is the filter itself. The states of different tracks are not 
 approximation when the indicator changes.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchpose._core.value_checks import values_visible
-from torchpose.errors import InputError
-from torchpose.filters.base import Measurements
-from torchpose.filters.fixed_tracks import step_fixed_weights, step_tracks
-from torchpose.filters.frame_weights import run_memoryless
-from torchpose.filters.mending import Mending, mending, stacked
-from torchpose.filters.outputs import FilterOutput, finish_output
-from torchpose.filters.tracks import MKFState, within_and_between
-from torchpose.filters.weights import mix_uniform, normalise
+from torchpose.filters.measurements import Measurements
+from torchpose.filters.memoryless import frame_log_likelihood
+from torchpose.filters.mkf import MixtureKalmanFilter, MKFState
+from torchpose.filters.outputs import (
+    FilterOutput,
+    Mending,
+    finish_output,
+    mending,
+    stacked_mending,
+)
+from torchpose.filters.track_steps import step_tracks, weigh_tracks
+from torchpose.filters.weights import WeightRule, mix_uniform, normalise, within_and_between
 from torchpose.math.gaussian import mended_cholesky, symmetrise
-
-if TYPE_CHECKING:
-    from torchpose.filters.mkf import MixtureKalmanFilter
 
 __all__ = ["smooth_fixed_tracks"]
 
@@ -51,9 +52,13 @@ class _Pass(NamedTuple):
 
 
 def smooth_fixed_tracks(
-    model: "MixtureKalmanFilter", frames: Measurements, lag: int | None, return_cov: bool
+    model: MixtureKalmanFilter,
+    rule: WeightRule,
+    frames: Measurements,
+    lag: int | None,
+    return_cov: bool,
 ) -> FilterOutput:
-    """Estimates given all measurements of a sequence, or those up to `lag` frames later.
+    """Return estimates given all measurements of a sequence, or those up to `lag` frames later.
 
     m_t|n = m_t + C_t (m_t+1|n - m^_t+1),  C_t = P_t F^T P^_t+1^-1,
     P_t|n = P_t + C_t (P_t+1|n - P^_t+1) C_t^T                                    in each track j;
@@ -62,46 +67,13 @@ def smooth_fixed_tracks(
 
     T is the chain whose forward pass alpha_t(j) = N_tj sum_i alpha_t-1(i) T_ij gives the weights w_t of
     the filter (BL 49): its rows do not sum to one, since every step multiplies by pi. So what uses no
-    later frame, a lag of 0 or the last frame, is the filter. Filters whose frames do not depend on each
-    other have nothing to smooth: their estimates are those of `forward`.
+    later frame, a lag of 0 or the last frame, is the filter.
 
     Args:
-        model: a filter with fixed tracks. frames: checked measurements.
-        lag: number of later frames that an estimate may use; None is all.
+        model: a filter with fixed tracks. rule: of their weights. frames: checked measurements.
+        lag: number of later frames that an estimate may use, at least 0; None is all.
         return_cov: whether to return covariances.
-
-    Raises:
-        InputError: lag below 0.
     """
-    if lag is not None and lag < 0:
-        raise InputError(
-            f"lag must be at least 0 frames, or None for the whole sequence, got {lag}"
-        )
-    if not values_visible():
-        return _smooth_unseen(model, frames, lag, return_cov)
-    if model.is_memoryless:
-        return run_memoryless(model, frames, return_cov, progress=False)
-    return _smooth_parts(model, frames, lag, return_cov)
-
-
-def _smooth_unseen(
-    model: "MixtureKalmanFilter", frames: Measurements, lag: int | None, return_cov: bool
-) -> FilterOutput:
-    """Smooth while nobody may look whether the rate is 0; without medians it makes no difference."""
-    smoothed = _smooth_parts(model, frames, lag, return_cov)
-    if model.gamma is None or not len(model.medians) or not model.weighs_frames_alone:
-        return smoothed
-    alone = run_memoryless(model, frames, return_cov, progress=False)
-    still = (model.gamma == 0).all()
-    pairs = zip(alone, smoothed, strict=True)
-    chosen = (a if a is None or b is None else torch.where(still, a, b) for a, b in pairs)
-    return FilterOutput(*chosen)  # type: ignore[arg-type]
-
-
-def _smooth_parts(
-    model: "MixtureKalmanFilter", frames: Measurements, lag: int | None, return_cov: bool
-) -> FilterOutput:
-    """Smooth a batch in parts that fit into memory."""
     batch, n_frames, _ = frames.z.shape
     n_tracks, dim = model.means.shape
     per_sequence = n_frames * n_tracks * dim * (3 * dim if return_cov else 4)
@@ -111,7 +83,7 @@ def _smooth_parts(
         rows = slice(first, first + part)
         noise = frames.cov if frames.cov.ndim == 2 else frames.cov[rows]
         piece = Measurements(frames.z[rows], frames.mask[rows], noise, frames.lengths[rows])
-        outputs.append(_smooth(model, piece, lag, return_cov))
+        outputs.append(_smooth(model, rule, piece, lag, return_cov))
     mean = torch.cat([out[0] for out in outputs])
     log_weights = torch.cat([out[1] for out in outputs])
     evidence = torch.cat([out[2] for out in outputs])
@@ -122,18 +94,21 @@ def _smooth_parts(
 
 
 def _smooth(
-    model: "MixtureKalmanFilter", frames: Measurements, lag: int | None, return_cov: bool
+    model: MixtureKalmanFilter,
+    rule: WeightRule,
+    frames: Measurements,
+    lag: int | None,
+    return_cov: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Mending]:
-    past = _forward(model, frames, return_cov)
+    past = _forward(model, rule, frames, return_cov)
     n_frames = frames.z.shape[1]
     reach = n_frames - 1 if lag is None else min(lag, n_frames - 1)
     gains, jitters = _smoother_gains(model, past)
     later = torch.arange(1, n_frames + 1, device=frames.z.device) < frames.lengths[:, None]
     means = past.mean + _mean_corrections(past, gains, later.mT, reach)
-    if model.weighting == "frame":
-        log_weights = past.log_weights
-    else:
-        log_weights = _smoothed_weights(model, past, later.mT, reach)
+    log_weights = past.log_weights
+    if not rule.by_frame:
+        log_weights = _smoothed_weights(rule, past, later.mT, reach)
     covs = _smoothed_covs(past, gains, later, reach) if return_cov else None
     estimate = (log_weights.exp()[:, :, None] @ means)[:, :, 0]
     total = None
@@ -143,12 +118,14 @@ def _smooth(
         total = torch.stack([within_and_between(w, m, e, c[finest]) for w, m, e, c in frames_of], 1)
     evidence = past.log_evidence.mT
     pairs = zip(past.jitter, jitters, strict=True)
-    work = stacked([mending(past.mean[0], *pair) for pair in pairs])
+    work = stacked_mending([mending(past.mean[0], *pair) for pair in pairs])
     return estimate.transpose(0, 1), log_weights.transpose(0, 1), evidence, total, work
 
 
-def _forward(model: "MixtureKalmanFilter", frames: Measurements, by_length: bool) -> _Pass:
-    """Filter, and keep what the backward pass needs."""
+def _forward(
+    model: MixtureKalmanFilter, rule: WeightRule, frames: Measurements, by_length: bool
+) -> _Pass:
+    """Filter, and return what the backward pass needs."""
     state = model.init(frames.z.shape[0])
     if by_length and values_visible():  # unseen, every element has a history of its own
         # Smoothed covariances depend on where a sequence ends: lengths make histories distinct.
@@ -159,7 +136,11 @@ def _forward(model: "MixtureKalmanFilter", frames: Measurements, by_length: bool
     for t in range(frames.z.shape[1]):
         frame = frames.frame(t)
         step = step_tracks(model, state, frame, model.transition(t))
-        log_weights, evidence = step_fixed_weights(model, state, step.log_likelihood, frame)
+        marginal = frame_log_likelihood(model, rule, frame.as_sequences())
+        own = None if marginal is None else marginal[:, 0]
+        log_weights, evidence = weigh_tracks(
+            rule, state.log_weights, step.log_likelihood, own, frame
+        )
         means.append(step.mean)
         corrections.append(step.mean - step.predicted)
         likelihoods.append(step.log_likelihood)
@@ -169,7 +150,7 @@ def _forward(model: "MixtureKalmanFilter", frames: Measurements, by_length: bool
         predicted_covs.append(step.predicted_cov)
         groups.append(step.group)
         jitters.append(step.jitter)
-        carried = mix_uniform(log_weights, model.uniform_weight)
+        carried = mix_uniform(log_weights, rule.uniform_weight)
         state = MKFState(carried, step.mean, step.cov, step.group, t + 1)
     values = (means, corrections, likelihoods, weights, evidences)
     mean, correction, likelihood, weight, evidence = (torch.stack(frames) for frames in values)
@@ -178,9 +159,9 @@ def _forward(model: "MixtureKalmanFilter", frames: Measurements, by_length: bool
 
 
 def _smoother_gains(
-    model: "MixtureKalmanFilter", past: _Pass
+    model: MixtureKalmanFilter, past: _Pass
 ) -> tuple[list[Tensor], list[Tensor | None]]:
-    """C_t for t = 0..T-2, in the groups of frame t+1 [G, M, D, D]; the jitter of each P^_t [B, M]."""
+    """Return C_t for t = 0..T-2, in the groups of frame t+1 [G, M, D, D]; the jitter of each P^_t [B, M]."""
     gains: list[Tensor] = []
     jitters: list[Tensor | None] = [None]
     for t in range(len(past.cov) - 1):
@@ -194,13 +175,13 @@ def _smoother_gains(
 
 
 def _parents(group: Tensor, following: Tensor, count: int) -> Tensor:
-    """The group of frame t that each of the `count` groups of frame t+1 came from."""
+    """Return the group of frame t that each of the `count` groups of frame t+1 came from."""
     parents = torch.zeros(count, dtype=torch.long, device=group.device)
     return parents.index_put((following,), group)
 
 
 def _mean_corrections(past: _Pass, gains: list[Tensor], later: Tensor, reach: int) -> Tensor:
-    """m_t|t+reach - m_t by Horner's rule: e_t = C_t (d_t+1 + e_t+1), from e = 0, [T, B, M, D].
+    """Return m_t|t+reach - m_t by Horner's rule: e_t = C_t (d_t+1 + e_t+1), from e = 0, [T, B, M, D].
 
     With a short reach all frames take each of the `reach` steps at once; when the reach is the
     whole sequence a single pass backwards over time gives the same.
@@ -222,7 +203,7 @@ def _mean_corrections(past: _Pass, gains: list[Tensor], later: Tensor, reach: in
 
 
 def _pull_back(gains: list[Tensor], groups: list[Tensor], step: Tensor) -> Tensor:
-    """C_t step_t for each frame, [T, B, M, D]; gains are [G, M, D, D] in the groups given."""
+    """Return C_t step_t for each frame, [T, B, M, D]; gains are [G, M, D, D] in the groups given."""
     if all(gain.shape[0] == 1 for gain in gains):
         shared = torch.cat(gains).to(step.dtype)
         return (shared @ step.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
@@ -233,17 +214,14 @@ def _pull_back(gains: list[Tensor], groups: list[Tensor], step: Tensor) -> Tenso
     return torch.stack(moved)
 
 
-def _smoothed_weights(
-    model: "MixtureKalmanFilter", past: _Pass, later: Tensor, reach: int
-) -> Tensor:
-    """log w_t|t+reach = log w_t + log beta_t, normalised, [T, B, M]."""
-    factors = model.log_prior.to(past.log_weights.dtype)
-    factors = factors + model.likelihood_power * past.log_likelihood
+def _smoothed_weights(rule: WeightRule, past: _Pass, later: Tensor, reach: int) -> Tensor:
+    """Return log w_t|t+reach = log w_t + log beta_t, normalised, [T, B, M]."""
+    factors = rule.log_prior + rule.power * past.log_likelihood
     n_frames = len(factors)
 
     def pulled(after: Tensor, is_later: Tensor) -> Tensor:
-        """beta_t up to a factor, from pi_j N_t+1,j beta_t+1(j)."""
-        beta = mix_uniform(normalise(after), model.uniform_weight)
+        """Return log beta_t up to a constant, from pi_j N_t+1,j beta_t+1(j)."""
+        beta = mix_uniform(normalise(after), rule.uniform_weight)
         return torch.where(is_later[..., None], beta, torch.zeros_like(beta))
 
     if reach >= n_frames - 1:
@@ -258,7 +236,7 @@ def _smoothed_weights(
 
 
 def _smoothed_covs(past: _Pass, gains: list[Tensor], later: Tensor, reach: int) -> list[Tensor]:
-    """P_t|t+reach in the groups of the last frame, which are the finest, per frame [G, M, D, D]."""
+    """Return P_t|t+reach per frame, in the groups of the last frame, the finest, [G, M, D, D]."""
     n_frames = len(past.cov)
     finest = past.group[-1]
     elements = torch.arange(finest.numel(), device=finest.device)

@@ -25,7 +25,7 @@ _TOLERANCE = 1e-9  # in log alpha
 
 
 def survival_rate(log_weights: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch"]:
-    """Share of the particles that resampling is expected to keep.
+    """Return the share of the particles that resampling is expected to keep.
 
     alpha = (sum_n w_n)^2 / (N sum_n w_n^2)
 
@@ -49,7 +49,7 @@ def survival_rate(log_weights: Float[Tensor, "*batch N"]) -> Float[Tensor, "*bat
 def survival_exponent(
     log_weights: Float[Tensor, "*batch N"], rate: float
 ) -> Float[Tensor, "*batch"]:
-    """The exponent beta for which a given share of the particles survives.
+    """Return the exponent beta for which a given share of the particles survives.
 
     alpha = (sum_n w_n^beta)^2 / (N sum_n w_n^(2 beta))
 
@@ -94,7 +94,7 @@ def survival_exponent(
 
 
 def _solve(relative: Tensor, alive: Tensor, start: Tensor, target: float) -> Tensor:
-    """log beta at which 2 log sum w^beta - log sum w^(2 beta) is the target."""
+    """Return log beta at which 2 log sum w^beta - log sum w^(2 beta) is the target."""
     low, high, u = start - _REACH, start + _REACH, start
     for _ in range(_MOST_STEPS):
         beta = u.exp()
@@ -137,7 +137,7 @@ def check_survival_rate(rate: float, n_particles: int) -> None:
 
 
 def survival_rate_per_frame(per_second: float, fps: float) -> float:
-    """The rate per frame that keeps the same share of the particles over a second.
+    """Return the rate per frame that keeps the same share of the particles over a second.
 
     alpha = exp(ln(alpha_c) / N_t)
 

@@ -16,6 +16,7 @@ __all__ = [
     "TRANSITIONS",
     "Transition",
     "check_transition_options",
+    "inflation",
     "make_transition",
 ]
 
@@ -71,6 +72,14 @@ def check_transition_options(
         raise InputError(f"burn_in_scale is of a burn-in: got {scale} and burn_in = 0")
 
 
+def inflation(time: int, burn_in: int, scale: float) -> float:
+    """Return the factor of Q in frame `time` (0-based): from `scale` geometrically to 1.
+
+    Q_t = scale^(1 - t / burn_in) Q, and Q after the burn-in.
+    """
+    return 1.0 if time >= burn_in else scale ** (1 - time / burn_in)
+
+
 def make_transition(
     kind: str,
     means: Float[Tensor, "K D"],
@@ -79,7 +88,7 @@ def make_transition(
     gamma: Float[Tensor, "*K"] | None = None,
     subspace: int | None = None,
 ) -> Transition:
-    """The transition of every component.
+    """Return the transition of every component.
 
     - ``paper``: F = Sigma (Q + Sigma)^-1, N = Sigma (Q + Sigma)^-1 Q   (BL 31-32, 35-37). It settles
       at Sigma (2 Sigma + Q)^-1 (Sigma + Q), less than Sigma: hidden joints come out too certain.

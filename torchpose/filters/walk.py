@@ -1,6 +1,6 @@
-"""The random walk of a state under a mixture prior: densities and moves for many particles at once.
+"""The random walk of a state under a mixture prior: densities and moves of many particles at once.
 
-Everything happens in coordinates whitened by the mean and covariance of the whole prior. There the
+All of it is computed in coordinates whitened by the mean and covariance of the whole prior. There the
 particles are of order one, so that float32 is enough for a prior whose scales span 1e-6 to 1e4.
 """
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose._core.value_checks import values_visible
@@ -66,17 +66,17 @@ class MixtureWalk:
             setattr(self, name, value)
 
     def whiten(self, x: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D"]:
-        """y = L^-1 (x - m), computed in float64 and returned in the dtype of the walk."""
+        """Return y = L^-1 (x - m), computed in float64 and returned in the dtype of the walk."""
         centred = (x.double() - self.mean)[..., None]
         white = torch.linalg.solve_triangular(self.scale, centred, upper=False)
         return white[..., 0].to(self.rows.dtype)
 
     def unwhiten(self, y: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D"]:
-        """x = m + L y, in float64."""
+        """Return x = m + L y, in float64."""
         return self.mean + y.double() @ self.scale.mT
 
     def log_prior(self, y: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch"]:
-        """log Phi (BL 7) at every whitened point."""
+        """Return log Phi (BL 7) at every whitened point."""
         weights = torch.ones_like(self._shrink(0.0))[:, None]
         chunks = self._terms(y, weights, self.log_norm[None])
         return torch.cat([_log_sum_exp_(terms[0]) for terms in chunks]).view(y.shape[:-1])
@@ -84,7 +84,7 @@ class MixtureWalk:
     def log_prior_and_evidence(
         self, y: Float[Tensor, "*batch D"], inflation: float = 1.0
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-        """log Phi (BL 7) and log sum_i pi_i c_i (BL 10, 13) at every point.
+        """Return log Phi (BL 7) and log sum_i pi_i c_i (BL 10, 13) at every point.
 
         Args:
             y: whitened points. inflation: factor s of Q.
@@ -124,7 +124,7 @@ class MixtureWalk:
         offset: Float[Tensor, "K D"],
         noise: Float[Tensor, "K D D"],
     ) -> Moves:
-        """The map of every component, x' = F x + b + N(0, N), for whitened points."""
+        """Return the map of every component, x' = F x + b + N(0, N), for whitened points."""
         matrix = torch.linalg.solve_triangular(self.scale, transition @ self.scale, upper=False)
         centred = (transition @ self.mean + offset - self.mean)[..., None]
         shift = torch.linalg.solve_triangular(self.scale, centred, upper=False)[..., 0]
@@ -135,9 +135,53 @@ class MixtureWalk:
         return Moves(torch.cat([matrix.mT, factor.mT], 1).to(dtype), shift.to(dtype), jitter)
 
     def noise_moves(self, means: Float[Tensor, "K D"], covs: Float[Tensor, "K D D"]) -> Moves:
-        """The map y = noise @ matrix + offset that draws from N(means, covs), for whitened points."""
+        """Return the map y = noise @ matrix + offset that draws from N(means, covs), for whitened points."""
         moves = self.moves(torch.zeros_like(covs), means, covs)
         return moves._replace(matrix=moves.matrix[:, self.dim :])
+
+    def log_likelihood(
+        self,
+        y: Float[Tensor, "B N D"],
+        z: Float[Tensor, "B Z"],
+        mask: Bool[Tensor, "B Z"],
+        measurement_cov: Float[Tensor, "*batch Z Z"],
+        observed: Int[Tensor, " Z"],
+    ) -> tuple[Float[Tensor, "B N"], Float[Tensor, " B"] | None]:
+        """Return log N(z | H x, R) (BL 15) of the measured dimensions, zero where there are none.
+
+        Args:
+            y: whitened points. z: measurements. mask: True where measured. measurement_cov: R, one or
+                [B, Z, Z]. observed: the rows of H.
+
+        Returns:
+            The log-likelihood of every point, and the jitter of each R, as `mended_cholesky`.
+        """
+        z = z.double()
+        eye = torch.eye(z.shape[1], dtype=z.dtype, device=z.device)
+        both = mask[:, :, None] & mask[:, None, :]
+        factor, jitter = mended_cholesky(torch.where(both, measurement_cov, eye))
+        rows = self.scale[observed] * mask[..., None]
+        target = torch.where(mask, z - self.mean[observed], 0.0)
+        joint = torch.cat([rows, target[..., None]], -1)
+        joint = torch.linalg.solve_triangular(factor, joint, upper=False).to(y.dtype)
+        residual = torch.baddbmm(joint[:, None, :, -1], y, joint[..., :-1].mT, alpha=-1)
+        log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        log_norm = -log_det - 0.5 * LOG_2PI * mask.sum(-1)
+        return log_norm[:, None] - 0.5 * residual.square().sum(-1), jitter
+
+    def moments(
+        self, y: Float[Tensor, "B N D"], log_weights: Float[Tensor, "B N"], return_cov: bool
+    ) -> tuple[Float[Tensor, "B D"], Float[Tensor, "B D D"] | None]:
+        """Return the mean and, on request, the covariance of weighted whitened points, unwhitened."""
+        weights = log_weights.exp()[:, None].to(y.dtype)
+        white_mean = weights @ y
+        mean = self.unwhiten(white_mean[:, 0])
+        if not return_cov:
+            return mean, None
+        # float32 sums of ten thousand products can come out indefinite
+        spread = ((y - white_mean) * weights.mT.sqrt()).double()
+        cov = spread.mT @ spread
+        return mean, self.scale @ cov @ self.scale.mT
 
     def _shrink(self, inflation: float) -> Float[Tensor, "K D"]:
         return (1 / (1 + inflation * self.ratio)).to(self.rows.dtype)
@@ -148,7 +192,7 @@ class MixtureWalk:
     def _terms(
         self, y: Tensor, weights: Float[Tensor, "K S D"], constant: Float[Tensor, "S K"]
     ) -> Iterator[Float[Tensor, "S K n"]]:
-        """Log terms of S mixtures, for chunks of points whose residuals stay in cache."""
+        """Yield log terms of S mixtures, for chunks of points whose residuals stay in cache."""
         points = y.reshape(-1, self.dim)
         # the row of ones carries the offset: cheaper than adding it to every residual
         points = torch.cat([points.T, points.new_ones(1, len(points))])
@@ -172,7 +216,7 @@ class MixtureWalk:
 def grouped_affine(
     x: Float[Tensor, "n E"], group: Int[Tensor, " n"], moves: Moves
 ) -> Float[Tensor, "n D"]:
-    """x @ matrix[group] + offset[group], without a copy of the matrix for every row.
+    """Return x @ matrix[group] + offset[group], without a copy of the matrix for every row.
 
     Rows are sorted by group into tiles of 32 that hold one group each, so one batched product of at
     most n / 32 + K tiles does the work, however uneven the groups are.
@@ -202,13 +246,13 @@ def grouped_affine(
 
 
 def _log_sum_exp_(terms: Float[Tensor, "*batch K n"]) -> Float[Tensor, "*batch n"]:
-    """log sum exp over K, in place; torch.logsumexp takes three times as long."""
+    """Return log sum exp over K, in place; torch.logsumexp takes three times as long."""
     top = terms.amax(-2, keepdim=True).clamp_min_(torch.finfo(terms.dtype).min)
     return _exp_(terms.sub_(top)).sum(-2).log_().add_(top.squeeze(-2))
 
 
 def _exp_(terms: Tensor) -> Tensor:
-    """exp in place of numbers of which the largest is 0; denormal results would be slow."""
+    """Return exp, in place, of numbers of which the largest is 0, without denormal results."""
     return terms.clamp_min_(NEGLIGIBLE).exp_()
 
 

@@ -1,40 +1,30 @@
-"""Weights of fixed tracks that a frame gives by itself, whatever was measured before it.
+"""Frames by themselves: the mixture conditioned on each, whatever was measured before it.
 
-The indicator of every frame is then drawn from pi anew, as for sampled tracks (BL 47), while each
-component's track goes on as if it had been right all along: weights without memory, states with. If
+Weights by frame draw the indicator of every frame from pi anew, as for sampled tracks (BL 47), while
+each component's track goes on as if it had been right all along: weights without memory, states with. If
 the states have none either (transition "ou" with gamma = 0), frames do not depend on each other at
 all: `run_memoryless` conditions the mixture on all of them at once.
 """
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose._core.module_state import outside_inference
+from torchpose._core.module_state import derived, outside_inference
 from torchpose._core.value_checks import values_visible
-from torchpose.filters.base import Measurements
-from torchpose.filters.mending import Mending, mending
-from torchpose.filters.outputs import FilterOutput, StepOutput, finish_output
+from torchpose.filters.measurements import Measurements
+from torchpose.filters.mkf import MixtureKalmanFilter, MKFState
+from torchpose.filters.outputs import FilterOutput, Mending, StepOutput, finish_output, mending
 from torchpose.filters.recompute import recomputed, wants_gradient
-from torchpose.filters.tracks import MKFState, estimate_of
-from torchpose.filters.weights import normalise
+from torchpose.filters.weights import WeightRule, estimate_of, frame_weights
 from torchpose.math.gaussian import Gain, kalman_gain
 from torchpose.math.geometric_median import median_estimate
 
-if TYPE_CHECKING:
-    from torchpose.filters.mkf import MixtureKalmanFilter
-
-__all__ = [
-    "FrameGains",
-    "advance_memoryless",
-    "frame_log_likelihood",
-    "frame_weights",
-    "run_memoryless",
-]
+__all__ = ["frame_log_likelihood", "run_memoryless", "step_memoryless"]
 
 _SHARED_FRAMES = 1024  # at a time, where they share their gains
 _PATTERNS = 24  # of measured dimensions and noise whose gains are kept; about 4 MB each
@@ -43,39 +33,35 @@ _RECOMPUTED_FRAMES = 64  # at a time, where gradients compute them again
 _LEAST_SHARE = 2  # frames to a noise, on average, below which sharing does not pay
 
 
-def frame_weights(
-    log_prior: Float[Tensor, " M"],
-    log_marginal: Float[Tensor, "*batch M"],
-    log_likelihood: Float[Tensor, "*batch M"],
-    power: float = 1.0,
-) -> tuple[Float[Tensor, "*batch M"], Float[Tensor, "*batch"]]:
-    """w_j prop. to pi_j N(z_t; H mu_j, H Sigma_j H^T + R)^power, and sum_j pi_j N_j as evidence.
-
-    Args:
-        log_prior: log pi. log_marginal: of `frame_log_likelihood`. log_likelihood: log N_j, of the
-            tracks' predictions (BL 41). power: exponent of the marginal likelihood.
-
-    Returns:
-        log w_t, normalised [..., M], and the increment of the log-evidence [...].
-    """
-    log_prior = normalise(log_prior)
-    evidence = torch.logsumexp(log_prior + log_likelihood, -1)
-    return normalise(log_prior + power * log_marginal), evidence
-
-
 def frame_log_likelihood(
-    model: "MixtureKalmanFilter", frames: Measurements
-) -> Float[Tensor, "B T M"]:
-    """log N(z_t; H mu_j, H Sigma_j H^T + R) of the measured dimensions of every frame."""
+    model: MixtureKalmanFilter, rule: WeightRule, frames: Measurements
+) -> Float[Tensor, "B T M"] | None:
+    """Return log N(z_t; H mu_j, H Sigma_j H^T + R) of the measured dimensions of every frame.
+
+    None for weights that are not by frame.
+    """
+    if not rule.by_frame:
+        return None
     groups = _groups(frames, _SHARED_FRAMES)
     found = [(group.rows, _condition(model, group, _gain(model, group))[1]) for group in groups]
     return _in_order(found).unflatten(0, frames.z.shape[:2])
 
 
 def run_memoryless(
-    model: "MixtureKalmanFilter", frames: Measurements, return_cov: bool, progress: bool
+    model: MixtureKalmanFilter,
+    rule: WeightRule,
+    medians: Tensor,
+    frames: Measurements,
+    return_cov: bool,
+    progress: bool = False,
 ) -> FilterOutput:
-    """All frames of a filter whose predictions are the components themselves (BL 39-41, 48)."""
+    """Filter sequences where the predictions are the components themselves (BL 39-41, 48).
+
+    Args:
+        model: whose components these are. rule: of the weights, by frame. medians: first dimensions of
+            the points that are estimated by their geometric medians. frames: all that is measured.
+        return_cov: whether to return covariances. progress: whether to show a progress bar.
+    """
     batch, n_frames, _ = frames.z.shape
     learning = wants_gradient(frames.z, frames.cov, model.log_prior, model.means, model.covariances)
     parts: list[list[tuple[Tensor, Tensor]]] = [[], [], [], [], [], []]
@@ -84,7 +70,7 @@ def run_memoryless(
     for group in _groups(frames, _RECOMPUTED_FRAMES if learning else _SHARED_FRAMES):
         # Gains that groups share are not among what a gradient computes anew for one of them.
         gain = _gain(model, group) if group.shares_gain else None
-        arguments = model, group, gain, return_cov
+        arguments = model, rule, medians, group, gain, return_cov
         values = recomputed(_estimate, *arguments) if learning else _estimate(*arguments)
         for part, value in zip(parts, values, strict=True):
             if value is not None:
@@ -102,39 +88,43 @@ def run_memoryless(
 
 
 def _estimate(
-    model: "MixtureKalmanFilter",
+    model: MixtureKalmanFilter,
+    rule: WeightRule,
+    medians: Tensor,
     group: "_Group",
     gain: tuple[Gain, Tensor] | None,
     return_cov: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor]:
-    """Estimates, log-weights, log-evidence, covariances and mending of a group of frames."""
-    log_prior, power = model.log_prior.to(model.dtype), model.likelihood_power
+    """Return estimates, log-weights, log-evidence, covariances and mending of a group of frames."""
     gain = gain or _gain(model, group)
     means, log_likelihood, cov, jitter = _condition(model, group, gain)
-    log_weights, evidence = frame_weights(log_prior, log_likelihood, log_likelihood, power)
+    log_weights, evidence = frame_weights(rule, log_likelihood, log_likelihood)
     measured = group.mask.any(-1).squeeze(-1)
     evidence = torch.where(measured, evidence, torch.zeros_like(evidence))
     mean, total = estimate_of(log_weights, means, cov if return_cov else None)
-    if len(model.medians):
-        mean, total = median_estimate(log_weights, means, cov, mean, total, model.medians)
+    if len(medians):
+        mean, total = median_estimate(log_weights, means, cov, mean, total, medians)
     return mean, log_weights, evidence, total, *mending(mean, jitter)
 
 
-def advance_memoryless(
-    model: "MixtureKalmanFilter", state: MKFState, frame: Measurements, return_cov: bool
+def step_memoryless(
+    model: MixtureKalmanFilter,
+    rule: WeightRule,
+    medians: Tensor,
+    state: MKFState,
+    frame: Measurements,
+    return_cov: bool,
 ) -> tuple[MKFState, StepOutput]:
-    """One frame of `run_memoryless`."""
+    """Filter one frame as `run_memoryless` does; the state only counts it."""
+    later = state._replace(time=state.time + 1)
+    frames = frame.as_sequences()
     if not values_visible():
-        (group,) = _groups(frame.as_sequences(), len(frame.z))
-        mean, log_weights, evidence, cov, *work = _estimate(model, group, None, return_cov)
-        step = StepOutput(mean, log_weights, evidence, cov, *work)
-        return state._replace(time=state.time + 1), step
-    out = run_memoryless(model, frame.as_sequences(), return_cov, progress=False)
-    cov = None if out.cov is None else out.cov[:, 0]
-    step = StepOutput(out.mean[:, 0], out.log_weights[:, 0], out.log_evidence[:, 0], cov)
-    mended = None if out.mended is None else out.mended[:, 0]
-    jitter = None if out.jitter is None else out.jitter[:, 0]
-    return state._replace(time=state.time + 1), step._replace(mended=mended, jitter=jitter)
+        (group,) = _groups(frames, len(frame.z))
+        return later, StepOutput(*_estimate(model, rule, medians, group, None, return_cov))
+    out = run_memoryless(model, rule, medians, frames, return_cov)
+    values = out.mean, out.log_weights, out.log_evidence, out.cov, out.mended, out.jitter
+    first = (None if value is None else value[:, 0] for value in values)
+    return later, StepOutput(*first)  # type: ignore[arg-type]
 
 
 class _Group(NamedTuple):
@@ -157,7 +147,7 @@ class _Group(NamedTuple):
 
 
 def _groups(frames: Measurements, at_a_time: int) -> Iterator[_Group]:
-    """Frames that measure the same dimensions with the same noise share their gains."""
+    """Yield frames that measure the same dimensions with the same noise, which share their gains."""
     z, mask = frames.z.flatten(0, 1), frames.mask.flatten(0, 1)
     noise = None if frames.cov.ndim == 2 else frames.cov.flatten(0, 1)
     if not values_visible():
@@ -180,15 +170,15 @@ def _groups(frames: Measurements, at_a_time: int) -> Iterator[_Group]:
 
 
 def _groups_of_own(z: Tensor, mask: Tensor, noise: Tensor) -> Iterator[_Group]:
-    """Frames that have gains of their own, some at a time."""
+    """Yield frames that have gains of their own, some at a time."""
     for rows in torch.arange(len(z), device=z.device).split(_OWN_FRAMES):
         yield _Group(rows, z[rows], mask[rows][:, None], noise[rows][:, None])
 
 
 def _condition(
-    model: "MixtureKalmanFilter", group: _Group, gain_and_cov: tuple[Gain, Tensor]
+    model: MixtureKalmanFilter, group: _Group, gain_and_cov: tuple[Gain, Tensor]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """Every component given a frame: means [N, M, D], log-likelihoods [N, M], covariances, jitter."""
+    """Return every component given a frame: means [N, M, D], log-likelihoods [N, M], covs, jitter."""
     gain, cov = gain_and_cov
     centres = model.means.to(model.dtype)
     residual = (group.z[:, None] - centres[:, model.observed]) * group.mask
@@ -203,31 +193,33 @@ def _condition(
     return means, gain.log_norm - 0.5 * white.square().sum((-2, -1)), cov, gain.jitter
 
 
-def _gain(model: "MixtureKalmanFilter", group: _Group) -> tuple[Gain, Tensor]:
-    """Gain and covariance of every component; those of a shared pattern are kept for later frames."""
+def _gain(model: MixtureKalmanFilter, group: _Group) -> tuple[Gain, Tensor]:
+    """Return gain and covariance of every component; those that frames share are kept for later."""
     if not group.shares_gain:
         return _make_gain(model, group)
-    found = model.frame_gains.get(group.noise, group.mask)
+    sources = (model.means, model.covariances)
+    kept = derived(model, f"frame gains {model.dtype}", sources, _FrameGains)
+    found = kept.get(group.noise, group.mask)
     if found is None:
         with outside_inference():
             found = _make_gain(model, group)
-        model.frame_gains.put(group.noise, group.mask, found)
+        kept.put(group.noise, group.mask, found)
     return found
 
 
-def _make_gain(model: "MixtureKalmanFilter", group: _Group) -> tuple[Gain, Tensor]:
+def _make_gain(model: MixtureKalmanFilter, group: _Group) -> tuple[Gain, Tensor]:
     gain, cov = kalman_gain(model.covariances, group.noise, model.observed, group.mask)
     return gain.to(model.dtype), cov
 
 
-class FrameGains:
+class _FrameGains:
     """The gains of the latest patterns of measured dimensions and noise, for one mixture."""
 
     def __init__(self) -> None:
         self._found: dict[tuple[Any, ...], tuple[Gain, Tensor]] = {}
 
     def get(self, noise: Tensor, mask: Tensor) -> tuple[Gain, Tensor] | None:
-        """What is known for this pattern and noise."""
+        """Return what is known for this pattern and noise, or None."""
         if torch.is_grad_enabled() and noise.requires_grad:
             return None
         key = _key(noise, mask)
@@ -237,7 +229,7 @@ class FrameGains:
         return found
 
     def put(self, noise: Tensor, mask: Tensor, value: tuple[Gain, Tensor]) -> None:
-        """Keep it, unless the noise wants gradients; the pattern unused longest makes room."""
+        """Keep a gain, unless the noise wants gradients; the pattern unused longest makes room."""
         if torch.is_grad_enabled() and noise.requires_grad:
             return
         if len(self._found) >= _PATTERNS:
@@ -250,7 +242,7 @@ def _key(noise: Tensor, mask: Tensor) -> tuple[Any, ...]:
 
 
 def _in_order(parts: list[tuple[Tensor, Tensor]]) -> Tensor:
-    """Values of all frames, in the order of the frames."""
+    """Return the values of all frames in the order of the frames."""
     rows = torch.cat([rows for rows, _ in parts])
     values = torch.cat([values for _, values in parts])
     return values.index_select(0, rows.argsort())
