@@ -5,6 +5,7 @@
 
 import inspect
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -324,10 +325,17 @@ class MixtureKalmanFilter(RecursiveFilter):
 def __getattr__(name: str) -> Any:
     if name != "TRACK_OPTIONS":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    own = {k: inspect.signature(c).parameters for k, c in MixtureKalmanFilter._kinds.items()}
+    own = {k: _defaults(c) for k, c in MixtureKalmanFilter._kinds.items()}
     names = {name for options in own.values() for name in options}
     of = {name: tuple(k for k in own if name in own[k]) for name in names}
     return {name: kinds for name, kinds in of.items() if len(kinds) < len(own)}
+
+
+@cache
+def _defaults(kind: type[MixtureKalmanFilter]) -> dict[str, Any]:
+    """Return the arguments of a constructor by name, each with its default."""
+    parameters = inspect.signature(kind).parameters
+    return {name: parameter.default for name, parameter in parameters.items()}
 
 
 def _kind_of(tracks: str) -> type[MixtureKalmanFilter]:
@@ -340,12 +348,11 @@ def _kind_of(tracks: str) -> type[MixtureKalmanFilter]:
 
 def _options_of(kind: type[MixtureKalmanFilter], given: Mapping[str, Any]) -> dict[str, Any]:
     """Return those of the given options that a kind has; refuse others that are not at default."""
-    defaults = inspect.signature(MixtureKalmanFilter).parameters
-    own = inspect.signature(kind).parameters
+    own, defaults = _defaults(kind), _defaults(MixtureKalmanFilter)
     for name in [name for name in given if name not in own]:
-        value, default = given[name], defaults[name].default
+        value, default = given[name], defaults[name]
         if value != default and not (default == () and len(value) == 0):
-            of = [k for k, c in kind._kinds.items() if name in inspect.signature(c).parameters]
+            of = [k for k, c in kind._kinds.items() if name in _defaults(c)]
             raise InputError(
                 f"{name} does not apply to tracks={kind.tracks!r}; it is of tracks="
                 f"{' or '.join(map(repr, of))}"
