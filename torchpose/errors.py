@@ -1,4 +1,4 @@
-"""Typed errors, and the checks that raise them.
+"""Typed errors, which are public, and the checks of arguments that raise them, which are not.
 
 Every message says what was expected, what came, and what to do about it. Messages are one line of
 printable characters, whatever the file or the name that they quote.
@@ -28,17 +28,6 @@ __all__ = [
     "ShapeError",
     "SkeletonError",
     "TorchposeError",
-    "check_covariance",
-    "check_finite",
-    "check_floating",
-    "check_grey",
-    "check_rate",
-    "check_real",
-    "check_rgb",
-    "check_shape",
-    "check_weights",
-    "printable",
-    "refuse_export",
 ]
 
 set_up_facade(__name__)
