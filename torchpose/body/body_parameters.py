@@ -20,7 +20,7 @@ _SHORTEST = 1e-4  # metres: no limb is as short as a tenth of a millimetre
 
 
 def checked_lengths(skeleton: BodySkeleton, lengths: Tensor) -> Tensor:
-    """Bone lengths [J] with 0 for the root; raise `InputError` where one is not positive."""
+    """Return bone lengths [J], 0 for the root; raise `InputError` where one is not positive."""
     check_shape("bone_lengths", lengths, [len(skeleton.names)])
     lengths = lengths.clone()
     lengths[0] = 0.0
@@ -37,7 +37,7 @@ def checked_lengths(skeleton: BodySkeleton, lengths: Tensor) -> Tensor:
 def checked_directions(
     skeleton: BodySkeleton, directions: Tensor | None, device: torch.device
 ) -> Tensor:
-    """Unit directions [J, 3], the skeleton's by default; raise where one has no length."""
+    """Return unit directions [J, 3], the skeleton's by default; raise where one has no length."""
     given = directions
     if given is None:
         given = torch.tensor(skeleton.directions, dtype=torch.float64)
@@ -51,7 +51,7 @@ def checked_directions(
 
 
 def checked_tips(skeleton: BodySkeleton, lengths: Tensor, tips: Tensor | None) -> Tensor:
-    """Offsets [K, 3] of the tips, metres; the skeleton's at the person's height by default."""
+    """Return offsets [K, 3] of the tips, metres; the skeleton's at the person's height by default."""
     if tips is None:
         share = torch.tensor([tip.offset for tip in skeleton.tips], dtype=torch.float64)
         return skeleton.height(lengths) * share.reshape(-1, 3).to(lengths.device)
@@ -61,7 +61,7 @@ def checked_tips(skeleton: BodySkeleton, lengths: Tensor, tips: Tensor | None) -
 
 
 def checked_radii(skeleton: BodySkeleton, radii: Tensor) -> Tensor:
-    """Radii [..., L, 2]; raise `InputError` where one is negative or not finite."""
+    """Return radii [..., L, 2]; raise `InputError` where one is negative or not finite."""
     check_shape("radii", radii, ["...", len(skeleton.limbs), 2])
     check_finite("radii", radii)
     if bool((radii < 0).any()):
@@ -71,7 +71,7 @@ def checked_radii(skeleton: BodySkeleton, radii: Tensor) -> Tensor:
 
 
 def point_weights(skeleton: BodySkeleton, offsets: Tensor, tips: Tensor) -> Tensor:
-    """[3 P, J + K]: how every point depends on the columns of every part's rotation."""
+    """Return how every point depends on the columns of every part's rotation, [3 P, J + K]."""
     n_points = len(skeleton.points)
     weights = offsets.new_zeros(len(skeleton.parts), 3, n_points)
     for level in skeleton.joint_levels[1:]:  # a joint moves with all that moves its parent
@@ -97,7 +97,7 @@ def check_limb_lengths(skeleton: BodySkeleton, limb_weights: Tensor) -> None:
 
 
 def level_plan(skeleton: BodySkeleton) -> dict[str, list[int]]:
-    """Per level its parts and their parents' places in the level above; then the way back."""
+    """Return per level its parts and their parents' places in the level above; then the way back."""
     plan, above = {}, [0]
     for depth, level in enumerate(skeleton.part_levels[1:], start=1):
         plan[f"_parts_{depth}"] = list(level)

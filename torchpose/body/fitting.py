@@ -48,7 +48,7 @@ def fit_body(
     frame: Frame = "parent",
     head_top: float | None = None,
 ) -> Body:
-    """The body of one person: constant bone lengths and directions from recorded joints.
+    """Fit the body of one person: constant bone lengths and directions from recorded joints.
 
     Arms and legs get the median length of their bones. The joints of the rigid parts (pelvis and
     torso) get their mean position in the part's axes, with rotations and mean positions in turn;
@@ -93,7 +93,7 @@ def fit_body(
 
 
 def _placed_tips(body: Body, head_top: float | None) -> Tensor:
-    """Tips [K, 3] at the height of the person, those on the neck by the middle of the shoulders."""
+    """Return tips [K, 3] at the height of the person, those on the neck by the middle of the shoulders."""
     if head_top is not None and not math.isfinite(head_top):
         raise InputError(f"head_top must be finite, metres, got {head_top}")
     skeleton = body.skeleton
@@ -114,7 +114,7 @@ def _placed_tips(body: Body, head_top: float | None) -> Tensor:
 
 
 def fit_state(body: Body, joints: Float[Tensor, "T J 3"], steps: int = 4) -> Float[Tensor, "T D"]:
-    """States whose joints are nearest to recorded ones, for all frames at once.
+    """Find the states whose joints are nearest to recorded ones, for all frames at once.
 
     Closed form first: rotations of pelvis and torso by the singular value decomposition, and of
     the other parts by the swing to their bone's direction. Then damped Gauss-Newton steps over the
@@ -146,7 +146,7 @@ def fit_state(body: Body, joints: Float[Tensor, "T J 3"], steps: int = 4) -> Flo
 def joint_errors(
     body: Body, state: Float[Tensor, "*batch D"], joints: Float[Tensor, "*batch J 3"]
 ) -> Float[Tensor, "*batch J"]:
-    """Distance of every joint from where it was recorded, millimetres, NaN where it was not."""
+    """Return the distance of every joint from where it was recorded, millimetres, NaN where it was not."""
     return 1000 * (body.joints(state) - joints.to(state)).norm(dim=-1)
 
 
@@ -204,7 +204,7 @@ def _fit_chunk(body: Body, joints: Tensor, known: Tensor, tilt: _Tilt, steps: in
 
 
 def _rigid_rotations(body: Body, joints: Tensor, tilt: _Tilt) -> Tensor:
-    """World rotations [T, P, 3, 3] of the parts that carry several joints; others are NaN.
+    """Return world rotations [T, P, 3, 3] of the parts that carry several joints; others are NaN.
 
     R = argmin sum_n |R w_n - (p_n - p_pivot)|^2 over the part's joints, by the singular value
     decomposition of sum_n (p_n - p_pivot) w_n^T. The root part also gets the direction of the
@@ -232,7 +232,7 @@ def swing_parts(
     bones: Float[Tensor, "T J 3"],
     known: Bool[Tensor, " J"],
 ) -> Float[Tensor, "T P 3 3"]:
-    """World rotations of the parts with one bone: from their centre to its direction, without twist.
+    """Return rotations of the parts with one bone, from their centre to its direction, without twist.
 
     Args:
         rotations: [T, P, 3, 3], of the rigid parts (pelvis and torso); what it holds for the others
@@ -260,7 +260,7 @@ def swing_parts(
 def _gauss_newton(
     body: Body, fit: _Fit, joints: Tensor, known: Tensor, tilt: _Tilt, steps: int
 ) -> _Fit:
-    """Steps (J^T J + mu I)^-1 J^T r, with the damping mu of each frame after Levenberg-Marquardt.
+    """Take steps (J^T J + mu I)^-1 J^T r, with the damping mu of each frame after Levenberg-Marquardt.
 
     A frame that a step makes worse stays where it is and gets more damping.
     """
@@ -294,7 +294,7 @@ def _moved(fit: _Fit, residual: Tensor, jacobian: Tensor, damping: Tensor) -> _F
 
 
 def _linearise(body: Body, fit: _Fit, joints: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-    """Residuals [T, R] of the known joints and how root and parts move them, [T, R, 3 + 3 P].
+    """Return residuals [T, R] of known joints and how root and parts move them, [T, R, 3 + 3 P].
 
     p_n = p_root + sum_p R_p w_pn, so that a small turn omega of part p about the world's axes moves
     it by omega x R_p w_pn.
@@ -309,12 +309,12 @@ def _linearise(body: Body, fit: _Fit, joints: Tensor, known: Tensor) -> tuple[Te
 
 
 def _where(condition: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """`torch.where` by frame."""
+    """Choose by frame, as `torch.where`."""
     return torch.where(condition.view(-1, *[1] * (new.ndim - 1)), new, old)
 
 
 def _tilt_residual(fit: _Fit, tilt: _Tilt) -> tuple[Tensor, Tensor]:
-    """Weighted sine [T, 1] of the angle that the root part lacks, and what moves it, [T, 1, D]."""
+    """Return the weighted sine [T, 1] of the angle that the root part lacks, and what moves it, [T, 1, D]."""
     root = fit.rotations[:, 0]
     axis, spine = root @ tilt.axis, root @ tilt.spine
     sine = (torch.linalg.cross(axis, spine) * tilt.seen).sum(-1, keepdim=True)
@@ -367,12 +367,12 @@ def _roles(skeleton: BodySkeleton) -> _Roles:
 
 
 def _bones(skeleton: BodySkeleton, joints: Tensor) -> Tensor:
-    """[T, J, 3], from each joint's parent to it; zero for the root."""
+    """Return the bones [T, J, 3], from each joint's parent to it; zero for the root."""
     return joints - joints[:, [max(parent, 0) for parent in skeleton.parents]]
 
 
 def _known_joints(skeleton: BodySkeleton, joints: Tensor) -> Bool[Tensor, " J"]:
-    """Joints that are there in all frames, with all joints between them and the root."""
+    """Tell which joints are there in all frames, with all joints between them and the root."""
     check_shape("joints", joints, ["T", len(skeleton.names), 3])
     if joints.shape[0] == 0:
         raise InputError("a fit needs at least one frame, got none")

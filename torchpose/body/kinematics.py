@@ -186,7 +186,7 @@ class Body(nn.Module):
         frame: Frame = "parent",
         dtype: torch.dtype = torch.float64,
     ) -> "Body":
-        """A person of average proportions and clothes, of this height in metres."""
+        """Return a person of average proportions and clothes, of this height in metres."""
         lengths, radii = skeleton.standard_lengths(height), skeleton.standard_radii(height)
         return cls(skeleton, lengths, radii, frame=frame, dtype=dtype)
 
@@ -197,7 +197,7 @@ class Body(nn.Module):
         centres: Float[Tensor, "P 3"] | None = None,
         frame: Frame | None = None,
     ) -> "Body":
-        """The same person with other radii, centres or frame.
+        """Return the same person with other radii, centres or frame.
 
         States of one mean nothing to another of other centres or frame: `convert` them.
         """
@@ -226,7 +226,7 @@ class Body(nn.Module):
     # --- states to points ---------------------------------------------------------------------
 
     def part_rotations(self, state: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch P 3 3"]:
-        """Rotations of all parts, from part axes to world axes."""
+        """Return rotations of all parts, from part axes to world axes."""
         self._check(state)
         turns = quaternion_vector_to_matrix(state[..., 3:].unflatten(-1, (-1, 3)))
         geometry = self._geometry()
@@ -244,17 +244,17 @@ class Body(nn.Module):
         return torch.cat(levels, -3).index_select(-3, self._order)
 
     def joints(self, state: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch J 3"]:
-        """Positions of all joints, metres, world axes."""
+        """Return positions of all joints, metres, world axes."""
         return self._points(state, self.part_rotations(state), self.joint_weights)
 
     def limbs(self, state: Float[Tensor, "*batch D"]) -> Limbs:
-        """Tapered cylinders of all limbs: start and end [..., L, 3], and the body's radii."""
+        """Return tapered cylinders of all limbs: start and end [..., L, 3], and the body's radii."""
         ends = self._points(state, self.part_rotations(state), self.limb_weights)
         start, end = ends.unflatten(-2, (-1, 2)).unbind(-2)
         return Limbs(start, end, self.radii)
 
     def forward(self, state: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch J 3"]:
-        """The same as `joints`."""
+        """Return the same as `joints`."""
         return self.joints(state)
 
     def _points(self, state: Tensor, rotations: Tensor, weights: Tensor) -> Tensor:
@@ -284,7 +284,7 @@ class Body(nn.Module):
     def difference(
         self, a: Float[Tensor, "*#batch D"], b: Float[Tensor, "*#batch D"]
     ) -> Float[Tensor, "*batch D"]:
-        """The step that leads from b to a: ``perturb(b, difference(a, b))`` is a."""
+        """Return the step that leads from b to a: ``perturb(b, difference(a, b))`` is a."""
         self._check(a, b)
         turn = compose(conjugate(b[..., _HEADING]), a[..., _HEADING])
         plain = a - b
@@ -293,7 +293,7 @@ class Body(nn.Module):
     def mean(
         self, states: Float[Tensor, "*batch N D"], log_weights: Float[Tensor, "*#batch N"]
     ) -> Float[Tensor, "*batch D"]:
-        """Weighted mean of particles; the root's orientation by the mean of quaternions.
+        """Return the weighted mean of particles; the root's orientation by the mean of quaternions.
 
         Args:
             states: [..., N, D]. log_weights: [..., N], of any common factor.
@@ -313,14 +313,14 @@ class Body(nn.Module):
         return torch.cat([plain[..., _ROOT], heading, plain[..., _RELATIVE]], -1)
 
     def relative(self, state: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch Q"]:
-        """The columns without the root's position and orientation."""
+        """Return the columns without the root's position and orientation."""
         self._check(state)
         return state[..., _RELATIVE]
 
     def with_relative(
         self, state: Float[Tensor, "*#batch D"], relative: Float[Tensor, "*#batch Q"]
     ) -> Float[Tensor, "*batch D"]:
-        """States with the root of `state` and other relative columns, kept in the unit ball."""
+        """Return states with the root of `state` and other relative columns, kept in the unit ball."""
         self._check(state)
         check_shape("relative", relative, ["...", self.dim - 6])
         # not torch.broadcast_shapes, whose first call imports a computer algebra system
@@ -334,7 +334,7 @@ class Body(nn.Module):
         position: Float[Tensor, "*batch 3"],
         rotations: Float[Tensor, "*batch P 3 3"],
     ) -> Float[Tensor, "*batch D"]:
-        """State of given world rotations of the parts; the inverse of `part_rotations`.
+        """Return the state of given world rotations of the parts; the inverse of `part_rotations`.
 
         Args:
             position: [..., 3], of the root, metres.
@@ -351,7 +351,7 @@ class Body(nn.Module):
         return torch.cat([position, vectors.flatten(-2)], -1)
 
     def convert(self, state: Float[Tensor, "*batch D"], other: "Body") -> Float[Tensor, "*batch D"]:
-        """The same rotations as a state of another body: other centres, frame or person.
+        """Return the same rotations as a state of another body: other centres, frame or person.
 
         Raises:
             SkeletonError: the other body has another skeleton.
@@ -376,7 +376,7 @@ class Body(nn.Module):
 
 
 def centres_of(body: Body, states: Float[Tensor, "*batch D"]) -> Float[Tensor, "P 3"]:
-    """Centres of the parts learnt from recorded states, for `Body.altered` and `Body.convert`.
+    """Learn centres of the parts from recorded states, for `Body.altered` and `Body.convert`.
 
     Each is the mean of the part's rotations, so that the vectors of the training data lie about
     zero and away from |q| = 1 where they would jump. (DX 1) takes that recorded q_i which maximises

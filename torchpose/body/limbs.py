@@ -24,7 +24,7 @@ class Limbs(NamedTuple):
     radii: Float[Tensor, "*radii L 2"]
 
     def select(self, index: Tensor) -> "Limbs":
-        """The limbs at `index` (indices [l], or bool [L])."""
+        """Return the limbs at `index` (indices [l], or bool [L])."""
         return Limbs(self.start[..., index, :], self.end[..., index, :], self.radii[..., index, :])
 
 

@@ -69,7 +69,7 @@ class JointLimits(nn.Module):
         quantile: float = 0.005,
         margin: float = 0.1,
     ) -> "JointLimits":
-        """Limits of recorded states, entry by entry.
+        """Fit limits to recorded states, entry by entry.
 
         l = Q(a) - m and u = Q(1 - a) + m with quantiles Q at a = 0.5 %, which drops single wrong
         frames, and a margin m of a tenth of the range between them, at least 0.03 (3.5 degrees),
@@ -100,26 +100,26 @@ class JointLimits(nn.Module):
         return cls((low - width).clamp_min(-1), (high + width).clamp_max(1), width)
 
     def inside(self, state: Float[Tensor, "*batch D"]) -> Bool[Tensor, "*batch parts"]:
-        """Whether each part but the root, [..., P - 1], is within its limits."""
+        """Tell whether each part but the root, [..., P - 1], is within its limits."""
         relative = self._relative(state)
         within = (relative >= self.lower) & (relative <= self.upper)
         return within.unflatten(-1, (-1, 3)).all(-1)
 
     def clamp(self, state: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D"]:
-        """The nearest state within the limits, entry by entry, and within the unit ball."""
+        """Return the nearest state within the limits, entry by entry, and within the unit ball."""
         relative = self._relative(state).clamp(self.lower, self.upper)
         relative = within_unit_ball(relative.unflatten(-1, (-1, 3))).flatten(-2)
         return torch.cat([state[..., :_ROOT_COLUMNS], relative], -1)
 
     def log_prob(self, state: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch"]:
-        """Log density of the relative columns, their entries taken as independent."""
+        """Return the log density of the relative columns, their entries taken as independent."""
         relative = self._relative(state)
         excess = torch.maximum(self.lower - relative, relative - self.upper).clamp_min(0)
         size = (self.upper - self.lower + math.sqrt(2 * math.pi) * self.softness).log()
         return (-0.5 * (excess / self.softness).square() - size).sum(-1)
 
     def forward(self, state: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch"]:
-        """The same as `log_prob`."""
+        """Return the same as `log_prob`."""
         return self.log_prob(state)
 
     def _relative(self, state: Tensor) -> Tensor:

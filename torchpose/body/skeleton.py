@@ -144,7 +144,7 @@ class BodySkeleton:
         return tuple(where.get(other_side(limb.name), i) for i, limb in enumerate(self.limbs))
 
     def joint(self, name: str) -> int:
-        """Index of a joint.
+        """Return the index of a joint.
 
         Raises:
             SkeletonError: there is no such joint.
@@ -154,7 +154,7 @@ class BodySkeleton:
         return self.names.index(name)
 
     def part(self, name: str) -> int:
-        """Index of a part.
+        """Return the index of a part.
 
         Raises:
             SkeletonError: there is no such part.
@@ -164,21 +164,21 @@ class BodySkeleton:
         return self.parts.index(name)
 
     def single_joint(self, part: int) -> int | None:
-        """The one joint that a part carries, or None: its twist about that bone is unseen."""
+        """Return the one joint that a part carries, or None: its twist about that bone is unseen."""
         carried = [j for j, p in enumerate(self.part_of) if p == part and self.parents[j] >= 0]
         return carried[0] if len(carried) == 1 else None
 
     def standard_lengths(self, height: float) -> Float[Tensor, " J"]:
-        """Bone lengths [J] of a person of this height, metres."""
+        """Return bone lengths [J] of a person of this height, metres."""
         return _positive("height", height) * torch.tensor(self.proportions, dtype=torch.float64)
 
     def standard_radii(self, height: float) -> Float[Tensor, "L 2"]:
-        """Radii [L, 2] of the limbs of a clothed adult of this height, metres."""
+        """Return radii [L, 2] of the limbs of a clothed adult of this height, metres."""
         radii = torch.tensor([limb.radii for limb in self.limbs], dtype=torch.float64)
         return _positive("height", height) * radii.reshape(-1, 2)
 
     def height(self, bone_lengths: Float[Tensor, " J"]) -> float:
-        """Body height by the lengths of the legs, whose joints all joint sets agree about.
+        """Return the body height by the lengths of the legs, whose joints all joint sets agree about.
 
         H = sum of their lengths / sum of their proportions; the other bones count where all of
         those are unknown. (CMU's wrist is 6 cm nearer to the elbow than that of others.)
@@ -233,7 +233,7 @@ def _check_names(skeleton: BodySkeleton) -> None:
 
 
 def other_side(name: str) -> str:
-    """The name of a joint, part or limb on the other side; the same for one in the middle.
+    """Return the name of a joint, part or limb on the other side; the same for one in the middle.
 
     >>> other_side("left_knee"), other_side("neck")
     ('right_knee', 'neck')
@@ -254,7 +254,7 @@ def _positive(name: str, value: float) -> float:
 
 
 def _body_15() -> BodySkeleton:
-    """Arms and legs once, for both sides; proportions after Drillis and Contini."""
+    """Return `BODY_15`, its sides described once; proportions after Drillis and Contini."""
     joints: list[tuple[str, str, str, Offset, float]] = [  # name, parent, part, direction, length
         ("pelvis", "", "pelvis", (0.0, 0.0, 0.0), 0.0),
         ("neck", "pelvis", "torso", (0.0, 1.0, 0.0), 0.29),

@@ -85,17 +85,17 @@ def _render(walker: "Walk", out: Path, seed: int) -> tuple[list[Path], list[Path
 
 
 def _errors(joints: "Tensor", truth: "Tensor") -> "Tensor":
-    """Distance of every joint [T, 15], millimetres."""
+    """Return the distance of every joint [T, 15], millimetres."""
     return 1000 * (joints - truth).norm(dim=-1)
 
 
 def _still(truth: "Tensor") -> "Tensor":
-    """Errors of whoever stays as they are in the first frame."""
+    """Return the errors of whoever stays as they are in the first frame."""
     return _errors(truth[:1].expand_as(truth), truth)
 
 
 def _report(scores: dict[str, Any], names: list[str]) -> str:
-    """Table of errors, one column for each estimate."""
+    """Return the table of errors, one column for each estimate."""
     rows = {"all joints": list(range(len(names)))}
     rows |= {part: [i for i, name in enumerate(names) if name.endswith(part)] for part in _PARTS}
     n_frames = len(next(iter(scores.values())))
@@ -112,7 +112,7 @@ def _report(scores: dict[str, Any], names: list[str]) -> str:
 
 
 def _write_truth(path: Path, walker: "Walk") -> None:
-    """The true joints as a recording, which `torchpose info` reads."""
+    """Write the true joints as a recording, which `torchpose info` reads."""
     import numpy as np
 
     from torchpose._core.files import write_npz

@@ -306,7 +306,7 @@ class BodyTracker(nn.Module):
         return f"method={self.method!r}, n_particles={self.n_particles}, fps={self.fps:g}"
 
     def _first_prior(self) -> Any:
-        """The manifold with which the first pose is looked for, or None."""
+        """Return the manifold with which the first pose is looked for, or None."""
         return getattr(self.filter, "manifold", None) if self._search is None else self._search
 
 

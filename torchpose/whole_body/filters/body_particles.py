@@ -22,9 +22,11 @@ __all__ = [
     "BodyTrack",
     "PoseSpace",
     "WeightedParticles",
+    "best_particle",
     "check_choice",
     "first_true",
     "joint_covariance",
+    "particle_std",
     "resample_state",
     "reweight",
     "stack_tracks",
@@ -221,6 +223,25 @@ def resample_state(
         memory=memory,
     )
     return resampled, ancestors
+
+
+def best_particle(
+    particles: Float[Tensor, "B N D"], log_weights: Float[Tensor, "B N"]
+) -> Float[Tensor, "B D"]:
+    """Return the particle of the largest weight."""
+    return take_particles(particles, log_weights.argmax(-1, keepdim=True))[:, 0]
+
+
+def particle_std(
+    body: PoseSpace,
+    particles: Float[Tensor, "B N D"],
+    log_weights: Float[Tensor, "B N"],
+    mean: Float[Tensor, "B D"],
+) -> Float[Tensor, "B D"]:
+    """Return the standard deviation of particles about an estimate, in the units of a step."""
+    gap = body.difference(particles, mean[:, None].expand_as(particles))
+    weights = log_weights.exp().to(gap.dtype)
+    return torch.einsum("bn,bnd->bd", weights, gap.square()).sqrt()
 
 
 def joint_covariance(

@@ -32,11 +32,12 @@ from torchpose.whole_body.filters.body_particles import (
     BodyTrack,
     PoseSpace,
     WeightedParticles,
+    best_particle,
     check_choice,
     joint_covariance,
+    particle_std,
     resample_state,
     stack_tracks,
-    take_particles,
     warn_of_frames,
 )
 from torchpose.whole_body.filters.leg_swap import check_leg_swap, extra_copies, swap_legs
@@ -46,8 +47,6 @@ from torchpose.whole_body.silhouettes.rectangles import check_limb_shape
 
 __all__ = ["SilhouetteParticleFilter"]
 
-LIMIT_MODES = ("clamp", "discard")
-ESTIMATES = ("mean", "map")
 _MOST_SPREAD = 10  # frames over which the noise of a filter that stays lost keeps growing
 _SHARPNESS = 100.0  # exponent of a likelihood in [-2, 0] that tells poses apart
 _DIED = (
@@ -88,12 +87,8 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         InputError, ShapeError: an argument is not as described.
     """
 
-    least_particles: ClassVar[int] = 1
-    """Particles, of a layer if there are several, of which two or more survive a frame."""
-
-    unused: ClassVar[frozenset[str]] = frozenset()
-    """Options that make no difference to the filter."""
-
+    least_particles: ClassVar[int] = 1  # of a layer if there are several: two or more survive
+    unused: ClassVar[frozenset[str]] = frozenset()  # options that make no difference
     step_std: Tensor
 
     def __init__(
@@ -116,9 +111,9 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         super().__init__()
         if not callable(likelihood):
             check_choice("likelihood", likelihood, LIKELIHOODS)
-        check_choice("limit_mode", limit_mode, LIMIT_MODES)
+        check_choice("limit_mode", limit_mode, ("clamp", "discard"))
         check_choice("resampling", resampling, RESAMPLING)
-        check_choice("estimate", estimate, ESTIMATES)
+        check_choice("estimate", estimate, ("mean", "map"))
         if n_particles < 1:
             raise InputError(f"n_particles must be at least 1, got {n_particles}")
         if not 0 <= resample_threshold <= 1:
@@ -168,9 +163,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         memory: Tensor | None,
     ) -> Float[Tensor, "B D"]:
         """Return the standard deviation about the estimate, in the units of a step."""
-        gap = self.body.difference(particles, mean[:, None].expand_as(particles))
-        weights = log_weights.exp().to(gap.dtype)
-        return torch.einsum("bn,bnd->bd", weights, gap.square()).sqrt()
+        return particle_std(self.body, particles, log_weights, mean)
 
     def joint_covariance(
         self, state: BodyFilterState, mean: Float[Tensor, "B D"]
@@ -403,5 +396,4 @@ class SilhouetteParticleFilter(nn.Module, ABC):
     def _estimate(self, particles: Tensor, log_weights: Tensor) -> Float[Tensor, "B D"]:
         if self.estimate == "mean":
             return self.body.mean(particles, log_weights.to(particles.dtype))
-        best = log_weights.argmax(-1, keepdim=True)
-        return take_particles(particles, best)[:, 0]
+        return best_particle(particles, log_weights)

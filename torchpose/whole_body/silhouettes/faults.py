@@ -64,7 +64,7 @@ def add_faults(
     generator: torch.Generator | None = None,
     kinds: Sequence[str] = FAULTS,
 ) -> Bool[Tensor, "T C H W"]:
-    """Silhouettes as background subtraction would have found them.
+    """Return silhouettes as background subtraction would have found them.
 
     Holes lie where a smooth field of the background and one that moves with the person add up to
     more than a threshold, so that they persist and drift. A lost region lies on a thin part of the
@@ -119,7 +119,7 @@ def _frame(
     kinds: Sequence[str],
     generator: torch.Generator,
 ) -> Tensor:
-    """One frame [C, H, W]; it draws the same numbers whatever the kinds are."""
+    """Return one frame [C, H, W] with faults; it draws the same numbers whatever the kinds are."""
     border = _noise(clean.shape[1:], generator)
     salt = torch.rand(clean.shape[1:], generator=generator)
     mask = clean[t]
@@ -140,7 +140,7 @@ def _frame(
 
 
 def _holes(scene: _Scene, t: int, severity: float) -> Tensor:
-    """Where the sum of both fields is above the quantile that the wanted share has."""
+    """Tell where the sum of both fields is above the quantile that the wanted share has."""
     top, left, height, width = scene.boxes[t].unbind(-1)
     shifts = torch.stack([top + height / 2, left + width / 2], -1).round().long().tolist()
     moved = [field.roll(shift, (0, 1)) for field, shift in zip(scene.clothes, shifts, strict=True)]
@@ -150,7 +150,7 @@ def _holes(scene: _Scene, t: int, severity: float) -> Tensor:
 
 
 def _shadow(clean: Tensor, scene: _Scene, t: int, severity: float) -> Tensor:
-    """The lower part of the silhouette, flattened and turned sideways about the feet.
+    """Return the lower part of the silhouette, flattened and turned sideways about the feet.
 
     A source pixel h above the feet falls `flatness` h above (or below) them and `shear` h beside.
     """
@@ -168,7 +168,7 @@ def _shadow(clean: Tensor, scene: _Scene, t: int, severity: float) -> Tensor:
 
 
 def _ragged(mask: Tensor, noise: Tensor, size: float, severity: float) -> Tensor:
-    """Half the height of the blurred mask plus noise that is strongest on the border."""
+    """Return where the blurred mask plus noise, strongest on the border, is above half its height."""
     sigma = max(size, 0.7)
     soft = _blur(mask.float(), sigma)
     noise = _unit(_blur(noise, sigma))
@@ -176,7 +176,7 @@ def _ragged(mask: Tensor, noise: Tensor, size: float, severity: float) -> Tensor
 
 
 def _median(mask: Tensor) -> Tensor:
-    """Median filter of 3 x 3, or 5 x 5 for images of more than 300 rows."""
+    """Filter by the median of 3 x 3, or 5 x 5 for images of more than 300 rows."""
     size = 3 if mask.shape[-2] <= 300 else 5
     return avg_pool2d(mask.float(), size, 1, size // 2) > 0.5
 
@@ -206,7 +206,7 @@ def _scene(clean: Tensor, generator: torch.Generator) -> _Scene:
 
 
 def _regions(clean: Tensor, scene: _Scene, severity: float, generator: torch.Generator) -> _Regions:
-    """Lost regions that come and go, each at a place of its own relative to the silhouette's box."""
+    """Return lost regions that come and go, each at a place of its own relative to the silhouette's box."""
     T, C = clean.shape[:2]
     share = min(_MISSING * severity, _MOST)
     stop = 1 / _MISSING_FRAMES
@@ -230,7 +230,7 @@ def _regions(clean: Tensor, scene: _Scene, severity: float, generator: torch.Gen
 
 
 def _thin_place(mask: Tensor, box: Tensor, where: float, size: float) -> Tensor | None:
-    """A pixel among the thinnest quarter of the mask, on a limb or the head, relative to its box."""
+    """Return a pixel of the thinnest quarter of the mask, on a limb or the head, relative to its box."""
     pixels = mask.nonzero()
     if not len(pixels):
         return None
@@ -256,12 +256,12 @@ def _noise(shape: Sequence[int], generator: torch.Generator) -> Tensor:
 
 
 def _unit(fields: Tensor) -> Tensor:
-    """Fields [C, H, W] of unit variance."""
+    """Return fields [C, H, W] of unit variance."""
     return fields / fields.std((-2, -1), keepdim=True).clamp_min(1e-6)
 
 
 def _blur(images: Tensor, sigma: float) -> Tensor:
-    """Gaussian blur of [C, H, W], the border repeated."""
+    """Blur [C, H, W] by a Gaussian, the border repeated."""
     radius = math.ceil(3 * sigma)
     kernel = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / sigma) ** 2)
     kernel = (kernel / kernel.sum()).view(1, 1, 1, -1)

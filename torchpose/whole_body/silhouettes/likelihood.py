@@ -15,7 +15,7 @@ __all__ = ["LIKELIHOODS", "bidirectional", "intersection_over_union", "silhouett
 
 
 def bidirectional(counts: SilhouetteCounts) -> Float[Tensor, "*batch"]:
-    """Bidirectional silhouette log-likelihood, up to a constant.
+    """Return the bidirectional silhouette log-likelihood, up to a constant.
 
     log p(I | x) = -1/|I| sum_I { |S(x) without S| / |S(x)| + |S without S(x)| / |S| }   (MR 12)
 
@@ -40,7 +40,7 @@ def bidirectional(counts: SilhouetteCounts) -> Float[Tensor, "*batch"]:
 
 
 def intersection_over_union(counts: SilhouetteCounts) -> Float[Tensor, "*batch"]:
-    """Intersection over union, mean over the cameras.
+    """Return the intersection over union, mean over the cameras.
 
     w = sum_xy I_OV(x, y) / sum_xy I_U(x, y)   (AS 7)
 
@@ -66,7 +66,7 @@ def intersection_over_union(counts: SilhouetteCounts) -> Float[Tensor, "*batch"]
 def silhouette_log_likelihood(
     counts: SilhouetteCounts, kind: str = "bidirectional", sharpness: float = 1.0
 ) -> Float[Tensor, "*batch"]:
-    """Sharpness times the log-likelihood of the named kind.
+    """Return sharpness times the log-likelihood of the named kind.
 
     Args:
         counts: of C cameras, each [..., C].

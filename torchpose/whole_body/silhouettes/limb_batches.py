@@ -34,7 +34,7 @@ _COVERED_ROWS = 0.15  # of an image's height, by a limb on average; a guess that
 
 
 def checked_limbs(limbs: Limbs, near: float) -> Limbs:
-    """Limbs without gradients; raise unless they fit together and `near` is a distance."""
+    """Return limbs without gradients; raise unless they fit together and `near` is a distance."""
     if not 0 < near < math.inf:
         raise InputError(f"near must be a positive number of metres, got {near}")
     check_limbs(limbs)
@@ -42,7 +42,7 @@ def checked_limbs(limbs: Limbs, near: float) -> Limbs:
 
 
 def flatten_limbs(limbs: Limbs) -> Limbs:
-    """Limbs [N, L] with radii [L, 2] or [N, L, 2]."""
+    """Return limbs [N, L] with radii [L, 2] or [N, L, 2]."""
     start, end, radii = limbs
     shape = math.prod(start.shape[:-2]), start.shape[-2]
     if radii.ndim > 2:
@@ -51,7 +51,7 @@ def flatten_limbs(limbs: Limbs) -> Limbs:
 
 
 def which_silhouette(n_items: int, n_silhouettes: int, before: Tensor) -> Tensor | None:
-    """Where each item's running sums begin [N]; None if all share one silhouette."""
+    """Return where each item's running sums begin [N]; None if all share one silhouette."""
     if n_silhouettes <= 1:
         return None
     begin = torch.arange(n_silhouettes, device=before.device) * before.shape[-1]
@@ -61,7 +61,7 @@ def which_silhouette(n_items: int, n_silhouettes: int, before: Tensor) -> Tensor
 def intervals_of(
     limbs: Limbs, items: slice, rig: CameraRig, strip: Strip, near: float, limb_shape: str
 ) -> RowIntervals:
-    """Disjoint intervals that some of the items [N, L] cover in every camera."""
+    """Return the disjoint intervals that some of the items [N, L] cover in every camera."""
     radii = limbs.radii if limbs.radii.ndim == 2 else limbs.radii[items]
     some = Limbs(limbs.start[items], limbs.end[items], radii)
     outlines = LIMB_SHAPES[limb_shape](project_limbs(some, rig, near), strip.height, strip.width)
@@ -71,7 +71,7 @@ def intervals_of(
 def count_intervals(
     intervals: RowIntervals, before: Tensor, begin: Tensor | None, strip: Strip
 ) -> Int[Tensor, "2 N C"]:
-    """Covered pixels, and those of them in the silhouette, of each item and camera."""
+    """Count covered pixels, and those of them in the silhouette, of each item and camera."""
     place = (1 << strip.bits) - 1
     start, stop = intervals.start & place, intervals.stop & place
     model = stop - start

@@ -54,7 +54,7 @@ def count_parts(
     chunk: int | None = None,
     near: float = NEAR,
 ) -> PartCounts:
-    """Weight of each position of a part: the sum of a silhouette that is 1/2 under the opposing part.
+    """Return each position's weight: the sum of a silhouette that is 1/2 under the opposing part.
 
     sum_{l in L} B_opp(l) = |L and fg| - 1/2 |L and fg and U|   (DX 4)
 
@@ -181,7 +181,7 @@ class _Union(NamedTuple):
         return cls(start, stop, before, first, running, begin, strip)
 
     def silhouette_before(self, places: Int[Tensor, " Q"]) -> Int[Tensor, " Q"]:
-        """F: silhouette pixels of the union before packed places."""
+        """Return F: silhouette pixels of the union before packed places."""
         last = torch.searchsorted(self.start, places, right=True) - 1
         end = torch.minimum(places, self.stop.index_select(0, last))
         within = _look_up(end, self.running, self.begin, self.strip)
@@ -190,7 +190,7 @@ class _Union(NamedTuple):
 
 
 def _look_up(packed: Tensor, running: Tensor, begin: Tensor | None, strip: Strip) -> Tensor:
-    """Silhouette pixels before packed places."""
+    """Return the silhouette pixels before packed places."""
     place = packed & ((1 << strip.bits) - 1)
     if begin is not None:
         place = place + begin.index_select(0, packed >> strip.bits)
@@ -200,7 +200,7 @@ def _look_up(packed: Tensor, running: Tensor, begin: Tensor | None, strip: Strip
 def _shared_pixels(
     rows: RowIntervals, union: _Union, n_positions: int, strip: Strip
 ) -> Int[Tensor, "N C"]:
-    """|L and fg and U| of every position and camera."""
+    """Return |L and fg and U| of every position and camera."""
     filled = torch.nonzero(rows.start < rows.stop).squeeze(-1)
     # items of the union by those of the rows: a table, since to divide takes longer
     items = torch.arange(len(rows.per_image), device=filled.device)
@@ -216,14 +216,14 @@ def _shared_pixels(
 
 
 def _positions(name: str, parts: Limbs, near: float) -> Limbs:
-    """Limbs [*batch, S, K] of which each position is one item."""
+    """Return limbs [*batch, S, K] of which each position is one item."""
     if parts.start.ndim < 4:
         raise ShapeError(f"{name} must have shape [..., S, K, 3], got {list(parts.start.shape)}")
     return checked_limbs(parts, near)
 
 
 def _union(opposing: Limbs, batch: tuple[int, ...], near: float) -> Limbs:
-    """All positions of the opposing part as limbs of one item."""
+    """Return all positions of the opposing part as limbs of one item."""
     opposing = _positions("opposing parts", opposing, near)
     if tuple(opposing.start.shape[:-3]) != batch:
         raise ShapeError(
@@ -236,7 +236,7 @@ def _union(opposing: Limbs, batch: tuple[int, ...], near: float) -> Limbs:
 
 
 def _shared(silhouettes: PreparedSilhouettes, batch: tuple[int, ...]) -> int:
-    """How many silhouettes the batch has; 1 if it shares one."""
+    """Return how many silhouettes the batch has; 1 if it shares one."""
     leading = tuple(silhouettes.area.shape[:-1])
     if batch[: len(leading)] != leading:
         raise ShapeError(

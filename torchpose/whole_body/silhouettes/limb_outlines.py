@@ -58,7 +58,7 @@ class Outlines(NamedTuple):
 
 
 def project_limbs(limbs: Limbs, rig: CameraRig, near: float = NEAR) -> ProjectedLimbs:
-    """Discs of both ends in every camera; what is nearer than `near` is cut off.
+    """Return the discs of both ends in every camera; what is nearer than `near` is cut off.
 
     Args:
         limbs: start and end [N, L, 3], radii [L, 2] or [N, L, 2], metres, world axes.
@@ -87,7 +87,7 @@ def project_limbs(limbs: Limbs, rig: CameraRig, near: float = NEAR) -> Projected
 
 
 def outline(limbs: ProjectedLimbs, height: int, width: int) -> Outlines:
-    """Discs, tangents and rows of the hull of both discs.
+    """Return the discs, tangents and rows of the hull of both discs.
 
     With d the vector from one centre to the other, the outer tangents have the unit normals n with
     n · d = r_a - r_b, and touch at a + r_a n and b + r_b n; there are none where one disc holds the

@@ -24,7 +24,7 @@ _POINT = 1e-9  # pixels: an axis shorter than this has no direction
 
 
 def outline_rectangles(limbs: ProjectedLimbs, height: int, width: int) -> Outlines:
-    """Edges and rows of the rectangles of projected limbs.
+    """Return the edges and rows of the rectangles of projected limbs.
 
     Args:
         limbs: both ends in every camera.
@@ -63,7 +63,7 @@ Vector = tuple[Tensor, Tensor]
 
 
 def _edge(middle: Vector, offset: Vector, half: Vector, side: int) -> list[Tensor]:
-    """Middle y, half the height, middle x and dx/dy of the edge from `half` behind to `half` ahead.
+    """Return middle y, half height, middle x and dx/dy of the edge from `half` behind to `half` ahead.
 
     An edge within one row is left out: its ends are ends of its neighbours.
     """

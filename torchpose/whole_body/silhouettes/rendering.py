@@ -45,7 +45,7 @@ class HasLimbs(Protocol):
     """Anything that knows where its limbs are, such as `Body`."""
 
     def limbs(self, state: Tensor) -> Limbs:
-        """Limbs [..., L] of states [..., D]."""
+        """Return limbs [..., L] of states [..., D]."""
         ...
 
 
@@ -78,7 +78,7 @@ class PreparedSilhouettes(NamedTuple):
 
 
 def prepare_silhouettes(silhouettes: Tensor) -> PreparedSilhouettes:
-    """Running sums of silhouettes along their rows.
+    """Return running sums of silhouettes along their rows.
 
     Args:
         silhouettes: [*B, C, H, W], True (or not zero) on the person.
@@ -107,7 +107,7 @@ def count_pixels(
     near: float = NEAR,
     limb_shape: str = "cylinders",
 ) -> SilhouetteCounts:
-    """Pixels of the projected body, of the silhouette, and of both, for every particle and camera.
+    """Count pixels of the projected body, of the silhouette, and of both, per particle and camera.
 
     Pixel (i, j) belongs to the body if (x, y) = (j, i) lies in the projection of one of its limbs,
     the convex hull of two discs or a rectangle. A limb is cut off where it comes nearer than `near`; a
@@ -172,7 +172,7 @@ def render(
     near: float = NEAR,
     limb_shape: str = "cylinders",
 ) -> Bool[Tensor, "*batch C H W"]:
-    """Silhouettes of bodies in every camera, exactly the pixels that `count_pixels` counts.
+    """Render silhouettes of bodies in every camera, exactly the pixels that `count_pixels` counts.
 
     Args:
         body: with `limbs(state)`.
@@ -201,7 +201,7 @@ def render_limbs(
     near: float = NEAR,
     limb_shape: str = "cylinders",
 ) -> Bool[Tensor, "*batch C H W"]:
-    """Silhouettes of limbs [..., L] in every camera, as `render`.
+    """Render silhouettes of limbs [..., L] in every camera, as `render`.
 
     >>> from torchpose.camera import PinholeCamera
     >>> ball = torch.tensor([[0.0, 0.0, 2.0]])
@@ -241,7 +241,7 @@ def _limbs_of(body: HasLimbs | Limbs, state: Tensor | None, near: float) -> Limb
 
 
 def _painted(intervals: RowIntervals, strip: Strip) -> Bool[Tensor, "N P"]:
-    """Images of disjoint intervals: +1 where one starts, -1 where it stops, summed up."""
+    """Paint disjoint intervals: +1 where one starts, -1 where it stops, summed up."""
     n, size = len(intervals.per_image), strip.pixels + 1
     filled = intervals.start < intervals.stop
     start, stop = (

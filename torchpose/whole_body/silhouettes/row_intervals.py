@@ -64,7 +64,7 @@ class RowIntervals(NamedTuple):
 
 
 def limb_intervals(outlines: Outlines, n_items: int, strip: Strip) -> RowIntervals:
-    """The union of every item's limbs in every camera as disjoint intervals.
+    """Return the union of every item's limbs in every camera as disjoint intervals.
 
     Pixel (i, j) is covered if (x, y) = (j, i) lies in a limb's hull.
 
@@ -89,7 +89,7 @@ def limb_intervals(outlines: Outlines, n_items: int, strip: Strip) -> RowInterva
 def _block_rows(
     outlines: Outlines, blocks: Tensor, limb: Tensor, rows: int, strip: Strip
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """First column and length [rows, n] of blocks of rows, and the first row [n] of each.
+    """Return first column and length [rows, n] of blocks of rows, and the first row [n] of each.
 
     Blocks at the lower border are moved up into the image: that a row then comes twice does not
     change the union.
@@ -106,7 +106,7 @@ def _block_rows(
 
 
 def _row_ends(outlines: Outlines, limb: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Leftmost and rightmost x [rows, n] of hulls in rows y [rows, n]; left > right if there is none.
+    """Return leftmost and rightmost x [rows, n] of hulls in rows y [rows, n]; left > right if none.
 
     A hull's boundary in a row is that of a disc or of an edge, whichever is outermost. Those that
     the row misses are pushed far inwards; to select by a mask takes three times as long.
@@ -131,12 +131,12 @@ def _row_ends(outlines: Outlines, limb: Tensor, y: Tensor) -> tuple[Tensor, Tens
 
 
 def _of_limbs(table: Tensor, limb: Tensor) -> Tensor:
-    """Columns `limb` of a table [n, k, M]; gather takes a sixth of the time of index_select."""
+    """Return columns `limb` of a table [n, k, M]; gather takes a sixth of index_select's time."""
     return table.gather(2, limb.expand(*table.shape[:2], -1))
 
 
 def _sqrt_(x: Tensor) -> Tensor:
-    """Square root in place; on the CPU NumPy's takes a third of the time."""
+    """Take the square root in place; on the CPU NumPy's takes a third of the time."""
     if not _by_numpy(x):
         return x.sqrt_()
     np.sqrt(x.numpy(), out=x.numpy())
@@ -146,7 +146,7 @@ def _sqrt_(x: Tensor) -> Tensor:
 def _keys(
     start: Tensor, length: Tensor, first_row: Tensor, image: Tensor, n_items: int, strip: Strip
 ) -> Tensor:
-    """Item, place and length of every interval packed in one number each, [rows * n].
+    """Pack item, place and length of every interval in one number each, [rows * n].
 
     `image` [n] is the camera times the number of items plus the item.
     """
@@ -162,7 +162,7 @@ def _keys(
 
 
 def _sorted_intervals(key: Tensor, length_bits: int) -> tuple[Tensor, Tensor]:
-    """Start and stop of intervals in rising order of their start."""
+    """Return start and stop of intervals in rising order of their start."""
     if _by_numpy(key):
         key.numpy().sort()  # in place, by SIMD instructions that torch.sort does not use
     else:
@@ -172,7 +172,7 @@ def _sorted_intervals(key: Tensor, length_bits: int) -> tuple[Tensor, Tensor]:
 
 
 def _covered_before(stops: Tensor) -> Tensor:
-    """The largest stop before each interval; 0 before the first."""
+    """Return the largest stop before each interval; 0 before the first."""
     if _by_numpy(stops):
         covered = np.zeros(len(stops) + 1, stops.numpy().dtype)
         np.maximum.accumulate(stops.numpy(), out=covered[1:])
@@ -181,5 +181,5 @@ def _covered_before(stops: Tensor) -> Tensor:
 
 
 def _by_numpy(x: Tensor) -> bool:
-    """Whether NumPy works in the memory of a tensor."""
+    """Tell whether NumPy works in the memory of a tensor."""
     return x.device.type == "cpu"

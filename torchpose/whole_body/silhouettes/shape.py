@@ -35,7 +35,7 @@ def fit_radii(
     n_candidates: int = 80,
     n_rounds: int = 12,
 ) -> Body:
-    """The body with those radii that cover the silhouettes best.
+    """Return the body with those radii that cover the silhouettes best.
 
     One factor f_g for every kind of limb, the same on both sides, multiplies the body's radii.
     Candidates are drawn from a Gaussian over log f, which is then moved to the best of them, round
@@ -94,7 +94,7 @@ def fit_radii(
 def _overlap(
     limbs: Limbs, factors: Tensor, rig: CameraRig, silhouettes: PreparedSilhouettes
 ) -> Float[Tensor, " N"]:
-    """Mean intersection over union of every candidate, in float64 on the CPU."""
+    """Return the mean intersection over union of every candidate, in float64 on the CPU."""
     n_frames, n_candidates = len(limbs.start), len(factors)
     shape = (n_frames, n_candidates, *limbs.start.shape[1:])
     start, end = (points[:, None].expand(shape) for points in (limbs.start, limbs.end))
@@ -104,7 +104,7 @@ def _overlap(
 
 
 def _limb_kinds(skeleton: BodySkeleton) -> list[int]:
-    """Number of every limb's kind: limbs that differ by their side only are of one."""
+    """Return the number of every limb's kind: limbs that differ by their side only are of one."""
     first = [min(i, other) for i, other in enumerate(skeleton.mirrored_limbs)]
     order = sorted(set(first))
     return [order.index(i) for i in first]
