@@ -90,7 +90,7 @@ def read_text(path: str | Path, expected: str, encoding: str = "utf-8-sig") -> s
 
 
 def read_json(path: str | Path, expected: str) -> Any:
-    """What a file of JSON holds.
+    """Return what a file of JSON holds.
 
     Raises:
         InputError: no such file. FileFormatError: no JSON, or too deeply nested.

@@ -309,7 +309,7 @@ def noisy_keypoints(
     gap: tuple[str, float, float] | None = ("hand_right", 2.6, 1.0),
     fps: float = 30.0,
 ) -> Float[Tensor, "T 4 2"]:
-    """What a detector of head, neck and hands would give: pixels with noise and a gap.
+    """Return what a detector of head, neck and hands would give: pixels with noise and a gap.
 
     Args:
         joints: [T, 8, 3], camera axes, metres.

@@ -88,7 +88,7 @@ class HandAssociation(nn.Module):
     limbs: Tensor
 
     def init(self) -> AssociationState:
-        """No persons yet."""
+        """Return the state without persons."""
         none = torch.zeros(0, dtype=torch.long)
         return AssociationState(torch.zeros(0, 2), none > 0, none)
 

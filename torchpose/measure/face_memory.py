@@ -85,7 +85,7 @@ class FaceMemory(nn.Module):
     pixel: Tensor
 
     def init(self, persons: int) -> FaceMemoryState:
-        """Nothing is known yet."""
+        """Return the state before the first frame."""
         zero = self.blur_rows.new_zeros(persons)
         return FaceMemoryState(
             zero.view(-1, 1, 1, 1).repeat(1, 3, _ROWS, _COLUMNS),

@@ -73,7 +73,7 @@ def predict(
     jump: float,
     rest: float = 0.35,
 ) -> Float[Tensor, "N 2 h w"]:
-    """p(x_t | z_1..t-1): diffusion, velocity, optical flow, and rebirth.
+    """Predict p(x_t | z_1..t-1): diffusion, velocity, optical flow, and rebirth.
 
         p' = m [(1 - j) ((1 - f) (s G_near(v) + (1 - s) G_far) p + f flow p) + j q] + (1 - m) G_rest p
 
@@ -106,7 +106,7 @@ def exclude(
     soft: float,
     rounds: int = 2,
 ) -> Float[Tensor, "N 2 h w"]:
-    """Beliefs of the left and the right hand after each has told the other where it is.
+    """Return the beliefs of the left and the right hand after each has told the other where it is.
 
         p_k(x) ~ b_k(x) (1 - (1 - e^-X) taken_l(x)) (1 - (1 - e^-C) wrong_l(x))
 

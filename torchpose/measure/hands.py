@@ -123,7 +123,7 @@ class HandTracker(nn.Module):
         )  # fmt: skip
 
     def init(self) -> HandState:
-        """No persons yet."""
+        """Return the state without persons."""
         return _rows(self._fresh(torch.zeros(1, 3)), slice(0, 0))
 
     @torch.no_grad()

@@ -152,7 +152,7 @@ class MeanShiftHandTracker(nn.Module):
     observed: Tensor
 
     def init(self) -> MeanShiftHandState:
-        """No persons yet."""
+        """Return the state without persons."""
         real, flags = self.matrix.new_zeros(0), torch.zeros(0, 2, dtype=torch.bool)
         whole = torch.zeros(0, 2, dtype=torch.long)
         none = SkinState(*(table[:0] for table in self.skin.init(1)))

@@ -216,7 +216,7 @@ class MediaPipePose(_Task):
         self._time, self._stamp = -math.inf, -1
 
     def __call__(self, image: Image, time: float) -> PoseLandmarks:
-        """Landmarks of everybody in a frame.
+        """Return the landmarks of everybody in a frame.
 
         Args:
             image: RGB, [H, W, 3], uint8. time: seconds, later than that of the frame before.

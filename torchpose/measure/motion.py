@@ -51,7 +51,7 @@ class Motion(nn.Module):
     channel_weights: Tensor
 
     def init(self, persons: int) -> MotionState:
-        """Nothing is known yet."""
+        """Return the state before the first frame."""
         rows, columns = CELLS
         small = torch.zeros(persons, 3, rows * EVIDENCE, columns * EVIDENCE)
         grey = torch.zeros(persons, rows * EVIDENCE, columns * EVIDENCE, dtype=torch.uint8)
@@ -122,7 +122,7 @@ def dense_flow(
     start: Float[Tensor, "N H W 2"],
     known: Bool[Tensor, " N"],
 ) -> tuple[Float[Tensor, "N H W 2"], Float[Tensor, "N r c 2"]]:
-    """Optical flow from `grey` back to `before` by DIS, in pixels, and as means over cells, in cells.
+    """Compute the flow from `grey` back to `before` by DIS, in pixels, and its means over cells, in cells.
 
     OpenCV's algorithm takes one pair of images at a time, hence the loop; persons without a frame
     before (`known`) get zeros.

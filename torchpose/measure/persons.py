@@ -80,7 +80,7 @@ class PersonRegister(nn.Module):
         self.within, self.likeness = within, likeness
 
     def init(self) -> Persons:
-        """Nobody yet."""
+        """Return the state without persons."""
         nobody = torch.zeros(0, dtype=torch.long)
         return Persons(nobody, torch.zeros(0, _BINS**3, dtype=torch.float64), nobody.clone())
 
@@ -93,7 +93,7 @@ class PersonRegister(nn.Module):
         frame: int,
         detected: Bool[Tensor, " N"] | None = None,
     ) -> tuple[Persons, Int[Tensor, " N"]]:
-        """Whose faces these are: the state with newcomers, and the number of each face's person.
+        """Tell whose faces these are: the state with newcomers, and the number of each face's person.
 
         Args:
             image: RGB. faces: (x, y, size), pixels. identity: of the tracked faces. frame: number.

@@ -42,7 +42,7 @@ class SkinState(NamedTuple):
 
 
 def rgb_to_lab(images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 H W"]:
-    """CIE Lab (L 0 to 100) of sRGB images in [0, 1].
+    """Return CIE Lab (L 0 to 100) of sRGB images in [0, 1].
 
     By kornia on a GPU and where a gradient is wanted; else by OpenCV, which is quicker on a CPU and
     agrees to 0.1 on average and 0.3 at worst, where a bin of `SkinModel` is 2 wide.
@@ -118,7 +118,7 @@ class SkinModel(nn.Module):
     smooth2: Tensor
 
     def init(self, batch_size: int) -> SkinState:
-        """Nothing is known yet."""
+        """Return the state before the first frame."""
         if batch_size < 1:
             raise InputError(f"batch_size must be at least 1, got {batch_size}")
         even = self.lowest.new_full((batch_size, *BINS), 1 / np.prod(BINS))
@@ -182,7 +182,7 @@ class SkinModel(nn.Module):
         return ((state.face + self.floor) / (other + self.floor)).log()
 
     def probability(self, log_ratio: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """p(skin) of log ratios."""
+        """Return p(skin) of log ratios."""
         bounded = log_ratio.clamp(-_LARGEST_RATIO, _LARGEST_RATIO)
         return torch.sigmoid(self.slope * (bounded - self.bias))
 
@@ -194,7 +194,7 @@ class SkinModel(nn.Module):
         hands: Float[Tensor, "B H W"] | None = None,
         valid: Bool[Tensor, "B H W"] | None = None,
     ) -> SkinState:
-        """What is known after a frame.
+        """Return what is known after a frame.
 
         Args:
             state, faces, hands: see `step`. bins: of every pixel, or of every second one; faces are

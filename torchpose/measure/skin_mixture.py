@@ -101,7 +101,7 @@ class SkinMixtureModel(nn.Module):
     samples: Tensor
 
     def init(self, batch_size: int) -> SkinMixtureState:
-        """Nothing is known yet."""
+        """Return the state before the first frame."""
         if batch_size < 1:
             raise InputError(f"batch_size must be at least 1, got {batch_size}")
         shape = (batch_size, self.n_components)
@@ -150,7 +150,7 @@ class SkinMixtureModel(nn.Module):
     def log_density(
         self, state: SkinMixtureState, colours: Float[Tensor, "B P 3"]
     ) -> Float[Tensor, "B P"]:
-        """log p(c) of colours."""
+        """Return log p(c) of colours."""
         return (_features(colours) @ _theta(state).mT).logsumexp(-1)
 
     def _sample(self, lab: Tensor, faces: Tensor, hands: Tensor | None) -> tuple[Tensor, Tensor]:

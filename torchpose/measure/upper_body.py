@@ -130,7 +130,7 @@ class UpperBodyMeasurer(nn.Module):
         self.background = BackgroundModel() if background else None
 
     def init(self) -> MeasurerState:
-        """Nobody was seen yet. The background model begins anew."""
+        """Return the state before the first frame, and let the background model begin anew."""
         if self.background is not None:
             self.background.reset()
         return MeasurerState(

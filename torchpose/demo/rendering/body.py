@@ -75,7 +75,7 @@ class Bodies(NamedTuple):
 
 
 def bodies(performance: Performance) -> Bodies:
-    """Everything that the drawing needs of a performance."""
+    """Return everything that the drawing needs of a performance."""
     upright = performance.rotation.double()
     torso = upright @ euler_to_matrix(performance.angles.torso.double())
     head = torso @ euler_to_matrix(performance.angles.head.double())

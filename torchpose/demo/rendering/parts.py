@@ -138,7 +138,7 @@ class View:
         self.focal = float(np.sqrt(abs(self.K[0, 0] * self.K[1, 1])))
 
     def __call__(self, points: Points) -> Points:
-        """Pixels [..., 2] of points [..., 3]."""
+        """Return the pixels [..., 2] of points [..., 3]."""
         homogeneous = points @ self.K.T
         return homogeneous[..., :2] / np.maximum(homogeneous[..., 2:], 0.05)
 
@@ -161,7 +161,7 @@ class View:
 
 
 def body_parts(pose: Pose, worn: Wardrobe, K: NDArray) -> list[Part]:
-    """Every part of one person, always in the same order.
+    """Return every part of one person, always in the same order.
 
     Args:
         pose: camera axes, metres. worn: clothes and skin. K: camera matrix [3, 3].

@@ -103,7 +103,7 @@ def performance(
 def crossing(
     n_frames: int = 1000, fps: float = 30.0, seed: int = 0, seconds: float = 9.0
 ) -> tuple[Performance, Performance]:
-    """Two performers who walk past each other, one behind the other, to and fro.
+    """Return two performers who walk past each other, one behind the other, to and fro.
 
     Args:
         n_frames, fps: how long, and frames per second. seed: of both movements.

@@ -32,7 +32,7 @@ def render_performance(
     scene: Scene | None = None,
     look: str | Look | Sequence[str | Look] = "dark sleeves",
 ) -> Iterator[Image]:
-    """Frames of one or more animated performers.
+    """Render frames of one or more animated performers.
 
     The head is cut out of the portrait that matplotlib ships and moves rigidly with the pose; the
     rest is painted. What is nearer hides what is farther. Motion blur is the mean of several
@@ -147,7 +147,7 @@ def _movement(a: Part, b: Part) -> float:
 def parts_at(
     people: Sequence[Bodies], worn: Sequence[Wardrobe], K: NDArray, time: float
 ) -> list[Part]:
-    """Parts of all persons at a time in frames, person by person, always in the same order."""
+    """Return the parts of all persons at a time in frames, person by person, always in the same order."""
     return [
         part
         for body, wear in zip(people, worn, strict=True)
@@ -158,7 +158,7 @@ def parts_at(
 def check_performances(
     performance: Performance | Sequence[Performance], camera: PinholeCamera
 ) -> tuple[list[Performance], tuple[int, int]]:
-    """Performances as a list, and width and height of the image.
+    """Return performances as a list, and width and height of the image.
 
     Raises:
         CameraError: a camera without image size. InputError: no performance, different lengths.

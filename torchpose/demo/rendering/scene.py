@@ -140,7 +140,7 @@ class Sensor:
         self._turn = 2 * math.pi * np.array([0.31, 0.83, 1.9]) / fps
 
     def __call__(self, image: Image, frame: int) -> Image:
-        """The image as the sensor records it."""
+        """Return the image as the sensor records it."""
         import cv2
 
         if self._scene.flicker:
