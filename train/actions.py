@@ -7,9 +7,9 @@ from typing import Any, Literal
 
 import torch
 
+from torchpose.learning.fit_files import write_action_files
 from torchpose.learning.recipes import ActionRecipe, Performances, fit_actions
 from torchpose.learning.recipes.actions import FittedActions, check_actions
-from torchpose.learning.recipes.files import write_action_files
 from torchpose.priors.actions.file import BankInfo
 from train.body_fit import BodyData, BodyFit
 

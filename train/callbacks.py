@@ -11,10 +11,8 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tqdm.auto import tqdm
 
 from torchpose._core.leftovers import clear_leftovers
-from torchpose.cli.common import show_progress
-from torchpose.cli.fit import summary, write_prior
-from torchpose.errors import OutputError
-from torchpose.learning.prior_files import prior_results
+from torchpose._core.terminal import show_progress
+from torchpose.learning.fit_files import check_fit_file, fit_results, write_prior_files
 from torchpose.priors import UpperBodyPrior
 from train.blocks import Sweep
 from train.mixture_em import MixtureEM
@@ -185,11 +183,7 @@ class PriorWriter(Callback):
         command: str = "",
         pictures: bool = True,
     ) -> None:
-        self.out = Path(out)
-        if self.out.suffix != ".safetensors":
-            raise OutputError(f"{out}: expected a name that ends in .safetensors")
-        if self.out.is_dir():
-            raise OutputError(f"{out}: is a folder; give the name of a file")
+        self.out = check_fit_file(out)
         self._facts = {"name": name or self.out.stem, "licence": licence, "command": command}
         self._pictures = pictures
         self._open = ExitStack()
@@ -198,8 +192,7 @@ class PriorWriter(Callback):
         """See that the prior can be written, and that nothing else is in its place, before any work."""
         if trainer.is_global_zero and stage == "fit":
             given = [value for value in pl_module.hparams.values() if isinstance(value, str)]
-            beside = (".md", ".png") if self._pictures else (".md",)
-            self.results = prior_results(self.out, given, beside)
+            self.results = fit_results(self.out, given, self._pictures)
             self._open.enter_context(self.results)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -208,8 +201,8 @@ class PriorWriter(Callback):
         prior = finish(**self._facts) if finish else None
         if prior is None:
             return
-        written = write_prior(prior, self.results, self.out.name, self._pictures)
-        print(summary(prior, written, self.results.notes), flush=True)
+        done = write_prior_files(prior, self.results, self.out.name, self._pictures)
+        print(done, flush=True)
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Remove what is temporary."""

@@ -5,8 +5,8 @@ from typing import Any
 import torch
 
 from torchpose.errors import InputError
+from torchpose.learning.fit_files import write_limb_files
 from torchpose.learning.recipes import LimbStates, fit_limbs
-from torchpose.learning.recipes.files import write_limb_files
 from torchpose.learning.recipes.limbs import check_least_std
 from train.body_fit import BodyData, BodyFit
 

@@ -9,8 +9,8 @@ import torch
 from torch import nn
 
 from torchpose.errors import InputError
+from torchpose.learning.fit_files import write_manifold_files
 from torchpose.learning.recipes import ManifoldFitting, ManifoldPoses, ManifoldRecipe
-from torchpose.learning.recipes.files import write_manifold_files
 from torchpose.learning.recipes.manifold import check_gathering
 from train.body_fit import BodyData, BodyFit
 

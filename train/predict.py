@@ -19,14 +19,14 @@ from tqdm.auto import tqdm
 
 from torchpose._core.files import check_output_folder
 from torchpose._core.leftovers import clear_leftovers
-from torchpose.cli.common import one_line, show_progress
+from torchpose._core.terminal import one_line, show_progress
 from torchpose.errors import InputError, OutputError, TorchposeError
+from torchpose.upper_body.keypoint_files import TrackSettings
 from train.predict_claims import Claim, Claims, Run
 from train.predict_recordings import Recording, find_keypoints, share
 from train.predict_summary import Outcome, check_summary, count_outcomes, write_summary
 from train.predict_tracking import (
     BatchTracker,
-    TrackSettings,
     facts_of,
     read_origin,
     save_result,

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 
-from torchpose.cli.common import one_line
+from torchpose._core.terminal import one_line
 from torchpose.errors import TorchposeError
 
 __all__ = ["reason"]

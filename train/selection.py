@@ -6,7 +6,7 @@ then made again from it without another search, and a fit that is resumed knows 
 
 from lightning.pytorch import LightningDataModule, LightningModule, Trainer
 
-from torchpose.cli.common import show_progress
+from torchpose._core.terminal import show_progress
 from torchpose.errors import InputError
 from torchpose.learning.selection import select_n_components
 from train.blocks import Key

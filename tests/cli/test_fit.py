@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchpose.cli.fit import build, command_line
+from torchpose.cli.fit import build, recorded_command
 from torchpose.io import read_recordings
 from torchpose.learning.curation import curate
 from torchpose.learning.recipes import UpperBodyRecipe
@@ -133,7 +133,7 @@ def test_what_jumps_is_left_out_and_said(torchpose, files, tmp_path):
 
 def test_many_paths_are_cut_short():
     args = build().parse_args([f"r{i}.npz" for i in range(20)] + ["--out", "p.safetensors"])
-    assert command_line(args) == "torchpose fit r0.npz '...19 more' --out p.safetensors"
+    assert recorded_command(args) == "torchpose fit r0.npz '...19 more' --out p.safetensors"
 
 
 def test_config_file_round_trip(torchpose, files, tmp_path):

@@ -22,12 +22,13 @@ from torchpose.cli.track import run as track
 from torchpose.errors import InputError, OutputError, PriorError
 from torchpose.learning.upper_body import fit_upper_body_prior
 from torchpose.upper_body import PoseTrack
+from torchpose.upper_body.keypoint_files import TrackSettings
 from train import predict as module
 from train.predict import build, main, predict, process_rank
 from train.predict_claims import Claims
 from train.predict_recordings import find_keypoints, share
 from train.predict_summary import COLUMNS
-from train.predict_tracking import BatchTracker, TrackSettings, read_origin
+from train.predict_tracking import BatchTracker, read_origin
 
 ROOT = Path(__file__).resolve().parents[2]
 LENGTHS = {"a": 12, "b": 30, "c": 7, "sub/d": 20, "sub/e": 25, "f": 9}

@@ -64,7 +64,7 @@ def guarded(command: Callable[[list[str]], int], arguments: list[str]) -> int:
     except Exception as error:
         if debug or not _is_refusal(error):
             raise
-        from torchpose.cli.common import one_line
+        from torchpose._core.terminal import one_line
 
         print(f"torchpose: error: {one_line(error)}", file=sys.stderr)
         return 2

@@ -1,41 +1,36 @@
-"""What the commands share: parsers, error text, checks, pictures."""
+"""What the commands share: parsers, input files, interruption, pictures."""
 
 import os
-import re
+import shlex
 import signal
-import sys
 import textwrap
 from argparse import ArgumentError, RawDescriptionHelpFormatter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
 from jsonargparse import ActionConfigFile, ArgumentParser, Namespace
 
-from torchpose.errors import InputError, printable
-
 __all__ = [
     "UntilInterrupted",
     "add_seed",
+    "command_line",
     "input_files",
     "new_parser",
-    "one_line",
     "pictures_possible",
-    "positive",
     "save_pictures",
     "share_cores",
-    "show_progress",
 ]
 
 T = TypeVar("T")
+_HOW = ("out", "config", "pictures")  # no part of what is made
+_SHOWN_PATHS = 8
 _SEED_DIGITS = 18  # so that it stays one of 64 bits when a little is added
 
 _COMMON = """\
 exit codes: 0 done; 1 done, but the result is not good; 2 refused, with one line on stderr
 --debug shows the traceback of an error"""
-
-_POSITIONALS = {"input": "INPUT", "recordings": "DIR"}
 
 
 def new_parser(
@@ -72,6 +67,28 @@ def add_seed(parser: ArgumentParser, of: str) -> None:
     )
 
 
+def command_line(
+    words: Sequence[str], args: Namespace, defaults: Namespace, out: str | Path
+) -> str:
+    """Return a command over recordings with every option that differs from its default.
+
+    Args:
+        words: after `torchpose`. args, defaults: values of the options, and those by default.
+        out: the output as it is to be said.
+    """
+    paths = list(args.recordings)
+    if len(paths) > _SHOWN_PATHS:
+        paths = [*paths[:1], f"...{len(paths) - 1} more"]
+    parts = ["torchpose", *words, *paths, "--out", str(out)]
+    for key, value in vars(args).items():
+        if key in ("recordings", *_HOW) or value == defaults.get(key):
+            continue
+        values = value if isinstance(value, list) else [value]
+        shown = [str(one).lower() if isinstance(one, bool) else str(one) for one in values]
+        parts += [f"--{key.replace('_', '-')}", *shown]
+    return shlex.join(parts)
+
+
 def input_files(args: Namespace, output: str = "out") -> list[Path]:
     """Files that the options name, that of the output apart."""
     given = [value for key, value in vars(args).items() if key != output]
@@ -95,25 +112,6 @@ def _seed(value: Any) -> int:
             f"--seed must be a whole number of at most {_SEED_DIGITS} digits, got {text!r:.60}",
         )
     return int(text)
-
-
-def positive(name: str, value: float | None) -> None:
-    """Raise `InputError` unless None or above zero."""
-    if value is not None and not 0 < value < float("inf"):
-        raise InputError(f"{name} must be positive, got {value:g}")
-
-
-def one_line(error: BaseException) -> str:
-    """Text of an error on one line, with options named as they are typed."""
-    text = " ".join(str(error).split())
-    text = re.sub(r'^Parser key "(\w+)":', lambda m: f"argument --{m[1].replace('_', '-')}:", text)
-    text = re.sub(r"<class '(\w+)'>", r"\1", text)
-    missing = re.search(r'arguments are required: (.*)|Key "(\w+)" is required', text)
-    if missing:
-        names = (missing[1] or missing[2]).split(", ")
-        options = (_POSITIONALS.get(name, f"--{name}") for name in names)
-        text = f"missing: {', '.join(options)}; see --help for examples"
-    return printable(text)
 
 
 class UntilInterrupted(Generic[T]):
@@ -160,11 +158,6 @@ def share_cores() -> None:
 
     torch.set_num_threads(1)
     cv2.setNumThreads(max(1, (os.cpu_count() or 1) - 1))
-
-
-def show_progress() -> bool:
-    """Whether bars go to somebody who looks at them."""
-    return sys.stderr.isatty()
 
 
 def pictures_possible(wanted: bool) -> bool:

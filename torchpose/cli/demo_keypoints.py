@@ -3,7 +3,8 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchpose.cli.common import save_pictures, show_progress
+from torchpose._core.terminal import show_progress
+from torchpose.cli.common import save_pictures
 from torchpose.cli.demo_scores import (
     MEAN_POSE,
     Hidden,

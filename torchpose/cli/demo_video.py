@@ -5,7 +5,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchpose.cli.common import save_pictures, share_cores, show_progress
+from torchpose._core.terminal import show_progress
+from torchpose.cli.common import save_pictures, share_cores
 from torchpose.cli.demo_scores import MEAN_POSE, beaten, report, score, score_mean_pose
 from torchpose.cli.track_output import camera_text, track_pictures
 from torchpose.cli.track_video import write_overlay, write_people

@@ -1,30 +1,24 @@
 """`torchpose fit`: a prior from recordings of 3D joints; what body trackers learn by a word of its own."""
 
-import shlex
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from statistics import fmean, stdev
 from typing import TYPE_CHECKING, Any
 
 from jsonargparse import ArgumentParser, Namespace
 
+from torchpose._core.terminal import show_progress
 from torchpose.cli.common import (
     add_seed,
+    command_line,
     input_files,
     new_parser,
     pictures_possible,
-    save_pictures,
-    show_progress,
 )
 from torchpose.cli.fit_bodies import KINDS
 from torchpose.cli.fit_bodies import main as fit_bodies
-from torchpose.errors import InputError, OutputError
-from torchpose.learning.prior_files import prior_results
+from torchpose.errors import InputError
 
 if TYPE_CHECKING:
     from torchpose.io.recordings import Recording
-    from torchpose.io.results import ResultsFolder
     from torchpose.priors.upper_body import UpperBodyPrior
 
 _EXAMPLES = """
@@ -38,7 +32,7 @@ torchpose fit manifold --help
 torchpose fit limbs --help
 torchpose fit actions --help"""
 
-_SHOWN_PATHS, _SHOWN_DROPS = 8, 5
+_SHOWN_DROPS = 5
 _NOISE = ("learnt", "none")
 
 
@@ -126,81 +120,24 @@ def build() -> ArgumentParser:
 def run(args: Namespace) -> int:
     """Read, curate, fit, write and report; every check of an option comes before any work."""
     from torchpose.io.recordings import find_recordings, read_recordings
+    from torchpose.learning.fit_files import check_fit_file, fit_results, write_prior_files
 
     _check_options(args)
-    out = output_file(args.out)
+    out = check_fit_file(args.out)
     recordings = read_recordings(find_recordings(args.recordings), args.axes)
     pictures = pictures_possible(args.pictures)
     recordings, curation = _curated(_without(recordings, args.without or []), args)
-    with prior_results(
-        out, input_files(args), (".md", ".png") if pictures else (".md",)
-    ) as results:
+    with fit_results(out, input_files(args), pictures) as results:
         print(curation["said"], flush=True)
         prior = _fit(recordings, args, args.name or out.stem)
         prior.info = replace(prior.info, extra=prior.info.extra | curation["facts"])
-        written = write_prior(prior, results, out.name, pictures)
-    print(summary(prior, written, results.notes))
+        done = write_prior_files(prior, results, out.name, pictures)
+    print(done)
     return 0
 
 
-def write_prior(
-    prior: "UpperBodyPrior", results: "ResultsFolder", name: str, pictures: bool
-) -> list[Path]:
-    """Write the prior, its model card and, if asked for, the picture of its mean poses."""
-    from torchpose.learning.model_card import write_model_card
-
-    out = results.stage / name
-    card = out.with_suffix(".md")
-    prior.save(out)
-    write_model_card(prior, card)
-    written = results.commit([out, card])  # first of all: the picture only shows it
-    if pictures:
-        from torchpose import viz
-
-        arms = {"left arm": prior.left, "right arm": prior.right}
-        drawn = {out.with_suffix(".png").name: lambda: viz.plot_prior_means(arms)}
-        written += results.commit(save_pictures(results.stage, drawn))
-    return written
-
-
-def summary(prior: "UpperBodyPrior", written: list[Path], notes: Sequence[str] = ()) -> str:
-    """A few lines for people: what was fitted, on what, how well it will do, which files."""
-    info = prior.info
-    windows = [w.left.n_components for w in prior.windows.values()]
-    over = f" and {max(windows)} over windows" if windows else ""
-    lines = [
-        f"prior    {info.name}, {prior.n_components} components per arm{over}, neck: {info.neck}, "
-        f"hand: {info.hand}",
-        f"persons  {len(info.persons)}",
-        f"states   {info.n_samples} per arm from {info.n_frames} recorded frames",
-    ]
-    fit = info.extra.get("fit")
-    if fit:
-        end = "" if fit["converged"] else ", not converged"
-        lines.append(
-            f"EM       mean log-likelihood {fit['log_likelihood']:.4f} after {fit['iterations']} "
-            f"iterations{end}"
-        )
-    lines.append(f"noise    {', '.join(prior.noise) or 'not learnt'}")
-    lines += [f"expect   {line}" for line in _expected(info.extra.get("held_out", {}))]
-    lines += [f"note     {note}" for note in notes]
-    return "\n".join([*lines, *(f"wrote    {path}" for path in written)])
-
-
-def _expected(held_out: dict[str, dict[str, float]]) -> list[str]:
-    """What somebody new can expect, from the errors of the persons that were held out."""
-    names = {"causal": "filtered", "full": "smoothed"}
-    lines = []
-    for mode, name in names.items():
-        errors = [100 * error for error in held_out.get(mode, {}).values()]
-        if errors:
-            spread = f" +- {stdev(errors):.1f}" if len(errors) > 1 else ""
-            lines.append(f"{fmean(errors):.1f}{spread} cm {name} on somebody new")
-    return lines
-
-
 def _fit(recordings: list["Recording"], args: Namespace, name: str) -> "UpperBodyPrior":
-    facts = {"name": name, "licence": args.licence, "command": command_line(args)}
+    facts = {"name": name, "licence": args.licence, "command": recorded_command(args)}
     own = {"neck": args.neck} | ({"n_samples": args.samples} if args.samples else {})
     if args.noise == "none":
         from torchpose.learning.upper_body import fit_upper_body_prior
@@ -277,34 +214,9 @@ def _check_options(args: Namespace) -> None:
         raise InputError("--window-components applies only with --noise learnt")
 
 
-def output_file(name: str) -> Path:
-    """Path of the file to be written.
-
-    Raises:
-        OutputError: another suffix than .safetensors, or a folder.
-    """
-    out = Path(name)
-    if out.suffix != ".safetensors":
-        raise OutputError(f"{out}: expected a name that ends in .safetensors")
-    if out.is_dir():
-        raise OutputError(f"{out}: is a folder; give the name of a file")
-    return out
-
-
-def command_line(args: Namespace) -> str:
-    """The command with every option that differs from what it is by default, many paths cut short."""
-    paths = list(args.recordings)
-    if len(paths) > _SHOWN_PATHS:
-        paths = [*paths[:1], f"...{len(paths) - 1} more"]
-    parts = ["torchpose", "fit", *paths, "--out", args.out]
-    defaults = build().get_defaults()
-    for key, value in vars(args).items():
-        if key in ("recordings", "out", "config", "pictures") or value == defaults.get(key):
-            continue
-        option = f"--{key.replace('_', '-')}"
-        for one in value if isinstance(value, list) else [value]:
-            parts += [option, str(one).lower() if isinstance(one, bool) else str(one)]
-    return shlex.join(parts)
+def recorded_command(args: Namespace) -> str:
+    """Return the command as the prior's file says it."""
+    return command_line(("fit",), args, build().get_defaults(), args.out)
 
 
 def _count(recordings: list["Recording"]) -> str:

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 from jsonargparse import ArgumentParser, Namespace
 
-from torchpose.cli.common import add_seed, input_files, new_parser, pictures_possible, show_progress
+from torchpose._core.terminal import show_progress
+from torchpose.cli.common import add_seed, command_line, input_files, new_parser, pictures_possible
 from torchpose.errors import InputError
 
 if TYPE_CHECKING:
@@ -34,8 +35,6 @@ _EXAMPLES = {
     "torchpose fit actions recordings/ --actions bend wave clap --out bank.safetensors",
 }
 _FPS = {"manifold": 60.0, "limbs": 60.0, "actions": 30.0}
-_HOW = ("out", "config", "pictures")  # no part of what is fitted
-_SHOWN_PATHS = 8
 _CHOICE = ("persons", "held_out", "actions", "axes", "fps")
 
 
@@ -78,38 +77,24 @@ def build(kind: str) -> ArgumentParser:
 
 def run(kind: str, args: Namespace) -> int:
     """Read, fit, write and report; every check of an option comes before any work."""
-    from torchpose.cli.fit import output_file
     from torchpose.io.formats.axes import AXES
-    from torchpose.learning.prior_files import prior_results
+    from torchpose.learning.fit_files import check_fit_file, fit_results
 
     if args.axes is not None and args.axes not in AXES:
         raise InputError(f"--axes must be one of {', '.join(AXES)}, got {args.axes!r}")
-    out = output_file(args.out)
+    out = check_fit_file(args.out)
     facts = {"name": args.name or out.stem, "licence": args.licence}
-    facts |= {"command": command_line(kind, args)}
-    beside = (".md", ".png") if getattr(args, "pictures", False) else (".md",)
-    with prior_results(out, input_files(args), beside) as results:
+    facts |= {"command": recorded_command(kind, args)}
+    with fit_results(out, input_files(args), getattr(args, "pictures", False)) as results:
         print(_FITS[kind](args, results, out, facts))
     return 0
 
 
-def command_line(kind: str, args: Namespace) -> str:
-    """The command with every option that differs from what it is by default."""
+def recorded_command(kind: str, args: Namespace) -> str:
+    """Return the command as the model's file says it."""
     if args.config:
-        config = " ".join(shlex.quote(str(path)) for path in args.config)
-        return f"torchpose fit {kind} --config {config}"
-    paths = list(args.recordings)
-    if len(paths) > _SHOWN_PATHS:
-        paths = [*paths[:1], f"...{len(paths) - 1} more"]
-    parts = ["torchpose", "fit", kind, *paths]
-    defaults = build(kind).get_defaults()
-    for key, value in vars(args).items():
-        if key in ("recordings", *_HOW) or value == defaults.get(key):
-            continue
-        values = value if isinstance(value, list) else [value]
-        shown = [str(one).lower() if isinstance(one, bool) else str(one) for one in values]
-        parts += [f"--{key.replace('_', '-')}", *shown]
-    return shlex.join([*parts, "--out", Path(args.out).name])
+        return shlex.join(["torchpose", "fit", kind, "--config", *map(str, args.config)])
+    return command_line(("fit", kind), args, build(kind).get_defaults(), Path(args.out).name)
 
 
 # --- manifolds ------------------------------------------------------------------------------------
@@ -140,9 +125,14 @@ def _manifold_options(parser: ArgumentParser) -> None:
 def _fit_manifold(
     args: Namespace, results: "ResultsFolder", out: Path, facts: dict[str, str]
 ) -> str:
-    from torchpose.learning.recipes.files import write_manifold_files
-    from torchpose.learning.recipes.manifold import ManifoldFitting, ManifoldPoses, ManifoldRecipe
-    from torchpose.learning.recipes.resuming import run_to_end, taken_up
+    from torchpose.learning.fit_files import write_manifold_files
+    from torchpose.learning.recipes.manifold import (
+        ManifoldFitting,
+        ManifoldPoses,
+        ManifoldRecipe,
+        run_to_end,
+        taken_up,
+    )
 
     names = ("latent_dim", "steps", "patience", "start", "smoothness", "standardise", "seed")
     recipe = ManifoldRecipe(**{name: getattr(args, name) for name in names})
@@ -169,7 +159,7 @@ def _limb_options(parser: ArgumentParser) -> None:
 
 
 def _fit_limbs(args: Namespace, results: "ResultsFolder", out: Path, facts: dict[str, str]) -> str:
-    from torchpose.learning.recipes.files import write_limb_files
+    from torchpose.learning.fit_files import write_limb_files
     from torchpose.learning.recipes.limbs import LimbStates, check_least_std
 
     check_least_std(args.least_std)
@@ -210,8 +200,8 @@ def _action_options(parser: ArgumentParser) -> None:
 def _fit_actions(
     args: Namespace, results: "ResultsFolder", out: Path, facts: dict[str, str]
 ) -> str:
+    from torchpose.learning.fit_files import write_action_files
     from torchpose.learning.recipes.actions import ActionRecipe, Performances, fit_actions
-    from torchpose.learning.recipes.files import write_action_files
 
     names = ("n_dimensions", "n_postures", "prominence", "stay", "spread", "background",
              "evidence_rate", "gate_dimensions", "seed")  # fmt: skip

@@ -11,7 +11,8 @@ from typing import Any, Literal, NamedTuple
 
 from jsonargparse import ArgumentParser, Namespace
 
-from torchpose.cli.common import add_seed, new_parser, show_progress
+from torchpose._core.terminal import show_progress
+from torchpose.cli.common import add_seed, new_parser
 from torchpose.errors import InputError
 
 __all__ = ["Protocol", "build", "execute"]

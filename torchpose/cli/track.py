@@ -1,6 +1,5 @@
 """`torchpose track`: video or 2D keypoints to 2D and 3D poses with covariances."""
 
-import sys
 from argparse import ArgumentError
 from pathlib import Path
 from typing import Any
@@ -8,7 +7,6 @@ from typing import Any
 from jsonargparse import ArgumentParser, Namespace
 
 from torchpose.cli.common import add_seed, new_parser
-from torchpose.errors import InputError
 
 _EXAMPLES = """
 torchpose track clip.mp4 --out result
@@ -249,37 +247,3 @@ def parse_smoothing(value: Any) -> int | str:
             None, f"--smoothing must be a number of frames or 'full', got {str(value)!r}"
         )
     return lag
-
-
-def tracker_options(args: Namespace) -> dict[str, Any]:
-    """Method, smoothing, frame and the filter's options, as `UpperBodyTracker` takes them.
-
-    Raises:
-        InputError: an option that the method does not have.
-    """
-    from torchpose.upper_body.methods import METHODS, WINDOWS, method_options, options_of_before
-
-    method, steady = args.method, args.steady
-    if args.window is not None:
-        print(
-            "torchpose: --window is deprecated; say --method window-mixture or mkf-fixed, or leave "
-            "both out",
-            file=sys.stderr,
-        )
-        method, steady = options_of_before(method, args.window, steady)
-    names = ("smoothing", "frame", "static_camera")
-    options = {name: getattr(args, name) for name in names} | {"method": method, "steady": steady}
-    for name in ("n_particles", "n_tracks"):
-        value, option = getattr(args, name), f"--{name.replace('_', '-')}"
-        if value is None:
-            continue
-        having = [other for other in METHODS if name in method_options(other)]
-        if method is None or (method in METHODS and method not in having):
-            raise InputError(
-                f"{option} does not apply to --method {method or WINDOWS}; it is of "
-                f"{', '.join(having)}"
-            )
-        if value < 1:
-            raise InputError(f"{option} must be at least 1, got {value}")
-        options[name] = value
-    return options

@@ -9,14 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from jsonargparse import ArgumentParser, Namespace
 
-from torchpose.cli.common import (
-    add_seed,
-    new_parser,
-    pictures_possible,
-    positive,
-    share_cores,
-    show_progress,
-)
+from torchpose._core.terminal import check_positive, show_progress
+from torchpose.cli.common import add_seed, new_parser, pictures_possible, share_cores
 from torchpose.cli.track_body_output import (
     body_results,
     draw,
@@ -145,7 +139,7 @@ def _check(args: Namespace) -> None:
     for option, value in (("--height", args.height), ("--sharpness", args.sharpness),
                           ("--rows", args.rows), ("--n-particles", args.n_particles),
                           ("--fps", args.fps)):  # fmt: skip
-        positive(option, value)
+        check_positive(option, value)
     if args.facing is not None and len(args.facing) != 3:
         raise InputError(f"--facing must be three numbers, got {args.facing}")
     if args.ignore_still and not args.background:

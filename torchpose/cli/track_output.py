@@ -1,7 +1,8 @@
-"""What `torchpose track` writes and prints, from keypoints and from video alike."""
+"""What `torchpose track` does alike with keypoints and video: its settings, its files, what it prints."""
 
 import sys
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ from torchpose.cli.common import input_files, save_pictures
 
 if TYPE_CHECKING:
     from torchpose.io.results import ResultsFolder
+    from torchpose.upper_body.keypoint_files import TrackSettings
     from torchpose.upper_body.pose_track import PoseTrack
 
 _POSES = ("poses.npz", "poses.csv", "poses.bvh")
@@ -26,9 +28,17 @@ __all__ = [
     "summary",
     "track_pictures",
     "track_results",
+    "track_settings",
     "write_pictures",
     "write_track",
 ]
+
+
+def track_settings(args: Namespace) -> "TrackSettings":
+    """Return the settings of a tracker that are among the options of the command."""
+    from torchpose.upper_body.keypoint_files import TrackSettings
+
+    return TrackSettings(**{f.name: getattr(args, f.name) for f in fields(TrackSettings)})
 
 
 def track_results(

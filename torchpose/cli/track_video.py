@@ -10,19 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 from jsonargparse import Namespace
 
-from torchpose.cli.common import (
-    UntilInterrupted,
-    pictures_possible,
-    positive,
-    share_cores,
-    show_progress,
-)
+from torchpose._core.terminal import check_positive, show_progress
+from torchpose.cli.common import UntilInterrupted, pictures_possible, share_cores
 from torchpose.cli.track_output import (
     camera_text,
     report_failure,
     smoothing_text,
     summary,
     track_results,
+    track_settings,
     write_pictures,
     write_track,
 )
@@ -42,11 +38,11 @@ __all__ = ["track_video", "write_overlay", "write_people"]
 
 def track_video(args: Namespace) -> int:
     """Track everybody, write and report; exit code 1 if there is nobody."""
-    from torchpose.cli.camera_option import resolve_camera
+    from torchpose.camera.choice import resolve_camera
     from torchpose.priors.upper_body import load_prior
 
     for option, value in (("--fps", args.fps), ("--max-gap", args.max_gap)):
-        positive(option, value)
+        check_positive(option, value)
     _refuse_keypoint_options(args)
     share_cores()
     prior = load_prior(args.prior)
@@ -113,7 +109,6 @@ def _refuse_keypoint_options(args: Namespace) -> None:
 
 
 def _tracker(args: Namespace, prior: Any, camera: "PinholeCamera", fps: float) -> "VideoTracker":
-    from torchpose.cli.track import tracker_options
     from torchpose.measure.mediapipe import MediaPipeFaceDetector
     from torchpose.video.tracker import VideoTracker
 
@@ -131,7 +126,7 @@ def _tracker(args: Namespace, prior: Any, camera: "PinholeCamera", fps: float) -
         max_persons=args.max_persons,
         max_gap=args.max_gap,
         seed=args.seed,
-        **tracker_options(args),
+        **track_settings(args).tracker_options(),
     )
 
 

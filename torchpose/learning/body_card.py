@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
-from torchpose._core.files import atomic_path
+from torchpose.learning.model_card import card_table, card_text
 from torchpose.priors.actions.bank import ActionBank
 from torchpose.priors.actions.space import ActionSpace
 from torchpose.priors.limb_conditionals import LimbConditionals
 from torchpose.priors.manifold.gplvm import BackConstrainedGPLVM
 
-__all__ = ["BodyModel", "body_card", "write_body_card"]
+__all__ = ["BodyModel", "body_card"]
 
 BodyModel = BackConstrainedGPLVM | LimbConditionals | ActionSpace | ActionBank
 
@@ -23,7 +22,7 @@ _LIMITS = (
 
 
 def body_card(model: BodyModel, name: str = "", results: str = "") -> str:
-    """Markdown text on what a model is, what it was fitted on, and what it is not good for.
+    """Return Markdown text on what a model is, what it was fitted on, and what it is not good for.
 
     Args:
         model: a manifold, limb conditionals, an action space or a bank.
@@ -34,27 +33,13 @@ def body_card(model: BodyModel, name: str = "", results: str = "") -> str:
     what, rows, held_out, use, limits = describe(model)
     sections = {
         "What it is": what,
-        "Fitted on": _table({**_data(model.info), **rows}),
+        "Fitted on": card_table({**_data(model.info), **rows}),
         "Held out while it was fitted": held_out,
         "On persons that it was not fitted on": results,
         "Use": f"```console\n$ torchpose track-body cameras.toml cam1.mp4 cam2.mp4 {use} --out result\n```",
         "Limits": f"{limits} {_LIMITS}",
     }
-    body = [f"## {title}\n\n{text}\n" for title, text in sections.items() if text]
-    return f"# {getattr(model.info, 'name', '') or name or 'Body model'}\n\n" + "\n".join(body)
-
-
-def write_body_card(
-    model: BodyModel, path: str | Path, name: str = "", results: str = ""
-) -> Path:  # fmt: skip
-    """Write `body_card` to a file, which appears whole or not at all; returns its path.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    with atomic_path(path) as temporary:
-        temporary.write_text(body_card(model, name, results), encoding="utf-8")
-    return Path(path)
+    return card_text(getattr(model.info, "name", "") or name or "Body model", sections)
 
 
 _Told = tuple[str, dict[str, Any], str, str, str]
@@ -171,8 +156,3 @@ def _call(name: str) -> str:
 
 def _joined(items: Iterable[str]) -> str:
     return ", ".join(items)
-
-
-def _table(rows: Mapping[str, Any]) -> str:
-    lines = [f"| {name} | {value} |" for name, value in rows.items() if value]
-    return "\n".join(["| | |", "|---|---|", *lines])

@@ -12,21 +12,18 @@ from torchpose._core.files import atomic_path
 from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.priors.window import WindowPrior
 
-__all__ = ["model_card", "write_model_card"]
+__all__ = ["card_table", "card_text", "model_card", "write_model_card"]
 
 _MODES = {"pose": "single poses", "causal": "filtered", "full": "smoothed"}
 
 
 def model_card(prior: UpperBodyPrior, results: Mapping[str, str] | None = None) -> str:
-    """Markdown text on what a prior is, what it was fitted on, and what it is not good for.
+    """Return Markdown text on what a prior is, what it was fitted on, and what it is not good for.
 
     Args:
         prior: the prior.
         results: lines of a table of results, value by what was measured. They have to come from
             the same recipe fitted without the test persons.
-
-    Returns:
-        The card.
     """
     sections = {
         "What it is": _description(prior),
@@ -37,8 +34,7 @@ def model_card(prior: UpperBodyPrior, results: Mapping[str, str] | None = None) 
         "Results": _results(results or {}),
         "Limits": _limits(prior),
     }
-    body = [f"## {title}\n\n{text}\n" for title, text in sections.items() if text]
-    return f"# {prior.info.name or 'Upper-body prior'}\n\n" + "\n".join(body)
+    return card_text(prior.info.name or "Upper-body prior", sections)
 
 
 def write_model_card(
@@ -51,6 +47,18 @@ def write_model_card(
     """
     with atomic_path(path) as temporary:
         temporary.write_text(model_card(prior, results), encoding="utf-8")
+
+
+def card_text(title: str, sections: Mapping[str, str]) -> str:
+    """Return a card in Markdown: a title, and the sections that have a text."""
+    body = [f"## {name}\n\n{text}\n" for name, text in sections.items() if text]
+    return f"# {title}\n\n" + "\n".join(body)
+
+
+def card_table(rows: Mapping[str, Any]) -> str:
+    """Return a table of names and values, without those that are empty."""
+    lines = [f"| {name} | {value} |" for name, value in rows.items() if value]
+    return "\n".join(["| | |", "|---|---|", *lines])
 
 
 def _description(prior: UpperBodyPrior) -> str:
@@ -111,7 +119,7 @@ def _data(prior: UpperBodyPrior) -> str:
             f"mean log-likelihood {fit['log_likelihood']:.4f} after {fit['iterations']} iterations"
             f"{'' if fit['converged'] else ' (not converged)'}, seed {extra.get('seed')}"
         )
-    return _table(rows)
+    return card_table(rows)
 
 
 def _fine_tuned(facts: Mapping[str, Any]) -> str:
@@ -128,7 +136,7 @@ def _fine_tuned(facts: Mapping[str, Any]) -> str:
 def _conventions(prior: UpperBodyPrior) -> str:
     info = prior.info
     orders = {"zxy": "Rz(roll) Rx(pitch) Ry(yaw)", "zyx": "Rz(roll) Ry(yaw) Rx(pitch)"}
-    return _table(
+    return card_table(
         {
             "camera": f"fx {info.fx:g}, fy {info.fy:g}, centre ({info.cx:g}, {info.cy:g}) pixels",
             "rotation": f"{info.rotation_order}: R = {orders[info.rotation_order]}",
@@ -194,7 +202,7 @@ def _held_out(prior: UpperBodyPrior) -> str:
 def _results(results: Mapping[str, str]) -> str:
     if not results:
         return ""
-    return "From the same recipe, fitted without the test persons.\n\n" + _table(results)
+    return "From the same recipe, fitted without the test persons.\n\n" + card_table(results)
 
 
 def _limits(prior: UpperBodyPrior) -> str:
@@ -217,8 +225,3 @@ def _views(views: Mapping[str, Any]) -> str:
 
 def _joined(items: Iterable[str]) -> str:
     return "; ".join(items) or "not stated"
-
-
-def _table(rows: Mapping[str, Any]) -> str:
-    lines = [f"| {name} | {value} |" for name, value in rows.items() if value]
-    return "\n".join(["| | |", "|---|---|", *lines])

@@ -6,17 +6,21 @@ and back; the step that did best on them is kept, and its standard deviations co
 
 import hashlib
 import math
+import os
+import pickle
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
+from torchpose._core.files import atomic_path
 from torchpose.body.fitting import fit_body, fit_state
 from torchpose.body.kinematics import Body
-from torchpose.errors import InputError
+from torchpose.errors import InputError, OutputError
 from torchpose.io.recordings import Recording
 from torchpose.learning.curation.duplicates import refuse_shared_recordings
 from torchpose.learning.recipes.choosing import (
@@ -31,7 +35,14 @@ from torchpose.priors.manifold.fit import GPLVMFit, median_gamma
 from torchpose.priors.manifold.gplvm import BackConstrainedGPLVM
 from torchpose.priors.manifold.pose_sequences import column_scale, join_sequences, thin
 
-__all__ = ["ManifoldFitting", "ManifoldPoses", "ManifoldRecipe", "check_gathering"]
+__all__ = [
+    "ManifoldFitting",
+    "ManifoldPoses",
+    "ManifoldRecipe",
+    "check_gathering",
+    "run_to_end",
+    "taken_up",
+]
 
 
 @dataclass(frozen=True)
@@ -220,6 +231,58 @@ class ManifoldFitting(nn.Module):
         return BackConstrainedGPLVM.from_fit(
             self.fit, self._poses, self._lengths, self._scale, self.data.info
         ).cpu()
+
+
+def run_to_end(
+    fitting: ManifoldFitting, kept: str | Path | None = None, progress: bool = False
+) -> ManifoldFitting:
+    """Take steps until the fit is finished.
+
+    Args:
+        fitting: at its start, or taken up. kept: file that holds the fit after every step, and is
+            removed at the end; None keeps nothing. progress: show a bar.
+    """
+    with tqdm(
+        total=fitting.recipe.steps, desc="manifold", unit="step", disable=not progress,
+        initial=len(fitting.fit.scores),
+    ) as bar:  # fmt: skip
+        while not fitting.finished:
+            found = fitting.step()
+            if kept is not None:
+                with atomic_path(kept) as temporary:
+                    torch.save({"of": fitting.identity(), "fit": fitting.state_dict()}, temporary)
+            bar.set_postfix_str(f"held-out error {found['held_out']:.5f}", refresh=False)
+            bar.update()
+    if kept is not None:
+        Path(kept).unlink(missing_ok=True)
+    return fitting
+
+
+def taken_up(fitting: ManifoldFitting, kept: str | Path) -> int:
+    """Take up a fit that `run_to_end` kept, if it is the same; return its steps so far, or 0.
+
+    Raises:
+        OutputError: the file is something else, which `run_to_end` would write over.
+    """
+    if not os.path.lexists(kept):
+        return 0
+    try:
+        found = torch.load(kept, weights_only=True)
+        if found["of"] != fitting.identity():
+            return 0
+        fitting.load_state_dict(found["fit"])
+    except (
+        OSError,
+        RuntimeError,
+        pickle.UnpicklingError,
+        EOFError,
+        LookupError,
+        TypeError,
+    ) as error:
+        raise OutputError(
+            f"{kept}: is in the place where a fit is kept, and is none; move it away"
+        ) from error
+    return len(fitting.fit.scores)
 
 
 def check_gathering(validation: int, frames: int, fps: float) -> None:
