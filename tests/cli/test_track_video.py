@@ -165,7 +165,7 @@ def test_a_camera_is_shown_recorded_and_stopped(clip, track, monkeypatch, full_d
     capture = Capture()
     monkeypatch.setattr("torchpose.video.camera.time.sleep", lambda seconds: None)
     monkeypatch.setattr(
-        "torchpose.video.open_video",
+        "torchpose.video.source.open_video",
         lambda where, fps=None: CameraSource(int(where), fps, capture=lambda index: capture),
     )
     done, out = track("0")
