@@ -41,6 +41,7 @@ from torchpose._core.files import atomic_path, check_output_folder
 from torchpose.body import BODY_15, Body, JointLimits, body_joints, fit_body, fit_state
 from torchpose.camera import CameraRig, load_cameras
 from torchpose.evaluation import Report
+from torchpose.learning import fit_gplvm, fit_gplvm_noise
 from torchpose.priors import BackConstrainedGPLVM, ManifoldInfo
 from torchpose.video import SilhouetteMeasurer, open_video, read_silhouettes
 from torchpose.video.silhouettes import fit_views, read_empty_scene
@@ -167,11 +168,11 @@ def prepare(folder: Path, person: str, action: str) -> Person:
         for joints in kinect(folder, p, action, "2")
     ]
     info = ManifoldInfo.of_body(body, name=f"{action} of {', '.join(OTHERS)}")
-    manifold = BackConstrainedGPLVM.fit(poses, seed=0, info=info)
+    manifold = fit_gplvm(poses, seed=0, info=info)
     validation = [
         body.relative(fit_state(body, joints)) for joints in kinect(folder, TUNING, action, "23")
     ]
-    manifold = manifold.fit_noise(validation, 30.0)
+    manifold = fit_gplvm_noise(manifold, validation, 30.0)
     std = motion_std(body, [fit_state(body, joints) for joints in own], floor=1e-3)
     seen = [fit_state(body, j) for p in OTHERS for a in ACTIONS for j in kinect(folder, p, a, "2")]
     return Person(body, std, manifold, JointLimits.fit(torch.cat(seen)))

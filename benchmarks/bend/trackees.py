@@ -15,12 +15,12 @@ from torchpose.body.fitting import fit_body, fit_state
 from torchpose.body.kinematics import Body, centres_of
 from torchpose.body.skeleton import BODY_15
 from torchpose.io.mocap import MocapClip
-from torchpose.priors.actions.file import ActionInfo
+from torchpose.learning.action_spaces import fit_synchronised
+from torchpose.priors.actions.file import ActionInfo, Synchronised
 from torchpose.priors.actions.gate import Acceptance
 from torchpose.priors.actions.polar_limbs import LIMBS_12
 from torchpose.priors.actions.postures import posture_angles, state_postures
 from torchpose.priors.actions.space import ActionSpace
-from torchpose.priors.actions.synchronisation import Synchronised
 from torchpose.whole_body.filters.constrained import ConstrainedParticleFilter
 from torchpose.whole_body.filters.motion import constant_velocity_std
 
@@ -164,7 +164,7 @@ def synchronised_space(
     """The same, and the performances in it before and after they are put in step."""
     postures = [state_postures(body, states) for one in performed for states in one]
     rank = min(MOST_DIMENSIONS, int(torch.linalg.matrix_rank(torch.cat(postures), rtol=1e-4)))
-    return ActionSpace.fit_synchronised(postures, rank, name=info.name, fps=info.fps, info=info)
+    return fit_synchronised(postures, rank, name=info.name, fps=info.fps, info=info)
 
 
 def known_angles(clip: MocapClip) -> Bool[Tensor, "36"]:

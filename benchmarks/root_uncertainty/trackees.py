@@ -33,6 +33,7 @@ from torchpose.body.limits import JointLimits
 from torchpose.errors import InputError
 from torchpose.filters.survival import survival_rate_per_frame
 from torchpose.io.mocap import MocapClip
+from torchpose.learning import fit_limb_conditionals
 from torchpose.priors.limb_conditionals import LimbConditionals
 from torchpose.whole_body.filters.annealed import AnnealedParticleFilter
 from torchpose.whole_body.filters.motion import motion_std
@@ -169,7 +170,7 @@ def _limits(states: Float[Tensor, "N D"]) -> JointLimits:
 def _motion(
     body: Body, training: Sequence[Tensor], up: Tensor, fps: float
 ) -> tuple[LimbConditionals, Float[Tensor, " D"]]:
-    conditionals = LimbConditionals.fit(body, list(training), fps)
+    conditionals = fit_limb_conditionals(body, list(training), fps)
     return conditionals, any_heading(motion_std(body, list(training)), up)
 
 

@@ -16,6 +16,7 @@ from torchpose.demo.rendering.clothed_body import TrueShape, true_silhouettes
 from torchpose.errors import InputError
 from torchpose.evaluation.common import settings_hash
 from torchpose.io.mocap import MocapClip
+from torchpose.learning import fit_gplvm, fit_gplvm_noise
 from torchpose.priors.manifold.file import ManifoldInfo
 from torchpose.priors.manifold.gplvm import BackConstrainedGPLVM
 from torchpose.whole_body.filters.annealed import AnnealedParticleFilter
@@ -298,9 +299,9 @@ def _manifold(split: Split, bodies: dict[str, Body], seed: int) -> BackConstrain
         sequences=tuple(c.trial for c in split.manifold),
     )
     poses = [body.relative(_states(bodies, clip)) for clip in split.manifold]
-    manifold = BackConstrainedGPLVM.fit(poses, seed=seed, info=info)
+    manifold = fit_gplvm(poses, seed=seed, info=info)
     held_out = [body.relative(_states(bodies, clip)) for clip in split.validation]
-    return manifold.fit_noise(held_out, split.validation[0].fps)
+    return fit_gplvm_noise(manifold, held_out, split.validation[0].fps)
 
 
 # --- views ----------------------------------------------------------------------------------------

@@ -23,6 +23,7 @@ from benchmarks.speed._timing import (
 )
 from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, PinholeCamera
+from torchpose.learning import fit_action_space
 from torchpose.priors import ActionSpace
 from torchpose.priors.actions.part_postures import PartPostures
 from torchpose.priors.actions.postures import posture_angles, state_postures
@@ -49,7 +50,7 @@ def main() -> None:
     report = Report("Constrained prediction", args.out)
     performances = [performance(seed) for seed in range(12)]
     postures = [state_postures(BODY, states) for states in performances]
-    action = ActionSpace.fit(postures, DIMENSIONS, name="bend", fps=30.0)
+    action = fit_action_space(postures, DIMENSIONS, name="bend", fps=30.0)
     std = constant_velocity_std(BODY, performances)
     sizes = (20, 40) if args.quick else PARTICLES
     frames(action, std, sizes, args.runs, report)

@@ -39,9 +39,10 @@ from benchmarks.speed._timing import (
     take_turns,
 )
 from torchpose.body import body_joints, fit_body, fit_state
+from torchpose.learning import fit_gplvm, fit_gplvm_noise
+from torchpose.learning.gplvm_fit import GPLVMFit
+from torchpose.learning.manifolds import thin
 from torchpose.priors import BackConstrainedGPLVM
-from torchpose.priors.manifold.fit import GPLVMFit
-from torchpose.priors.manifold.pose_sequences import thin
 
 FRAMES, COLUMNS, CYCLE = 350, 30, 66
 SIZES = (500, 10_000)
@@ -76,7 +77,7 @@ def main() -> None:
     report = Report("A manifold: prediction and fit", args.out)
     frames, sizes = (40, (60,)) if args.quick else (FRAMES, SIZES)
     poses = walk(frames)
-    manifold = BackConstrainedGPLVM.fit(poses, steps=3)
+    manifold = fit_gplvm(poses, steps=3)
     limits, failed, rows, ratios = measure_limits(args.quick), False, [], []
     for count in sizes:
         z = latent_points(manifold, count)
@@ -248,7 +249,7 @@ def fit_rows(poses: Tensor, manifold: BackConstrainedGPLVM, args: Any) -> list[l
     timings = take_turns(cases, runs)
     whole = Case(
         "torchpose, whole fit (3 steps of 10 L-BFGS iterations)",
-        lambda: BackConstrainedGPLVM.fit(poses, steps=3),
+        lambda: fit_gplvm(poses, steps=3),
     )
     timings += take_turns([whole], runs)
     found = []
@@ -307,8 +308,8 @@ def held_out_tables(args: Any, report: Report) -> None:
     )
     rows = []
     for person, walks in people.items():
-        manifold = BackConstrainedGPLVM.fit(thin(walks.train, TRAINED), validation=walks.validation)
-        manifold.fit_noise(walks.validation, 60.0)
+        manifold = fit_gplvm(thin(walks.train, TRAINED), validation=walks.validation)
+        fit_gplvm_noise(manifold, walks.validation, 60.0)
         pose, step = (x.square().mean().sqrt() for x in (manifold.std_pose, manifold.std_step))
         latent = " ".join(f"{value:.3f}" for value in manifold.std_latent.tolist())
         rows.append([person, f"{pose:.4f}", f"{step:.4f}", f"{pose / step:.2f}", latent])
@@ -364,7 +365,7 @@ def errors_of_walks(
     """Of the test poses, and of the same where g is given noisy ones."""
     train = [torch.cat(walks.train)[:TRAINED]] if row else thin(walks.train, TRAINED)
     watched = walks.validation if validation else None
-    manifold = BackConstrainedGPLVM.fit(train, validation=watched, **options)
+    manifold = fit_gplvm(train, validation=watched, **options)
     noise = torch.randn(walks.test.shape, generator=torch.Generator().manual_seed(0))
     noisy = walks.test - manifold.reconstruct(walks.test + NOISE * noise.double())
     return manifold.reconstruction_error(walks.test), float(noisy.square().mean().sqrt())

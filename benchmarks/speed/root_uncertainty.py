@@ -30,6 +30,7 @@ from benchmarks.speed._timing import (
 from benchmarks.speed.silhouettes import make_rig
 from torchpose.body import BODY_15, Body, Limbs
 from torchpose.camera import CameraRig
+from torchpose.learning import fit_limb_conditionals
 from torchpose.math import sigma_points
 from torchpose.math.tree_messages import propagate
 from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
@@ -119,7 +120,7 @@ def make_scene(height: int, width: int) -> Scene:
     swing[:, :6] = 0
     swing[:, 1] = 0.93
     body, recorded = in_body_frame([(upright, [swing])])
-    conditionals = LimbConditionals.fit(body, recorded, FPS)
+    conditionals = fit_limb_conditionals(body, recorded, FPS)
     rig = make_rig(CAMERAS, height, width)
     state = recorded[0][30]
     return Scene(body, conditionals, rig, state, render(body, state, rig, height, width)[None])

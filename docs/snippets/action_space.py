@@ -3,9 +3,10 @@ import math
 import torch
 
 from torchpose.body import BODY_15, Body, body_joints
-from torchpose.priors import ActionBank, ActionSpace
+from torchpose.learning import fit_action_space
+from torchpose.learning.performances import repetition_axis, split_repetitions
+from torchpose.priors import ActionBank
 from torchpose.priors.actions.postures import posture_angles, posture_to_state
-from torchpose.priors.actions.repetitions import repetition_axis, split_repetitions
 
 
 def somebody(
@@ -30,7 +31,7 @@ for name, action in (("bend", bend), ("raise arms", raise_arms)):
     postures = [posture_angles(joints) for joints in recordings]  # [T, 36], degrees
     axis = repetition_axis(postures)
     performances = [p[part] for p in postures for part in split_repetitions(p, 30.0, axis)]
-    spaces.append(ActionSpace.fit(performances, 3, name=name, fps=30.0))
+    spaces.append(fit_action_space(performances, 3, name=name, fps=30.0))
 
 # the gate: is a posture one of the action, and the nearest one that is
 space, generator = spaces[0], torch.Generator().manual_seed(0)

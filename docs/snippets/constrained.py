@@ -4,7 +4,7 @@ import torch
 
 from torchpose.body import BODY_15, Body
 from torchpose.camera import PinholeCamera
-from torchpose.priors import ActionSpace
+from torchpose.learning import fit_action_space
 from torchpose.priors.actions.postures import state_postures
 from torchpose.whole_body import ConstrainedParticleFilter, constant_velocity_std, render
 
@@ -20,7 +20,7 @@ def bend(depth, sway):  # stand-ins for recordings: states [T, D] of somebody wh
 
 
 recorded = [bend(0.4 + 0.05 * i, 0.03 * (-1) ** i) for i in range(6)]
-action = ActionSpace.fit(
+action = fit_action_space(
     [state_postures(body, states) for states in recorded], 2, name="bend", fps=30
 )
 

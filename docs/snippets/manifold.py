@@ -3,8 +3,9 @@ import math
 import torch
 
 from torchpose.body import BODY_15, Body, fit_body, fit_state
-from torchpose.priors import BackConstrainedGPLVM, ManifoldInfo
-from torchpose.priors.manifold.pose_sequences import thin
+from torchpose.learning import fit_gplvm, fit_gplvm_noise
+from torchpose.learning.manifolds import thin
+from torchpose.priors import ManifoldInfo
 
 # recordings of one person; here legs that walk, in yours joints [T, 15, 3] of `read_mocap`
 body = Body.of_height(BODY_15, 1.75)
@@ -17,10 +18,10 @@ trials = [body.joints(scale * states) for scale in (1.0, 0.9, 1.1)]
 
 body = fit_body(torch.cat(trials))
 poses = [body.relative(fit_state(body, joints)) for joints in trials]
-manifold = BackConstrainedGPLVM.fit(
+manifold = fit_gplvm(
     thin(poses[:-1], 60), validation=poses[-1:], info=ManifoldInfo.of_body(body, name="walk")
 )
-manifold.fit_noise(poses[-1:], fps=60.0)  # the three standard deviations
+fit_gplvm_noise(manifold, poses[-1:], fps=60.0)  # the three standard deviations
 
 z = manifold.to_latent(poses[0])  # [T, 2]
 mean, variance = manifold.to_pose(z)  # [T, 30] and [T]

@@ -4,7 +4,8 @@ import torch
 
 from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, PinholeCamera
-from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
+from torchpose.learning import fit_limb_conditionals
+from torchpose.priors.limb_conditionals import in_body_frame
 from torchpose.whole_body import RootUncertaintyTracker, render
 
 # recorded states of a person; here legs that walk, in yours `fit_state` of `read_mocap`
@@ -16,7 +17,7 @@ for side, sign in (("left", 1.0), ("right", -1.0)):
     recorded[:, 3 + 3 * BODY_15.part(f"{side}_shank")] = 0.2 + 0.1 * sign * phase.cos()
 
 body, states = in_body_frame([(person, [recorded])])  # rotations against the root, safe centres
-conditionals = LimbConditionals.fit(body, states, fps=60.0)  # (DX 3), (DX 14)
+conditionals = fit_limb_conditionals(body, states, fps=60.0)  # (DX 3), (DX 14)
 
 cameras = CameraRig(
     [

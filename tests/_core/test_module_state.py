@@ -21,12 +21,13 @@ from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walk
 from torchpose import body, filters, measure, priors, whole_body
 from torchpose.body import Body, JointLimits
 from torchpose.camera import PinholeCamera
+from torchpose.learning import fit_gplvm, fit_gplvm_noise, fit_limb_conditionals
 from torchpose.measure.association import HandAssociation
 from torchpose.measure.brightness_background import BrightnessBackground
 from torchpose.measure.persons import PersonRegister
-from torchpose.priors import ActionBank, BackConstrainedGPLVM
+from torchpose.priors import ActionBank
 from torchpose.priors.actions.part_postures import PartPostures
-from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
+from torchpose.priors.limb_conditionals import in_body_frame
 from torchpose.upper_body.fusion import MotionStage
 from torchpose.whole_body.filters.posture_gate import PostureGate
 
@@ -73,8 +74,8 @@ def scene(seed, n=4):
 
 def manifold(seed):
     poses = walk(walker(), 40, seed=seed, phase=seed)[:, 6:]
-    made = BackConstrainedGPLVM.fit(poses, steps=1, n_init=1)
-    made.fit_noise(walk(walker(), 30, seed=seed + 5)[:, 6:], 60.0)
+    made = fit_gplvm(poses, steps=1, n_init=1)
+    fit_gplvm_noise(made, walk(walker(), 30, seed=seed + 5)[:, 6:], 60.0)
     return made
 
 
@@ -86,7 +87,7 @@ def walks(seed):
 
 
 def limbs(seed):
-    return LimbConditionals.fit(*walks(seed), 60.0)
+    return fit_limb_conditionals(*walks(seed), 60.0)
 
 
 def actions(seed):
@@ -94,7 +95,7 @@ def actions(seed):
 
 
 def bank(seed):
-    other = priors.ActionSpace.fit(performances("wave", first=50 * seed), 4, name="wave", fps=30.0)
+    other = priors.fit_action_space(performances("wave", first=50 * seed), 4, name="wave", fps=30.0)
     return ActionBank([space("bend"), other])
 
 
@@ -122,7 +123,7 @@ def follow(tracker):
 def root_tracker(seed):
     own, _ = walks(1)
     own = own.altered(radii=own.radii * (1 + 0.1 * seed))
-    learnt = LimbConditionals.fit(own, [0.9 * seed * s for s in walks(1)[1]], 60.0)
+    learnt = fit_limb_conditionals(own, [0.9 * seed * s for s in walks(1)[1]], 60.0)
     return whole_body.RootUncertaintyTracker(own, learnt, 10, fps=60.0, step_std=0.01 * seed)
 
 

@@ -10,8 +10,9 @@ from tests.cli.conftest import keypoints
 from torchpose.body import BODY_15, Body
 from torchpose.camera import PinholeCamera
 from torchpose.io import write_keypoints
-from torchpose.priors import ActionBank, ActionInfo, ActionSpace, BackConstrainedGPLVM, ManifoldInfo
-from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
+from torchpose.learning import fit_action_space, fit_gplvm, fit_limb_conditionals
+from torchpose.priors import ActionBank, ActionInfo, ManifoldInfo
+from torchpose.priors.limb_conditionals import in_body_frame
 from torchpose.whole_body import BodyPoses
 
 
@@ -66,22 +67,20 @@ def test_what_body_trackers_learn(torchpose, tmp_path):
     states = 0.1 * torch.randn(60, body.dim, generator=g, dtype=torch.float64)
     about = {"name": "walk", "persons": ("set#p1", "set#p2"), "licence": "free"}
     own, moved = in_body_frame([(body, [states])])
-    limbs = LimbConditionals.fit(own, moved, 60.0, **about).at_rate(30.0)
+    limbs = fit_limb_conditionals(own, moved, 60.0, **about).at_rate(30.0)
     held_out = {"frames": 7, "deviation": 1.25, "speed": 2.0}
     limbs.info = replace(limbs.info, extra={"held_out": held_out})
     limbs.save(tmp_path / "limbs.safetensors")
     wave = torch.linspace(0, 6, 40, dtype=torch.float64)[:, None].sin()
     turns = 30 * torch.rand(5, 1, 36, generator=g, dtype=torch.float64)
     spaces = [
-        ActionSpace.fit([wave * k * turn for turn in turns], 3, name=name, fps=30.0,
+        fit_action_space([wave * k * turn for turn in turns], 3, name=name, fps=30.0,
                         info=ActionInfo(persons=("set#p1",), extra={"accepted": 0.5}))
         for name, k in (("bend", 1.0), ("wave", -0.5))
     ]  # fmt: skip
     spaces[0].save(tmp_path / "bend.safetensors")
     ActionBank(spaces, gate_dimensions=2).save(tmp_path / "bank.safetensors")
-    manifold = BackConstrainedGPLVM.fit(
-        body.relative(states), steps=1, info=ManifoldInfo.of_body(body, **about)
-    )
+    manifold = fit_gplvm(body.relative(states), steps=1, info=ManifoldInfo.of_body(body, **about))
     manifold.save(tmp_path / "manifold.safetensors")
     expected = {
         "limbs": ("walk", "30, learnt at 60", "left_shank on left_thigh:", "2: set#p1, set#p2",

@@ -9,9 +9,10 @@ from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, PinholeCamera, load_cameras, save_cameras
 from torchpose.cli import main
 from torchpose.cli.track_body_output import action_text
-from torchpose.priors import ActionBank, ActionSpace, BackConstrainedGPLVM, ManifoldInfo
+from torchpose.learning import fit_action_space, fit_gplvm, fit_gplvm_noise, fit_limb_conditionals
+from torchpose.priors import ActionBank, ManifoldInfo
 from torchpose.priors.actions.postures import state_postures
-from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
+from torchpose.priors.limb_conditionals import in_body_frame
 from torchpose.video import VideoWriter
 from torchpose.whole_body import BodyPoses, BodyTracker, render
 
@@ -163,8 +164,8 @@ def rising_arms_manifold(body, fps=60.0):
             states[:, 3 + 3 * part + 2] = sign * (0.2 + height * phase.sin())
             states[:, 3 + 3 * part] = 0.1 * phase.cos()
         trials.append(body.relative(states))
-    manifold = BackConstrainedGPLVM.fit(trials[0], info=ManifoldInfo.of_body(body, name="arms"))
-    return manifold.fit_noise(trials[1], fps)
+    manifold = fit_gplvm(trials[0], info=ManifoldInfo.of_body(body, name="arms"))
+    return fit_gplvm_noise(manifold, trials[1], fps)
 
 
 def test_a_manifold_of_the_motion(recorded, tmp_path, capsys):
@@ -199,7 +200,7 @@ def limbs_of_rising_arms(body, fps=60.0):
         )
         recorded.append(states)
     body, states = in_body_frame([(body, recorded)])
-    return LimbConditionals.fit(body, states, fps, name="arms")
+    return fit_limb_conditionals(body, states, fps, name="arms")
 
 
 def bank_of_arms(body):
@@ -218,7 +219,7 @@ def bank_of_arms(body):
                     0.05 + (0.4 + 0.02 * person) * phase
                 )
             performances.append(state_postures(body, states))
-        spaces.append(ActionSpace.fit(performances, 2, name=name, fps=30.0))
+        spaces.append(fit_action_space(performances, 2, name=name, fps=30.0))
     return ActionBank(spaces)
 
 

@@ -25,15 +25,15 @@ from tests.priors.motions import motion
 from tests.priors.performances import performances
 from torchpose.body import BODY_15, Body, centres_of
 from torchpose.camera import PinholeCamera, save_cameras
+from torchpose.learning import fit_action_space, fit_gplvm, fit_limb_conditionals
 from torchpose.priors import (
     ActionBank,
     ActionSpace,
-    BackConstrainedGPLVM,
     ManifoldInfo,
     PriorInfo,
     UpperBodyPrior,
 )
-from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
+from torchpose.priors.limb_conditionals import in_body_frame
 from torchpose.skeleton import SKELETONS, UPPER_BODY
 from torchpose.upper_body import PoseTrack
 from torchpose.upper_body.bvh import write_bvh
@@ -191,7 +191,7 @@ def _cameras(path: Path) -> None:
 def _manifold(path: Path) -> None:
     body = Body.of_height(BODY_15, 1.7)
     info = ManifoldInfo.of_body(body, name="walk", fps=60.0, persons=("a",))
-    BackConstrainedGPLVM.fit([motion(20), motion(15)], steps=1, info=info).save(path)
+    fit_gplvm([motion(20), motion(15)], steps=1, info=info).save(path)
 
 
 def _limbs(path: Path) -> None:
@@ -199,11 +199,11 @@ def _limbs(path: Path) -> None:
     body = Body.of_height(BODY_15, 1.75)
     states = 0.1 * torch.randn(60, body.dim, generator=g, dtype=torch.float64)
     own, moved = in_body_frame([(body, [states])])
-    LimbConditionals.fit(own, moved, 60.0, name="walk", persons=("a",)).save(path)
+    fit_limb_conditionals(own, moved, 60.0, name="walk", persons=("a",)).save(path)
 
 
 def _spaces() -> list[ActionSpace]:
-    return [ActionSpace.fit(performances(6, i), 3, name=f"action {i}", fps=30.0) for i in range(2)]
+    return [fit_action_space(performances(6, i), 3, name=f"action {i}", fps=30.0) for i in range(2)]
 
 
 def _azure(_: Path) -> bytes:

@@ -9,6 +9,7 @@ import torch
 
 from tests.priors.performances import performances
 from torchpose.errors import FileFormatError, InputError, ShapeError
+from torchpose.learning import fit_action_space
 from torchpose.learning.action_recognition import Performed, recognition_of_unseen
 from torchpose.priors import ActionBank, ActionSpace
 from torchpose.priors.actions.gate import match_postures
@@ -19,7 +20,7 @@ SIZES = (6, 4, 5)
 @pytest.fixture(scope="module")
 def spaces() -> list[ActionSpace]:
     return [
-        ActionSpace.fit(performances(15, i, 30 + 8 * i, seed=i), d, name=f"action {i}", fps=30.0)
+        fit_action_space(performances(15, i, 30 + 8 * i, seed=i), d, name=f"action {i}", fps=30.0)
         for i, d in enumerate(SIZES)
     ]
 
@@ -210,8 +211,8 @@ def test_float32(spaces):
 
 
 def test_bad_input(bank, spaces):
-    other = ActionSpace.fit(performances(5), 4, name="slow", fps=15.0)
-    unnamed = ActionSpace.fit(performances(5), 4, fps=30.0)
+    other = fit_action_space(performances(5), 4, name="slow", fps=15.0)
+    unnamed = fit_action_space(performances(5), 4, fps=30.0)
     for bad, message in (
         ([], "got none"),
         ([spaces[0], spaces[0]], "names of their own"),
@@ -234,6 +235,6 @@ def test_bad_input(bank, spaces):
         bank.recognise(torch.full((2, 36), torch.nan).double())
     with pytest.raises(InputError, match="fps must be positive"):
         bank.recognise(torch.zeros(2, 36).double(), fps=0.0)
-    named = ActionSpace.fit(performances(5), 4, name="bend")
+    named = fit_action_space(performances(5), 4, name="bend")
     with pytest.raises(InputError, match="without a frame rate"):
         ActionBank([named]).recognise(torch.zeros(2, 36).double())

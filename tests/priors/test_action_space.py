@@ -10,16 +10,18 @@ from tests.data import data_dir_or_skip
 from tests.priors.performances import performances
 from torchpose.body import BODY_15, Body
 from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError, SkeletonError
+from torchpose.learning import fit_action_space
+from torchpose.learning.action_spaces import fit_synchronised
+from torchpose.learning.performances import repetition_axis, split_repetitions
 from torchpose.priors import ActionInfo, ActionSpace
 from torchpose.priors.actions.gate import match_postures
 from torchpose.priors.actions.polar_limbs import LIMBS_12
 from torchpose.priors.actions.postures import normalise_postures, recorded_postures, state_postures
-from torchpose.priors.actions.repetitions import repetition_axis, split_repetitions
 
 
 @pytest.fixture(scope="module")
 def space() -> ActionSpace:
-    return ActionSpace.fit(performances(30), 6, name="bend", fps=30.0)
+    return fit_action_space(performances(30), 6, name="bend", fps=30.0)
 
 
 def test_the_axes_are_those_of_a_principal_component_analysis(space):
@@ -44,7 +46,7 @@ def test_the_axes_are_those_of_a_principal_component_analysis(space):
 
 
 def test_mean_performance_and_deviation_are_those_of_the_synchronised_ones():
-    one, found = ActionSpace.fit_synchronised(performances(30), 6)
+    one, found = fit_synchronised(performances(30), 6)
     torch.testing.assert_close(one.performance, found.after.mean(0))
     off = found.after - one.performance
     torch.testing.assert_close(one.match_std, off.square().mean((0, 1)).sqrt())
@@ -55,7 +57,7 @@ def test_mean_performance_and_deviation_are_those_of_the_synchronised_ones():
 
 
 def test_with_dimensions_is_the_fit_of_as_many(space):
-    small = ActionSpace.fit(performances(30), 3, name="bend", fps=30.0)
+    small = fit_action_space(performances(30), 3, name="bend", fps=30.0)
     cut = space.with_dimensions(3)
     for name, value in small.state_dict().items():
         torch.testing.assert_close(cut.state_dict()[name], value, msg=name)
@@ -105,7 +107,7 @@ def test_the_gate(space):
 def test_clamped_postures_are_postures_of_a_body():
     body = Body.of_height(BODY_15, 1.75)
     moves = [torch.nn.functional.pad(0.004 * p[:, :30], (6, 0)) for p in performances(12)]
-    one = ActionSpace.fit([state_postures(body, states) for states in moves], 6)
+    one = fit_action_space([state_postures(body, states) for states in moves], 6)
     generator = torch.Generator().manual_seed(0)
     shaken = torch.cat(moves[:5])
     shaken = shaken + 0.04 * torch.randn(shaken.shape, generator=generator, dtype=torch.float64)
@@ -137,7 +139,7 @@ def test_perfectly_matched_postures_pass_as_often_as_gaussians_do(d):
 
 def test_any_batch_shape_and_dtype(space):
     z = torch.randn(2, 3, 4, 6)
-    single = ActionSpace.fit(performances(30), 6).float()
+    single = fit_action_space(performances(30), 6).float()
     j = single.match(z, torch.Generator().manual_seed(0))
     assert j.shape == (2, 3, 4) and single.clamp(z, j).dtype == torch.float32
     assert single.inside(z, j).shape == (2, 3, 4)
@@ -171,16 +173,16 @@ def test_limbs_of_other_names(space):
 def test_fewer_dimensions_than_asked_for_are_said():
     flat = [p @ torch.diag(torch.tensor([1.0] * 4 + [0.0] * 32)).double() for p in performances(5)]
     with pytest.warns(UserWarning, match="bend span 4 dimensions, fewer than the 13"):
-        found = ActionSpace.fit(flat, 13, name="bend")
+        found = fit_action_space(flat, 13, name="bend")
     assert found.n_dimensions == 4
     with pytest.warns(UserWarning, match="fewer than the 99"):
-        assert ActionSpace.fit(performances(5), 99).n_dimensions == 36
+        assert fit_action_space(performances(5), 99).n_dimensions == 36
 
 
 def test_deviations_have_a_floor():
     one = performances(1, noise=0.0)[0]
     nearly = [one, one + 1e-9, one - 1e-9]
-    found = ActionSpace.fit(nearly, 2)
+    found = fit_action_space(nearly, 2)
     assert float(found.std.min()) >= 0.01 and float(found.match_std.min()) == 0.1
 
 
@@ -196,15 +198,15 @@ def test_bad_input(space):
         ([good[0][:3], good[1][:3]], "performance 0 has 3 frames"),  # not that D is reduced
     ):
         with pytest.raises(InputError, match=message):
-            ActionSpace.fit(bad)
+            fit_action_space(bad)
     with pytest.raises(ShapeError, match="performance 1"):
-        ActionSpace.fit([good[0], good[1][:, :30]])
+        fit_action_space([good[0], good[1][:, :30]])
     for count in (0, -2):
         with pytest.raises(InputError, match=f"n_dimensions must be at least 1, got {count}"):
-            ActionSpace.fit(good, count)
+            fit_action_space(good, count)
     for fps in (0.0, math.inf):
         with pytest.raises(InputError, match="fps must be positive"):
-            ActionSpace.fit(good, fps=fps)
+            fit_action_space(good, fps=fps)
     for count in (0, 7):
         with pytest.raises(InputError, match="from 1 to 6 dimensions"):
             space.with_dimensions(count)
@@ -240,7 +242,7 @@ def test_bends_of_an_unseen_person_pass_the_gate_about_as_often_as_they_should()
     assert [len(parts) for parts in cut] == [5] * len(files)  # each was asked for five
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = ActionSpace.fit([p for parts in cut[3:] for p in parts], 13, name="bend", fps=30.0)
+        found = fit_action_space([p for parts in cut[3:] for p in parts], 13, name="bend", fps=30.0)
     assert len(found.info.key_frames) == 5 and 60 < found.n_postures < 95
     one = found.acceptance(torch.cat([p for parts in cut[3:] for p in parts]))
     other = found.with_dimensions(8).acceptance(torch.cat(cut[0]), width=3.0)

@@ -16,10 +16,11 @@ from tests.data import data_dir_or_skip
 from tests.priors.motions import CYCLE, NOISE, motion
 from torchpose.body import BODY_15, Body, body_joints, fit_body, fit_state
 from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError
+from torchpose.learning import fit_gplvm, fit_gplvm_noise
+from torchpose.learning.gplvm_fit import GPLVMFit, median_gamma, run_fit
+from torchpose.learning.manifolds import gplvm_of_fit, thin
 from torchpose.priors import BackConstrainedGPLVM, ManifoldInfo
-from torchpose.priors.manifold.fit import GPLVMFit, median_gamma, run_fit
-from torchpose.priors.manifold.kernel import KernelParameters
-from torchpose.priors.manifold.pose_sequences import thin
+from torchpose.priors.manifold.prediction import KernelParameters
 
 FACTS = {"name": "walk", "fps": 60.0, "persons": ("a#1",), "sequences": ("one", "two")}
 
@@ -44,8 +45,8 @@ def body() -> Body:
 def manifold(body) -> BackConstrainedGPLVM:
     info = ManifoldInfo.of_body(body, **FACTS)
     poses = [motion(90), motion(70, phase=2.0, seed=1)]
-    fitted = BackConstrainedGPLVM.fit(poses, steps=12, info=info)
-    return fitted.fit_noise(motion(150, phase=1.0, seed=2), 60.0)
+    fitted = fit_gplvm(poses, steps=12, info=info)
+    return fit_gplvm_noise(fitted, motion(150, phase=1.0, seed=2), 60.0)
 
 
 # --- prediction
@@ -139,7 +140,7 @@ def test_neighbours_in_time_are_neighbours_in_latent_space(manifold) -> None:
 
 def test_latent_axes_are_principal_and_do_not_depend_on_the_optimiser() -> None:
     poses = motion(60)
-    one = BackConstrainedGPLVM.fit(poses, steps=6)
+    one = fit_gplvm(poses, steps=6)
     centred = one.latents - one.latents.mean(0)
     products = centred.T @ centred
     assert abs(float(products[0, 1])) < 1e-8 * float(products[0, 0])
@@ -150,8 +151,8 @@ def test_latent_axes_are_principal_and_do_not_depend_on_the_optimiser() -> None:
 def test_units_do_not_matter() -> None:
     """Degrees instead of quaternion vectors: gamma_x and beta follow the data."""
     poses = motion(60)
-    one = BackConstrainedGPLVM.fit(poses, steps=4)
-    other = BackConstrainedGPLVM.fit(100 * poses, steps=4)
+    one = fit_gplvm(poses, steps=4)
+    other = fit_gplvm(100 * poses, steps=4)
     assert float(other.gamma_x) == pytest.approx(1e-4 * float(one.gamma_x))
     test = motion(30, seed=3)
     torch.testing.assert_close(
@@ -162,8 +163,8 @@ def test_units_do_not_matter() -> None:
 def test_standardised_columns_weigh_the_same() -> None:
     poses = motion(60)
     poses[:, 0] *= 50
-    plain = BackConstrainedGPLVM.fit(poses, steps=8)
-    scaled = BackConstrainedGPLVM.fit(poses, steps=8, standardise=True)
+    plain = fit_gplvm(poses, steps=8)
+    scaled = fit_gplvm(poses, steps=8, standardise=True)
     assert torch.equal(plain.scale, torch.ones(30).double())
     torch.testing.assert_close(scaled.scale[0], poses[:, 0].std(), rtol=1e-6, atol=0)
     test = motion(60, seed=4)
@@ -175,14 +176,11 @@ def test_standardised_columns_weigh_the_same() -> None:
 def test_validation_poses_end_a_fit_where_they_come_back_best() -> None:
     poses, other = motion(60, noise=0.05), motion(60, phase=0.5, seed=3, noise=0.05)
     errors = [
-        BackConstrainedGPLVM.fit(poses, steps=n, tolerance=0).reconstruction_error(other)
-        for n in range(1, 9)
+        fit_gplvm(poses, steps=n, tolerance=0).reconstruction_error(other) for n in range(1, 9)
     ]
-    found = BackConstrainedGPLVM.fit(
-        poses, steps=8, tolerance=0, validation=other, patience=8, n_init=1
-    )
+    found = fit_gplvm(poses, steps=8, tolerance=0, validation=other, patience=8, n_init=1)
     assert found.reconstruction_error(other) == pytest.approx(min(errors), rel=1e-6)
-    early = BackConstrainedGPLVM.fit(poses, tolerance=0, validation=[other], patience=1, n_init=1)
+    early = fit_gplvm(poses, tolerance=0, validation=[other], patience=1, n_init=1)
     first = next(n for n in range(1, 9) if n == 8 or errors[n] >= errors[n - 1])
     assert early.reconstruction_error(other) == pytest.approx(errors[first - 1], rel=1e-6)
 
@@ -194,11 +192,11 @@ def test_several_starts_keep_the_best() -> None:
         target = poses - poses.mean(0)
         fit = run_fit(GPLVMFit(target, 2, median_gamma(target), start=start), 3)
         scale = torch.ones(30, dtype=torch.float64)
-        each.append((fit.history[-1], BackConstrainedGPLVM.from_fit(fit, poses, [50], scale)))
-    best = BackConstrainedGPLVM.fit(poses, steps=3, n_init=3)
+        each.append((fit.history[-1], gplvm_of_fit(fit, poses, [50], scale)))
+    best = fit_gplvm(poses, steps=3, n_init=3)
     assert torch.equal(best.latents, max(each, key=lambda one: one[0])[1].latents)
-    watched = BackConstrainedGPLVM.fit(poses, steps=3, n_init=3, validation=other)
-    single = BackConstrainedGPLVM.fit(poses, steps=3, n_init=1, validation=other)
+    watched = fit_gplvm(poses, steps=3, n_init=3, validation=other)
+    single = fit_gplvm(poses, steps=3, n_init=1, validation=other)
     assert watched.reconstruction_error(other) <= single.reconstruction_error(other)
 
 
@@ -214,7 +212,7 @@ def test_poses_are_thinned_evenly() -> None:
 
 def test_deviations_are_of_validation_poses_within_sequences(manifold) -> None:
     poses = [motion(40, seed=20), motion(30, phase=3.0, seed=21)]
-    other = copy.deepcopy(manifold).fit_noise(poses, 30.0)
+    other = fit_gplvm_noise(copy.deepcopy(manifold), poses, 30.0)
     assert other.info.fps == 30.0 and manifold.info.fps == 60.0
     steps = torch.cat([part.diff(dim=0) for part in poses])
     torch.testing.assert_close(other.std_step, steps.square().mean(0).sqrt())
@@ -228,10 +226,10 @@ def test_deviations_are_of_validation_poses_within_sequences(manifold) -> None:
 def test_a_still_column_keeps_a_deviation(manifold) -> None:
     poses = motion(60, noise=0.0)
     poses[:, 3] = 0.1
-    still = BackConstrainedGPLVM.fit(poses, steps=3)
+    still = fit_gplvm(poses, steps=3)
     other = motion(50, phase=1.0, noise=0.0)
     other[:, 3] = 0.1
-    still.fit_noise(other, 60)
+    fit_gplvm_noise(still, other, 60)
     for deviations in (still.std_pose, still.std_step):
         moving = torch.cat([deviations[:3], deviations[4:]])
         assert float(deviations[3]) == pytest.approx(
@@ -241,18 +239,18 @@ def test_a_still_column_keeps_a_deviation(manifold) -> None:
 
 def test_deviations_refuse_poses_that_were_fitted_to(manifold) -> None:
     with pytest.raises(InputError, match="poses that were not fitted to, got some that were"):
-        manifold.fit_noise(motion(90), 60.0)
+        fit_gplvm_noise(manifold, motion(90), 60.0)
     for fps in (0.0, -1.0, math.inf):
         with pytest.raises(InputError, match="fps must be positive"):
-            manifold.fit_noise(motion(20, seed=3), fps)
+            fit_gplvm_noise(manifold, motion(20, seed=3), fps)
     with pytest.raises(InputError, match="a step takes two frames of one sequence"):
-        manifold.fit_noise([motion(1, seed=i) for i in range(30, 42)], 60.0)
+        fit_gplvm_noise(manifold, [motion(1, seed=i) for i in range(30, 42)], 60.0)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 def test_a_gpu_gives_the_same(manifold) -> None:
     poses = [part.cuda() for part in (motion(90), motion(70, phase=2.0, seed=1))]
-    there = BackConstrainedGPLVM.fit(poses, steps=12).fit_noise(motion(50, seed=3).cuda(), 60.0)
+    there = fit_gplvm_noise(fit_gplvm(poses, steps=12), motion(50, seed=3).cuda(), 60.0)
     x = motion(20, seed=8)
     torch.testing.assert_close(
         there.reconstruct(x.cuda()).cpu(), manifold.reconstruct(x), rtol=0, atol=5e-3
@@ -268,28 +266,28 @@ def test_a_gpu_gives_the_same(manifold) -> None:
 
 def test_bad_poses_are_refused(manifold, body) -> None:
     with pytest.raises(InputError, match="at least 10 frames of poses, got 9"):
-        BackConstrainedGPLVM.fit(motion(9))
+        fit_gplvm(motion(9))
     with pytest.raises(InputError, match="at least 10 frames of poses, got 0"):
-        BackConstrainedGPLVM.fit([])
+        fit_gplvm([])
     poses = motion(20)
     poses[7, 4] = math.nan
     with pytest.raises(InputError, match="got nan in frame 7, column 4; 1 such values"):
-        BackConstrainedGPLVM.fit(poses)
+        fit_gplvm(poses)
     named = ManifoldInfo.of_body(body)
     with pytest.raises(InputError, match=r"sequence 1 .* frame 7, column 4 \(head y\)"):
-        BackConstrainedGPLVM.fit([motion(20), poses], info=named)
+        fit_gplvm([motion(20), poses], info=named)
     with pytest.raises(InputError, match="gamma_x cannot be told"):
-        BackConstrainedGPLVM.fit(torch.ones(20, 30).double())
+        fit_gplvm(torch.ones(20, 30).double())
     with pytest.raises(ShapeError, match=r"sequence 1 of the poses must have shape \[T, 30\]"):
-        BackConstrainedGPLVM.fit([motion(20), motion(20)[:, :29]])
+        fit_gplvm([motion(20), motion(20)[:, :29]])
     with pytest.raises(ShapeError, match=r"poses must have shape \[T, 30\], got \[20, 29\]"):
-        manifold.fit_noise(motion(20)[:, :29], 60.0)
+        fit_gplvm_noise(manifold, motion(20)[:, :29], 60.0)
     with pytest.raises(ShapeError, match=r"x must have shape \[..., 30\]"):
         manifold.to_latent(motion(3)[:, :29])
     with pytest.raises(ShapeError, match=r"z must have shape \[..., 2\]"):
         manifold.to_pose(motion(3))
     with pytest.raises(InputError, match="n_init and steps must be at least 1"):
-        BackConstrainedGPLVM.fit(motion(20), steps=0)
+        fit_gplvm(motion(20), steps=0)
 
 
 def test_a_manifold_of_another_body_is_refused(manifold, body) -> None:
@@ -307,11 +305,11 @@ def test_a_manifold_of_another_body_is_refused(manifold, body) -> None:
         manifold.check_for(other)
     with pytest.raises(PriorError, match="are for 60 frames per second, got 30"):
         manifold.check_for(body, fps=30.0)
-    plain = BackConstrainedGPLVM.fit(motion(20), steps=1)
+    plain = fit_gplvm(motion(20), steps=1)
     plain.check_for(body)
     with pytest.raises(PriorError, match="no standard deviations yet; call fit_noise"):
         plain.check_for(body, fps=60.0)
-    narrow = BackConstrainedGPLVM.fit(motion(20)[:, :12], steps=1)
+    narrow = fit_gplvm(motion(20)[:, :12], steps=1)
     with pytest.raises(PriorError, match="it has 12 columns, poses of the body have 30"):
         narrow.check_for(body)
 
@@ -345,7 +343,7 @@ def test_a_file_holds_everything(manifold, tmp_path) -> None:
 
 def test_a_state_dict_brings_its_predictions_along(manifold) -> None:
     poses = [motion(90, seed=30), motion(70, seed=31)]
-    other = BackConstrainedGPLVM.fit(poses, steps=1)
+    other = fit_gplvm(poses, steps=1)
     other.load_state_dict(manifold.state_dict())
     x = motion(20, seed=8)
     assert torch.equal(other.reconstruct(x), manifold.reconstruct(x))
@@ -395,7 +393,7 @@ def test_a_real_walk_is_reconstructed_better_than_by_principal_components() -> N
     poses = [body.relative(fit_state(body, part)) for part in joints]
     train = thin(poses[:4], 250)
     info = ManifoldInfo.of_body(body, fps=60.0)
-    manifold = BackConstrainedGPLVM.fit(train, steps=8, info=info).fit_noise(poses[4:], 60.0)
+    manifold = fit_gplvm_noise(fit_gplvm(train, steps=8, info=info), poses[4:], 60.0)
     manifold.check_for(body, fps=60.0)
     error = rms(poses[4] - manifold.reconstruct(poses[4]))
     assert error < 0.6 * pca_error(torch.cat(train), poses[4])

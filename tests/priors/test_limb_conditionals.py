@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from tests.data import data_dir_or_skip
 from torchpose.body import BODY_15, Body, centres_of, fit_body, fit_state
 from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError, SkeletonError
+from torchpose.learning import fit_limb_conditionals
 from torchpose.math import compose, gaussian_rotate, rotate_gaussian, turn_gaussian
 from torchpose.math.quaternion_vectors import within_unit_ball
 from torchpose.math.tree_messages import propagate
@@ -44,7 +45,7 @@ def sequences(body):
 
 @pytest.fixture(scope="module")
 def conditionals(body, sequences):
-    return LimbConditionals.fit(body, sequences, 50.0, name="noise", persons=("a", "b"))
+    return fit_limb_conditionals(body, sequences, 50.0, name="noise", persons=("a", "b"))
 
 
 def scipy_turns(body, states, part):
@@ -145,9 +146,9 @@ def walks(growth, n_frames=4000):
 @pytest.mark.parametrize("growth", [1, 2])
 def test_the_growth_of_diffusion_is_learnt_and_rescales_it(growth):
     body, states = walks(growth)
-    learnt = LimbConditionals.fit(body, states, 60.0)
+    learnt = fit_limb_conditionals(body, states, 60.0)
     np.testing.assert_allclose(learnt.growth, growth, atol=0.1)
-    slow = LimbConditionals.fit(body, states[::4], 15.0)
+    slow = fit_limb_conditionals(body, states[::4], 15.0)
     size = torch.func.vmap(torch.trace)
     ratio = size(learnt.at_rate(15.0).diffusion) / size(slow.diffusion)
     np.testing.assert_allclose(ratio, 1, atol=0.2)
@@ -174,7 +175,7 @@ def test_several_persons_in_one_frame():
         own.joints(torch.cat(joined[2:])), people[1].joints(states[1]), atol=1e-9, rtol=0
     )
     torch.testing.assert_close(centres_of(body, torch.cat(joined)), body.centres, atol=1e-9, rtol=0)
-    LimbConditionals.fit(body, joined, 60.0).check_for(own)
+    fit_limb_conditionals(body, joined, 60.0).check_for(own)
 
 
 def test_a_file_and_a_state_dict_bring_it_back(conditionals, tmp_path):
@@ -209,7 +210,7 @@ def test_knees_of_recorded_walkers_bend_about_the_knee():
         person = fit_body(torch.cat([clip.joints for clip in clips]))
         persons.append((person, [fit_state(person, clip.joints) for clip in clips]))
     body, sequences = in_body_frame(persons)
-    limbs = LimbConditionals.fit(body, sequences, 60.0)
+    limbs = fit_limb_conditionals(body, sequences, 60.0)
     assert bool((limbs.growth[1:] > 1.3).all())  # limbs swing on
     for side in ("left", "right"):
         edge = PART_TREE.index((f"{side}_thigh", f"{side}_shank"))
@@ -230,7 +231,7 @@ def test_knees_of_recorded_walkers_bend_about_the_knee():
 
 
 def test_bad_input(body, sequences, conditionals):
-    fit = LimbConditionals.fit
+    fit = fit_limb_conditionals
     with pytest.raises(PriorError, match="frame='body', got a body with 'parent'"):
         fit(body.altered(frame="parent"), sequences, 60.0)
     with pytest.raises(PriorError, match="root part 'pelvis' conditions all"):

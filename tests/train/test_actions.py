@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from torchpose.learning import fit_action_space
+
 pytest.importorskip("lightning", reason="lightning is not installed; training needs it")
 
 from tests.priors.performances import performances
@@ -70,7 +72,7 @@ def test_it_is_the_fit_of_the_library(scene, capsys) -> None:
     found = ActionSpace.load(scene.home / "one.safetensors")
     data = Performances.gather([str(scene.folder)], ["action0"], held_out=["p3"])
     assert len(data.train) == 9 and len(data.watched) == 3
-    expected = ActionSpace.fit([p.postures for p in data.train], 5, name="action0", fps=30.0)
+    expected = fit_action_space([p.postures for p in data.train], 5, name="action0", fps=30.0)
     for name, value in expected.state_dict().items():
         assert torch.equal(found.state_dict()[name], value), name
     info = found.info

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from torchpose.learning import fit_limb_conditionals
+
 pytest.importorskip("lightning", reason="lightning is not installed; training needs it")
 
 from torchpose.body import BODY_15, Body
@@ -101,7 +103,7 @@ def test_limbs_come_back_as_they_were_moved(scene, capsys) -> None:
 def test_it_is_the_fit_of_the_library_on_one_body(scene) -> None:
     data = LimbStates.gather([str(scene.folder)], held_out=["p2"], actions=["walk0"])
     assert data.body.frame == "body" and len(data.train) == 2 and len(data.watched) == 1
-    one = LimbConditionals.fit(data.body, data.train, 60.0)
+    one = fit_limb_conditionals(data.body, data.train, 60.0)
     one.check_for(data.body)
     same = held_out_spread(one, data.body, data.train)
     assert same.deviation == pytest.approx(1, abs=0.15)  # the floor of the twist counts as spread

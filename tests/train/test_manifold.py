@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 import torch
 
+from torchpose.learning.manifolds import gplvm_of_fit
+
 pytest.importorskip("lightning", reason="lightning is not installed; training needs it")
 
 from tests.priors.motions import motion
 from torchpose.body import BODY_15, Body
+from torchpose.learning.gplvm_fit import GPLVMFit, median_gamma, run_fit
 from torchpose.learning.recipes import ManifoldFitting
 from torchpose.priors import BackConstrainedGPLVM
-from torchpose.priors.manifold.fit import GPLVMFit, median_gamma, run_fit
 from train.cli import main
 from train.manifold import ManifoldData
 
@@ -90,7 +92,7 @@ def test_it_is_the_fit_of_the_library(scene, whole) -> None:
     errors = []
     for step in range(1, 5):
         run_fit(fit, step, tolerance=-math.inf)
-        one = BackConstrainedGPLVM.from_fit(fit, poses, [30, 30], torch.ones(30).double())
+        one = gplvm_of_fit(fit, poses, [30, 30], torch.ones(30).double())
         errors.append(float((data.watched[0] - one.reconstruct(data.watched[0])).square().mean()))
         if errors[-1] == min(errors):
             best = one

@@ -3,16 +3,17 @@
 import numpy as np
 import pytest
 
+from torchpose.learning.action_spaces import fit_synchronised
+
 pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 
 from tests.priors.performances import performances
 from torchpose.errors import InputError, ShapeError
-from torchpose.priors import ActionSpace
 from torchpose.viz import plot_action_space, save_figure
 
 
 def test_the_picture_shows_performances_mean_and_deviation(tmp_path) -> None:
-    space, steps = ActionSpace.fit_synchronised(performances(8), 5, name="bend")
+    space, steps = fit_synchronised(performances(8), 5, name="bend")
     figure = plot_action_space(space, steps, deviations=2.0)
     axes = np.array(figure.axes).reshape(2, 4)
     for d in range(4):
@@ -33,7 +34,7 @@ def test_the_picture_shows_performances_mean_and_deviation(tmp_path) -> None:
 
 
 def test_bad_input() -> None:
-    space, steps = ActionSpace.fit_synchronised(performances(8), 5)
+    space, steps = fit_synchronised(performances(8), 5)
     with pytest.raises(InputError, match="n_dimensions must be at least 1"):
         plot_action_space(space, steps, n_dimensions=0)
     with pytest.raises(ShapeError, match="postures and dimensions"):

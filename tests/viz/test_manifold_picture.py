@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from torchpose.learning import fit_gplvm
+
 pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 
 from tests.priors.motions import motion
@@ -22,7 +24,7 @@ def body() -> Body:
 def manifold(body) -> BackConstrainedGPLVM:
     info = ManifoldInfo.of_body(body, name="walk", sequences=("a", "b", "a"))
     poses = [motion(80), motion(40, phase=2.0, seed=1), motion(40, phase=1.0, seed=2)]
-    return BackConstrainedGPLVM.fit(poses, steps=5, info=info)
+    return fit_gplvm(poses, steps=5, info=info)
 
 
 def lines(ax) -> list[np.ndarray]:
@@ -68,7 +70,7 @@ def test_other_poses_and_a_body_are_drawn_too(manifold, body, tmp_path) -> None:
 
 
 def test_what_cannot_be_drawn_is_refused(manifold, body) -> None:
-    one = BackConstrainedGPLVM.fit(motion(30), latent_dim=1, steps=1)
+    one = fit_gplvm(motion(30), latent_dim=1, steps=1)
     with pytest.raises(InputError, match="needs two dimensions or more, got 1"):
         plot_manifold(one)
     with pytest.raises(InputError, match="resolution and n_poses must be at least 2"):
@@ -80,6 +82,6 @@ def test_what_cannot_be_drawn_is_refused(manifold, body) -> None:
 
 
 def test_more_than_two_dimensions_show_the_first_two() -> None:
-    three = BackConstrainedGPLVM.fit(motion(40), latent_dim=3, steps=2)
+    three = fit_gplvm(motion(40), latent_dim=3, steps=2)
     ax = plot_manifold(three, resolution=20).axes[0]
     np.testing.assert_allclose(lines(ax)[0], three.latents[:, :2].numpy())

@@ -7,7 +7,8 @@ import torch
 from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.errors import InputError, ShapeError
-from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
+from torchpose.learning import fit_limb_conditionals
+from torchpose.priors.limb_conditionals import in_body_frame
 from torchpose.whole_body import (
     AnnealedParticleFilter,
     BodyFilterState,
@@ -133,7 +134,7 @@ def test_the_root_tracker_tells_the_covariance_of_both(scene, monkeypatch):
     g = torch.Generator().manual_seed(0)
     moves = 0.1 * torch.randn(40, upright.dim, generator=g, dtype=torch.float64)
     body, recorded = in_body_frame([(upright, [moves])])
-    model = RootUncertaintyTracker(body, LimbConditionals.fit(body, recorded, 60.0), 8, fps=60.0)
+    model = RootUncertaintyTracker(body, fit_limb_conditionals(body, recorded, 60.0), 8, fps=60.0)
     start = upright.convert(states[0], body)
 
     def covariance():

@@ -12,7 +12,15 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
-__all__ = ["MODULES", "NAMES", "install", "moved_from", "moved_names", "present_module"]
+__all__ = [
+    "MODULES",
+    "NAMES",
+    "install",
+    "moved_from",
+    "moved_function",
+    "moved_names",
+    "present_module",
+]
 
 MODULES = {
     "arm_filters": "upper_body.single_poses",
@@ -98,7 +106,7 @@ MODULES = {
     "priors.action_bank": "priors.actions.bank",
     "priors.action_chain": "priors.actions.chain",
     "priors.action_file": "priors.actions.file",
-    "priors.action_fit": "priors.actions.fit",
+    "priors.action_fit": "learning.action_spaces",
     "priors.action_gate": "priors.actions.gate",
     "priors.action_recognition": "learning.action_recognition",
     "priors.action_space": "priors.actions.space",
@@ -110,9 +118,9 @@ MODULES = {
     "priors.fine_tuning": "learning.fine_tuning",
     "priors.gmm": "priors.gaussian_mixture",
     "priors.gplvm": "priors.manifold.gplvm",
-    "priors.gplvm_fit": "priors.manifold.fit",
-    "priors.gplvm_kernel": "priors.manifold.kernel",
-    "priors.gplvm_noise": "priors.manifold.noise",
+    "priors.gplvm_fit": "learning.gplvm_fit",
+    "priors.gplvm_kernel": "priors.manifold.prediction",
+    "priors.gplvm_noise": "learning.manifolds",
     "priors.gplvm_prediction": "priors.manifold.prediction",
     "priors.increments": "learning.increments",
     "priors.manifold_file": "priors.manifold.file",
@@ -120,9 +128,9 @@ MODULES = {
     "priors.neck": "skeleton.neck",
     "priors.part_postures": "priors.actions.part_postures",
     "priors.polar_limbs": "priors.actions.polar_limbs",
-    "priors.pose_sequences": "priors.manifold.pose_sequences",
+    "priors.pose_sequences": "learning.manifolds",
     "priors.postures": "priors.actions.postures",
-    "priors.repetitions": "priors.actions.repetitions",
+    "priors.repetitions": "learning.performances",
     "priors.samplers": "learning.samplers",
     "priors.seen_keypoints": "learning.seen_keypoints",
     "priors.selection": "learning.selection",
@@ -130,7 +138,7 @@ MODULES = {
     "priors.start": "math.mixture_start",
     "priors.stepwise_em": "learning.stepwise_em",
     "priors.streamed_em": "learning.streamed_em",
-    "priors.synchronisation": "priors.actions.synchronisation",
+    "priors.synchronisation": "learning.performances",
     "priors.tensor_file": "_core.tensor_file",
     "priors.training": "learning.training",
     "priors.usable_samples": "learning.usable_samples",
@@ -329,6 +337,14 @@ def moved_from(package: str) -> list[tuple[str, str, str]]:
     ]
 
 
+def moved_function(old: str, new: str) -> Callable[..., Any]:
+    """Return the function that a method has become, by its full name, and warn who called the method."""
+    _warn(old, new)
+    home, _, name = new.rpartition(".")
+    function: Callable[..., Any] = getattr(import_module(home), name)
+    return function
+
+
 def install() -> None:
     """Let `import` find modules by their old names."""
     if not any(isinstance(finder, _OldNames) for finder in sys.meta_path):
@@ -338,7 +354,7 @@ def install() -> None:
 def _warn(old: str, new: str) -> None:
     """Warn where the caller of the caller stands; frames of the import machinery do not count."""
     warnings.warn(
-        f"{old} is {new} now; the old path goes with version 0.3.0",
+        f"{old} is {new} now; the old one goes with version 0.3.0",
         DeprecationWarning,
         stacklevel=3,
     )

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.errors import InputError
+from torchpose.learning import fit_action_space
 from torchpose.priors.actions.bank import ActionBank
-from torchpose.priors.actions.space import ActionSpace
 
 __all__ = ["ConfusionTable", "Performed", "recognition_of_unseen"]
 
@@ -83,7 +83,7 @@ def recognition_of_unseen(
                     f"without {person} there are {len(postures)} performances of {action}; two or "
                     "more are needed"
                 )
-            spaces.append(ActionSpace.fit(postures, n_dimensions, name=action, fps=fps))
+            spaces.append(fit_action_space(postures, n_dimensions, name=action, fps=fps))
         bank = ActionBank(spaces, **(settings or {}))
         for recording in (r for r in recordings if r.person == person):
             row = truth.index(recording.action)

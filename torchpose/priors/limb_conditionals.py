@@ -5,7 +5,6 @@ hangs on it; temporal diffusion is one over the rotation of a part from one fram
 are what `torchpose.math.tree_messages` passes messages with.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,24 +15,23 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchpose._core.module_state import derived, register_given
+from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import FileKind, read_tensors, write_tensors
 from torchpose.body.kinematics import Body, centres_of
-from torchpose.body.skeleton import BodySkeleton
 from torchpose.errors import InputError, PriorError, check_finite, check_rate, check_shape
 from torchpose.math.quaternion_vectors import compose, conjugate, vector_to_quaternion
 from torchpose.math.rotation_gaussians import (
-    fit_gaussian,
     left_matrix,
     quaternion_moments,
     right_matrix,
-    safe_centre,
     sigma_quaternions,
     turn_gaussian,
 )
-from torchpose.math.unscented import Directions, floor_eigenvalues
+from torchpose.math.tree_messages import message_tree
+from torchpose.math.unscented import Directions
 
-__all__ = ["PART_TREE", "LimbConditionals", "LimbInfo", "in_body_frame"]
+__all__ = ["PART_TREE", "LimbConditionals", "LimbInfo", "check_body_frame", "in_body_frame"]
 
 _SIDES = ("left", "right")
 PART_TREE: tuple[tuple[str, str], ...] = (
@@ -45,10 +43,7 @@ PART_TREE: tuple[tuple[str, str], ...] = (
 )
 """Parts above and below of every edge (DX, Figure 2); the root sends no messages, it conditions all."""
 
-_LEAST_STD = 0.01  # of a vector: 1.1 degrees, about what joints tell of a rotation
-_MOST_CANDIDATES = 2000  # training rotations that a centre is looked for among
 _SAME_CENTRE = 1e-6  # of a quaternion vector
-_STRIDES = (2, 3, 4)  # frames, over which the growth of diffusion is looked at
 
 
 @dataclass(frozen=True)
@@ -181,65 +176,12 @@ class LimbConditionals(nn.Module):
             register_given(self, name, value)
 
     @classmethod
-    def fit(
-        cls,
-        body: Body,
-        sequences: Tensor | Sequence[Tensor],
-        fps: float,
-        *,
-        edges: Sequence[tuple[str, str]] = PART_TREE,
-        least_std: float = _LEAST_STD,
-        **facts: Any,
-    ) -> "LimbConditionals":
-        """Limb conditionals and diffusion of recorded states.
-
-        The covariance of q_ij is taken about its mean, that of the steps about zero (DX 14).
-
-        Args:
-            body: whose states they are, with ``frame="body"``. States of several persons come from
-                `in_body_frame`: only centres and frame of the body count, not its size.
-            sequences: states [T, D], one tensor per recording without gaps.
-            fps: of all of them.
-            edges: names of the parts above and below.
-            least_std: floor of the standard deviations of q_ij, as an eigenvalue of the covariance:
-                joints tell no twist of a limb, whose variance would be zero.
-            facts: fields of `LimbInfo`.
-
-        Raises:
-            PriorError: a body of another frame, or an edge of the root. InputError: no states, not
-                finite, no two frames in a row, a rate that is not positive. SkeletonError: an
-                unknown part or edges that are no tree. ShapeError: another number of columns.
-        """
-        _check_body_frame(body)
-        _check_rate(fps)
-        parts = [sequences] if isinstance(sequences, Tensor) else list(sequences)
-        turns = [_part_vectors(body, states) for states in parts]  # [T, P, 3] each
-        diffusion = _steps(turns, 1) if turns else None
-        if diffusion is None:
-            raise InputError("limb conditionals need two frames in a row, got none; add recordings")
-        pairs = _edge_indices(body.skeleton, edges).to(body.centres.device)
-        above, below = torch.cat(turns)[:, pairs].unbind(2)
-        between = compose(conjugate(above), below).transpose(0, 1)  # q_ij [E, N, 3]
-        every = -(-between.shape[1] // _MOST_CANDIDATES)
-        centres = safe_centre(between[:, ::every])
-        mean, covariance = fit_gaussian(between, centres)
-        info = LimbInfo(
-            parts=tuple(body.skeleton.parts),
-            fps=float(fps),
-            fitted_fps=float(fps),
-            n_frames=between.shape[1],
-            **facts,
-        )
-        return cls(
-            info,
-            pairs,
-            mean,
-            floor_eigenvalues(covariance, least_std**2),
-            centres,
-            body.centres.clone(),
-            diffusion,
-            _growth(turns, diffusion),
-        )
+    def fit(cls, *args: Any, **options: Any) -> "LimbConditionals":
+        """Fit limbs. Deprecated: `torchpose.learning.fit_limb_conditionals`, with the same arguments."""
+        # learning is a layer above: until this goes, it is looked up by its name
+        name = "torchpose.learning.fit_limb_conditionals"
+        limbs: LimbConditionals = moved_function("LimbConditionals.fit", name)(*args, **options)
+        return limbs
 
     # --- messages -----------------------------------------------------------------------------
 
@@ -307,7 +249,7 @@ class LimbConditionals(nn.Module):
         Raises:
             InputError: a rate that is not positive.
         """
-        _check_rate(fps)
+        check_rate("fps", fps)
         tensors = {name: value.clone() for name, value in self._tensors().items()}
         exponent = tensors["growth"] if growth is None else torch.full_like(self.growth, growth)
         tensors["diffusion"] *= ((self.info.fps / fps) ** exponent)[:, None, None]
@@ -316,7 +258,7 @@ class LimbConditionals(nn.Module):
 
     def check_for(self, body: Body) -> None:
         """Raise `PriorError` unless they are of the parts, frame and centres of a body."""
-        _check_body_frame(body)
+        check_body_frame(body)
         found = []
         if tuple(body.skeleton.parts) != self.info.parts:
             found.append(f"they are of the parts {', '.join(self.info.parts)}")
@@ -410,51 +352,13 @@ def in_body_frame(
 
 def _tree(edges: Tensor, n_parts: int) -> Any:
     """The message tree over the parts that are not the root."""
-    from torchpose.math.tree_messages import message_tree  # the filters import this module
-
     return message_tree(edges.long() - 1, n_parts - 1)
 
 
-def _edge_indices(skeleton: BodySkeleton, edges: Sequence[tuple[str, str]]) -> Tensor:
-    pairs = [[skeleton.part(name) for name in edge] for edge in edges]
-    return torch.tensor(pairs, dtype=torch.long).reshape(-1, 2)
-
-
-def _check_body_frame(body: Body) -> None:
+def check_body_frame(body: Body) -> None:
+    """Raise `PriorError` unless states of a body are relative to its root part."""
     if body.frame != "body":
         raise PriorError(
             f"limb conditionals are of states with frame='body', got a body with {body.frame!r}; "
             "bring body and states into it with in_body_frame"
         )
-
-
-def _check_rate(fps: float) -> None:
-    check_rate("fps", fps)
-
-
-def _steps(turns: Sequence[Tensor], stride: int) -> Tensor | None:
-    """Second moments [P, 3, 3] of the rotations over so many frames; None without such frames."""
-    steps = torch.cat([compose(conjugate(q[:-stride]), q[stride:]) for q in turns])
-    return torch.einsum("npi,npj->pij", steps, steps) / len(steps) if len(steps) else None
-
-
-def _growth(turns: Sequence[Tensor], diffusion: Tensor) -> Tensor:
-    """Exponents g [P] of diffusion over time, by least squares over some strides; 0 to 2."""
-    size = _trace(diffusion)
-    found = [(math.log(k), steps) for k in _STRIDES if (steps := _steps(turns, k)) is not None]
-    if not found:
-        return torch.ones_like(size)
-    logs = [log * (_trace(steps) / size).log() for log, steps in found]
-    slopes = torch.stack(logs).sum(0) / sum(log * log for log, _ in found)
-    return torch.where(size > 0, slopes, torch.ones_like(size)).clamp(0, 2)
-
-
-def _trace(matrices: Tensor) -> Tensor:
-    return matrices.diagonal(dim1=-2, dim2=-1).sum(-1)
-
-
-def _part_vectors(body: Body, states: Tensor) -> Tensor:
-    """Rotations of the parts [T, P, 3] without centres: the root's in the world, others in its axes."""
-    check_shape("states", states, [None, body.dim])
-    check_finite("states", states, hint="end the sequence where the recording has a gap")
-    return compose(body.centres, states[:, 3:].unflatten(-1, (-1, 3)))

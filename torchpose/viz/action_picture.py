@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from torchpose.priors.actions.file import Synchronised
     from torchpose.priors.actions.space import ActionSpace
-    from torchpose.priors.actions.synchronisation import Synchronised
 else:
     Axes = Figure = ActionSpace = Synchronised = Any
 
@@ -47,7 +47,7 @@ def plot_action_space(
     either side of it; upright lines stand at the key frames.
 
     Args:
-        space: the fitted action. synchronised: its performances, of `ActionSpace.fit_synchronised`.
+        space: the fitted action. synchronised: its performances, of `fit_synchronised`.
         n_dimensions: that are shown, as many as there are at most. deviations: of the dashed lines.
         title: above the picture; by default the action's name and size.
 

@@ -5,7 +5,7 @@ import math
 import torch
 
 from torchpose.body import BODY_15, Body
-from torchpose.priors import ActionSpace
+from torchpose.learning import fit_action_space
 from torchpose.priors.actions.postures import state_postures
 
 BODY = Body.of_height(BODY_15, 1.75)
@@ -45,4 +45,4 @@ def performances(action, n=8, first=100):
 def space(action, n_dimensions=4):
     """An action learnt from eight performances."""
     postures = [state_postures(BODY, states) for states in performances(action)]
-    return ActionSpace.fit(postures, n_dimensions, name=action, fps=FPS)
+    return fit_action_space(postures, n_dimensions, name=action, fps=FPS)

@@ -9,8 +9,9 @@ import torch
 from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walker
 from torchpose.body import JointLimits
 from torchpose.errors import DegenerateFilterWarning, InputError, PriorError
+from torchpose.learning import fit_limb_conditionals
 from torchpose.math import sigma_points
-from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
+from torchpose.priors.limb_conditionals import in_body_frame
 from torchpose.whole_body import RootUncertaintyTracker, prepare_silhouettes, render
 from torchpose.whole_body.filters.leg_swap import exchange_legs
 from torchpose.whole_body.filters.limb_observations import count_positions, part_log_likelihood
@@ -25,7 +26,7 @@ def scene():
     upright = walker()
     seen = [walk(upright, 120, seed=s, phase=s, speed=0.01) for s in (1, 2)]
     body, states = in_body_frame([(upright, seen)])
-    conditionals = LimbConditionals.fit(body, states, 60.0)
+    conditionals = fit_limb_conditionals(body, states, 60.0)
     truth = upright.convert(walk(upright, FRAMES, speed=0.01), body)
     return body, conditionals, truth, render(body, truth, rig(), HEIGHT, WIDTH)
 

@@ -8,7 +8,7 @@ import torch
 from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walker
 from torchpose.body import JointLimits
 from torchpose.errors import CameraError, PriorError
-from torchpose.priors import BackConstrainedGPLVM
+from torchpose.learning import fit_gplvm, fit_gplvm_noise
 from torchpose.whole_body import (
     AnnealedParticleFilter,
     ManifoldParticleFilter,
@@ -42,8 +42,8 @@ def step_std():
 @pytest.fixture(scope="module")
 def manifold():
     train, validation = walk(BODY, 90, seed=1), walk(BODY, 70, seed=2, phase=0.2)
-    found = BackConstrainedGPLVM.fit(BODY.relative(train), steps=4)
-    return found.fit_noise(BODY.relative(validation), fps=60.0)
+    found = fit_gplvm(BODY.relative(train), steps=4)
+    return fit_gplvm_noise(found, BODY.relative(validation), fps=60.0)
 
 
 def make(kind, step_std, manifold, **options):
@@ -125,13 +125,13 @@ def test_cameras_that_do_not_match(sequence, step_std):
 
 
 def test_a_manifold_of_another_body_is_refused(manifold):
-    other = BackConstrainedGPLVM.fit(walk(BODY, 40)[:, 6:12], steps=1)
-    other.fit_noise(walk(BODY, 40, seed=4)[:, 6:12], fps=60.0)
+    other = fit_gplvm(walk(BODY, 40)[:, 6:12], steps=1)
+    fit_gplvm_noise(other, walk(BODY, 40, seed=4)[:, 6:12], fps=60.0)
     with pytest.raises(PriorError, match="6 columns"):
         ManifoldParticleFilter(BODY, other)
     with pytest.raises(PriorError, match="30"):
         ManifoldParticleFilter(BODY, manifold, fps=30.0)
-    unfinished = BackConstrainedGPLVM.fit(BODY.relative(walk(BODY, 40)), steps=1)
+    unfinished = fit_gplvm(BODY.relative(walk(BODY, 40)), steps=1)
     with pytest.raises(PriorError, match="fit_noise"):
         ManifoldParticleFilter(BODY, unfinished)
 

@@ -16,6 +16,13 @@ from torchpose.body.skeleton import BODY_15
 from torchpose.errors import InputError
 from torchpose.io.recordings import Recording
 from torchpose.learning.action_recognition import Performed
+from torchpose.learning.action_spaces import fit_synchronised
+from torchpose.learning.performances import (
+    LEAST_FRAMES,
+    Synchronised,
+    repetition_axis,
+    split_repetitions,
+)
 from torchpose.learning.recipes.choosing import (
     choose_recordings,
     fingerprint,
@@ -26,9 +33,7 @@ from torchpose.learning.recipes.choosing import (
 from torchpose.priors.actions.bank import ActionBank
 from torchpose.priors.actions.file import ActionInfo, BankInfo
 from torchpose.priors.actions.postures import posture_angles, state_postures
-from torchpose.priors.actions.repetitions import repetition_axis, split_repetitions
 from torchpose.priors.actions.space import ActionSpace
-from torchpose.priors.actions.synchronisation import LEAST_FRAMES, Synchronised
 
 __all__ = ["COMMON_HEIGHT", "ActionRecipe", "FittedActions", "Performances", "fit_actions"]
 
@@ -217,11 +222,11 @@ def fit_actions(performances: Performances, recipe: ActionRecipe) -> FittedActio
     """Fit every action, and try its gate on who is held out.
 
     Raises:
-        InputError: as `ActionSpace.fit`.
+        InputError: as `fit_action_space`.
     """
     spaces, accepted = {}, {}
     for action in performances.actions:
-        spaces[action] = ActionSpace.fit_synchronised(
+        spaces[action] = fit_synchronised(
             [p.postures for p in performances.train if p.action == action], recipe.n_dimensions,
             name=action, fps=performances.fps, n_postures=recipe.n_postures,
             prominence=recipe.prominence, info=performances.facts(action),

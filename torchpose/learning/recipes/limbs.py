@@ -15,6 +15,7 @@ from torchpose.body.fitting import fit_body, fit_state
 from torchpose.body.kinematics import Body, centres_of
 from torchpose.errors import InputError
 from torchpose.io.recordings import Recording
+from torchpose.learning import fit_limb_conditionals
 from torchpose.learning.recipes.choosing import (
     choose_recordings,
     fingerprint,
@@ -110,15 +111,15 @@ def fit_limbs(
 
     Args:
         states: to fit to.
-        least_std: floor of the standard deviations of q_ij, see `LimbConditionals.fit`.
+        least_std: floor of the standard deviations of q_ij, see `fit_limb_conditionals`.
         facts: name, licence, command; those that are empty are left out.
 
     Raises:
-        InputError: `least_std` is negative, and as `LimbConditionals.fit`.
+        InputError: `least_std` is negative, and as `fit_limb_conditionals`.
     """
     check_least_std(least_std)
     given: dict[str, Any] = {name: value for name, value in facts.items() if value}
-    found = LimbConditionals.fit(
+    found = fit_limb_conditionals(
         states.body, states.train, states.fps, least_std=least_std, **origin_of(states.fitted)
     )
     held_out = None

@@ -22,7 +22,10 @@ from torchpose.body.fitting import fit_body, fit_state
 from torchpose.body.kinematics import Body
 from torchpose.errors import InputError, OutputError
 from torchpose.io.recordings import Recording
+from torchpose.learning import fit_gplvm_noise
 from torchpose.learning.curation.duplicates import refuse_shared_recordings
+from torchpose.learning.gplvm_fit import GPLVMFit, median_gamma
+from torchpose.learning.manifolds import column_scale, gplvm_of_fit, join_sequences, thin
 from torchpose.learning.recipes.choosing import (
     choose_recordings,
     fingerprint,
@@ -31,9 +34,7 @@ from torchpose.learning.recipes.choosing import (
     recording_name,
 )
 from torchpose.priors.manifold.file import ManifoldInfo
-from torchpose.priors.manifold.fit import GPLVMFit, median_gamma
 from torchpose.priors.manifold.gplvm import BackConstrainedGPLVM
-from torchpose.priors.manifold.pose_sequences import column_scale, join_sequences, thin
 
 __all__ = [
     "ManifoldFitting",
@@ -55,7 +56,7 @@ class ManifoldRecipe:
         steps: of ten iterations, at most. patience: steps without a better held-out error after
             which it ends.
         start: which principal components to start from: 0 the first ones, see `principal_start`.
-        smoothness: see `GPLVMFit`. standardise: see `BackConstrainedGPLVM.fit`.
+        smoothness: see `GPLVMFit`. standardise: see `fit_gplvm`.
         seed: of the frames whose distances give gamma_x, where there are very many.
 
     Raises:
@@ -207,7 +208,7 @@ class ManifoldFitting(nn.Module):
         self.fit.restore_best()
         given: dict[str, Any] = {name: value for name, value in facts.items() if value}
         found = self._current()
-        found.fit_noise(self.data.watched, self.data.fps)
+        fit_gplvm_noise(found, self.data.watched, self.data.fps)
         extra = {
             "settings": asdict(self.recipe),
             "steps": self.fit.best_step,
@@ -228,9 +229,7 @@ class ManifoldFitting(nn.Module):
         )
 
     def _current(self) -> BackConstrainedGPLVM:
-        return BackConstrainedGPLVM.from_fit(
-            self.fit, self._poses, self._lengths, self._scale, self.data.info
-        ).cpu()
+        return gplvm_of_fit(self.fit, self._poses, self._lengths, self._scale, self.data.info).cpu()
 
 
 def run_to_end(

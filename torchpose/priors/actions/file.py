@@ -1,14 +1,16 @@
-"""What action spaces and banks of them were fitted on, and the files that they are kept in."""
+"""What action spaces and banks were fitted on: performances in step, facts, and the files."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
+
+from torch import Tensor
 
 from torchpose._core.tensor_file import FileKind
 from torchpose.priors.actions.polar_limbs import LIMBS_12
 
-__all__ = ["BANK_FILE", "SPACE_FILE", "ActionInfo", "BankInfo"]
+__all__ = ["BANK_FILE", "SPACE_FILE", "ActionInfo", "BankInfo", "Synchronised"]
 
 _LIMBS = tuple(limb.name for limb in LIMBS_12)
 
@@ -105,3 +107,18 @@ BANK_FILE = FileKind(
     positive=("std", "match_std", "residual_std", "background_std"),
 )
 """Files of `ActionBank`."""
+
+
+class Synchronised(NamedTuple):
+    """Performances with the same number K of postures.
+
+    Attributes:
+        before: [P, K, R], only their lengths normalised. after: [P, K, R], in step.
+        key_frames: indices into the K postures, first and last included.
+        times: [P, K], frame of each performance that the postures of `after` stand for.
+    """
+
+    before: Tensor
+    after: Tensor
+    key_frames: tuple[int, ...]
+    times: Tensor

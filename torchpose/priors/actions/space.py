@@ -3,16 +3,17 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import read_tensors, write_tensors
 from torchpose.errors import InputError, PriorError, check_finite, check_shape
 from torchpose.priors.actions.file import SPACE_FILE, ActionInfo
-from torchpose.priors.actions.fit import fit_action
 from torchpose.priors.actions.gate import (
     CLAMP_ROUNDS,
     GATE_WIDTH,
@@ -24,7 +25,6 @@ from torchpose.priors.actions.gate import (
     passes_any_gate,
 )
 from torchpose.priors.actions.polar_limbs import POSTURE_DIM, check_limbs
-from torchpose.priors.actions.synchronisation import Synchronised
 
 __all__ = [
     "CLAMP_ROUNDS",
@@ -67,10 +67,11 @@ class ActionSpace(nn.Module):
     Reference: Rius, Varona, Roca & Gonzalez, Posture constraints for Bayesian human motion
     tracking, AMDO 2006, section 2 and equations (1) and (6).
 
+    >>> from torchpose.learning import fit_action_space
     >>> t = torch.linspace(0, 3.14, 40, dtype=torch.float64)[:, None]
     >>> sway = torch.rand(1, 36, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     >>> bends = [40 * (1 + 0.1 * i) * t.sin() * sway + 5 * (i * t).cos() for i in range(5)]
-    >>> space = ActionSpace.fit(bends, 2, name="bend", fps=30.0)
+    >>> space = fit_action_space(bends, 2, name="bend", fps=30.0)
     >>> z = space.project(bends[0])
     >>> j = space.match(z, torch.Generator().manual_seed(0))
     >>> space.inside(z, j).shape
@@ -123,58 +124,21 @@ class ActionSpace(nn.Module):
             self.register_buffer(name, value)
 
     @classmethod
-    def fit(
-        cls,
-        performances: Sequence[Float[Tensor, "_ 36"]],
-        n_dimensions: int = 13,
-        *,
-        name: str = "",
-        fps: float | None = None,
-        n_postures: int | None = None,
-        prominence: float = 0.15,
-        info: ActionInfo | None = None,
-    ) -> "ActionSpace":
-        """Fit an action space to performances of one action (AS 1).
-
-        Performances are synchronised in all principal axes, whatever D is, so that
-        `with_dimensions(d)` of a larger space is the fit with d.
-
-        Args:
-            performances: [T_p, 36] each, degrees, of any lengths, one repetition of the action from
-                its start to its end (`split_repetitions` cuts them out of recordings).
-            n_dimensions: D; reduced, with a warning, if the postures span fewer.
-            name: of the action. fps: of the performances, for the record.
-            n_postures: K; by default the median length. prominence: see `synchronise`.
-            info: more facts; name, fps and what the fit finds are filled in.
-
-        Raises:
-            InputError: one performance only, one with too few frames, NaN, D or fps not positive,
-                nothing moves. ShapeError: postures of other than 36 angles.
-        """
-        found = fit_action(
-            performances, n_dimensions, name=name, fps=fps, n_postures=n_postures,
-            prominence=prominence, info=info,
-        )  # fmt: skip
-        return cls(**found.tensors, info=found.info)
+    def fit(cls, *args: Any, **options: Any) -> "ActionSpace":
+        """Fit an action. Deprecated: `torchpose.learning.fit_action_space` takes the same arguments."""
+        # learning is a layer above: until this goes, it is looked up by its name
+        fit = moved_function("ActionSpace.fit", "torchpose.learning.fit_action_space")
+        space: ActionSpace = fit(*args, **options)
+        return space
 
     @classmethod
-    def fit_synchronised(
-        cls,
-        performances: Sequence[Float[Tensor, "_ 36"]],
-        n_dimensions: int = 13,
-        *,
-        name: str = "",
-        fps: float | None = None,
-        n_postures: int | None = None,
-        prominence: float = 0.15,
-        info: ActionInfo | None = None,
-    ) -> tuple["ActionSpace", Synchronised]:
-        """The same as `fit`, and the performances before and after being put in step, for pictures."""
-        found = fit_action(
-            performances, n_dimensions, name=name, fps=fps, n_postures=n_postures,
-            prominence=prominence, info=info,
-        )  # fmt: skip
-        return cls(**found.tensors, info=found.info), found.synchronised
+    def fit_synchronised(cls, *args: Any, **options: Any) -> tuple["ActionSpace", Any]:
+        """Fit an action. Deprecated: `torchpose.learning.action_spaces.fit_synchronised`."""
+        # as in `fit`
+        name = "torchpose.learning.action_spaces.fit_synchronised"
+        fit = moved_function("ActionSpace.fit_synchronised", name)
+        found: tuple[ActionSpace, Any] = fit(*args, **options)
+        return found
 
     # --- sizes ------------------------------------------------------------------------------------
 

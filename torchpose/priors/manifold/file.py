@@ -18,7 +18,6 @@ from torchpose._core.tensor_file import (
     write_tensors,
 )
 from torchpose.errors import PriorError
-from torchpose.priors.manifold.pose_sequences import steps_growth
 
 __all__ = ["TENSORS", "ManifoldInfo", "read_manifold", "write_manifold"]
 
@@ -84,28 +83,25 @@ class ManifoldInfo:
         if found:
             raise PriorError(
                 f"the manifold {self.name!r} is of another body: {'; '.join(found)}; fit one to "
-                "poses of this body with BackConstrainedGPLVM.fit"
+                "poses of this body with torchpose.learning.fit_gplvm"
             )
 
     def check_rate(self, fps: float, known: bool) -> None:
         """Raise `PriorError` unless the standard deviations are known, and for this frame rate."""
         if not known:
             raise PriorError(
-                f"the manifold {self.name!r} has no standard deviations yet; call fit_noise with "
+                f"the manifold {self.name!r} has no standard deviations yet; call fit_gplvm_noise with "
                 "validation poses"
             )
         if self.fps is not None and abs(fps / self.fps - 1) > _SAME_FRAME_RATE:
             raise PriorError(
                 f"the standard deviations of the manifold {self.name!r} are for {self.fps:g} frames "
-                f"per second, got {fps:g}; call fit_noise with validation poses at that rate"
+                f"per second, got {fps:g}; call fit_gplvm_noise with validation poses at that rate"
             )
 
-    def with_noise(
-        self, fps: float, latents: Tensor, poses: Tensor, lengths: Sequence[int]
-    ) -> ManifoldInfo:
-        """The same with the frame rate of the standard deviations, and how they grow with time."""
-        growth = {"latent": steps_growth(latents, lengths), "step": steps_growth(poses, lengths)}
-        return replace(self, fps=float(fps), extra={**self.extra, _GROWTH: growth})
+    def with_noise(self, fps: float, growth: Mapping[str, float]) -> ManifoldInfo:
+        """Return the same with the frame rate of the standard deviations, and how they grow with time."""
+        return replace(self, fps=float(fps), extra={**self.extra, _GROWTH: dict(growth)})
 
     def noise_factors(self, fps: float, known: bool) -> tuple[float, float]:
         """Factors of sigma x->z and sigma x->x for another frame rate.

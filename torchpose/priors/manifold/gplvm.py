@@ -7,34 +7,83 @@ the relative part rotations of a motion it is the manifold of the manifold-regul
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
 from torchpose.errors import FileFormatError, InputError, ShapeError, check_finite, check_shape
 from torchpose.priors.manifold import prediction as gplvm_prediction
 from torchpose.priors.manifold.file import TENSORS, ManifoldInfo, read_manifold, write_manifold
-from torchpose.priors.manifold.fit import GPLVMFit, best_fit, median_gamma
-from torchpose.priors.manifold.kernel import KernelParameters
-from torchpose.priors.manifold.noise import (
-    MotionNoise,
-    at_rate,
-    check_unseen,
-    motion_noise,
-    no_noise,
-)
-from torchpose.priors.manifold.pose_sequences import column_scale, join_sequences, principal_axes
-from torchpose.priors.manifold.prediction import Fitted, Prepared
+from torchpose.priors.manifold.prediction import Fitted, KernelParameters, Prepared
 
-__all__ = ["BackConstrainedGPLVM"]
+__all__ = ["LEAST_FRAMES", "BackConstrainedGPLVM", "MotionNoise", "join_sequences", "no_noise"]
 
-_WATCHED, _ALONE = {"steps": 40, "n_init": 4}, {"steps": 3, "n_init": 1}
+LEAST_FRAMES = 10
+"""Of the poses of a manifold."""
+
+
+class MotionNoise(NamedTuple):
+    """Standard deviations per frame.
+
+    Attributes:
+        std_latent: sigma x->z [d] (MR 27). std_pose: sigma z->x [Q] (MR 30). std_step: sigma x->x [Q]
+            (MR 29).
+    """
+
+    std_latent: Tensor
+    std_pose: Tensor
+    std_step: Tensor
+
+
+def no_noise(latent_dim: int, columns: int, like: Tensor) -> MotionNoise:
+    """Return NaN for all of it, as before there are validation poses."""
+    return MotionNoise(*(like.new_full((n,), math.nan) for n in (latent_dim, columns, columns)))
+
+
+def join_sequences(
+    poses: Tensor | Sequence[Tensor], columns: Sequence[str] = (), dim: int | None = None
+) -> tuple[Float[Tensor, "T Q"], list[int]]:
+    """Return the poses of all sequences as one matrix in double precision, and how long each is.
+
+    Args:
+        poses: one sequence [T, Q] or several. columns: their names, for messages. dim: the number of
+            columns that there have to be; any if None.
+
+    Raises:
+        ShapeError: not [T, Q], or another number of columns. InputError: no sequence, fewer than 10
+            frames in all, or a value that is not finite.
+    """
+    parts = [poses] if isinstance(poses, Tensor) else list(poses)
+    wanted = dim if dim is not None else next((p.shape[-1] for p in parts if p.ndim == 2), None)
+    for number, part in enumerate(parts):
+        where = "poses" if isinstance(poses, Tensor) else f"sequence {number} of the poses"
+        if part.ndim != 2 or part.shape[1] != wanted:
+            raise ShapeError(
+                f"{where} must have shape [T, {'Q' if wanted is None else wanted}], got "
+                f"{list(part.shape)}; a pose is the columns that `Body.relative` returns"
+            )
+        bad = (~torch.isfinite(part)).nonzero()
+        if len(bad):
+            frame, column = (int(i) for i in bad[0])
+            name = f" ({columns[column]})" if len(columns) == part.shape[1] else ""
+            raise InputError(
+                f"{where} must be finite, got {float(part[frame, column])} in frame {frame}, column "
+                f"{column}{name}; {len(bad)} such values; leave out the frames with gaps, and end "
+                "the sequence there"
+            )
+    count = sum(len(part) for part in parts)
+    if count < LEAST_FRAMES:
+        raise InputError(f"a manifold needs at least {LEAST_FRAMES} frames of poses, got {count}")
+    return torch.cat([part.detach().double() for part in parts]), [len(part) for part in parts]
 
 
 class BackConstrainedGPLVM(nn.Module):
@@ -43,10 +92,10 @@ class BackConstrainedGPLVM(nn.Module):
     k(z, z') = beta exp(-gamma_z / 2 ||z - z'||^2) + beta_0   (MR 14)
     g_i(x) = sum_t a_ti exp(-gamma_x / 2 ||x - x_t||^2) + b_i   (MR 21, 22)
 
-    Use `fit`; the constructor takes what a fit has found. The factor of the kernel matrix and
-    alpha = K^-1 X are computed once, so that the poses of any number of latent points are a single
-    product. `.float()` makes a manifold that predicts in single precision, from an alpha computed in
-    double.
+    Use `torchpose.learning.fit_gplvm`; the constructor takes what a fit has found. The factor of the
+    kernel matrix and alpha = K^-1 X are computed once, so that the poses of any number of latent
+    points are a single product. `.float()` makes a manifold that predicts in single precision, from an
+    alpha computed in double.
 
     Args:
         poses: training poses X [T, Q]; of bodies, columns without a unit (quaternion vectors).
@@ -58,7 +107,7 @@ class BackConstrainedGPLVM(nn.Module):
 
     Attributes:
         std_latent: sigma x->z [d] (MR 27). std_pose: sigma z->x [Q] (MR 30). std_step: sigma x->x
-            [Q] (MR 29). All are for one frame, and NaN until `fit_noise` has been called.
+            [Q] (MR 29). All are for one frame, and NaN until `fit_gplvm_noise` has been called.
         latents: z of the training poses [T, d].
 
     Raises:
@@ -68,9 +117,10 @@ class BackConstrainedGPLVM(nn.Module):
     2016, section 5.
 
     >>> import torch
+    >>> from torchpose.learning import fit_gplvm
     >>> angle = torch.linspace(0, 12, 60, dtype=torch.float64)
     >>> poses = torch.stack([angle.sin(), angle.cos(), (2 * angle).sin()], 1)
-    >>> manifold = BackConstrainedGPLVM.fit(poses, steps=5)
+    >>> manifold = fit_gplvm(poses, steps=5)
     >>> mean, variance = manifold.to_pose(manifold.to_latent(poses[:4]))
     >>> mean.shape, variance.shape, bool((mean - poses[:4]).abs().max() < 0.05)
     (torch.Size([4, 3]), torch.Size([4]), True)
@@ -128,132 +178,36 @@ class BackConstrainedGPLVM(nn.Module):
     # --- fit
 
     @classmethod
-    def fit(
-        cls,
-        poses: Float[Tensor, "T Q"] | Sequence[Float[Tensor, "_ Q"]],
-        latent_dim: int = 2,
-        *,
-        gamma_x: float | None = None,
-        steps: int | None = None,
-        seed: int = 0,
-        optimiser: str = "lbfgs",
-        learning_rate: float | None = None,
-        tolerance: float = 1e-5,
-        n_init: int | None = None,
-        smoothness: float = 0.0,
-        standardise: bool = False,
-        validation: Float[Tensor, "V Q"] | Sequence[Float[Tensor, "_ Q"]] | None = None,
-        patience: int = 3,
-        info: ManifoldInfo | None = None,
-        progress: bool = False,
-    ) -> BackConstrainedGPLVM:
-        """Fit a manifold to the poses of one motion, or of several sequences.
+    def fit(cls, *args: Any, **options: Any) -> BackConstrainedGPLVM:
+        """Fit a manifold. Deprecated: `torchpose.learning.fit_gplvm` takes the same arguments."""
+        # learning is a layer above: until this goes, it is looked up by its name
+        fit = moved_function("BackConstrainedGPLVM.fit", "torchpose.learning.fit_gplvm")
+        manifold: BackConstrainedGPLVM = fit(*args, **options)
+        return manifold
 
-        The mean pose is subtracted, latent points start from principal components, and the objective
-        (MR 16) is maximised. Time and memory of a step grow with the cube and the square of the
-        number of frames: 0.1 s for 350 frames, some 20 s for 2,000, on one core.
-
-        Args:
-            poses: one sequence [T, Q], or several of the same columns.
-            latent_dim: d.
-            gamma_x: of (MR 22); by default one over the squared median distance of the poses. The
-                published 1e-4 is for other units.
-            steps: of ten iterations of the optimiser, at most; by default 40 with validation poses and
-                3 without. Further ones make the back constraints follow the training poses so closely
-                that other poses come back worse.
-            seed: of the frames whose distances are compared, where there are more than 2,000.
-            optimiser: "lbfgs" or "adam". learning_rate: None for the optimiser's own.
-            tolerance: gain of the objective per number and step at which to stop.
-            n_init: starts, see `principal_start`; the one with the lowest held-out error, or else
-                the highest objective, is kept. By default 4 with validation poses and 1 without.
-            smoothness: of the back constraints, see `GPLVMFit`.
-            standardise: divide every column by its standard deviation, so that all weigh the same
-                in the objective and in gamma_x; the published form does not.
-            validation: poses of other trials. With them the fit stops after `patience` steps that
-                bring them back no better, x - f(g(x)), and returns to the step that was best.
-            patience: see there.
-            info: what the poses are of. progress: show a bar for every start.
-
-        Raises:
-            InputError: fewer than 10 frames, NaN (frame and column are named), no motion, bad
-                settings. ShapeError: not [T, Q], or sequences with different columns.
-        """
-        info = ManifoldInfo() if info is None else info
-        joined, lengths = join_sequences(poses, info.columns)
-        scale = column_scale(joined) if standardise else torch.ones_like(joined[0])
-        target = (joined - joined.mean(0)) / scale
-        gamma = median_gamma(target, seed) if gamma_x is None else gamma_x
-        defaults = _ALONE if validation is None else _WATCHED
-        steps = defaults["steps"] if steps is None else steps
-        n_init = defaults["n_init"] if n_init is None else n_init
-        error = None
-        if validation is not None:
-            watched, _ = join_sequences(validation, info.columns, joined.shape[1])
-            error = lambda fit: (  # noqa: E731
-                cls.from_fit(fit, joined, lengths, scale).reconstruction_error(watched)
-            )
-        best = best_fit(
-            lambda start: GPLVMFit(
-                target, latent_dim, gamma, optimiser, learning_rate, smoothness, start=start
-            ),
-            n_init, steps, tolerance, progress, error, patience,
-        )  # fmt: skip
-        return cls.from_fit(best, joined, lengths, scale, info)
-
-    @classmethod
-    def from_fit(
-        cls,
-        fit: GPLVMFit,
-        poses: Float[Tensor, "T Q"],
-        lengths: Sequence[int],
-        scale: Float[Tensor, " Q"],
-        info: ManifoldInfo | None = None,
-    ) -> BackConstrainedGPLVM:
-        """The manifold that a fit stands at, its latent axes turned to the principal ones.
-
-        Args:
-            fit: to (poses - mean) / scale. lengths: frames of each sequence.
-        """
-        with torch.no_grad():
-            latents = fit.features @ fit.coordinates + fit.bias
-            turn = principal_axes(latents)
-            weights, bias = fit.weights @ turn, fit.bias @ turn
-            sizes = torch.tensor(list(lengths))
-            return cls(poses, sizes, weights, bias, fit.gamma_x, fit.kernel, scale=scale, info=info)
-
-    def fit_noise(
-        self,
-        poses: Float[Tensor, "T Q"] | Sequence[Float[Tensor, "_ Q"]],
-        fps: float,
-    ) -> BackConstrainedGPLVM:
-        """Set the three standard deviations from validation poses; returns the manifold itself.
-
-        sigma x->z: root mean square of g(x_t) - g(x_t-1) (MR 27); sigma z->x: of x_t - f(g(x_t))
-        (MR 30); sigma x->x: of x_t - x_t-1 (MR 29), each dimension apart; see `motion_noise`.
-
-        Args:
-            poses: one sequence or several that were not fitted to; on those that were, sigma z->x
-                comes out too small. fps: their frame rate, which all three are for.
-
-        Raises:
-            InputError: fewer than 10 frames, NaN, a frame rate that is not positive, or frames that
-                were fitted to. ShapeError: other columns.
-        """
-        if not 0 < fps < math.inf:
-            raise InputError(f"fps must be positive, got {fps:g}")
-        joined, lengths = join_sequences(poses, self.info.columns, self.dim)
-        joined = joined.to(self.poses)
-        check_unseen(joined, lengths, self.poses)
-        latents = self.to_latent(joined)
-        noise = motion_noise(joined, latents, self.pose_mean(latents), lengths)
-        for name, value in noise._asdict().items():
-            getattr(self, name).copy_(value)
-        self.info = self.info.with_noise(fps, latents, joined, lengths)
-        return self
+    def fit_noise(self, *args: Any, **options: Any) -> BackConstrainedGPLVM:
+        """Set the noise. Deprecated: `torchpose.learning.fit_gplvm_noise`, with the manifold first."""
+        # as in `fit`
+        fit = moved_function("fit_noise", "torchpose.learning.fit_gplvm_noise")
+        manifold: BackConstrainedGPLVM = fit(self, *args, **options)
+        return manifold
 
     def at_rate(self, fps: float) -> BackConstrainedGPLVM:
-        """The same with standard deviations for another frame rate, see `gplvm_noise.at_rate`."""
-        return at_rate(self, fps)
+        """Return the same manifold with its standard deviations for another frame rate.
+
+        sigma(fps) = sigma (fps_0 / fps)^g of sigma x->z and x->x, g learnt with them; sigma z->x does
+        not depend on the rate.
+
+        Raises:
+            PriorError: no standard deviations, or a file that does not say how they grow.
+        """
+        known = bool(torch.isfinite(self.std_pose).all())
+        latent, step = self.info.noise_factors(fps, known)
+        other = copy.deepcopy(self)
+        other.std_latent *= latent
+        other.std_step *= step
+        other.info = replace(self.info, fps=float(fps))
+        return other
 
     # --- both ways
 

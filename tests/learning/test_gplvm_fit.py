@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.priors.motions import motion
 from torchpose.errors import InputError, ShapeError
-from torchpose.priors.manifold.fit import (
+from torchpose.learning.gplvm_fit import (
     GPLVMFit,
     log_likelihood,
     median_gamma,
@@ -19,7 +19,7 @@ from torchpose.priors.manifold.fit import (
     principal_start,
     run_fit,
 )
-from torchpose.priors.manifold.kernel import KernelParameters, covariance, rbf
+from torchpose.priors.manifold.prediction import KernelParameters, covariance, rbf
 
 T, Q, D = 12, 5, 2
 

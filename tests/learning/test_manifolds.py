@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchpose.errors import InputError
-from torchpose.priors.manifold.noise import check_unseen, motion_noise, no_noise
+from torchpose.learning.manifolds import check_unseen, motion_noise, no_noise
 
 
 def test_root_mean_squares_never_cross_the_end_of_a_sequence() -> None:

@@ -1,49 +1,79 @@
-"""The fit of an action space to performances of the action (AS 1): axes, mean performance, deviations."""
+"""Fit action spaces to performances of an action (AS 1): axes, mean performance, deviations."""
 
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.errors import InputError, check_shape
+from torchpose.learning.performances import Synchronised, checked_performances, synchronise
 from torchpose.priors.actions.file import ActionInfo
 from torchpose.priors.actions.polar_limbs import POSTURE_DIM
-from torchpose.priors.actions.synchronisation import Synchronised, checked_performances, synchronise
+from torchpose.priors.actions.space import ActionSpace
 
-__all__ = ["FittedAction", "fit_action"]
+__all__ = ["fit_action_space", "fit_synchronised"]
 
 _STD_FLOOR = 0.1  # of a dimension's deviation over the whole performance
 _LEAST_STD = 0.1  # degrees
 _SMALLEST_VARIANCE = 1e-10  # of the largest; below it a direction is rounding
 
 
-class FittedAction(NamedTuple):
-    """What `ActionSpace` holds, by the names of its arguments, and what it came from.
+def fit_action_space(
+    performances: Sequence[Float[Tensor, "_ 36"]],
+    n_dimensions: int = 13,
+    *,
+    name: str = "",
+    fps: float | None = None,
+    n_postures: int | None = None,
+    prominence: float = 0.15,
+    info: ActionInfo | None = None,
+) -> ActionSpace:
+    """Fit an action space to performances of one action (AS 1).
 
-    Attributes:
-        tensors: by name. info: of the action. synchronised: the performances in the D dimensions.
+    Performances are synchronised in all principal axes, whatever D is, so that
+    `with_dimensions(d)` of a larger space is the fit with d.
+
+    Args:
+        performances: [T_p, 36] each, degrees, of any lengths, one repetition of the action from
+            its start to its end (`split_repetitions` cuts them out of recordings).
+        n_dimensions: D; reduced, with a warning, if the postures span fewer.
+        name: of the action. fps: of the performances, for the record.
+        n_postures: K; by default the median length. prominence: see `synchronise`.
+        info: more facts; name, fps and what the fit finds are filled in.
+
+    Raises:
+        InputError: one performance only, one with too few frames, NaN, D or fps not positive,
+            nothing moves. ShapeError: postures of other than 36 angles.
     """
-
-    tensors: dict[str, Tensor]
-    info: ActionInfo
-    synchronised: Synchronised
+    return _fit(performances, n_dimensions, name, fps, n_postures, prominence, info)[0]
 
 
-def fit_action(
+def fit_synchronised(
+    performances: Sequence[Float[Tensor, "_ 36"]],
+    n_dimensions: int = 13,
+    *,
+    name: str = "",
+    fps: float | None = None,
+    n_postures: int | None = None,
+    prominence: float = 0.15,
+    info: ActionInfo | None = None,
+) -> tuple[ActionSpace, Synchronised]:
+    """Fit as `fit_action_space`, and return also the performances that were put in step, for pictures."""
+    return _fit(performances, n_dimensions, name, fps, n_postures, prominence, info)
+
+
+def _fit(
     performances: Sequence[Float[Tensor, "_ 36"]],
     n_dimensions: int,
-    *,
     name: str,
     fps: float | None,
     n_postures: int | None,
     prominence: float,
     info: ActionInfo | None,
-) -> FittedAction:
-    """Fit what an action space holds; see `ActionSpace.fit`, which calls it, for everything."""
+) -> tuple[ActionSpace, Synchronised]:
     known = info or ActionInfo()
     name, fps = name or known.name, known.fps if fps is None else fps
     if fps is not None and not 0 < fps < float("inf"):
@@ -57,7 +87,7 @@ def fit_action(
         warnings.warn(
             f"the postures of {name or 'the action'} span {rank} dimensions, fewer than the "
             f"{n_dimensions} that were asked for: the action space has {rank}",
-            stacklevel=3,  # who called ActionSpace.fit
+            stacklevel=3,  # who called the public function
         )
     d = min(n_dimensions, rank)
     axes = axes[:, :rank]
@@ -74,7 +104,7 @@ def fit_action(
         known, name=name, fps=fps, performances=len(parts), key_frames=found.key_frames,
         explained=float(variances[:d].sum() / variances.sum()),
     )  # fmt: skip
-    return FittedAction(tensors, facts, found)
+    return ActionSpace(**tensors, info=facts), found
 
 
 def _principal_axes(moves: Float[Tensor, "N 36"]) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchpose.errors import InputError, check_shape
 from torchpose.math.gaussian import safe_cholesky
-from torchpose.priors.manifold.kernel import KernelParameters, covariance, rbf
+from torchpose.priors.manifold.prediction import KernelParameters, covariance, rbf
 
 __all__ = [
     "OPTIMISERS",

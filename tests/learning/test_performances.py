@@ -8,11 +8,12 @@ import torch
 
 from tests.priors.performances import performances
 from torchpose.errors import InputError, ShapeError
-from torchpose.priors.actions.repetitions import repetition_axis, split_repetitions
-from torchpose.priors.actions.synchronisation import (
+from torchpose.learning.performances import (
     find_key_frames,
     match_key_frames,
     natural_spline,
+    repetition_axis,
+    split_repetitions,
     synchronise,
 )
 
