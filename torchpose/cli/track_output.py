@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from jsonargparse import Namespace
 
 from torchpose.cli.common import input_files, save_pictures
+from torchpose.errors import InputError
 
 if TYPE_CHECKING:
     from torchpose.io.results import ResultsFolder
@@ -38,6 +39,8 @@ def track_settings(args: Namespace) -> "TrackSettings":
     """Return the settings of a tracker that are among the options of the command."""
     from torchpose.upper_body.keypoint_files import TrackSettings
 
+    if args.prior is None:  # as a configuration may say it
+        raise InputError("--prior must be a name or a file, got null")
     return TrackSettings(**{f.name: getattr(args, f.name) for f in fields(TrackSettings)})
 
 
