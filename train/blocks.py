@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from torchpose.errors import InputError
-from torchpose.learning.samplers import PRODUCT, Samples, SampleSource, join_samples
-from torchpose.learning.usable_samples import usable_block
+from torchpose.learning.blocks import joined_blocks, usable_block
+from torchpose.learning.samplers import Samples, SampleSource
 
 __all__ = ["Block", "Key", "Part", "ShareSampler", "Sweep", "SweepLoader", "list_blocks"]
 
@@ -110,23 +110,14 @@ class Sweep:
         return self._length
 
     def __iter__(self) -> Iterator[Part]:
-        kept: list[Part] = []
+        for key, samples in joined_blocks(self._watched()):
+            yield Part(key, samples)
+
+    def _watched(self) -> Iterator[tuple[Key, Samples]]:
         for part in self._blocks:
-            if kept and kept[0].key != part.key:
-                yield _join(kept)
-                kept = []
-            kept.append(part)
-            if sum(len(p.samples.states) for p in kept) >= PRODUCT:
-                yield _join(kept)
-                kept = []
+            yield part
             for watcher in self.watchers:
                 watcher()
-        if kept:
-            yield _join(kept)
-
-
-def _join(parts: list[Part]) -> Part:
-    return Part(parts[0].key, join_samples([part.samples for part in parts]))
 
 
 class SweepLoader:

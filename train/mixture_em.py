@@ -15,9 +15,9 @@ from torch import nn
 from torch.optim import Optimizer
 
 from torchpose.errors import InputError, TorchposeError
+from torchpose.learning.blocks import Share
 from torchpose.learning.recipes import MixtureTask
 from torchpose.learning.recipes.calibration import folds
-from torchpose.learning.share import Share
 from torchpose.learning.stepwise_em import stepwise_pass
 from torchpose.learning.streamed_em import StreamedEM
 from torchpose.math.mixture_em import SufficientStatistics

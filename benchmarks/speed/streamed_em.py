@@ -48,8 +48,8 @@ from benchmarks.speed.expectation_maximisation import (
     torchpose_fit,
     wide,
 )
+from torchpose.learning.blocks import Share
 from torchpose.learning.samplers import ArmSource, SampleSource, TensorSource
-from torchpose.learning.share import Share
 from torchpose.learning.streamed_em import StreamedEM, run_streamed
 from torchpose.math.mixture_em import MixtureParameters
 

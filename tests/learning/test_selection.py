@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from torchpose.errors import InputError
+from torchpose.learning.blocks import Share
 from torchpose.learning.samplers import BLOCK, TensorSource
 from torchpose.learning.selection import held_out_scores, select_n_components
-from torchpose.learning.share import Share
 from torchpose.learning.streamed_em import StreamedEM
 from torchpose.priors import GaussianMixture
 

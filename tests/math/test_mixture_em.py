@@ -12,9 +12,9 @@ from tests.priors.mixtures import random_mixture
 from torchpose.errors import CovarianceError, InputError, ShapeError
 from torchpose.math import expectation_maximisation
 from torchpose.math import mixture_em as em
-from torchpose.math.mixture_em import MixtureParameters, e_step, m_step, natural_parameters
 from torchpose.math.mixture_features import CyclicFeatures, cyclic_order
 from torchpose.math.mixture_start import STARTS, floor_variances, k_means, start_mixture
+from torchpose.math.mixture_steps import MixtureParameters, e_step, m_step, natural_parameters
 from torchpose.priors import GaussianMixture
 
 

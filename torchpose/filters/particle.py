@@ -34,7 +34,7 @@ from torchpose.filters.transition import (
 )
 from torchpose.filters.walk import MixtureWalk, Moves, grouped_affine
 from torchpose.math.gaussian import mended_update, safe_cholesky
-from torchpose.math.mixture_em import MixtureParameters
+from torchpose.math.mixture_steps import MixtureParameters
 from torchpose.priors.gaussian_mixture import GaussianMixture
 
 __all__ = ["PROPOSALS", "BootstrapParticleFilter", "ParticleState"]

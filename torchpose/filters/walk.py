@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchpose._core.value_checks import values_visible
 from torchpose.math.gaussian import LOG_2PI, mended_cholesky, safe_cholesky
-from torchpose.math.mixture_em import MixtureParameters
+from torchpose.math.mixture_steps import MixtureParameters
 
 __all__ = ["MixtureWalk", "Moves", "grouped_affine"]
 

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import torch
 
 from torchpose.errors import InputError
+from torchpose.learning.blocks import usable_block
 from torchpose.learning.samplers import Samples, SampleSource
-from torchpose.learning.usable_samples import usable_block
 from torchpose.math.gaussian import symmetrise
 from torchpose.priors.gaussian_mixture import GaussianMixture
 

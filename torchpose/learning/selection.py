@@ -11,10 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.errors import InputError
+from torchpose.learning.blocks import ALONE, Share, usable_samples
 from torchpose.learning.samplers import SampleSource
-from torchpose.learning.share import ALONE, Share
 from torchpose.learning.streamed_em import StreamedEM, run_streamed
-from torchpose.learning.usable_samples import usable_samples
 from torchpose.priors.gaussian_mixture import GaussianMixture
 
 __all__ = ["RULES", "Candidate", "Selection", "held_out_scores", "select_n_components"]

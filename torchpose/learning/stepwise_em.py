@@ -14,10 +14,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.errors import InputError
+from torchpose.learning.blocks import ALONE, Share
 from torchpose.learning.samplers import Samples, SampleSource
-from torchpose.learning.share import ALONE, Share
 from torchpose.learning.streamed_em import StreamedEM
-from torchpose.math.mixture_em import IterationBar, MixtureParameters, SufficientStatistics, m_step
+from torchpose.math.mixture_em import IterationBar
+from torchpose.math.mixture_steps import (
+    MixtureParameters,
+    SufficientStatistics,
+    m_step,
+    upper_triangle,
+)
 
 __all__ = [
     "StepwiseState",
@@ -59,7 +65,7 @@ def implied_statistics(
         parameters: the mixture. floor: as for `m_step`.
     """
     weights, means, covariances = parameters
-    rows, columns = torch.triu_indices(means.shape[1], means.shape[1], device=means.device)
+    rows, columns = upper_triangle(means.shape[1], means.device)
     second = covariances - floor + means.unsqueeze(-1) * means.unsqueeze(-2)
     features = torch.cat([torch.ones_like(means[:, :1]), means, second[:, rows, columns]], 1)
     return features * weights.unsqueeze(-1)

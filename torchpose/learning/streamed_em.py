@@ -9,28 +9,24 @@ on how the blocks are shared out, up to the rounding of sums.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchpose.errors import InputError, check_shape
-from torchpose.learning.samplers import PRODUCT, Samples, SampleSource, join_samples
-from torchpose.learning.share import ALONE, Share
-from torchpose.learning.usable_samples import spread_samples, usable_block, usable_samples
-from torchpose.math.mixture_em import (
-    FitReport,
-    IterationBar,
-    MixtureParameters,
-    SufficientStatistics,
-    e_step,
-    m_step,
-    map_mixture,
-    whitening,
+from torchpose.learning.blocks import (
+    ALONE,
+    Share,
+    joined_blocks,
+    spread_samples,
+    usable_block,
+    usable_samples,
 )
+from torchpose.learning.samplers import Samples, SampleSource
+from torchpose.math.mixture_em import MixtureFit, run_fit, whitening
 from torchpose.math.mixture_start import STARTS, floor_variances, start_mixture
+from torchpose.math.mixture_steps import MixtureParameters, SufficientStatistics, e_step
 from torchpose.priors.gaussian_mixture import GaussianMixture
 
 __all__ = [
@@ -45,24 +41,11 @@ __all__ = [
 START_SAMPLES = 100_000
 
 
-class StreamedEM(nn.Module):
-    """A Gaussian mixture in the middle of its fit; all there is to know is in its `state_dict`.
+class StreamedEM(MixtureFit):
+    """The fit of a mixture to sources of states, which come block by block.
 
-    `expect` sums up samples, the sums of all samples together go to `maximise`, and that is one step
-    of EM. Buffers are float64 and in units in which the states have about unit covariance,
-    y = L^-1 (x - m), which takes away the cancellation of the products and does not change EM.
-
-    Attributes:
-        weights [K], means [K, D], covariances [K, D, D]: of the mixture of y.
-        shift: m [D]. factor: L [D, D], lower triangular. floor: added to covariances of y [D, D].
-        history: mean log-likelihood before every step and, if `record` was last, at the end.
-        steps: maximisation steps taken. moved: components moved in the last of them (see `m_step`).
-        reseeded: components moved in all of them. converged: the last change was below `tol`.
-
-    Args:
-        start: the mixture of y to start from.
-        shift, factor, floor: see above.
-        dtype: of the products over the states; float32 is faster and good to about 1e-4.
+    `expect` sums up samples, and `accumulate` a whole source, of which every process does its share.
+    Attributes and arguments are those of `MixtureFit`.
 
     >>> import torch
     >>> from torchpose.learning.samplers import TensorSource
@@ -74,38 +57,6 @@ class StreamedEM(nn.Module):
     >>> em.mixture().n_components
     3
     """
-
-    weights: Tensor
-    means: Tensor
-    covariances: Tensor
-    shift: Tensor
-    factor: Tensor
-    floor: Tensor
-    history: Tensor
-    steps: Tensor
-    moved: Tensor
-    reseeded: Tensor
-    converged: Tensor
-
-    def __init__(
-        self,
-        start: MixtureParameters,
-        shift: Float[Tensor, " D"],
-        factor: Float[Tensor, "D D"],
-        floor: Float[Tensor, "D D"],
-        dtype: torch.dtype = torch.float64,
-    ) -> None:
-        super().__init__()
-        parts = {**start._asdict(), "shift": shift, "factor": factor, "floor": floor}
-        for name, value in parts.items():
-            # in the order in memory that a checkpoint has: the last bit of products depends on it
-            wide = value.detach().double().clone(memory_format=torch.contiguous_format)
-            self.register_buffer(name, wide)
-        self.register_buffer("history", torch.zeros(0, dtype=torch.float64))
-        for name in ("steps", "moved", "reseeded"):
-            self.register_buffer(name, torch.tensor(0))
-        self.register_buffer("converged", torch.tensor(False))
-        self.dtype = dtype
 
     # --- where a fit begins
 
@@ -153,30 +104,9 @@ class StreamedEM(nn.Module):
             init = start_mixture(states, n_components, generator, variances, sample_weight, init)
         check_shape("init.means", init.means, (n_components, source.dim))
         shift, _, factor = whitening(states, sample_weight, variances)
-        floor = (_inverse(factor) * variances) @ _inverse(factor).T
-        return cls(_to_units(init, shift, factor), shift, factor, floor, dtype)
-
-    @classmethod
-    def blank(cls, n_components: int, dim: int, dtype: torch.dtype = torch.float64) -> StreamedEM:
-        """A mixture of the given size to load a `state_dict` into."""
-        eye = torch.eye(dim, dtype=torch.float64)
-        means = torch.zeros(n_components, dim, dtype=torch.float64)
-        weights = torch.full((n_components,), 1 / n_components, dtype=torch.float64)
-        start = MixtureParameters(weights, means, eye.expand(n_components, -1, -1))
-        return cls(start, means[0], eye, torch.zeros_like(eye), dtype)
-
-    def restart(self, parameters: MixtureParameters) -> None:
-        """Go on from another mixture, given in the units of the buffers, with an empty history."""
-        self._set(parameters)
-        self.history = self.history[:0]
-        for name in ("steps", "moved", "reseeded", "converged"):
-            setattr(self, name, torch.zeros_like(getattr(self, name)))
+        return cls.in_units(init, shift, factor, variances, dtype)
 
     # --- one step
-
-    def parameters_tuple(self) -> MixtureParameters:
-        """Weights, means and covariances in the units of the buffers."""
-        return MixtureParameters(self.weights, self.means, self.covariances)
 
     @torch.no_grad()
     def expect(self, samples: Samples) -> SufficientStatistics:
@@ -193,9 +123,8 @@ class StreamedEM(nn.Module):
     def _expect(self, samples: Samples) -> SufficientStatistics:
         states, weight = (values.to(self.means) for values in samples)
         check_shape("states", states, ("N", self.means.shape[1]))
-        white = (_inverse(self.factor) @ (states - self.shift).T).to(self.dtype)
         sample_weight = None if bool((weight == 1).all()) else weight
-        return e_step(white.T, self.parameters_tuple(), sample_weight)
+        return e_step(self.whitened(states).T, self.parameters_tuple(), sample_weight)
 
     @torch.no_grad()
     def accumulate(
@@ -217,93 +146,18 @@ class StreamedEM(nn.Module):
         n_components, dim = self.means.shape
         total = SufficientStatistics.zeros(n_components, dim, self.means.device)
         with share.failing_together(total.pack()):
-            for samples in _products(source, share, int(self.steps) if epoch is None else epoch):
+            epoch = int(self.steps) if epoch is None else epoch
+            mine = share.blocks(source.n_blocks)
+            blocks = ((None, usable_block(source, index, epoch)) for index in mine)
+            for _, samples in joined_blocks(blocks):
                 total = total.merge(self._expect(samples))
         return SufficientStatistics.unpack(share.total(total.pack()), len(self.means))
 
-    @torch.no_grad()
-    def record(self, statistics: SufficientStatistics, tol: float = 0.0) -> float:
-        """Note the mean log-likelihood of the mixture, and whether it has settled.
-
-        Args:
-            statistics: of all samples, made with the mixture as it is.
-            tol: change of the mean log-likelihood below which the fit has converged, unless a
-                component was moved in the last step; 0 never converges.
-
-        Returns:
-            Mean log-likelihood in units of the states.
-
-        Raises:
-            InputError: no samples, or a log-likelihood that is not finite.
-        """
-        value = self.mean_log_likelihood(statistics)
-        steps = int(self.steps)
-        if not math.isfinite(value):
-            raise InputError(
-                f"EM broke down: the mean log-likelihood became {value} after {steps} steps; use "
-                "float64, a larger covariance floor, or another start (or another process failed: "
-                "see its message)"
-            )
-        settled = steps > 0 and abs(value - float(self.history[steps - 1])) < tol
-        self.converged = torch.full_like(self.converged, settled and int(self.moved) == 0)
-        self.history = torch.cat([self.history[:steps], self.history.new_tensor([value])])
-        return value
-
-    @torch.no_grad()
-    def maximise(self, statistics: SufficientStatistics, tol: float = 0.0) -> float:
-        """`record`, and the maximisation step unless the fit has converged.
-
-        Returns:
-            Mean log-likelihood, in units of the states, of the mixture before the step.
-        """
-        value = self.record(statistics, tol)
-        if not bool(self.converged):
-            parameters, moved = m_step(statistics, self.floor)
-            self._set(parameters)
-            self.moved = torch.full_like(self.moved, moved)
-            self.reseeded = self.reseeded + moved
-            self.steps = self.steps + 1
-        return value
-
-    def mean_log_likelihood(self, statistics: SufficientStatistics) -> float:
-        """Mean log-likelihood, in units of the states, from statistics that `expect` made."""
-        if float(statistics.weight) == 0:
-            raise InputError("EM needs samples of positive weight, got none; look at the weights")
-        offset = float(self.factor.diagonal().log().sum())
-        return float(statistics.log_likelihood / statistics.weight) - offset
-
     def mixture(self) -> GaussianMixture:
-        """The mixture as it is, in units of the states; its `fit_report` says how the fit went."""
-        state = map_mixture(self.parameters_tuple(), self.factor)
-        mixture = GaussianMixture(state.weights, state.means + self.shift, state.covariances)
-        mixture.fit_report = FitReport(
-            iterations=int(self.steps),
-            log_likelihood=tuple(self.history.tolist()),
-            converged=bool(self.converged),
-            reseeded=int(self.reseeded),
-        )
+        """Return the mixture as it is, in units of the states; its `fit_report` says how the fit went."""
+        mixture = GaussianMixture(*self.parameters_of_points())
+        mixture.fit_report = self.report()
         return mixture
-
-    def extra_repr(self) -> str:
-        n_components, dim = self.means.shape
-        return f"n_components={n_components}, dim={dim}, steps={int(self.steps)}"
-
-    def _set(self, parameters: MixtureParameters) -> None:
-        for name, value in parameters._asdict().items():
-            setattr(self, name, value.to(self.means).contiguous())
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        means, history = (state_dict.get(prefix + name) for name in ("means", "history"))
-        if means is not None and means.shape != self.means.shape:
-            raise InputError(
-                "the checkpoint holds a mixture of {} components over {} dimensions, this fit has "
-                "{} over {}; resume it with the settings that it was made with".format(
-                    *means.shape, *self.means.shape
-                )
-            )
-        if history is not None:
-            self.history = self.history.new_zeros(history.shape)
-        super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
 def fit_streamed(
@@ -351,37 +205,8 @@ def run_streamed(
     share: Share = ALONE,
     progress: bool = False,
 ) -> None:
-    """Take EM steps until `em` has converged or taken `max_iter` of them, those before included."""
-    with IterationBar(max_iter, progress) as bar:
-        while not bool(em.converged):
-            statistics = em.accumulate(source, share)
-            if int(em.steps) >= max_iter:
-                em.record(statistics, tol)
-                return
-            bar.update(em.maximise(statistics, tol))
-
-
-def _products(source: SampleSource, share: Share, epoch: int) -> Iterator[Samples]:
-    """The samples of this process, as many at a time as one product takes."""
-    parts, count = [], 0
-    for index in share.blocks(source.n_blocks):
-        parts.append(usable_block(source, index, epoch))
-        count += len(parts[-1].states)
-        if count >= PRODUCT:
-            yield join_samples(parts)
-            parts, count = [], 0
-    if parts:
-        yield join_samples(parts)
-
-
-def _inverse(factor: Tensor) -> Tensor:
-    return torch.linalg.solve_triangular(factor, torch.eye(len(factor)).to(factor), upper=False)
-
-
-def _to_units(mixture: MixtureParameters, shift: Tensor, factor: Tensor) -> MixtureParameters:
-    """Mixture of L^-1 (x - m)."""
-    weights, means, covariances = (p.detach().double() for p in mixture)
-    return map_mixture(MixtureParameters(weights, means - shift, covariances), _inverse(factor))
+    """Take EM steps over a source until `em` has converged or taken `max_iter` of them in all."""
+    run_fit(em, lambda: em.accumulate(source, share), max_iter=max_iter, tol=tol, progress=progress)
 
 
 def _check_settings(

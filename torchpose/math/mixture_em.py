@@ -1,258 +1,246 @@
-"""Expectation-maximisation for Gaussian mixtures with full covariances.
-
-With the features phi(x) = [1, x_i, x_i x_j (i <= j)] of a point, the log of every term of a mixture
-is a product theta_k . phi(x), and what the maximisation step needs is sum_n r_nk phi(x_n): one
-matrix product each way. The table of these sums, [K, 1 + D + D (D + 1) / 2], is all that processes
-have to exchange: each runs `e_step` on its share of the points, one merges, all run `m_step`.
-"""
+"""Fit Gaussian mixtures by expectation-maximisation: one engine, for points in memory and in blocks."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, Self
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
-from torchpose.errors import CovarianceError, InputError, check_finite, check_shape
-from torchpose.math.gaussian import least_exponent, symmetrise
-from torchpose.math.mixture_features import CyclicFeatures, cyclic_order
+from torchpose.errors import InputError, check_finite, check_shape
+from torchpose.math.gaussian import symmetrise
+from torchpose.math.mixture_steps import (
+    FitReport,
+    MixtureParameters,
+    SufficientStatistics,
+    e_step,
+    m_step,
+)
 
 __all__ = [
     "FitReport",
     "IterationBar",
+    "MixtureFit",
     "MixtureParameters",
     "SufficientStatistics",
     "e_step",
     "expectation_maximisation",
     "m_step",
     "map_mixture",
-    "natural_parameters",
+    "run_fit",
     "whitening",
 ]
 
-POINTS = 1008  # at a time and core: 253 features are 2 MB; a power of two is 10 % slower
-LOG_2, LOG_2PI = math.log(2.0), math.log(2.0 * math.pi)
 
+class MixtureFit(nn.Module):
+    """A Gaussian mixture in the middle of its fit; all there is to know is in its `state_dict`.
 
-class MixtureParameters(NamedTuple):
-    """Weights, means and covariances of a Gaussian mixture, as plain tensors."""
-
-    weights: Float[Tensor, " K"]
-    means: Float[Tensor, "K D"]
-    covariances: Float[Tensor, "K D D"]
-
-
-class SufficientStatistics(NamedTuple):
-    """What an expectation step hands to the maximisation step.
+    The sums of all points together go to `maximise`, and that is one step of EM. Buffers are float64
+    and in units in which the points have about unit covariance, y = L^-1 (x - m), which takes away the
+    cancellation of the products and does not change EM.
 
     Attributes:
-        table: sum_n w_n r_nk phi(x_n); the first column is the number of points per component.
-        log_likelihood: sum_n w_n log p(x_n).
-        weight: sum_n w_n.
+        weights [K], means [K, D], covariances [K, D, D]: of the mixture of y.
+        shift: m [D]. factor: L [D, D], lower triangular. floor: added to covariances of y [D, D].
+        history: mean log-likelihood before every step and, if `record` was last, at the end.
+        steps: maximisation steps taken. moved: components moved in the last of them (see `m_step`).
+        reseeded: components moved in all of them. converged: the last change was below `tol`.
+
+    Args:
+        start: the mixture of y to start from.
+        shift, factor, floor: see above.
+        dtype: of the products over the points; float32 is faster and good to about 1e-4.
     """
 
-    table: Float[Tensor, "K F"]
-    log_likelihood: Float[Tensor, ""]
-    weight: Float[Tensor, ""]
+    weights: Tensor
+    means: Tensor
+    covariances: Tensor
+    shift: Tensor
+    factor: Tensor
+    floor: Tensor
+    history: Tensor
+    steps: Tensor
+    moved: Tensor
+    reseeded: Tensor
+    converged: Tensor
 
-    def merge(self, *others: SufficientStatistics) -> SufficientStatistics:
-        """Return the statistics of all points together."""
-        total = self
-        for other in others:
-            pairs = zip(total, other, strict=True)
-            total = SufficientStatistics(*(a + b for a, b in pairs))
-        return total
+    def __init__(
+        self,
+        start: MixtureParameters,
+        shift: Float[Tensor, " D"],
+        factor: Float[Tensor, "D D"],
+        floor: Float[Tensor, "D D"],
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        super().__init__()
+        parts = {**start._asdict(), "shift": shift, "factor": factor, "floor": floor}
+        for name, value in parts.items():
+            # in the order in memory that a checkpoint has: the last bit of products depends on it
+            wide = value.detach().double().clone(memory_format=torch.contiguous_format)
+            self.register_buffer(name, wide)
+        self.register_buffer("history", torch.zeros(0, dtype=torch.float64))
+        for name in ("steps", "moved", "reseeded"):
+            self.register_buffer(name, torch.tensor(0))
+        self.register_buffer("converged", torch.tensor(False))
+        self.dtype = dtype
 
     @classmethod
-    def zeros(cls, n_components: int, dim: int, device: Any = None) -> SufficientStatistics:
-        """Return the statistics of no points."""
-        n_features = 1 + dim + dim * (dim + 1) // 2
-        table = torch.zeros(n_components, n_features, dtype=torch.float64, device=device)
-        return cls(table, table.new_zeros(()), table.new_zeros(()))
+    def in_units(
+        cls,
+        start: MixtureParameters,
+        shift: Float[Tensor, " D"],
+        factor: Float[Tensor, "D D"],
+        variances: Float[Tensor, " D"],
+        dtype: torch.dtype = torch.float64,
+    ) -> Self:
+        """Return the fit of a mixture that is given in the units of the points.
 
-    def pack(self) -> Float[Tensor, " P"]:
-        """Everything in one vector, which processes can sum up in a single exchange."""
-        return torch.cat([self.table.flatten(), self.log_likelihood[None], self.weight[None]])
+        Args:
+            start: the mixture of x. shift, factor: m and L, see `whitening`.
+            variances: added to the diagonal of every covariance of x. dtype: as for the class.
+        """
+        inverse = _inverse(factor)
+        weights, means, covariances = (p.detach().double() for p in start)
+        first = map_mixture(MixtureParameters(weights, means - shift, covariances), inverse)
+        return cls(first, shift, factor, (inverse * variances) @ inverse.T, dtype)
 
     @classmethod
-    def unpack(cls, packed: Float[Tensor, " P"], n_components: int) -> SufficientStatistics:
-        """What `pack` was given."""
-        return cls(packed[:-2].reshape(n_components, -1), packed[-2], packed[-1])
+    def blank(cls, n_components: int, dim: int, dtype: torch.dtype = torch.float64) -> Self:
+        """Return a mixture of the given size to load a `state_dict` into."""
+        eye = torch.eye(dim, dtype=torch.float64)
+        means = torch.zeros(n_components, dim, dtype=torch.float64)
+        weights = torch.full((n_components,), 1 / n_components, dtype=torch.float64)
+        start = MixtureParameters(weights, means, eye.expand(n_components, -1, -1))
+        return cls(start, means[0], eye, torch.zeros_like(eye), dtype)
 
+    def restart(self, parameters: MixtureParameters) -> None:
+        """Go on from another mixture, given in the units of the buffers, with an empty history."""
+        self._set(parameters)
+        self.history = self.history[:0]
+        for name in ("steps", "moved", "reseeded", "converged"):
+            setattr(self, name, torch.zeros_like(getattr(self, name)))
 
-@dataclass(frozen=True)
-class FitReport:
-    """How a fit went.
+    # --- one step
 
-    Attributes:
-        iterations: maximisation steps taken.
-        log_likelihood: mean log-likelihood before every maximisation step and at the end.
-        converged: the last change was below the tolerance.
-        reseeded: how often an empty or collapsed component was moved.
-        starts: final mean log-likelihood of every start.
-    """
+    def parameters_tuple(self) -> MixtureParameters:
+        """Return weights, means and covariances in the units of the buffers."""
+        return MixtureParameters(self.weights, self.means, self.covariances)
 
-    iterations: int
-    log_likelihood: tuple[float, ...]
-    converged: bool
-    reseeded: int
-    starts: tuple[float, ...] = ()
+    def whitened(self, points: Float[Tensor, "N D"]) -> Float[Tensor, "D N"]:
+        """Return y = L^-1 (x - m) of points, in the dtype of the products."""
+        return (_inverse(self.factor) @ (points - self.shift).T).to(self.dtype)
 
+    @torch.no_grad()
+    def record(self, statistics: SufficientStatistics, tol: float = 0.0) -> float:
+        """Note the mean log-likelihood of the mixture, and whether it has settled.
 
-def natural_parameters(parameters: MixtureParameters) -> Float[Tensor, "K F"]:
-    """theta with theta_k . phi(x) = log pi_k + log N(x; mu_k, Sigma_k).
+        Args:
+            statistics: of all samples, made with the mixture as it is.
+            tol: change of the mean log-likelihood below which the fit has converged, unless a
+                component was moved in the last step; 0 never converges.
 
-    With P_k = Sigma_k^-1,
-    theta_k = [log pi_k - log|2 pi Sigma_k|/2 - mu_k' P_k mu_k/2, P_k mu_k, -P_k/2].
+        Returns:
+            Mean log-likelihood in units of the states.
 
-    Raises:
-        CovarianceError: a covariance is not positive definite.
-    """
-    weights, means, covariances = parameters
-    dim = means.shape[-1]
-    factor, info = torch.linalg.cholesky_ex(symmetrise(covariances))
-    if bool(info.any()):
-        raise CovarianceError(
-            f"covariances must be positive definite, got {int((info != 0).sum())} that are not; "
-            "use a larger covariance floor, or fewer components"
+        Raises:
+            InputError: no samples, or a log-likelihood that is not finite.
+        """
+        value = self.mean_log_likelihood(statistics)
+        steps = int(self.steps)
+        if not math.isfinite(value):
+            raise InputError(
+                f"EM broke down: the mean log-likelihood became {value} after {steps} steps; use "
+                "float64, a larger covariance floor, or another start (or another process failed: "
+                "see its message)"
+            )
+        settled = steps > 0 and abs(value - float(self.history[steps - 1])) < tol
+        self.converged = torch.full_like(self.converged, settled and int(self.moved) == 0)
+        self.history = torch.cat([self.history[:steps], self.history.new_tensor([value])])
+        return value
+
+    @torch.no_grad()
+    def maximise(self, statistics: SufficientStatistics, tol: float = 0.0) -> float:
+        """`record`, and the maximisation step unless the fit has converged.
+
+        Returns:
+            Mean log-likelihood, in units of the states, of the mixture before the step.
+        """
+        value = self.record(statistics, tol)
+        if not bool(self.converged):
+            parameters, moved = m_step(statistics, self.floor)
+            self._set(parameters)
+            self.moved = torch.full_like(self.moved, moved)
+            self.reseeded = self.reseeded + moved
+            self.steps = self.steps + 1
+        return value
+
+    def mean_log_likelihood(self, statistics: SufficientStatistics) -> float:
+        """Mean log-likelihood, in units of the states, from statistics that `expect` made."""
+        if float(statistics.weight) == 0:
+            raise InputError("EM needs samples of positive weight, got none; look at the weights")
+        offset = float(self.factor.diagonal().log().sum())
+        return float(statistics.log_likelihood / statistics.weight) - offset
+
+    def parameters_of_points(self) -> MixtureParameters:
+        """Return the mixture as it is, in the units of the points."""
+        state = map_mixture(self.parameters_tuple(), self.factor)
+        return state._replace(means=state.means + self.shift)
+
+    def report(self) -> FitReport:
+        """Return how the fit has gone so far."""
+        return FitReport(
+            iterations=int(self.steps),
+            log_likelihood=tuple(self.history.tolist()),
+            converged=bool(self.converged),
+            reseeded=int(self.reseeded),
         )
-    precision = torch.cholesky_inverse(factor)
-    linear = (precision @ means.unsqueeze(-1)).squeeze(-1)
-    log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    constant = weights.log() - log_det - 0.5 * dim * LOG_2PI - 0.5 * (means * linear).sum(-1)
-    rows, columns = _upper_triangle(dim, means.device)
-    fold = torch.where(rows == columns, -0.5, -1.0).to(means)
-    return torch.cat([constant.unsqueeze(-1), linear, precision[:, rows, columns] * fold], -1)
+
+    def extra_repr(self) -> str:
+        n_components, dim = self.means.shape
+        return f"n_components={n_components}, dim={dim}, steps={int(self.steps)}"
+
+    def _set(self, parameters: MixtureParameters) -> None:
+        for name, value in parameters._asdict().items():
+            setattr(self, name, value.to(self.means).contiguous())
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        means, history = (state_dict.get(prefix + name) for name in ("means", "history"))
+        if means is not None and means.shape != self.means.shape:
+            raise InputError(
+                "the checkpoint holds a mixture of {} components over {} dimensions, this fit has "
+                "{} over {}; resume it with the settings that it was made with".format(
+                    *means.shape, *self.means.shape
+                )
+            )
+        if history is not None:
+            self.history = self.history.new_zeros(history.shape)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
-@torch.no_grad()
-def e_step(
-    x: Float[Tensor, "N D"],
-    parameters: MixtureParameters,
-    sample_weight: Float[Tensor, " N"] | None = None,
-) -> SufficientStatistics:
-    """Run the expectation step: responsibilities, summed up at once (BL 53-56).
-
-    Args:
-        x: points; a transposed [D, N] tensor in memory is fastest. Its dtype is that of the
-            products, sums over chunks are kept in the dtype of the parameters.
-        parameters: the mixture. Best in units in which the data have unit covariance, since
-            theta . phi(x) cancels.
-        sample_weight: w_n >= 0; a point of weight 2 counts as two points.
-
-    Returns:
-        The statistics of `m_step`.
-    """
-    theta = natural_parameters(parameters)
-    order = cyclic_order(x.shape[1], x.device)
-    # powers of two, 2^(theta . phi(x) / log 2), take a third of the time that those of e take
-    powers = _pad_components((theta[:, order] / LOG_2).to(x.dtype))
-    table, total = torch.zeros_like(powers, dtype=theta.dtype), theta.new_zeros(())
-    chunk, least = _chunk_size(x.device), least_exponent(x.dtype) / LOG_2
-    features, points = CyclicFeatures(x, chunk), x.T
-    for start in range(0, len(x), chunk):
-        phi = features.of(points[:, start : start + chunk])
-        terms = powers @ phi
-        top = terms.amax(0)
-        norm = terms.sub_(top).clamp_min_(least).exp2_().sum(0)
-        log_density, scale = norm.log2().add_(top), norm.reciprocal_()
-        if sample_weight is not None:
-            weight = sample_weight[start : start + chunk].to(x.dtype)
-            scale.mul_(weight)
-            log_density.mul_(weight)
-        table += terms.mul_(scale) @ phi.T
-        total += log_density.sum(dtype=total.dtype)
-    count = sample_weight.sum() if sample_weight is not None else total.new_tensor(len(x))
-    sums = torch.empty_like(theta)
-    sums[:, order] = table[: len(theta)]
-    return SufficientStatistics(sums, total * LOG_2, count.to(total.dtype))
-
-
-def _chunk_size(device: torch.device) -> int:
-    """Return how many points go into one product: 2 MB of features for each core, which stay in its cache."""
-    return POINTS * (torch.get_num_threads() if device.type == "cpu" else 64)
-
-
-def _pad_components(theta: Tensor) -> Tensor:
-    """Terms that vanish, up to a multiple of four: products are 10 % faster than with 30."""
-    extra = theta.new_zeros(-len(theta) % 4, theta.shape[1])
-    extra[:, 0] = torch.finfo(theta.dtype).min
-    return torch.cat([theta, extra])
-
-
-def m_step(
-    statistics: SufficientStatistics, floor: Float[Tensor, "D D"]
-) -> tuple[MixtureParameters, int]:
-    """Run the maximisation step, with empty and collapsed components moved (BL 54-56).
-
-    pi_k = n_k / n,  mu_k = s_k / n_k,  Sigma_k = S_k / n_k - mu_k mu_k' + floor
-
-    A component has collapsed if it explains fewer than D + 1 points (or a tenth of its share n / K
-    if that is less), if its covariance before the floor is below the floor in every direction, or
-    if its covariance is not positive definite. It is given half of the component that explains
-    most points, which is split in two along its longest axis so that both together keep its mean
-    and covariance. So no weight is ever zero and the number of components stays.
+def run_fit(
+    fit: MixtureFit,
+    expect: Callable[[], SufficientStatistics],
+    *,
+    max_iter: int = 200,
+    tol: float = 1e-4,
+    progress: bool = False,
+) -> None:
+    """Take EM steps until a fit has converged or taken `max_iter` of them, those before included.
 
     Args:
-        statistics: of all points.
-        floor: added to every covariance; zeros for none.
-
-    Returns:
-        The mixture and how many components were moved.
+        fit: in whatever state. expect: gives the sums of all points, with the mixture as it is.
+        max_iter: largest number of steps. tol: as for `MixtureFit.record`. progress: show a bar.
     """
-    table = statistics.table
-    n_components, dim = len(table), floor.shape[-1]
-    count = table[:, 0]
-    safe = count.clamp_min(torch.finfo(table.dtype).tiny)
-    means = table[:, 1 : 1 + dim] / safe.unsqueeze(-1)
-    rows, columns = _upper_triangle(dim, table.device)
-    spread = table.new_zeros(n_components, dim, dim)
-    spread[:, rows, columns] = table[:, 1 + dim :] / safe.unsqueeze(-1)
-    spread[:, columns, rows] = spread[:, rows, columns]
-    spread = spread - means.unsqueeze(-1) * means.unsqueeze(-2)
-    lost = _collapsed(count, spread, floor)
-    moved = int(lost.sum())
-    state = MixtureParameters(count / statistics.weight, means, spread + floor)
-    for index in lost.nonzero().flatten().tolist():
-        state, lost = _split_largest(state, index, lost)
-    return state._replace(weights=state.weights / state.weights.sum()), moved
-
-
-def _collapsed(count: Tensor, spread: Tensor, floor: Tensor) -> Tensor:
-    """Return which components [K] are empty, below the floor everywhere, or not positive definite."""
-    n_components, dim = spread.shape[:2]
-    least = min(dim + 1.0, float(count.sum()) / (10 * n_components))
-    usable = torch.isfinite(spread).all(-1).all(-1)
-    excess = torch.where(usable[:, None, None], symmetrise(spread - floor), -floor)
-    flat = (excess.diagonal(dim1=-2, dim2=-1) <= 0).all(-1)
-    if bool(flat.any()):  # the diagonal alone decides nearly always
-        flat &= torch.linalg.eigvalsh(excess)[:, -1] <= 0
-    singular = torch.linalg.cholesky_ex(torch.where(usable[:, None, None], spread, 0) + floor).info
-    return (count < least) | flat | (singular != 0) | ~usable
-
-
-def _split_largest(
-    state: MixtureParameters, index: int, lost: Tensor
-) -> tuple[MixtureParameters, Tensor]:
-    """Give component `index` half of the heaviest component that is not lost."""
-    weights, means, covariances = (p.clone() for p in state)
-    lost = lost.clone()
-    candidates = torch.where(lost, torch.zeros_like(weights), weights)
-    if not bool((candidates > 0).any()):  # all collapsed, as on points that coincide
-        candidates = torch.where(torch.isfinite(means).all(-1), weights, torch.zeros_like(weights))
-    parent = int(candidates.argmax())
-    values, vectors = torch.linalg.eigh(covariances[parent])
-    # half of the longest axis' variance goes into the distance of the two means
-    step = vectors[:, -1] * (values[-1] / 2).sqrt()
-    covariances[parent] = symmetrise(covariances[parent] - torch.outer(step, step))
-    weights[parent] = weights[parent] / 2
-    means[index], means[parent] = means[parent] + step, means[parent] - step
-    weights[index], covariances[index] = weights[parent], covariances[parent]
-    lost[index] = False
-    return MixtureParameters(weights, means, covariances), lost
+    with IterationBar(max_iter, progress) as bar:
+        while not bool(fit.converged):
+            statistics = expect()
+            if int(fit.steps) >= max_iter:
+                fit.record(statistics, tol)
+                return
+            bar.update(fit.maximise(statistics, tol))
 
 
 def expectation_maximisation(
@@ -265,7 +253,7 @@ def expectation_maximisation(
     dtype: torch.dtype = torch.float64,
     progress: bool = False,
 ) -> tuple[MixtureParameters, FitReport]:
-    """Run EM from a given start until the mean log-likelihood changes by less than `tol`.
+    """Fit by EM from a given start until the mean log-likelihood changes by less than `tol`.
 
     Internally the points are whitened with their own covariance, in float64: that takes away the
     cancellation in theta . phi(x), and EM itself does not change under such a map. Parameters and
@@ -300,48 +288,15 @@ def expectation_maximisation(
     if sample_weight is not None:
         sample_weight = sample_weight.detach().double()
     diagonal = torch.zeros_like(x[0]) if floor is None else floor.to(x)
-    mean, centred, factor = whitening(x, sample_weight, diagonal)
-    inverse = torch.linalg.solve_triangular(factor, torch.eye(len(mean)).to(x), upper=False)
-    white = (inverse @ centred).to(dtype)  # [D, N] in memory, as `e_step` wants it
-    weights, means, covariances = (p.detach().double() for p in start)
-    state = map_mixture(MixtureParameters(weights, means - mean, covariances), inverse)
-    state, report = _iterate(
-        white.T, state, sample_weight, max_iter, tol, (inverse * diagonal) @ inverse.T, progress,
-        offset=float(factor.diagonal().log().sum()),
-    )  # fmt: skip
-    state = map_mixture(state, factor)
-    return state._replace(means=state.means + mean), report
+    shift, centred, factor = whitening(x, sample_weight, diagonal)
+    fit = MixtureFit.in_units(start, shift, factor, diagonal, dtype)
+    white = (_inverse(factor) @ centred).to(dtype)  # [D, N] in memory, as `e_step` wants it
 
+    def expect() -> SufficientStatistics:
+        return e_step(white.T, fit.parameters_tuple(), sample_weight)
 
-def _iterate(
-    points: Tensor,
-    state: MixtureParameters,
-    sample_weight: Tensor | None,
-    max_iter: int,
-    tol: float,
-    floor: Tensor,
-    progress: bool,
-    offset: float,
-) -> tuple[MixtureParameters, FitReport]:
-    history: list[float] = []
-    moved_before, reseeded, converged = 0, 0, False
-    with IterationBar(max_iter, progress) as bar:
-        for iteration in range(max_iter + 1):
-            statistics = e_step(points, state, sample_weight)
-            history.append(float(statistics.log_likelihood / statistics.weight) - offset)
-            if not math.isfinite(history[-1]):
-                raise InputError(
-                    f"EM broke down: the mean log-likelihood became {history[-1]} after "
-                    f"{iteration} iterations; use float64, a larger covariance floor, or another start"
-                )
-            settled = len(history) > 1 and abs(history[-1] - history[-2]) < tol
-            converged = settled and moved_before == 0
-            if converged or iteration == max_iter:
-                break
-            state, moved_before = m_step(statistics, floor)
-            reseeded += moved_before
-            bar.update(history[-1])
-    return state, FitReport(len(history) - 1, tuple(history), converged, reseeded)
+    run_fit(fit, expect, max_iter=max_iter, tol=tol, progress=progress)
+    return fit.parameters_of_points(), fit.report()
 
 
 class IterationBar:
@@ -409,6 +364,5 @@ def _check_points(x: Tensor, start: MixtureParameters, sample_weight: Tensor | N
             )
 
 
-def _upper_triangle(dim: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    rows, columns = torch.triu_indices(dim, dim, device=device)
-    return rows, columns
+def _inverse(factor: Tensor) -> Tensor:
+    return torch.linalg.solve_triangular(factor, torch.eye(len(factor)).to(factor), upper=False)

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.errors import check_finite, check_shape, check_weights
-from torchpose.math.mixture_em import MixtureParameters
+from torchpose.math.mixture_steps import MixtureParameters
 
 __all__ = ["STARTS", "floor_variances", "k_means", "start_mixture"]
 

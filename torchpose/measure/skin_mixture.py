@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchpose.errors import InputError, check_shape
-from torchpose.math.mixture_em import MixtureParameters, natural_parameters
+from torchpose.math.mixture_steps import MixtureParameters, natural_parameters
 from torchpose.measure.face import check_faces
 
 __all__ = ["SkinMixtureModel", "SkinMixtureState"]

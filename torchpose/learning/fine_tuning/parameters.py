@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from torchpose.camera.projection import lift
-from torchpose.math.mixture_em import MixtureParameters
+from torchpose.math.mixture_steps import MixtureParameters
 from torchpose.math.rotations import euler_to_matrix
 from torchpose.metrics.poses import ALIGN_JOINTS, procrustes
 from torchpose.priors.gaussian_mixture import GaussianMixture

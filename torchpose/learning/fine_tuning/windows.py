@@ -22,7 +22,7 @@ from torchpose.learning.fine_tuning.parameters import (
     tuned_mixtures,
 )
 from torchpose.learning.samplers import WindowSource
-from torchpose.math.mixture_em import MixtureParameters
+from torchpose.math.mixture_steps import MixtureParameters
 from torchpose.priors.arm_state import STATE_DIM
 from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.priors.window import WindowPrior

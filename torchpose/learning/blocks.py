@@ -1,16 +1,77 @@
-"""Samples that a fit can use: finite, and of positive weight."""
+"""Blocks of samples: which are whose, which of their samples a fit can use, and products of many."""
 
 from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from torchpose.errors import InputError
-from torchpose.learning.samplers import BLOCK, Samples, SampleSource
+from torchpose.learning.samplers import BLOCK, PRODUCT, Samples, SampleSource, join_samples
 
-__all__ = ["spread_samples", "usable_block", "usable_samples"]
+__all__ = [
+    "ALONE",
+    "Share",
+    "joined_blocks",
+    "spread_samples",
+    "usable_block",
+    "usable_samples",
+]
 
+K = TypeVar("K")
 _START_BLOCKS = 4  # times as many blocks as the samples would fill, for variety
+
+
+def _alone(values: Tensor) -> Tensor:
+    return values
+
+
+def _sum_over_processes(values: Tensor) -> Tensor:
+    total = values.clone()
+    torch.distributed.all_reduce(total)
+    return total
+
+
+class Share(NamedTuple):
+    """Which part of the work this process does.
+
+    Attributes:
+        rank, size: number of this process, and how many there are.
+        total: the sum of a tensor over all processes, which each of them has to call.
+    """
+
+    rank: int = 0
+    size: int = 1
+    total: Callable[[Tensor], Tensor] = _alone
+
+    @classmethod
+    def of_processes(cls) -> Share:
+        """This process' share in the group of `torch.distributed`; all of it without a group."""
+        if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
+            return cls()
+        rank, size = torch.distributed.get_rank(), torch.distributed.get_world_size()
+        return cls(rank, size, _sum_over_processes)
+
+    def blocks(self, n_blocks: int) -> range:
+        """The blocks of this process: every block belongs to exactly one, none is padded."""
+        return range(self.rank, n_blocks, self.size)
+
+    @contextlib.contextmanager
+    def failing_together(self, like: Tensor) -> Iterator[None]:
+        """Work before a `total` of the shape of `like`, which the others get as NaN if it fails."""
+        try:
+            yield
+        except Exception:
+            if self.size > 1:  # or the others would wait for this process for ever
+                self.total(torch.full_like(like, torch.nan))
+            raise
+
+
+ALONE = Share()
+"""All of the work, for a process without others."""
 
 
 def usable_samples(samples: Samples, name: str) -> Samples:
@@ -84,3 +145,24 @@ def usable_block(source: SampleSource, index: int, epoch: int = 0) -> Samples:
     """Samples of positive weight of a block, which is named in the error if they are not finite."""
     name = f"block {index} of {source.n_blocks}"
     return usable_samples(source.block(index, epoch), name)
+
+
+def joined_blocks(blocks: Iterable[tuple[K, Samples]]) -> Iterator[tuple[K, Samples]]:
+    """Join blocks of one key that follow each other to as many samples as one product takes.
+
+    Args:
+        blocks: keys, such as the name of their source, and samples; those of one key together.
+    """
+    kept: list[Samples] = []
+    last: list[K] = []
+    for key, samples in blocks:
+        if kept and last != [key]:
+            yield last[0], join_samples(kept)
+            kept = []
+        last = [key]
+        kept.append(samples)
+        if sum(len(s.states) for s in kept) >= PRODUCT:
+            yield key, join_samples(kept)
+            kept = []
+    if kept:
+        yield last[0], join_samples(kept)
