@@ -10,8 +10,7 @@ from sklearn.mixture import GaussianMixture as Sklearn
 
 from tests.priors.mixtures import random_mixture
 from torchpose.errors import CovarianceError, InputError, ShapeError
-from torchpose.math import expectation_maximisation
-from torchpose.math import mixture_em as em
+from torchpose.math import expectation_maximisation, mixture_steps
 from torchpose.math.mixture_features import CyclicFeatures, cyclic_order
 from torchpose.math.mixture_start import STARTS, floor_variances, k_means, start_mixture
 from torchpose.math.mixture_steps import MixtureParameters, e_step, m_step, natural_parameters
@@ -72,7 +71,7 @@ def test_features_times_theta_is_the_log_density():
 
 @pytest.mark.parametrize(("k", "dim"), [(1, 1), (5, 2), (4, 3), (6, 8), (3, 21)])
 def test_statistics_are_the_sums_they_say(k, dim, monkeypatch):
-    monkeypatch.setattr(em, "POINTS", 600 // torch.get_num_threads())  # several chunks
+    monkeypatch.setattr(mixture_steps, "POINTS", 600 // torch.get_num_threads())  # several chunks
     mixture, x = random_mixture(k, dim), sample(2500, dim=dim)
     r = mixture.component_log_prob(x).softmax(-1)
     statistics = e_step(x, mixture.parameters_tuple())
