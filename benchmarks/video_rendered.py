@@ -27,7 +27,6 @@ from tqdm.auto import tqdm
 from benchmarks.speed._timing import markdown_table, processor_model
 from torchpose import VideoTracker, load_prior, viz
 from torchpose._core.files import check_output_folder
-from torchpose.cli.demo_scores import mean_pose
 from torchpose.demo import KEYPOINT_NAMES, demo_camera
 from torchpose.demo.rendering import LOOKS, PERFORMANCES, performance, render_video
 from torchpose.metrics import joint_errors_3d
@@ -107,7 +106,7 @@ def main() -> None:
         ]
     outcomes[TRUE_2D] = [from_truth(prior, clip) for clip in clips]
     outcomes[MEAN_POSE] = [
-        Outcome(joint_errors_3d(mean_pose(prior).expand_as(clip.joints3d), clip.joints3d))
+        Outcome(joint_errors_3d(prior.mean_pose().expand_as(clip.joints3d), clip.joints3d))
         for clip in clips
     ]
     text = report(outcomes, clips, arguments.look)

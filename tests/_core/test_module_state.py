@@ -21,7 +21,7 @@ from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walk
 from torchpose import body, filters, measure, priors, whole_body
 from torchpose.body import Body, JointLimits
 from torchpose.camera import PinholeCamera
-from torchpose.learning import fit_gplvm, fit_gplvm_noise, fit_limb_conditionals
+from torchpose.learning import fit_action_space, fit_gplvm, fit_gplvm_noise, fit_limb_conditionals
 from torchpose.measure.association import HandAssociation
 from torchpose.measure.brightness_background import BrightnessBackground
 from torchpose.measure.persons import PersonRegister
@@ -95,7 +95,7 @@ def actions(seed):
 
 
 def bank(seed):
-    other = priors.fit_action_space(performances("wave", first=50 * seed), 4, name="wave", fps=30.0)
+    other = fit_action_space(performances("wave", first=50 * seed), 4, name="wave", fps=30.0)
     return ActionBank([space("bend"), other])
 
 

@@ -85,7 +85,7 @@ def test_refusals(torchpose, calls, tmp_path):
     data, out = ("--data", tmp_path), ("--out", tmp_path / "out")
     (tmp_path / "file").write_text("")
     for arguments, message in (
-        ((), "the protocol is missing; known are leave-one-person-out, learning-curve"),
+        ((), "the protocol is missing; known are score, leave-one-person-out"),
         (("ub-two", *data, *out), "unknown protocol 'ub-two'"),
         (("learning-curve", *data), "missing: --out"),
         (("learning-curve", "--data", tmp_path / "none", *out), "no such folder"),

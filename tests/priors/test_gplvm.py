@@ -307,7 +307,7 @@ def test_a_manifold_of_another_body_is_refused(manifold, body) -> None:
         manifold.check_for(body, fps=30.0)
     plain = fit_gplvm(motion(20), steps=1)
     plain.check_for(body)
-    with pytest.raises(PriorError, match="no standard deviations yet; call fit_noise"):
+    with pytest.raises(PriorError, match="no standard deviations yet; call fit_gplvm_noise"):
         plain.check_for(body, fps=60.0)
     narrow = fit_gplvm(motion(20)[:, :12], steps=1)
     with pytest.raises(PriorError, match="it has 12 columns, poses of the body have 30"):

@@ -17,7 +17,7 @@ COMMANDS = {
     "track": "2D keypoints to 2D and 3D poses",
     "track-body": "videos of calibrated cameras to the poses of a whole body",
     "fit": "fit a prior to recorded 3D poses",
-    "evaluate": "score priors on recordings: leave-one-person-out, learning-curve, ...",
+    "evaluate": "score priors on recordings: score, leave-one-person-out, ...",
     "demo": "track an animated performer; needs no data",
     "info": "version, priors that are there, what a file holds",
 }
@@ -27,7 +27,7 @@ examples:
   torchpose track keypoints.npz --out result
   torchpose track keypoints.csv --out result --camera 525,525,319.5,239.5 --smoothing full
   torchpose fit recordings/ --out prior.safetensors --components 30 --seed 0
-  torchpose evaluate leave-one-person-out recordings/ --out result
+  torchpose evaluate score recordings/ --prior kinect-upper-body --out result
   torchpose info kinect-upper-body"""
 
 

@@ -1,7 +1,7 @@
 """How good the tracks of the animated performer are, beside the mean pose of the prior."""
 
 import sys
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -14,7 +14,6 @@ __all__ = [
     "Hidden",
     "Scores",
     "beaten",
-    "mean_pose",
     "report",
     "score",
     "score_mean_pose",
@@ -44,18 +43,6 @@ class Hidden(NamedTuple):
     frames: slice
 
 
-def mean_pose(prior: "UpperBodyPrior") -> "Tensor":
-    """Mean of the prior over poses, [8, 3] in the body frame, metres: the least one has to beat."""
-    from torchpose.camera.lifting import arm_in_body_frame, join_arms
-
-    order: Any = prior.info.rotation_order
-    arms = []
-    for arm in (prior.left, prior.right):
-        joints, _ = arm_in_body_frame(arm.means, arm.covariances, prior.info.matrix, order)
-        arms.append((arm.weights[:, None, None] * joints).sum(0)[None, None])
-    return join_arms(*arms)[0, 0]
-
-
 def score(track: "PoseTrack", truth: "Tensor") -> Scores:
     """Errors and coverage of a track of true joints [T, 8, 3] before `demo_camera`."""
     from torchpose.demo.performer import demo_camera
@@ -76,7 +63,7 @@ def score_mean_pose(prior: "UpperBodyPrior", truth: "Tensor") -> Scores:
     """Errors of the mean pose of the prior, which does not move."""
     from torchpose.metrics.poses import joint_errors_3d
 
-    return Scores(joint_errors_3d(mean_pose(prior).expand_as(truth), truth))
+    return Scores(joint_errors_3d(prior.mean_pose().expand_as(truth), truth))
 
 
 def report(scores: dict[str, Scores], measured: str, hidden: Hidden | None = None) -> str:

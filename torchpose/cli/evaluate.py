@@ -8,6 +8,11 @@ from torchpose.cli.common import new_parser
 from torchpose.cli.protocol import Protocol, build, execute
 
 PROTOCOLS = {
+    "score": Protocol(
+        "torchpose.evaluation.score",
+        "a prior and a tracker on recordings of persons whom the prior does not know",
+        "recordings",
+    ),
     "leave-one-person-out": Protocol(
         "torchpose.evaluation.leave_one_person_out",
         "each person of some recordings under a prior of the others",

@@ -168,7 +168,9 @@ def _add_own_options(parser: ArgumentParser, function: Callable[..., Any]) -> No
             "--prior",
             type=str,
             metavar="NAME|FILE",
-            help="score this prior, fitted on other persons, instead of fitting one",
+            help=texts.get(
+                "prior", "score this prior, fitted on other persons, instead of fitting one"
+            ),
         )
 
 

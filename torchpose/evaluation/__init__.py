@@ -1,5 +1,6 @@
 """Evaluate priors and trackers on recordings: each protocol is one function, ``run(data, out)``.
 
+- `score`: a prior and a tracker on any recordings, beside the mean pose.
 - `leave_one_person_out`: each person of any recordings under a prior of the others.
 - `learning_curve`: error over the number of training persons; one person's prior against many.
 - `cross_dataset`: a prior of one data set on another one's persons, and what motion capture adds.

@@ -63,7 +63,6 @@ TEST_TRANSLATION = (0.05, -0.2, 2.0)
 
 MEASURED = ("head", "neck", "hand_left", "hand_right")
 HANDS = (UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right"))
-_MEASURED_AT = tuple(UPPER_BODY.index(name) for name in MEASURED)
 _NECK = UPPER_BODY.index("neck")
 
 Recipe = Callable[..., UpperBodyPrior]
@@ -146,14 +145,16 @@ class Trials(NamedTuple):
 
     Attributes:
         truth3d: [B, T, 8, 3], camera axes, metres. truth2d: [B, T, 8, 2], pixels.
-        keypoints: of `MEASURED`, with noise, [B, T, 4, 2]. lengths: [B]. fps: frame rate.
+        keypoints: with noise, [B, T, M, 2]. lengths: [B]. fps: frame rate.
+        names: of the M measured joints.
     """
 
     truth3d: Float[Tensor, "B T 8 3"]
     truth2d: Float[Tensor, "B T 8 2"]
-    keypoints: Float[Tensor, "B T 4 2"]
+    keypoints: Float[Tensor, "B T M 2"]
     lengths: Int[Tensor, " B"]
     fps: float
+    names: tuple[str, ...] = MEASURED
 
     @property
     def inside(self) -> Bool[Tensor, "B T"]:
@@ -173,14 +174,16 @@ def make_test_set(
     seed: int = 0,
     noise_std: float = 3.0,
     paths: Sequence[Float[Tensor, "T 3"]] | None = None,
+    names: tuple[str, ...] = MEASURED,
 ) -> Trials:
-    """Project poses into the test camera and measure head, neck and hands with Gaussian noise.
+    """Project poses into the test camera and measure some joints with Gaussian noise.
 
     Args:
         poses: one tensor for each sequence, metres, centred, camera axes.
         camera: of the test. fps: frame rate.
         seed: of the noise, which is independent over joints, frames and coordinates.
         noise_std: pixels. paths: translation of the whole body in each frame, metres.
+        names: of the measured joints; by default head, neck and hands.
 
     Raises:
         InputError: no sequences, or a missing joint.
@@ -196,9 +199,11 @@ def make_test_set(
     truth3d = joints @ rotation.mT + place[..., None, :]
     truth2d = project(joints, camera.matrix, rotation, place)[..., :2]
     generator = torch.Generator().manual_seed(seed)
-    noise = torch.randn(*joints.shape[:2], 4, 2, generator=generator, dtype=torch.float64)
-    keypoints = truth2d[:, :, list(_MEASURED_AT)] + noise_std * noise
-    test = Trials(truth3d, truth2d, keypoints, lengths, fps)
+    measured = [UPPER_BODY.index(name) for name in names]
+    shape = (*joints.shape[:2], len(names), 2)
+    noise = torch.randn(shape, generator=generator, dtype=torch.float64)
+    keypoints = truth2d[:, :, measured] + noise_std * noise
+    test = Trials(truth3d, truth2d, keypoints, lengths, fps, names)
     outside = ~test.inside
     if not bool(torch.isfinite(truth3d[~outside]).all()):
         raise InputError("test sequences must hold all eight joints, got missing ones")
@@ -219,7 +224,7 @@ def track(
     prior: UpperBodyPrior,
     camera: PinholeCamera,
     test: Trials,
-    mask: Bool[Tensor, "B T 4"] | None = None,
+    mask: Bool[Tensor, "B T M"] | None = None,
     *,
     chunk: int = 32,
     progress: bool = False,
@@ -230,7 +235,7 @@ def track(
     """Run `UpperBodyTracker` over a test set, some sequences at a time.
 
     Args:
-        prior: of the tracker. camera: of the test. mask: [B, T, 4], False = hidden.
+        prior: of the tracker. camera: of the test. mask: [B, T, M], False = hidden.
         chunk: sequences at a time. progress, label: of the bar. generator: for methods that draw.
         options: of the tracker.
     """
@@ -246,7 +251,7 @@ def track(
         with torch.inference_mode():
             poses = tracker(
                 test.keypoints[rows, :longest],
-                names=MEASURED,
+                names=test.names,
                 mask=None if mask is None else mask[rows, :longest],
                 lengths=test.lengths[rows],
                 generator=own,

@@ -50,6 +50,7 @@ __all__ = [
     "Job",
     "ScoreSettings",
     "Scored",
+    "compare",
     "fit_settings",
     "log_likelihood",
     "poses_to_score",
@@ -233,9 +234,9 @@ def score_person(
     mask = mask.expand(*inside.shape, len(MEASURED))
     scored = torch.tensor([name not in settings.unscored for name in UPPER_BODY])
     own: dict[str, Any] = {"mask": mask, "progress": progress}
-    filtered = _compare(track(prior, CAMERA, test, label="filter", **own), test, scored)
+    filtered = compare(track(prior, CAMERA, test, label="filter", **own), test, scored)
     smooth = track(prior, CAMERA, test, label="smoother", smoothing="full", **own)
-    smoothed = _compare(smooth, test, scored)
+    smoothed = compare(smooth, test, scored)
     truth = torch.cat(list(poses)).double()
     likelihood = torch.full((len(truth),), torch.nan, dtype=torch.float64)
     if settings.likelihood:
@@ -246,8 +247,13 @@ def score_person(
     )  # fmt: skip
 
 
-def _compare(found: Estimate, test: Trials, scored: Bool[Tensor, " 8"]) -> tuple[Tensor, Tensor]:
-    """Errors [N, 8], and whether the truth is inside the ellipsoids [N, L, 8]; NaN if unscored."""
+def compare(found: Estimate, test: Trials, scored: Bool[Tensor, " 8"]) -> tuple[Tensor, Tensor]:
+    """Return errors [N, 8], and whether the truth is inside the ellipsoids [N, L, 8]; NaN if unscored.
+
+    Args:
+        found: by a tracker, with covariances. test: that it was given. scored: joints that count; the
+            others are not aligned on.
+    """
     inside = test.inside
     truth, estimate = test.truth3d[inside], found.joints3d[inside]
     on = [joint for joint in ALIGN_JOINTS if bool(scored[joint])]
@@ -284,7 +290,7 @@ def log_likelihood(
 def poses_to_score(
     recordings: Sequence[Recording],
     prior: UpperBodyPrior,
-    train: Sequence[Recording],
+    train: Sequence[Recording] | None,
     name: str = "",
 ) -> list[Float[Tensor, "T 8 3"]]:
     """Complete sequences with the prior's neck, centred on it.
@@ -293,7 +299,8 @@ def poses_to_score(
     neck of another kind is put where the training recordings have theirs (`learn_neck_offset`).
 
     Args:
-        recordings: of a person. prior: that is to track them. train: its training recordings.
+        recordings: of a person. prior: that is to track them. train: its training recordings; None
+            leaves necks of another kind where they are.
         name: of the person, for errors.
 
     Raises:
@@ -311,7 +318,7 @@ def poses_to_score(
     found = []
     for body in bodies:
         joints = body.joints.double()
-        if body.neck != prior.info.neck:
+        if train is not None and body.neck != prior.info.neck:
             offset = offset or training_neck(train, str(prior.info.neck))
             joints = place_neck(joints, offset)
         found += [centred_on_neck(piece) for piece in complete_pieces(joints)]

@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import cast
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from torchpose._core.module_state import register_given
 from torchpose._core.npz import read_npz
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import require_tensor
+from torchpose.camera.lifting import arm_in_body_frame, join_arms
 from torchpose.camera.pinhole import PinholeCamera
 from torchpose.errors import (
     FileFormatError,
@@ -28,6 +30,7 @@ from torchpose.errors import (
 from torchpose.priors.arm_state import (
     STATE_DIM,
     arm_states,
+    check_rotation_order,
     mirror_arm_state,
     mirror_covariance,
     mirror_mixture,
@@ -130,6 +133,15 @@ class UpperBodyPrior(nn.Module):
     def n_components(self) -> int:
         """Number of Gaussians of the left arm."""
         return self.left.n_components
+
+    def mean_pose(self) -> Float[Tensor, "8 3"]:
+        """Return the mean of the mixtures over poses in the body frame, metres: the least to be beaten."""
+        order, matrix = check_rotation_order(self.info.rotation_order), self.info.matrix
+        arms = []
+        for arm in (self.left, self.right):
+            joints, _ = arm_in_body_frame(arm.means, arm.covariances, matrix, order)
+            arms.append((arm.weights[:, None, None] * joints).sum(0)[None, None])
+        return join_arms(*arms)[0, 0]
 
     def mirrored(self) -> UpperBodyPrior:
         """Prior of the mirrored person: each arm is the mirror image of the other one.

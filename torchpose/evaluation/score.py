@@ -1,0 +1,238 @@
+"""Score a prior and a tracker on recordings of one's own, beside the mean pose.
+
+Every recording is seen by the camera of the other evaluations, with Gaussian noise on the keypoints,
+and tracked. Errors are 3D distances after fixed-scale Procrustes on head, neck and shoulders. Persons
+whom the prior was fitted on are refused: on them it looks better than on anybody else.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from torchpose._core.files import check_output_folder
+from torchpose.errors import InputError
+from torchpose.evaluation.common import MEASURED, Trials, add_picture, make_test_set, track
+from torchpose.evaluation.person_tables import (
+    add_persons,
+    add_pose_classes,
+    mean_error,
+    plot_persons,
+    pooled,
+)
+from torchpose.evaluation.persons import by_person, pose_classes, spread
+from torchpose.evaluation.report import Report
+from torchpose.evaluation.unseen import (
+    CAMERA,
+    LEVELS,
+    Scored,
+    compare,
+    log_likelihood,
+    poses_to_score,
+)
+from torchpose.io.recordings import Recording, read_recordings
+from torchpose.metrics.poses import ALIGN_JOINTS, align, joint_errors
+from torchpose.priors.upper_body import UpperBodyPrior, load_prior
+from torchpose.skeleton.joint_sets import UPPER_BODY
+from torchpose.upper_body.methods import METHODS, SMOOTHABLE
+
+__all__ = ["run"]
+
+_SEEN = {"head+hands": MEASURED, "all": UPPER_BODY}
+_DEFAULT_RATE = 30.0
+
+
+class _PersonScores(NamedTuple):
+    """How a person was tracked, and how far off the mean pose of the prior is [N, 8], metres."""
+
+    scored: Scored
+    baseline: Tensor
+    same_neck: bool
+
+
+def run(
+    data: Sequence[str | Path] | str | Path,
+    out: str | Path,
+    *,
+    seed: int = 0,
+    progress: bool = True,
+    prior: UpperBodyPrior | None = None,
+    method: str | None = None,
+    joints: Literal["head+hands", "all"] = "head+hands",
+    noise_std: float = 3.0,
+    every: int = 1,
+    seen: bool = False,
+) -> Report:
+    """Score a prior and a tracker; writes report.json, report.md and a picture to `out`.
+
+    Args:
+        data: folders or files of recordings. out: folder for the results.
+        seed: of the noise, and of methods that draw. progress: whether to show bars.
+        prior: to be scored, a name or a file (default kinect-upper-body).
+        method: of the tracker (default that of torchpose track).
+        joints: what the tracker is given: head, neck and hands, or all eight.
+        noise_std: of a keypoint, pixels (default 3). every: only each n-th recording of a person.
+        seen: score also persons whom the prior was fitted on; the report says so.
+
+    Returns:
+        The report, with the tables `joints`, `persons` and `pose_classes`.
+
+    Raises:
+        InputError: no recordings, or settings out of range. OverlapError: the prior was fitted on one
+            of the persons. PriorError: another kind of hand than the prior's. OutputError: `out`
+            cannot be written.
+    """
+    _check(method, joints, noise_std, every)
+    out = check_output_folder(out)
+    prior = load_prior("kinect-upper-body") if prior is None else prior
+    recordings = read_recordings(data)
+    known = sorted({r.person_id for r in recordings} & set(prior.info.persons))
+    if not seen:
+        prior.check_unseen({r.person_id for r in recordings})
+    persons = {name: group[::every] for name, group in by_person(recordings).items()}
+    found = {}
+    for name, group in tqdm(persons.items(), disable=not progress, unit="person", desc="score"):
+        found[name] = _score(prior, name, group, method, _SEEN[joints], noise_std, seed)
+    report = Report("A prior and a tracker on recordings", {
+        "prior": prior.info.name, "method": method or "default", "joints": joints, "seed": seed,
+        "noise_std": noise_std, "every": every, "persons the prior was fitted on": known,
+        "persons": {name: f"{len(group)} recordings" for name, group in persons.items()},
+    })  # fmt: skip
+    _add_joints(report, found)
+    scored = {name: scores.scored for name, scores in found.items()}
+    add_persons(report, scored)
+    add_pose_classes(report, {"all": pooled(list(scored.values()))})
+    _add_findings(report, found, known)
+    title = f"3D error of each person under {prior.info.name or 'the prior'}"
+    add_picture(report, out, "persons.png", plot_persons(scored, title))
+    report.save(out)
+    return report
+
+
+def _check(method: str | None, joints: str, noise_std: float, every: int) -> None:
+    if method is not None and method not in METHODS:
+        raise InputError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    if joints not in _SEEN:
+        raise InputError(f"joints must be one of {', '.join(_SEEN)}, got {joints!r}")
+    if not 0 < noise_std < float("inf"):
+        raise InputError(f"noise_std must be positive, got {noise_std:g}")
+    if every < 1:
+        raise InputError(f"every must be at least 1, got {every}")
+
+
+def _score(
+    prior: UpperBodyPrior,
+    name: str,
+    recordings: Sequence[Recording],
+    method: str | None,
+    names: tuple[str, ...],
+    noise_std: float,
+    seed: int,
+) -> _PersonScores:
+    """Track the recordings of a person, filtered and, where the method can, smoothed.
+
+    A neck of another kind than the prior's is neither measured nor scored, as there is no telling
+    where the prior would have it.
+    """
+    poses = poses_to_score(recordings, prior, None, name)
+    same_neck = all(r.upper_body().neck == prior.info.neck for r in recordings)
+    rates = [float(r.fps or prior.info.fps or _DEFAULT_RATE) for r in recordings]
+    left_out = () if same_neck else ("neck",)
+    names = tuple(joint for joint in names if joint not in left_out)
+    test = make_test_set(poses, CAMERA, float(np.median(rates)), seed, noise_std, names=names)
+    counted = torch.tensor([joint not in left_out for joint in UPPER_BODY])
+    filtered, inside = _tracked(prior, test, counted, method, seed)
+    smoothed = torch.full_like(filtered, torch.nan)
+    if method is None or method in SMOOTHABLE:
+        smoothed, _ = _tracked(prior, test, counted, method, seed, smoothing="full")
+    truth = torch.cat(list(poses)).double()
+    likelihood = torch.full((len(truth),), torch.nan, dtype=torch.float64)
+    if same_neck:
+        likelihood = log_likelihood(prior, truth, seed)
+    scored = Scored(
+        filtered.float(), smoothed.float(), inside.float(), likelihood, pose_classes(truth)
+    )
+    return _PersonScores(scored, _mean_pose_errors(prior, truth, counted), same_neck)
+
+
+def _tracked(
+    prior: UpperBodyPrior,
+    test: Trials,
+    counted: Bool[Tensor, " 8"],
+    method: str | None,
+    seed: int,
+    **options: Any,
+) -> tuple[Tensor, Tensor]:
+    """Return errors [N, 8] and whether the truth is inside the ellipsoids [N, L, 8]."""
+    generator = torch.Generator().manual_seed(seed)
+    estimate = track(prior, CAMERA, test, method=method, generator=generator, **options)
+    return compare(estimate, test, counted)
+
+
+def _mean_pose_errors(
+    prior: UpperBodyPrior, truth: Float[Tensor, "N 8 3"], counted: Bool[Tensor, " 8"]
+) -> Float[Tensor, "N 8"]:
+    """Return how far the mean pose of the prior is from the truth, aligned as estimates are."""
+    on = [joint for joint in ALIGN_JOINTS if bool(counted[joint])]
+    still = prior.mean_pose().to(truth).expand_as(truth)
+    errors = joint_errors(align(still, truth, on).points, truth)
+    return errors.masked_fill(~counted, torch.nan).float()
+
+
+# --- the report -----------------------------------------------------------------------------------
+
+
+def _add_joints(report: Report, found: Mapping[str, _PersonScores]) -> None:
+    """Add a row for each joint: errors beside those of the mean pose, and coverage."""
+    table = report.table(
+        "joints",
+        "3D error after Procrustes (cm) and true joints inside the ellipsoids (%), by joint",
+        ["mean pose", "filtered", "smoothed", "in 50 %", "in 90 %"],
+        digits=(2, 2, 2, 0, 0),
+        note="All frames of all persons. The mean pose is that of the prior; a tracker that is no "
+        "better than it has learnt nothing from the keypoints.",
+    )
+    everybody = pooled([scores.scored for scores in found.values()])
+    baseline = torch.cat([scores.baseline for scores in found.values()])
+    errors = [baseline, everybody.filtered, everybody.smoothed]
+    for j, joint in enumerate(UPPER_BODY):
+        means = [100 * float(e[:, j].double().nanmean()) for e in errors]
+        inside = (100 * everybody.inside[:, :, j].double().nanmean(0)).tolist()
+        table.add(joint.replace("_", " "), [*means, *inside])
+    means = [100 * float(e.double().nanmean()) for e in errors]
+    inside = (100 * everybody.inside.double().nanmean((0, 2))).tolist()
+    table.add("all joints", [*means, *inside])
+
+
+def _add_findings(report: Report, found: Mapping[str, _PersonScores], known: Sequence[str]) -> None:
+    errors = [mean_error(scores.scored) for scores in found.values()]
+    still = [100 * float(scores.baseline.double().nanmean()) for scores in found.values()]
+    (mean, wide), (base, _) = spread(errors), spread(still)
+    persons = f"{len(found)} person{'s' * (len(found) != 1)}"
+    deviation = f" ± {wide:.2f}" if len(found) > 1 else ""
+    report.findings.append(
+        f"Over {persons}: {mean:.2f}{deviation} cm filtered; the mean pose of the prior is "
+        f"{base:.2f} cm off."
+    )
+    table: Any = report["joints"]
+    levels = ", ".join(
+        f"{table['all joints', f'in {100 * level:.0f} %']:.0f} % in those of {100 * level:.0f} %"
+        for level in LEVELS
+    )
+    report.findings.append(f"True joints inside the filter's ellipsoids: {levels}.")
+    others = [name for name, scores in found.items() if not scores.same_neck]
+    if others:
+        report.findings.append(
+            f"The neck of {', '.join(others)} is of another kind than the prior's: it is neither "
+            "measured nor scored, nor aligned on."
+        )
+    if known:
+        report.findings.append(
+            f"The prior was fitted on {', '.join(known)}: these errors are not what anybody else can "
+            "expect."
+        )
