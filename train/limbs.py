@@ -55,7 +55,7 @@ class LimbFit(BodyFit):
     Logged, with persons held out: `deviation` and `speed` of `HeldOut`.
 
     Args:
-        least_std: floor of the standard deviations of q_ij, see `LimbConditionals.fit`.
+        least_std: floor of the standard deviations of q_ij, see `fit_limb_conditionals`.
     """
 
     data_type, what = LimbData, "limb conditionals are"

@@ -8,7 +8,8 @@ import torch
 from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walker
 from torchpose.body import BODY_15, Body
 from torchpose.errors import InputError, NobodySeenError, PriorError
-from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
+from torchpose.learning import fit_limb_conditionals
+from torchpose.priors.limb_conditionals import in_body_frame
 from torchpose.whole_body import (
     METHODS,
     AnnealedParticleFilter,
@@ -113,7 +114,7 @@ def test_covariances_are_those_of_the_filter(scene):
 def test_models_put_the_body_into_their_frame(scene):
     states, silhouettes = scene
     moves = [walk(walker(), 40, seed=k, phase=k) for k in (1, 2)]
-    limbs = LimbConditionals.fit(*in_body_frame([(walker(), moves)]), 30.0)
+    limbs = fit_limb_conditionals(*in_body_frame([(walker(), moves)]), 30.0)
     tracker = BodyTracker(
         rig(), "root", body=walker(), conditionals=limbs, manifold="walk", n_particles=21 * 7
     )

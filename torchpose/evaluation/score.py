@@ -39,7 +39,7 @@ from torchpose.io.recordings import Recording, read_recordings
 from torchpose.metrics.poses import ALIGN_JOINTS, align, joint_errors
 from torchpose.priors.upper_body import UpperBodyPrior, load_prior
 from torchpose.skeleton.joint_sets import UPPER_BODY
-from torchpose.upper_body.methods import METHODS, SMOOTHABLE
+from torchpose.upper_body.methods import METHODS
 
 __all__ = ["run"]
 
@@ -148,7 +148,7 @@ def _score(
     counted = torch.tensor([joint not in left_out for joint in UPPER_BODY])
     filtered, inside = _tracked(prior, test, counted, method, seed)
     smoothed = torch.full_like(filtered, torch.nan)
-    if method is None or method in SMOOTHABLE:
+    if method is None or METHODS[method].smooths:
         smoothed, _ = _tracked(prior, test, counted, method, seed, smoothing="full")
     truth = torch.cat(list(poses)).double()
     likelihood = torch.full((len(truth),), torch.nan, dtype=torch.float64)
