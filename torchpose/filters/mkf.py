@@ -322,15 +322,6 @@ class MixtureKalmanFilter(RecursiveFilter):
         )
 
 
-def __getattr__(name: str) -> Any:
-    if name != "TRACK_OPTIONS":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    own = {k: _defaults(c) for k, c in MixtureKalmanFilter._kinds.items()}
-    names = {name for options in own.values() for name in options}
-    of = {name: tuple(k for k in own if name in own[k]) for name in names}
-    return {name: kinds for name, kinds in of.items() if len(kinds) < len(own)}
-
-
 @cache
 def _defaults(kind: type[MixtureKalmanFilter]) -> dict[str, Any]:
     """Return the arguments of a constructor by name, each with its default."""

@@ -8,8 +8,11 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from torchpose.errors import InputError
-from torchpose.filters.mkf import TRACK_OPTIONS, MixtureKalmanFilter
+from torchpose.filters.fixed_tracks import FixedTrackFilter
+from torchpose.filters.mkf import MixtureKalmanFilter
 from torchpose.filters.particle import BootstrapParticleFilter
+from torchpose.filters.sampled_tracks import SampledTrackFilter
+from torchpose.filters.split_tracks import SplitTrackFilter
 from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.upper_body.estimator import Estimator
 from torchpose.upper_body.process_noise import ProcessNoise
@@ -42,16 +45,11 @@ Method = type[Estimator] | PoseFilter
 
 
 def _kalman_bank(
-    tracks: str, factor: float, brought: tuple[str, ...], smooths: bool = False
+    kind: type[MixtureKalmanFilter], factor: float, brought: tuple[str, ...]
 ) -> PoseFilter:
-    return PoseFilter(
-        MixtureKalmanFilter,
-        {"tracks": tracks, "medians": ()},
-        unused=tuple(name for name, kinds in TRACK_OPTIONS.items() if tracks not in kinds),
-        noise=ProcessNoise(factor),
-        brought=brought,
-        smooths=smooths,
-    )
+    fixed = kind is FixedTrackFilter
+    settings = {"medians": ()} if fixed else {}
+    return PoseFilter(kind, settings, noise=ProcessNoise(factor), brought=brought, smooths=fixed)
 
 
 def _particles(proposal: str, noise: ProcessNoise) -> PoseFilter:
@@ -61,9 +59,9 @@ def _particles(proposal: str, noise: ProcessNoise) -> PoseFilter:
 
 METHODS: dict[str, Method] = {
     WINDOWS: WindowMixture,
-    SINGLE_POSES: _kalman_bank("fixed", 100.0, ("transition", "gamma", "uniform_weight"), True),
-    "mkf-sampled": _kalman_bank("sampled", 10.0, ("transition", "gamma")),
-    "mkf-split": _kalman_bank("split", 10.0, ("transition", "gamma")),
+    SINGLE_POSES: _kalman_bank(FixedTrackFilter, 100.0, ("transition", "gamma", "uniform_weight")),
+    "mkf-sampled": _kalman_bank(SampledTrackFilter, 10.0, ("transition", "gamma")),
+    "mkf-split": _kalman_bank(SplitTrackFilter, 10.0, ("transition", "gamma")),
     "pf-mixture": _particles("mixture", ProcessNoise(10.0, tuned=False)),
     "pf-walk": _particles("random-walk", ProcessNoise(1.0, walks=True)),
     "pf-walk-unscaled": _particles("random-walk-unscaled", ProcessNoise(1.0, walks=True)),
