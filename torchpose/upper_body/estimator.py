@@ -6,13 +6,15 @@ from typing import Any, ClassVar, NamedTuple
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from torchpose.camera.pinhole import PinholeCamera
 from torchpose.camera.virtual_camera import BodyView
+from torchpose.errors import CameraError, PriorError, check_rate
 from torchpose.filters.base import Generators
 from torchpose.filters.outputs import FilterOutput
 from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.upper_body.measurements import MeasuredJoints
 
-__all__ = ["ArmJoints", "Estimates", "Estimator", "MotionRatios", "TrackerModel"]
+__all__ = ["ArmJoints", "Estimates", "Estimator", "MotionRatios", "TrackerModel", "check_model"]
 
 ArmJoints = dict[str, tuple[str, ...]]
 """For each arm, "left" and "right", those of `ARM_JOINTS` that are measured."""
@@ -38,6 +40,29 @@ class TrackerModel(NamedTuple):
     def rate(self) -> float:
         """Frames per second, 30 where nobody says."""
         return self.fps or 30.0
+
+
+def check_model(
+    prior: UpperBodyPrior, camera: PinholeCamera | None, fps: float | None
+) -> PinholeCamera:
+    """Return the camera, if what a tracker works with is all there.
+
+    Raises:
+        PriorError: no prior of the upper body. CameraError: no camera. InputError: a frame rate that is
+            not positive.
+    """
+    if not isinstance(prior, UpperBodyPrior):
+        raise PriorError(
+            f"prior must be an UpperBodyPrior, got {type(prior).__name__}; see torchpose.load_prior"
+        )
+    if fps is not None:
+        check_rate("fps", fps)
+    if camera is None:
+        raise CameraError(
+            "a camera is needed, got None; pass camera=PinholeCamera(fx, fy, cx, cy), "
+            "PinholeCamera.from_image_size(width, height), or prior.camera if it is the same"
+        )
+    return camera
 
 
 class Estimates(NamedTuple):

@@ -17,21 +17,13 @@ from torchpose._core.module_state import (
     working_precision,
 )
 from torchpose.camera.pinhole import PinholeCamera
-from torchpose.errors import (
-    CameraError,
-    InputError,
-    PriorError,
-    check_floating,
-    check_rate,
-    check_shape,
-    refuse_export,
-)
+from torchpose.errors import InputError, check_floating, check_shape, refuse_export
 from torchpose.filters.base import Generators
 from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.skeleton.joint_sets import UPPER_BODY
 from torchpose.upper_body.arms import arm_joints, generators_of_arms
 from torchpose.upper_body.collapse import note_collapse
-from torchpose.upper_body.estimator import Estimator, TrackerModel
+from torchpose.upper_body.estimator import Estimator, TrackerModel, check_model
 from torchpose.upper_body.fusion import MotionStage
 from torchpose.upper_body.live import LivePose, StreamState, live_pose, unseen_frames
 from torchpose.upper_body.measurements import (
@@ -136,7 +128,7 @@ class UpperBodyTracker(WideModule):
         **options: Any,
     ) -> None:
         super().__init__()
-        self.camera = _check_model(prior, camera, fps)
+        self.camera = check_model(prior, camera, fps)
         check_frame(frame, static_camera)
         if window is not None:
             warnings.warn(
@@ -402,21 +394,3 @@ def _refuse_export() -> None:
         "UpperBodyTracker, which chooses its filters by what was measured,",
         "a step of a filter of torchpose.filters",
     )
-
-
-def _check_model(
-    prior: UpperBodyPrior, camera: PinholeCamera | None, fps: float | None
-) -> PinholeCamera:
-    """Return the camera, if there is one and the prior is one."""
-    if not isinstance(prior, UpperBodyPrior):
-        raise PriorError(
-            f"prior must be an UpperBodyPrior, got {type(prior).__name__}; see torchpose.load_prior"
-        )
-    if fps is not None:
-        check_rate("fps", fps)
-    if camera is None:
-        raise CameraError(
-            "a camera is needed, got None; pass camera=PinholeCamera(fx, fy, cx, cy), "
-            "PinholeCamera.from_image_size(width, height), or prior.camera if it is the same"
-        )
-    return camera
