@@ -1,27 +1,62 @@
 """`python -m benchmarks.NAME` for the reproductions of the papers."""
 
 import sys
-from typing import Any
 
 from torchpose.cli import guarded
-from torchpose.cli.protocol import Data, Protocol, build, execute
+from torchpose.cli.protocol import Protocol, build, execute
 
-__all__ = ["main"]
+__all__ = ["PROTOCOLS", "main", "run"]
+
+PROTOCOLS = {
+    "ub_people": Protocol(
+        "benchmarks.ub_people", "persons whom the prior never saw (kinect_utd_mhad)", "folder"
+    ),
+    "ub_one": Protocol(
+        "benchmarks.ub_one",
+        "the paper's trackers on the authors' own recording (burke_kinect)",
+        "folder",
+    ),
+    "signer": Protocol(
+        "benchmarks.signer", "the authors' released sign-language tracker", "folder"
+    ),
+    "uncommon_poses": Protocol(
+        "benchmarks.uncommon_poses",
+        "training recordings of raised arms left out (kinect_utd_mhad)",
+        "folder",
+    ),
+    "silhouette": Protocol(
+        "benchmarks.silhouette.protocol",
+        "whole bodies tracked from silhouettes of several cameras by three particle filters",
+        "mocap",
+    ),
+    "root_uncertainty": Protocol(
+        "benchmarks.root_uncertainty.protocol",
+        "whole bodies by many hypotheses of the root, over cameras, frame rates, displacements",
+        "mocap",
+    ),
+    "body_models": Protocol(
+        "benchmarks.body_models",
+        "whole bodies of persons whom a manifold, limb conditionals or actions do not know",
+        "mocap",
+    ),
+    "bend": Protocol(
+        "benchmarks.bend.protocol",
+        "an action tracked from one camera, with and without the constraints of its action model",
+        "mocap",
+    ),
+}
 
 
-def main(name: str, text: str, data: Data, module: str | None = None) -> None:
-    """Run a protocol with the options of the command line, and exit.
+def main(name: str) -> None:
+    """Run a protocol with the options of the command line, and exit."""
+    sys.exit(run(name, sys.argv[1:]))
 
-    Args:
-        name: of the module or package in benchmarks. text: what it evaluates, for the help.
-        data: what it runs on, as `Protocol` has it.
-        module: full name of the module that has `run`; `benchmarks.NAME` if None.
-    """
-    protocol = Protocol(module or f"benchmarks.{name}", text, data)
+
+def run(name: str, arguments: list[str]) -> int:
+    """Run a protocol, and return the exit code: 2 if it refuses what it was given."""
 
     def command(arguments: list[str]) -> int:
-        parser = build(f"benchmarks.{name}", protocol, "python -m")
-        args: Any = parser.parse_args(arguments)
-        return execute(protocol, args)
+        parser = build(f"benchmarks.{name}", PROTOCOLS[name], "python -m")
+        return execute(PROTOCOLS[name], parser.parse_args(arguments))
 
-    sys.exit(guarded(command, sys.argv[1:]))
+    return guarded(command, arguments)

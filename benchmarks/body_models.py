@@ -270,8 +270,4 @@ def _add_errors(report: Report, runs: Runs, tracked: Sequence[Tracked]) -> None:
 if __name__ == "__main__":
     from benchmarks._command import main
 
-    main(
-        "body_models",
-        "whole bodies of persons whom a manifold, limb conditionals or actions do not know",
-        "mocap",
-    )
+    main("body_models")

@@ -402,4 +402,4 @@ def _cut(videos: Videos, n: int, frames: int) -> Videos:
 if __name__ == "__main__":
     from benchmarks._command import main
 
-    main("signer", "the authors' released sign-language tracker", "folder")
+    main("signer")

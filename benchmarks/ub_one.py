@@ -279,4 +279,4 @@ def time_step(
 if __name__ == "__main__":
     from benchmarks._command import main
 
-    main("ub_one", "the paper's trackers on the authors' own recording (burke_kinect)", "folder")
+    main("ub_one")

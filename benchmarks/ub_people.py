@@ -263,4 +263,4 @@ def nearest_neighbour(
 if __name__ == "__main__":
     from benchmarks._command import main
 
-    main("ub_people", "persons whom the prior never saw (kinect_utd_mhad)", "folder")
+    main("ub_people")

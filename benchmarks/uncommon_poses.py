@@ -137,6 +137,4 @@ def without_raised(
 if __name__ == "__main__":
     from benchmarks._command import main
 
-    main(
-        "uncommon_poses", "training recordings of raised arms left out (kinect_utd_mhad)", "folder"
-    )
+    main("uncommon_poses")

@@ -252,11 +252,12 @@ def test_two_persons_are_too_few(tmp_path):
 
 
 def test_the_command_recognises_actions(folder, tmp_path, capsys):
-    from torchpose.cli import main
+    from benchmarks._command import run
 
-    line = ["evaluate", "bend", "--mocap", str(folder), "--out", str(tmp_path / "out")]
+    line = ["--mocap", str(folder), "--out", str(tmp_path / "out")]
     line += ["--quick", "true", "--part", "actions", "--size", "64x48", "--at", "8"]
-    assert main([*line, "--test-persons", "p2", "--frames", "4", "--validation-persons", "p3"]) == 0
+    line += ["--test-persons", "p2", "--frames", "4", "--validation-persons", "p3"]
+    assert run("bend", line) == 0
     text = capsys.readouterr().out
     assert "Actions from recorded joints" in text and "Tracked actions" in text
 

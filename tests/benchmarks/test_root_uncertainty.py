@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import torchpose
+from benchmarks._command import PROTOCOLS
 from benchmarks.root_uncertainty import protocol as root_uncertainty
 from benchmarks.root_uncertainty import runs as root_uncertainty_runs
 from benchmarks.root_uncertainty import search as root_uncertainty_search
@@ -31,7 +32,7 @@ from benchmarks.silhouette.data import split_clips
 from benchmarks.silhouette.runs import Run, Tuning
 from benchmarks.silhouette.trackees import Conditions, Setting
 from tests.benchmarks.walkers import write_walkers
-from torchpose.cli.protocol import Protocol, build
+from torchpose.cli.protocol import build
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import settings_hash
@@ -440,9 +441,8 @@ def test_options_that_mean_nothing_are_refused(folder, tmp_path, options, messag
 
 def test_words_of_the_command_line():
     words = "--mocap d --out o --cameras-used 3 2 --fps 60 15 --method sir root --part rates"
-    args = build(
-        "benchmarks.root_uncertainty",
-        Protocol("benchmarks.root_uncertainty.protocol", "whole bodies", "mocap"),
-    ).parse_args(words.split())
+    args = build("benchmarks.root_uncertainty", PROTOCOLS["root_uncertainty"]).parse_args(
+        words.split()
+    )
     assert args.cameras_used == [3, 2] and args.fps == [60.0, 15.0]
     assert args.method == ["sir", "root"] and args.part == "rates" and args.particles == 800

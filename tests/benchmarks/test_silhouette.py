@@ -497,22 +497,22 @@ def test_several_actions_are_refused(tmp_path):
         silhouette.run(tmp_path / "a", tmp_path / "out")
 
 
-def test_the_command(torchpose_command, folder, tmp_path):
-    line = ["evaluate", "silhouette", "--mocap", str(folder), "--out", str(tmp_path / "out")]
+def test_the_command(command, folder, tmp_path):
+    line = ["--mocap", str(folder), "--out", str(tmp_path / "out")]
     line += ["--method", "sir", "mrpf", "--test-persons", "p1", "--train-persons", "p1"]
     line += ["--size", "64x48", "--particles", "10", "20", "--sharpness", "100", "--frames", "5"]
-    code, text = torchpose_command([*line, "--quick", "true"])
+    code, text = command([*line, "--quick", "true"])
     assert code == 0 and "20 likelihoods: MRPF - SIR" in text
-    code, text = torchpose_command(["evaluate", "silhouette", "--mocap", "none", "--out", "o"])
+    code, text = command(["--mocap", "none", "--out", "o"])
     assert code == 2 and "--mocap none: no such folder" in text
 
 
 @pytest.fixture
-def torchpose_command(capsys):
-    from torchpose.cli import main
+def command(capsys):
+    from benchmarks._command import run
 
     def call(arguments):
-        code = main(arguments)
+        code = run("silhouette", arguments)
         captured = capsys.readouterr()
         return code, captured.out + captured.err
 

@@ -197,7 +197,7 @@ def test_a_fit_again_and_one_beside_it(torchpose, files, tmp_path):
 
 @pytest.fixture
 def protocol(monkeypatch):
-    """A protocol that stands in for ub-people, and writes a report with a picture."""
+    """A protocol that stands in for learning-curve, and writes a report with a picture."""
     figures = pytest.importorskip("matplotlib.figure")
 
     def run(data, out, *, seed=0, progress=True):
@@ -206,13 +206,13 @@ def protocol(monkeypatch):
         report.save(out)
         return report
 
-    module = ModuleType("benchmarks.ub_people")
+    module = ModuleType("torchpose.evaluation.learning_curve")
     module.run = run
-    monkeypatch.setitem(sys.modules, "benchmarks.ub_people", module)
+    monkeypatch.setitem(sys.modules, "torchpose.evaluation.learning_curve", module)
 
 
 def test_an_evaluation_spares_other_reports_and_moves_other_pictures(torchpose, protocol, tmp_path):
-    line = ("evaluate", "ub-people", "--data", tmp_path, "--out", tmp_path)
+    line = ("evaluate", "learning-curve", "--data", tmp_path, "--out", tmp_path)
     (tmp_path / "report.md").write_bytes(b"mine")
     refused(torchpose(*line), "report.md: is there, and is not known")
     assert content(tmp_path) == {"report.md": b"mine"}
