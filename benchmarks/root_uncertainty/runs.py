@@ -40,10 +40,11 @@ __all__ = [
 ]
 
 _MADE_WITH = (
-    "body", "filters", "priors", "unscented.py", "protocols/root_uncertainty_runs.py",
-    "protocols/root_uncertainty_trackees.py", "protocols/silhouette_runs.py",
+    "torchpose/body", "torchpose/filters", "torchpose/math", "torchpose/priors",
+    "torchpose/whole_body", "benchmarks/root_uncertainty/runs.py",
+    "benchmarks/root_uncertainty/trackees.py", "benchmarks/silhouette/runs.py",
 )  # fmt: skip
-"""What the numbers of a run depend on beside its facts: files and folders of the package."""
+"""What the numbers of a run depend on beside its facts: files and folders of a checkout."""
 
 
 # --- conditions -----------------------------------------------------------------------------------

@@ -123,7 +123,7 @@ def row(timing: Timing) -> tuple[str, ...]:
 
 def mediapipe_row(python: Path, clip: Path, args: argparse.Namespace) -> tuple[str, ...]:
     """The full pose model of MediaPipe on the same file and cores."""
-    script = Path(__file__).with_name("mediapipe_landmarks.py")
+    script = Path(__file__).parents[1] / "mediapipe_landmarks.py"
     command = [str(python), str(script), str(clip), "--time", "--threads", str(args.threads)]
     command += ["--repeat", str(args.runs)]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)

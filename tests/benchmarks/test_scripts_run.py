@@ -11,25 +11,26 @@ from tests.data import data_dir_or_skip
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = (
-    "mixture_kalman_filter",
-    "kalman_step",
-    "expectation_maximisation",
-    "batch_memory",
-    "gradients",
-    "streamed_em",
-    "silhouettes",
-    "root_uncertainty",
-    "gplvm",
-    "tree_messages",
+    "speed.mixture_kalman_filter",
+    "speed.kalman_step",
+    "speed.expectation_maximisation",
+    "speed.batch_memory",
+    "speed.gradients",
+    "speed.streamed_em",
+    "speed.silhouettes",
+    "speed.root_uncertainty",
+    "speed.gplvm",
+    "speed.tree_messages",
 )
 
 
 def run(script: str, *options: str) -> subprocess.CompletedProcess[str]:
     paths = [str(ROOT), os.environ.get("PYTHONPATH", "")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
-    command = [sys.executable, str(ROOT / "benchmarks" / f"{script}.py"), "--threads", "1"]
+    command = [sys.executable, "-m", f"benchmarks.{script}", "--threads", "1"]
     return subprocess.run(
         [*command, *options],
+        cwd=ROOT,
         env=environment,
         capture_output=True,
         text=True,

@@ -14,18 +14,18 @@ from torchpose.errors import TorchposeError
 
 __all__ = ["keep", "kept", "read_kept", "source_hash"]
 
-_PACKAGE = Path(__file__).parents[1]
+_CHECKOUT = Path(__file__).parents[2]
 
 
 @cache
-def source_hash(*names: str, root: Path = _PACKAGE) -> str:
+def source_hash(*names: str, root: Path = _CHECKOUT) -> str:
     """Sixteen letters that change with the source of these modules and packages.
 
     A result that is kept under them is made anew once a constant, a default or a formula of what it
     was made with has changed. The files are read once in a process.
 
     Args:
-        names: of files and folders in `root`, such as "filters" and "unscented.py".
+        names: of files and folders in `root`, such as "torchpose/filters" and "benchmarks/bend/runs.py".
     """
     digest = hashlib.sha256()
     for name in names:
