@@ -68,7 +68,7 @@ def test_mean_pose_is_that_of_samples(files):
     """The oracle draws states, lifts each by (BL 5) and averages."""
     prior = load_prior(files / "prior.safetensors")
     g = torch.Generator().manual_seed(0)
-    mean = demo_scores.mean_pose(prior)
+    mean = prior.mean_pose()
     for mixture, arm in ((prior.left, LEFT_ARM), (prior.right, RIGHT_ARM)):
         x = mixture.sample((20_000,), generator=g)
         R = euler_to_matrix(x[:, 15:18], prior.info.rotation_order)

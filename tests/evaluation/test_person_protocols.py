@@ -13,7 +13,7 @@ import torch
 from benchmarks import uncommon_poses
 from tests.data import data_dir_or_skip
 from tests.evaluation.recordings import V1, poses, small_recipe, write_one, write_people
-from torchpose.cli import evaluate
+from torchpose.cli import evaluate, protocol
 from torchpose.errors import InputError, OutputError
 from torchpose.evaluation import cross_dataset, learning_curve, leave_one_person_out, unseen
 from torchpose.evaluation import persons as persons_module
@@ -269,10 +269,13 @@ def test_real_data_sets(tmp_path):
 
 
 def test_folders_on_the_command_line():
-    parser = evaluate.build("leave-one-person-out")
+    several = evaluate.PROTOCOLS["leave-one-person-out"]
+    parser = protocol.build("evaluate leave-one-person-out", several)
     line = ["a", "b", "--out", "o", "--workers", "2"]
     args = parser.parse_args(line)
-    assert evaluate._folders(args) == [Path("a"), Path("b")] and args.workers == 2
-    assert evaluate._folders(parser.parse_args([*line, "--data", "c"]))[-1] == Path("c")
+    assert protocol.checked_data("recordings", args) == [Path("a"), Path("b")]
+    assert args.workers == 2
+    more = parser.parse_args([*line, "--data", "c"])
+    assert protocol.checked_data("recordings", more)[-1] == Path("c")
     with pytest.raises(InputError, match="got none"):
-        evaluate._folders(parser.parse_args(["--out", "o"]))
+        protocol.checked_data("recordings", parser.parse_args(["--out", "o"]))

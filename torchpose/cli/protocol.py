@@ -15,7 +15,7 @@ from torchpose._core.terminal import show_progress
 from torchpose.cli.common import add_seed, new_parser
 from torchpose.errors import InputError
 
-__all__ = ["Protocol", "build", "execute"]
+__all__ = ["Protocol", "build", "checked_data", "execute"]
 
 Data = Literal["folder", "recordings", "mocap"]
 _COMMON = ("data", "out", "seed", "progress")
@@ -75,7 +75,7 @@ def execute(protocol: Protocol, args: Namespace) -> int:
     """Run a protocol after checking its folders, print its summary, and return the exit code."""
     from torchpose._core.files import check_output_folder
 
-    data = _checked_data(protocol.data, args)
+    data = checked_data(protocol.data, args)
     given = {key: getattr(args, key) for key in _own_options(protocol.run)}
     own = {key: tuple(v) if isinstance(v, list) else v for key, v in given.items()}
     if getattr(args, "prior", None) is not None:
@@ -106,8 +106,8 @@ def _add_data(parser: ArgumentParser, data: Data) -> None:
         add("--data", type=str, required=True, metavar="DIR", help="folder with the recordings")
 
 
-def _checked_data(data: Data, args: Namespace) -> Any:
-    """The folder or folders of the recordings, which have to be there."""
+def checked_data(data: Data, args: Namespace) -> Any:
+    """Return the folder or folders of the recordings, which have to be there."""
     if data == "recordings":
         given = [*(args.recordings or ()), *([args.data] if args.data else ())]
         if not given:

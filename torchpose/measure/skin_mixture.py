@@ -61,7 +61,7 @@ class SkinMixtureModel(nn.Module):
 
     Example:
         >>> import torch
-        >>> from torchpose.measure import rgb_to_lab
+        >>> from torchpose.measure.skin import rgb_to_lab
         >>> from torchpose.measure.skin_mixture import SkinMixtureModel
         >>> image = torch.zeros(1, 3, 60, 80)
         >>> image[:, :, 10:30, 30:50] = torch.tensor([0.8, 0.6, 0.5])[:, None, None]
