@@ -4,7 +4,7 @@ Every message says what was expected, what came, and what to do about it. Messag
 printable characters, whatever the file or the name that they quote.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from numbers import Real
 from typing import Any
 
@@ -253,4 +253,31 @@ def check_covariance(name: str, covariance: Tensor, tolerance: float = 1e-6) -> 
         raise CovarianceError(
             f"{name} must be positive definite, got a matrix that is not at index {index}; "
             "add a small multiple of the identity or drop its dependent dimensions"
+        )
+
+
+def refuse_unused(
+    options: Iterable[str],
+    said: str,
+    method: str,
+    methods: Iterable[str],
+    options_of: Callable[[str], tuple[str, ...]],
+) -> None:
+    """Raise for the first option that a method does not use, and name the methods that do.
+
+    Args:
+        options: names given. said: what is wrong with such an option, after its name.
+        method: the one that was chosen, of `methods`. options_of: the options of a method.
+
+    Raises:
+        InputError: such an option.
+    """
+    own = options_of(method)
+    for name in options:
+        if name in own:
+            continue
+        others = [other for other in methods if name in options_of(other)]
+        raise InputError(
+            f"option {name!r} {said}, which has {', '.join(own)}; "
+            + (f"it is of {', '.join(others)}" if others else "it is of no method")
         )

@@ -2,8 +2,6 @@
 
 import sys
 from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, version
-from pkgutil import iter_modules
 
 from torchpose._core.moved import NAMES, moved_names
 
@@ -29,6 +27,8 @@ def list_public(module: str) -> Callable[[], list[str]]:
     """Return the `__dir__` of a room: names in `__all__`, subpackages, and names like `__doc__`."""
 
     def names() -> list[str]:
+        from pkgutil import iter_modules  # here, since `import torchpose` is to be quick
+
         room = sys.modules[module]
         packages = [m.name for m in iter_modules(getattr(room, "__path__", [])) if m.ispkg]
         public = {name for name in packages if not name.startswith("_")}
@@ -40,6 +40,11 @@ def list_public(module: str) -> Callable[[], list[str]]:
 
 def package_version() -> str:
     """Return the version of the installed package, "0+unknown" in a source tree that is not installed."""
+    from importlib.metadata import (  # takes longer than all of torchpose
+        PackageNotFoundError,
+        version,
+    )
+
     try:
         return version("torchpose")
     except PackageNotFoundError:

@@ -7,7 +7,6 @@ import sys
 import warnings
 from collections.abc import Callable
 from importlib import import_module
-from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
@@ -360,8 +359,12 @@ def _warn(old: str, new: str) -> None:
     )
 
 
-class _OldNames(MetaPathFinder):
-    """Finds a module by its old name, and gives the present one in its place."""
+class _OldNames:
+    """Finds a module by its old name, and gives the present one in its place.
+
+    A finder as `sys.meta_path` has them. The base classes of `importlib.abc` are not needed for that, and
+    take as long to import as half of torchpose.
+    """
 
     def find_spec(
         self, fullname: str, path: object = None, target: ModuleType | None = None
@@ -375,10 +378,12 @@ class _OldNames(MetaPathFinder):
                 name=fullname,
             )
         present = present_module(fullname)
-        return None if present is None else ModuleSpec(fullname, _Alias(present))
+        if present is None:
+            return None
+        return ModuleSpec(fullname, _Alias(present))  # type: ignore[arg-type]  # no `importlib.abc.Loader`
 
 
-class _Alias(Loader):
+class _Alias:
     """Loads the present module, and leaves it as it was."""
 
     def __init__(self, present: str) -> None:

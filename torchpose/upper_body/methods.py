@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from torchpose.errors import InputError
+from torchpose.errors import InputError, refuse_unused
 from torchpose.filters.fixed_tracks import FixedTrackFilter
 from torchpose.filters.mkf import MixtureKalmanFilter
 from torchpose.filters.particle import BootstrapParticleFilter
@@ -143,16 +143,8 @@ def check_options(method: str, options: Iterable[str]) -> None:
     Raises:
         InputError: such an option.
     """
-    own = method_options(method)
-    for name in options:
-        if name in own:
-            continue
-        others = [other for other in METHODS if name in method_options(other)]
-        raise InputError(
-            f"option {name!r} does not apply to method {method!r}, which has "
-            f"{', '.join(own)}; "
-            + (f"it is of {', '.join(others)}" if others else "it is of no method")
-        )
+    said = f"does not apply to method {method!r}"
+    refuse_unused(options, said, method, METHODS, method_options)
 
 
 class Chosen(NamedTuple):

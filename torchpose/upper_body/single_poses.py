@@ -7,14 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, cast
 
 import torch
-from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose._core.module_state import derived
 from torchpose.errors import DegenerateFilterWarning, InputError
 from torchpose.filters.base import Generators, RecursiveFilter
 from torchpose.filters.mkf import MixtureKalmanFilter
-from torchpose.filters.outputs import FilterOutput, collect
+from torchpose.filters.outputs import FilterOutput
 from torchpose.priors.gaussian_mixture import GaussianMixture
 from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.skeleton.upper_body import ARM_JOINTS
@@ -37,7 +36,6 @@ class PoseFilter:
             options; a `RecursiveFilter`. If it has a `process_cov`, that is the prior's by default.
         settings: arguments that make it this method, and are no options of it.
         defaults: of options, in place of the filter's own.
-        unused: options of the filter that do nothing in this method, which refuses them.
         noise: how the process noise follows from what the prior brings.
         brought: which of the options "transition", "gamma" and "uniform_weight" the prior sets.
         smooths, particles: as in `Estimator`.
@@ -53,7 +51,6 @@ class PoseFilter:
     filter: Callable[..., RecursiveFilter]
     settings: Mapping[str, Any] = field(default_factory=dict)
     defaults: Mapping[str, Any] = field(default_factory=dict)
-    unused: tuple[str, ...] = ()
     noise: ProcessNoise = field(default_factory=ProcessNoise)
     brought: tuple[str, ...] = ()
     smooths: bool = False
@@ -63,7 +60,7 @@ class PoseFilter:
     def options(self) -> tuple[str, ...]:
         """Names of the method's options, by the signature of its filter."""
         names = [*inspect.signature(self.filter).parameters][1:]  # without the mixture
-        taken = {*_GIVEN, *self.settings, *self.unused}
+        taken = {*_GIVEN, *self.settings}
         return tuple(name for name in names if name not in taken)
 
     def __call__(self, model: TrackerModel, **options: Any) -> "SinglePoses":
@@ -193,9 +190,12 @@ class SinglePoses(Estimator):
         for side, arm in ARMS.items():
             joints, model = state.joints[side], self.filter(side, state.joints[side])
             z, mask, cov = arm_measurements(arm, joints, measured)
-            filters[side], arms[side] = _advance(
-                model, state.filters[side], z, mask, cov, state.generators[side]
-            )
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DegenerateFilterWarning)  # told by `failed`
+                filters[side], out = model.advance(
+                    state.filters[side], z, mask, cov, state.generators[side], return_cov=True
+                )
+            arms[side] = _wide(out)
         return state._replace(filters=filters), Estimates(arms["left"], arms["right"])
 
     def forward(
@@ -221,29 +221,6 @@ class SinglePoses(Estimator):
                 )
             arms[side] = in_double(out)
         return Estimates(arms["left"], arms["right"])
-
-
-def _advance(
-    model: RecursiveFilter,
-    state: Any,
-    z: Float[Tensor, "B T Z"],
-    mask: Bool[Tensor, "B T Z"],
-    cov: Tensor,
-    generator: Generators,
-) -> tuple[Any, FilterOutput]:
-    """Return the filter's next state and its estimates of some frames, one by one."""
-    if isinstance(model, MixtureKalmanFilter) and model.is_memoryless:
-        out = model(z, mask, cov, return_cov=True)
-        return state._replace(time=state.time + z.shape[1]), _wide(out)
-    steps = []
-    for t in range(z.shape[1]):
-        noise = cov[:, t] if cov.ndim == 4 else cov
-        state, step = model.step(state, z[:, t], mask[:, t], noise, generator, return_cov=True)
-        steps.append(step)
-    lengths = torch.full((len(z),), z.shape[1], device=z.device)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DegenerateFilterWarning)  # told by `failed`
-        return state, _wide(collect(steps, lengths))
 
 
 def _wide(out: FilterOutput) -> FilterOutput:

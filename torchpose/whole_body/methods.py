@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 
 from torchpose.body.kinematics import Body
-from torchpose.errors import InputError, PriorError
+from torchpose.errors import InputError, PriorError, refuse_unused
 from torchpose.priors.limb_conditionals import LimbConditionals
 from torchpose.priors.manifold.gplvm import BackConstrainedGPLVM
 from torchpose.priors.shipped import load_action, load_limb_conditionals, load_manifold
@@ -243,15 +243,8 @@ def check_options(method: str, options: Iterable[str]) -> None:
     Raises:
         InputError: such an option.
     """
-    own = method_options(method)
-    for name in options:
-        if name in own:
-            continue
-        others = [other for other in METHODS if name in method_options(other)]
-        raise InputError(
-            f"option {name!r} does nothing for method {method}, which has {', '.join(own)}; "
-            + (f"it is of {', '.join(others)}" if others else "it is of no method")
-        )
+    said = f"does nothing for method {method}"
+    refuse_unused(options, said, method, METHODS, method_options)
 
 
 def make_filter(

@@ -15,6 +15,7 @@ from torchpose.metrics.calibration import chi2_quantile
 from torchpose.metrics.poses import align
 from torchpose.priors.upper_body import UpperBodyPrior
 from torchpose.upper_body.fusion import calibration_mode
+from torchpose.upper_body.methods import METHODS
 from torchpose.upper_body.tracker import UpperBodyTracker
 
 __all__ = [
@@ -36,7 +37,8 @@ MODES: dict[str, dict[str, Any]] = {
 
 DRAWN = {
     calibration_mode(method): {"method": method}
-    for method in ("mkf-sampled", "mkf-split", "pf-mixture", "pf-walk", "pf-walk-unscaled")
+    for method in METHODS
+    if method not in {options["method"] for options in MODES.values()}
 }
 """Those that follow a sample of what is possible. They take longer, and are tried on fewer frames."""
 
