@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from torchpose.skeleton import UPPER_BODY
-from torchpose.skeleton.joint_sets import canonical_names
-from torchpose.skeleton.mediapipe_landmarks import derive_joints
+from torchpose.skeleton._joint_sets import canonical_names
+from torchpose.skeleton._mediapipe_landmarks import derive_joints
 
 CLIPS = ("again", "brother", "help", "bird", "milk", "book", "learn")
 BURN_IN = 15
@@ -19,7 +19,7 @@ GROUPS = {"head": (3,), "shoulders": (2, 5), "elbows": (1, 6), "hands": (0, 7)}
 
 
 class Clip(NamedTuple):
-    """What MediaPipe saw in a clip; head, neck and hands are `torchpose.skeleton.mediapipe_landmarks`'s.
+    """What MediaPipe saw in a clip; head, neck and hands are `torchpose.skeleton._mediapipe_landmarks`'s.
 
     Attributes:
         points: [T, 8, 2], pixels, in the order of `UPPER_BODY`. points3d: [T, 8, 3], metres.

@@ -13,7 +13,7 @@ from torchpose._core.files import atomic_path, check_output_folder
 from torchpose.body import BODY_15, Body, body_joints
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.evaluation import Report
-from torchpose.video.body_overlay import draw_body
+from torchpose.video._overlay import draw_body
 from torchpose.whole_body import render
 
 _ENLARGED = 2  # pixels of the picture for one of a silhouette

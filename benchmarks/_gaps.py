@@ -11,7 +11,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose.camera.pinhole import PinholeCamera
+from torchpose.camera import PinholeCamera
+from torchpose.evaluation import Report
 from torchpose.evaluation.common import (
     MEASURED,
     Estimate,
@@ -21,11 +22,10 @@ from torchpose.evaluation.common import (
     plain_prior,
     track,
 )
-from torchpose.evaluation.report import Report
-from torchpose.metrics.calibration import coverage
-from torchpose.metrics.poses import align, joint_errors_3d
-from torchpose.priors.upper_body import UpperBodyPrior
-from torchpose.skeleton.upper_body import LEFT_ARM, OTHER_SIDE, RIGHT_ARM
+from torchpose.metrics import align, coverage, joint_errors_3d
+from torchpose.priors import UpperBodyPrior
+from torchpose.skeleton import LEFT_ARM, RIGHT_ARM
+from torchpose.skeleton._upper_body import OTHER_SIDE
 
 __all__ = ["add_gap_tables", "back_and_forth"]
 
@@ -194,7 +194,7 @@ def _jump(
 def _picture(
     report: Report, out: Path, curves: dict[str, Tensor], fps: float, seconds: float
 ) -> None:
-    from torchpose.viz.charts import plot_errors_over_time
+    from torchpose.viz import plot_errors_over_time
 
     figure = plot_errors_over_time(
         curves, fps, ("hand_left", "hand_right", "elbow_left", "elbow_right"), scale=1.0,

@@ -26,13 +26,13 @@ from torchpose.evaluation.common import (
 from torchpose.filters import MixtureKalmanFilter
 from torchpose.io import Recording, read_recordings
 from torchpose.learning import TRAINING_VIEWS
-from torchpose.learning.recipes import VERSION, UpperBodyRecipe
+from torchpose.learning._recipes import VERSION, UpperBodyRecipe
 from torchpose.priors import GaussianMixture, UpperBodyPrior
-from torchpose.priors.window import WindowLayout, WindowPrior
-from torchpose.skeleton.upper_body import ARM_JOINTS
+from torchpose.priors._window import WindowLayout, WindowPrior
+from torchpose.skeleton._upper_body import ARM_JOINTS
 from torchpose.upper_body import UpperBodyTracker
-from torchpose.upper_body.measurements import pixel_indices
-from torchpose.upper_body.methods import process_cov
+from torchpose.upper_body._measurements import pixel_indices
+from torchpose.upper_body._methods import process_cov
 
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 FIT_PERSONS, SCORED_PERSONS = ("s1", "s2", "s4", "s5"), ("s3", "s6")

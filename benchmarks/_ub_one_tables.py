@@ -9,11 +9,12 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from torchpose.evaluation import Report, Table
 from torchpose.evaluation.common import HANDS, Scores, Trials, add_picture
 from torchpose.evaluation.people_tables import SHORT_NAMES
-from torchpose.evaluation.report import Report, Table
-from torchpose.metrics.poses import jitter, share_below
-from torchpose.priors.upper_body import UpperBodyPrior
+from torchpose.metrics import jitter
+from torchpose.metrics._poses import share_below
+from torchpose.priors import UpperBodyPrior
 
 __all__ = ["SAMPLED", "SUMMARY", "add_findings", "add_pictures", "add_tables", "fill_summary"]
 

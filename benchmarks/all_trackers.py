@@ -36,7 +36,7 @@ from torchpose.evaluation.common import (
 )
 from torchpose.evaluation.kept_runs import keep, read_kept
 from torchpose.io import Recording
-from torchpose.learning.recipes import fit_kinect_prior
+from torchpose.learning._recipes import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import METHODS, UpperBodyTracker, method_options
 

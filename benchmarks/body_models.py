@@ -28,18 +28,12 @@ from benchmarks.silhouette.runs import (
 from benchmarks.silhouette.tables import mean_of, part_errors, pooled_std, write_csv
 from benchmarks.silhouette.trackees import Conditions, Tracked, View, body_of, view_of
 from torchpose._core.files import check_output_folder
-from torchpose.body.fitting import fit_state
-from torchpose.body.kinematics import Body
+from torchpose.body import Body, fit_state
 from torchpose.errors import InputError
-from torchpose.evaluation.report import Report
-from torchpose.io.mocap import MocapClip, read_mocap, select_persons
-from torchpose.priors.shipped import (
-    load_action,
-    load_limb_conditionals,
-    load_manifold,
-    persons_of_model,
-    refuse_seen,
-)
+from torchpose.evaluation import Report
+from torchpose.io._mocap import MocapClip, read_mocap, select_persons
+from torchpose.priors import load_action, load_limb_conditionals, load_manifold
+from torchpose.priors._shipped import persons_of_model, refuse_seen
 from torchpose.whole_body import METHODS, BodyTracker
 
 __all__ = ["MEAN_POSE", "STILL", "run"]

@@ -19,9 +19,10 @@ import torch
 
 from benchmarks._asl import CLIPS, SIZE, read_clip
 from torchpose.camera import PinholeCamera
-from torchpose.measure import FaceTracker, HeadNeck
-from torchpose.measure.head_neck import FACE_OFFSETS
-from torchpose.measure.upper_body import MEASURED, rounded_covariance
+from torchpose.measure import HeadNeck
+from torchpose.measure._face import FaceTracker
+from torchpose.measure._head import FACE_OFFSETS
+from torchpose.measure._upper_body import MEASURED, rounded_covariance
 from torchpose.priors import load_prior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import UpperBodyTracker

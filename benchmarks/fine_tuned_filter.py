@@ -32,8 +32,8 @@ from torchpose.evaluation.common import (
     track,
 )
 from torchpose.io import Recording, read_recordings
-from torchpose.learning.fine_tuning import TunableKalman, draw_sequences, parameter_groups
-from torchpose.learning.recipes import UpperBodyRecipe
+from torchpose.learning._fine_tuning import TunableKalman, draw_sequences, parameter_groups
+from torchpose.learning._recipes import UpperBodyRecipe
 from torchpose.priors import UpperBodyPrior
 
 SPLITS = {"A": ("s3", "s6"), "B": ("s2", "s4"), "C": ("s1", "s5")}

@@ -21,7 +21,7 @@ from benchmarks.silhouette.protocol import FPS, WALKERS
 from benchmarks.silhouette.trackees import Conditions, prepare
 from torchpose.body import BODY_15, Body, fit_state
 from torchpose.camera import CameraRig
-from torchpose.io.mocap import read_mocap
+from torchpose.io._mocap import read_mocap
 from torchpose.priors import BackConstrainedGPLVM
 from torchpose.whole_body import find_first_pose, find_pose
 

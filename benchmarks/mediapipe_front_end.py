@@ -95,7 +95,7 @@ def jitter_tables(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) ->
         "Jitter in the image: mean acceleration (px/s²), and distance from MediaPipe's joints (px)",
         [*GROUPS, *(f"{g}, distance" for g in GROUPS)],
         digits=(0, 0, 0, 0, 1, 1, 1, 1),
-        note="The head is the prior's (see torchpose.skeleton.mediapipe_landmarks), not MediaPipe's.",
+        note="The head is the prior's (see torchpose.skeleton._mediapipe_landmarks), not MediaPipe's.",
     )
     space = report.table(
         "jitter3d",
@@ -172,7 +172,7 @@ def inferred_table(bench: Bench, report: Report) -> None:
 
 
 def place_table(bench: Bench, report: Report) -> None:
-    """What the places of head and neck of `torchpose.skeleton.mediapipe_landmarks` were chosen from."""
+    """What the places of head and neck of `torchpose.skeleton._mediapipe_landmarks` were chosen from."""
     table = report.table(
         "places",
         "Where head and neck are put: inferred elbows / shoulders (shoulder widths)",

@@ -24,7 +24,7 @@ from torchpose.evaluation.common import (
     score,
     track,
 )
-from torchpose.learning.recipes import UpperBodyRecipe
+from torchpose.learning._recipes import UpperBodyRecipe
 from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import METHODS, PoseFilter, method_options
 

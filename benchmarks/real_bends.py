@@ -30,14 +30,10 @@ from torchpose.body import Body, centres_of, fit_body, fit_state
 from torchpose.errors import DegenerateFilterWarning
 from torchpose.evaluation import Report
 from torchpose.priors import ActionSpace
-from torchpose.priors.actions.postures import state_postures
-from torchpose.whole_body import (
-    ConstrainedParticleFilter,
-    constant_velocity_std,
-    count_pixels,
-    fit_radii,
-    intersection_over_union,
-)
+from torchpose.priors._actions.postures import state_postures
+from torchpose.whole_body import ConstrainedParticleFilter, constant_velocity_std, count_pixels
+from torchpose.whole_body._silhouettes.likelihood import intersection_over_union
+from torchpose.whole_body._silhouettes.shape import fit_radii
 
 ACTION, FPS = "pickup_throw", 30.0
 TEST, TUNING, OTHERS = ("s02", "s04", "s06"), "s08", ("s01", "s03", "s05", "s07")

@@ -1,7 +1,7 @@
 """Real silhouettes: four cameras around a balancing man, and one depth camera before eight persons.
 
 The four views (`multicam_pose2sim`) are silhouettes of its videos against pictures of the empty room,
-made by `torchpose.video.silhouettes`; the reference is the set's triangulated 3D, which no marker
+made by `torchpose.video._silhouettes`; the reference is the set's triangulated 3D, which no marker
 measured, so the table is a difference and not an error. The single view (`utd_mhad_silhouettes`) is
 segmented depth, paired with the Kinect's skeleton at the lag that the set gives; body, noise and
 manifold come from other recordings than the one that is tracked, sharpness from another person. A
@@ -44,16 +44,16 @@ from torchpose.evaluation import Report
 from torchpose.learning import fit_gplvm, fit_gplvm_noise
 from torchpose.priors import BackConstrainedGPLVM, ManifoldInfo
 from torchpose.video import SilhouetteMeasurer, open_video, read_silhouettes
-from torchpose.video.silhouettes import fit_views, read_empty_scene
+from torchpose.video._silhouettes import fit_views, read_empty_scene
 from torchpose.whole_body import (
     AnnealedParticleFilter,
     ManifoldParticleFilter,
     SilhouetteParticleFilter,
     SIRParticleFilter,
     find_pose,
-    fit_radii,
     motion_std,
 )
+from torchpose.whole_body._silhouettes.shape import fit_radii
 
 ROWS = 160
 HEIGHT = 1.75  # metres, of the man in the four views: nobody wrote it down

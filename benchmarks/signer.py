@@ -20,13 +20,13 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchpose._core.files import check_output_folder
-from torchpose._core.npz import read_npz
+from torchpose._core.reading import read_npz
 from torchpose.errors import FileFormatError
+from torchpose.evaluation import Report
 from torchpose.evaluation.common import add_picture, data_folder
-from torchpose.evaluation.report import Report
-from torchpose.filters.mkf import MixtureKalmanFilter
-from torchpose.priors.gaussian_mixture import GaussianMixture
-from torchpose.priors.upper_body import UpperBodyPrior, released_process_cov
+from torchpose.filters import MixtureKalmanFilter
+from torchpose.priors import GaussianMixture, UpperBodyPrior
+from torchpose.priors._upper_body import released_process_cov
 
 __all__ = ["Videos", "hand_log_density", "read_videos", "released_filter", "run"]
 
@@ -370,7 +370,7 @@ def _add_noise(report: Report, learnt: dict[str, Noise]) -> None:
 
 def _picture(report: Report, out: Path, found: Predictions) -> None:
     """Mean log-density over the time since the hand was last seen."""
-    from torchpose.viz.style import INK, NORMAL, add_legend, method_styles, new_figure, style_axes
+    from torchpose.viz._style import INK, NORMAL, add_legend, method_styles, new_figure, style_axes
 
     styles = method_styles(list(found))
     figure = new_figure(7.5, 4.4, "How well a hidden hand is predicted")

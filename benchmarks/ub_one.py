@@ -5,7 +5,7 @@ with 3 pixels of noise. All trackers have the paper's transition and the same R.
 print its Q; here
 
 - the mixture Kalman filters have that of the authors' released tracker
-  (`torchpose.upper_body.process_noise.default_process_cov`);
+  (`torchpose.upper_body._single_poses.default_process_cov`);
 - the mixture proposal has, as published, no burn-in and a larger Q of its own (and is shown with the
   Q of the Kalman filters as well);
 - the random walks have a burn-in and a smaller Q: the released one lets lambda move by a metre in
@@ -35,9 +35,10 @@ from benchmarks._ub_one_tables import (
     fill_summary,
 )
 from torchpose._core.files import check_output_folder, write_npz
-from torchpose._core.npz import read_npz
-from torchpose.camera.pinhole import PinholeCamera
+from torchpose._core.reading import read_npz
+from torchpose.camera import PinholeCamera
 from torchpose.errors import InputError
+from torchpose.evaluation import Report
 from torchpose.evaluation.common import (
     Estimate,
     Recipe,
@@ -52,11 +53,10 @@ from torchpose.evaluation.common import (
     settings_hash,
     track,
 )
-from torchpose.evaluation.report import Report
-from torchpose.io.recordings import Recording, read_recordings
-from torchpose.learning.recipes.upper_body import fit_kinect_prior
-from torchpose.priors.upper_body import UpperBodyPrior
-from torchpose.upper_body.tracker import UpperBodyTracker
+from torchpose.io import Recording, read_recordings
+from torchpose.learning._recipes.upper_body import fit_kinect_prior
+from torchpose.priors import UpperBodyPrior
+from torchpose.upper_body import UpperBodyTracker
 
 __all__ = ["TRACKERS", "run", "split_recording"]
 

@@ -20,8 +20,9 @@ from tqdm.auto import tqdm
 
 from benchmarks._gaps import add_gap_tables
 from torchpose._core.files import check_output_folder
-from torchpose.camera.pinhole import PinholeCamera
+from torchpose.camera import PinholeCamera
 from torchpose.errors import InputError
+from torchpose.evaluation import Report
 from torchpose.evaluation.common import (
     Estimate,
     Recipe,
@@ -50,10 +51,9 @@ from torchpose.evaluation.people_tables import (
     add_pcp_table,
     add_pictures,
 )
-from torchpose.evaluation.report import Report
-from torchpose.io.recordings import Recording, read_recordings
-from torchpose.learning.recipes.upper_body import fit_kinect_prior
-from torchpose.priors.upper_body import UpperBodyPrior
+from torchpose.io import Recording, read_recordings
+from torchpose.learning._recipes.upper_body import fit_kinect_prior
+from torchpose.priors import UpperBodyPrior
 
 __all__ = ["TEST_PERSONS", "TRAIN_PERSONS", "people", "run", "sway"]
 

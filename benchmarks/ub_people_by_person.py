@@ -2,7 +2,7 @@
 
 For each of s1 to s6 a prior is fitted to the other five, without calibration, and tracks that person
 in the test camera. Scale and floor of the covariances then come from the errors of the other five,
-each under the prior that did not know them (`torchpose.learning.recipes.fit_calibration`). The table
+each under the prior that did not know them (`torchpose.learning._recipes.fit_calibration`). The table
 shows the error and the share of true joints inside the 50 % and 90 % ellipsoids, person by person:
 its spread
 is what a calibration on a handful of persons can promise for the next one.
@@ -24,7 +24,7 @@ from torchpose.camera import PinholeCamera
 from torchpose.evaluation.common import cached_prior, centred_on_neck, make_test_set, track
 from torchpose.evaluation.people_tables import SHORT_NAMES
 from torchpose.io import Recording
-from torchpose.learning.recipes import fit_calibration, fit_kinect_prior
+from torchpose.learning._recipes import fit_calibration, fit_kinect_prior
 from torchpose.metrics import align, coverage
 
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)

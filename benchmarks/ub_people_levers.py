@@ -38,9 +38,9 @@ from benchmarks._levers import (
 )
 from benchmarks.speed._timing import machine_line, markdown_table
 from torchpose._core.files import atomic_path, check_output_folder
-from torchpose.camera.viewpoints import PAPER_VIEWS
+from torchpose.camera._viewpoints import PAPER_VIEWS
 from torchpose.learning import TRAINING_VIEWS
-from torchpose.priors.window import WindowLayout
+from torchpose.priors._window import WindowLayout
 
 HEADER = ("lever", "filtered (cm)", "jitter", "fit (s)", "smoothed (cm)", "jitter", "fit (s)")
 

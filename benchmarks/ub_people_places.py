@@ -2,7 +2,7 @@
 
 A prior is fitted to the training persons s1 to s3 of UB-people and tracks s4 to s6 in the test camera,
 still at the usual place (about 2 m away), walking in a circle, and standing elsewhere. Windows see
-the body by a virtual camera that follows it (`torchpose.camera.virtual_camera`), single poses do not.
+the body by a virtual camera that follows it (`torchpose.camera._virtual_camera`), single poses do not.
 
     python -m benchmarks.ub_people_places --data DIR --out DIR
 """
@@ -19,7 +19,7 @@ from torchpose._core.files import check_output_folder
 from torchpose.camera import PinholeCamera
 from torchpose.evaluation.common import Trials, cached_prior, centred_on_neck, make_test_set, score
 from torchpose.evaluation.common import track as track_test
-from torchpose.learning.recipes import fit_kinect_prior
+from torchpose.learning._recipes import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
 
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)

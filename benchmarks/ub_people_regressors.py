@@ -42,7 +42,8 @@ from torchpose.evaluation.common import (
 from torchpose.evaluation.people_tables import SHORT_NAMES
 from torchpose.learning import TRAINING_VIEWS
 from torchpose.math import euler_to_matrix
-from torchpose.skeleton import UPPER_BODY, mirror_pose
+from torchpose.skeleton import UPPER_BODY
+from torchpose.skeleton._upper_body import mirror_pose
 
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 COLUMNS = [UPPER_BODY.index(name) for name in MEASURED]

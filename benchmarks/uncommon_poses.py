@@ -14,6 +14,7 @@ import torch
 from benchmarks.ub_people import people
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
+from torchpose.evaluation import Report
 from torchpose.evaluation.common import Recipe, add_picture
 from torchpose.evaluation.person_tables import (
     add_pose_classes,
@@ -23,10 +24,9 @@ from torchpose.evaluation.person_tables import (
     pooled,
 )
 from torchpose.evaluation.persons import by_person, raised_share
-from torchpose.evaluation.report import Report
 from torchpose.evaluation.unseen import Job, ScoreSettings, fit_settings, run_jobs
-from torchpose.io.recordings import Recording
-from torchpose.learning.recipes.upper_body import fit_kinect_prior
+from torchpose.io import Recording
+from torchpose.learning._recipes.upper_body import fit_kinect_prior
 
 __all__ = ["run", "without_raised"]
 

@@ -31,8 +31,11 @@ from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, FPS, Clip, read_clip
 from benchmarks.speed._timing import Report, limit_threads, machine_line
-from torchpose.measure import FaceTracker, HandPrior, HandSettings, HandTracker
-from torchpose.measure.edges import edge_map
+from torchpose.measure import HandTracker
+from torchpose.measure._edges import edge_map
+from torchpose.measure._face import FaceTracker
+from torchpose.measure._hand_likelihood import HandSettings
+from torchpose.measure._hand_prior import HandPrior
 from torchpose.priors import load_prior
 from torchpose.video import open_video
 

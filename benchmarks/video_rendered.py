@@ -3,7 +3,7 @@
     python -m benchmarks.video_rendered --out DIR
 
 Figures 10 and 11 of Burke & Lasenby in kind. They compared with a Kinect's skeleton; here performers are
-rendered (`torchpose.demo.rendering`), 1,000 frames each, H.264, so the truth is exact and everything
+rendered (`torchpose.demo._rendering`), 1,000 frames each, H.264, so the truth is exact and everything
 else made up: movements, clothes, room. The shipped prior has seen none of it. Errors are distances
 in centimetres
 after fixed-scale Procrustes on head, neck and shoulders, frame by frame, in all frames with a pose.
@@ -28,14 +28,14 @@ from benchmarks.speed._timing import markdown_table, processor_model
 from torchpose import VideoTracker, load_prior, viz
 from torchpose._core.files import check_output_folder
 from torchpose.demo import KEYPOINT_NAMES, demo_camera
-from torchpose.demo.rendering import LOOKS, PERFORMANCES, performance, render_video
+from torchpose.demo._rendering import LOOKS, PERFORMANCES, performance, render_video
 from torchpose.metrics import joint_errors_3d
 from torchpose.priors import UpperBodyPrior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack, UpperBodyTracker
 from torchpose.video import open_video
 from torchpose.viz import save_figure
-from torchpose.viz.style import readable
+from torchpose.viz._style import readable
 
 DISTANCE = 1.6  # metres; a face of about 55 pixels
 FPS = 30.0

@@ -45,7 +45,7 @@ def test_modules_load_no_optional_package():
 FILTERS = """
 import torch
 from torchpose.filters import BootstrapParticleFilter, MixtureKalmanFilter
-from torchpose.math.gaussian import kalman_update
+from torchpose.math._gaussian import kalman_update
 from torchpose.priors import GaussianMixture
 gmm = GaussianMixture(torch.full((2,), 0.5), torch.eye(2), torch.eye(2).repeat(2, 1, 1))
 z, mask = torch.zeros(2, 3, 2), torch.ones(2, 3, 2, dtype=torch.bool)

@@ -14,8 +14,8 @@ from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walk
 from torchpose import body, filters, priors, whole_body
 from torchpose.camera import backproject, lift, map_pixels, project
 from torchpose.math import euler_to_matrix, matrix_to_euler
-from torchpose.priors.actions.part_postures import PartPostures
-from torchpose.upper_body.fusion import MotionStage, ReadOut
+from torchpose.priors._actions.part_postures import PartPostures
+from torchpose.upper_body._fusion import MotionStage, ReadOut
 
 POINTS = modules.points
 ELSEWHERE = {

@@ -6,9 +6,9 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
-from torchpose.camera import projection
+from torchpose.camera import _projection as projection
 from torchpose.errors import ShapeError
-from torchpose.math import gaussian
+from torchpose.math import _gaussian as gaussian
 
 pytestmark = pytest.mark.skipif(
     os.environ.get("TORCHPOSE_SHAPE_CHECKS") == "0", reason="shape checks are switched off"

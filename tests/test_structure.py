@@ -1,5 +1,6 @@
 """The structure of the package: what its rooms show, and no circles of imports."""
 
+import re
 import warnings
 from importlib import import_module
 from pathlib import Path
@@ -8,7 +9,7 @@ from pkgutil import iter_modules
 import pytest
 
 import torchpose
-from benchmarks.import_graph import circles, module_files, module_imports
+from benchmarks.import_graph import circles, distinct_names, module_files, module_imports
 from torchpose._core.moved import NAMES, moved_from
 
 ROOT = Path(__file__).parents[1]
@@ -66,6 +67,22 @@ def test_a_room_shows_public_names_and_subpackages_alone(name):
     assert len(set(room.__all__)) == len(room.__all__)
     for public in room.__all__:
         assert getattr(room, public) is not None
+
+
+def test_everything_else_is_private():
+    """Outside `__all__`, nothing can be imported from a room without writing an underscore."""
+    rooms = {f"torchpose.{room}" for room in ROOMS}
+    open_modules = {
+        module
+        for module in module_files(ROOT, ["torchpose"])
+        if not any(part.startswith("_") for part in module.split("."))
+    }
+    programs = {m for m in open_modules if re.match(r"torchpose\.(cli|evaluation)\b", m)}
+    assert open_modules - programs == {"torchpose", *rooms} - programs
+
+
+def test_few_names_are_public():
+    assert len(distinct_names(ROOT)) <= 200
 
 
 @pytest.mark.parametrize(("room", "name", "home"), MOVED, ids=lambda value: value)

@@ -12,8 +12,8 @@ pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 
 from torchpose import demo, metrics, viz
 from torchpose.errors import InputError, MissingDependencyError, OutputError, ShapeError
-from torchpose.viz import style
-from torchpose.viz.charts import _spans
+from torchpose.viz import _style as style
+from torchpose.viz._charts import _spans
 
 
 @pytest.fixture(scope="module")

@@ -29,19 +29,19 @@ if TYPE_CHECKING:
     from torchpose import viz as viz
     from torchpose import whole_body as whole_body
     from torchpose._core.value_checks import without_value_checks as without_value_checks
-    from torchpose.camera.pinhole import PinholeCamera as PinholeCamera
+    from torchpose.camera._pinhole import PinholeCamera as PinholeCamera
     from torchpose.errors import TorchposeError as TorchposeError
-    from torchpose.priors.gaussian_mixture import GaussianMixture as GaussianMixture
-    from torchpose.priors.shipped import load_action as load_action
-    from torchpose.priors.shipped import load_limb_conditionals as load_limb_conditionals
-    from torchpose.priors.shipped import load_manifold as load_manifold
-    from torchpose.priors.upper_body import UpperBodyPrior as UpperBodyPrior
-    from torchpose.priors.upper_body import load_prior as load_prior
-    from torchpose.upper_body.pose_track import PoseTrack as PoseTrack
-    from torchpose.upper_body.tracker import UpperBodyTracker as UpperBodyTracker
-    from torchpose.video.tracker import VideoTracker as VideoTracker
-    from torchpose.whole_body.poses import BodyPoses as BodyPoses
-    from torchpose.whole_body.tracker import BodyTracker as BodyTracker
+    from torchpose.priors._gaussian_mixture import GaussianMixture as GaussianMixture
+    from torchpose.priors._shipped import load_action as load_action
+    from torchpose.priors._shipped import load_limb_conditionals as load_limb_conditionals
+    from torchpose.priors._shipped import load_manifold as load_manifold
+    from torchpose.priors._upper_body import UpperBodyPrior as UpperBodyPrior
+    from torchpose.priors._upper_body import load_prior as load_prior
+    from torchpose.upper_body._pose_track import PoseTrack as PoseTrack
+    from torchpose.upper_body._tracker import UpperBodyTracker as UpperBodyTracker
+    from torchpose.video._tracker import VideoTracker as VideoTracker
+    from torchpose.whole_body._poses import BodyPoses as BodyPoses
+    from torchpose.whole_body._tracker import BodyTracker as BodyTracker
 
     __version__: str
 
@@ -67,19 +67,19 @@ _PACKAGES = frozenset(
     ]
 )
 _HOMES = {
-    "BodyPoses": "whole_body.poses",
-    "BodyTracker": "whole_body.tracker",
-    "GaussianMixture": "priors.gaussian_mixture",
-    "PinholeCamera": "camera.pinhole",
-    "PoseTrack": "upper_body.pose_track",
+    "BodyPoses": "whole_body._poses",
+    "BodyTracker": "whole_body._tracker",
+    "GaussianMixture": "priors._gaussian_mixture",
+    "PinholeCamera": "camera._pinhole",
+    "PoseTrack": "upper_body._pose_track",
     "TorchposeError": "errors",
-    "UpperBodyPrior": "priors.upper_body",
-    "UpperBodyTracker": "upper_body.tracker",
-    "VideoTracker": "video.tracker",
-    "load_action": "priors.shipped",
-    "load_limb_conditionals": "priors.shipped",
-    "load_manifold": "priors.shipped",
-    "load_prior": "priors.upper_body",
+    "UpperBodyPrior": "priors._upper_body",
+    "UpperBodyTracker": "upper_body._tracker",
+    "VideoTracker": "video._tracker",
+    "load_action": "priors._shipped",
+    "load_limb_conditionals": "priors._shipped",
+    "load_manifold": "priors._shipped",
+    "load_prior": "priors._upper_body",
     "without_value_checks": "_core.value_checks",
 }
 

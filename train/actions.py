@@ -1,16 +1,16 @@
 """Fit of action spaces, or of a bank, with Lightning: one step.
 
-The fit itself is `torchpose.learning.recipes.actions`.
+The fit itself is `torchpose.learning._recipes.actions`.
 """
 
 from typing import Any, Literal
 
 import torch
 
-from torchpose.learning.fit_files import write_action_files
-from torchpose.learning.recipes import ActionRecipe, Performances, fit_actions
-from torchpose.learning.recipes.actions import FittedActions, check_actions
-from torchpose.priors.actions.file import BankInfo
+from torchpose.learning._fit_files import write_action_files
+from torchpose.learning._recipes import ActionRecipe, Performances, fit_actions
+from torchpose.learning._recipes.actions import FittedActions, check_actions
+from torchpose.priors._actions.file import BankInfo
 from train.body_fit import BodyData, BodyFit
 
 __all__ = ["ActionData", "ActionFit"]

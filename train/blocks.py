@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from torchpose.errors import InputError
-from torchpose.learning.blocks import joined_blocks, usable_block
-from torchpose.learning.samplers import Samples, SampleSource
+from torchpose.learning._blocks import joined_blocks, usable_block
+from torchpose.learning._samplers import Samples, SampleSource
 
 __all__ = ["Block", "Key", "Part", "ShareSampler", "Sweep", "SweepLoader", "list_blocks"]
 

@@ -1,6 +1,6 @@
 """What fits to whole bodies share: one process, the identity of a fit, and where its file goes.
 
-What is fitted, and to which recordings, is `torchpose.learning.recipes`; here are the steps of Lightning.
+What is fitted, and to which recordings, is `torchpose.learning._recipes`; here are the steps of Lightning.
 """
 
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from lightning.pytorch import LightningDataModule, LightningModule
 from torch.optim import Optimizer
 
 from torchpose.errors import InputError
-from torchpose.io import ResultsFolder
+from torchpose.io._results import ResultsFolder
 from train.callbacks import PriorWriter
 from train.identity import check_identity
 

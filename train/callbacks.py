@@ -10,9 +10,9 @@ from lightning.pytorch.callbacks import Checkpoint, ProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 from tqdm.auto import tqdm
 
-from torchpose._core.leftovers import clear_leftovers
+from torchpose._core.files import clear_leftovers
 from torchpose._core.terminal import show_progress
-from torchpose.learning.fit_files import check_fit_file, fit_results, write_prior_files
+from torchpose.learning._fit_files import check_fit_file, fit_results, write_prior_files
 from torchpose.priors import UpperBodyPrior
 from train.blocks import Sweep
 from train.mixture_em import MixtureEM
@@ -134,7 +134,7 @@ def _pictures(
     module: MixtureEM, prior: UpperBodyPrior, n_shown: int
 ) -> dict[str, Callable[[], Any]]:
     from torchpose.viz import plot_prior_components, plot_prior_samples
-    from torchpose.viz.prior_pictures import plot_log_likelihood
+    from torchpose.viz._prior_pictures import plot_log_likelihood
 
     found: dict[str, Callable[[], Any]] = {
         "likelihood": lambda: plot_log_likelihood(module.histories, module.held_out_history),

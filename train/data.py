@@ -9,16 +9,16 @@ from lightning.pytorch import LightningDataModule
 
 from torchpose.errors import InputError, OverlapError
 from torchpose.io import Recording, find_recordings, read_recordings
-from torchpose.learning.curation import (
+from torchpose.learning._curation import (
     CurationReport,
     CurationSettings,
     curate,
     pick_persons,
     refuse_leaks,
 )
-from torchpose.learning.recipes import VERSION, MixtureTask, UpperBodyRecipe
-from torchpose.learning.recipes.choosing import expand_path, fingerprint
-from torchpose.learning.samplers import SampleSource, cached
+from torchpose.learning._recipes import VERSION, MixtureTask, UpperBodyRecipe
+from torchpose.learning._recipes.choosing import expand_path, fingerprint
+from torchpose.learning._samplers import SampleSource, cached
 from train.blocks import Key, SweepLoader
 
 __all__ = ["RecordingsDataModule", "read_sides", "split"]

@@ -19,11 +19,11 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from torchpose.errors import InputError
 from torchpose.io import Recording
-from torchpose.learning import collect_poses
-from torchpose.learning.curation import CurationSettings
-from torchpose.learning.fine_tuning import TunableKalman, TunableWindow, parameter_groups
-from torchpose.learning.recipes.calibration import HeldOut, calibration_noise, track_held_out
-from torchpose.learning.recipes.choosing import fingerprint
+from torchpose.learning._curation import CurationSettings
+from torchpose.learning._fine_tuning import TunableKalman, TunableWindow, parameter_groups
+from torchpose.learning._recipes.calibration import HeldOut, calibration_noise, track_held_out
+from torchpose.learning._recipes.choosing import fingerprint
+from torchpose.learning._training import collect_poses
 from torchpose.priors import UpperBodyPrior, load_prior
 from train.data import read_sides
 from train.fine_tuning_batches import batches_of

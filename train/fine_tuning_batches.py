@@ -14,17 +14,17 @@ from torch import Tensor
 from torchpose.camera import ViewRange
 from torchpose.errors import InputError
 from torchpose.io import Recording
-from torchpose.learning import collect_poses
-from torchpose.learning.completion import ColumnsSource
-from torchpose.learning.fine_tuning import (
+from torchpose.learning._fine_tuning import (
     TunableKalman,
     TunableWindow,
     WindowBatch,
     draw_sequences,
     draw_windows,
 )
-from torchpose.learning.recipes import UpperBodyRecipe
-from torchpose.learning.samplers import WindowSource, derived_seed
+from torchpose.learning._recipes import UpperBodyRecipe
+from torchpose.learning._samplers import WindowSource, derived_seed
+from torchpose.learning._streamed_em import ColumnsSource
+from torchpose.learning._training import collect_poses
 from torchpose.priors import UpperBodyPrior
 
 __all__ = ["Batches", "SequenceBatches", "WindowBatches", "batches_of"]

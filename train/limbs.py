@@ -1,13 +1,13 @@
-"""Fit of limb conditionals with Lightning: one step; the fit itself is `torchpose.learning.recipes.limbs`."""
+"""Fit limb conditionals with Lightning: one step of `torchpose.learning._recipes.limbs`."""
 
 from typing import Any
 
 import torch
 
 from torchpose.errors import InputError
-from torchpose.learning.fit_files import write_limb_files
-from torchpose.learning.recipes import LimbStates, fit_limbs
-from torchpose.learning.recipes.limbs import check_least_std
+from torchpose.learning._fit_files import write_limb_files
+from torchpose.learning._recipes import LimbStates, fit_limbs
+from torchpose.learning._recipes.limbs import check_least_std
 from train.body_fit import BodyData, BodyFit
 
 __all__ = ["LimbData", "LimbFit"]

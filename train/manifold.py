@@ -1,4 +1,4 @@
-"""Fit of a manifold of poses with Lightning; the fit itself is `torchpose.learning.recipes.manifold`.
+"""Fit of a manifold of poses with Lightning; the fit itself is `torchpose.learning._recipes.manifold`.
 
 An epoch is one step, ten iterations of the optimiser over all poses at once.
 """
@@ -9,9 +9,9 @@ import torch
 from torch import nn
 
 from torchpose.errors import InputError
-from torchpose.learning.fit_files import write_manifold_files
-from torchpose.learning.recipes import ManifoldFitting, ManifoldPoses, ManifoldRecipe
-from torchpose.learning.recipes.manifold import check_gathering
+from torchpose.learning._fit_files import write_manifold_files
+from torchpose.learning._recipes import ManifoldFitting, ManifoldPoses, ManifoldRecipe
+from torchpose.learning._recipes.manifold import check_gathering
 from train.body_fit import BodyData, BodyFit
 
 __all__ = ["ManifoldData", "ManifoldFit"]

@@ -15,12 +15,12 @@ from torch import nn
 from torch.optim import Optimizer
 
 from torchpose.errors import InputError, TorchposeError
-from torchpose.learning.blocks import Share
-from torchpose.learning.recipes import MixtureTask
-from torchpose.learning.recipes.calibration import folds
-from torchpose.learning.stepwise_em import stepwise_pass
-from torchpose.learning.streamed_em import StreamedEM
-from torchpose.math.mixture_em import SufficientStatistics
+from torchpose.learning._blocks import Share
+from torchpose.learning._recipes import MixtureTask
+from torchpose.learning._recipes.calibration import folds
+from torchpose.learning._stepwise_em import stepwise_pass
+from torchpose.learning._streamed_em import StreamedEM
+from torchpose.math._mixture_em import SufficientStatistics
 from torchpose.priors import GaussianMixture, UpperBodyPrior
 from train.blocks import Key, Sweep
 from train.data import RecordingsDataModule

@@ -17,11 +17,10 @@ from typing import Any, NamedTuple
 from jsonargparse import ActionConfigFile, ArgumentParser
 from tqdm.auto import tqdm
 
-from torchpose._core.files import check_output_folder
-from torchpose._core.leftovers import clear_leftovers
+from torchpose._core.files import check_output_folder, clear_leftovers
 from torchpose._core.terminal import one_line, show_progress
 from torchpose.errors import InputError, OutputError, TorchposeError
-from torchpose.upper_body.keypoint_files import TrackSettings
+from torchpose.upper_body._keypoint_files import TrackSettings
 from train.predict_claims import Claim, Claims, Run
 from train.predict_recordings import Recording, find_keypoints, share
 from train.predict_summary import Outcome, check_summary, count_outcomes, write_summary

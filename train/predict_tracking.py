@@ -20,7 +20,7 @@ from torchpose.errors import InputError, OutputError
 from torchpose.io import read_keypoints
 from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import PoseTrack
-from torchpose.upper_body.keypoint_files import KeypointFileTracker, TrackSettings
+from torchpose.upper_body._keypoint_files import KeypointFileTracker, TrackSettings
 from train.predict_recordings import Recording, content_of
 
 __all__ = [

@@ -8,7 +8,7 @@ from lightning.pytorch import LightningDataModule, LightningModule, Trainer
 
 from torchpose._core.terminal import show_progress
 from torchpose.errors import InputError
-from torchpose.learning.selection import select_n_components
+from torchpose.learning._selection import select_n_components
 from train.blocks import Key
 from train.data import RecordingsDataModule
 

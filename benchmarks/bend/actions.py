@@ -23,13 +23,12 @@ from benchmarks.bend.trackees import (
     perform,
 )
 from benchmarks.silhouette.trackees import Conditions, Setting, view_of
-from torchpose.body.fitting import fit_state
-from torchpose.evaluation.report import Report
-from torchpose.io.mocap import MocapClip
-from torchpose.priors.actions.bank import ActionBank
-from torchpose.priors.actions.postures import state_postures
-from torchpose.priors.actions.space import ActionSpace
-from torchpose.whole_body.filters.motion import constant_velocity_std
+from torchpose.body import fit_state
+from torchpose.evaluation import Report
+from torchpose.io._mocap import MocapClip
+from torchpose.priors import ActionBank, ActionSpace
+from torchpose.priors._actions.postures import state_postures
+from torchpose.whole_body import constant_velocity_std
 
 __all__ = [
     "BANK_SETTINGS",

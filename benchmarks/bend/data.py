@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 from benchmarks.silhouette.data import Split
 from torchpose.errors import InputError
-from torchpose.io.mocap import MocapClip, select_persons
-from torchpose.learning.performances import split_repetitions
-from torchpose.priors.actions.postures import posture_angles
+from torchpose.io._mocap import MocapClip, select_persons
+from torchpose.learning._performances import split_repetitions
+from torchpose.priors._actions.postures import posture_angles
 
 __all__ = ["action_clips", "first_bend", "leave_one_out", "performances"]
 

@@ -12,11 +12,9 @@ from benchmarks.bend.runs import BendRun, BendRuns, Start, run_variants
 from benchmarks.bend.trackees import BendTrackee, Variant
 from benchmarks.silhouette.runs import sequence_name
 from benchmarks.silhouette.trackees import Setting, View
-from torchpose.body.fitting import fit_state
-from torchpose.body.limbs import Limbs
-from torchpose.body.skeleton import BODY_15
-from torchpose.evaluation.report import Report
-from torchpose.whole_body.silhouettes.rendering import render_limbs
+from torchpose.body import BODY_15, Limbs, fit_state
+from torchpose.evaluation import Report
+from torchpose.whole_body._silhouettes.rendering import render_limbs
 
 __all__ = [
     "HIDDEN",

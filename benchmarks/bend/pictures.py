@@ -14,9 +14,9 @@ from benchmarks.bend.runs import BendRuns, mean_squared
 from benchmarks.bend.tables import joint_error, root_error
 from benchmarks.silhouette.tables import pooled_std
 from benchmarks.silhouette.trackees import View
-from torchpose.body.skeleton import BODY_15
+from torchpose.body import BODY_15
 from torchpose.errors import DegenerateFilterWarning
-from torchpose.viz.style import (
+from torchpose.viz._style import (
     INK,
     LEFT,
     MUTED,
@@ -29,7 +29,7 @@ from torchpose.viz.style import (
     style_axes,
     to_numpy,
 )
-from torchpose.whole_body.filters.silhouette_filter import SilhouetteParticleFilter
+from torchpose.whole_body import SilhouetteParticleFilter
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -45,9 +45,9 @@ from benchmarks.silhouette.runs import Tuning
 from benchmarks.silhouette.trackees import SCALES, Conditions, Setting
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
+from torchpose.evaluation import Report
 from torchpose.evaluation.common import add_picture
-from torchpose.evaluation.report import Report
-from torchpose.io.mocap import MocapClip, read_mocap, select_persons
+from torchpose.io._mocap import MocapClip, read_mocap, select_persons
 
 __all__ = ["PARTS", "run"]
 
@@ -213,7 +213,7 @@ def run(
 def _particles(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> None:
     """Figures 1, 3 and 4."""
     from benchmarks.bend.pictures import plot_particles, plot_predictions, predictions
-    from torchpose.viz.action_picture import plot_action_space
+    from torchpose.viz import plot_action_space
 
     settings = stage.both(tunings, *stage.numbers)
     runs = run_variants(

@@ -23,9 +23,8 @@ from benchmarks.silhouette.trackees import SCALES, Setting, View
 from torchpose.errors import DegenerateFilterWarning
 from torchpose.evaluation.common import settings_hash
 from torchpose.evaluation.kept_runs import keep, read_kept
-from torchpose.priors.actions.postures import state_postures
-from torchpose.whole_body.filters.body_particles import BodyTrack
-from torchpose.whole_body.filters.silhouette_filter import SilhouetteParticleFilter
+from torchpose.priors._actions.postures import state_postures
+from torchpose.whole_body import BodyTrack, SilhouetteParticleFilter
 
 __all__ = [
     "BendRun",

@@ -12,9 +12,10 @@ from benchmarks.bend.runs import BendRun, BendRuns, mean_squared
 from benchmarks.bend.trackees import BendTrackee, Variant, true_acceptance
 from benchmarks.silhouette.runs import Tuning, sequence_name
 from benchmarks.silhouette.tables import bootstrap, mean_of, pooled_std
-from torchpose.body.skeleton import BODY_15
-from torchpose.evaluation.report import RESULTS, Report
-from torchpose.io.results import replace_own
+from torchpose.body import BODY_15
+from torchpose.evaluation import Report
+from torchpose.evaluation.report import RESULTS
+from torchpose.io._results import replace_own
 
 __all__ = [
     "GATE",

@@ -11,18 +11,15 @@ from torch import Tensor
 
 from benchmarks.silhouette.data import Split
 from benchmarks.silhouette.trackees import Conditions, Setting, Tracked, body_of, view_of
-from torchpose.body.fitting import fit_body, fit_state
-from torchpose.body.kinematics import Body, centres_of
-from torchpose.body.skeleton import BODY_15
-from torchpose.io.mocap import MocapClip
-from torchpose.learning.action_spaces import fit_synchronised
-from torchpose.priors.actions.file import ActionInfo, Synchronised
-from torchpose.priors.actions.gate import Acceptance
-from torchpose.priors.actions.polar_limbs import LIMBS_12
-from torchpose.priors.actions.postures import posture_angles, state_postures
-from torchpose.priors.actions.space import ActionSpace
-from torchpose.whole_body.filters.constrained import ConstrainedParticleFilter
-from torchpose.whole_body.filters.motion import constant_velocity_std
+from torchpose.body import BODY_15, Body, centres_of, fit_body, fit_state
+from torchpose.io._mocap import MocapClip
+from torchpose.learning._action_spaces import fit_synchronised
+from torchpose.priors import ActionSpace
+from torchpose.priors._actions.file import ActionInfo, Synchronised
+from torchpose.priors._actions.gate import Acceptance
+from torchpose.priors._actions.polar_limbs import LIMBS_12
+from torchpose.priors._actions.postures import posture_angles, state_postures
+from torchpose.whole_body import ConstrainedParticleFilter, constant_velocity_std
 
 __all__ = [
     "BendTrackee",

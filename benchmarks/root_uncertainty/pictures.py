@@ -16,14 +16,12 @@ from benchmarks.root_uncertainty.trackees import METHODS, Budget, Walker, make_f
 from benchmarks.silhouette.pictures import plot_silhouettes
 from benchmarks.silhouette.runs import Runs, generators_of, sequence_name
 from benchmarks.silhouette.trackees import Setting, View
-from torchpose.body.fitting import fit_state
-from torchpose.body.kinematics import Body
-from torchpose.body.limbs import Limbs
-from torchpose.camera.rig import CameraRig
+from torchpose.body import Body, Limbs, fit_state
+from torchpose.camera import CameraRig
+from torchpose.evaluation import Report
 from torchpose.evaluation.common import add_picture
-from torchpose.evaluation.report import Report
-from torchpose.math.unscented import sigma_points
-from torchpose.viz.style import (
+from torchpose.math._unscented import sigma_points
+from torchpose.viz._style import (
     INK,
     LEFT,
     MIDDLE,
@@ -35,8 +33,8 @@ from torchpose.viz.style import (
     require_matplotlib,
     to_numpy,
 )
-from torchpose.whole_body.filters.body_particles import BodyFilterState
-from torchpose.whole_body.filters.silhouette_filter import SilhouetteParticleFilter
+from torchpose.whole_body import SilhouetteParticleFilter
+from torchpose.whole_body._filters.body_particles import BodyFilterState
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -246,7 +244,7 @@ def _draw_limbs(
     import numpy as np
     from matplotlib.collections import PolyCollection
 
-    from torchpose.whole_body.silhouettes.limb_outlines import project_limbs
+    from torchpose.whole_body._silhouettes.outlines import project_limbs
 
     ends = project_limbs(
         Limbs(limbs.start[None], limbs.end[None], limbs.radii), rig.select([camera])

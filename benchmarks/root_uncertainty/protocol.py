@@ -51,9 +51,9 @@ from benchmarks.silhouette.tables import write_csv
 from benchmarks.silhouette.trackees import Conditions, Setting
 from torchpose._core.files import check_output_folder
 from torchpose.errors import DegenerateFilterWarning, InputError
+from torchpose.evaluation import Report
 from torchpose.evaluation.common import add_picture
-from torchpose.evaluation.report import Report
-from torchpose.io.mocap import MocapClip, read_mocap
+from torchpose.io._mocap import MocapClip, read_mocap
 
 __all__ = ["run"]
 

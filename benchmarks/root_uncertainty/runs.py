@@ -22,11 +22,11 @@ from benchmarks.silhouette.runs import (
     view_errors,
 )
 from benchmarks.silhouette.trackees import Setting, View
-from torchpose.body.kinematics import Body
+from torchpose.body import Body
 from torchpose.evaluation.common import settings_hash
 from torchpose.evaluation.kept_runs import keep, kept, read_kept, source_hash
-from torchpose.math.quaternion_vectors import compose
-from torchpose.whole_body.filters.silhouette_filter import SilhouetteParticleFilter
+from torchpose.math import compose
+from torchpose.whole_body import SilhouetteParticleFilter
 
 __all__ = [
     "DISPLACEMENTS",

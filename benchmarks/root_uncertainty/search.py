@@ -8,7 +8,7 @@ from benchmarks.root_uncertainty.runs import validation_error
 from benchmarks.root_uncertainty.trackees import METHODS, Budget, Walker, published, selected_among
 from benchmarks.silhouette.runs import Tuning
 from benchmarks.silhouette.trackees import SCALES, Setting
-from torchpose.filters.survival import LEAST_SURVIVORS
+from torchpose.filters._resampling import LEAST_SURVIVORS
 
 __all__ = ["search_setting", "tune"]
 

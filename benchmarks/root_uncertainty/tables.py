@@ -11,8 +11,8 @@ from benchmarks.root_uncertainty.trackees import METHODS, Budget, Walker, publis
 from benchmarks.silhouette.runs import Runs, Tuning, sequence_name
 from benchmarks.silhouette.tables import bootstrap, mean_of, part_errors, pooled_std
 from benchmarks.silhouette.trackees import Setting
-from torchpose.body.fitting import fit_state
-from torchpose.evaluation.report import Report
+from torchpose.body import fit_state
+from torchpose.evaluation import Report
 
 __all__ = [
     "add_differences",

@@ -27,19 +27,19 @@ from benchmarks.silhouette.trackees import (
     body_of,
     view_of,
 )
-from torchpose.body.fitting import fit_state
-from torchpose.body.kinematics import Body, centres_of
-from torchpose.body.limits import JointLimits
+from torchpose.body import Body, JointLimits, centres_of, fit_state
 from torchpose.errors import InputError
-from torchpose.filters.survival import survival_rate_per_frame
-from torchpose.io.mocap import MocapClip
+from torchpose.filters._resampling import survival_rate_per_frame
+from torchpose.io._mocap import MocapClip
 from torchpose.learning import fit_limb_conditionals
-from torchpose.priors.limb_conditionals import LimbConditionals
-from torchpose.whole_body.filters.annealed import AnnealedParticleFilter
-from torchpose.whole_body.filters.motion import motion_std
-from torchpose.whole_body.filters.root_uncertainty import RootUncertaintyTracker
-from torchpose.whole_body.filters.silhouette_filter import SilhouetteParticleFilter
-from torchpose.whole_body.filters.sir import SIRParticleFilter
+from torchpose.priors._limb_conditionals import LimbConditionals
+from torchpose.whole_body import (
+    AnnealedParticleFilter,
+    RootUncertaintyTracker,
+    SilhouetteParticleFilter,
+    SIRParticleFilter,
+    motion_std,
+)
 
 __all__ = [
     "FPS",

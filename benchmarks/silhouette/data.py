@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.body.skeleton import BODY_15
-from torchpose.camera.rig import CameraRig
-from torchpose.demo.rendering.cameras import AZIMUTHS, cameras_around
+from torchpose.body import BODY_15
+from torchpose.camera import CameraRig
+from torchpose.demo._rendering.walk import AZIMUTHS, cameras_around
 from torchpose.errors import InputError
-from torchpose.io.mocap import MocapClip, select_persons
+from torchpose.io._mocap import MocapClip, select_persons
 
 __all__ = [
     "Split",

@@ -20,23 +20,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks.humaneva_files import FPS, PARTITIONS, HumanEvaTrial, find_humaneva, read_humaneva
 from benchmarks.silhouette.data import Split, take_frames, whole_frames
-from torchpose.camera.rig import CameraRig
+from torchpose.camera import CameraRig
 from torchpose.errors import InputError
 from torchpose.evaluation.common import settings_hash
 from torchpose.evaluation.kept_runs import keep, read_kept
-from torchpose.io.humaneva import FPS, PARTITIONS, HumanEvaTrial, find_humaneva, read_humaneva
-from torchpose.io.mocap import MocapClip, select_persons
-from torchpose.video.base import VideoSource
-from torchpose.video.silhouettes import (
-    SilhouetteMeasurer,
-    SilhouetteView,
-    clean_silhouette,
-    fit_view,
-    learning_frames,
-    read_silhouettes,
-)
-from torchpose.video.source import open_video
+from torchpose.io._mocap import MocapClip, select_persons
+from torchpose.video import SilhouetteMeasurer, VideoSource, open_video, read_silhouettes
+from torchpose.video._silhouettes import SilhouetteView, clean_silhouette, fit_view, learning_frames
 
 __all__ = ["ACTIONS", "HumanEvaFootage", "humaneva_splits"]
 

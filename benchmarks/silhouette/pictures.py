@@ -12,7 +12,7 @@ from torch import Tensor
 from benchmarks.silhouette.runs import Run, Runs
 from benchmarks.silhouette.tables import PARTS, part_errors, pooled_std
 from benchmarks.silhouette.trackees import Tracked, View, label_of
-from torchpose.viz.style import (
+from torchpose.viz._style import (
     INK,
     NORMAL,
     add_legend,
@@ -22,7 +22,7 @@ from torchpose.viz.style import (
     style_axes,
     to_numpy,
 )
-from torchpose.whole_body.silhouettes.rendering import render
+from torchpose.whole_body import render
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -13,17 +13,17 @@ from pathlib import Path
 import torch
 from tqdm.auto import tqdm
 
+from benchmarks.humaneva_files import is_humaneva
 from benchmarks.silhouette.data import Split, looped, split_clips
 from benchmarks.silhouette.humaneva import HumanEvaFootage, humaneva_splits
 from benchmarks.silhouette.report import Cell, fill_one, fill_several
 from benchmarks.silhouette.runs import Tuning, read_settings, run_all, tune
 from benchmarks.silhouette.trackees import METHODS, PUBLISHED_SURVIVAL, Conditions, Setting, prepare
 from torchpose._core.files import check_output_folder
-from torchpose.camera.rig import CameraRig
+from torchpose.camera import CameraRig
 from torchpose.errors import InputError
-from torchpose.evaluation.report import Report
-from torchpose.io.humaneva import is_humaneva
-from torchpose.io.mocap import MocapClip, read_mocap
+from torchpose.evaluation import Report
+from torchpose.io._mocap import MocapClip, read_mocap
 
 __all__ = ["WALKERS", "image_size", "run"]
 

@@ -24,8 +24,8 @@ from benchmarks.silhouette.tables import (
     write_csv,
 )
 from benchmarks.silhouette.trackees import METHODS, Trackee
+from torchpose.evaluation import Report
 from torchpose.evaluation.common import add_picture
-from torchpose.evaluation.report import Report
 
 __all__ = ["Cell", "fill_one", "fill_several"]
 

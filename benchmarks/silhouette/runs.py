@@ -26,14 +26,12 @@ from benchmarks.silhouette.trackees import (
     make_filter,
 )
 from torchpose._core.reading import require_file
-from torchpose.body.kinematics import Body
+from torchpose.body import Body
 from torchpose.errors import FileFormatError, InputError
 from torchpose.evaluation.common import settings_hash
 from torchpose.evaluation.kept_runs import keep, kept, read_kept
-from torchpose.whole_body.filters.body_particles import BodyTrack
-from torchpose.whole_body.filters.silhouette_filter import SilhouetteParticleFilter
-from torchpose.whole_body.first_pose import find_first_pose
-from torchpose.whole_body.sharpness import ValidationSequence, fit_sharpness
+from torchpose.whole_body import BodyTrack, SilhouetteParticleFilter, find_first_pose, fit_sharpness
+from torchpose.whole_body._sharpness import ValidationSequence
 
 __all__ = [
     "Run",

@@ -11,9 +11,10 @@ from torch import Tensor
 from benchmarks.silhouette.data import Split
 from benchmarks.silhouette.runs import Runs, Tuning, sequence_name
 from benchmarks.silhouette.trackees import METHODS, PUBLISHED_SURVIVAL, Setting, Tracked, label_of
-from torchpose.body.skeleton import BODY_15
-from torchpose.evaluation.report import RESULTS, Report
-from torchpose.io.results import replace_own
+from torchpose.body import BODY_15
+from torchpose.evaluation import Report
+from torchpose.evaluation.report import RESULTS
+from torchpose.io._results import replace_own
 
 __all__ = [
     "PARTS",

@@ -9,24 +9,24 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from benchmarks.silhouette.data import AZIMUTHS, Split, in_view, place_cameras, whole_frames
-from torchpose.body.fitting import fit_body, fit_state
-from torchpose.body.kinematics import Body
-from torchpose.camera.rig import CameraRig
-from torchpose.demo.rendering.clothed_body import TrueShape, true_silhouettes
+from torchpose.body import Body, fit_body, fit_state
+from torchpose.camera import CameraRig
+from torchpose.demo._rendering.clothed_body import TrueShape, true_silhouettes
 from torchpose.errors import InputError
 from torchpose.evaluation.common import settings_hash
-from torchpose.io.mocap import MocapClip
+from torchpose.io._mocap import MocapClip
 from torchpose.learning import fit_gplvm, fit_gplvm_noise
-from torchpose.priors.manifold.file import ManifoldInfo
-from torchpose.priors.manifold.gplvm import BackConstrainedGPLVM
-from torchpose.whole_body.filters.annealed import AnnealedParticleFilter
-from torchpose.whole_body.filters.manifold import ManifoldParticleFilter
-from torchpose.whole_body.filters.motion import motion_std
-from torchpose.whole_body.filters.silhouette_filter import SilhouetteParticleFilter
-from torchpose.whole_body.filters.sir import SIRParticleFilter
-from torchpose.whole_body.silhouettes.likelihood import intersection_over_union
-from torchpose.whole_body.silhouettes.rendering import count_pixels
-from torchpose.whole_body.silhouettes.shape import fit_radii
+from torchpose.priors import BackConstrainedGPLVM, ManifoldInfo
+from torchpose.whole_body import (
+    AnnealedParticleFilter,
+    ManifoldParticleFilter,
+    SilhouetteParticleFilter,
+    SIRParticleFilter,
+    count_pixels,
+    motion_std,
+)
+from torchpose.whole_body._silhouettes.likelihood import intersection_over_union
+from torchpose.whole_body._silhouettes.shape import fit_radii
 
 __all__ = [
     "METHODS",

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpose.filters import MixtureKalmanFilter
-from torchpose.filters.transition import make_transition
+from torchpose.filters._transition import make_transition
 from torchpose.priors import GaussianMixture
 
 DIM = 21

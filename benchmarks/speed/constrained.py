@@ -25,17 +25,17 @@ from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.learning import fit_action_space
 from torchpose.priors import ActionSpace
-from torchpose.priors.actions.part_postures import PartPostures
-from torchpose.priors.actions.postures import posture_angles, state_postures
+from torchpose.priors._actions.part_postures import PartPostures
+from torchpose.priors._actions.postures import posture_angles, state_postures
 from torchpose.whole_body import (
     ConstrainedParticleFilter,
     SIRParticleFilter,
     constant_velocity_std,
     count_pixels,
-    prepare_silhouettes,
     render,
 )
-from torchpose.whole_body.filters.posture_gate import PostureGate, Rows
+from torchpose.whole_body._filters.posture_gate import PostureGate, Rows
+from torchpose.whole_body._silhouettes.rendering import prepare_silhouettes
 
 HEIGHT, WIDTH = 120, 160
 PARTICLES = (100, 300, 1000, 3000, 10_000)

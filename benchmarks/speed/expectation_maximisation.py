@@ -33,7 +33,7 @@ from benchmarks.speed._timing import (
     take_turns,
 )
 from torchpose.math import expectation_maximisation
-from torchpose.math.mixture_em import MixtureParameters
+from torchpose.math._mixture_em import MixtureParameters
 
 DIM, RIDGE = 21, 1e-6
 TOLERANCE = 1e-6  # of the difference of mean log-likelihoods, torchpose - scikit-learn in float64

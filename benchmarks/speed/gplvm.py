@@ -40,8 +40,8 @@ from benchmarks.speed._timing import (
 )
 from torchpose.body import body_joints, fit_body, fit_state
 from torchpose.learning import fit_gplvm, fit_gplvm_noise
-from torchpose.learning.gplvm_fit import GPLVMFit
-from torchpose.learning.manifolds import thin
+from torchpose.learning._gplvm_fit import GPLVMFit
+from torchpose.learning._manifolds import thin
 from torchpose.priors import BackConstrainedGPLVM
 
 FRAMES, COLUMNS, CYCLE = 350, 30, 66

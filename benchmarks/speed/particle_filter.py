@@ -23,8 +23,8 @@ import numpy as np
 import torch
 
 from torchpose.filters import BootstrapParticleFilter
-from torchpose.filters.transition import make_transition
-from torchpose.filters.walk import MixtureWalk
+from torchpose.filters._transition import make_transition
+from torchpose.filters._walk import MixtureWalk
 from torchpose.priors import GaussianMixture
 
 DIM = 21

@@ -31,25 +31,24 @@ from benchmarks.speed.silhouettes import make_rig
 from torchpose.body import BODY_15, Body, Limbs
 from torchpose.camera import CameraRig
 from torchpose.learning import fit_limb_conditionals
-from torchpose.math import sigma_points
-from torchpose.math.tree_messages import propagate
-from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
+from torchpose.math._tree_messages import propagate
+from torchpose.math._unscented import sigma_points
+from torchpose.priors._limb_conditionals import LimbConditionals, in_body_frame
 from torchpose.whole_body import (
     AnnealedParticleFilter,
     RootUncertaintyTracker,
     SilhouetteParticleFilter,
     SIRParticleFilter,
     count_pixels,
-    prepare_silhouettes,
     render,
-    render_limbs,
 )
-from torchpose.whole_body.filters.limb_observations import (
+from torchpose.whole_body._filters.limb_observations import (
     count_positions,
     observation_gaussians,
     part_log_likelihood,
     part_positions,
 )
+from torchpose.whole_body._silhouettes.rendering import prepare_silhouettes, render_limbs
 
 SIZES = ((120, 160), (480, 640))
 HYPOTHESES, LAYERS, CAMERAS, POINTS = 114, 5, 3, 7

@@ -32,20 +32,22 @@ from benchmarks.speed._timing import (
 )
 from torchpose.body import BODY_15, Body, Limbs
 from torchpose.camera import CameraRig, PinholeCamera
-from torchpose.whole_body import (
-    PreparedSilhouettes,
-    SilhouetteCounts,
-    count_pixels,
-    prepare_silhouettes,
-    render_limbs,
-)
-from torchpose.whole_body.silhouettes.limb_outlines import (
+from torchpose.whole_body import count_pixels
+from torchpose.whole_body._silhouettes.outlines import (
     NEAR,
     ProjectedLimbs,
+    Strip,
+    _row_ends,
+    limb_intervals,
     outline,
     project_limbs,
 )
-from torchpose.whole_body.silhouettes.row_intervals import Strip, _row_ends, limb_intervals
+from torchpose.whole_body._silhouettes.rendering import (
+    PreparedSilhouettes,
+    SilhouetteCounts,
+    prepare_silhouettes,
+    render_limbs,
+)
 
 SIZES = ((120, 160), (480, 640))
 PARTICLES, CAMERAS = 500, 3

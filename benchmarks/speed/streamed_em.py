@@ -48,10 +48,10 @@ from benchmarks.speed.expectation_maximisation import (
     torchpose_fit,
     wide,
 )
-from torchpose.learning.blocks import Share
-from torchpose.learning.samplers import ArmSource, SampleSource, TensorSource
-from torchpose.learning.streamed_em import StreamedEM, run_streamed
-from torchpose.math.mixture_em import MixtureParameters
+from torchpose.learning._blocks import Share
+from torchpose.learning._samplers import ArmSource, SampleSource, TensorSource
+from torchpose.learning._streamed_em import StreamedEM, run_streamed
+from torchpose.math._mixture_em import MixtureParameters
 
 MB, MILLION = 2**20, 1_000_000
 STEPS, COMPONENTS, POSES = 20, 30, 60_000
@@ -198,7 +198,7 @@ def make_source(job: Job) -> SampleSource:
     matrix = torch.tensor([[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]])
     if job.data is not None:
         from torchpose.io import read_recordings
-        from torchpose.learning import arm_sources, collect_poses
+        from torchpose.learning._training import arm_sources, collect_poses
 
         poses = collect_poses(read_recordings([job.data]))
         return arm_sources(poses, matrix.double(), n_samples=job.samples).left

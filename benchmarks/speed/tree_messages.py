@@ -24,8 +24,8 @@ from benchmarks.speed._timing import (
 )
 from torchpose.body import BODY_15
 from torchpose.math import compose, conjugate, fit_gaussian, rotate_gaussian
-from torchpose.math.tree_messages import message_tree, propagate
-from torchpose.priors.limb_conditionals import PART_TREE, LimbConditionals, LimbInfo
+from torchpose.math._tree_messages import message_tree, propagate
+from torchpose.priors._limb_conditionals import PART_TREE, LimbConditionals, LimbInfo
 
 DEGREES = (2, 5, 10, 15, 20, 30)  # standard deviation of a rotation about each axis
 TOLERANCE = 1e-8  # from the dense joint Gaussian

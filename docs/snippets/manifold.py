@@ -4,7 +4,7 @@ import torch
 
 from torchpose.body import BODY_15, Body, fit_body, fit_state
 from torchpose.learning import fit_gplvm, fit_gplvm_noise
-from torchpose.learning.manifolds import thin
+from torchpose.learning._manifolds import thin
 from torchpose.priors import ManifoldInfo
 
 # recordings of one person; here legs that walk, in yours joints [T, 15, 3] of `read_mocap`

@@ -1,6 +1,6 @@
 import torchpose
 from torchpose.errors import InputError
-from torchpose.upper_body.methods import method_options
+from torchpose.upper_body import method_options
 
 prior = torchpose.load_prior("kinect-upper-body-small")
 print(torchpose.UpperBodyTracker(prior, prior.camera).method)

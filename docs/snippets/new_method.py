@@ -8,9 +8,9 @@ from torchpose import PoseTrack
 from torchpose.cli import main
 from torchpose.filters import FilterOutput
 from torchpose.math import kalman_update
-from torchpose.skeleton.upper_body import LEFT_ARM, RIGHT_ARM
+from torchpose.skeleton import LEFT_ARM, RIGHT_ARM
 from torchpose.upper_body import Estimates, Estimator, register_method
-from torchpose.upper_body.measurements import arm_measurements, pixel_indices
+from torchpose.upper_body._measurements import arm_measurements, pixel_indices
 
 
 class Alone(NamedTuple):

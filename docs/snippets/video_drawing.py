@@ -1,8 +1,9 @@
 import torchpose
-from torchpose.upper_body.bvh import write_bvh
-from torchpose.video import VideoWriter, open_video, prefetch
-from torchpose.video.overlay import draw_overlay
-from torchpose.viz.report import write_report
+from torchpose.upper_body._pose_files import write_bvh
+from torchpose.video import VideoWriter, open_video
+from torchpose.video._overlay import draw_overlay
+from torchpose.video._prefetch import prefetch
+from torchpose.viz._report import write_report
 
 prior = torchpose.load_prior("kinect-upper-body")
 with open_video("clip.mp4") as video:

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from torchpose._core.files import atomic_path, check_output_folder, write_npz
-from torchpose._core.npz import read_npz
-from torchpose._core.reading import require_file
+from torchpose._core.reading import read_npz, require_file
 from torchpose.errors import FileFormatError, InputError, OutputError
 
 

@@ -22,14 +22,16 @@ from torchpose import body, filters, measure, priors, whole_body
 from torchpose.body import Body, JointLimits
 from torchpose.camera import PinholeCamera
 from torchpose.learning import fit_action_space, fit_gplvm, fit_gplvm_noise, fit_limb_conditionals
-from torchpose.measure.association import HandAssociation
-from torchpose.measure.brightness_background import BrightnessBackground
-from torchpose.measure.persons import PersonRegister
+from torchpose.measure._association import HandAssociation
+from torchpose.measure._brightness_background import BrightnessBackground
+from torchpose.measure._face import FaceTracker
+from torchpose.measure._hand_prior import HandPrior
+from torchpose.measure._persons import PersonRegister
 from torchpose.priors import ActionBank
-from torchpose.priors.actions.part_postures import PartPostures
-from torchpose.priors.limb_conditionals import in_body_frame
-from torchpose.upper_body.fusion import MotionStage
-from torchpose.whole_body.filters.posture_gate import PostureGate
+from torchpose.priors._actions.part_postures import PartPostures
+from torchpose.priors._limb_conditionals import in_body_frame
+from torchpose.upper_body._fusion import MotionStage
+from torchpose.whole_body._filters.posture_gate import PostureGate
 
 G = torch.Generator
 PACKAGES = (
@@ -163,7 +165,7 @@ def state_of(module):
 
 STATE_ONLY = {
     kind.__name__: kind
-    for kind in (measure.FaceTracker, HandAssociation, measure.HeadNeck, measure.MeanShiftHandTracker,
+    for kind in (FaceTracker, HandAssociation, measure.HeadNeck, measure.MeanShiftHandTracker,
                  PersonRegister, measure.SkinMixtureModel, measure.SkinModel)
 } | {
     "HandTracker": lambda: measure.HandTracker(CASES["HandPrior"][0](1)),
@@ -220,7 +222,7 @@ CASES = {
         lambda m: m(scene(7)[0]),
     ),
     "HandPrior": (
-        lambda s: measure.HandPrior.from_prior(upper_body_prior(s)),
+        lambda s: HandPrior.from_prior(upper_body_prior(s)),
         lambda m: m(torch.tensor([[1.5, 4.0], [-1.5, 4.0]])),
     ),
     "VideoTracker": (

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchpose._core.npz import npz_keys, read_npz
-from torchpose._core.reading import check_span, read_json, reading, require_file
+from torchpose._core.reading import check_span, npz_keys, read_json, read_npz, reading, require_file
 from torchpose.camera import PinholeCamera, load_cameras
 from torchpose.errors import (
     CameraError,

@@ -9,8 +9,8 @@ import torch
 from benchmarks import body_models
 from tests.benchmarks.walkers import walker, write_walkers
 from torchpose.errors import InputError, OverlapError, PriorError
-from torchpose.io.mocap import read_mocap
-from torchpose.learning.recipes import (
+from torchpose.io._mocap import read_mocap
+from torchpose.learning._recipes import (
     LimbStates,
     ManifoldFitting,
     ManifoldPoses,

@@ -37,7 +37,7 @@ from torchpose.errors import InputError
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import settings_hash
 from torchpose.evaluation.kept_runs import source_hash
-from torchpose.io.mocap import read_mocap
+from torchpose.io._mocap import read_mocap
 from torchpose.math import quaternion_vector_to_matrix
 from torchpose.whole_body import AnnealedParticleFilter, RootUncertaintyTracker
 

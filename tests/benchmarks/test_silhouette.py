@@ -24,11 +24,11 @@ from benchmarks.silhouette.trackees import (
 from tests.benchmarks.walkers import write_walkers
 from torchpose.body import BODY_15
 from torchpose.camera import save_cameras
-from torchpose.demo.rendering.clothed_body import TrueShape, true_limbs, true_silhouettes
+from torchpose.demo._rendering.clothed_body import TrueShape, true_limbs, true_silhouettes
 from torchpose.errors import FileFormatError, InputError
-from torchpose.io.mocap import read_mocap
+from torchpose.io._mocap import read_mocap
 from torchpose.whole_body import AnnealedParticleFilter, SIRParticleFilter
-from torchpose.whole_body.sharpness import SharpnessFit
+from torchpose.whole_body._sharpness import SharpnessFit
 
 SMALL = {
     "progress": False, "frames": 8, "particles": (20,), "seeds": 2, "size": ("64x48",), "faults": 0.5,

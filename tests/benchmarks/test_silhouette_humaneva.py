@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks import humaneva_files as humaneva
 from benchmarks.silhouette import data as silhouette_data
 from benchmarks.silhouette import humaneva as silhouette_humaneva
 from benchmarks.silhouette import protocol as silhouette
 from benchmarks.silhouette.humaneva import HumanEvaFootage, humaneva_splits
 from tests.io.humaneva_files import clip_of, walking_joints, write_avi, write_humaneva
-from torchpose.demo.rendering.clothed_body import TrueShape, true_silhouettes
+from torchpose.demo._rendering.clothed_body import TrueShape, true_silhouettes
 from torchpose.errors import InputError
-from torchpose.io import humaneva
 
 SIZE = (120, 160)
 N = 48

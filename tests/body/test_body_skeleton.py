@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchpose.body import BODY_15, TaperedCylinder, Tip, body_joints
-from torchpose.body.skeleton import tree_levels
+from torchpose.body._skeleton import tree_levels
 from torchpose.errors import InputError, ShapeError, SkeletonError
 from torchpose.skeleton import SKELETONS
 

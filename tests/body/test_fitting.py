@@ -9,7 +9,8 @@ from scipy.optimize import least_squares
 
 from tests.body.test_kinematics import random_centres, random_states, some_body
 from tests.data import data_dir_or_skip
-from torchpose.body import BODY_15, Body, body_joints, fit_body, fit_state, joint_errors
+from torchpose.body import BODY_15, Body, body_joints, fit_body, fit_state
+from torchpose.body._fitting import joint_errors
 from torchpose.errors import InputError, ShapeError
 
 

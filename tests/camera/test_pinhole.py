@@ -20,8 +20,8 @@ from torchpose.camera import (
     sample_viewpoints,
     save_cameras,
 )
-from torchpose.camera.projection import check_intrinsics, map_pixel_covariance
-from torchpose.camera.viewpoints import PAPER_VIEWS
+from torchpose.camera._projection import check_intrinsics, map_pixel_covariance
+from torchpose.camera._viewpoints import PAPER_VIEWS
 from torchpose.errors import CameraError, FileFormatError, InputError, OutputError, ShapeError
 from torchpose.math import euler_to_matrix
 

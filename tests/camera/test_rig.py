@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchpose.camera import CameraRig, PinholeCamera, save_cameras
-from torchpose.camera.rig import as_rig
+from torchpose.camera._rig import as_rig
 from torchpose.errors import CameraError, InputError
 
 DISTORTIONS = (-0.25, 0.08, 0.002, -0.001)

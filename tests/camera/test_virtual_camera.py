@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from tests.priors.poses import poses
+from torchpose.camera import _virtual_camera as body_view
 from torchpose.camera import project
-from torchpose.camera import virtual_camera as body_view
-from torchpose.camera.virtual_camera import (
+from torchpose.camera._virtual_camera import (
     MEMORY,
     PathModel,
     body_path,

@@ -10,7 +10,7 @@ import torch
 from torchpose import demo
 from torchpose.cli import main
 from torchpose.io import Keypoints, Recording, write_keypoints
-from torchpose.learning.upper_body import fit_upper_body_prior
+from torchpose.learning import fit_upper_body_prior
 
 N_FRAMES = 90
 GAP = slice(40, 50)

@@ -20,7 +20,7 @@ def shipped(files, tmp_path, monkeypatch):
     weights.mkdir()
     prior = (files / "prior.safetensors").read_bytes()
     (weights / "kinect-upper-body.safetensors").write_bytes(prior)
-    monkeypatch.setattr("torchpose.priors.upper_body.WEIGHTS", weights)
+    monkeypatch.setattr("torchpose.priors._upper_body.WEIGHTS", weights)
 
 
 def test_demo_beats_the_mean_pose(torchpose, shipped, tmp_path):

@@ -8,9 +8,9 @@ import torch
 
 from torchpose.cli.fit import build, recorded_command
 from torchpose.io import read_recordings
-from torchpose.learning.curation import curate
-from torchpose.learning.recipes import UpperBodyRecipe
-from torchpose.learning.upper_body import fit_upper_body_prior
+from torchpose.learning import fit_upper_body_prior
+from torchpose.learning._curation import curate
+from torchpose.learning._recipes import UpperBodyRecipe
 from torchpose.priors import UpperBodyPrior, load_prior
 
 QUICK = ("--components", 2, "--samples", 500, "--noise", "none", "--pictures", "false")

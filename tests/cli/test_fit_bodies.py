@@ -14,10 +14,10 @@ from tests.priors.performances import performances
 from torchpose._core.tensor_file import format_of
 from torchpose.body import BODY_15, Body
 from torchpose.cli.fit_bodies import KINDS, build, recorded_command
-from torchpose.learning.gplvm_fit import GPLVMFit
+from torchpose.learning._gplvm_fit import GPLVMFit
 from torchpose.priors import ActionBank, ActionSpace, BackConstrainedGPLVM
-from torchpose.priors.actions.postures import posture_angles, posture_to_state
-from torchpose.priors.limb_conditionals import LimbConditionals
+from torchpose.priors._actions.postures import posture_angles, posture_to_state
+from torchpose.priors._limb_conditionals import LimbConditionals
 
 LOADERS = {
     "manifold": BackConstrainedGPLVM.load,

@@ -11,8 +11,9 @@ from torchpose.body import BODY_15, Body
 from torchpose.camera import PinholeCamera
 from torchpose.io import write_keypoints
 from torchpose.learning import fit_action_space, fit_gplvm, fit_limb_conditionals
-from torchpose.priors import ActionBank, ActionInfo, ManifoldInfo
-from torchpose.priors.limb_conditionals import in_body_frame
+from torchpose.priors import ActionBank, ManifoldInfo
+from torchpose.priors._actions.file import ActionInfo
+from torchpose.priors._limb_conditionals import in_body_frame
 from torchpose.whole_body import BodyPoses
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import add_picture
-from torchpose.io import ResultsFolder
+from torchpose.io._results import ResultsFolder
 from torchpose.upper_body import PoseTrack
 from torchpose.video import VideoWriter
 
@@ -19,8 +19,8 @@ POSES = ("poses.npz", "poses.csv", "poses.bvh")
 LIST = ".torchpose-track.json"
 KILLED = """
 import os, signal, sys
-import torchpose.upper_body.bvh
-torchpose.upper_body.bvh.write_bvh = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+import torchpose.upper_body._pose_files
+torchpose.upper_body._pose_files.write_bvh = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
 from torchpose.cli import main
 main(sys.argv[1:])
 """

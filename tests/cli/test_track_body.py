@@ -11,8 +11,8 @@ from torchpose.cli import main
 from torchpose.cli.track_body_output import action_text
 from torchpose.learning import fit_action_space, fit_gplvm, fit_gplvm_noise, fit_limb_conditionals
 from torchpose.priors import ActionBank, ManifoldInfo
-from torchpose.priors.actions.postures import state_postures
-from torchpose.priors.limb_conditionals import in_body_frame
+from torchpose.priors._actions.postures import state_postures
+from torchpose.priors._limb_conditionals import in_body_frame
 from torchpose.video import VideoWriter
 from torchpose.whole_body import BodyPoses, BodyTracker, render
 

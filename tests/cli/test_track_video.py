@@ -29,7 +29,7 @@ def _no_space(*_, **__):
 def clip(tmp_path_factory):
     """1.5 s of a rendered performer, and where the joints are in it."""
     pytest.importorskip("matplotlib", reason="the performer's face comes from matplotlib")
-    from torchpose.demo.rendering import render_video
+    from torchpose.demo._rendering import render_video
 
     folder = tmp_path_factory.mktemp("clip")
     truth = render_video(folder / "clip.mp4", demo.performer(N), demo.demo_camera())[0]
@@ -163,9 +163,9 @@ def test_a_camera_is_shown_recorded_and_stopped(clip, track, monkeypatch, full_d
             pass
 
     capture = Capture()
-    monkeypatch.setattr("torchpose.video.camera.time.sleep", lambda seconds: None)
+    monkeypatch.setattr("torchpose.video._camera.time.sleep", lambda seconds: None)
     monkeypatch.setattr(
-        "torchpose.video.source.open_video",
+        "torchpose.video.open_video",
         lambda where, fps=None: CameraSource(int(where), fps, capture=lambda index: capture),
     )
     done, out = track("0")
@@ -226,7 +226,7 @@ def test_a_full_disk_is_told_and_leaves_nothing_half_written(clip, track, monkey
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("torchpose.video.pose_spool._array", full)
+    monkeypatch.setattr("torchpose.video._recording._array", full)
     done, out = track(clip[0])
     assert done.code == 2 and "No space left" in done.err
     assert list(out.iterdir()) == []

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torchpose.demo.mannequin import BodyAngles, BodySize, angles_to_joints, hands_to_arms
+from torchpose.demo._mannequin import BodyAngles, BodySize, angles_to_joints, hands_to_arms
 from torchpose.errors import InputError
 
 

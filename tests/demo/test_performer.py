@@ -9,11 +9,11 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from torchpose import demo
-from torchpose.demo.mannequin import ANGLE_LIMITS, BodyAngles, BodySize, angles_to_joints
-from torchpose.demo.performer import minimum_jerk
+from torchpose.demo._mannequin import ANGLE_LIMITS, BodyAngles, BodySize, angles_to_joints
+from torchpose.demo._performer import minimum_jerk
 from torchpose.errors import InputError
-from torchpose.skeleton import LIMBS, UPPER_BODY
-from torchpose.skeleton.upper_body import measure_neck_kind
+from torchpose.skeleton import UPPER_BODY
+from torchpose.skeleton._upper_body import LIMBS, measure_neck_kind
 
 SEEDS = (0, 1, 2)
 

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from torchpose.demo import performer
-from torchpose.learning.upper_body import fit_upper_body_prior
+from torchpose.learning import fit_upper_body_prior
 from torchpose.skeleton import SKELETONS, UPPER_BODY
 
 V1 = SKELETONS["kinect-v1-20"].joints
@@ -63,7 +63,7 @@ def small_recipe(recordings, n_components=3, seed=0, progress=False, name=""):
     prior = fit_upper_body_prior(
         recordings, n_components, seed, n_samples=1500, max_iter=15, name=name, progress=progress
     )
-    from torchpose.upper_body.process_noise import default_process_cov
+    from torchpose.upper_body._single_poses import default_process_cov
 
     prior.set_noise("process_cov", 2 * default_process_cov(prior))
     prior.set_noise("gamma", torch.full((n_components,), 0.9, dtype=torch.float64))

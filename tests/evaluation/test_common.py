@@ -20,8 +20,8 @@ from torchpose.evaluation.common import (
     score,
     track,
 )
-from torchpose.skeleton import mirror_pose
-from torchpose.upper_body.process_noise import default_process_cov
+from torchpose.skeleton._upper_body import mirror_pose
+from torchpose.upper_body._single_poses import default_process_cov
 
 CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5)
 

@@ -182,9 +182,9 @@ def test_a_point_of_the_curve():
 
 
 def test_recipes_by_name(data, tmp_path):
-    name, function = learning_curve._imported("x=torchpose.learning.recipes.fit_kinect_prior")
+    name, function = learning_curve._imported("x=torchpose.learning._recipes.fit_kinect_prior")
     assert name == "x" and function.__name__ == "fit_kinect_prior"
-    for text in ("fit_kinect_prior", "x=torchpose.none.f", "x=torchpose.learning.recipes.none"):
+    for text in ("fit_kinect_prior", "x=torchpose.none.f", "x=torchpose.learning._recipes.none"):
         with pytest.raises(InputError, match="--compare"):
             learning_curve._imported(text)
     with pytest.raises(InputError, match="9 training persons"):

@@ -15,7 +15,7 @@ from torchpose.evaluation import score
 from torchpose.evaluation.common import MEASURED, make_test_set, track
 from torchpose.evaluation.unseen import CAMERA, poses_to_score
 from torchpose.io import read_recordings
-from torchpose.metrics.poses import align
+from torchpose.metrics import align
 from torchpose.priors import load_prior
 from torchpose.skeleton import UPPER_BODY
 

@@ -15,7 +15,7 @@ from torchpose.evaluation.completion import with_wrists
 from torchpose.evaluation.person_tables import mean_error, pooled
 from torchpose.io import read_recordings
 from torchpose.metrics import joint_errors_3d
-from torchpose.priors import arm_states
+from torchpose.priors._arm_state import arm_states
 from torchpose.skeleton import UPPER_BODY
 
 

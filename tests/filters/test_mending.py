@@ -5,7 +5,7 @@ import torch
 
 from torchpose.filters import BootstrapParticleFilter, MixtureKalmanFilter
 from torchpose.priors import GaussianMixture
-from torchpose.upper_body.arms import mending_notes
+from torchpose.upper_body._estimator import mending_notes
 
 N_FRAMES = 5
 # Of rank one, in powers of two: pixels and radians whose factor breaks down at exactly zero.

@@ -25,7 +25,7 @@ from torchpose.filters import (
     SplitTrackFilter,
     StepOutput,
 )
-from torchpose.filters.transition import make_transition
+from torchpose.filters._transition import make_transition
 from torchpose.priors import GaussianMixture
 from torchpose.whole_body import SilhouetteParticleFilter
 

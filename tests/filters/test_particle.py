@@ -17,11 +17,11 @@ from tests.filters.oracles import (
 )
 from torchpose.errors import CovarianceError, DegenerateFilterWarning, InputError, ShapeError
 from torchpose.filters import BootstrapParticleFilter, RecursiveFilter
-from torchpose.filters.particle import PROPOSALS
-from torchpose.filters.transition import make_transition
-from torchpose.filters.walk import MixtureWalk, Moves, grouped_affine
-from torchpose.math import log_prob, mixture_moments
-from torchpose.math.gaussian import safe_cholesky
+from torchpose.filters._particle import PROPOSALS
+from torchpose.filters._transition import make_transition
+from torchpose.filters._walk import MixtureWalk, Moves, grouped_affine
+from torchpose.math import log_prob
+from torchpose.math._gaussian import mixture_moments, safe_cholesky
 from torchpose.priors import GaussianMixture
 
 WIDE = torch.float64

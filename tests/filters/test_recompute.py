@@ -5,7 +5,7 @@ import gc
 import pytest
 import torch
 
-from torchpose.filters.recompute import recomputed
+from torchpose.filters._recompute import recomputed
 
 
 def curve(x, slope):

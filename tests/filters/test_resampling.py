@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from torchpose.errors import InputError, ShapeError
 from torchpose.filters import resample
-from torchpose.filters.resampling import RESAMPLING
+from torchpose.filters._resampling import RESAMPLING
 
 METHODS = sorted(RESAMPLING)
 

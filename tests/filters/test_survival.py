@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchpose.errors import InputError
-from torchpose.filters.survival import (
+from torchpose.filters._resampling import (
     check_survival_rate,
     survival_exponent,
     survival_rate,

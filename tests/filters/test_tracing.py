@@ -26,7 +26,7 @@ from tests.filters.traced_steps import (
 )
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import CovarianceError, InputError, ShapeError, check_covariance
-from torchpose.math.gaussian import mended_cholesky
+from torchpose.math._gaussian import mended_cholesky
 
 FILTERS = (*KALMAN, *PARTICLES)
 TRACED = (

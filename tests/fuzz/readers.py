@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 import torchpose.cli
+from benchmarks.humaneva_files import read_calibration, read_stream_offset
 from torchpose.camera import CameraRig, load_cameras
 from torchpose.io import read_keypoints, read_recording
-from torchpose.io.humaneva import read_calibration, read_stream_offset
 from torchpose.priors import ActionBank, ActionSpace, BackConstrainedGPLVM, UpperBodyPrior
-from torchpose.priors.limb_conditionals import LimbConditionals
+from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack
 from torchpose.video import open_video

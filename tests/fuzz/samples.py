@@ -26,17 +26,12 @@ from tests.priors.performances import performances
 from torchpose.body import BODY_15, Body, centres_of
 from torchpose.camera import PinholeCamera, save_cameras
 from torchpose.learning import fit_action_space, fit_gplvm, fit_limb_conditionals
-from torchpose.priors import (
-    ActionBank,
-    ActionSpace,
-    ManifoldInfo,
-    PriorInfo,
-    UpperBodyPrior,
-)
-from torchpose.priors.limb_conditionals import in_body_frame
+from torchpose.priors import ActionBank, ActionSpace, ManifoldInfo, UpperBodyPrior
+from torchpose.priors._limb_conditionals import in_body_frame
+from torchpose.priors._prior_file import PriorInfo
 from torchpose.skeleton import SKELETONS, UPPER_BODY
 from torchpose.upper_body import PoseTrack
-from torchpose.upper_body.bvh import write_bvh
+from torchpose.upper_body._pose_files import write_bvh
 from torchpose.whole_body import BodyPoses
 
 __all__ = ["SAMPLES", "Content"]

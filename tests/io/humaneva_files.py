@@ -10,8 +10,8 @@ import torch
 from benchmarks.silhouette.data import place_cameras
 from tests.benchmarks.walkers import NAMES, walker
 from torchpose.body import body_joints
-from torchpose.demo.rendering.clothed_body import TrueShape, true_silhouettes
-from torchpose.io.mocap import MocapClip
+from torchpose.demo._rendering.clothed_body import TrueShape, true_silhouettes
+from torchpose.io._mocap import MocapClip
 
 WIDTH, HEIGHT = 640, 480
 CAMERAS = ("C1", "C2", "C3")

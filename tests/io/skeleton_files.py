@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 
-from torchpose.skeleton.joint_sets import canonical_names
+from torchpose.skeleton._joint_sets import canonical_names
 
 # metres in camera axes (y down) from the middle of the shoulders, someone who faces the camera
 _CENTRAL = {

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchpose.errors import FileFormatError, InputError
-from torchpose.io.formats.axes import AXES, axes_rotation, check_upright, default_axes, heading
+from torchpose.io._formats.axes import AXES, axes_rotation, check_upright, default_axes, heading
 from torchpose.skeleton import SKELETONS, UPPER_BODY
 
 NAMES = ("head", "shoulder_left", "shoulder_right", "hip_left", "hip_right")

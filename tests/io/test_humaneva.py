@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks import humaneva_files as humaneva
+from benchmarks._humaneva_joints import joint_centres
 from tests.io import humaneva_files
 from tests.io.humaneva_files import write_c3d
 from torchpose.errors import FileFormatError, InputError
-from torchpose.io import humaneva
-from torchpose.io.formats.humaneva_joints import joint_centres
-from torchpose.math import rotvec_to_matrix
+from torchpose.math._rotations import rotvec_to_matrix
 
 SEGMENTS = ("PEL", "TRX", "HED", "LFE", "LTI", "RFE", "RTI", "LHU", "LRA", "RHU", "RRA")
 ORIGINS = {  # millimetres, z up, facing +x, left at +y

@@ -7,9 +7,9 @@ import torch
 from tests.data import data_dir_or_skip
 from torchpose.body import BODY_15
 from torchpose.errors import InputError
-from torchpose.io.mocap import read_mocap, resample, select_persons
+from torchpose.io._mocap import read_mocap, resample, select_persons
 from torchpose.skeleton import SKELETONS
-from torchpose.skeleton.joint_sets import canonical_names
+from torchpose.skeleton._joint_sets import canonical_names
 
 # metres from the floor: height, and how far to the side; someone who stands, arms hanging
 _HEIGHTS = {

@@ -13,9 +13,9 @@ from tests.upper_body.test_bvh import track_of
 from torchpose.demo import performer
 from torchpose.errors import FileFormatError, MissingDependencyError, SkeletonError
 from torchpose.io import find_recordings, read_recording
-from torchpose.io.formats.bvh_recordings import bvh_joint_names
+from torchpose.io._formats.mocap_files import bvh_joint_names
 from torchpose.skeleton import UPPER_BODY
-from torchpose.upper_body.bvh import write_bvh
+from torchpose.upper_body._pose_files import write_bvh
 
 # Someone in a T pose who faces +z: offsets in centimetres, arms along ±x.
 ARM = """

@@ -10,8 +10,7 @@ import pytest
 
 from torchpose._core.files import atomic_path, check_output_folder
 from torchpose.errors import OutputError
-from torchpose.io import ResultsFolder
-from torchpose.io.results import refuse_stranger, replace_own
+from torchpose.io._results import ResultsFolder, refuse_stranger, replace_own
 
 NAMES = ("a.txt", "b.txt", "c.txt")
 LIST = ".torchpose-notes.json"
@@ -154,7 +153,7 @@ def test_a_second_run_at_once_is_refused(tmp_path):
 
 
 def test_without_locks_the_last_one_wins(tmp_path, monkeypatch):
-    monkeypatch.setattr("torchpose._core.leftovers.fcntl", None)
+    monkeypatch.setattr("torchpose._core.files.fcntl", None)
     with folder_of(tmp_path) as one:
         (one.stage / "a.txt").write_text("one")
         write(tmp_path, "two")

@@ -5,8 +5,8 @@ import torch
 
 from tests.priors.mixtures import random_mixture
 from torchpose.errors import InputError
-from torchpose.learning.completion import ColumnsSource, complete_mixture
-from torchpose.learning.samplers import TensorSource, all_samples
+from torchpose.learning._samplers import TensorSource, all_samples
+from torchpose.learning._streamed_em import ColumnsSource, complete_mixture
 from torchpose.priors import GaussianMixture
 
 

@@ -9,7 +9,7 @@ from tests.priors.mixtures import random_mixture
 from tests.priors.poses import recording
 from torchpose.demo import performer
 from torchpose.errors import InputError, PriorError
-from torchpose.learning.fine_tuning import (
+from torchpose.learning._fine_tuning import (
     SequenceBatch,
     TunableKalman,
     TunableMixture,
@@ -19,10 +19,10 @@ from torchpose.learning.fine_tuning import (
     parameter_groups,
     pose_error,
 )
-from torchpose.learning.recipes import UpperBodyRecipe
+from torchpose.learning._recipes import UpperBodyRecipe
 from torchpose.metrics import joint_errors_3d
 from torchpose.priors import UpperBodyPrior
-from torchpose.priors.upper_body import released_process_cov
+from torchpose.priors._upper_body import released_process_cov
 from torchpose.upper_body import UpperBodyTracker
 
 RECIPE = UpperBodyRecipe(

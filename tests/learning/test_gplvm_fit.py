@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.priors.motions import motion
 from torchpose.errors import InputError, ShapeError
-from torchpose.learning.gplvm_fit import (
+from torchpose.learning._gplvm_fit import (
     GPLVMFit,
     log_likelihood,
     median_gamma,
@@ -19,7 +19,7 @@ from torchpose.learning.gplvm_fit import (
     principal_start,
     run_fit,
 )
-from torchpose.priors.manifold.prediction import KernelParameters, covariance, rbf
+from torchpose.priors._manifold.prediction import KernelParameters, covariance, rbf
 
 T, Q, D = 12, 5, 2
 

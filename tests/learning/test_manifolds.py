@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from torchpose.errors import InputError
-from torchpose.learning.manifolds import check_unseen, motion_noise
-from torchpose.priors.manifold.gplvm import no_noise
+from torchpose.learning._manifolds import check_unseen, motion_noise
+from torchpose.priors._manifold.gplvm import no_noise
 
 
 def test_root_mean_squares_never_cross_the_end_of_a_sequence() -> None:

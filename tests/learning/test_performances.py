@@ -8,7 +8,7 @@ import torch
 
 from tests.priors.performances import performances
 from torchpose.errors import InputError, ShapeError
-from torchpose.learning.performances import (
+from torchpose.learning._performances import (
     find_key_frames,
     match_key_frames,
     natural_spline,

@@ -9,8 +9,8 @@ import torch
 from tests.priors.poses import poses, recording
 from torchpose.camera import ViewRange
 from torchpose.errors import InputError
-from torchpose.learning import TRAINING_VIEWS, arm_sources, collect_poses
-from torchpose.learning.samplers import (
+from torchpose.learning import TRAINING_VIEWS
+from torchpose.learning._samplers import (
     BLOCK,
     ArmSource,
     CachedSource,
@@ -23,8 +23,9 @@ from torchpose.learning.samplers import (
     cached,
     derived_seed,
 )
-from torchpose.priors import mirror_arm_state
-from torchpose.priors.window import WindowLayout
+from torchpose.learning._training import arm_sources, collect_poses
+from torchpose.priors._arm_state import mirror_arm_state
+from torchpose.priors._window import WindowLayout
 
 MATRIX = torch.tensor([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]], dtype=torch.float64)
 FRONT = ViewRange(roll=0, pitch=0, yaw=0, tx=(0, 0), ty=(0, 0), tz=(2, 2))

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from torchpose.errors import InputError
-from torchpose.learning.blocks import Share
-from torchpose.learning.samplers import BLOCK, TensorSource
-from torchpose.learning.selection import held_out_scores, select_n_components
-from torchpose.learning.streamed_em import StreamedEM
+from torchpose.learning._blocks import Share
+from torchpose.learning._samplers import BLOCK, TensorSource
+from torchpose.learning._selection import held_out_scores, select_n_components
+from torchpose.learning._streamed_em import StreamedEM
 from torchpose.priors import GaussianMixture
 
 

@@ -8,11 +8,11 @@ import torch
 
 from tests.priors.mixtures import random_mixture
 from torchpose.errors import InputError
-from torchpose.learning.blocks import Share
-from torchpose.learning.samplers import BLOCK, TensorSource
-from torchpose.learning.stepwise_em import implied_statistics, stepwise_pass
-from torchpose.learning.streamed_em import StreamedEM, run_streamed
-from torchpose.math.mixture_em import MixtureParameters, SufficientStatistics, m_step
+from torchpose.learning._blocks import Share
+from torchpose.learning._samplers import BLOCK, TensorSource
+from torchpose.learning._stepwise_em import implied_statistics, stepwise_pass
+from torchpose.learning._streamed_em import StreamedEM, run_streamed
+from torchpose.math._mixture_em import MixtureParameters, SufficientStatistics, m_step
 
 N = 12 * BLOCK + 700
 

@@ -10,12 +10,12 @@ import torch.multiprocessing as mp
 
 from tests.priors.mixtures import random_mixture
 from torchpose.errors import CovarianceError, InputError, ShapeError
-from torchpose.learning.blocks import Share, spread_samples, usable_samples
-from torchpose.learning.samplers import BLOCK, Samples, SampleSource, TensorSource
-from torchpose.learning.streamed_em import StreamedEM, fit_streamed, run_streamed
+from torchpose.learning._blocks import Share, spread_samples, usable_samples
+from torchpose.learning._samplers import BLOCK, Samples, SampleSource, TensorSource
+from torchpose.learning._streamed_em import StreamedEM, fit_streamed, run_streamed
 from torchpose.math import expectation_maximisation
-from torchpose.math.mixture_start import floor_variances
-from torchpose.math.mixture_steps import MixtureParameters, SufficientStatistics, e_step
+from torchpose.math._mixture_start import floor_variances
+from torchpose.math._mixture_steps import MixtureParameters, SufficientStatistics, e_step
 from torchpose.priors import GaussianMixture
 
 N = 2 * BLOCK + 1500  # three blocks, the last one short: two for one process, one for the other

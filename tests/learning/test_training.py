@@ -9,8 +9,9 @@ import torch
 from tests.priors.poses import lowered_neck, poses, recording
 from torchpose.camera import ViewRange, lift
 from torchpose.errors import InputError, PriorError
-from torchpose.learning import TRAINING_VIEWS, arm_sources, collect_poses
-from torchpose.learning.samplers import all_samples
+from torchpose.learning import TRAINING_VIEWS
+from torchpose.learning._samplers import all_samples
+from torchpose.learning._training import arm_sources, collect_poses
 from torchpose.math import euler_to_matrix as rotate
 from torchpose.skeleton import UPPER_BODY
 

@@ -6,7 +6,7 @@ import torch
 from scipy.stats import multivariate_normal
 
 from tests.filters.oracles import random_covariance, tensor
-from torchpose.math import gaussian
+from torchpose.math import _gaussian as gaussian
 
 
 @pytest.fixture

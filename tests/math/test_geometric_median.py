@@ -5,7 +5,7 @@ import torch
 
 from tests.priors.mixtures import random_mixture
 from torchpose.filters import MixtureKalmanFilter
-from torchpose.math.geometric_median import geometric_median
+from torchpose.math._geometric_median import geometric_median
 
 
 def problem(n=5, m=7, p=2):

@@ -10,10 +10,17 @@ from sklearn.mixture import GaussianMixture as Sklearn
 
 from tests.priors.mixtures import random_mixture
 from torchpose.errors import CovarianceError, InputError, ShapeError
-from torchpose.math import expectation_maximisation, mixture_steps
-from torchpose.math.mixture_features import CyclicFeatures, cyclic_order
-from torchpose.math.mixture_start import STARTS, floor_variances, k_means, start_mixture
-from torchpose.math.mixture_steps import MixtureParameters, e_step, m_step, natural_parameters
+from torchpose.math import _mixture_steps as mixture_steps
+from torchpose.math import expectation_maximisation
+from torchpose.math._mixture_start import STARTS, floor_variances, k_means, start_mixture
+from torchpose.math._mixture_steps import (
+    CyclicFeatures,
+    MixtureParameters,
+    cyclic_order,
+    e_step,
+    m_step,
+    natural_parameters,
+)
 from torchpose.priors import GaussianMixture
 
 

@@ -17,7 +17,7 @@ from torchpose.math import (
     mean_rotation,
     quaternion_vector_to_matrix,
 )
-from torchpose.math.quaternion_vectors import (
+from torchpose.math._rotations import (
     minimal_rotation,
     quaternion_to_vector,
     vector_to_quaternion,

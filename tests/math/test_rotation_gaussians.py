@@ -16,8 +16,8 @@ from torchpose.math import (
     gaussian_rotate,
     rotate_gaussian,
     safe_centre,
-    turn_gaussian,
 )
+from torchpose.math._rotation_gaussians import turn_gaussian
 
 
 def rotation(degrees):

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from torchpose.errors import ShapeError, SkeletonError
 from torchpose.math import compose
-from torchpose.math.tree_messages import message_tree, propagate
-from torchpose.priors.limb_conditionals import LimbConditionals, LimbInfo
+from torchpose.math._tree_messages import message_tree, propagate
+from torchpose.priors._limb_conditionals import LimbConditionals, LimbInfo
 
 
 def normal(g, *sizes):

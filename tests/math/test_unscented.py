@@ -9,8 +9,8 @@ from scipy.stats import multivariate_normal
 
 from tests.filters.oracles import random_covariance, tensor
 from torchpose.errors import InputError, ShapeError
-from torchpose.math import sigma_points, unscented_transform, unscented_update
-from torchpose.math.unscented import floor_eigenvalues, moments
+from torchpose.math import unscented_transform, unscented_update
+from torchpose.math._unscented import floor_eigenvalues, moments, sigma_points
 
 OPTIONS = [(c, d) for c in (False, True) for d in ("eigen", "cholesky")]
 

@@ -9,9 +9,9 @@ import torch
 from tests.measure.drawn_arms import drawing, pose
 from torchpose import load_prior
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure import HandPrior
-from torchpose.measure.association import HandAssociation, arm_hypotheses
-from torchpose.measure.edges import limb_votes, segments_of_arms
+from torchpose.measure._association import HandAssociation, arm_hypotheses
+from torchpose.measure._edges import limb_votes, segments_of_arms
+from torchpose.measure._hand_prior import HandPrior
 from torchpose.skeleton import UPPER_BODY
 
 pytest.importorskip("cv2")

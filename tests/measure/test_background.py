@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure.background import BackgroundModel, person_region
+from torchpose.measure._background import BackgroundModel, person_region
 
 cv2 = pytest.importorskip("cv2")
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchpose.errors import InputError
-from torchpose.measure.body_window import (
+from torchpose.measure._body_window import (
     CELL,
     CELLS,
     COLOURS,

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure.brightness_background import BrightnessBackground, PixelKind
+from torchpose.measure._brightness_background import BrightnessBackground, PixelKind
 
 
 def noisy_scene(n=30, height=24, width=32, seed=0):
@@ -76,7 +76,7 @@ def test_one_frame_is_enough_and_black_walls_are_no_shadows():
 def test_batches_and_chunks_change_nothing(monkeypatch):
     _, frames = noisy_scene(12)
     one = BrightnessBackground().fit(frames)
-    monkeypatch.setattr("torchpose.measure.brightness_background._CHUNK", 1)
+    monkeypatch.setattr("torchpose.measure._brightness_background._CHUNK", 1)
     many = BrightnessBackground().fit(frames)
     for name, value in one.state_dict().items():
         torch.testing.assert_close(value, many.state_dict()[name])

@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 from tests.data import data_dir_or_skip
 from tests.measure.drawn_arms import drawing, pose
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure.edges import (
+from torchpose.measure._edges import (
     ARM_LIMBS,
     Segments,
     edge_map,

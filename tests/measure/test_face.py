@@ -6,8 +6,8 @@ import torch
 
 from tests.data import data_dir_or_skip
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure import FaceTracker, HaarFaceDetector
-from torchpose.measure.face import Region
+from torchpose.measure import HaarFaceDetector
+from torchpose.measure._face import FaceTracker, Region
 
 
 def nobody(image, region=None):

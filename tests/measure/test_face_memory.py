@@ -6,8 +6,8 @@ import torch
 import torch.nn.functional as functional
 
 from torchpose.errors import ShapeError
-from torchpose.measure.body_window import CELLS, EVIDENCE, place_windows
-from torchpose.measure.face_memory import FaceMemory, head_mask, head_part
+from torchpose.measure._body_window import CELLS, EVIDENCE, place_windows
+from torchpose.measure._head import FaceMemory, head_mask, head_part
 
 FACE = torch.tensor([[320.0, 150.0, 76.0]], dtype=torch.float64)
 ANCHOR = place_windows(FACE)
@@ -30,7 +30,7 @@ def learnt(memory, lab, frames=12):
 
 def mean_over(hidden, x0, x1, y0, y1):
     """Mean over a rectangle, in B from the face."""
-    from torchpose.measure.body_window import cell_centres
+    from torchpose.measure._body_window import cell_centres
 
     place = cell_centres(EVIDENCE)[head_part(EVIDENCE)]
     inside = (

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import torch
 
-from torchpose.measure.grid_filter import exclude, predict, read_out
+from torchpose.measure._grid_filter import exclude, predict, read_out
 
 H, W = 7, 9
 RNG = np.random.default_rng(0)

@@ -6,9 +6,9 @@ import torch
 
 import torchpose
 from torchpose.errors import InputError
-from torchpose.measure import HandPrior
-from torchpose.measure.hand_prior import FACE_HEIGHT
-from torchpose.priors import GaussianMixture, PriorInfo, UpperBodyPrior
+from torchpose.measure._hand_prior import FACE_HEIGHT, HandPrior
+from torchpose.priors import GaussianMixture, UpperBodyPrior
+from torchpose.priors._prior_file import PriorInfo
 
 
 @pytest.fixture(scope="module")

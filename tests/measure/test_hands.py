@@ -7,10 +7,11 @@ import torch
 import torchpose
 from tests.data import data_dir_or_skip
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure import HandPrior, HandSettings, HandTracker
-from torchpose.measure.body_window import CELLS, cell_centres
-from torchpose.measure.hand_likelihood import HandLikelihood
-from torchpose.measure.hands import HandState
+from torchpose.measure import HandTracker
+from torchpose.measure._body_window import CELLS, cell_centres
+from torchpose.measure._hand_likelihood import HandLikelihood, HandSettings
+from torchpose.measure._hand_prior import HandPrior
+from torchpose.measure._hands import HandState
 
 cv2 = pytest.importorskip("cv2")
 SKIN, CLOTH, WALL = (205, 152, 128), (40, 50, 115), (190, 190, 180)

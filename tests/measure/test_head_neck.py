@@ -5,7 +5,7 @@ import torch
 
 from torchpose.errors import InputError
 from torchpose.measure import HeadNeck
-from torchpose.measure.head_neck import FACE_OFFSETS
+from torchpose.measure._head import FACE_OFFSETS
 
 
 def test_offsets_and_covariances_are_those_of_drawn_faces():

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure.mean_shift import mean_shift
+from torchpose.measure._mean_shift import mean_shift
 
 cv2 = pytest.importorskip("cv2")
 

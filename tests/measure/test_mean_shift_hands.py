@@ -9,7 +9,9 @@ import torch
 from tests.data import data_dir_or_skip
 from torchpose import load_prior
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure import FaceTracker, HandPrior, MeanShiftHandTracker
+from torchpose.measure import MeanShiftHandTracker
+from torchpose.measure._face import FaceTracker
+from torchpose.measure._hand_prior import HandPrior
 
 cv2 = pytest.importorskip("cv2")
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from torchpose.errors import InputError, MissingDependencyError
-from torchpose.measure import FaceDetector, FaceTracker, MediaPipeFaceDetector, MediaPipePose
-from torchpose.measure.face import Region
-from torchpose.skeleton.mediapipe_landmarks import LANDMARKS
+from torchpose.measure import FaceDetector, MediaPipeFaceDetector, MediaPipePose
+from torchpose.measure._face import FaceTracker, Region
+from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 
 
 class Stand:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchpose.measure.body_window import CELLS, EVIDENCE, place_windows
-from torchpose.measure.motion import Motion, dense_flow
+from torchpose.measure._background import Motion, dense_flow
+from torchpose.measure._body_window import CELLS, EVIDENCE, place_windows
 
 pytest.importorskip("cv2")
 SHAPE = (CELLS[0] * EVIDENCE, CELLS[1] * EVIDENCE)

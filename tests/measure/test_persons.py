@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchpose.errors import InputError
-from torchpose.measure.persons import PersonRegister, clothes_colours
+from torchpose.measure._persons import PersonRegister, clothes_colours
 
 RED, BLUE, GREEN = (200, 30, 40), (20, 40, 180), (40, 160, 60)
 

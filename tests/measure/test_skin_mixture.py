@@ -6,9 +6,9 @@ import torch
 
 from torchpose.errors import InputError, ShapeError
 from torchpose.math import expectation_maximisation
-from torchpose.math.mixture_em import MixtureParameters
+from torchpose.math._mixture_em import MixtureParameters
 from torchpose.measure import SkinMixtureModel
-from torchpose.measure.skin import rgb_to_lab
+from torchpose.measure._skin import rgb_to_lab
 
 FACE = torch.tensor([[80.0, 40.0, 32.0]])
 SKIN, DARK, CLOTH, WALL = (

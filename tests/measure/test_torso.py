@@ -9,9 +9,10 @@ import torch
 import torchpose
 from tests.data import data_dir_or_skip
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure import FaceTracker, SkinModel, UpperBodyMeasurer
-from torchpose.measure.skin import SkinState
-from torchpose.measure.torso import _supported, clothes_likelihood, elbows_from_torso
+from torchpose.measure import SkinModel, UpperBodyMeasurer
+from torchpose.measure._face import FaceTracker
+from torchpose.measure._skin import SkinState
+from torchpose.measure._torso import _supported, clothes_likelihood, elbows_from_torso
 
 cv2 = pytest.importorskip("cv2")
 

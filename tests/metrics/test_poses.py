@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from torchpose import metrics
 from torchpose.errors import InputError, MissingDependencyError, ShapeError
-from torchpose.metrics.calibration import chi2_cdf, chi2_quantile
-from torchpose.metrics.poses import share_below
+from torchpose.metrics._calibration import chi2_cdf, chi2_quantile
+from torchpose.metrics._poses import share_below
 
 
 def normal(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -284,7 +284,7 @@ def test_bad_input_is_named() -> None:
 @pytest.fixture
 def adapters():
     pytest.importorskip("torchmetrics", reason="torchmetrics is not installed")
-    return importlib.import_module("torchpose.metrics.torchmetrics_adapters")
+    return importlib.import_module("torchpose.metrics._torchmetrics_adapters")
 
 
 def test_torchmetrics_add_up_over_batches_and_ranks(adapters) -> None:
@@ -331,6 +331,6 @@ def test_torchmetrics_pooled_values_reset_and_errors(adapters) -> None:
 
 def test_without_torchmetrics_the_message_says_what_to_do(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "torchmetrics", None)
-    monkeypatch.delitem(sys.modules, "torchpose.metrics.torchmetrics_adapters", raising=False)
+    monkeypatch.delitem(sys.modules, "torchpose.metrics._torchmetrics_adapters", raising=False)
     with pytest.raises(MissingDependencyError, match="pip install torchmetrics"):
-        importlib.import_module("torchpose.metrics.torchmetrics_adapters")
+        importlib.import_module("torchpose.metrics._torchmetrics_adapters")

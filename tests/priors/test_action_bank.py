@@ -10,9 +10,9 @@ import torch
 from tests.priors.performances import performances
 from torchpose.errors import FileFormatError, InputError, ShapeError
 from torchpose.learning import fit_action_space
-from torchpose.learning.action_recognition import Performed, recognition_of_unseen
+from torchpose.learning._action_spaces import Performed, recognition_of_unseen
 from torchpose.priors import ActionBank, ActionSpace
-from torchpose.priors.actions.gate import match_postures
+from torchpose.priors._actions.gate import match_postures
 
 SIZES = (6, 4, 5)
 

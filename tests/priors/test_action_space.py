@@ -11,12 +11,13 @@ from tests.priors.performances import performances
 from torchpose.body import BODY_15, Body
 from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError, SkeletonError
 from torchpose.learning import fit_action_space
-from torchpose.learning.action_spaces import fit_synchronised
-from torchpose.learning.performances import repetition_axis, split_repetitions
-from torchpose.priors import ActionInfo, ActionSpace
-from torchpose.priors.actions.gate import match_postures
-from torchpose.priors.actions.polar_limbs import LIMBS_12
-from torchpose.priors.actions.postures import normalise_postures, recorded_postures, state_postures
+from torchpose.learning._action_spaces import fit_synchronised
+from torchpose.learning._performances import repetition_axis, split_repetitions
+from torchpose.priors import ActionSpace
+from torchpose.priors._actions.file import ActionInfo
+from torchpose.priors._actions.gate import match_postures
+from torchpose.priors._actions.polar_limbs import LIMBS_12
+from torchpose.priors._actions.postures import normalise_postures, recorded_postures, state_postures
 
 
 @pytest.fixture(scope="module")

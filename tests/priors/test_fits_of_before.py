@@ -8,15 +8,10 @@ import torch
 from tests.priors.motions import motion
 from tests.priors.performances import performances
 from tests.whole_body.filters.walking_body import walk, walker
-from torchpose.learning import (
-    fit_action_space,
-    fit_gplvm,
-    fit_gplvm_noise,
-    fit_limb_conditionals,
-)
-from torchpose.learning.action_spaces import fit_synchronised
+from torchpose.learning import fit_action_space, fit_gplvm, fit_gplvm_noise, fit_limb_conditionals
+from torchpose.learning._action_spaces import fit_synchronised
 from torchpose.priors import ActionSpace, BackConstrainedGPLVM
-from torchpose.priors.limb_conditionals import LimbConditionals, in_body_frame
+from torchpose.priors._limb_conditionals import LimbConditionals, in_body_frame
 
 
 def _same(one: torch.nn.Module, other: torch.nn.Module) -> None:

@@ -17,10 +17,10 @@ from tests.priors.motions import CYCLE, NOISE, motion
 from torchpose.body import BODY_15, Body, body_joints, fit_body, fit_state
 from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError
 from torchpose.learning import fit_gplvm, fit_gplvm_noise
-from torchpose.learning.gplvm_fit import GPLVMFit, median_gamma, run_fit
-from torchpose.learning.manifolds import gplvm_of_fit, thin
+from torchpose.learning._gplvm_fit import GPLVMFit, median_gamma, run_fit
+from torchpose.learning._manifolds import gplvm_of_fit, thin
 from torchpose.priors import BackConstrainedGPLVM, ManifoldInfo
-from torchpose.priors.manifold.prediction import KernelParameters
+from torchpose.priors._manifold.prediction import KernelParameters
 
 FACTS = {"name": "walk", "fps": 60.0, "persons": ("a#1",), "sequences": ("one", "two")}
 

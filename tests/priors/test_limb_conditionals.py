@@ -11,10 +11,11 @@ from tests.data import data_dir_or_skip
 from torchpose.body import BODY_15, Body, centres_of, fit_body, fit_state
 from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError, SkeletonError
 from torchpose.learning import fit_limb_conditionals
-from torchpose.math import compose, gaussian_rotate, rotate_gaussian, turn_gaussian
-from torchpose.math.quaternion_vectors import within_unit_ball
-from torchpose.math.tree_messages import propagate
-from torchpose.priors.limb_conditionals import PART_TREE, LimbConditionals, in_body_frame
+from torchpose.math import compose, gaussian_rotate, rotate_gaussian
+from torchpose.math._rotation_gaussians import turn_gaussian
+from torchpose.math._rotations import within_unit_ball
+from torchpose.math._tree_messages import propagate
+from torchpose.priors._limb_conditionals import PART_TREE, LimbConditionals, in_body_frame
 
 N_PARTS = len(BODY_15.parts)
 
@@ -202,7 +203,7 @@ def test_a_file_and_a_state_dict_bring_it_back(conditionals, tmp_path):
 def test_knees_of_recorded_walkers_bend_about_the_knee():
     """Across the thigh, from left to right: x of the part's axes; 80 % of the variance or more."""
     folder = data_dir_or_skip("mocap_cmu_walk")
-    from torchpose.io.mocap import read_mocap
+    from torchpose.io._mocap import read_mocap
 
     persons = []
     for trials in (("s07_07_01", "s07_07_02"), ("s08_08_01", "s08_08_02")):

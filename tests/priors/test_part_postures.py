@@ -5,8 +5,8 @@ import torch
 
 from torchpose.body import BODY_15, Body
 from torchpose.errors import ShapeError
-from torchpose.priors.actions.part_postures import PartPostures
-from torchpose.priors.actions.postures import posture_angles
+from torchpose.priors._actions.part_postures import PartPostures
+from torchpose.priors._actions.postures import posture_angles
 
 G = torch.Generator().manual_seed(0)
 
@@ -39,7 +39,7 @@ def test_many_states_in_chunks_and_few(monkeypatch):
     postures = PartPostures(Body.of_height(BODY_15, 1.75))
     states = 0.2 * torch.randn(50, 36, generator=G)
     whole = postures(states)
-    monkeypatch.setattr("torchpose.priors.actions.part_postures._CHUNK", 7)
+    monkeypatch.setattr("torchpose.priors._actions.part_postures._CHUNK", 7)
     assert torch.equal(postures(states), whole)
     assert torch.equal(postures.of_relative(states[:, 6:]), whole)
     assert postures(states[:0]).shape == (0, 36)

@@ -7,9 +7,9 @@ import torch
 
 from torchpose.body import BODY_15, Body, BodySkeleton
 from torchpose.errors import InputError, ShapeError, SkeletonError
-from torchpose.math import rotvec_to_matrix
-from torchpose.priors.actions.polar_limbs import ANGLE_NAMES, LIMBS_12, check_limbs
-from torchpose.priors.actions.postures import (
+from torchpose.math._rotations import rotvec_to_matrix
+from torchpose.priors._actions.polar_limbs import ANGLE_NAMES, LIMBS_12, check_limbs
+from torchpose.priors._actions.postures import (
     normalise_postures,
     posture_angles,
     posture_directions,

@@ -22,8 +22,8 @@ from torchpose.priors import (
     UpperBodyPrior,
     load_prior,
 )
-from torchpose.priors.limb_conditionals import LimbConditionals
-from torchpose.priors.prior_noise import check_noise
+from torchpose.priors._limb_conditionals import LimbConditionals
+from torchpose.priors._prior_file import check_noise
 
 KINDS = {
     "prior": UpperBodyPrior, "manifold": BackConstrainedGPLVM, "limbs": LimbConditionals,

@@ -12,9 +12,9 @@ from torchpose import load_action, load_limb_conditionals, load_manifold
 from torchpose.body import BODY_15, Body
 from torchpose.cli.fit_bodies import build
 from torchpose.errors import OverlapError, PriorError
-from torchpose.learning.body_card import body_card
+from torchpose.learning._model_card import body_card
 from torchpose.priors import BackConstrainedGPLVM, known_models
-from torchpose.priors.shipped import KINDS, WEIGHTS, find_model, refuse_seen
+from torchpose.priors._shipped import KINDS, WEIGHTS, find_model, refuse_seen
 
 ROOT = Path(__file__).parents[2]
 LOADERS = {

@@ -19,11 +19,13 @@ from torchpose.errors import (
     OverlapError,
     PriorError,
 )
-from torchpose.learning import arm_sources, collect_poses, model_card, write_model_card
-from torchpose.learning.samplers import all_samples
-from torchpose.learning.upper_body import fit_upper_body_prior
-from torchpose.priors import GaussianMixture, PriorInfo, UpperBodyPrior, known_priors, load_prior
-from torchpose.priors import upper_body as module
+from torchpose.learning import fit_upper_body_prior
+from torchpose.learning._model_card import model_card, write_model_card
+from torchpose.learning._samplers import all_samples
+from torchpose.learning._training import arm_sources, collect_poses
+from torchpose.priors import GaussianMixture, UpperBodyPrior, known_priors, load_prior
+from torchpose.priors import _upper_body as module
+from torchpose.priors._prior_file import PriorInfo
 
 
 @pytest.fixture(scope="module")

@@ -5,11 +5,12 @@ import torch
 
 from tests.priors.poses import poses
 from torchpose.camera import ViewRange
-from torchpose.camera.virtual_camera import BodyPath
+from torchpose.camera._virtual_camera import BodyPath
 from torchpose.errors import PriorError
-from torchpose.learning.samplers import PoseFrames, WindowSource, all_samples
-from torchpose.priors import GaussianMixture, mirror_arm_state
-from torchpose.priors.window import WindowLayout, WindowPrior, augment_bodies, window_measurements
+from torchpose.learning._samplers import PoseFrames, WindowSource, all_samples
+from torchpose.priors import GaussianMixture
+from torchpose.priors._arm_state import mirror_arm_state
+from torchpose.priors._window import WindowLayout, WindowPrior, augment_bodies, window_measurements
 
 MATRIX = torch.tensor([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]], dtype=torch.float64)
 FRONT = ViewRange(roll=0, pitch=0, yaw=0, tx=(0, 0), ty=(0, 0), tz=(2, 2))

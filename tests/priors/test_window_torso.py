@@ -7,15 +7,15 @@ from tests.priors.mixtures import random_mixture
 from tests.priors.poses import recording
 from torchpose.camera import lift
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
-from torchpose.learning.recipes import UpperBodyRecipe
-from torchpose.learning.samplers import all_samples
+from torchpose.learning._recipes import UpperBodyRecipe
+from torchpose.learning._samplers import all_samples
 from torchpose.math import euler_to_matrix
 from torchpose.metrics import joint_errors_3d
 from torchpose.priors import UpperBodyPrior
-from torchpose.priors.window import WindowLayout, WindowPrior
-from torchpose.skeleton.torso import in_torso_axes
+from torchpose.priors._window import WindowLayout, WindowPrior
+from torchpose.skeleton._torso import in_torso_axes
 from torchpose.upper_body import UpperBodyTracker
-from torchpose.upper_body.measurements import in_prior_pixels, pick_joints
+from torchpose.upper_body._measurements import in_prior_pixels, pick_joints
 
 NAMES = list(KEYPOINT_NAMES)
 LAYOUT = WindowLayout((2, 5), (0,), torso=True)

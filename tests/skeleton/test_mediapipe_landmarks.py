@@ -10,8 +10,8 @@ from tests.data import data_dir_or_skip
 from torchpose.errors import ShapeError, SkeletonError
 from torchpose.io import read_keypoints, write_keypoints
 from torchpose.skeleton import upper_body_indices
-from torchpose.skeleton.joint_sets import canonical_names
-from torchpose.skeleton.mediapipe_landmarks import (
+from torchpose.skeleton._joint_sets import canonical_names
+from torchpose.skeleton._mediapipe_landmarks import (
     DERIVED_JOINTS,
     LANDMARKS,
     derive_joints,

@@ -9,7 +9,7 @@ from tests.priors.poses import lowered_neck, poses
 from torchpose.errors import PriorError
 from torchpose.io import read_recording
 from torchpose.math import euler_to_matrix
-from torchpose.skeleton.neck import (
+from torchpose.skeleton._torso import (
     KINECT_NECK,
     NeckOffset,
     learn_neck_fraction,

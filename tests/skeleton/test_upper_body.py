@@ -12,7 +12,6 @@ from tests.data import data_dir_or_skip
 from torchpose.errors import ShapeError, SkeletonError
 from torchpose.skeleton import (
     LEFT_ARM,
-    LIMBS,
     RIGHT_ARM,
     SKELETONS,
     UPPER_BODY,
@@ -21,8 +20,8 @@ from torchpose.skeleton import (
     to_upper_body,
     upper_body_indices,
 )
-from torchpose.skeleton.joint_sets import canonical_names
-from torchpose.skeleton.upper_body import ARM_JOINTS, measure_neck_kind
+from torchpose.skeleton._joint_sets import canonical_names
+from torchpose.skeleton._upper_body import ARM_JOINTS, LIMBS, measure_neck_kind
 
 SPELLINGS = [
     lambda p, s: f"{s}_{p}",

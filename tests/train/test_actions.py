@@ -13,9 +13,9 @@ pytest.importorskip("lightning", reason="lightning is not installed; training ne
 
 from tests.priors.performances import performances
 from torchpose.body import BODY_15, Body
-from torchpose.learning.recipes import Performances
+from torchpose.learning._recipes import Performances
 from torchpose.priors import ActionBank, ActionSpace
-from torchpose.priors.actions.postures import posture_angles, posture_to_state
+from torchpose.priors._actions.postures import posture_angles, posture_to_state
 from train.cli import main
 
 ROOT = Path(__file__).resolve().parents[2]

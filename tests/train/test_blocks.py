@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchpose.errors import InputError
-from torchpose.learning.samplers import BLOCK, PRODUCT, TensorSource
+from torchpose.learning._samplers import BLOCK, PRODUCT, TensorSource
 from train.blocks import Key, ShareSampler, Sweep, SweepLoader, list_blocks
 
 POSE, WINDOW, WATCHED = Key("pose"), Key("causal.left"), Key("pose", held_out=True)

@@ -15,9 +15,9 @@ pytest.importorskip("lightning", reason="lightning is not installed; training ne
 
 from tests.priors.poses import poses
 from torchpose.io import read_recordings
-from torchpose.learning.recipes import UpperBodyRecipe
+from torchpose.learning._recipes import UpperBodyRecipe
 from torchpose.priors import UpperBodyPrior, load_prior
-from torchpose.priors.upper_body import released_process_cov
+from torchpose.priors._upper_body import released_process_cov
 from torchpose.skeleton import UPPER_BODY
 from train.cli import main
 from train.fine_tuning import FineTuning

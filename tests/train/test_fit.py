@@ -11,8 +11,8 @@ pytest.importorskip("tensorboard", reason="training needs the extra `train`")
 
 from tests.train.people import RECIPE, WINDOWS, settings, write_recordings, write_settings
 from torchpose.io import read_recordings
-from torchpose.learning.curation import CurationSettings, curate
-from torchpose.learning.recipes import UpperBodyRecipe
+from torchpose.learning._curation import CurationSettings, curate
+from torchpose.learning._recipes import UpperBodyRecipe
 from torchpose.priors import load_prior
 from train.cli import main
 

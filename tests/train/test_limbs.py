@@ -13,9 +13,9 @@ from torchpose.learning import fit_limb_conditionals
 pytest.importorskip("lightning", reason="lightning is not installed; training needs it")
 
 from torchpose.body import BODY_15, Body
-from torchpose.learning.recipes import LimbStates
-from torchpose.learning.recipes.limbs import held_out_spread
-from torchpose.priors.limb_conditionals import LimbConditionals
+from torchpose.learning._recipes import LimbStates
+from torchpose.learning._recipes.limbs import held_out_spread
+from torchpose.priors._limb_conditionals import LimbConditionals
 from train.cli import main
 
 ROOT = Path(__file__).resolve().parents[2]

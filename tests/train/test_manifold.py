@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from torchpose.learning.manifolds import gplvm_of_fit
+from torchpose.learning._manifolds import gplvm_of_fit
 
 pytest.importorskip("lightning", reason="lightning is not installed; training needs it")
 
 from tests.priors.motions import motion
 from torchpose.body import BODY_15, Body
-from torchpose.learning.gplvm_fit import GPLVMFit, median_gamma, run_fit
-from torchpose.learning.recipes import ManifoldFitting
+from torchpose.learning._gplvm_fit import GPLVMFit, median_gamma, run_fit
+from torchpose.learning._recipes import ManifoldFitting
 from torchpose.priors import BackConstrainedGPLVM
 from train.cli import main
 from train.manifold import ManifoldData

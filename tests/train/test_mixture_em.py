@@ -9,11 +9,11 @@ pytest.importorskip("lightning", reason="training needs the extra `train`")
 
 from torchpose.errors import FileFormatError, InputError, OverlapError
 from torchpose.io import Recording
-from torchpose.learning.recipes import MixtureTask
-from torchpose.learning.recipes.choosing import expand_path, fingerprint
-from torchpose.learning.samplers import BLOCK, TensorSource
-from torchpose.learning.streamed_em import StreamedEM, fit_streamed
-from torchpose.math.mixture_em import SufficientStatistics
+from torchpose.learning._recipes import MixtureTask
+from torchpose.learning._recipes.choosing import expand_path, fingerprint
+from torchpose.learning._samplers import BLOCK, TensorSource
+from torchpose.learning._streamed_em import StreamedEM, fit_streamed
+from torchpose.math._mixture_em import SufficientStatistics
 from torchpose.skeleton import UPPER_BODY
 from train.blocks import Key, SweepLoader
 from train.data import RecordingsDataModule, split

@@ -20,9 +20,9 @@ from torchpose._core.files import atomic_path
 from torchpose.cli.track import build as track_parser
 from torchpose.cli.track import run as track
 from torchpose.errors import InputError, OutputError, PriorError
-from torchpose.learning.upper_body import fit_upper_body_prior
+from torchpose.learning import fit_upper_body_prior
 from torchpose.upper_body import PoseTrack
-from torchpose.upper_body.keypoint_files import TrackSettings
+from torchpose.upper_body._keypoint_files import TrackSettings
 from train import predict as module
 from train.predict import build, main, predict, process_rank
 from train.predict_claims import Claims

@@ -81,7 +81,7 @@ def test_a_signal_at_any_time(recordings, tmp_path, monkeypatch, capsys, when, s
     else:
         where = {
             "reading": "train.data.read_recordings",
-            "calibration": "torchpose.learning.recipes.UpperBodyRecipe.hold_out",
+            "calibration": "torchpose.learning._recipes.UpperBodyRecipe.hold_out",
         }
         monkeypatch.setattr(where[when], lambda *_, **__: os.kill(os.getpid(), signum))
     assert main(["fit", "--config", str(write_settings(tmp_path, values))]) == code

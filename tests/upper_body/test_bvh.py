@@ -11,7 +11,7 @@ from torchpose.demo import performer
 from torchpose.errors import InputError, OutputError, ShapeError
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack
-from torchpose.upper_body.bvh import joints_to_bvh, write_bvh
+from torchpose.upper_body._pose_files import joints_to_bvh, write_bvh
 
 Y_UP = np.array([1.0, -1.0, -1.0])
 LEFT_ARM = ("shoulder_left", "elbow_left", "hand_left")

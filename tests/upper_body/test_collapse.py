@@ -9,11 +9,11 @@ import torch
 from torchpose.camera import PinholeCamera, backproject, project
 from torchpose.demo import performer
 from torchpose.priors import load_prior
-from torchpose.priors.upper_body import released_process_cov
+from torchpose.priors._upper_body import released_process_cov
 from torchpose.skeleton import LEFT_ARM, RIGHT_ARM, UPPER_BODY
 from torchpose.upper_body import PoseTrack, UpperBodyTracker
-from torchpose.upper_body.collapse import note_collapse
-from torchpose.video.pose_spool import PoseSpool
+from torchpose.upper_body._reading import note_collapse
+from torchpose.video._recording import PoseSpool
 
 NAMES = ["head", "neck", "hand_left", "hand_right"]
 N_FRAMES = 24

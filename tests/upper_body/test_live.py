@@ -6,7 +6,7 @@ import torch
 from tests.priors.poses import recording
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.errors import InputError, ShapeError, SkeletonError
-from torchpose.learning.recipes import fit_kinect_prior
+from torchpose.learning._recipes import fit_kinect_prior
 from torchpose.upper_body import METHODS, UpperBodyTracker, method_options
 
 NAMES = list(KEYPOINT_NAMES)

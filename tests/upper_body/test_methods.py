@@ -10,7 +10,7 @@ from tests.priors.poses import recording
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.errors import InputError
 from torchpose.filters import MixtureKalmanFilter
-from torchpose.learning.recipes import fit_kinect_prior
+from torchpose.learning._recipes import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import (
     METHODS,
@@ -20,8 +20,8 @@ from torchpose.upper_body import (
     method_options,
     register_method,
 )
-from torchpose.upper_body.arms import arm_joints
-from torchpose.upper_body.measurements import in_prior_pixels, pick_joints
+from torchpose.upper_body._estimator import arm_joints
+from torchpose.upper_body._measurements import in_prior_pixels, pick_joints
 
 NAMES = list(KEYPOINT_NAMES)
 
@@ -162,7 +162,7 @@ def test_options_of_single_poses_without_a_method_still_mean_single_poses(prior,
 
 
 def test_a_method_is_registered_under_a_new_name_only(monkeypatch):
-    monkeypatch.setattr("torchpose.upper_body.methods.METHODS", dict(METHODS))
+    monkeypatch.setattr("torchpose.upper_body.METHODS", dict(METHODS))
     with pytest.raises(InputError, match="'mkf-fixed' exists"):
         register_method("mkf-fixed", METHODS["mkf-split"])
 

@@ -3,7 +3,7 @@ import torch
 from torchpose.camera import project
 from torchpose.math import euler_to_matrix
 from torchpose.skeleton import UPPER_BODY
-from torchpose.upper_body.fusion import ReadOut, on_their_rays
+from torchpose.upper_body._fusion import ReadOut, on_their_rays
 
 K = torch.tensor([[525.0, 0, 320], [0, 525, 240], [0, 0, 1]], dtype=torch.float64)
 HAND, ELBOW, HEAD = (UPPER_BODY.index(n) for n in ("hand_left", "elbow_right", "head"))

@@ -9,7 +9,7 @@ import torch
 
 from tests.priors.poses import recording
 from torchpose.camera import PinholeCamera, map_pixels, project
-from torchpose.camera.lifting import arm_in_body_frame, arm_in_camera_frame
+from torchpose.camera._projection import arm_in_body_frame, arm_in_camera_frame
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.errors import (
     CameraError,
@@ -21,15 +21,15 @@ from torchpose.errors import (
     ShapeError,
     SkeletonError,
 )
-from torchpose.learning.recipes import fit_calibration, fit_kinect_prior
-from torchpose.learning.upper_body import fit_upper_body_prior
+from torchpose.learning import fit_upper_body_prior
+from torchpose.learning._recipes import fit_calibration, fit_kinect_prior
 from torchpose.math import euler_to_matrix
 from torchpose.metrics import joint_errors_3d
 from torchpose.priors import UpperBodyPrior
 from torchpose.skeleton import UPPER_BODY
-from torchpose.skeleton.neck import KINECT_NECK
+from torchpose.skeleton._torso import KINECT_NECK
 from torchpose.upper_body import METHODS, PoseTrack, UpperBodyTracker
-from torchpose.upper_body.process_noise import default_process_cov
+from torchpose.upper_body._single_poses import default_process_cov
 
 NAMES = list(KEYPOINT_NAMES)
 

@@ -12,7 +12,7 @@ from torch import nn
 
 from torchpose import GaussianMixture, UpperBodyPrior, UpperBodyTracker, load_prior
 from torchpose.errors import InputError, PriorError
-from torchpose.priors.window import WindowPrior
+from torchpose.priors._window import WindowPrior
 
 NAMES = ["head", "neck", "hand_left", "hand_right"]
 METHODS = {

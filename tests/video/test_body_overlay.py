@@ -4,7 +4,7 @@ import torch
 
 from torchpose.body import BODY_15
 from torchpose.errors import InputError, ShapeError
-from torchpose.video.body_overlay import draw_body
+from torchpose.video._overlay import draw_body
 
 
 def joints():

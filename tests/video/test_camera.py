@@ -6,7 +6,7 @@ import pytest
 
 from torchpose.errors import FileFormatError, InputError
 from torchpose.video import CameraSource, open_video
-from torchpose.video import camera as module
+from torchpose.video import _camera as module
 
 WARM_UP = 10
 

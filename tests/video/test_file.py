@@ -9,7 +9,8 @@ import pytest
 
 from tests.video.make import add_sound, make_video, number_of, numbered
 from torchpose.errors import FileFormatError, InputError
-from torchpose.video import FileSource, open_video, probe
+from torchpose.video import FileSource, open_video
+from torchpose.video import _timing as probe
 
 
 def read(path, **options):

@@ -8,8 +8,8 @@ import torch
 
 from torchpose.errors import InputError, ShapeError
 from torchpose.skeleton import UPPER_BODY
-from torchpose.video.overlay import PERSON_TINTS, draw_overlay
-from torchpose.viz.style import LEFT, RIGHT
+from torchpose.video._overlay import PERSON_TINTS, draw_overlay
+from torchpose.viz._style import LEFT, RIGHT
 
 GREY = 128
 HAND_LEFT, ELBOW_LEFT, SHOULDER_LEFT, HEAD, NECK = range(5)

@@ -5,7 +5,7 @@ import torch
 
 from torchpose.errors import InputError, OutputError
 from torchpose.upper_body import PoseTrack
-from torchpose.video.pose_spool import PoseSpool
+from torchpose.video._recording import PoseSpool
 
 FIELDS = ("joints2d", "joints3d", "covariance2d", "covariance3d", "observed", "log_evidence")
 

@@ -11,7 +11,8 @@ import pytest
 
 from tests.video.make import make_video
 from torchpose.errors import InputError
-from torchpose.video import open_video, prefetch
+from torchpose.video import open_video
+from torchpose.video._prefetch import prefetch
 
 
 @pytest.fixture(autouse=True)

@@ -5,12 +5,12 @@ import torch
 
 from tests.priors.poses import recording
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
-from torchpose.learning.recipes import fit_kinect_prior
-from torchpose.measure.hand_measurements import HandMeasurements
-from torchpose.measure.upper_body import MEASURED, FrameMeasurements, rounded_covariance
+from torchpose.learning._recipes import fit_kinect_prior
+from torchpose.measure._hand_likelihood import HandMeasurements
+from torchpose.measure._upper_body import MEASURED, FrameMeasurements, rounded_covariance
 from torchpose.upper_body import UpperBodyTracker
-from torchpose.video.person_stream import PersonStream
-from torchpose.video.recording import TrackedRecording
+from torchpose.video._person_stream import PersonStream
+from torchpose.video._recording import TrackedRecording
 
 FIELDS = ("joints2d", "joints3d", "covariance3d")
 GAP = 20

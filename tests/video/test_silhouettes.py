@@ -5,8 +5,8 @@ import torch
 
 from torchpose.camera import PinholeCamera
 from torchpose.errors import CameraError, InputError
-from torchpose.video import SilhouetteMeasurer, VideoFrame, VideoSource, fit_view, read_silhouettes
-from torchpose.video.silhouettes import clean_silhouette
+from torchpose.video import SilhouetteMeasurer, VideoFrame, VideoSource, read_silhouettes
+from torchpose.video._silhouettes import clean_silhouette, fit_view
 
 
 class Frames(VideoSource):

@@ -7,7 +7,7 @@ import pytest
 from tests.video.make import make_video
 from torchpose.errors import InputError
 from torchpose.video import CameraSource, FileSource, FolderSource, open_video
-from torchpose.video import source as module
+from torchpose.video import _source as module
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torchpose.errors import InputError
-from torchpose.video.timing import Rate, Tally, frame_rate, shown_for, to_constant_rate
+from torchpose.video._timing import Rate, Tally, frame_rate, shown_for, to_constant_rate
 
 
 def resample(times, fps, snap=False):

@@ -8,7 +8,7 @@ from tests.priors.poses import recording
 from torchpose import VideoTracker
 from torchpose.demo import demo_camera, performer
 from torchpose.errors import InputError
-from torchpose.learning.recipes import fit_kinect_prior
+from torchpose.learning._recipes import fit_kinect_prior
 
 pytest.importorskip("matplotlib", reason="the performer's face comes from matplotlib")
 FACE = 3  # the head, in `UPPER_BODY`
@@ -23,7 +23,7 @@ def prior():
 
 
 def rendered(*performances):
-    from torchpose.demo.rendering import Scene, render_performance
+    from torchpose.demo._rendering import Scene, render_performance
 
     return list(
         render_performance(performances, demo_camera(), scene=Scene(clutter=False, exposure=0.0))
@@ -45,7 +45,7 @@ def test_somebody_who_leaves_and_comes_back_is_the_same_person(prior):
 
 
 def test_two_who_cross_stay_who_they_are(prior):
-    from torchpose.demo.rendering import crossing
+    from torchpose.demo._rendering import crossing
 
     pair = crossing(100, seconds=3.0)
     tracker = VideoTracker(prior, demo_camera())
@@ -66,7 +66,7 @@ def test_two_who_cross_stay_who_they_are(prior):
 
 
 def test_only_the_largest_face_is_followed_if_asked_for(prior):
-    from torchpose.demo.rendering import crossing
+    from torchpose.demo._rendering import crossing
 
     tracker = VideoTracker(prior, demo_camera(), max_persons=1)
     people = tracker(rendered(*crossing(30)))

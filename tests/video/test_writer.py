@@ -12,7 +12,7 @@ import pytest
 from tests.video.make import number_of, numbered
 from torchpose.errors import InputError, MissingDependencyError, OutputError, ShapeError
 from torchpose.video import VideoWriter, open_video
-from torchpose.video import writer as module
+from torchpose.video import _writer as module
 
 
 def write(path, n=20, size=(64, 48), fps=25, **options):

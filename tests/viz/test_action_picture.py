@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchpose.learning.action_spaces import fit_synchronised
+from torchpose.learning._action_spaces import fit_synchronised
 
 pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 

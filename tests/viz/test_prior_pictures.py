@@ -8,12 +8,14 @@ pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 
 from tests.priors.mixtures import random_mixture
 from tests.priors.poses import REST
-from torchpose.camera.viewpoints import Viewpoints
+from torchpose.camera._viewpoints import Viewpoints
 from torchpose.errors import InputError
-from torchpose.priors import GaussianMixture, PriorInfo, UpperBodyPrior, arm_states, mirror_mixture
-from torchpose.priors.window import WindowLayout, WindowPrior
+from torchpose.priors import GaussianMixture, UpperBodyPrior
+from torchpose.priors._arm_state import arm_states, mirror_mixture
+from torchpose.priors._prior_file import PriorInfo
+from torchpose.priors._window import WindowLayout, WindowPrior
 from torchpose.viz import plot_prior_components, plot_prior_samples
-from torchpose.viz.prior_pictures import plot_log_likelihood
+from torchpose.viz._prior_pictures import plot_log_likelihood
 
 WEIGHTS = torch.tensor([0.2, 0.5, 0.3], dtype=torch.float64)
 RAISED = REST.clone()

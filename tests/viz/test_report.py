@@ -17,7 +17,7 @@ from torchpose.demo import performer
 from torchpose.errors import InputError, OutputError, ShapeError
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack
-from torchpose.viz.report import packing, page, write_report
+from torchpose.viz._report import packing, page, write_report
 
 HOSTILE = (
     "</script><script>alert(1)</script><img src=x onerror=alert(2)> & \"quotes\" 'too' {{data}}"
@@ -256,7 +256,7 @@ def test_wrong_input_is_refused(tmp_path):
 
 
 def test_the_templates_are_part_of_the_package():
-    template = files("torchpose.viz.report").joinpath("template.html").read_text(encoding="utf-8")
+    template = files("torchpose.viz._report").joinpath("template.html").read_text(encoding="utf-8")
     keys = {"title", "summary", "style", "script", "facts", "notes", "data", "video"}
     assert set(re.findall(r"\{\{(\w+)\}\}", template)) == keys
     assert UPPER_BODY[0] not in template

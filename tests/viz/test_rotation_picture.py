@@ -10,7 +10,7 @@ pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 
 from torchpose.errors import InputError, ShapeError
 from torchpose.viz import save_figure
-from torchpose.viz.rotation_picture import plot_rotations
+from torchpose.viz._rotation_picture import plot_rotations
 
 COVARIANCE = torch.diag(torch.tensor([0.2, 0.05, 0.0]).double() ** 2)
 

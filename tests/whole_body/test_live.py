@@ -8,18 +8,17 @@ from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.errors import InputError, ShapeError
 from torchpose.learning import fit_limb_conditionals
-from torchpose.priors.limb_conditionals import in_body_frame
+from torchpose.priors._limb_conditionals import in_body_frame
 from torchpose.whole_body import (
     AnnealedParticleFilter,
-    BodyFilterState,
     RootUncertaintyTracker,
     SilhouetteParticleFilter,
     SIRParticleFilter,
-    joint_covariance,
     render,
     track_body,
 )
-from torchpose.whole_body.filters.root_uncertainty import joint_covariance_with_parts
+from torchpose.whole_body._filters.body_particles import BodyFilterState, joint_covariance
+from torchpose.whole_body._filters.root_uncertainty import joint_covariance_with_parts
 
 
 @pytest.fixture(scope="module")

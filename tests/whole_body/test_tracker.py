@@ -9,7 +9,7 @@ from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walk
 from torchpose.body import BODY_15, Body
 from torchpose.errors import InputError, NobodySeenError, PriorError
 from torchpose.learning import fit_limb_conditionals
-from torchpose.priors.limb_conditionals import in_body_frame
+from torchpose.priors._limb_conditionals import in_body_frame
 from torchpose.whole_body import (
     METHODS,
     AnnealedParticleFilter,
@@ -24,9 +24,9 @@ from torchpose.whole_body import (
     reweight,
     track_body,
 )
-from torchpose.whole_body.filters.body_particles import BodyFilterOptions
-from torchpose.whole_body.methods import choose_method, method_options
-from torchpose.whole_body.tracker import all_see
+from torchpose.whole_body._filters.body_particles import BodyFilterOptions
+from torchpose.whole_body._methods import choose_method, method_options
+from torchpose.whole_body._tracker import all_see
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose._core.fields import one_number, texts
+from torchpose._core.reading import one_number, texts
 from torchpose.errors import FileFormatError, InputError, check_rate
 
 __all__ = ["check_estimates", "check_number_range", "frame_facts", "to_tensor"]

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable
 from importlib import import_module
 from importlib.machinery import ModuleSpec
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -21,281 +22,339 @@ __all__ = [
     "present_module",
 ]
 
+_PACKAGE = Path(__file__).parents[1]
+
 MODULES = {
-    "arm_filters": "upper_body.single_poses",
-    "arm_windows": "upper_body.windows",
-    "arms": "upper_body.arms",
-    "body.faults": "whole_body.silhouettes.faults",
-    "body.limb_batches": "whole_body.silhouettes.limb_batches",
-    "body.limb_counts": "whole_body.silhouettes.limb_counts",
-    "body.limb_outlines": "whole_body.silhouettes.limb_outlines",
-    "body.quaternion_vectors": "math.quaternion_vectors",
-    "body.rectangles": "whole_body.silhouettes.rectangles",
-    "body.row_intervals": "whole_body.silhouettes.row_intervals",
-    "body.shape": "whole_body.silhouettes.shape",
-    "body.silhouette": "whole_body.silhouettes.rendering",
-    "body.silhouette_likelihood": "whole_body.silhouettes.likelihood",
-    "body_poses": "whole_body.poses",
-    "body_tracking": "whole_body.tracker",
-    "body_view": "camera.virtual_camera",
-    "calibration": "metrics.calibration",
-    "camera_rig": "camera.rig",
-    "cli.pose_csv": "upper_body.csv",
-    "cli.camera_option": "camera.choice",
-    "cli.prior_files": "learning.fit_files",
-    "collapse": "upper_body.collapse",
-    "curation": "learning.curation",
-    "filters.annealed": "whole_body.filters.annealed",
-    "filters.body_frames": "whole_body.filters.body_frames",
-    "filters.body_particles": "whole_body.filters.body_particles",
-    "filters.constrained": "whole_body.filters.constrained",
-    "filters.first_order": "whole_body.filters.motion",
-    "filters.first_pose": "whole_body.first_pose",
-    "filters.frame_weights": "filters.memoryless",
-    "filters.gains": "filters.gain_graph",
-    "filters.geometric_median": "math.geometric_median",
-    "filters.joint_spread": "whole_body.filters.body_particles",
-    "filters.leg_swap": "whole_body.filters.leg_swap",
-    "filters.limb_observations": "whole_body.filters.limb_observations",
-    "filters.manifold": "whole_body.filters.manifold",
-    "filters.mending": "filters.outputs",
-    "filters.particle_options": "filters.particle",
-    "filters.pose_search": "whole_body.pose_search",
-    "filters.posture_gate": "whole_body.filters.posture_gate",
-    "filters.redraw": "whole_body.filters.posture_gate",
-    "filters.root_uncertainty": "whole_body.filters.root_uncertainty",
-    "filters.scan": "filters.shared_gains",
-    "filters.sharpness": "whole_body.sharpness",
-    "filters.silhouette_filter": "whole_body.filters.silhouette_filter",
-    "filters.sir": "whole_body.filters.sir",
-    "filters.tracks": "filters.mkf",
-    "filters.tree_messages": "math.tree_messages",
-    "gaussian": "math.gaussian",
-    "io.axes": "io.formats.axes",
-    "io.azure_json": "io.formats.azure_json",
-    "io.bvh": "upper_body.bvh",
-    "io.bvh_recordings": "io.formats.bvh_recordings",
-    "io.c3d_recordings": "io.formats.c3d_recordings",
+    "arm_filters": "upper_body._single_poses",
+    "arm_windows": "upper_body._windows",
+    "arms": "upper_body._estimator",
+    "body.body_parameters": "body._limbs",
+    "body.faults": "whole_body._silhouettes.faults",
+    "body.limb_batches": "whole_body._silhouettes.limb_batches",
+    "body.limb_counts": "whole_body._silhouettes.limb_counts",
+    "body.limb_outlines": "whole_body._silhouettes.outlines",
+    "body.quaternion_vectors": "math._rotations",
+    "body.rectangles": "whole_body._silhouettes.outlines",
+    "body.row_intervals": "whole_body._silhouettes.outlines",
+    "body.shape": "whole_body._silhouettes.shape",
+    "body.silhouette": "whole_body._silhouettes.rendering",
+    "body.silhouette_likelihood": "whole_body._silhouettes.likelihood",
+    "body_poses": "whole_body._poses",
+    "body_tracking": "whole_body._tracker",
+    "body_view": "camera._virtual_camera",
+    "calibration": "metrics._calibration",
+    "camera_rig": "camera._rig",
+    "cli.camera_option": "camera._choice",
+    "cli.pose_csv": "upper_body._pose_files",
+    "cli.prior_files": "learning._fit_files",
+    "collapse": "upper_body._reading",
+    "curation": "learning._curation",
+    "filters.annealed": "whole_body._filters.annealed",
+    "filters.body_frames": "whole_body._filters.body_frames",
+    "filters.body_particles": "whole_body._filters.body_particles",
+    "filters.constrained": "whole_body._filters.constrained",
+    "filters.first_order": "whole_body._filters.motion",
+    "filters.first_pose": "whole_body._first_pose",
+    "filters.frame_weights": "filters._memoryless",
+    "filters.gains": "filters._gain_graph",
+    "filters.gamma": "filters._transition",
+    "filters.geometric_median": "math._geometric_median",
+    "filters.joint_spread": "whole_body._filters.body_particles",
+    "filters.leg_swap": "whole_body._filters.motion",
+    "filters.limb_observations": "whole_body._filters.limb_observations",
+    "filters.manifold": "whole_body._filters.manifold",
+    "filters.mending": "filters._outputs",
+    "filters.particle_options": "filters._particle",
+    "filters.pose_search": "whole_body._pose_search",
+    "filters.posture_gate": "whole_body._filters.posture_gate",
+    "filters.redraw": "whole_body._filters.posture_gate",
+    "filters.root_uncertainty": "whole_body._filters.root_uncertainty",
+    "filters.scan": "filters._shared_gains",
+    "filters.sharpness": "whole_body._sharpness",
+    "filters.silhouette_filter": "whole_body._filters.silhouette_filter",
+    "filters.sir": "whole_body._filters.sir",
+    "filters.survival": "filters._resampling",
+    "filters.tracks": "filters._mkf",
+    "filters.tree_messages": "math._tree_messages",
+    "gaussian": "math._gaussian",
+    "io.axes": "io._formats.axes",
+    "io.azure_json": "io._formats.skeleton_files",
+    "io.bvh": "upper_body._pose_files",
+    "io.bvh_recordings": "io._formats.mocap_files",
+    "io.c3d_recordings": "io._formats.mocap_files",
     "io.estimates": "_core.estimates",
-    "io.fields": "_core.fields",
+    "io.fields": "_core.reading",
     "io.files": "_core.files",
-    "io.humaneva_joints": "io.formats.humaneva_joints",
-    "io.kinect_csv": "io.formats.kinect_csv",
-    "io.kinect_v1": "io.formats.kinect_v1",
-    "io.landmarks": "skeleton.mediapipe_landmarks",
-    "io.leftovers": "_core.leftovers",
-    "io.npz": "_core.npz",
-    "io.npz_recordings": "io.formats.npz_recordings",
-    "io.ntu_skeleton": "io.formats.ntu_skeleton",
-    "io.openpose": "io.formats.openpose",
-    "io.raw_recording": "io.formats.raw_recording",
+    "io.kinect_csv": "io._formats.kinect_csv",
+    "io.kinect_v1": "io._formats.skeleton_files",
+    "io.landmarks": "skeleton._mediapipe_landmarks",
+    "io.leftovers": "_core.files",
+    "io.npz": "_core.reading",
+    "io.npz_recordings": "io._formats.raw_recording",
+    "io.ntu_skeleton": "io._formats.skeleton_files",
+    "io.openpose": "io._formats.openpose",
+    "io.raw_recording": "io._formats.raw_recording",
     "io.reading": "_core.reading",
-    "io.units": "io.formats.units",
-    "joint_sets": "skeleton.joint_sets",
-    "lifting": "camera.lifting",
-    "mannequin": "demo.mannequin",
-    "measure.silhouettes": "video.silhouettes",
-    "measurements": "upper_body.measurements",
-    "methods": "upper_body.methods",
+    "io.units": "io._formats.axes",
+    "joint_sets": "skeleton._joint_sets",
+    "lifting": "camera._projection",
+    "mannequin": "demo._mannequin",
+    "measure.face_memory": "measure._head",
+    "measure.hand_measurements": "measure._hand_likelihood",
+    "measure.hand_settings": "measure._hand_likelihood",
+    "measure.head_neck": "measure._head",
+    "measure.motion": "measure._background",
+    "measure.silhouettes": "video._silhouettes",
+    "measurements": "upper_body._measurements",
+    "methods": "upper_body._methods",
     "metric_arguments": "_core.arguments",
     "module_state": "_core.module_state",
-    "person_stream": "video.person_stream",
-    "pose_spool": "video.pose_spool",
-    "pose_track": "upper_body.pose_track",
-    "priors.action_bank": "priors.actions.bank",
-    "priors.action_chain": "priors.actions.chain",
-    "priors.action_file": "priors.actions.file",
-    "priors.action_fit": "learning.action_spaces",
-    "priors.action_gate": "priors.actions.gate",
-    "priors.action_recognition": "learning.action_recognition",
-    "priors.action_space": "priors.actions.space",
-    "priors.action_stack": "priors.actions.stack",
-    "priors.body_card": "learning.body_card",
-    "priors.completion": "learning.completion",
-    "priors.em": "math.mixture_em",
-    "priors.features": "math.mixture_features",
-    "priors.fine_tuning": "learning.fine_tuning",
-    "priors.gmm": "priors.gaussian_mixture",
-    "priors.gplvm": "priors.manifold.gplvm",
-    "priors.gplvm_fit": "learning.gplvm_fit",
-    "priors.gplvm_kernel": "priors.manifold.prediction",
-    "priors.gplvm_noise": "learning.manifolds",
-    "priors.gplvm_prediction": "priors.manifold.prediction",
-    "priors.increments": "learning.increments",
-    "priors.manifold_file": "priors.manifold.file",
-    "priors.model_card": "learning.model_card",
-    "priors.neck": "skeleton.neck",
-    "priors.part_postures": "priors.actions.part_postures",
-    "priors.polar_limbs": "priors.actions.polar_limbs",
-    "priors.pose_sequences": "learning.manifolds",
-    "priors.postures": "priors.actions.postures",
-    "priors.repetitions": "learning.performances",
-    "priors.samplers": "learning.samplers",
-    "priors.seen_keypoints": "learning.seen_keypoints",
-    "priors.selection": "learning.selection",
-    "priors.share": "learning.blocks",
-    "priors.start": "math.mixture_start",
-    "priors.stepwise_em": "learning.stepwise_em",
-    "priors.streamed_em": "learning.streamed_em",
-    "priors.synchronisation": "learning.performances",
+    "person_stream": "video._person_stream",
+    "pose_spool": "video._recording",
+    "pose_track": "upper_body._pose_track",
+    "priors.action_bank": "priors._actions.bank",
+    "priors.action_chain": "priors._actions.stack",
+    "priors.action_file": "priors._actions.file",
+    "priors.action_fit": "learning._action_spaces",
+    "priors.action_gate": "priors._actions.gate",
+    "priors.action_recognition": "learning._action_spaces",
+    "priors.action_space": "priors._actions.space",
+    "priors.action_stack": "priors._actions.stack",
+    "priors.body_card": "learning._model_card",
+    "priors.completion": "learning._streamed_em",
+    "priors.em": "math._mixture_em",
+    "priors.features": "math._mixture_steps",
+    "priors.fine_tuning": "learning._fine_tuning",
+    "priors.gmm": "priors._gaussian_mixture",
+    "priors.gplvm": "priors._manifold.gplvm",
+    "priors.gplvm_fit": "learning._gplvm_fit",
+    "priors.gplvm_kernel": "priors._manifold.prediction",
+    "priors.gplvm_noise": "learning._manifolds",
+    "priors.gplvm_prediction": "priors._manifold.prediction",
+    "priors.increments": "learning._upper_body",
+    "priors.manifold_file": "priors._manifold.file",
+    "priors.model_card": "learning._model_card",
+    "priors.neck": "skeleton._torso",
+    "priors.part_postures": "priors._actions.part_postures",
+    "priors.polar_limbs": "priors._actions.polar_limbs",
+    "priors.pose_sequences": "learning._manifolds",
+    "priors.postures": "priors._actions.postures",
+    "priors.prior_noise": "priors._prior_file",
+    "priors.repetitions": "learning._performances",
+    "priors.samplers": "learning._samplers",
+    "priors.seen_keypoints": "learning._seen_keypoints",
+    "priors.selection": "learning._selection",
+    "priors.share": "learning._blocks",
+    "priors.start": "math._mixture_start",
+    "priors.stepwise_em": "learning._stepwise_em",
+    "priors.streamed_em": "learning._streamed_em",
+    "priors.synchronisation": "learning._performances",
     "priors.tensor_file": "_core.tensor_file",
-    "priors.training": "learning.training",
-    "priors.usable_samples": "learning.blocks",
-    "process_noise": "upper_body.process_noise",
-    "projection": "camera.projection",
+    "priors.training": "learning._training",
+    "priors.usable_samples": "learning._blocks",
+    "process_noise": "upper_body._single_poses",
+    "projection": "camera._projection",
     "protocols": "evaluation",
-    "read_out": "upper_body.fusion",
-    "recipes": "learning.recipes",
-    "recording": "video.recording",
-    "rendering": "demo.rendering",
-    "report": "viz.report",
-    "rotation_gaussians": "math.rotation_gaussians",
-    "rotations": "math.rotations",
-    "streaming": "upper_body.live",
-    "torchmetrics_adapters": "metrics.torchmetrics_adapters",
-    "torso": "skeleton.torso",
-    "tracking": "upper_body.tracker",
-    "unscented": "math.unscented",
+    "read_out": "upper_body._fusion",
+    "recipes": "learning._recipes",
+    "recording": "video._recording",
+    "rendering": "demo._rendering",
+    "report": "viz._report",
+    "rotation_gaussians": "math._rotation_gaussians",
+    "rotations": "math._rotations",
+    "streaming": "upper_body._live",
+    "torchmetrics_adapters": "metrics._torchmetrics_adapters",
+    "torso": "skeleton._torso",
+    "tracking": "upper_body._tracker",
+    "unscented": "math._unscented",
     "value_checks": "_core.value_checks",
-    "video_tracker": "video.tracker",
-    "viewpoints": "camera.viewpoints",
+    "video.body_overlay": "video._overlay",
+    "video.pen": "video._overlay",
+    "video.probe": "video._timing",
+    "video_tracker": "video._tracker",
+    "viewpoints": "camera._viewpoints",
+    "viz.action_picture": "viz._model_pictures",
+    "viz.manifold_picture": "viz._model_pictures",
 }
-"""Old module to present module, both without `torchpose.`; submodules follow their package."""
+"""Old module to present module, both without `torchpose.`; submodules follow their package.
+
+A module that only became private (`filters.mkf` is `filters._mkf`) does not stand here.
+"""
 
 LABORATORY = frozenset(
     [
-        "bend",
-        "bend_actions",
-        "bend_data",
-        "bend_occlusion",
-        "bend_pictures",
-        "bend_runs",
-        "bend_tables",
-        "bend_trackees",
-        "body_models",
-        "gaps",
-        "one_tables",
-        "root_uncertainty",
-        "root_uncertainty_pictures",
-        "root_uncertainty_runs",
-        "root_uncertainty_search",
-        "root_uncertainty_tables",
-        "root_uncertainty_trackees",
-        "signer",
-        "silhouette",
-        "silhouette_data",
-        "silhouette_humaneva",
-        "silhouette_pictures",
-        "silhouette_report",
-        "silhouette_runs",
-        "silhouette_tables",
-        "silhouette_trackees",
-        "ub_one",
-        "ub_people",
-        "uncommon_poses",
+        "io.humaneva",
+        "io.humaneva_joints",
+        "protocols.bend",
+        "protocols.bend_actions",
+        "protocols.bend_data",
+        "protocols.bend_occlusion",
+        "protocols.bend_pictures",
+        "protocols.bend_runs",
+        "protocols.bend_tables",
+        "protocols.bend_trackees",
+        "protocols.body_models",
+        "protocols.gaps",
+        "protocols.one_tables",
+        "protocols.root_uncertainty",
+        "protocols.root_uncertainty_pictures",
+        "protocols.root_uncertainty_runs",
+        "protocols.root_uncertainty_search",
+        "protocols.root_uncertainty_tables",
+        "protocols.root_uncertainty_trackees",
+        "protocols.signer",
+        "protocols.silhouette",
+        "protocols.silhouette_data",
+        "protocols.silhouette_humaneva",
+        "protocols.silhouette_pictures",
+        "protocols.silhouette_report",
+        "protocols.silhouette_runs",
+        "protocols.silhouette_tables",
+        "protocols.silhouette_trackees",
+        "protocols.ub_one",
+        "protocols.ub_people",
+        "protocols.uncommon_poses",
     ]
 )
-"""Modules of `torchpose.protocols` that are benchmarks of a checkout now, not part of the package."""
+"""Modules that belong to the benchmarks of a checkout now, and are no part of the package."""
 
 NAMES: dict[str, dict[str, str]] = {
     "torchpose.body": {
-        "whole_body": (
-            "PreparedSilhouettes SilhouetteCounts bidirectional count_pixels fit_radii "
-            "intersection_over_union prepare_silhouettes render render_limbs"
+        "body._fitting": "joint_errors",
+        "body._kinematics": "FRAMES",
+        "whole_body": "bidirectional count_pixels render",
+        "whole_body._silhouettes.likelihood": "intersection_over_union",
+        "whole_body._silhouettes.rendering": (
+            "PreparedSilhouettes SilhouetteCounts prepare_silhouettes render_limbs"
         ),
+        "whole_body._silhouettes.shape": "fit_radii",
     },
     "torchpose.camera": {
-        "camera.lifting": "arm_in_body_frame arm_in_camera_frame join_arms pixel_covariances",
-        "camera.projection": "check_intrinsics intrinsics map_pixel_covariance",
-        "camera.rig": "RigView as_rig undistortion_maps",
-        "camera.viewpoints": "PAPER_VIEWS Viewpoints",
-        "math.rotations": (
+        "camera._projection": (
+            "arm_in_body_frame arm_in_camera_frame check_intrinsics intrinsics join_arms "
+            "map_pixel_covariance pixel_covariances"
+        ),
+        "camera._rig": "RigView as_rig undistortion_maps",
+        "camera._viewpoints": "PAPER_VIEWS Viewpoints",
+        "math._rotations": (
             "ROTATION_ORDERS RotationOrder euler_to_matrix matrix_to_euler rotvec_to_matrix"
         ),
     },
     "torchpose.demo": {
-        "demo.mannequin": "ANGLE_LIMITS BodyAngles BodySize angles_to_joints",
-        "demo.performer": "hip_sway minimum_jerk performer_angles stage sway",
+        "demo._mannequin": "ANGLE_LIMITS BodyAngles BodySize angles_to_joints",
+        "demo._performer": "Performance hip_sway minimum_jerk performer_angles stage sway",
     },
     "torchpose.filters": {
+        "filters._constant_velocity": "ConstantVelocityState",
+        "filters._mkf": "MKFState",
+        "filters._particle": "ParticleState",
         "whole_body": (
-            "AnnealedParticleFilter BodyFilterState BodyTrack ConstrainedParticleFilter "
-            "FirstPose ManifoldParticleFilter RootUncertaintyTracker SIRParticleFilter "
-            "SilhouetteParticleFilter ValidationSequence constant_velocity_std "
+            "AnnealedParticleFilter BodyTrack ConstrainedParticleFilter ManifoldParticleFilter "
+            "RootUncertaintyTracker SIRParticleFilter SilhouetteParticleFilter constant_velocity_std "
             "default_step_std find_first_pose find_pose fit_sharpness motion_std"
         ),
+        "whole_body._filters.body_particles": "BodyFilterState",
+        "whole_body._first_pose": "FirstPose",
+        "whole_body._sharpness": "ValidationSequence",
     },
     "torchpose.io": {
         "_core.files": "atomic_path check_output_folder read_npz require_file write_npz",
-        "io.formats.axes": "AXES",
+        "io._formats.axes": "AXES",
+        "io._results": "ResultsFolder",
+    },
+    "torchpose.learning": {
+        "learning._model_card": "model_card write_model_card",
+        "learning._training": "arm_sources collect_poses",
     },
     "torchpose.math": {
-        "math.gaussian": (
-            "Gain condition kalman_correct kalman_gain least_exponent marginal "
-            "mended_cholesky product safe_cholesky symmetrise"
+        "math._gaussian": (
+            "Gain condition kalman_correct kalman_gain least_exponent marginal mended_cholesky "
+            "mixture_moments product safe_cholesky symmetrise"
         ),
-        "math.mixture_em": "FitReport MixtureParameters SufficientStatistics e_step m_step",
-        "math.quaternion_vectors": (
-            "cross_matrix minimal_rotation quaternion_to_vector vector_to_quaternion "
-            "within_unit_ball"
+        "math._mixture_em": "FitReport MixtureParameters SufficientStatistics e_step m_step",
+        "math._rotation_gaussians": (
+            "left_matrix quaternion_moments right_matrix sigma_quaternions turn_gaussian"
         ),
-        "math.rotation_gaussians": (
-            "left_matrix quaternion_moments right_matrix sigma_quaternions"
+        "math._rotations": (
+            "ROTATION_ORDERS RotationOrder cross_matrix minimal_rotation quaternion_to_vector "
+            "rotvec_to_matrix vector_to_quaternion within_unit_ball"
         ),
-        "math.rotations": "ROTATION_ORDERS RotationOrder",
-        "math.unscented": "DIRECTIONS Directions floor_eigenvalues moments",
+        "math._unscented": "DIRECTIONS Directions floor_eigenvalues moments sigma_points",
     },
     "torchpose.measure": {
-        "measure.association": "AssociationState HandAssociation",
-        "measure.background": "BackgroundModel",
-        "measure.brightness_background": "BrightnessBackground PixelKind",
-        "measure.edges": "Segments edge_map find_segments limb_votes",
-        "measure.face": "FaceTracks Region",
-        "measure.hand_measurements": "HandMeasurements",
-        "measure.hands": "HandState",
-        "measure.head_neck": "FACE_OFFSETS",
-        "measure.mean_shift": "MeanShift",
-        "measure.mean_shift_hands": "MeanShiftHandState",
-        "measure.mediapipe": "PoseLandmarks",
-        "measure.persons": "PersonRegister Persons",
-        "measure.skin": "SkinState rgb_to_lab",
-        "measure.skin_mixture": "SkinMixtureState",
-        "measure.torso": "TorsoElbows clothes_likelihood elbows_from_torso",
-        "measure.upper_body": "FrameMeasurements MEASURED MeasurerState",
-        "video.silhouettes": "SilhouetteMeasurer fit_view read_silhouettes",
+        "measure._association": "AssociationState HandAssociation",
+        "measure._background": "BackgroundModel",
+        "measure._brightness_background": "BrightnessBackground PixelKind",
+        "measure._edges": "Segments edge_map find_segments limb_votes",
+        "measure._face": "FaceTracker FaceTracks Region",
+        "measure._hand_likelihood": "HandMeasurements HandSettings",
+        "measure._hand_prior": "HandPrior",
+        "measure._hands": "HandState",
+        "measure._head": "FACE_OFFSETS FaceOffsets",
+        "measure._mean_shift": "MeanShift mean_shift",
+        "measure._mean_shift_hands": "MeanShiftHandState",
+        "measure._mediapipe": "PoseLandmarks",
+        "measure._persons": "PersonRegister Persons",
+        "measure._skin": "SkinState rgb_to_lab",
+        "measure._skin_mixture": "SkinMixtureState",
+        "measure._torso": "TorsoElbows clothes_likelihood elbows_from_torso",
+        "measure._upper_body": "FrameMeasurements MEASURED MeasurerState",
+        "video._silhouettes": "SilhouetteMeasurer fit_view read_silhouettes",
     },
     "torchpose.metrics": {
-        "metrics.calibration": "Coverage chi2_cdf chi2_quantile mahalanobis_squared",
-        "metrics.poses": (
+        "metrics._calibration": "Coverage chi2_cdf chi2_quantile mahalanobis_squared",
+        "metrics._poses": (
             "ALIGN_JOINTS ARM_LIMBS Alignment ErrorSummary PCP RigidMotion limb_hits share_below"
         ),
     },
     "torchpose.priors": {
-        "learning": (
-            "TRAINING_VIEWS arm_sources collect_poses fit_upper_body_prior model_card "
-            "write_model_card"
+        "learning": "TRAINING_VIEWS fit_upper_body_prior",
+        "learning._model_card": "model_card write_model_card",
+        "learning._training": "arm_sources collect_poses",
+        "math._mixture_em": (
+            "FitReport MixtureParameters SufficientStatistics e_step expectation_maximisation m_step"
         ),
-        "math.mixture_em": (
-            "FitReport MixtureParameters SufficientStatistics e_step expectation_maximisation "
-            "m_step"
-        ),
-        "skeleton.neck": (
+        "priors._actions.file": "ActionInfo",
+        "priors._arm_state": "arm_states mirror_arm_state mirror_mixture",
+        "priors._prior_file": "PriorInfo",
+        "skeleton._torso": (
             "NeckFraction NeckOffset learn_neck_fraction learn_neck_offset place_neck"
         ),
     },
     "torchpose.skeleton": {
-        "skeleton.joint_sets": "canonical_names",
-        "skeleton.neck": (
+        "skeleton._joint_sets": "canonical_names",
+        "skeleton._torso": (
             "NeckFraction NeckOffset learn_neck_fraction learn_neck_offset place_neck"
         ),
-        "skeleton.upper_body": (
-            "ARM_JOINTS BONES NECK_KINDS OTHER_SIDE UpperBodyMap measure_neck_kind scale_bones"
+        "skeleton._upper_body": (
+            "ARM_JOINTS BONES LIMBS NECK_KINDS OTHER_SIDE UpperBodyMap measure_neck_kind mirror_pose "
+            "scale_bones"
         ),
     },
-    "torchpose.viz": {
-        "viz.prior_pictures": "plot_log_likelihood",
+    "torchpose.upper_body": {
+        "upper_body._live": "StreamState",
     },
-    "torchpose.video.recording": {"video.recording": "Recording=TrackedRecording"},
+    "torchpose.video": {
+        "video._base": "Image",
+        "video._prefetch": "prefetch",
+        "video._silhouettes": "fit_view",
+    },
+    "torchpose.video._recording": {
+        "video._recording": "Recording=TrackedRecording",
+    },
+    "torchpose.viz": {
+        "viz._prior_pictures": "plot_log_likelihood",
+    },
+    "torchpose.whole_body": {
+        "whole_body._filters.body_particles": "BodyFilterState joint_covariance",
+        "whole_body._first_pose": "FirstPose",
+        "whole_body._sharpness": "ValidationSequence",
+        "whole_body._silhouettes.likelihood": "intersection_over_union",
+        "whole_body._silhouettes.rendering": (
+            "PreparedSilhouettes SilhouetteCounts prepare_silhouettes render_limbs"
+        ),
+        "whole_body._silhouettes.shape": "fit_radii",
+    },
 }
 """Names that a package or module had: present home (without `torchpose.`) to the names in it.
 
@@ -310,6 +369,9 @@ def present_module(old: str) -> str | None:
         home = MODULES.get(".".join(parts[:length]))
         if home is not None:
             return ".".join(["torchpose", home, *parts[length:]])
+    *folder, name = parts
+    if (_PACKAGE.joinpath(*folder) / f"_{name}.py").is_file():
+        return ".".join(["torchpose", *folder, f"_{name}"])
     return None
 
 
@@ -371,7 +433,7 @@ class _OldNames:
     ) -> ModuleSpec | None:
         if not fullname.startswith("torchpose."):
             return None
-        if fullname.startswith("torchpose.protocols.") and fullname.split(".")[2] in LABORATORY:
+        if fullname.removeprefix("torchpose.") in LABORATORY:
             raise ModuleNotFoundError(
                 f"{fullname} is no part of the package any more; from a checkout of torchpose it is "
                 "run by python -m benchmarks.NAME (docs/benchmarks.md)",

@@ -20,9 +20,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from torchpose._core.fields import sizes_fit
 from torchpose._core.files import atomic_path
-from torchpose._core.reading import reading, require_file
+from torchpose._core.reading import reading, require_file, sizes_fit
 from torchpose.errors import (
     FileFormatError,
     OutputError,

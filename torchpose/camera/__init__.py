@@ -1,19 +1,10 @@
 """Cameras: pinhole models, rigs, projection and lifting, viewpoints."""
 
 from torchpose._core.facade import set_up_facade
-from torchpose.camera.pinhole import (
-    PinholeCamera,
-    load_cameras,
-    save_cameras,
-)
-from torchpose.camera.projection import (
-    backproject,
-    lift,
-    map_pixels,
-    project,
-)
-from torchpose.camera.rig import CameraRig
-from torchpose.camera.viewpoints import ViewRange, sample_viewpoints
+from torchpose.camera._pinhole import PinholeCamera, load_cameras, save_cameras
+from torchpose.camera._projection import backproject, lift, map_pixels, project
+from torchpose.camera._rig import CameraRig
+from torchpose.camera._viewpoints import ViewRange, sample_viewpoints
 
 __all__ = [
     "CameraRig",

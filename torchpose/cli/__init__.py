@@ -11,7 +11,7 @@ from argparse import ArgumentError
 from collections.abc import Callable, Sequence
 from importlib import import_module
 
-__all__ = ["guarded", "main"]
+__all__ = ["main"]
 
 COMMANDS = {
     "track": "2D keypoints to 2D and 3D poses",

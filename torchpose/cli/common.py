@@ -172,6 +172,6 @@ def pictures_possible(wanted: bool) -> bool:
 
 def save_pictures(folder: Path, pictures: dict[str, Callable[[], Any]]) -> list[Path]:
     """Draw and write pictures by file name; returns their paths."""
-    from torchpose.viz.style import save_figure
+    from torchpose.viz._style import save_figure
 
     return [save_figure(draw(), folder / name) for name, draw in pictures.items()]

@@ -9,8 +9,8 @@ from torchpose.cli.common import add_seed, new_parser, pictures_possible
 from torchpose.errors import InputError
 
 if TYPE_CHECKING:
-    from torchpose.io.results import ResultsFolder
-    from torchpose.priors.upper_body import UpperBodyPrior
+    from torchpose.io._results import ResultsFolder
+    from torchpose.priors._upper_body import UpperBodyPrior
 
 _EXAMPLES = """
 torchpose demo --out demo-output
@@ -72,7 +72,7 @@ def build() -> ArgumentParser:
 def run(args: Namespace) -> int:
     """Perform, track, score, draw; exit code 1 if the mean pose, or standing still, is not beaten."""
     from torchpose.cli.track_output import track_results
-    from torchpose.priors.upper_body import load_prior
+    from torchpose.priors._upper_body import load_prior
 
     if args.input not in _INPUTS:
         raise InputError(f"--input must be one of {', '.join(_INPUTS)}, got {args.input!r}")

@@ -17,11 +17,11 @@ from torchpose.cli.demo_scores import (
 from torchpose.cli.track_output import track_pictures, write_track
 
 if TYPE_CHECKING:
-    from torchpose.demo.performer import Performance
-    from torchpose.io.keypoints import Keypoints
-    from torchpose.io.results import ResultsFolder
-    from torchpose.priors.upper_body import UpperBodyPrior
-    from torchpose.upper_body.pose_track import PoseTrack
+    from torchpose.demo._performer import Performance
+    from torchpose.io._keypoints import Keypoints
+    from torchpose.io._results import ResultsFolder
+    from torchpose.priors._upper_body import UpperBodyPrior
+    from torchpose.upper_body._pose_track import PoseTrack
 
 __all__ = ["demo_keypoints", "perform", "track_clip"]
 
@@ -34,7 +34,7 @@ def demo_keypoints(
     prior: "UpperBodyPrior", results: "ResultsFolder", seconds: float, seed: int, pictures: bool
 ) -> int:
     """Perform, track, score, draw; exit code 1 if the mean pose is not beaten."""
-    from torchpose.io.keypoints import write_keypoints
+    from torchpose.io._keypoints import write_keypoints
 
     performance, clip, gap = perform(seconds, seed)
     tracks = {
@@ -65,9 +65,9 @@ def perform(seconds: float, seed: int) -> tuple["Performance", "Keypoints", slic
 
     The gap takes one second out of the wave; in short performances it is earlier and shorter.
     """
-    from torchpose.demo.performer import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
-    from torchpose.io.keypoints import Keypoints
-    from torchpose.skeleton.upper_body import measure_neck_kind
+    from torchpose.demo._performer import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
+    from torchpose.io._keypoints import Keypoints
+    from torchpose.skeleton._upper_body import measure_neck_kind
 
     n_frames = round(seconds * _FPS)
     performance = performer(n_frames, _FPS, seed)
@@ -90,8 +90,8 @@ def perform(seconds: float, seed: int) -> tuple["Performance", "Keypoints", slic
 
 def track_clip(prior: "UpperBodyPrior", clip: "Keypoints", smoothing: str | None) -> "PoseTrack":
     """Poses from the keypoints by the mixture Kalman filter with fixed tracks."""
-    from torchpose.camera.pinhole import PinholeCamera
-    from torchpose.upper_body.tracker import UpperBodyTracker
+    from torchpose.camera._pinhole import PinholeCamera
+    from torchpose.upper_body._tracker import UpperBodyTracker
 
     camera = PinholeCamera.from_matrix(clip.K)
     tracker = UpperBodyTracker(prior, camera, fps=clip.fps, smoothing=smoothing, neck=clip.neck)

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchpose.priors.upper_body import UpperBodyPrior
-    from torchpose.upper_body.pose_track import PoseTrack
+    from torchpose.priors._upper_body import UpperBodyPrior
+    from torchpose.upper_body._pose_track import PoseTrack
 
 __all__ = [
     "MEAN_POSE",
@@ -45,9 +45,9 @@ class Hidden(NamedTuple):
 
 def score(track: "PoseTrack", truth: "Tensor") -> Scores:
     """Errors and coverage of a track of true joints [T, 8, 3] before `demo_camera`."""
-    from torchpose.demo.performer import demo_camera
-    from torchpose.metrics.calibration import coverage
-    from torchpose.metrics.poses import align, joint_errors_2d, joint_errors_3d
+    from torchpose.demo._performer import demo_camera
+    from torchpose.metrics._calibration import coverage
+    from torchpose.metrics._poses import align, joint_errors_2d, joint_errors_3d
 
     points = demo_camera()(truth)[..., :2]
     points3d, covariance, _ = align(track.joints3d[0], truth, covariance=track.covariance3d[0])
@@ -61,15 +61,15 @@ def score(track: "PoseTrack", truth: "Tensor") -> Scores:
 
 def score_mean_pose(prior: "UpperBodyPrior", truth: "Tensor") -> Scores:
     """Errors of the mean pose of the prior, which does not move."""
-    from torchpose.metrics.poses import joint_errors_3d
+    from torchpose.metrics._poses import joint_errors_3d
 
     return Scores(joint_errors_3d(prior.mean_pose().expand_as(truth), truth))
 
 
 def report(scores: dict[str, Scores], measured: str, hidden: Hidden | None = None) -> str:
     """Table of errors per joint, pixel errors and coverage, one column for each estimate."""
-    from torchpose.skeleton.joint_sets import UPPER_BODY
-    from torchpose.viz.style import readable
+    from torchpose.skeleton._joint_sets import UPPER_BODY
+    from torchpose.viz._style import readable
 
     n_frames = next(iter(scores.values())).errors3d.shape[0]
     rows = {

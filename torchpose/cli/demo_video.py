@@ -12,12 +12,12 @@ from torchpose.cli.track_output import camera_text, track_pictures
 from torchpose.cli.track_video import write_overlay, write_people
 
 if TYPE_CHECKING:
-    from torchpose.demo.performer import Performance
-    from torchpose.io.results import ResultsFolder
-    from torchpose.priors.upper_body import UpperBodyPrior
-    from torchpose.upper_body.pose_track import PoseTrack
-    from torchpose.video.recording import TrackedPerson
-    from torchpose.video.tracker import VideoTracker
+    from torchpose.demo._performer import Performance
+    from torchpose.io._results import ResultsFolder
+    from torchpose.priors._upper_body import UpperBodyPrior
+    from torchpose.upper_body._pose_track import PoseTrack
+    from torchpose.video._recording import TrackedPerson
+    from torchpose.video._tracker import VideoTracker
 
 __all__ = ["demo_video"]
 
@@ -29,9 +29,9 @@ def demo_video(
     prior: "UpperBodyPrior", results: "ResultsFolder", seconds: float, seed: int, pictures: bool
 ) -> int:
     """Render, track, score, draw; exit code 1 if the mean pose is not beaten."""
-    from torchpose.demo.performer import demo_camera, performer
-    from torchpose.video.source import open_video
-    from torchpose.video.tracker import VideoTracker
+    from torchpose.demo._performer import demo_camera, performer
+    from torchpose.video._source import open_video
+    from torchpose.video._tracker import VideoTracker
 
     share_cores()
     performance, camera = (
@@ -75,8 +75,8 @@ def demo_video(
 
 
 def _render(clip: Path, performance: "Performance", seed: int) -> None:
-    from torchpose.demo.performer import demo_camera
-    from torchpose.demo.rendering.truth import render_video
+    from torchpose.demo._performer import demo_camera
+    from torchpose.demo._rendering.performer import render_video
 
     print(f"rendering {len(performance.joints)} frames ...", flush=True)
     render_video(clip, performance, demo_camera(), seed=seed)
@@ -84,8 +84,8 @@ def _render(clip: Path, performance: "Performance", seed: int) -> None:
 
 def _smoothed(tracker: "VideoTracker", person: "TrackedPerson") -> "PoseTrack":
     """The poses from the same measurements, all frames together."""
-    from torchpose.upper_body.tracker import UpperBodyTracker
-    from torchpose.video.recording import smoothed
+    from torchpose.upper_body._tracker import UpperBodyTracker
+    from torchpose.video._recording import smoothed
 
     smoother = UpperBodyTracker(
         tracker.tracker.prior, tracker.tracker.camera, fps=_FPS, smoothing="full", max_gap=None
@@ -103,7 +103,7 @@ def _seen(person: "TrackedPerson") -> str:
 def _write_report(
     out: Path, people: "list[TrackedPerson]", performance: "Performance", camera: str
 ) -> Path:
-    from torchpose.viz.report.page import write_report
+    from torchpose.viz._report.page import write_report
 
     first = people[0].first_frame
     return write_report(

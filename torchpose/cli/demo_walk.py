@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchpose.demo.rendering.gait import Walk
+    from torchpose.demo._rendering.walk import Walk
 
 __all__ = ["demo_walk"]
 
@@ -29,8 +29,8 @@ _PARTS = ("neck", "elbow", "wrist", "hip", "knee", "ankle")
 def demo_walk(folder: str, seconds: float, seed: int, pictures: bool) -> int:
     """Render, track by `torchpose track-body`, score; exit code 1 if standing still is not beaten."""
     from torchpose.cli import track_body
-    from torchpose.demo.rendering.gait import walk
-    from torchpose.whole_body.poses import BodyPoses
+    from torchpose.demo._rendering.walk import walk
+    from torchpose.whole_body._poses import BodyPoses
 
     print(_SAID.format(height=_HEIGHT))
     walker, out = walk(seconds, _FPS, _HEIGHT, seed), Path(folder)
@@ -67,10 +67,9 @@ def demo_walk(folder: str, seconds: float, seed: int, pictures: bool) -> int:
 
 def _render(walker: "Walk", out: Path, seed: int) -> tuple[list[Path], list[Path]]:
     """Write videos, pictures of the empty scenes, cameras and truth; returns videos and pictures."""
-    from torchpose.camera.pinhole import save_cameras
-    from torchpose.demo.rendering.body_video import render_body_video, walk_clip
-    from torchpose.demo.rendering.cameras import cameras_around
-    from torchpose.io.results import ResultsFolder
+    from torchpose.camera._pinhole import save_cameras
+    from torchpose.demo._rendering.walk import cameras_around, render_body_video, walk_clip
+    from torchpose.io._results import ResultsFolder
 
     cameras = cameras_around(walk_clip(walker))
     expected = ["cameras.toml", "truth.npz"]

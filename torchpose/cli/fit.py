@@ -6,20 +6,14 @@ from typing import TYPE_CHECKING, Any
 from jsonargparse import ArgumentParser, Namespace
 
 from torchpose._core.terminal import show_progress
-from torchpose.cli.common import (
-    add_seed,
-    command_line,
-    input_files,
-    new_parser,
-    pictures_possible,
-)
+from torchpose.cli.common import add_seed, command_line, input_files, new_parser, pictures_possible
 from torchpose.cli.fit_bodies import KINDS
 from torchpose.cli.fit_bodies import main as fit_bodies
 from torchpose.errors import InputError
 
 if TYPE_CHECKING:
-    from torchpose.io.recordings import Recording
-    from torchpose.priors.upper_body import UpperBodyPrior
+    from torchpose.io._recordings import Recording
+    from torchpose.priors._upper_body import UpperBodyPrior
 
 _EXAMPLES = """
 torchpose fit recordings/ --out prior.safetensors
@@ -119,8 +113,8 @@ def build() -> ArgumentParser:
 
 def run(args: Namespace) -> int:
     """Read, curate, fit, write and report; every check of an option comes before any work."""
-    from torchpose.io.recordings import find_recordings, read_recordings
-    from torchpose.learning.fit_files import check_fit_file, fit_results, write_prior_files
+    from torchpose.io._recordings import find_recordings, read_recordings
+    from torchpose.learning._fit_files import check_fit_file, fit_results, write_prior_files
 
     _check_options(args)
     out = check_fit_file(args.out)
@@ -140,15 +134,15 @@ def _fit(recordings: list["Recording"], args: Namespace, name: str) -> "UpperBod
     facts = {"name": name, "licence": args.licence, "command": recorded_command(args)}
     own = {"neck": args.neck} | ({"n_samples": args.samples} if args.samples else {})
     if args.noise == "none":
-        from torchpose.learning.upper_body import fit_upper_body_prior
+        from torchpose.learning._upper_body import fit_upper_body_prior
 
         settings: dict[str, Any] = facts | own | {"progress": show_progress()}
         return fit_upper_body_prior(recordings, args.components, args.seed, **settings)
-    from torchpose.learning.recipes.upper_body import UpperBodyRecipe
+    from torchpose.learning._recipes.upper_body import UpperBodyRecipe
 
     if args.noise_of is not None:
-        from torchpose.learning.recipes.renewal import renew_noise
-        from torchpose.priors.upper_body import load_prior
+        from torchpose.learning._recipes.renewal import renew_noise
+        from torchpose.priors._upper_body import load_prior
 
         before = load_prior(args.noise_of)
         return renew_noise(
@@ -172,8 +166,8 @@ def _curated(
     """Recordings without what is no body, what was dropped in words, and as facts for the card."""
     if not args.curate:
         return recordings, {"said": f"read     {_count(recordings)}", "facts": {}}
-    from torchpose.learning.curation import curate
-    from torchpose.learning.curation.curate import CurationSettings
+    from torchpose.learning._curation import curate
+    from torchpose.learning._curation.curate import CurationSettings
 
     curated = curate(recordings, CurationSettings(harmonise=args.harmonise))
     report = curated.report
@@ -182,15 +176,15 @@ def _curated(
 
 def _without(recordings: list["Recording"], persons: list[str]) -> list["Recording"]:
     """Recordings of everybody else."""
-    from torchpose.learning.curation.splits import pick_persons
+    from torchpose.learning._curation.splits import pick_persons
 
     out = pick_persons(persons, sorted({r.person_id for r in recordings}))
     return [r for r in recordings if r.person_id not in out]
 
 
 def _check_options(args: Namespace) -> None:
-    from torchpose.io.formats.axes import AXES
-    from torchpose.skeleton.upper_body import NECK_KINDS
+    from torchpose.io._formats.axes import AXES
+    from torchpose.skeleton._upper_body import NECK_KINDS
 
     for option, value, known in (
         ("--axes", args.axes, AXES),

@@ -11,7 +11,7 @@ from torchpose.cli.common import add_seed, command_line, input_files, new_parser
 from torchpose.errors import InputError
 
 if TYPE_CHECKING:
-    from torchpose.io.results import ResultsFolder
+    from torchpose.io._results import ResultsFolder
 
 __all__ = ["KINDS", "build", "main"]
 
@@ -77,8 +77,8 @@ def build(kind: str) -> ArgumentParser:
 
 def run(kind: str, args: Namespace) -> int:
     """Read, fit, write and report; every check of an option comes before any work."""
-    from torchpose.io.formats.axes import AXES
-    from torchpose.learning.fit_files import check_fit_file, fit_results
+    from torchpose.io._formats.axes import AXES
+    from torchpose.learning._fit_files import check_fit_file, fit_results
 
     if args.axes is not None and args.axes not in AXES:
         raise InputError(f"--axes must be one of {', '.join(AXES)}, got {args.axes!r}")
@@ -125,8 +125,8 @@ def _manifold_options(parser: ArgumentParser) -> None:
 def _fit_manifold(
     args: Namespace, results: "ResultsFolder", out: Path, facts: dict[str, str]
 ) -> str:
-    from torchpose.learning.fit_files import write_manifold_files
-    from torchpose.learning.recipes.manifold import (
+    from torchpose.learning._fit_files import write_manifold_files
+    from torchpose.learning._recipes.manifold import (
         ManifoldFitting,
         ManifoldPoses,
         ManifoldRecipe,
@@ -159,8 +159,8 @@ def _limb_options(parser: ArgumentParser) -> None:
 
 
 def _fit_limbs(args: Namespace, results: "ResultsFolder", out: Path, facts: dict[str, str]) -> str:
-    from torchpose.learning.fit_files import write_limb_files
-    from torchpose.learning.recipes.limbs import LimbStates, check_least_std
+    from torchpose.learning._fit_files import write_limb_files
+    from torchpose.learning._recipes.limbs import LimbStates, check_least_std
 
     check_least_std(args.least_std)
     states = LimbStates.gather(args.recordings, without=args.without_files, **_chosen(args))
@@ -200,8 +200,8 @@ def _action_options(parser: ArgumentParser) -> None:
 def _fit_actions(
     args: Namespace, results: "ResultsFolder", out: Path, facts: dict[str, str]
 ) -> str:
-    from torchpose.learning.fit_files import write_action_files
-    from torchpose.learning.recipes.actions import ActionRecipe, Performances, fit_actions
+    from torchpose.learning._fit_files import write_action_files
+    from torchpose.learning._recipes.actions import ActionRecipe, Performances, fit_actions
 
     names = ("n_dimensions", "n_postures", "prominence", "stay", "spread", "background",
              "evidence_rate", "gate_dimensions", "seed")  # fmt: skip

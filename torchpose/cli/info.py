@@ -12,8 +12,8 @@ from torchpose.errors import InputError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchpose.io.keypoints import Keypoints
-    from torchpose.priors.upper_body import UpperBodyPrior
+    from torchpose.io._keypoints import Keypoints
+    from torchpose.priors._upper_body import UpperBodyPrior
 
 _EXAMPLES = """
 torchpose info
@@ -64,8 +64,8 @@ def _installation() -> str:
     import torch
 
     import torchpose
-    from torchpose.priors.shipped import KINDS, known_models
-    from torchpose.priors.upper_body import known_priors
+    from torchpose.priors._shipped import KINDS, known_models
+    from torchpose.priors._upper_body import known_priors
 
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     return _table(
@@ -81,7 +81,7 @@ def _installation() -> str:
 
 
 def _describe(what: str) -> str:
-    from torchpose.priors.upper_body import known_priors, load_prior
+    from torchpose.priors._upper_body import known_priors, load_prior
 
     path = Path(what)
     files = _models_of(what) or (
@@ -107,22 +107,22 @@ def _describe(what: str) -> str:
         return _describe_recordings(path)
     if path.suffix == ".csv" and not _starts_as_keypoints(path):
         return _describe_recordings(path)
-    from torchpose.io.keypoints import read_keypoints
+    from torchpose.io._keypoints import read_keypoints
 
     return describe_keypoints(read_keypoints(path))
 
 
 def _models_of(name: str) -> list[Path]:
     """Files of the models of whole bodies that come with the package under this name."""
-    from torchpose.priors.shipped import KINDS, find_model, known_models
+    from torchpose.priors._shipped import KINDS, find_model, known_models
 
     return [find_model(kind, name) for kind in KINDS if name in known_models(kind)]
 
 
 def _describe_npz(path: Path) -> str:
     """Poses, recordings or keypoints, by the keys."""
-    from torchpose._core.npz import npz_keys
-    from torchpose.io.keypoints import read_keypoints
+    from torchpose._core.reading import npz_keys
+    from torchpose.io._keypoints import read_keypoints
 
     keys = set(npz_keys(path))
     if {"state", "body_frame"} <= keys:
@@ -173,7 +173,7 @@ def describe_prior(prior: "UpperBodyPrior") -> str:
 
 def describe_poses(path: Path) -> str:
     """Frames, shares, uncertainty and notes of a file of poses."""
-    from torchpose.upper_body.pose_track import PoseTrack
+    from torchpose.upper_body._pose_track import PoseTrack
 
     track = PoseTrack.load(path)
     std = track.covariance3d.diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(0).sqrt()
@@ -209,10 +209,10 @@ def _sample_sizes(size: "Tensor") -> str:
 
 def describe_keypoints(keypoints: "Keypoints") -> str:
     """Frames, joints, camera of a file of keypoints."""
-    from torchpose.camera.pinhole import PinholeCamera
+    from torchpose.camera._pinhole import PinholeCamera
     from torchpose.cli.track_output import camera_text, percent
-    from torchpose.skeleton.joint_sets import UPPER_BODY
-    from torchpose.skeleton.upper_body import upper_body_indices
+    from torchpose.skeleton._joint_sets import UPPER_BODY
+    from torchpose.skeleton._upper_body import upper_body_indices
 
     found = upper_body_indices(keypoints.names)
     shares = keypoints.measured.double().mean(0).tolist()
@@ -238,7 +238,7 @@ def describe_keypoints(keypoints: "Keypoints") -> str:
 
 
 def _describe_recordings(path: Path) -> str:
-    from torchpose.io.recordings import read_recordings
+    from torchpose.io._recordings import read_recordings
 
     recordings = read_recordings(path)
     frames = sum(len(r) for r in recordings)
@@ -256,7 +256,7 @@ def _describe_recordings(path: Path) -> str:
 
 
 def _describe_cameras(path: Path) -> str:
-    from torchpose.camera.pinhole import load_cameras
+    from torchpose.camera._pinhole import load_cameras
     from torchpose.cli.track_output import camera_text
 
     return _table({name: camera_text(camera) for name, camera in load_cameras(path).items()})

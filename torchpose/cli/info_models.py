@@ -13,7 +13,7 @@ _LISTED, _SOURCES = 12, 3  # persons or actions that are named, and sources
 
 def describe_manifold(path: Path) -> Facts:
     """A manifold of poses."""
-    from torchpose.priors.manifold.gplvm import BackConstrainedGPLVM
+    from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 
     manifold = BackConstrainedGPLVM.load(path)
     info = manifold.info
@@ -34,7 +34,7 @@ def describe_manifold(path: Path) -> Facts:
 
 def describe_limbs(path: Path) -> Facts:
     """Limb conditionals: how far each limb turns against the one above it, and how fast."""
-    from torchpose.priors.limb_conditionals import LimbConditionals
+    from torchpose.priors._limb_conditionals import LimbConditionals
 
     limbs = LimbConditionals.load(path)
     info = limbs.info
@@ -61,7 +61,7 @@ def describe_limbs(path: Path) -> Facts:
 
 def describe_action(path: Path) -> Facts:
     """The postures of one action."""
-    from torchpose.priors.actions.space import ActionSpace
+    from torchpose.priors._actions.space import ActionSpace
 
     space = ActionSpace.load(path)
     info = space.info
@@ -85,7 +85,7 @@ def describe_action(path: Path) -> Facts:
 
 def describe_bank(path: Path) -> Facts:
     """The postures of several actions."""
-    from torchpose.priors.actions.bank import ActionBank
+    from torchpose.priors._actions.bank import ActionBank
 
     bank = ActionBank.load(path)
     info = bank.info
@@ -122,7 +122,7 @@ DESCRIBED: dict[str, Callable[[Path], Facts]] = {
 def describe_body_poses(path: Path) -> Facts:
     """Poses of a whole body, from `torchpose track-body`."""
     from torchpose.cli.track_body_output import action_text
-    from torchpose.whole_body.poses import BodyPoses
+    from torchpose.whole_body._poses import BodyPoses
 
     poses = BodyPoses.load(path)
     spread = poses.covariance3d.diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(0).sqrt().mean(0)

@@ -124,7 +124,7 @@ def checked_data(data: Data, args: Namespace) -> Any:
 def _refuse_other_reports(out: Path) -> None:
     """See that the report will be written over none but an earlier one."""
     from torchpose.evaluation.report import RESULTS
-    from torchpose.io.results import refuse_stranger
+    from torchpose.io._results import refuse_stranger
 
     earlier = _is_report(out / "report.json")
     for name in ("report.json", "report.md"):

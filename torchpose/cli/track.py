@@ -29,7 +29,7 @@ def main(arguments: list[str]) -> int:
 
 def build() -> ArgumentParser:
     """Parser of the command."""
-    from torchpose.upper_body.methods import METHODS
+    from torchpose.upper_body._methods import METHODS
 
     parser = new_parser(
         "track",

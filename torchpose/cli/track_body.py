@@ -23,9 +23,9 @@ from torchpose.cli.track_body_videos import Recordings
 from torchpose.errors import CameraError, DegenerateFilterWarning, InputError, NobodySeenError
 
 if TYPE_CHECKING:
-    from torchpose.camera.pinhole import PinholeCamera
-    from torchpose.whole_body.poses import BodyPoses
-    from torchpose.whole_body.tracker import BodyTracker
+    from torchpose.camera._pinhole import PinholeCamera
+    from torchpose.whole_body._poses import BodyPoses
+    from torchpose.whole_body._tracker import BodyTracker
 
 _EXAMPLES = """
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 cam3.mp4 --out result
@@ -44,7 +44,7 @@ def main(arguments: list[str]) -> int:
 
 def build() -> ArgumentParser:
     """Return the parser of the command."""
-    from torchpose.whole_body.methods import METHODS
+    from torchpose.whole_body._methods import METHODS
 
     parser = new_parser(
         "track-body",
@@ -153,7 +153,7 @@ def _check(args: Namespace) -> None:
 
 
 def _cameras(args: Namespace) -> "list[PinholeCamera]":
-    from torchpose.camera.pinhole import load_cameras
+    from torchpose.camera._pinhole import load_cameras
 
     found = load_cameras(args.cameras)
     names = list(found) if args.camera_names is None else args.camera_names
@@ -168,7 +168,7 @@ def _cameras(args: Namespace) -> "list[PinholeCamera]":
 
 def _learnt(args: Namespace) -> dict[str, Any]:
     """Return the models that the options name; refuse options that do not go together."""
-    from torchpose.whole_body.methods import LEARNT, METHODS, check_options, choose_method
+    from torchpose.whole_body._methods import LEARNT, METHODS, check_options, choose_method
 
     given = {kind: getattr(args, kind) for kind in _LEARNT if getattr(args, kind)}
     method = choose_method(args.method, given)
@@ -180,7 +180,7 @@ def _learnt(args: Namespace) -> dict[str, Any]:
 
 
 def _tracker(args: Namespace, recordings: "Recordings", learnt: dict[str, Any]) -> "BodyTracker":
-    from torchpose.whole_body.tracker import BodyTracker
+    from torchpose.whole_body._tracker import BodyTracker
 
     options = {} if args.sharpness is None else {"sharpness": args.sharpness}
     return BodyTracker(
@@ -193,8 +193,8 @@ def _track(args: Namespace, recordings: "Recordings", tracker: "BodyTracker") ->
     """Find the person, then track; None if there is nobody."""
     import torch
 
-    from torchpose.body.fitting import fit_state
-    from torchpose.whole_body.poses import BodyPoses
+    from torchpose.body._fitting import fit_state
+    from torchpose.whole_body._poses import BodyPoses
 
     start, facing = None, None
     frames = recordings.silhouettes()

@@ -12,12 +12,12 @@ from torchpose.cli.common import input_files
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchpose.camera.pinhole import PinholeCamera
+    from torchpose.camera._pinhole import PinholeCamera
     from torchpose.cli.track_body_videos import Recordings
-    from torchpose.io.results import ResultsFolder
-    from torchpose.video.silhouettes import SilhouetteView
-    from torchpose.whole_body.poses import BodyPoses
-    from torchpose.whole_body.tracker import BodyTracker
+    from torchpose.io._results import ResultsFolder
+    from torchpose.video._silhouettes import SilhouetteView
+    from torchpose.whole_body._poses import BodyPoses
+    from torchpose.whole_body._tracker import BodyTracker
 
 __all__ = [
     "action_text",
@@ -39,7 +39,7 @@ def body_results(
     args: Namespace, cameras: "Sequence[PinholeCamera]", pictures: bool
 ) -> "ResultsFolder":
     """Return the folder of `--out`, for poses of a body and what shows them."""
-    from torchpose.io.results import ResultsFolder, holds_arrays
+    from torchpose.io._results import ResultsFolder, holds_arrays
 
     videos = [_overlay_name(camera.name) for camera in cameras] if args.overlay else []
     return ResultsFolder(
@@ -86,7 +86,7 @@ def draw(
     """Draw the body into the frames of every camera: videos, and some frames as one picture."""
     from contextlib import ExitStack
 
-    from torchpose.video.writer import VideoWriter
+    from torchpose.video._writer import VideoWriter
 
     names = recordings.rig.names
     files = [out / _overlay_name(name) for name in names] if videos else []
@@ -115,8 +115,8 @@ def draw(
 def _drawn(
     recordings: "Recordings", poses: "BodyPoses", t: int, images: Iterable[Any]
 ) -> list[Any]:
-    from torchpose.video.body_overlay import draw_body
-    from torchpose.whole_body.silhouettes.rendering import render
+    from torchpose.video._overlay import draw_body
+    from torchpose.whole_body._silhouettes.rendering import render
 
     k, rig = t - poses.first_frame, recordings.rig
     height, width = rig.sizes[0]  # type: ignore[misc]  # views have sizes
@@ -224,7 +224,7 @@ def write_page(
     recordings: "Recordings", poses: "BodyPoses", facts: dict[str, str], out: Path
 ) -> list[Path]:
     """Write the page with the first camera's overlay, the skeleton and curves."""
-    from torchpose.viz.report.page import write_report
+    from torchpose.viz._report.page import write_report
 
     camera = recordings.views[0].source
     overlay = out / _overlay_name(recordings.rig.names[0])

@@ -9,10 +9,10 @@ from jsonargparse import Namespace
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchpose.camera.pinhole import PinholeCamera
-    from torchpose.camera.rig import CameraRig
-    from torchpose.video.base import VideoSource
-    from torchpose.video.silhouettes import SilhouetteMeasurer
+    from torchpose.camera._pinhole import PinholeCamera
+    from torchpose.camera._rig import CameraRig
+    from torchpose.video._base import VideoSource
+    from torchpose.video._silhouettes import SilhouetteMeasurer
 
 __all__ = ["Recordings"]
 
@@ -21,7 +21,7 @@ class Recordings:
     """The videos, how each becomes silhouettes, and the silhouettes that were seen so far."""
 
     def __init__(self, args: Namespace, cameras: "Sequence[PinholeCamera]") -> None:
-        from torchpose.video.silhouettes import fit_views
+        from torchpose.video._silhouettes import fit_views
 
         self._args = args
         self.sources = self._open()
@@ -39,7 +39,7 @@ class Recordings:
     @cached_property
     def rig(self) -> "CameraRig":
         """The cameras of the silhouettes."""
-        from torchpose.camera.rig import CameraRig
+        from torchpose.camera._rig import CameraRig
 
         return CameraRig([view.camera for view in self.views])
 
@@ -64,7 +64,7 @@ class Recordings:
     def _read(self, measurers: "list[SilhouetteMeasurer]") -> "Iterator[Tensor]":
         import numpy as np
 
-        from torchpose.video.silhouettes import read_silhouettes
+        from torchpose.video._silhouettes import read_silhouettes
 
         for masks in read_silhouettes(self.sources, measurers, self._args.delays):
             self.packed.append(np.packbits(masks.numpy(), axis=-1))
@@ -81,7 +81,7 @@ class Recordings:
 
     def images(self) -> Iterator[tuple[Any, ...]]:
         """Read the frames of all cameras once more."""
-        from torchpose.video.silhouettes import frames_in_step
+        from torchpose.video._silhouettes import frames_in_step
 
         sources = self._open()
         try:
@@ -92,17 +92,17 @@ class Recordings:
                 source.close()
 
     def _open(self) -> "list[VideoSource]":
-        from torchpose.video.source import open_video
+        from torchpose.video._source import open_video
 
         return [open_video(path, fps=self._args.fps) for path in self._args.videos]
 
     def _measurers(self) -> "list[SilhouetteMeasurer]":
-        from torchpose.video.silhouettes import (
+        from torchpose.video._silhouettes import (
             SilhouetteMeasurer,
             learning_frames,
             read_empty_scene,
         )
-        from torchpose.video.source import open_video
+        from torchpose.video._source import open_video
 
         print("learning the background ...", flush=True)
         empty = [read_empty_scene(path) for path in self._args.background or []]

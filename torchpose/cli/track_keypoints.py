@@ -20,8 +20,8 @@ __all__ = ["track_keypoints"]
 
 def track_keypoints(args: Namespace) -> int:
     """Track, write and report, and return the exit code; every check comes before any work."""
-    from torchpose.io.keypoints import read_keypoints
-    from torchpose.upper_body.keypoint_files import KeypointFileTracker
+    from torchpose.io._keypoints import read_keypoints
+    from torchpose.upper_body._keypoint_files import KeypointFileTracker
 
     keypoints = read_keypoints(args.input)
     for option, value in (("--fps", args.fps), ("--max-gap", args.max_gap)):

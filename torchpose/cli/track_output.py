@@ -12,9 +12,9 @@ from torchpose.cli.common import input_files, save_pictures
 from torchpose.errors import InputError
 
 if TYPE_CHECKING:
-    from torchpose.io.results import ResultsFolder
-    from torchpose.upper_body.keypoint_files import TrackSettings
-    from torchpose.upper_body.pose_track import PoseTrack
+    from torchpose.io._results import ResultsFolder
+    from torchpose.upper_body._keypoint_files import TrackSettings
+    from torchpose.upper_body._pose_track import PoseTrack
 
 _POSES = ("poses.npz", "poses.csv", "poses.bvh")
 _PICTURES = ("pose_strip.png", "joint_curves.png")
@@ -37,7 +37,7 @@ __all__ = [
 
 def track_settings(args: Namespace) -> "TrackSettings":
     """Return the settings of a tracker that are among the options of the command."""
-    from torchpose.upper_body.keypoint_files import TrackSettings
+    from torchpose.upper_body._keypoint_files import TrackSettings
 
     if args.prior is None:  # as a configuration may say it
         raise InputError("--prior must be a name or a file, got null")
@@ -53,7 +53,7 @@ def track_results(
         args: of the command. pictures, video: whether they are going to be written.
         more: further names that are. own: pattern of further names that a run may write.
     """
-    from torchpose.io.results import ResultsFolder, holds_arrays
+    from torchpose.io._results import ResultsFolder, holds_arrays
 
     return ResultsFolder(
         args.out,
@@ -71,8 +71,7 @@ def write_track(track: "PoseTrack", out: Path, suffix: str = "") -> list[Path]:
     Args:
         suffix: of the names, such as "_p02".
     """
-    from torchpose.upper_body.bvh import write_bvh
-    from torchpose.upper_body.csv import write_pose_csv
+    from torchpose.upper_body._pose_files import write_bvh, write_pose_csv
 
     written = [out / f"poses{suffix}.{kind}" for kind in ("npz", "csv", "bvh")]
     track.save(written[0])

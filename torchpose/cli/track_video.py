@@ -25,10 +25,10 @@ from torchpose.cli.track_output import (
 from torchpose.errors import FileFormatError, InputError, OutputError
 
 if TYPE_CHECKING:
-    from torchpose.camera.pinhole import PinholeCamera
-    from torchpose.video.base import VideoSource
-    from torchpose.video.recording import TrackedPerson
-    from torchpose.video.tracker import VideoTracker
+    from torchpose.camera._pinhole import PinholeCamera
+    from torchpose.video._base import VideoSource
+    from torchpose.video._recording import TrackedPerson
+    from torchpose.video._tracker import VideoTracker
 
 _OVERLAY = "overlay.mp4"
 _KEYPOINTS = "keypoints are expected as .npz, .csv or a folder of OpenPose JSON files"
@@ -38,8 +38,8 @@ __all__ = ["track_video", "write_overlay", "write_people"]
 
 def track_video(args: Namespace) -> int:
     """Track everybody, write and report; exit code 1 if there is nobody."""
-    from torchpose.camera.choice import resolve_camera
-    from torchpose.priors.upper_body import load_prior
+    from torchpose.camera._choice import resolve_camera
+    from torchpose.priors._upper_body import load_prior
 
     for option, value in (("--fps", args.fps), ("--max-gap", args.max_gap)):
         check_positive(option, value)
@@ -88,7 +88,7 @@ def track_video(args: Namespace) -> int:
 
 
 def _open(where: str, fps: float | None) -> "VideoSource":
-    from torchpose.video.source import open_video
+    from torchpose.video._source import open_video
 
     try:
         return open_video(where, fps=fps)
@@ -109,8 +109,8 @@ def _refuse_keypoint_options(args: Namespace) -> None:
 
 
 def _tracker(args: Namespace, prior: Any, camera: "PinholeCamera", fps: float) -> "VideoTracker":
-    from torchpose.measure.mediapipe import MediaPipeFaceDetector
-    from torchpose.video.tracker import VideoTracker
+    from torchpose.measure._mediapipe import MediaPipeFaceDetector
+    from torchpose.video._tracker import VideoTracker
 
     detector = None if args.face_model is None else MediaPipeFaceDetector(args.face_model)
     return VideoTracker(
@@ -143,8 +143,8 @@ def _track_camera(
     tracker: "VideoTracker", source: "VideoSource", out: Path, overlay: bool
 ) -> tuple[list["TrackedPerson"], int]:
     """Everybody before a camera, shown on a page while it runs, until q, stop or Ctrl-C."""
-    from torchpose.video.live import LiveView
-    from torchpose.video.writer import VideoWriter
+    from torchpose.video._live import LiveView
+    from torchpose.video._writer import VideoWriter
 
     with contextlib.ExitStack() as stack:
         view = stack.enter_context(LiveView())
@@ -184,8 +184,8 @@ def write_overlay(
     """
     from tqdm.auto import tqdm
 
-    from torchpose.video import prefetch
-    from torchpose.video.writer import VideoWriter
+    from torchpose.video._prefetch import prefetch
+    from torchpose.video._writer import VideoWriter
 
     with source, VideoWriter(path, source.fps, source.size) as writer:
         bar = tqdm(total=n_frames, disable=not show_progress(), unit="frame", desc="overlay")
@@ -210,7 +210,7 @@ def _drawn(
     """A frame with the poses of everybody there, by place, of a frame of their tracks."""
     import torch
 
-    from torchpose.video.overlay import draw_overlay
+    from torchpose.video._overlay import draw_overlay
 
     at = {n: frame if isinstance(frame, int) else frame[n] for n in tracks}
     if not tracks:
@@ -243,7 +243,7 @@ def _write_report(
     notes: tuple[str, ...],
     title: str,
 ) -> list[Path]:
-    from torchpose.viz.report.page import write_report
+    from torchpose.viz._report.page import write_report
 
     overlay = out / _OVERLAY
     written = [overlay] if overlay.exists() else []

@@ -1,17 +1,10 @@
 """An animated performer with known joints: what the demo, the examples and the tests track."""
 
 from torchpose._core.facade import set_up_facade
-from torchpose.demo.performer import (
-    KEYPOINT_NAMES,
-    Performance,
-    demo_camera,
-    noisy_keypoints,
-    performer,
-)
+from torchpose.demo._performer import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 
 __all__ = [
     "KEYPOINT_NAMES",
-    "Performance",
     "demo_camera",
     "noisy_keypoints",
     "performer",

@@ -16,23 +16,23 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchpose._core.facade import package_version
-from torchpose.camera.pinhole import PinholeCamera
-from torchpose.camera.projection import project
-from torchpose.camera.viewpoints import sample_viewpoints
+from torchpose.camera._pinhole import PinholeCamera
+from torchpose.camera._projection import project
+from torchpose.camera._viewpoints import sample_viewpoints
 from torchpose.errors import InputError, TorchposeError
 from torchpose.evaluation.report import RESULTS, Report
-from torchpose.filters.base import Generators
-from torchpose.io.recordings import Recording
-from torchpose.io.results import replace_own
-from torchpose.learning.training import TRAINING_VIEWS, collect_poses
-from torchpose.math.rotations import euler_to_matrix
-from torchpose.metrics.calibration import Coverage, coverage, reliability
-from torchpose.metrics.poses import PCP, align, jitter, joint_errors_2d, joint_errors_3d, pcp
-from torchpose.priors.upper_body import UpperBodyPrior
-from torchpose.skeleton.joint_sets import UPPER_BODY
-from torchpose.skeleton.upper_body import mirror_pose
-from torchpose.upper_body.process_noise import default_process_cov
-from torchpose.upper_body.tracker import UpperBodyTracker
+from torchpose.filters._base import Generators
+from torchpose.io._recordings import Recording
+from torchpose.io._results import replace_own
+from torchpose.learning._training import TRAINING_VIEWS, collect_poses
+from torchpose.math._rotations import euler_to_matrix
+from torchpose.metrics._calibration import Coverage, coverage, reliability
+from torchpose.metrics._poses import PCP, align, jitter, joint_errors_2d, joint_errors_3d, pcp
+from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.skeleton._upper_body import mirror_pose
+from torchpose.upper_body._single_poses import default_process_cov
+from torchpose.upper_body._tracker import UpperBodyTracker
 
 __all__ = [
     "HANDS",
@@ -314,7 +314,7 @@ def data_folder(data: str | Path, name: str) -> Path:
 
 def add_picture(report: Report, out: Path, name: str, figure: Any) -> None:
     """Write a matplotlib figure to the folder and list it in the report."""
-    from torchpose.viz.style import save_figure
+    from torchpose.viz._style import save_figure
 
     with replace_own(out / name, RESULTS) as temporary:
         save_figure(figure, temporary)

@@ -16,9 +16,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.errors import PriorError, SkeletonError
-from torchpose.io.recordings import Recording
-from torchpose.skeleton.joint_sets import UPPER_BODY, canonical_names
-from torchpose.skeleton.neck import NeckOffset, learn_neck_offset, place_neck
+from torchpose.io._recordings import Recording
+from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
+from torchpose.skeleton._torso import NeckOffset, learn_neck_offset, place_neck
 
 __all__ = ["Completion", "complete", "facing_pieces", "learn_completion", "with_wrists"]
 

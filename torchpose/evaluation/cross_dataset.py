@@ -33,8 +33,8 @@ from torchpose.evaluation.cross_tables import add_added, add_cross, plot_cross
 from torchpose.evaluation.persons import by_person
 from torchpose.evaluation.report import Report
 from torchpose.evaluation.unseen import Job, ScoreSettings, fit_settings, run_jobs
-from torchpose.io.recordings import Recording, read_recordings
-from torchpose.learning.recipes.upper_body import fit_kinect_prior
+from torchpose.io._recordings import Recording, read_recordings
+from torchpose.learning._recipes.upper_body import fit_kinect_prior
 
 __all__ = ["run"]
 

@@ -115,7 +115,7 @@ def plot_cross(report: Report) -> Any:
     """Bars of the error on the test persons of each set, by training set."""
     from matplotlib.patches import Patch
 
-    from torchpose.viz.style import add_legend, method_styles, new_figure, style_axes
+    from torchpose.viz._style import add_legend, method_styles, new_figure, style_axes
 
     table = report["cross"]
     rows = {name.split(" (")[0]: name for name in table.rows if "all persons" not in name}

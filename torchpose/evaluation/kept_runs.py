@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from torchpose._core.files import write_npz
-from torchpose._core.npz import read_npz
+from torchpose._core.reading import read_npz
 from torchpose.errors import TorchposeError
 
 __all__ = ["keep", "kept", "read_kept", "source_hash"]

@@ -30,8 +30,8 @@ from torchpose.evaluation.person_tables import (
 from torchpose.evaluation.persons import by_person, renamed, spread
 from torchpose.evaluation.report import Report
 from torchpose.evaluation.unseen import Job, Scored, ScoreSettings, fit_settings, run_jobs
-from torchpose.io.recordings import Recording, read_recordings
-from torchpose.learning.recipes.upper_body import fit_kinect_prior
+from torchpose.io._recordings import Recording, read_recordings
+from torchpose.learning._recipes.upper_body import fit_kinect_prior
 
 __all__ = ["cyclic_subsets", "halves", "run"]
 
@@ -80,7 +80,7 @@ def run(
         window_components: Gaussians per arm over windows. window_samples: training windows.
         every: only each n-th sequence of a person is tracked. workers: processes.
         fits: folder of fitted priors, to share them with other protocols; `out` if None.
-        compare: other recipes to draw beside `torchpose.learning.recipes.fit_kinect_prior`, each as
+        compare: other recipes to draw beside `torchpose.learning._recipes.fit_kinect_prior`, each as
             NAME=module.function.
         recipes: names and functions, instead of all that.
 

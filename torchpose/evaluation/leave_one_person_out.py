@@ -23,8 +23,8 @@ from torchpose.evaluation.person_tables import (
 from torchpose.evaluation.persons import POSE_CLASSES, by_person, spread
 from torchpose.evaluation.report import Report
 from torchpose.evaluation.unseen import Job, Scored, ScoreSettings, fit_settings, run_jobs
-from torchpose.io.recordings import read_recordings
-from torchpose.learning.recipes.upper_body import fit_kinect_prior
+from torchpose.io._recordings import read_recordings
+from torchpose.learning._recipes.upper_body import fit_kinect_prior
 
 __all__ = ["run"]
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from torchpose.evaluation.common import HANDS, Scores, Trials, add_picture
 from torchpose.evaluation.report import Report
-from torchpose.metrics.poses import jitter, share_below
-from torchpose.priors.upper_body import UpperBodyPrior
-from torchpose.skeleton.joint_sets import UPPER_BODY
+from torchpose.metrics._poses import jitter, share_below
+from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.skeleton._joint_sets import UPPER_BODY
 
 __all__ = [
     "SHORT_NAMES",

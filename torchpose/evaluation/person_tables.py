@@ -105,7 +105,7 @@ def plot_persons(persons: Mapping[str, Scored], title: str) -> Any:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    from torchpose.viz.style import INK, add_legend, method_styles, new_figure, style_axes
+    from torchpose.viz._style import INK, add_legend, method_styles, new_figure, style_axes
 
     figure = new_figure(max(6.4, 0.62 * len(persons) + 2.8), 3.9, title)
     ax = style_axes(figure.add_subplot(), y="mean 3D error (cm)")
@@ -151,7 +151,7 @@ def plot_curves(curves: Mapping[str, Mapping[str, Curve]], title: str) -> Any:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    from torchpose.viz.style import INK, PALE, add_legend, method_styles, new_figure, style_axes
+    from torchpose.viz._style import INK, PALE, add_legend, method_styles, new_figure, style_axes
 
     figure = new_figure(4.6 * len(curves), 4.3, title)
     panels = figure.subplots(1, len(curves), sharey=True, squeeze=False)[0]
@@ -189,7 +189,7 @@ def plot_pose_classes(groups: Mapping[str, Scored], title: str) -> Any:
     """Error of hands and elbows by what the arm does, a bar for each group."""
     from matplotlib.patches import Patch
 
-    from torchpose.viz.style import add_legend, method_styles, new_figure, style_axes
+    from torchpose.viz._style import add_legend, method_styles, new_figure, style_axes
 
     figure = new_figure(7.6, 3.9, title)
     ax = style_axes(figure.add_subplot(), y="mean error of hand and elbow (cm)")

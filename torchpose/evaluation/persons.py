@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.io.recordings import Recording
-from torchpose.learning.curation.upper import measured, runs
+from torchpose.io._recordings import Recording
+from torchpose.learning._curation.joints import measured, runs
 
 __all__ = [
     "LEAST_FRAMES",

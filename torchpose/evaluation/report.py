@@ -12,12 +12,12 @@ from typing import Any
 from torch import Tensor
 
 from torchpose.errors import InputError
-from torchpose.io.results import replace_own
+from torchpose.io._results import replace_own
 
 __all__ = ["RESULTS", "Report", "Table"]
 
 RESULTS = "evaluate"
-"""Kind of the files in the folder of a protocol, for `torchpose.io.results.replace_own`."""
+"""Kind of the files in the folder of a protocol, for `torchpose.io._results.replace_own`."""
 
 Cell = float | int | str | None
 

@@ -35,11 +35,11 @@ from torchpose.evaluation.unseen import (
     log_likelihood,
     poses_to_score,
 )
-from torchpose.io.recordings import Recording, read_recordings
-from torchpose.metrics.poses import ALIGN_JOINTS, align, joint_errors
-from torchpose.priors.upper_body import UpperBodyPrior, load_prior
-from torchpose.skeleton.joint_sets import UPPER_BODY
-from torchpose.upper_body.methods import METHODS
+from torchpose.io._recordings import Recording, read_recordings
+from torchpose.metrics._poses import ALIGN_JOINTS, align, joint_errors
+from torchpose.priors._upper_body import UpperBodyPrior, load_prior
+from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.upper_body._methods import METHODS
 
 __all__ = ["run"]
 

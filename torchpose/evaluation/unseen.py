@@ -18,9 +18,9 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchpose._core.files import write_npz
-from torchpose._core.npz import read_npz
-from torchpose.camera.pinhole import PinholeCamera
-from torchpose.camera.viewpoints import ViewRange, sample_viewpoints
+from torchpose._core.reading import read_npz
+from torchpose.camera._pinhole import PinholeCamera
+from torchpose.camera._viewpoints import ViewRange, sample_viewpoints
 from torchpose.errors import InputError, PriorError, TorchposeError
 from torchpose.evaluation.common import (
     MEASURED,
@@ -34,14 +34,14 @@ from torchpose.evaluation.common import (
     track,
 )
 from torchpose.evaluation.persons import LEAST_FRAMES, complete_pieces, pose_classes
-from torchpose.io.recordings import Recording
-from torchpose.learning.recipes.upper_body import fit_kinect_prior
-from torchpose.metrics.calibration import chi2_quantile, mahalanobis_squared
-from torchpose.metrics.poses import ALIGN_JOINTS, align, joint_errors
-from torchpose.priors.arm_state import arm_states
-from torchpose.priors.upper_body import UpperBodyPrior
-from torchpose.skeleton.joint_sets import UPPER_BODY
-from torchpose.skeleton.neck import NeckOffset, learn_neck_offset, place_neck
+from torchpose.io._recordings import Recording
+from torchpose.learning._recipes.upper_body import fit_kinect_prior
+from torchpose.metrics._calibration import chi2_quantile, mahalanobis_squared
+from torchpose.metrics._poses import ALIGN_JOINTS, align, joint_errors
+from torchpose.priors._arm_state import arm_states
+from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.skeleton._torso import NeckOffset, learn_neck_offset, place_neck
 
 __all__ = [
     "CAMERA",

@@ -1,26 +1,23 @@
 """Recursive Bayesian filters over learned motion priors."""
 
 from torchpose._core.facade import set_up_facade
-from torchpose.filters.base import RecursiveFilter
-from torchpose.filters.constant_velocity import ConstantVelocityFilter, ConstantVelocityState
-from torchpose.filters.fixed_tracks import FixedTrackFilter
-from torchpose.filters.gamma import fit_gamma
-from torchpose.filters.mkf import MixtureKalmanFilter, MKFState
-from torchpose.filters.outputs import FilterOutput, StepOutput
-from torchpose.filters.particle import BootstrapParticleFilter, ParticleState
-from torchpose.filters.resampling import resample
-from torchpose.filters.sampled_tracks import SampledTrackFilter
-from torchpose.filters.split_tracks import SplitTrackFilter
+from torchpose.filters._base import RecursiveFilter
+from torchpose.filters._constant_velocity import ConstantVelocityFilter
+from torchpose.filters._fixed_tracks import FixedTrackFilter
+from torchpose.filters._mkf import MixtureKalmanFilter
+from torchpose.filters._outputs import FilterOutput, StepOutput
+from torchpose.filters._particle import BootstrapParticleFilter
+from torchpose.filters._resampling import resample
+from torchpose.filters._sampled_tracks import SampledTrackFilter
+from torchpose.filters._split_tracks import SplitTrackFilter
+from torchpose.filters._transition import fit_gamma
 
 __all__ = [
     "BootstrapParticleFilter",
     "ConstantVelocityFilter",
-    "ConstantVelocityState",
     "FilterOutput",
     "FixedTrackFilter",
-    "MKFState",
     "MixtureKalmanFilter",
-    "ParticleState",
     "RecursiveFilter",
     "SampledTrackFilter",
     "SplitTrackFilter",

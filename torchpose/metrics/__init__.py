@@ -1,13 +1,13 @@
 """How good is a pose: Procrustes, joint errors, PCP, calibration of covariances, jitter."""
 
 from torchpose._core.facade import set_up_facade
-from torchpose.metrics.calibration import (
+from torchpose.metrics._calibration import (
     calibration_error,
     coverage,
     predictive_log_likelihood,
     reliability,
 )
-from torchpose.metrics.poses import (
+from torchpose.metrics._poses import (
     align,
     jitter,
     joint_errors,

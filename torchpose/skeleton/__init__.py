@@ -1,26 +1,23 @@
 """Joint sets, their names and trees, and the eight joints of the upper body."""
 
 from torchpose._core.facade import set_up_facade
-from torchpose.skeleton.joint_sets import (
+from torchpose.skeleton._joint_sets import (
     SKELETONS,
     UPPER_BODY,
     Skeleton,
     canonical_name,
     identify_skeleton,
 )
-from torchpose.skeleton.upper_body import (
+from torchpose.skeleton._upper_body import (
     LEFT_ARM,
-    LIMBS,
     RIGHT_ARM,
     UpperBody,
-    mirror_pose,
     to_upper_body,
     upper_body_indices,
 )
 
 __all__ = [
     "LEFT_ARM",
-    "LIMBS",
     "RIGHT_ARM",
     "SKELETONS",
     "UPPER_BODY",
@@ -28,7 +25,6 @@ __all__ = [
     "UpperBody",
     "canonical_name",
     "identify_skeleton",
-    "mirror_pose",
     "to_upper_body",
     "upper_body_indices",
 ]

@@ -7,24 +7,24 @@ which colour-blind readers can tell apart; lines differ in their dashes as well.
 """
 
 from torchpose._core.facade import set_up_facade
-from torchpose.viz.action_picture import plot_action_space
-from torchpose.viz.charts import (
+from torchpose.viz._charts import (
     plot_error_bars,
     plot_errors_over_time,
     plot_joint_curves,
     plot_pcp,
     plot_reliability,
 )
-from torchpose.viz.manifold_picture import plot_manifold
-from torchpose.viz.prior_pictures import plot_prior_components, plot_prior_samples
-from torchpose.viz.skeletons import (
+from torchpose.viz._model_pictures import plot_action_space, plot_manifold
+from torchpose.viz._prior_pictures import plot_prior_components, plot_prior_samples
+from torchpose.viz._report.page import write_report
+from torchpose.viz._skeletons import (
     draw_skeleton,
     plot_pose,
     plot_pose_3d,
     plot_pose_strip,
     plot_prior_means,
 )
-from torchpose.viz.style import save_figure
+from torchpose.viz._style import save_figure
 
 __all__ = [
     "draw_skeleton",
@@ -42,6 +42,7 @@ __all__ = [
     "plot_prior_samples",
     "plot_reliability",
     "save_figure",
+    "write_report",
 ]
 
 set_up_facade(__name__)

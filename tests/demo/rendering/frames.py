@@ -6,14 +6,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from torchpose.demo import Performance, demo_camera
-from torchpose.demo.mannequin import BodyAngles
-from torchpose.demo.performer import stage
-from torchpose.demo.rendering import LOOKS
-from torchpose.demo.rendering.body import bodies
-from torchpose.demo.rendering.look import wardrobe
-from torchpose.demo.rendering.parts import Part
-from torchpose.demo.rendering.performer import parts_at
+from torchpose.demo import demo_camera
+from torchpose.demo._mannequin import BodyAngles
+from torchpose.demo._performer import Performance, stage
+from torchpose.demo._rendering import LOOKS
+from torchpose.demo._rendering.look import wardrobe
+from torchpose.demo._rendering.parts import Part, bodies
+from torchpose.demo._rendering.performer import parts_at
 
 CAMERA = demo_camera()
 K = CAMERA.matrix.numpy()

@@ -8,9 +8,14 @@ import pytest
 import torch
 
 from torchpose.body import BODY_15, Body
-from torchpose.demo.rendering.body_video import empty_scene, render_body_video, walk_clip
-from torchpose.demo.rendering.cameras import cameras_around
-from torchpose.demo.rendering.gait import gait_angles, walk
+from torchpose.demo._rendering.walk import (
+    cameras_around,
+    empty_scene,
+    gait_angles,
+    render_body_video,
+    walk,
+    walk_clip,
+)
 from torchpose.errors import InputError
 from torchpose.video import open_video
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from torchpose.demo.mannequin import ANGLE_LIMITS, BodySize
-from torchpose.demo.rendering import PERFORMANCES, crossing, performance
+from torchpose.demo._mannequin import ANGLE_LIMITS, BodySize
+from torchpose.demo._rendering import PERFORMANCES, crossing, performance
 from torchpose.errors import InputError
 from torchpose.math import euler_to_matrix
-from torchpose.skeleton import LIMBS
+from torchpose.skeleton._upper_body import LIMBS
 
 MADE_UP = [name for name in PERFORMANCES if name != "performer"]
 

@@ -10,7 +10,7 @@ import torch
 from tests.demo.rendering.frames import CAMERA, K, painted, posture, sampled
 from torchpose.camera import PinholeCamera
 from torchpose.demo import performer
-from torchpose.demo.rendering import (
+from torchpose.demo._rendering import (
     LOOKS,
     PERFORMANCES,
     Look,
@@ -20,8 +20,8 @@ from torchpose.demo.rendering import (
     performance_truth,
     render_performance,
 )
-from torchpose.demo.rendering.body import FACE_FROM_HEAD
-from torchpose.demo.rendering.portrait import FACE_BOX, load_portrait
+from torchpose.demo._rendering.parts import FACE_FROM_HEAD
+from torchpose.demo._rendering.portrait import FACE_BOX, load_portrait
 from torchpose.errors import CameraError, InputError, MissingDependencyError
 from torchpose.measure import HaarFaceDetector
 from torchpose.skeleton import UPPER_BODY

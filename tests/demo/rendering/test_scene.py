@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from torchpose.demo.rendering import Scene
-from torchpose.demo.rendering.scene import Sensor, room
+from torchpose.demo._rendering import Scene
+from torchpose.demo._rendering.scene import Sensor, room
 from torchpose.errors import InputError
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from tests.demo.rendering.frames import CAMERA
 from torchpose.demo import performer
-from torchpose.demo.rendering import (
+from torchpose.demo._rendering import (
     Scene,
     crossing,
     performance_truth,

@@ -10,7 +10,7 @@ from tests.data import data_dir_or_skip
 from tests.learning.curation.bodies import moving, recording
 from torchpose.errors import InputError, OverlapError, PriorError
 from torchpose.io import find_recordings, read_recordings
-from torchpose.learning.curation import CurationSettings, complete_runs, curate
+from torchpose.learning._curation import CurationSettings, complete_runs, curate
 from torchpose.skeleton import UPPER_BODY
 
 WRISTS = tuple(name.replace("hand", "wrist") for name in UPPER_BODY)

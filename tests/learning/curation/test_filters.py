@@ -7,15 +7,15 @@ import torch
 
 from tests.learning.curation.bodies import moving, recording
 from torchpose.errors import InputError, ShapeError
-from torchpose.learning.curation import (
+from torchpose.learning._curation import (
     JUMP_SPEEDS,
     bone_lengths,
     find_jumps,
     find_wrong_joints,
     person_bones,
 )
-from torchpose.learning.curation.bones import PersonBones, human_size
-from torchpose.learning.curation.upper import with_missing
+from torchpose.learning._curation.bones import PersonBones, human_size
+from torchpose.learning._curation.joints import with_missing
 
 
 def put(joints, frames, joint, shift):

@@ -7,7 +7,7 @@ import torch
 
 from tests.learning.curation.bodies import kinect_v1, moving, recording
 from torchpose.errors import InputError
-from torchpose.learning.curation import (
+from torchpose.learning._curation import (
     bone_lengths,
     face_camera,
     harmonise_bones,
@@ -16,7 +16,7 @@ from torchpose.learning.curation import (
 )
 from torchpose.math import euler_to_matrix
 from torchpose.skeleton import SKELETONS
-from torchpose.skeleton.upper_body import scale_bones
+from torchpose.skeleton._upper_body import scale_bones
 
 
 def turn(joints, roll=0.0, pitch=0.0, yaw=0.0):

@@ -5,7 +5,7 @@ import torch
 
 from tests.learning.curation.bodies import kinect_v1, moving, recording
 from torchpose.errors import InputError, OverlapError
-from torchpose.learning.curation import (
+from torchpose.learning._curation import (
     find_duplicates,
     leave_one_person_out,
     persons_of,

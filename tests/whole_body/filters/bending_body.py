@@ -6,7 +6,7 @@ import torch
 
 from torchpose.body import BODY_15, Body
 from torchpose.learning import fit_action_space
-from torchpose.priors.actions.postures import state_postures
+from torchpose.priors._actions.postures import state_postures
 
 BODY = Body.of_height(BODY_15, 1.75)
 FPS = 30.0

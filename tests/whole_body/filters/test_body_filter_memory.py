@@ -8,9 +8,13 @@ import torch
 from tests.filters.linear_poses import LinearBody
 from torchpose.body import BODY_15, Body, JointLimits
 from torchpose.errors import DegenerateFilterWarning, InputError, SkeletonError
-from torchpose.whole_body import AnnealedParticleFilter, SilhouetteParticleFilter, SIRParticleFilter
-from torchpose.whole_body.filters.body_particles import reweight
-from torchpose.whole_body.filters.leg_swap import exchange_legs
+from torchpose.whole_body import (
+    AnnealedParticleFilter,
+    SilhouetteParticleFilter,
+    SIRParticleFilter,
+    reweight,
+)
+from torchpose.whole_body._filters.motion import exchange_legs
 
 WIDE = torch.float64
 

@@ -10,15 +10,16 @@ from tests.whole_body.filters.bending_body import BODY, performance, performance
 from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig
 from torchpose.body import JointLimits
 from torchpose.errors import DegenerateFilterWarning, InputError, SkeletonError
-from torchpose.priors import ActionBank, ActionInfo, ActionSpace
-from torchpose.priors.actions.postures import state_postures
+from torchpose.priors import ActionBank, ActionSpace
+from torchpose.priors._actions.file import ActionInfo
+from torchpose.priors._actions.postures import state_postures
 from torchpose.whole_body import (
     ConstrainedParticleFilter,
     SIRParticleFilter,
     constant_velocity_std,
     render,
 )
-from torchpose.whole_body.filters.posture_gate import PostureGate, Rows
+from torchpose.whole_body._filters.posture_gate import PostureGate, Rows
 
 BEND, WAVE = space("bend"), space("wave")
 STD = torch.full((36,), 0.03, dtype=torch.float64)

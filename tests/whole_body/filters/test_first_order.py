@@ -7,7 +7,7 @@ from tests.filters.linear_poses import LinearBody
 from tests.whole_body.filters.walking_body import walk, walker
 from torchpose.errors import InputError
 from torchpose.whole_body import constant_velocity_std
-from torchpose.whole_body.filters.motion import next_velocity
+from torchpose.whole_body._filters.motion import next_velocity
 
 BODY = LinearBody(3)
 SCALE = torch.tensor([0.1, 1.0, 3.0], dtype=torch.float64)

@@ -7,8 +7,9 @@ import torch
 
 from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walker
 from torchpose.errors import InputError, ShapeError
-from torchpose.whole_body import count_pixels, find_first_pose, intersection_over_union, render
-from torchpose.whole_body.first_pose import facing_evidence, turned_round
+from torchpose.whole_body import count_pixels, find_first_pose, render
+from torchpose.whole_body._first_pose import facing_evidence, turned_round
+from torchpose.whole_body._silhouettes.likelihood import intersection_over_union
 
 BODY, RIG = walker(), rig()
 UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)

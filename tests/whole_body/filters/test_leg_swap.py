@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from tests.whole_body.filters.walking_body import walk, walker
-from torchpose.body import BODY_15, FRAMES, Body, centres_of
+from torchpose.body import BODY_15, Body, centres_of
+from torchpose.body._kinematics import FRAMES
 from torchpose.errors import InputError, SkeletonError
-from torchpose.filters.resampling import RESAMPLING
-from torchpose.whole_body import SilhouetteParticleFilter
-from torchpose.whole_body.filters.body_particles import reweight
-from torchpose.whole_body.filters.leg_swap import (
+from torchpose.filters._resampling import RESAMPLING
+from torchpose.whole_body import SilhouetteParticleFilter, reweight
+from torchpose.whole_body._filters.motion import (
     exchange_legs,
     extra_copies,
     leg_angle,

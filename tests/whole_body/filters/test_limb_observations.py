@@ -9,16 +9,17 @@ import torch
 from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walker
 from torchpose.body import BODY_15, Limbs, centres_of
 from torchpose.errors import InputError, SkeletonError
-from torchpose.math import sigma_points
-from torchpose.whole_body import prepare_silhouettes, render, render_limbs
-from torchpose.whole_body.filters.limb_observations import (
+from torchpose.math._unscented import sigma_points
+from torchpose.whole_body import render
+from torchpose.whole_body._filters.limb_observations import (
     count_positions,
     observation_gaussians,
     part_groups,
     part_log_likelihood,
     part_positions,
 )
-from torchpose.whole_body.silhouettes.limb_counts import PartCounts
+from torchpose.whole_body._silhouettes.limb_counts import PartCounts
+from torchpose.whole_body._silhouettes.rendering import prepare_silhouettes, render_limbs
 
 N_PARTS = len(BODY_15.parts) - 1
 

@@ -7,12 +7,13 @@ from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, rotation_v
 from torchpose.body import Limbs
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.errors import CameraError, InputError, ShapeError
-from torchpose.whole_body import find_pose, render, render_limbs
-from torchpose.whole_body.pose_search import (
+from torchpose.whole_body import find_pose, render
+from torchpose.whole_body._pose_search import (
     find_candidates,
     place_from_silhouettes,
     upward_direction,
 )
+from torchpose.whole_body._silhouettes.rendering import render_limbs
 
 BODY, RIG = walker(), rig()
 

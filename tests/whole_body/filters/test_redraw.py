@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.filters.linear_poses import assert_within_error
-from torchpose.whole_body.filters.posture_gate import Rows, redraw_until_accepted
+from torchpose.whole_body._filters.posture_gate import Rows, redraw_until_accepted
 
 
 def generator(seed=0):

@@ -10,12 +10,13 @@ from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walk
 from torchpose.body import JointLimits
 from torchpose.errors import DegenerateFilterWarning, InputError, PriorError
 from torchpose.learning import fit_limb_conditionals
-from torchpose.math import sigma_points
-from torchpose.priors.limb_conditionals import in_body_frame
-from torchpose.whole_body import RootUncertaintyTracker, prepare_silhouettes, render
-from torchpose.whole_body.filters.leg_swap import exchange_legs
-from torchpose.whole_body.filters.limb_observations import count_positions, part_log_likelihood
-from torchpose.whole_body.filters.root_uncertainty import PUBLISHED
+from torchpose.math._unscented import sigma_points
+from torchpose.priors._limb_conditionals import in_body_frame
+from torchpose.whole_body import RootUncertaintyTracker, render
+from torchpose.whole_body._filters.limb_observations import count_positions, part_log_likelihood
+from torchpose.whole_body._filters.motion import exchange_legs
+from torchpose.whole_body._filters.root_uncertainty import PUBLISHED
+from torchpose.whole_body._silhouettes.rendering import prepare_silhouettes
 
 FRAMES = 8
 

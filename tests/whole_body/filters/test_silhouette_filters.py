@@ -20,14 +20,13 @@ from torchpose.whole_body import (
     BodyTrack,
     ManifoldParticleFilter,
     SIRParticleFilter,
-    ValidationSequence,
     default_step_std,
     fit_sharpness,
     motion_std,
 )
-from torchpose.whole_body.filters.annealed import anneal
-from torchpose.whole_body.filters.manifold import MANIFOLD_PROPOSALS, MANIFOLD_WEIGHTS
-from torchpose.whole_body.sharpness import log_grid, mean_joint_error
+from torchpose.whole_body._filters.annealed import anneal
+from torchpose.whole_body._filters.manifold import MANIFOLD_PROPOSALS, MANIFOLD_WEIGHTS
+from torchpose.whole_body._sharpness import ValidationSequence, log_grid, mean_joint_error
 
 WIDE = torch.float64
 RUNS = 48

@@ -13,12 +13,11 @@ from torchpose.whole_body import (
     AnnealedParticleFilter,
     ManifoldParticleFilter,
     SIRParticleFilter,
-    ValidationSequence,
     fit_sharpness,
     motion_std,
     render,
 )
-from torchpose.whole_body.sharpness import mean_joint_error
+from torchpose.whole_body._sharpness import ValidationSequence, mean_joint_error
 
 BODY, RIG = walker(), rig()
 

@@ -7,8 +7,8 @@ from torch.nn.functional import max_pool2d
 from torchpose.body import Limbs
 from torchpose.camera import PinholeCamera
 from torchpose.errors import InputError, ShapeError
-from torchpose.whole_body import render_limbs
-from torchpose.whole_body.silhouettes.faults import FAULTS, add_faults
+from torchpose.whole_body._silhouettes.faults import FAULTS, add_faults
+from torchpose.whole_body._silhouettes.rendering import render_limbs
 
 
 @pytest.fixture(scope="module")

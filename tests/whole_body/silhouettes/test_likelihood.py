@@ -4,8 +4,12 @@ import pytest
 import torch
 
 from torchpose.errors import InputError
-from torchpose.whole_body import SilhouetteCounts, bidirectional, intersection_over_union
-from torchpose.whole_body.silhouettes.likelihood import silhouette_log_likelihood
+from torchpose.whole_body import bidirectional
+from torchpose.whole_body._silhouettes.likelihood import (
+    intersection_over_union,
+    silhouette_log_likelihood,
+)
+from torchpose.whole_body._silhouettes.rendering import SilhouetteCounts
 
 
 def images(seed=0, n=6, cameras=3):

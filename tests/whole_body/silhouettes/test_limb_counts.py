@@ -6,8 +6,8 @@ import torch
 from tests.whole_body.silhouettes.test_rendering import HEIGHT, WIDTH, make_rig, random_limbs
 from torchpose.body import Limbs
 from torchpose.errors import ShapeError
-from torchpose.whole_body import render_limbs
-from torchpose.whole_body.silhouettes.limb_counts import PartCounts, count_limbs, count_parts
+from torchpose.whole_body._silhouettes.limb_counts import PartCounts, count_limbs, count_parts
+from torchpose.whole_body._silhouettes.rendering import render_limbs
 
 
 def weight_by_pixels(limbs, opposing, rig, silhouettes):

@@ -19,7 +19,8 @@ from tests.whole_body.silhouettes.test_rendering import (
 from torchpose.body import BODY_15, Body, Limbs
 from torchpose.camera import CameraRig
 from torchpose.errors import InputError
-from torchpose.whole_body import count_pixels, render, render_limbs
+from torchpose.whole_body import count_pixels, render
+from torchpose.whole_body._silhouettes.rendering import render_limbs
 
 
 def slow_rectangle(start, end, radii, K, R, t):

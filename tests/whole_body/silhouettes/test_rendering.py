@@ -9,7 +9,8 @@ import torch
 from torchpose.body import Limbs
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.errors import CameraError, InputError, ShapeError
-from torchpose.whole_body import count_pixels, prepare_silhouettes, render, render_limbs
+from torchpose.whole_body import count_pixels, render
+from torchpose.whole_body._silhouettes.rendering import prepare_silhouettes, render_limbs
 
 HEIGHT, WIDTH = 34, 45
 NEAR = 0.1
@@ -188,7 +189,7 @@ def test_threads_change_nothing(threads):
 
 
 def test_without_numpy_as_on_other_devices(monkeypatch):
-    monkeypatch.setattr("torchpose.whole_body.silhouettes.row_intervals._by_numpy", lambda x: False)
+    monkeypatch.setattr("torchpose.whole_body._silhouettes.outlines._by_numpy", lambda x: False)
     limbs, rig = random_limbs(7, seed=11), make_rig(3)
     assert torch.equal(
         render_limbs(limbs, rig, HEIGHT, WIDTH), slow_render(limbs, rig, HEIGHT, WIDTH)

@@ -8,7 +8,9 @@ from tests.body.test_kinematics import random_states
 from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.errors import InputError, ShapeError
-from torchpose.whole_body import count_pixels, fit_radii, intersection_over_union, render
+from torchpose.whole_body import count_pixels, render
+from torchpose.whole_body._silhouettes.likelihood import intersection_over_union
+from torchpose.whole_body._silhouettes.shape import fit_radii
 
 FACTORS = {
     "thigh": 1.3,

@@ -1,0 +1,330 @@
+"""Pinhole camera as a module, and its TOML file.
+
+Camera axes: x right, y down, z forward. Metres, pixels, radians. The functions on tensors are in
+`torchpose.camera._projection` and `torchpose.math._rotations`, random viewpoints in
+`torchpose.camera._viewpoints`; they can be imported from here as well.
+"""
+
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from torchpose.camera._projection import (
+    backproject,
+    check_intrinsics,
+    intrinsics,
+    lift,
+    map_pixel_covariance,
+    map_pixels,
+    project,
+)
+from torchpose.camera._viewpoints import PAPER_VIEWS, Viewpoints, ViewRange, sample_viewpoints
+from torchpose.errors import CameraError, FileFormatError, InputError, check_floating, check_real
+from torchpose.math._rotations import (
+    ROTATION_ORDERS,
+    RotationOrder,
+    euler_to_matrix,
+    matrix_to_euler,
+    rotvec_to_matrix,
+)
+
+__all__ = [
+    "PAPER_VIEWS",
+    "ROTATION_ORDERS",
+    "PinholeCamera",
+    "RotationOrder",
+    "ViewRange",
+    "Viewpoints",
+    "backproject",
+    "check_intrinsics",
+    "euler_to_matrix",
+    "lift",
+    "load_cameras",
+    "map_pixel_covariance",
+    "map_pixels",
+    "matrix_to_euler",
+    "project",
+    "rotvec_to_matrix",
+    "sample_viewpoints",
+    "save_cameras",
+]
+
+_FARTHEST = 1e9  # pixels or metres: no number of a camera is larger
+_LARGEST_TURN = 100.0  # radians; a few full turns mean the same as none
+_LARGEST_SIDE = 100_000  # pixels of an image
+FOCAL_PER_WIDTH = 525 / 640  # Kinect's colour camera, and a fair guess for a webcam
+
+
+class PinholeCamera(nn.Module):
+    """A calibrated camera: K in pixels and, when it has one, its pose in the room.
+
+    Args:
+        fx, fy: focal lengths, pixels. cx, cy: principal point, pixels.
+        width, height: image size, pixels, if known.
+        name: what the camera is called.
+        skew: K[0, 1], pixels; nearly always 0.
+        distortions: OpenCV's k1, k2, p1, p2, ...; kept and saved, not applied by `forward`.
+        rotation, translation: pose, x_camera = R(rotation) x_world + translation; a Rodrigues
+            vector in radians, and metres. The identity without them.
+        fisheye: the distortions are OpenCV's fisheye model.
+
+    Buffers: matrix [3, 3], distortions [n], rotation [3], translation [3], all float64.
+
+    Raises:
+        CameraError: a focal length is not positive and finite, or another value is not finite.
+
+    >>> PinholeCamera(525, 525, 319.5, 239.5).matrix[0]
+    tensor([525.0000,   0.0000, 319.5000], dtype=torch.float64)
+    """
+
+    matrix: Tensor
+    distortions: Tensor
+    rotation: Tensor
+    translation: Tensor
+
+    def __init__(
+        self,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        width: float | None = None,
+        height: float | None = None,
+        name: str = "",
+        *,
+        skew: float = 0.0,
+        distortions: Sequence[float] = (),
+        rotation: Sequence[float] = (0.0, 0.0, 0.0),
+        translation: Sequence[float] = (0.0, 0.0, 0.0),
+        fisheye: bool = False,
+    ) -> None:
+        super().__init__()
+        self.name = name
+        label = f"camera {name!r}" if name else "the camera"
+        matrix = _vector(f"matrix of {label}", [fx, skew, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], 9)
+        check_intrinsics(f"matrix of {label}", matrix.reshape(3, 3))
+        self.width = _image_side(f"width of {label}", width)
+        self.height = _image_side(f"height of {label}", height)
+        self.fisheye = bool(fisheye)
+        self.register_buffer("matrix", matrix.reshape(3, 3))
+        self.register_buffer("distortions", _vector(f"distortions of {label}", distortions, None))
+        turn = _vector(f"rotation of {label}", rotation, 3)
+        if float(turn.norm()) > _LARGEST_TURN:
+            raise CameraError(
+                f"rotation of {label} must be a Rodrigues vector in radians of at most "
+                f"{_LARGEST_TURN:g}, got {turn.tolist()}; give degrees as radians"
+            )
+        self.register_buffer("rotation", turn)
+        self.register_buffer("translation", _vector(f"translation of {label}", translation, 3))
+
+    @classmethod
+    def from_matrix(
+        cls, matrix: Any, width: float | None = None, height: float | None = None, name: str = ""
+    ) -> Self:
+        """Return the camera of a matrix K [3, 3] (tensor, array or nested list).
+
+        Raises:
+            CameraError: wrong shape, singular, or not of the form (BL 4).
+        """
+        K = _numbers("matrix", matrix, "3 x 3 numbers")
+        if tuple(K.shape) != (3, 3):
+            raise CameraError(f"matrix must have shape [3, 3], got {list(K.shape)}")
+        if float(K[2, 2]) not in (0.0, 1.0):
+            K = K / K[2, 2]  # a camera matrix is defined up to scale
+        check_intrinsics("matrix", K)
+        fx, fy, skew, cx, cy = (float(e) for e in intrinsics(K))
+        return cls(fx, fy, cx, cy, width, height, name, skew=skew)
+
+    @classmethod
+    def from_image_size(cls, width: float, height: float, name: str = "") -> Self:
+        """Guess a camera from the image size alone: f = 525/640 of the longer side, centre in the middle.
+
+        >>> PinholeCamera.from_image_size(640, 480).matrix[0].tolist()
+        [525.0, 0.0, 319.5]
+        """
+        w = _image_side("width", width)
+        h = _image_side("height", height)
+        if w is None or h is None:
+            raise CameraError(f"an image size is (width, height) in pixels, got {(width, height)}")
+        focal = FOCAL_PER_WIDTH * max(w, h)
+        return cls(focal, focal, (w - 1) / 2, (h - 1) / 2, w, h, name)
+
+    @classmethod
+    def load(cls, path: str | Path, name: str | None = None) -> "PinholeCamera":
+        """Read one camera of a TOML file; `name` is needed when there are several.
+
+        Raises:
+            FileFormatError: not such a file. CameraError: no such camera, or several and no name.
+        """
+        cameras = load_cameras(path)
+        if name is None and len(cameras) == 1:
+            return next(iter(cameras.values()))
+        if name is None or name not in cameras:
+            wanted = "a name must say which camera is meant" if name is None else f"no {name!r}"
+            raise CameraError(f"{path}: {wanted}; it holds {', '.join(sorted(cameras))}")
+        return cameras[name]
+
+    def save(self, path: str | Path) -> None:
+        """Write this camera as TOML; the file appears whole or not at all."""
+        save_cameras([self], path)
+
+    @property
+    def image_size(self) -> tuple[int, int] | None:
+        """(width, height) in pixels, or None."""
+        return None if self.width is None or self.height is None else (self.width, self.height)
+
+    @property
+    def rotation_matrix(self) -> Tensor:
+        """R [3, 3] of the Rodrigues vector `rotation`, world axes to camera axes."""
+        return rotvec_to_matrix(self.rotation)
+
+    def forward(self, points: Float[Tensor, "... J 3"]) -> Float[Tensor, "... J 3"]:
+        """(u, v, lambda) of world points [..., J, 3] by K, rotation and translation (BL 3)."""
+        check_floating("points", points)
+        K, R, t = (m.to(points) for m in (self.matrix, self.rotation_matrix, self.translation))
+        return project(points, K, R, t)
+
+    def extra_repr(self) -> str:
+        fx, fy, _, cx, cy = (float(e) for e in intrinsics(self.matrix))
+        size = "" if self.image_size is None else f", width={self.width}, height={self.height}"
+        return f"fx={fx:g}, fy={fy:g}, cx={cx:g}, cy={cy:g}{size}, name={self.name!r}"
+
+
+def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
+    """Read every camera of a TOML file.
+
+    One table per camera with `matrix` (3 x 3, pixels) and, optionally, `size` (width, height),
+    `distortions`, `rotation` (Rodrigues vector), `translation` (metres), `name`, `fisheye`. A table
+    `[metadata]` is passed over. Pose2Sim and Anipose write such files.
+
+    Returns:
+        Cameras by the name of their table, in the order of the file.
+
+    Raises:
+        InputError: no such file. FileFormatError: not TOML, or no camera in it.
+        CameraError: a camera lacks its matrix or has values that no camera has.
+    """
+    from torchpose._core.reading import read_text, reading  # io imports this module
+
+    expected = "a TOML camera file"
+    text = read_text(path, expected, "utf-8")
+    with reading(path, expected):
+        content = tomllib.loads(text)
+        return _cameras_of(path, content)
+
+
+def _cameras_of(path: str | Path, content: Mapping[str, Any]) -> dict[str, PinholeCamera]:
+    tables = {k: v for k, v in content.items() if isinstance(v, Mapping) and k != "metadata"}
+    if not tables:
+        raise FileFormatError(f"{path}: expected a table per camera with `matrix`, found none")
+    return {name: _camera_from_table(f"{path} [{name}]", name, t) for name, t in tables.items()}
+
+
+def save_cameras(cameras: Sequence[PinholeCamera], path: str | Path) -> None:
+    """Write cameras as TOML, one table each; the file appears whole or not at all.
+
+    Raises:
+        InputError: two cameras share a name. OutputError: the file cannot be written.
+    """
+    from torchpose._core.files import atomic_path  # io imports this module
+
+    names = [c.name or (f"cam_{i:02d}" if len(cameras) > 1 else "camera")
+             for i, c in enumerate(cameras, start=1)]  # fmt: skip
+    if not names or len(set(names)) != len(names):
+        raise InputError(f"cameras must be one or more with names of their own, got {names}")
+    text = "\n".join(_camera_to_toml(n, c) for n, c in zip(names, cameras, strict=True))
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+# --- helpers --------------------------------------------------------------------------------------
+
+
+def _vector(name: str, values: Any, length: int | None) -> Tensor:
+    vector = _numbers(name, values)
+    if vector.ndim != 1 or (length is not None and len(vector) != length):
+        wanted = "a list of numbers" if length is None else f"{length} numbers"
+        raise CameraError(f"{name} must be {wanted}, got shape {list(vector.shape)}")
+    if not bool((vector.abs() <= _FARTHEST).all()):
+        raise CameraError(
+            f"{name} must be finite and at most {_FARTHEST:g}, got {vector.tolist()!s:.200}"
+        )
+    return vector
+
+
+def _numbers(name: str, values: Any, wanted: str = "numbers") -> Tensor:
+    """Return a tensor of numbers; true and false are none."""
+    try:
+        if _holds_bool(values):
+            raise TypeError
+        check_real(name, values)
+        return torch.as_tensor(values, dtype=torch.float64).detach().cpu().clone()
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise CameraError(f"{name} must be {wanted}, got {values!r:.200}") from error
+
+
+def _holds_bool(values: Any) -> bool:
+    if isinstance(values, list | tuple):
+        return any(_holds_bool(value) for value in values)
+    return isinstance(values, bool) or getattr(values, "dtype", None) in (torch.bool, np.bool_)
+
+
+def _image_side(name: str, value: Any) -> int | None:
+    if value is None:
+        return None
+    try:
+        side = int(value)
+        if isinstance(value, bool) or not 0 < side <= _LARGEST_SIDE or side != float(value):
+            raise ValueError
+    except (TypeError, ValueError, OverflowError) as error:
+        raise CameraError(
+            f"{name} must be a positive whole number of pixels, at most {_LARGEST_SIDE}, got "
+            f"{value!r:.60}"
+        ) from error
+    return side
+
+
+def _camera_from_table(where: str, name: str, table: Mapping[str, Any]) -> PinholeCamera:
+    if "matrix" not in table:
+        raise CameraError(f"{where}: a camera needs `matrix` (3 x 3, pixels), got {sorted(table)}")
+    size = table.get("size", (None, None))
+    try:
+        if not isinstance(size, Sequence) or len(size) != 2:
+            raise CameraError(f"size must be [width, height], got {size!r:.60}")
+        if not isinstance(table.get("fisheye", False), bool):
+            raise CameraError(f"fisheye must be true or false, got {table['fisheye']!r:.60}")
+        base = PinholeCamera.from_matrix(table["matrix"])
+        fx, fy, skew, cx, cy = (float(e) for e in intrinsics(base.matrix))
+        return PinholeCamera(
+            fx, fy, cx, cy, size[0], size[1], str(table.get("name", name)), skew=skew,
+            distortions=table.get("distortions", ()),
+            rotation=table.get("rotation", (0.0, 0.0, 0.0)),
+            translation=table.get("translation", (0.0, 0.0, 0.0)),
+            fisheye=bool(table.get("fisheye", False)),
+        )  # fmt: skip
+    except CameraError as error:
+        raise CameraError(f"{where}: {error}") from error
+
+
+def _toml_string(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in escaped) + '"'
+
+
+def _camera_to_toml(name: str, camera: PinholeCamera) -> str:
+    header = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _toml_string(name)
+    lines = [f"[{header}]", f"name = {_toml_string(name)}"]
+    if camera.image_size is not None:
+        lines.append(f"size = {[float(s) for s in camera.image_size]}")
+    for key in ("matrix", "distortions", "rotation", "translation"):
+        # repr of a Python float is the shortest text that reads back to the same number
+        lines.append(f"{key} = {getattr(camera, key).double().tolist()}")
+    lines.append(f"fisheye = {str(camera.fisheye).lower()}")
+    return "\n".join(lines) + "\n"

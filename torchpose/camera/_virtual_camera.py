@@ -1,0 +1,325 @@
+"""Where the body is in the image, and a virtual camera that sees it where the prior expects it.
+
+A prior over windows has bodies in one place, between the distances of its training views. Head and
+neck of the last second tell where a body is and how large it is seen, so that hands of other frames
+can be moved along with it, and so that the camera can be turned, and zoomed where it is much nearer
+or farther, until body and prior agree.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchpose.skeleton._joint_sets import UPPER_BODY
+
+__all__ = [
+    "BodyPath",
+    "BodyView",
+    "PathModel",
+    "body_path",
+    "from_view",
+    "memory_frames",
+    "to_view",
+    "view_body",
+    "view_jacobian",
+]
+
+MEMORY = 1.0
+"""Seconds of the past that tell where head and neck are."""
+
+_HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
+# Chosen on training persons who stand and who walk in a circle, see the benchmarks page.
+_NECK_ACCELERATION, _NECK_SPEED = 0.5, 1.0  # m/s after one second, and m/s at its start
+_HEIGHT_ACCELERATION, _HEIGHT_SPEED = 0.002, 0.01
+_NODDING = 0.046  # metres: the head moves against the neck without the body coming nearer
+_NECK_SPREAD, _HEIGHT_SPREAD = 1.0, 0.05  # metres, where nothing is measured
+# Log of how much farther (nearer) than usual the body seems: below the first the prior's own views
+# do, from the second on the body is brought to the usual distance altogether. Persons whose necks
+# are long only seem nearer.
+_FARTHER, _NEARER = (0.15, 0.25), (0.3, 0.5)
+_REACH = 0.8  # metres from the neck to a hand, at most
+_BESIDE = 0.05  # radians beside the usual place, up to which the camera is not turned
+_LARGEST_ZOOM = 6.0
+_FRAMES_AT_A_TIME, _NUMBERS_AT_A_TIME = 4096, 1 << 24
+
+
+class PathModel(NamedTuple):
+    """Head and neck of a body that nothing is known about, in the prior's pixels.
+
+    Attributes:
+        neck: mean place [2]. height: mean of head minus neck [2]. variance: R of head and neck [2],
+            pixels squared. scale: pixels per metre at the mean distance.
+    """
+
+    neck: Tensor
+    height: Tensor
+    variance: Tensor
+    scale: float
+
+
+class BodyPath(NamedTuple):
+    """Estimated neck, and head minus neck, at t - lag for each of S lags, [B, T, S, 2], pixels."""
+
+    lags: tuple[int, ...]
+    neck: Tensor
+    height: Tensor
+
+    def at(self, lag: int) -> tuple[Tensor, Tensor]:
+        """Return the neck and height at one lag, [B, T, 2]."""
+        i = self.lags.index(lag)
+        return self.neck[:, :, i], self.height[:, :, i]
+
+    def carried(self, uv: Float[Tensor, "B T 2"], lag: int) -> Float[Tensor, "B T 2"]:
+        """Return where pixels on the body of `lag` frames ago lie on the body in the present frame.
+
+        It moves along with the neck, and away from it as the body comes nearer:
+            u' = n_t + (u - n_{t-lag}) |h_t| / |h_{t-lag}|
+        """
+        if lag == 0:
+            return uv
+        (neck, height), (then_neck, then_height) = self.at(0), self.at(lag)
+        ratio = height.norm(dim=-1) / then_height.norm(dim=-1).clamp_min(1e-6)
+        return neck + (uv - then_neck) * ratio.clamp(0.5, 2.0)[..., None]
+
+
+class BodyView(NamedTuple):
+    """A virtual camera for each frame.
+
+    Attributes:
+        rotation: from the axes of the camera to those of the virtual one [B, T, 3, 3].
+        zoom: how much larger it sees the body, [B, T].
+        centre: the pixel that it zooms about, which is that of the neck, [B, T, 2].
+    """
+
+    rotation: Tensor
+    zoom: Tensor
+    centre: Tensor
+
+
+def body_path(
+    uv: Float[Tensor, "B T 8 2"],
+    mask: Bool[Tensor, "B T 8"],
+    lags: tuple[int, ...],
+    ahead: int,
+    fps: float,
+    model: PathModel,
+    start: int = 0,
+    variance: Float[Tensor, "B T 2"] | None = None,
+) -> BodyPath:
+    """Return the neck and head at t - lag, by regression on what was measured from a second ago to `ahead`.
+
+    The neck moves with a velocity that is a random walk, and so, much more slowly, does the height
+    of the head above it; the head nods besides:
+        neck = n(t) + noise,  head = n(t) + h(t) + nodding + noise.
+    Given its last second this is what a Kalman smoother says, as one weighted sum of the measured
+    pixels, whose weights are the same wherever the same joints were measured.
+
+    Args:
+        uv, mask: the eight joints. lags: S lags in frames, positive is the past. ahead: number of
+            later frames that may be used. fps: frame rate. model: what is known beforehand.
+        start: first frame that is wanted; those before it are its past. Returned are T - start.
+        variance: R of head and neck, pixels squared, if it is not that of `model` throughout.
+    """
+    past = memory_frames(lags, fps)
+    regression = _regression(torch.arange(-past, ahead + 1), lags, fps, model, uv)
+    anchors = uv[:, :, [_HEAD, _NECK]] - torch.stack([model.neck + model.height, model.neck])
+    known = mask[:, :, [_HEAD, _NECK], None].to(uv)
+    more = torch.zeros_like(known) if variance is None else (variance - model.variance)[..., None]
+    frames = torch.cat([torch.where(known > 0, anchors, 0.0), known, more * known], -1)
+    frames = torch.nn.functional.pad(frames, (0, 0, 0, 0, past - start, ahead))
+    batch, n_frames, width = uv.shape[0], uv.shape[1] - start, past + ahead + 1
+    most = _FRAMES_AT_A_TIME if variance is None else _FRAMES_AT_A_TIME // 8
+    most = min(most, _NUMBERS_AT_A_TIME // (2 * width) ** 2)  # a covariance for each pattern
+    step = max(1, most // batch)
+    parts = []
+    for first in range(0, n_frames, step):
+        span = slice(first, min(first + step, n_frames) + width - 1)
+        part = frames[:, span].unfold(1, width, 1).movedim(-1, 2).flatten(2, 3)
+        weights = regression.of_frames(part[..., 2] > 0, part[..., 3], variance is None)
+        parts.append(weights @ part[..., :2])
+    neck, height = torch.cat(parts, 1).chunk(2, 2)
+    return BodyPath(lags, neck + model.neck, height + model.height)
+
+
+def memory_frames(lags: tuple[int, ...], fps: float) -> int:
+    """Return how many frames before the present one `body_path` and windows of these lags go back."""
+    return max(round(MEMORY * fps), *lags)
+
+
+class _Regression(NamedTuple):
+    """Covariances of the measured pixels [N, N], and of the wanted values with them [2 S, N]."""
+
+    measured: Tensor
+    wanted: Tensor
+
+    def of_frames(
+        self, known: Bool[Tensor, "B T N"], more: Float[Tensor, "B T N"], alike: bool
+    ) -> Float[Tensor, "B1 T1 Q N"]:
+        """Return the weights for every frame's measured pixels; [1, 1, Q, N] if they are all the same.
+
+        Args:
+            known: which pixels are measured. more: their variance beyond the usual one.
+            alike: whether that is zero throughout.
+        """
+        if not alike:
+            return self.weights(known.flatten(0, 1), more.flatten(0, 1)).unflatten(
+                0, known.shape[:2]
+            )
+        patterns, row = _distinct(known.flatten(0, 1))
+        weights = self.weights(patterns, torch.zeros_like(patterns, dtype=more.dtype))
+        return weights[None] if len(patterns) == 1 else weights[row].unflatten(0, known.shape[:2])
+
+    def weights(
+        self, known: Bool[Tensor, "P N"], more: Float[Tensor, "P N"]
+    ) -> Float[Tensor, "P Q N"]:
+        """Return the weights of the measured pixels where only some are known; zero for the others."""
+        both = known[:, :, None] & known[:, None, :]
+        eye = torch.eye(len(self.measured), dtype=self.measured.dtype, device=known.device)
+        cov = torch.where(both, self.measured, eye) + torch.diag_embed(more)
+        wanted = (self.wanted * known[:, None]).mT
+        return torch.cholesky_solve(wanted, torch.linalg.cholesky(cov)).mT
+
+
+def _regression(
+    frames: Tensor, lags: tuple[int, ...], fps: float, model: PathModel, like: Tensor
+) -> _Regression:
+    times = torch.cat([frames, -torch.tensor(lags)]).to(like) / fps
+    pixels = model.scale
+    neck = _walk(times, _NECK_SPREAD * pixels, _NECK_SPEED * pixels, _NECK_ACCELERATION * pixels)
+    height = _walk(
+        times, _HEIGHT_SPREAD * pixels, _HEIGHT_SPEED * pixels, _HEIGHT_ACCELERATION * pixels
+    )
+    n = len(frames)
+    # Frames come with head and neck beside each other, as the measured pixels do.
+    is_head = like.new_tensor([1.0, 0.0]).repeat(n)
+    of_frame = torch.arange(n).repeat_interleave(2)
+    noise = model.variance.to(like) + like.new_tensor([(_NODDING * pixels) ** 2, 0.0])
+    measured = neck[of_frame[:, None], of_frame] + torch.diag(noise.repeat(n))
+    measured = measured + height[of_frame[:, None], of_frame] * is_head * is_head[:, None]
+    wanted = torch.cat([neck[n:, of_frame], height[n:, of_frame] * is_head])
+    return _Regression(measured, wanted)
+
+
+def _walk(times: Tensor, spread: float, speed: float, acceleration: float) -> Tensor:
+    """Return the covariance of positions whose velocity is a random walk from the first of the times on."""
+    since = times - times.min()
+    first = torch.minimum(since[:, None], since)
+    last = torch.maximum(since[:, None], since)
+    walk = first.square() * (3 * last - first) / 6
+    return spread**2 + speed**2 * since[:, None] * since + acceleration**2 * walk
+
+
+def _distinct(patterns: Bool[Tensor, "F N"]) -> tuple[Bool[Tensor, "P N"], Tensor]:
+    """Return the distinct rows, and which of them each row is."""
+    if bool((patterns == patterns[:1]).all()):
+        return patterns[:1], torch.zeros(len(patterns), dtype=torch.long, device=patterns.device)
+    pieces = patterns.split(62, 1)  # as many bits as fit into a whole number
+    codes = [(p * 2 ** torch.arange(p.shape[1], device=p.device)).sum(1) for p in pieces]
+    distinct, row = torch.unique(torch.stack(codes, 1), dim=0, return_inverse=True)
+    first = torch.zeros(len(distinct), dtype=torch.long, device=row.device)
+    first[row] = torch.arange(len(row), device=row.device)
+    return patterns[first], row
+
+
+def view_body(
+    neck: Float[Tensor, "*batch 2"],
+    height: Float[Tensor, "*batch 2"],
+    model: PathModel,
+    matrix: Float[Tensor, "3 3"],
+    reach: Float[Tensor, "*batch"] | None = None,
+) -> BodyView:
+    """Return the virtual camera that sees this neck where the prior has it, and a far body larger.
+
+    The rotation is exact whatever the body does, since a camera that turns about its centre sees no
+    other side of it. The zoom takes the head's height above the neck as a measure of distance,
+    which it is to about a tenth; it is meant for bodies far outside of the prior's views. A person
+    who bends forward seems far as well, but has hands that a far person could not have: the zoom
+    leaves them within an arm's reach.
+
+    Args:
+        neck, height: pixels, see `BodyPath`. model: what the prior expects. matrix: K of the pixels.
+        reach: how far from the neck a hand is measured, pixels; 0 (or None) where none is.
+    """
+    offset = neck - model.neck.to(neck)
+    room = _BESIDE * matrix[0, 0] / offset.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+    target = model.neck.to(neck) + offset * room.clamp_max(1.0)
+    rotation = _axes(_ray(target, matrix)) @ _axes(_ray(neck, matrix)).mT
+    seen = height.norm(dim=-1).clamp_min(1e-6)
+    farther = (model.height.to(height).norm() / seen).log()
+    excess = _excess(farther, *_FARTHER) - _excess(-farther, *_NEARER)
+    zoom = excess.clamp_max(math.log(_LARGEST_ZOOM)).exp()
+    if reach is not None:
+        within = _REACH * model.scale / reach.clamp_min(1e-6)
+        zoom = torch.minimum(zoom, within.clamp_min(1.0))
+    return BodyView(rotation, zoom, target)
+
+
+def _excess(value: Tensor, low: float, high: float) -> Tensor:
+    """Nothing below `low`, the value itself above `high`, and a line between."""
+    line = (value - low).clamp_min(0.0) * (high / (high - low))
+    return torch.minimum(line, value.clamp_min(0.0))
+
+
+def _ray(pixel: Float[Tensor, "*batch 2"], matrix: Tensor) -> Float[Tensor, "*batch 3"]:
+    return _homogeneous(pixel) @ torch.linalg.inv(matrix).mT
+
+
+def _axes(ray: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Return the axes with z along a ray and x level, as columns."""
+    z = torch.nn.functional.normalize(ray, dim=-1)
+    down = torch.zeros_like(z)
+    down[..., 1] = 1.0
+    x = torch.nn.functional.normalize(torch.linalg.cross(down, z), dim=-1)
+    return torch.stack([x, torch.linalg.cross(z, x), z], -1)
+
+
+def to_view(
+    uv: Float[Tensor, "B T J 2"], view: BodyView, matrix: Float[Tensor, "3 3"]
+) -> Float[Tensor, "B T J 2"]:
+    """Return the pixels of the camera as the virtual camera sees them."""
+    turned = _turned(uv, view.rotation, matrix)
+    return (
+        view.centre[..., None, :]
+        + (turned - view.centre[..., None, :]) * view.zoom[..., None, None]
+    )
+
+
+def from_view(
+    uv: Float[Tensor, "B T J 2"], view: BodyView, matrix: Float[Tensor, "3 3"]
+) -> Float[Tensor, "B T J 2"]:
+    """Return the pixels of the virtual camera as the camera sees them."""
+    shrunk = (
+        view.centre[..., None, :] + (uv - view.centre[..., None, :]) / view.zoom[..., None, None]
+    )
+    return _turned(shrunk, view.rotation.mT, matrix)
+
+
+def view_jacobian(
+    uv: Float[Tensor, "B T J 2"], view: BodyView, matrix: Float[Tensor, "3 3"]
+) -> Float[Tensor, "B T J 2 2"]:
+    """Return the derivative of `from_view` at these pixels."""
+    shrunk = (
+        view.centre[..., None, :] + (uv - view.centre[..., None, :]) / view.zoom[..., None, None]
+    )
+    homography = _homography(view.rotation.mT, matrix)[..., None, :, :]
+    top = (homography @ _homogeneous(shrunk)[..., None])[..., 0]
+    value, depth = top[..., :2] / top[..., 2:], top[..., 2, None, None]
+    slopes = homography[..., :2, :2] - value[..., None] * homography[..., 2:, :2]
+    return slopes / depth / view.zoom[..., None, None, None]
+
+
+def _turned(uv: Tensor, rotation: Tensor, matrix: Tensor) -> Tensor:
+    seen = _homogeneous(uv) @ _homography(rotation, matrix).mT
+    # Behind the virtual camera is only what was far beside the image: keep it finite.
+    return seen[..., :2] / seen[..., 2:].clamp_min(1e-3)
+
+
+def _homography(rotation: Tensor, matrix: Tensor) -> Tensor:
+    return matrix @ rotation @ torch.linalg.inv(matrix)
+
+
+def _homogeneous(uv: Tensor) -> Tensor:
+    return torch.cat([uv, torch.ones_like(uv[..., :1])], -1)

@@ -1,0 +1,166 @@
+"""How the performer looks: clothes, complexion, and the textures of torso, neck and hands."""
+
+from functools import lru_cache
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpose.demo._rendering.paint import Capsule, paint_capsule
+from torchpose.demo._rendering.portrait import Portrait, Sprite, load_portrait
+from torchpose.errors import InputError
+
+__all__ = ["LOOKS", "TORSO_TEXTURE", "Look", "Wardrobe", "wardrobe"]
+
+Array = NDArray[np.float32]
+Colour = tuple[float, float, float]
+
+# Left, top (metres on the torso, from the neck) and pixels per metre of the torso's texture.
+TORSO_TEXTURE = (-0.32, -0.12, 250.0)
+_HAND_SCALE = 0.00102  # metres per pixel of a hand's sprite
+_HAND_ORIGIN = (106.0, 66.0)
+
+
+class Look(NamedTuple):
+    """What the performer wears.
+
+    Attributes:
+        clothes, trousers: colours, red, green, blue, 0 to 255.
+        sleeves: "long", or "short" with bare forearms.
+        mirrored: the portrait with left and right exchanged. tone: factors on the skin's colour.
+    """
+
+    clothes: Colour
+    trousers: Colour = (44.0, 52.0, 74.0)
+    sleeves: Literal["long", "short"] = "long"
+    mirrored: bool = False
+    tone: Colour = (1.0, 1.0, 1.0)
+
+
+LOOKS = {
+    "dark sleeves": Look((47.0, 51.0, 62.0)),
+    "short sleeves": Look((96.0, 104.0, 108.0), (50.0, 54.0, 56.0), "short"),
+    "skin-coloured jumper": Look((196.0, 128.0, 92.0), (62.0, 70.0, 92.0)),
+}
+"""Looks by name: what makes hands easy to find by colour, harder, and hardest."""
+
+
+class Wardrobe(NamedTuple):
+    """Everything that is worn and shown.
+
+    Attributes:
+        look: what was asked for. portrait: head, neck, skin. skin: colour of bare arms [3].
+        torso: texture of the clothes, see `TORSO_TEXTURE`. neck: texture of the neck.
+        hand: sprite of an open hand: x along the fingers, y to the thumb, about the hand joint.
+    """
+
+    look: Look
+    portrait: Portrait
+    skin: Array
+    torso: Array
+    neck: Array
+    hand: Sprite
+
+
+@lru_cache(maxsize=8)
+def wardrobe(look: Look) -> Wardrobe:
+    """Return the textures of a look.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed. InputError: colours that are none.
+    """
+    colours = np.array([look.clothes, look.trousers], np.float64)
+    if not ((colours >= 0) & (colours <= 255)).all() or look.sleeves not in ("long", "short"):
+        raise InputError(
+            "Look needs colours of three numbers from 0 to 255 and sleeves 'long' or 'short', got "
+            f"{look}"
+        )
+    portrait = load_portrait(look.mirrored, look.tone)
+    skin = portrait.skin
+    return Wardrobe(
+        look, portrait, skin, _torso(np.asarray(look.clothes, np.float32)), _neck(portrait),
+        _hand(portrait, look.sleeves == "short"),
+    )  # fmt: skip
+
+
+def smooth_noise(shape: tuple[int, int], sigma: tuple[float, float], seed: int) -> Array:
+    """Return the Gaussian noise [h, w] of unit variance, smoothed by (vertical, horizontal) pixels."""
+    import cv2
+
+    white = np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
+    noise = np.asarray(cv2.GaussianBlur(white, (0, 0), sigmaX=sigma[1], sigmaY=sigma[0]))
+    return noise.astype(np.float32) / max(float(noise.std()), 1e-6)
+
+
+def _torso(colour: Array) -> Array:
+    left, top, scale = TORSO_TEXTURE
+    height, width = round(0.82 * scale), round(-2 * left * scale)
+    x = (left + (np.arange(width) + 0.5) / scale)[None] + np.zeros((height, 1))
+    y = (top + (np.arange(height) + 0.5) / scale)[:, None] + np.zeros((1, width))
+    across = np.clip(x / 0.20, -1, 1)
+    # A barrel lit from the upper left, darker towards the hem, with soft upright folds.
+    light = 0.64 + 0.38 * np.sqrt(1 - 0.85 * across**2) - 0.04 * across - 0.16 * (y - 0.1)
+    folds = smooth_noise((height, width), (0.045 * scale, 0.012 * scale), 5)
+    folds += 0.4 * smooth_noise((height, width), (0.012 * scale, 0.05 * scale), 6)
+    light *= 1 + 0.03 * folds * np.clip((y - 0.05) / 0.2, 0.2, 1)
+    ring = np.exp(-0.5 * ((np.hypot(x / 0.070, (y + 0.068) / 0.070) - 1) / 0.08) ** 2)
+    hem = np.exp(-0.5 * ((y - 0.535) / 0.004) ** 2)
+    light *= 1 - 0.22 * ring - 0.25 * hem
+    return np.clip(light[..., None] * colour, 0, 255).astype(np.float32)
+
+
+def _neck(portrait: Portrait) -> Array:
+    """Return the portrait's neck, rounded, in the shadow of the chin."""
+    import cv2
+
+    skin = cv2.resize(portrait.neck, (64, 64), interpolation=cv2.INTER_LINEAR)
+    across = np.linspace(-1, 1, 64)[None]
+    down = np.linspace(0, 1, 64)[:, None]
+    light = (0.60 + 0.40 * np.sqrt(1 - 0.9 * across**2)) * (
+        0.60 + 0.46 * np.clip(1.6 * down - 0.2, 0, 1)
+    )
+    # A little of the cheek's colour: the portrait's own neck lies in deep shadow.
+    skin = cv2.GaussianBlur(skin, (0, 0), 1.5)
+    tone = 0.35 * skin + 0.65 * portrait.skin * (skin.mean(-1, keepdims=True) / skin.mean())
+    return np.clip(tone * light[..., None], 0, 255).astype(np.float32)
+
+
+def _hand(portrait: Portrait, bare: bool) -> Sprite:
+    """Return a relaxed open hand: palm, four fingers and a thumb, each lit as a round thing."""
+    import cv2
+
+    x0, y0 = _HAND_ORIGIN
+    shape = (150, 218)
+    canvas = np.zeros((*shape, 3), np.float32)
+    alpha = np.zeros(shape, np.float32)
+
+    def add(limb: Capsule, colour: NDArray) -> None:
+        paint_capsule(canvas, limb, colour)
+        box = limb.box(shape)
+        view = box.of(alpha)
+        np.maximum(view, limb.field(box)[0], out=view)
+
+    def limb(ax: float, ay: float, bx: float, by: float, ra: float, rb: float) -> Capsule:
+        return Capsule((x0 + ax, y0 + ay), (x0 + bx, y0 + by), ra, rb)
+
+    skin = 1.08 * portrait.skin
+    # Pixels from the hand joint; the wrist is at x = -60.
+    add(limb(-102, 0, -40, 0, 25, 30), skin)
+    add(limb(-22, 4, -4, 0, 33, 39), skin)
+    fingers = ((-31, 8, 58, -37, 9.5, 7.5), (-11, 16, 79, -14, 10, 8), (10, 17, 84, 11, 10, 8),
+               (30, 14, 73, 36, 10, 8))  # fmt: skip
+    for root, x, tip_x, tip_y, wide, narrow in fingers:
+        add(limb(x - 12, root, tip_x, tip_y, wide, narrow), 0.98 * skin)
+    add(limb(-34, 26, 24, 62, 15, 9), 1.0 * skin)
+    palm = np.exp(-0.5 * ((np.arange(shape[1]) - x0 - 2)[None] / 24) ** 2)
+    palm = palm * np.exp(-0.5 * ((np.arange(shape[0]) - y0)[:, None] / 30) ** 2)
+    canvas += 0.75 * palm[..., None].astype(np.float32) * (skin - canvas)
+    cheek = cv2.resize(portrait.cheek, shape[::-1], interpolation=cv2.INTER_CUBIC)
+    grain = cheek / np.maximum(cv2.GaussianBlur(cheek, (0, 0), 25), 1)
+    mottled = smooth_noise(shape, (9, 9), 8)[..., None]
+    canvas *= np.clip(grain, 0.85, 1.15) * (1 + 0.03 * mottled)
+    # A bare wrist fades into the forearm, another one ends within its cuff.
+    start, width = (98, 20) if bare else (69, 3)
+    wrist = np.clip((np.arange(shape[1]) - x0 + start) / width, 0, 1)[None]
+    soft = cv2.GaussianBlur(alpha, (0, 0), 1.0) * wrist
+    return Sprite.of(np.clip(canvas, 0, 255), soft, _HAND_ORIGIN, _HAND_SCALE)

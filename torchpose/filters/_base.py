@@ -1,0 +1,294 @@
+"""Interface of the recursive filters: checks of what is measured, and the one loop over time.
+
+A filter is a fixed model (buffers) and pure steps over a state, which is a NamedTuple. A new filter
+implements `init` and `filter_frame`; shapes, masks, lengths and failures are handled here.
+"""
+
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from torchpose._core.module_state import (
+    WideModule,
+    derived,
+    one_run,
+    register_given,
+    working_precision,
+)
+from torchpose.errors import InputError, ShapeError, check_shape
+from torchpose.filters._measurements import (
+    Measurements,
+    as_covariance,
+    check_noise,
+    check_values,
+    given_covariance,
+)
+from torchpose.filters._outputs import FilterOutput, StepOutput, collect
+
+__all__ = [
+    "Generators",
+    "RecursiveFilter",
+    "require_state",
+    "standard_normal",
+    "uniform",
+]
+
+Generators = torch.Generator | Sequence[torch.Generator] | None
+"""One generator, a list of one for each element of the batch, or None for PyTorch's own."""
+
+
+def standard_normal(
+    batch: int, shape: Sequence[int], generator: Generators, like: Tensor
+) -> Float[Tensor, "B *shape"]:
+    """Draw standard normal numbers [B, *shape].
+
+    Args:
+        batch: B. shape: of one element. generator: with a list, each element draws from its own, and its
+            numbers do not depend on the batch. like: tells dtype and device.
+    """
+    kind = {"dtype": like.dtype, "device": like.device}
+    if isinstance(generator, torch.Generator) or generator is None:
+        return torch.randn(batch, *shape, generator=generator, **kind)
+    return torch.stack([torch.randn(*shape, generator=g, **kind) for g in generator])
+
+
+def uniform(
+    batch: int, shape: Sequence[int], generator: Generators, like: Tensor
+) -> Float[Tensor, "B *shape"]:
+    """Draw uniform numbers in [0, 1) [B, *shape]; arguments as `standard_normal`."""
+    kind = {"dtype": like.dtype, "device": like.device}
+    if isinstance(generator, torch.Generator) or generator is None:
+        return torch.rand(batch, *shape, generator=generator, **kind)
+    return torch.stack([torch.rand(*shape, generator=g, **kind) for g in generator])
+
+
+def require_state(state: Any, kind: type, field: str, shape: Sequence[int | None]) -> None:
+    """Raise unless a state is of this type, with a tensor of this shape; for `check_state`.
+
+    Raises:
+        InputError: of another filter. ShapeError: of another batch, or of a filter of another size.
+    """
+    if not isinstance(state, kind):
+        raise InputError(
+            f"state must be a {kind.__name__} from this filter's init or step, got {type(state).__name__}"
+        )
+    found = getattr(state, field)
+    if not isinstance(found, Tensor):
+        raise InputError(f"state.{field} must be a tensor, got {type(found).__name__}")
+    try:
+        check_shape(f"state.{field}", found, shape)
+    except ShapeError as error:
+        raise ShapeError(
+            f"{error}, for this filter and the {shape[0]} elements of z; begin with init({shape[0]})"
+        ) from error
+
+
+class RecursiveFilter(WideModule, ABC):
+    """A recursive Bayesian filter over batches of sequences.
+
+    `forward` filters whole sequences; `init`, then `step` (one frame) or `advance` (some more frames)
+    give the same numbers online. Randomness, masks and noise have the same arguments in all of them.
+
+    A filter implements `init` and `filter_frame`, which get checked arguments; it may override
+    `filter_frames`, the loop over time, where it knows a faster way.
+
+    Args:
+        measurement_cov: R, [Z, Z] or its diagonal [Z].
+        observed: the Z state indices that are measured (the rows of H in BL 15).
+        dim: number of state dimensions D.
+        dtype: of means, particles and measurements; covariances are always float64.
+    """
+
+    def __init__(
+        self,
+        measurement_cov: Tensor,
+        observed: Sequence[int] | Tensor,
+        dim: int,
+        dtype: torch.dtype,
+    ) -> None:
+        super().__init__()
+        index = torch.as_tensor(observed, dtype=torch.long)
+        check_shape("observed", index, ["Z"])
+        inside = bool(((index >= 0) & (index < dim)).all())
+        if index.numel() == 0 or not inside or index.unique().numel() != index.numel():
+            raise InputError(
+                f"observed must hold distinct state indices in [0, {dim}), got {index.tolist()}"
+            )
+        self.dim = dim
+        self.dtype = working_precision("dtype", dtype)
+        register_given(self, "observed", index)
+        noise = given_covariance("measurement_cov", measurement_cov, index.numel())
+        register_given(self, "measurement_cov", noise)
+
+    observed: Tensor
+    measurement_cov: Tensor
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "advance" in vars(cls) and "filter_frame" not in vars(cls):
+            warnings.warn(
+                f"{cls.__name__}.advance is to be called filter_frame; the old name goes with version "
+                "0.3.0",
+                DeprecationWarning,
+                stacklevel=2,
+            )
+            cls.filter_frame = vars(cls)["advance"]  # type: ignore[method-assign]
+            del cls.advance
+
+    @abstractmethod
+    def init(self, batch_size: int, generator: Generators = None) -> Any:
+        """Return the state before the first measurement; the first step predicts, then updates."""
+
+    @abstractmethod
+    def filter_frame(
+        self, state: Any, frame: Measurements, generator: Generators, return_cov: bool
+    ) -> tuple[Any, StepOutput]:
+        """Return the next state and the estimate, given checked measurements of one frame."""
+
+    def check_state(self, state: Any, batch: int) -> None:
+        """Raise unless a state is one of this filter's with so many elements; may be left out."""
+
+    def step(
+        self,
+        state: Any,
+        z: Float[Tensor, "B Z"],
+        mask: Bool[Tensor, "B Z"] | None = None,
+        measurement_cov: Tensor | None = None,
+        generator: Generators = None,
+        return_cov: bool = False,
+    ) -> tuple[Any, StepOutput]:
+        """Filter one frame online: the same numbers as the same frame of `forward`.
+
+        Args:
+            state: from `init` or the step before. z: [B, Z], pixels. mask: [B, Z], True = measured.
+            measurement_cov: R of this frame, [Z, Z] or [B, Z, Z]; None is the filter's own.
+            generator: for filters that draw; a generator, or a list of one for each element.
+            return_cov: whether to return the covariance as well.
+
+        Returns:
+            The next state and a `StepOutput`.
+
+        Raises:
+            ShapeError, InputError, CovarianceError: as `forward`.
+        """
+        check_shape("z", z, ["B", self.observed.numel()])
+        self.check_state(state, len(z))
+        if measurement_cov is not None and measurement_cov.ndim == 3:
+            measurement_cov = measurement_cov[:, None]
+        mask = None if mask is None else mask[:, None]
+        with one_run(self.observed.device):
+            frames = self.check(z[:, None], mask, measurement_cov, None, generator)
+            return self.filter_frame(state, frames.frame(0), generator, return_cov)
+
+    def advance(
+        self,
+        state: Any,
+        z: Float[Tensor, "B T Z"],
+        mask: Bool[Tensor, "B T Z"] | None = None,
+        measurement_cov: Tensor | None = None,
+        generator: Generators = None,
+        return_cov: bool = False,
+    ) -> tuple[Any, FilterOutput]:
+        """Filter some more frames online: the same numbers as `step` for one after the other.
+
+        Args:
+            state: from `init`, `step` or `advance`. z, mask, measurement_cov, generator, return_cov: as
+                `forward`.
+
+        Returns:
+            The next state and a `FilterOutput`, whose `failed_at` counts from the first of these frames.
+
+        Raises:
+            ShapeError, InputError, CovarianceError: as `forward`.
+        """
+        check_shape("z", z, ["B", "T", self.observed.numel()])
+        self.check_state(state, len(z))
+        with one_run(self.observed.device):
+            frames = self.check(z, mask, measurement_cov, None, generator)
+            return self.continue_frames(state, frames, generator, return_cov)
+
+    def forward(
+        self,
+        z: Float[Tensor, "B T Z"],
+        mask: Bool[Tensor, "B T Z"] | None = None,
+        measurement_cov: Tensor | None = None,
+        lengths: Int[Tensor, " B"] | None = None,
+        generator: Generators = None,
+        return_cov: bool = False,
+        progress: bool = False,
+    ) -> FilterOutput:
+        """Filter a batch of sequences.
+
+        Args:
+            z: measurements [B, T, Z] in the units of the state (pixels). mask: [B, T, Z], True where
+                measured; what z holds elsewhere is ignored. measurement_cov: R [Z, Z] or
+                [B, T, Z, Z], overrides the filter's own. lengths: [B], frames of each sequence.
+            generator: for filters that draw; a generator, or a list of B generators, one for each
+                element, which makes an element's numbers independent of its batch.
+            return_cov: whether to return covariances. progress: whether to show a progress bar.
+
+        Returns:
+            `FilterOutput`.
+
+        Raises:
+            ShapeError: wrong shapes. InputError: empty sequences, NaN or infinite values that are
+            not masked, lengths outside 1..T. CovarianceError: R not symmetric positive definite.
+        """
+        with one_run(self.observed.device):
+            frames = self.check(z, mask, measurement_cov, lengths, generator)
+            return self.filter_frames(frames, generator, return_cov, progress)
+
+    def filter_frames(
+        self, frames: Measurements, generator: Generators, return_cov: bool, progress: bool
+    ) -> FilterOutput:
+        """Return the estimates of whole sequences, given checked measurements."""
+        state = self.init(len(frames.z), generator)
+        return self.continue_frames(state, frames, generator, return_cov, progress)[1]
+
+    def continue_frames(
+        self,
+        state: Any,
+        frames: Measurements,
+        generator: Generators,
+        return_cov: bool,
+        progress: bool = False,
+    ) -> tuple[Any, FilterOutput]:
+        """Return the state after some frames, and their estimates: the one loop over time."""
+        steps = []
+        times = range(frames.z.shape[1])
+        # a bar that shows nothing would still keep torch.compile out
+        for t in tqdm(times, unit="frame") if progress else times:
+            state, out = self.filter_frame(state, frames.frame(t), generator, return_cov)
+            steps.append(out)
+        return state, collect(steps, frames.lengths)
+
+    def check(
+        self,
+        z: Tensor,
+        mask: Tensor | None,
+        measurement_cov: Tensor | None,
+        lengths: Tensor | None,
+        generator: Generators,
+    ) -> Measurements:
+        """Return the arguments of `forward` as `Measurements`, checked before any work is done."""
+        like = torch.empty(0, dtype=self.dtype, device=self.observed.device)
+        z, mask, lengths = check_values(z, mask, lengths, like, self.observed.numel())
+        cov = self._own_noise() if measurement_cov is None else check_noise(measurement_cov, z)
+        if isinstance(generator, Sequence) and len(generator) != len(z):
+            raise InputError(
+                f"a list of generators must hold one for each of the {len(z)} sequences, "
+                f"got {len(generator)}"
+            )
+        return Measurements(z, mask, cov, lengths)
+
+    def _own_noise(self) -> Float[Tensor, "Z Z"]:
+        """Return R of the filter, float64."""
+        given, count = self.measurement_cov, self.observed.numel()
+        sources = (given,)
+        return derived(self, "R", sources, lambda: as_covariance("measurement_cov", given, count))

@@ -1,0 +1,188 @@
+"""A Kalman filter and smoother for numbers that move at nearly constant velocity."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from torchpose._core.module_state import derived
+from torchpose.errors import InputError, check_shape
+from torchpose.math._gaussian import kalman_gain, safe_cholesky, symmetrise
+
+__all__ = ["ConstantVelocityFilter", "ConstantVelocityState"]
+
+_SETTLED = 1e-13
+_MOST_STEPS = 10_000
+_VELOCITY_VARIANCE = 100.0  # at the start, in units of r per s^2
+
+
+class ConstantVelocityState(NamedTuple):
+    """Position and velocity of every number.
+
+    Attributes:
+        mean: [B, 2, N], in the units of the numbers and per second. time: frames seen.
+    """
+
+    mean: Tensor
+    time: int
+
+
+class _Gains(NamedTuple):
+    """The motion matrix [2, 2], and gains frame by frame: filter [S, 2], smoother [S, 2, 2]."""
+
+    matrix: Tensor
+    filter: Tensor
+    smoother: Tensor
+
+
+class ConstantVelocityFilter(nn.Module):
+    """Kalman filter of numbers that are measured in every frame and move at nearly constant velocity.
+
+    Each number by itself, at all times with the same gains:
+        (x, v)_t = [1 dt; 0 1] (x, v)_{t-1} + N(0, q [dt^3/3 dt^2/2; dt^2/2 dt]),   z_t = x_t + N(0, r).
+    Only the ratio q/r matters for the estimates. Large ratios follow the measurements, small ones are
+    smooth and late.
+
+    Args:
+        ratio: q/r, 1/s^3. fps: frames per second.
+
+    Raises:
+        InputError: either is not positive and finite.
+
+    Reference:
+        Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and
+        Navigation" (2001), section 6.2.2; H. Rauch, F. Tung, C. Striebel (1965) for the smoother.
+
+    Example:
+        >>> import torch
+        >>> f = ConstantVelocityFilter(ratio=1e3, fps=30.0)
+        >>> z = torch.linspace(0, 1, 100, dtype=torch.float64)[None, :, None]
+        >>> bool((f(z)[0, -1] - 1).abs() < 1e-3)
+        True
+    """
+
+    def __init__(self, ratio: float, fps: float) -> None:
+        super().__init__()
+        for name, value in (("ratio", ratio), ("fps", fps)):
+            if not 0 < value < float("inf"):
+                raise InputError(f"{name} must be positive and finite, got {value}")
+        for name, value in (("ratio", ratio), ("fps", fps)):
+            self.register_buffer(name, torch.tensor(float(value), dtype=torch.float64))
+
+    ratio: Tensor
+    fps: Tensor
+
+    def _gains(self) -> "_Gains":
+        return derived(self, "gains", (self.ratio, self.fps), self._make_gains)
+
+    def _make_gains(self) -> "_Gains":
+        dt = 1.0 / float(self.fps)
+        matrix = torch.tensor([[1.0, dt], [0.0, 1.0]], dtype=torch.float64)
+        noise = torch.tensor([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], dtype=torch.float64)
+        gains = _riccati(matrix, float(self.ratio) * noise)
+        return _Gains(*(part.to(self.ratio.device) for part in (matrix, *gains)))
+
+    def init(self, z: Float[Tensor, "B N"]) -> ConstantVelocityState:
+        """Return the state before the first frame, whose values are `z`."""
+        return ConstantVelocityState(torch.stack([z, torch.zeros_like(z)], 1), 0)
+
+    def step(
+        self, state: ConstantVelocityState, z: Float[Tensor, "B N"]
+    ) -> tuple[ConstantVelocityState, Float[Tensor, "B N"]]:
+        """Filter one frame: the same numbers as the same frame of `forward`."""
+        state, _ = self._advance(state, z)
+        return state, state.mean[:, 0]
+
+    def advance(
+        self, state: ConstantVelocityState, z: Float[Tensor, "B T N"]
+    ) -> tuple[ConstantVelocityState, Float[Tensor, "B T N"]]:
+        """Filter some more frames: the same numbers as `step` for one after the other."""
+        state, means, _ = self._run(state, z)
+        return state, means[:, :, 0]
+
+    def _advance(
+        self, state: ConstantVelocityState, z: Tensor
+    ) -> tuple[ConstantVelocityState, Tensor]:
+        """Return the next state, and by how much it differs from its prediction [B, 2, N]."""
+        known = self._gains()
+        predicted = state.mean if state.time == 0 else known.matrix.to(state.mean) @ state.mean
+        gain = known.filter[min(state.time, len(known.filter) - 1)].to(z)
+        correction = gain[:, None] * (z - predicted[:, 0])[:, None]
+        return ConstantVelocityState(predicted + correction, state.time + 1), correction
+
+    def forward(self, z: Float[Tensor, "B T N"]) -> Float[Tensor, "B T N"]:
+        """Return filtered numbers: each uses its own frame and those before."""
+        check_shape("z", z, ["B", "T", "N"])
+        return self.advance(self.init(z[:, 0]), z)[1]
+
+    def _run(
+        self, state: ConstantVelocityState, z: Tensor
+    ) -> tuple[ConstantVelocityState, Tensor, Tensor]:
+        """Return the state after all frames, filtered means, and these minus predicted, [B, T, 2, N]."""
+        means, corrections = [], []
+        for frame in z.unbind(1):
+            state, correction = self._advance(state, frame)
+            means.append(state.mean)
+            corrections.append(correction)
+        return state, torch.stack(means, 1), torch.stack(corrections, 1)
+
+    def smooth(
+        self,
+        z: Float[Tensor, "B T N"],
+        lengths: Int[Tensor, " B"] | None = None,
+        lag: int | None = None,
+    ) -> Float[Tensor, "B T N"]:
+        """Return numbers that use later frames too.
+
+        Args:
+            z: [B, T, N]. lengths: frames of each sequence [B]; those after are not used.
+            lag: number of later frames that each may use; None is all.
+
+        Raises:
+            ShapeError, InputError: wrong shapes, or a negative lag.
+        """
+        check_shape("z", z, ["B", "T", "N"])
+        if lag is not None and lag < 0:
+            raise InputError(f"lag must be at least 0 frames, or None for all, got {lag}")
+        _, means, corrections = self._run(self.init(z[:, 0]), z)
+        n_frames = z.shape[1]
+        frames = torch.arange(n_frames, device=z.device)
+        if lengths is None:
+            lengths = torch.full((len(z),), n_frames, device=z.device)
+        later = (frames + 1 < lengths[:, None])[..., None, None]
+        known = self._gains().smoother
+        gains = known[frames.clamp(max=len(known) - 1)].to(z)
+        if lag is None or lag >= n_frames - 1:
+            changes = [torch.zeros_like(means[:, 0])]
+            for t in range(n_frames - 2, -1, -1):
+                pulled = gains[t] @ (corrections[:, t + 1] + changes[-1])
+                changes.append(torch.where(later[:, t], pulled, torch.zeros_like(pulled)))
+            return (means + torch.stack(changes[::-1], 1))[:, :, 0]
+        change = torch.zeros_like(means)
+        for _ in range(lag):
+            pulled = gains[:-1] @ (corrections[:, 1:] + change[:, 1:])
+            pulled = torch.where(later[:, :-1], pulled, torch.zeros_like(pulled))
+            change = torch.cat([pulled, change[:, -1:]], 1)
+        return (means + change)[:, :, 0]
+
+    def extra_repr(self) -> str:
+        """Return the settings, for printing."""
+        return f"ratio={float(self.ratio):g}, fps={float(self.fps):g}"
+
+
+def _riccati(matrix: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Return Kalman gains [S, 2] and smoother gains [S, 2, 2], until they settle; r = 1."""
+    observed, unit = torch.tensor([0]), torch.ones(1, 1, dtype=matrix.dtype)
+    predicted = torch.diag(torch.tensor([1.0, _VELOCITY_VARIANCE], dtype=matrix.dtype))
+    gains, smoothers = [], []
+    for _ in range(_MOST_STEPS):
+        gain, cov = kalman_gain(predicted, unit, observed)
+        gains.append(gain.white[0] / gain.factor[0, 0])
+        following = symmetrise(matrix @ cov @ matrix.mT + noise)
+        smoothers.append(torch.cholesky_solve(matrix @ cov, safe_cholesky(following)).mT)
+        settled = bool(((following - predicted).abs() <= _SETTLED * following.abs()).all())
+        predicted = following
+        if settled:
+            break
+    return torch.stack(gains), torch.stack(smoothers)

@@ -1,0 +1,248 @@
+"""Frames by themselves: the mixture conditioned on each, whatever was measured before it.
+
+Weights by frame draw the indicator of every frame from pi anew, as for sampled tracks (BL 47), while
+each component's track goes on as if it had been right all along: weights without memory, states with. If
+the states have none either (transition "ou" with gamma = 0), frames do not depend on each other at
+all: `run_memoryless` conditions the mixture on all of them at once.
+"""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from torchpose._core.module_state import derived, outside_inference
+from torchpose._core.value_checks import values_visible
+from torchpose.filters._measurements import Measurements
+from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
+from torchpose.filters._outputs import FilterOutput, Mending, StepOutput, finish_output, mending
+from torchpose.filters._recompute import recomputed, wants_gradient
+from torchpose.filters._weights import WeightRule, estimate_of, frame_weights
+from torchpose.math._gaussian import Gain, kalman_gain
+from torchpose.math._geometric_median import median_estimate
+
+__all__ = ["frame_log_likelihood", "run_memoryless", "step_memoryless"]
+
+_SHARED_FRAMES = 1024  # at a time, where they share their gains
+_PATTERNS = 24  # of measured dimensions and noise whose gains are kept; about 4 MB each
+_OWN_FRAMES = 32  # at a time, where each has gains of its own
+_RECOMPUTED_FRAMES = 64  # at a time, where gradients compute them again
+_LEAST_SHARE = 2  # frames to a noise, on average, below which sharing does not pay
+
+
+def frame_log_likelihood(
+    model: MixtureKalmanFilter, rule: WeightRule, frames: Measurements
+) -> Float[Tensor, "B T M"] | None:
+    """Return log N(z_t; H mu_j, H Sigma_j H^T + R) of the measured dimensions of every frame.
+
+    None for weights that are not by frame.
+    """
+    if not rule.by_frame:
+        return None
+    groups = _groups(frames, _SHARED_FRAMES)
+    found = [(group.rows, _condition(model, group, _gain(model, group))[1]) for group in groups]
+    return _in_order(found).unflatten(0, frames.z.shape[:2])
+
+
+def run_memoryless(
+    model: MixtureKalmanFilter,
+    rule: WeightRule,
+    medians: Tensor,
+    frames: Measurements,
+    return_cov: bool,
+    progress: bool = False,
+) -> FilterOutput:
+    """Filter sequences where the predictions are the components themselves (BL 39-41, 48).
+
+    Args:
+        model: whose components these are. rule: of the weights, by frame. medians: first dimensions of
+            the points that are estimated by their geometric medians. frames: all that is measured.
+        return_cov: whether to return covariances. progress: whether to show a progress bar.
+    """
+    batch, n_frames, _ = frames.z.shape
+    learning = wants_gradient(frames.z, frames.cov, model.log_prior, model.means, model.covariances)
+    parts: list[list[tuple[Tensor, Tensor]]] = [[], [], [], [], [], []]
+    # a bar that shows nothing would still keep torch.compile out
+    bar = tqdm(total=batch * n_frames, unit="frame") if progress else None
+    for group in _groups(frames, _RECOMPUTED_FRAMES if learning else _SHARED_FRAMES):
+        # Gains that groups share are not among what a gradient computes anew for one of them.
+        gain = _gain(model, group) if group.shares_gain else None
+        arguments = model, rule, medians, group, gain, return_cov
+        values = recomputed(_estimate, *arguments) if learning else _estimate(*arguments)
+        for part, value in zip(parts, values, strict=True):
+            if value is not None:
+                part.append((group.rows, value))
+        if bar is not None:
+            bar.update(len(group.rows))
+    if bar is not None:
+        bar.close()
+    mean, log_weights, evidence = (
+        _in_order(part).unflatten(0, (batch, n_frames)) for part in parts[:3]
+    )
+    covs = _in_order(parts[3]).unflatten(0, (batch, n_frames)) if return_cov else None
+    work = Mending(*(_in_order(part).unflatten(0, (batch, n_frames)) for part in parts[4:]))
+    return finish_output(mean, log_weights, evidence, covs, frames.lengths, work)
+
+
+def _estimate(
+    model: MixtureKalmanFilter,
+    rule: WeightRule,
+    medians: Tensor,
+    group: "_Group",
+    gain: tuple[Gain, Tensor] | None,
+    return_cov: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor]:
+    """Return estimates, log-weights, log-evidence, covariances and mending of a group of frames."""
+    gain = gain or _gain(model, group)
+    means, log_likelihood, cov, jitter = _condition(model, group, gain)
+    log_weights, evidence = frame_weights(rule, log_likelihood, log_likelihood)
+    measured = group.mask.any(-1).squeeze(-1)
+    evidence = torch.where(measured, evidence, torch.zeros_like(evidence))
+    mean, total = estimate_of(log_weights, means, cov if return_cov else None)
+    if len(medians):
+        mean, total = median_estimate(log_weights, means, cov, mean, total, medians)
+    return mean, log_weights, evidence, total, *mending(mean, jitter)
+
+
+def step_memoryless(
+    model: MixtureKalmanFilter,
+    rule: WeightRule,
+    medians: Tensor,
+    state: MKFState,
+    frame: Measurements,
+    return_cov: bool,
+) -> tuple[MKFState, StepOutput]:
+    """Filter one frame as `run_memoryless` does; the state only counts it."""
+    later = state._replace(time=state.time + 1)
+    frames = frame.as_sequences()
+    if not values_visible():
+        (group,) = _groups(frames, len(frame.z))
+        return later, StepOutput(*_estimate(model, rule, medians, group, None, return_cov))
+    out = run_memoryless(model, rule, medians, frames, return_cov)
+    values = out.mean, out.log_weights, out.log_evidence, out.cov, out.mended, out.jitter
+    first = (None if value is None else value[:, 0] for value in values)
+    return later, StepOutput(*first)  # type: ignore[arg-type]
+
+
+class _Group(NamedTuple):
+    """Frames whose gains are computed together.
+
+    Attributes:
+        rows: which of the B T frames [N]. z: [N, Z].
+        mask, noise: [Z] and [Z, Z] for all of them, or [N, 1, Z] and [N, 1, Z, Z].
+    """
+
+    rows: Tensor
+    z: Tensor
+    mask: Tensor
+    noise: Tensor
+
+    @property
+    def shares_gain(self) -> bool:
+        """Whether all frames have one gain."""
+        return self.mask.ndim == 1
+
+
+def _groups(frames: Measurements, at_a_time: int) -> Iterator[_Group]:
+    """Yield frames that measure the same dimensions with the same noise, which share their gains."""
+    z, mask = frames.z.flatten(0, 1), frames.mask.flatten(0, 1)
+    noise = None if frames.cov.ndim == 2 else frames.cov.flatten(0, 1)
+    if not values_visible():
+        each = frames.cov if noise is None else noise[:, None]
+        yield _Group(torch.arange(len(z), device=z.device), z, mask[:, None], each)
+        return
+    settings = mask if noise is None else torch.cat([mask.to(noise), noise.flatten(1)], 1)
+    if noise is not None and noise.requires_grad:
+        yield from _groups_of_own(z, mask, noise)
+        return
+    _, group = torch.unique(settings, dim=0, return_inverse=True)
+    sizes = torch.bincount(group)
+    if noise is not None and len(z) > 1 and len(sizes) > len(z) / _LEAST_SHARE:
+        yield from _groups_of_own(z, mask, noise)
+        return
+    for same in group.argsort(stable=True).split(sizes.tolist()):
+        own_noise = frames.cov if noise is None else noise[same[0]]
+        for rows in same.split(at_a_time):
+            yield _Group(rows, z[rows], mask[same[0]], own_noise)
+
+
+def _groups_of_own(z: Tensor, mask: Tensor, noise: Tensor) -> Iterator[_Group]:
+    """Yield frames that have gains of their own, some at a time."""
+    for rows in torch.arange(len(z), device=z.device).split(_OWN_FRAMES):
+        yield _Group(rows, z[rows], mask[rows][:, None], noise[rows][:, None])
+
+
+def _condition(
+    model: MixtureKalmanFilter, group: _Group, gain_and_cov: tuple[Gain, Tensor]
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """Return every component given a frame: means [N, M, D], log-likelihoods [N, M], covs, jitter."""
+    gain, cov = gain_and_cov
+    centres = model.means.to(model.dtype)
+    residual = (group.z[:, None] - centres[:, model.observed]) * group.mask
+    if group.shares_gain:
+        white = torch.linalg.solve_triangular(gain.factor, residual.permute(1, 2, 0), upper=False)
+        means = (centres[:, None] + white.mT @ gain.white).transpose(0, 1)
+        log_likelihood = (gain.log_norm[:, None] - 0.5 * white.square().sum(1)).mT
+        jitter = None if gain.jitter is None else gain.jitter.expand(len(group.rows), -1)
+        return means, log_likelihood, cov, jitter
+    white = torch.linalg.solve_triangular(gain.factor, residual[..., None], upper=False)
+    means = centres + (gain.white.mT @ white)[..., 0]
+    return means, gain.log_norm - 0.5 * white.square().sum((-2, -1)), cov, gain.jitter
+
+
+def _gain(model: MixtureKalmanFilter, group: _Group) -> tuple[Gain, Tensor]:
+    """Return gain and covariance of every component; those that frames share are kept for later."""
+    if not group.shares_gain:
+        return _make_gain(model, group)
+    sources = (model.means, model.covariances)
+    kept = derived(model, f"frame gains {model.dtype}", sources, _FrameGains)
+    found = kept.get(group.noise, group.mask)
+    if found is None:
+        with outside_inference():
+            found = _make_gain(model, group)
+        kept.put(group.noise, group.mask, found)
+    return found
+
+
+def _make_gain(model: MixtureKalmanFilter, group: _Group) -> tuple[Gain, Tensor]:
+    gain, cov = kalman_gain(model.covariances, group.noise, model.observed, group.mask)
+    return gain.to(model.dtype), cov
+
+
+class _FrameGains:
+    """The gains of the latest patterns of measured dimensions and noise, for one mixture."""
+
+    def __init__(self) -> None:
+        self._found: dict[tuple[Any, ...], tuple[Gain, Tensor]] = {}
+
+    def get(self, noise: Tensor, mask: Tensor) -> tuple[Gain, Tensor] | None:
+        """Return what is known for this pattern and noise, or None."""
+        if torch.is_grad_enabled() and noise.requires_grad:
+            return None
+        key = _key(noise, mask)
+        found = self._found.pop(key, None)
+        if found is not None:
+            self._found[key] = found  # the latest one used is the last to go
+        return found
+
+    def put(self, noise: Tensor, mask: Tensor, value: tuple[Gain, Tensor]) -> None:
+        """Keep a gain, unless the noise wants gradients; the pattern unused longest makes room."""
+        if torch.is_grad_enabled() and noise.requires_grad:
+            return
+        if len(self._found) >= _PATTERNS:
+            self._found.pop(next(iter(self._found)))
+        self._found[_key(noise, mask)] = value
+
+
+def _key(noise: Tensor, mask: Tensor) -> tuple[Any, ...]:
+    return (*mask.tolist(), *noise.detach().flatten().tolist())
+
+
+def _in_order(parts: list[tuple[Tensor, Tensor]]) -> Tensor:
+    """Return the values of all frames in the order of the frames."""
+    rows = torch.cat([rows for rows, _ in parts])
+    values = torch.cat([values for _, values in parts])
+    return values.index_select(0, rows.argsort())

@@ -1,0 +1,109 @@
+"""OpenPose output: a folder with one `*_keypoints.json` per frame.
+
+Of several people one is followed: in the first frame with people the one of largest mean confidence,
+afterwards the one nearest to the last frame in which that person was seen (mean pixel distance over
+the keypoints that both have); where nothing can be compared, again the one of largest mean
+confidence. An empty list of people is a frame without measurements.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from torchpose._core.reading import check_span, read_json, reading
+from torchpose.errors import FileFormatError, InputError
+from torchpose.skeleton._joint_sets import SKELETONS
+
+__all__ = ["read_openpose"]
+
+_SUFFIX = "_keypoints.json"
+_LAYOUTS = {25: SKELETONS["openpose-25"].joints, 18: SKELETONS["openpose-18"].joints}
+_EXPECTED = "OpenPose's JSON with people / pose_keypoints_2d"
+_FAR = 1e9  # pixels; no keypoint is there
+
+
+def read_openpose(folder: str | Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Read a folder of OpenPose JSON files.
+
+    The number in front of ``_keypoints.json`` is the frame; frames without a file are missing.
+
+    Args:
+        folder: the folder.
+
+    Returns:
+        keypoints [T, J, 2], pixels, NaN where missing; confidence [T, J]; the J names of BODY_25 or
+        COCO 18, whichever the files hold. BODY_25B has as many keypoints as BODY_25 in another order
+        and cannot be told from it: do not pass it here.
+
+    Raises:
+        InputError: no such files, or nobody in any of them. FileFormatError: not OpenPose's JSON,
+            or another number of keypoints; the file is named.
+    """
+    files = _files_by_frame(Path(folder))
+    people = {frame: _people(path) for frame, path in files.items()}
+    sizes = {len(person) for group in people.values() for person in group}
+    if not sizes:
+        raise InputError(f"{folder}: nobody was found in any of {len(files)} frames")
+    if len(sizes) > 1 or sizes.isdisjoint(_LAYOUTS):
+        raise FileFormatError(
+            f"{folder}: expected 25 keypoints (BODY_25) or 18 (COCO) for everybody, got "
+            f"{', '.join(map(str, sorted(sizes)))}"
+        )
+    names = _LAYOUTS[sizes.pop()]
+    first, last = min(files), max(files)
+    table = np.zeros((last - first + 1, len(names), 3))
+    followed = None
+    for frame in sorted(people):
+        if people[frame]:
+            followed = _pick(np.stack(people[frame]), followed)
+            table[frame - first] = followed
+    confidence = table[..., 2].clip(max=1.0)  # a peak of the heat map, which may exceed 1
+    return np.where(confidence[..., None] > 0, table[..., :2], np.nan), confidence, names
+
+
+def _files_by_frame(folder: Path) -> dict[int, Path]:
+    with reading(folder, "a folder"):
+        files = sorted(folder.glob(f"*{_SUFFIX}"))
+    if not files:
+        raise InputError(f"{folder}: expected OpenPose files *{_SUFFIX}, found none")
+    found = [re.search(r"(\d+)$", path.name.removesuffix(_SUFFIX)) for path in files]
+    numbers = [int(match.group(1)) for match in found if match is not None]
+    if len(numbers) < len(files):  # names without numbers: their order is all there is
+        return dict(enumerate(files))
+    if len(set(numbers)) < len(files):
+        raise FileFormatError(f"{folder}: two files have one frame number; expected one video")
+    check_span(folder, max(numbers) - min(numbers) + 1, len(numbers))
+    return dict(zip(numbers, files, strict=True))
+
+
+def _people(path: Path) -> list[np.ndarray]:
+    """Return the keypoints [J, 3] (u, v, confidence) of everybody in one file, without empty ones."""
+    content = read_json(path, _EXPECTED)
+    with reading(path, _EXPECTED):
+        listed = content["people"]
+        flat = [p["pose_keypoints_2d"] if "pose_keypoints_2d" in p else p["pose_keypoints"]
+                for p in listed]  # fmt: skip
+        arrays = [np.asarray(values, dtype=np.float64) for values in flat]
+    people = []
+    for array in arrays:
+        if array.ndim != 1 or array.size % 3 or not (np.abs(array) < _FAR).all():
+            raise FileFormatError(
+                f"{path}: pose_keypoints_2d must be x, y, confidence of each keypoint, below {_FAR:g}; "
+                f"got {array.size} values"
+            )
+        if array.size and (array[2::3] > 0).any():
+            people.append(array.reshape(-1, 3))
+    return people
+
+
+def _pick(people: np.ndarray, followed: np.ndarray | None) -> np.ndarray:
+    """Return the person [J, 3] to follow among [P, J, 3]."""
+    if followed is not None and len(people) > 1:
+        both = (people[..., 2] > 0) & (followed[:, 2] > 0)
+        gaps = np.linalg.norm(people[..., :2] - followed[:, :2], axis=-1)
+        shared = both.sum(-1)
+        if shared.any():
+            distance = np.where(both, gaps, 0.0).sum(-1) / np.maximum(shared, 1)
+            return people[int(np.where(shared > 0, distance, np.inf).argmin())]
+    return people[int(people[..., 2].mean(-1).argmax())]

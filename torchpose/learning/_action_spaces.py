@@ -1,0 +1,223 @@
+"""Fit action spaces to performances of an action (AS 1), and count how well they tell actions."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.errors import InputError, check_shape
+from torchpose.learning._performances import Synchronised, checked_performances, synchronise
+from torchpose.priors._actions.bank import ActionBank
+from torchpose.priors._actions.file import ActionInfo
+from torchpose.priors._actions.polar_limbs import POSTURE_DIM
+from torchpose.priors._actions.space import ActionSpace
+
+__all__ = [
+    "ConfusionTable",
+    "Performed",
+    "fit_action_space",
+    "fit_synchronised",
+    "recognition_of_unseen",
+]
+
+_STD_FLOOR = 0.1  # of a dimension's deviation over the whole performance
+_LEAST_STD = 0.1  # degrees
+_SMALLEST_VARIANCE = 1e-10  # of the largest; below it a direction is rounding
+
+
+def fit_action_space(
+    performances: Sequence[Float[Tensor, "_ 36"]],
+    n_dimensions: int = 13,
+    *,
+    name: str = "",
+    fps: float | None = None,
+    n_postures: int | None = None,
+    prominence: float = 0.15,
+    info: ActionInfo | None = None,
+) -> ActionSpace:
+    """Fit an action space to performances of one action (AS 1).
+
+    Performances are synchronised in all principal axes, whatever D is, so that
+    `with_dimensions(d)` of a larger space is the fit with d.
+
+    Args:
+        performances: [T_p, 36] each, degrees, of any lengths, one repetition of the action from
+            its start to its end (`split_repetitions` cuts them out of recordings).
+        n_dimensions: D; reduced, with a warning, if the postures span fewer.
+        name: of the action. fps: of the performances, for the record.
+        n_postures: K; by default the median length. prominence: see `synchronise`.
+        info: more facts; name, fps and what the fit finds are filled in.
+
+    Raises:
+        InputError: one performance only, one with too few frames, NaN, D or fps not positive,
+            nothing moves. ShapeError: postures of other than 36 angles.
+    """
+    return _fit(performances, n_dimensions, name, fps, n_postures, prominence, info)[0]
+
+
+def fit_synchronised(
+    performances: Sequence[Float[Tensor, "_ 36"]],
+    n_dimensions: int = 13,
+    *,
+    name: str = "",
+    fps: float | None = None,
+    n_postures: int | None = None,
+    prominence: float = 0.15,
+    info: ActionInfo | None = None,
+) -> tuple[ActionSpace, Synchronised]:
+    """Fit as `fit_action_space`, and return also the performances that were put in step, for pictures."""
+    return _fit(performances, n_dimensions, name, fps, n_postures, prominence, info)
+
+
+def _fit(
+    performances: Sequence[Float[Tensor, "_ 36"]],
+    n_dimensions: int,
+    name: str,
+    fps: float | None,
+    n_postures: int | None,
+    prominence: float,
+    info: ActionInfo | None,
+) -> tuple[ActionSpace, Synchronised]:
+    known = info or ActionInfo()
+    name, fps = name or known.name, known.fps if fps is None else fps
+    if fps is not None and not 0 < fps < float("inf"):
+        raise InputError(f"fps must be positive, got {fps:g}")
+    parts = _checked(performances, n_dimensions)
+    postures = torch.cat(parts)
+    mean = postures.mean(0)
+    variances, axes = _principal_axes(postures - mean)
+    rank = int((variances > _SMALLEST_VARIANCE * variances[0]).sum())
+    if n_dimensions > rank:
+        warnings.warn(
+            f"the postures of {name or 'the action'} span {rank} dimensions, fewer than the "
+            f"{n_dimensions} that were asked for: the action space has {rank}",
+            stacklevel=3,  # who called the public function
+        )
+    d = min(n_dimensions, rank)
+    axes = axes[:, :rank]
+    found = synchronise([(part - mean) @ axes for part in parts], n_postures, prominence)
+    found = found._replace(before=found.before[..., :d], after=found.after[..., :d])
+    performance, std = found.after.mean(0), found.after.std(0)
+    match_std = (found.after - performance).square().mean((0, 1)).sqrt().clamp_min(_LEAST_STD)
+    tensors = {
+        "mean": mean, "basis": axes[:, :d].contiguous(), "performance": performance,
+        "std": torch.maximum(std, _STD_FLOOR * match_std), "match_std": match_std,
+        "variances": variances[:d].clone(), "lost_variance": variances[d:].sum(),
+    }  # fmt: skip
+    facts = replace(
+        known, name=name, fps=fps, performances=len(parts), key_frames=found.key_frames,
+        explained=float(variances[:d].sum() / variances.sum()),
+    )  # fmt: skip
+    return ActionSpace(**tensors, info=facts), found
+
+
+def _principal_axes(moves: Float[Tensor, "N 36"]) -> tuple[Tensor, Tensor]:
+    """Variances [36], falling, and axes [36, 36] with their largest entry positive."""
+    variances, axes = torch.linalg.eigh(moves.mT @ moves / len(moves))
+    variances, axes = variances.flip(0).clamp_min(0), axes.flip(1)
+    largest = axes.gather(0, axes.abs().argmax(0, keepdim=True))
+    return variances, axes * largest.sign()
+
+
+def _checked(performances: Sequence[Tensor], n_dimensions: int) -> list[Tensor]:
+    """The performances in double precision, or what is wrong with them."""
+    if n_dimensions < 1:
+        raise InputError(f"n_dimensions must be at least 1, got {n_dimensions}")
+    if len(performances) < 2:
+        raise InputError(
+            f"an action space needs the deviation between performances: expected two or more, got "
+            f"{len(performances)}; add recordings, or cut one with `split_repetitions`"
+        )
+    for number, performance in enumerate(performances):
+        check_shape(f"performance {number}", performance, ["T", POSTURE_DIM])
+    parts = checked_performances(performances)
+    if all(torch.equal(parts[0], part) for part in parts[1:]):
+        raise InputError("all performances are one and the same: there is no deviation to learn")
+    if all(bool((part == parts[0][0]).all()) for part in parts):
+        raise InputError("all postures are one and the same: there is no motion to learn")
+    return parts
+
+
+class Performed(NamedTuple):
+    """A recording or a single performance.
+
+    Attributes:
+        person, action: who and what. postures: [T, 36], degrees.
+    """
+
+    person: str
+    action: str
+    postures: Tensor
+
+
+class ConfusionTable(NamedTuple):
+    """What recordings of unseen persons were taken for.
+
+    Attributes:
+        truth: the R actions of the rows. columns: the A + 1 states, the last one "none".
+        frames: [R, A + 1], mean over frames of the posterior of each frame.
+        recordings: [R, A + 1], share of the recordings whose mean posterior over all frames is
+            highest there. n_recordings: [R].
+    """
+
+    truth: tuple[str, ...]
+    columns: tuple[str, ...]
+    frames: Tensor
+    recordings: Tensor
+    n_recordings: Tensor
+
+    def correct(self) -> Float[Tensor, " R"]:
+        """Share of each row's recordings that were told rightly: others than the known are none."""
+        right = [self.columns.index(a) if a in self.columns else -1 for a in self.truth]
+        return self.recordings[torch.arange(len(right)), torch.tensor(right)]
+
+
+def recognition_of_unseen(
+    performances: Sequence[Performed],
+    recordings: Sequence[Performed],
+    fps: float,
+    *,
+    n_dimensions: int = 25,
+    settings: Mapping[str, Any] | None = None,
+) -> ConfusionTable:
+    """Leave one person out: fit a bank to everybody else, recognise what the person does.
+
+    Args:
+        performances: single performances of the known actions, of several persons.
+        recordings: to be recognised, of these and of other actions.
+        fps: of all of them. n_dimensions: D of every action.
+        settings: of `ActionBank`.
+
+    Raises:
+        InputError: no performances or recordings, or an action that one person alone performed.
+    """
+    known = tuple(dict.fromkeys(p.action for p in performances))
+    if not known or not recordings:
+        raise InputError("expected performances to learn from and recordings to tell, got none")
+    truth = (*known, *sorted({r.action for r in recordings} - set(known)))
+    frames = torch.zeros(len(truth), len(known) + 1, dtype=torch.float64)
+    taken, count = torch.zeros_like(frames), torch.zeros(len(truth), dtype=torch.float64)
+    for person in sorted({r.person for r in recordings}):
+        others = [p for p in performances if p.person != person]
+        spaces = []
+        for action in known:
+            postures = [p.postures for p in others if p.action == action]
+            if len(postures) < 2:
+                raise InputError(
+                    f"without {person} there are {len(postures)} performances of {action}; two or "
+                    "more are needed"
+                )
+            spaces.append(fit_action_space(postures, n_dimensions, name=action, fps=fps))
+        bank = ActionBank(spaces, **(settings or {}))
+        for recording in (r for r in recordings if r.person == person):
+            row = truth.index(recording.action)
+            mean = bank.recognise(recording.postures, fps).mean(0)
+            frames[row] += mean
+            taken[row, int(mean.argmax())] += 1
+            count[row] += 1
+    share = count.clamp_min(1)[:, None]
+    return ConfusionTable(truth, bank.names, frames / share, taken / share, count.long())

@@ -1,0 +1,168 @@
+"""Blocks of samples: which are whose, which of their samples a fit can use, and products of many."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+
+from torchpose.errors import InputError
+from torchpose.learning._samplers import BLOCK, PRODUCT, Samples, SampleSource, join_samples
+
+__all__ = [
+    "ALONE",
+    "Share",
+    "joined_blocks",
+    "spread_samples",
+    "usable_block",
+    "usable_samples",
+]
+
+K = TypeVar("K")
+_START_BLOCKS = 4  # times as many blocks as the samples would fill, for variety
+
+
+def _alone(values: Tensor) -> Tensor:
+    return values
+
+
+def _sum_over_processes(values: Tensor) -> Tensor:
+    total = values.clone()
+    torch.distributed.all_reduce(total)
+    return total
+
+
+class Share(NamedTuple):
+    """Which part of the work this process does.
+
+    Attributes:
+        rank, size: number of this process, and how many there are.
+        total: the sum of a tensor over all processes, which each of them has to call.
+    """
+
+    rank: int = 0
+    size: int = 1
+    total: Callable[[Tensor], Tensor] = _alone
+
+    @classmethod
+    def of_processes(cls) -> Share:
+        """This process' share in the group of `torch.distributed`; all of it without a group."""
+        if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
+            return cls()
+        rank, size = torch.distributed.get_rank(), torch.distributed.get_world_size()
+        return cls(rank, size, _sum_over_processes)
+
+    def blocks(self, n_blocks: int) -> range:
+        """The blocks of this process: every block belongs to exactly one, none is padded."""
+        return range(self.rank, n_blocks, self.size)
+
+    @contextlib.contextmanager
+    def failing_together(self, like: Tensor) -> Iterator[None]:
+        """Work before a `total` of the shape of `like`, which the others get as NaN if it fails."""
+        try:
+            yield
+        except Exception:
+            if self.size > 1:  # or the others would wait for this process for ever
+                self.total(torch.full_like(like, torch.nan))
+            raise
+
+
+ALONE = Share()
+"""All of the work, for a process without others."""
+
+
+def usable_samples(samples: Samples, name: str) -> Samples:
+    """Samples of positive weight.
+
+    Args:
+        samples: states and weights.
+        name: what the samples are called in a message, such as their block.
+
+    Raises:
+        InputError: weights that are negative or not finite, states of positive weight that are not.
+    """
+    states, weight = samples
+    if len(weight) and _all_usable(states, weight):
+        return samples
+    if not bool((weight >= 0).all()) or bool(torch.isinf(weight).any()):
+        bad = ~((weight >= 0) & torch.isfinite(weight))
+        row = int(bad.nonzero()[0])
+        raise InputError(
+            f"{name}: weights must be finite and not negative, got {float(weight[row]):g} in row "
+            f"{row} ({int(bad.sum())} such weights)"
+        )
+    positive = weight > 0
+    if not bool(positive.all()):
+        states, weight = states[positive], weight[positive]
+    if not bool(torch.isfinite(states).all()):
+        bad = ~torch.isfinite(states).all(1)
+        row = int((positive.nonzero()[:, 0])[bad][0])
+        raise InputError(
+            f"{name}: states must be finite, got {int(bad.sum())} of {len(samples.states)} that are "
+            f"not, the first in row {row}; drop frames with missing joints, or give them weight 0"
+        )
+    return Samples(states, weight)
+
+
+def _all_usable(states: Tensor, weight: Tensor) -> bool:
+    """In one pass over each: NaN and infinity show in a sum and in the extremes."""
+    low, high = weight.aminmax()
+    return bool((low > 0) & (high < torch.inf) & torch.isfinite(states.sum()))
+
+
+def spread_samples(source: SampleSource, count: int) -> Samples:
+    """About `count` usable samples, spread evenly over a source; the same for whoever asks.
+
+    Args:
+        source: the states; all of them are taken if there are no more than `count`.
+        count: how many.
+
+    Raises:
+        InputError: samples that are not finite; the block is named.
+    """
+    n_blocks = source.n_blocks
+    if source.n_samples > count:
+        n_blocks = min(n_blocks, _START_BLOCKS * -(-count // BLOCK))
+    each = -(-count // max(n_blocks, 1))
+    parts = []
+    for place in range(n_blocks):
+        index = (place * source.n_blocks + source.n_blocks // 2) // n_blocks
+        samples = usable_block(source, index)
+        n = len(samples.states)
+        if source.n_samples > count and each < n:
+            rows = torch.arange(each) * n // each
+            samples = Samples(*(values[rows] for values in samples))
+        parts.append(samples)
+    if not parts:
+        return Samples(torch.zeros(0, source.dim).double(), torch.zeros(0).double())
+    return Samples(*(torch.cat(values) for values in zip(*parts, strict=True)))
+
+
+def usable_block(source: SampleSource, index: int, epoch: int = 0) -> Samples:
+    """Samples of positive weight of a block, which is named in the error if they are not finite."""
+    name = f"block {index} of {source.n_blocks}"
+    return usable_samples(source.block(index, epoch), name)
+
+
+def joined_blocks(blocks: Iterable[tuple[K, Samples]]) -> Iterator[tuple[K, Samples]]:
+    """Join blocks of one key that follow each other to as many samples as one product takes.
+
+    Args:
+        blocks: keys, such as the name of their source, and samples; those of one key together.
+    """
+    kept: list[Samples] = []
+    last: list[K] = []
+    for key, samples in blocks:
+        if kept and last != [key]:
+            yield last[0], join_samples(kept)
+            kept = []
+        last = [key]
+        kept.append(samples)
+        if sum(len(s.states) for s in kept) >= PRODUCT:
+            yield key, join_samples(kept)
+            kept = []
+    if kept:
+        yield last[0], join_samples(kept)

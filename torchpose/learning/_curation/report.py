@@ -1,0 +1,134 @@
+"""What curation dropped and changed, for people and for model cards."""
+
+from collections import Counter
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+from torchpose.io._formats.raw_recording import frame_ranges
+
+__all__ = ["CurationReport", "Drop", "Size"]
+
+_SHOWN_NOTES = 20
+
+
+class Drop(NamedTuple):
+    """Something that was left out.
+
+    Attributes:
+        reason: ``jump``, ``bone length``, ``no body``, ``no person's size``, ``companion``,
+            ``duplicate`` or ``too few frames``.
+        file, person: whose. joint: empty for whole poses.
+        frames: numbers as in the file; n_frames: how many.
+        why: more about it, may be empty.
+    """
+
+    reason: str
+    file: str
+    person: str
+    joint: str
+    frames: str
+    n_frames: int
+    why: str = ""
+
+    def text(self) -> str:
+        """One line for people."""
+        joint = f"{self.joint} in " if self.joint else ""
+        why = f" ({self.why})" if self.why else ""
+        return (
+            f"{self.reason}: {self.file}, person {self.person}: {joint}"
+            f"{_several(self.n_frames, 'frame')} {self.frames}{why}"
+        )
+
+
+class Size(NamedTuple):
+    """How much there is: persons, recordings, frames, and measured joints among the eight."""
+
+    persons: int
+    recordings: int
+    frames: int
+    joints: int
+
+    def text(self) -> str:
+        """For people."""
+        return (
+            f"{_several(self.recordings, 'recording')} of {_several(self.persons, 'person')}, "
+            f"{_several(self.frames, 'frame')}, {_several(self.joints, 'joint')}"
+        )
+
+
+class CurationReport(NamedTuple):
+    """What came, what was left out and why, what is left.
+
+    Attributes:
+        before, after: counts. drops: one per file, joint and reason. notes: what reading assumed and
+            converted, with the number of recordings it concerns; what was changed on purpose.
+        settings: of the curation.
+    """
+
+    before: Size
+    after: Size
+    drops: tuple[Drop, ...]
+    notes: tuple[str, ...]
+    settings: dict[str, Any]
+
+    def text(self, most: int = 20) -> str:
+        """A few lines for people: totals, then the largest drops, at most this many."""
+        lines = [f"read     {self.before.text()}", f"kept     {self.after.text()}"]
+        lines += [f"dropped  {n} {what}: {reason}" for reason, (n, what) in self.totals().items()]
+        largest = sorted(self.drops, key=lambda drop: -drop.n_frames)[:most]
+        lines += [f"         {drop.text()}" for drop in largest]
+        if len(self.drops) > most:
+            lines.append(f"         and {len(self.drops) - most} more")
+        return "\n".join([*lines, *(f"note     {note}" for note in self.notes[:_SHOWN_NOTES])])
+
+    def totals(self) -> dict[str, tuple[int, str]]:
+        """By reason: how many, and of what (joints or frames)."""
+        counts: Counter[tuple[str, str]] = Counter()
+        for drop in self.drops:
+            counts[drop.reason, "joints" if drop.joint else "frames"] += drop.n_frames
+        return {reason: (n, what) for (reason, what), n in sorted(counts.items())}
+
+    def facts(self, most: int = 100) -> dict[str, Any]:
+        """The same for a model card: plain values that JSON can hold, the largest drops."""
+        largest = sorted(self.drops, key=lambda drop: -drop.n_frames)[:most]
+        return {
+            "before": self.before._asdict(),
+            "after": self.after._asdict(),
+            "dropped": {reason: f"{n} {what}" for reason, (n, what) in self.totals().items()},
+            "by_person": self._by_person(),
+            "drops": [drop._asdict() for drop in largest],
+            "drops_in_all": len(self.drops),
+            "notes": list(self.notes),
+            "settings": self.settings,
+        }
+
+    def for_prior(self) -> dict[str, Any]:
+        """What the file of a prior says: counts, reasons and notes, without single drops."""
+        told = ("before", "after", "dropped", "by_person", "notes")
+        facts = self.facts()
+        return {"curation": {name: facts[name] for name in told}}
+
+    def _by_person(self) -> dict[str, dict[str, int]]:
+        found: dict[str, dict[str, int]] = {}
+        for drop in self.drops:
+            reasons = found.setdefault(drop.person, {})
+            reasons[drop.reason] = reasons.get(drop.reason, 0) + drop.n_frames
+        return found
+
+
+def drop_frames(
+    reason: str,
+    file: str,
+    person: str,
+    joint: str,
+    frames: Iterable[int],
+    first: int,
+    why: str = "",
+) -> Drop:
+    """A `Drop` of these frames, counted from 0; `first` is the number of the first in the file."""
+    listed = list(frames)
+    return Drop(reason, file, person, joint, frame_ranges(listed, first), len(listed), why)
+
+
+def _several(count: int, what: str) -> str:
+    return f"{count} {what}{'s' * (count != 1)}"

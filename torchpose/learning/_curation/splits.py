@@ -1,0 +1,282 @@
+"""Split persons into training and test without leaks: duplicates, shared recordings, kinds of joints."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchpose.errors import InputError, OverlapError, PriorError
+from torchpose.io._recordings import Recording
+from torchpose.learning._curation.joints import label, measured
+
+__all__ = [
+    "Duplicate",
+    "PersonSplit",
+    "check_kinds",
+    "describe_duplicate",
+    "find_duplicates",
+    "leave_one_person_out",
+    "persons_of",
+    "pick_persons",
+    "refuse_leaks",
+    "refuse_shared_between_persons",
+    "refuse_shared_recordings",
+    "skeleton_counts",
+    "split_persons",
+]
+
+_GRID = 0.02  # metres: coarse, so that copies in whole millimetres mostly agree on it
+_SHARED = 0.5  # of the shorter recording's frames
+_MOST_COPIES = 64  # of one frame that are compared
+_NECK = 4
+_MISSING = -(2**40)
+
+
+class Duplicate(NamedTuple):
+    """Two recordings with the same frames: their indices, and the share of the shorter one's frames."""
+
+    first: int
+    second: int
+    shared: float
+
+
+def find_duplicates(recordings: Sequence[Recording], shared: float = _SHARED) -> list[Duplicate]:
+    """Pairs of recordings that have at least this share of the shorter one's frames in common.
+
+    A frame is its eight joints relative to the neck, rounded to 2 cm, as a hash of 64 bits; so copies
+    are found that were moved, cut, renamed, or written in whole millimetres. A copy that was turned,
+    scaled or mirrored is not. Equal frames within one recording count once.
+    """
+    keys = [torch.unique(_frame_keys(r.upper_body().joints)) for r in recordings]
+    sizes = torch.tensor([len(k) for k in keys], dtype=torch.long)
+    which = torch.arange(len(keys)).repeat_interleave(sizes)
+    flat, order = torch.sort(torch.cat(keys) if keys else sizes, stable=True)
+    which = which[order]
+    pairs = []
+    for apart in range(1, _MOST_COPIES):
+        same = flat[apart:] == flat[:-apart]
+        if not bool(same.any()):
+            break
+        pairs.append(torch.stack([which[:-apart][same], which[apart:][same]], 1))
+    if not pairs:
+        return []
+    found, counts = torch.unique(torch.cat(pairs), dim=0, return_counts=True)
+    share = counts / torch.minimum(sizes[found[:, 0]], sizes[found[:, 1]])
+    return [
+        Duplicate(first, second, part)
+        for (first, second), part in zip(found.tolist(), share.tolist(), strict=True)
+        if part >= shared
+    ]
+
+
+def refuse_shared_recordings(
+    train: Sequence[Recording], test: Sequence[Recording], shared: float = _SHARED
+) -> None:
+    """Raise if a recording, or part of it, is on both sides.
+
+    Raises:
+        OverlapError: both files and persons are named.
+    """
+    both = [*train, *test]
+    for found in find_duplicates(both, shared):
+        if found.first < len(train) <= found.second:
+            raise OverlapError(
+                f"{describe_duplicate(found, both)}; the first would be in the test and the second "
+                "in training: remove one"
+            )
+
+
+def refuse_shared_between_persons(
+    recordings: Sequence[Recording], shared: float = _SHARED
+) -> list[Duplicate]:
+    """Raise if a recording, or part of it, is there under two persons.
+
+    Returns:
+        The duplicates of one person.
+
+    Raises:
+        OverlapError: both files and persons are named.
+    """
+    duplicates = find_duplicates(recordings, shared)
+    for found in duplicates:
+        if recordings[found.first].person_id != recordings[found.second].person_id:
+            raise OverlapError(
+                f"{describe_duplicate(found, recordings)}; a recording under two persons would leak "
+                "from training into a test: remove one, or put both into the folder of one person"
+            )
+    return duplicates
+
+
+def describe_duplicate(found: Duplicate, recordings: Sequence[Recording]) -> str:
+    """Which recording is in which other one, for people."""
+    first, second = recordings[found.first], recordings[found.second]
+    return (
+        f"{100 * found.shared:.0f} % of the frames of {label(second)} (person {second.person_id}) "
+        f"are also in {label(first)} (person {first.person_id})"
+    )
+
+
+def _frame_keys(joints: Float[Tensor, "T 8 3"]) -> Int[Tensor, " N"]:
+    """A hash of each frame that has a joint."""
+    joints = joints[measured(joints).any(1)].double()
+    neck = joints[:, _NECK : _NECK + 1]
+    joints = joints - torch.where(torch.isfinite(neck), neck, 0.0)
+    grid = torch.where(torch.isfinite(joints), (joints / _GRID).round(), _MISSING).long()
+    generator = torch.Generator().manual_seed(0)
+    factors = torch.randint(-(2**62), 2**62, (grid[0].numel() if len(grid) else 24,),
+                            generator=generator) | 1  # fmt: skip
+    return (grid.flatten(1) * factors).sum(1)  # in the ring of 64-bit numbers
+
+
+class PersonSplit(NamedTuple):
+    """Recordings to train on, recordings of other persons to test on, and who those are."""
+
+    train: list[Recording]
+    test: list[Recording]
+    persons: tuple[str, ...]
+
+
+def persons_of(recordings: Iterable[Recording]) -> list[str]:
+    """The persons (`Recording.person_id`) in order, each once; companions are none of them."""
+    return sorted({r.person_id for r in recordings if not r.companion})
+
+
+def pick_persons(names: Iterable[str], known: Sequence[str]) -> set[str]:
+    """Ids of the persons that are meant by names, which may leave out their origin.
+
+    Where a folder stands for a person, its name is the person's.
+
+    Args:
+        names: ids (`Recording.person_id`), or what stands on one side of their ``#``.
+        known: ids of everybody.
+
+    Raises:
+        InputError: nobody, or several persons, of that name.
+
+    >>> sorted(pick_persons(["s1", "b#s2", "bob"], ["a#s1", "a#s2", "b#s2", "bob#"]))
+    ['a#s1', 'b#s2', 'bob#']
+    """
+    found = set()
+    for name in names:
+        fitting = [p for p in known if name in (p, p.partition("#")[2], p.removesuffix("#"))]
+        if len(fitting) != 1:
+            which = f"could be {' or '.join(fitting)}" if fitting else "is nobody's name"
+            raise InputError(
+                f"{name!r} {which}; the recordings are of {', '.join(known) or 'nobody'}"
+            )
+        found.add(fitting[0])
+    return found
+
+
+def split_persons(recordings: Sequence[Recording], test_persons: Iterable[str]) -> PersonSplit:
+    """Recordings of some persons to test on, those of all others to train on.
+
+    Other people in a file of a test person are on neither side, because nobody says who they are.
+
+    Args:
+        recordings: all of them.
+        test_persons: ids (`Recording.person_id`).
+
+    Raises:
+        InputError: a person without a recording, or nobody left on one side. OverlapError: one
+            recording, or part of it, on both sides under different persons.
+    """
+    split = _split(recordings, sorted(set(test_persons)))
+    refuse_leaks(split.train, split.test)
+    return split
+
+
+def _split(recordings: Sequence[Recording], wanted: list[str]) -> PersonSplit:
+    known = persons_of(recordings)
+    strangers = [person for person in wanted if person not in known]
+    if strangers:
+        raise InputError(
+            f"no recording of {', '.join(strangers)}; there are recordings of {', '.join(known)}"
+        )
+    test = [r for r in recordings if r.person_id in wanted]
+    files = {r.path for r in test if r.path is not None}
+    train = [r for r in recordings if r.person_id not in wanted and r.path not in files]
+    if not test or not train:
+        raise InputError(
+            f"a split needs persons on both sides, got {len(wanted)} to test of {len(known)} in all"
+        )
+    return PersonSplit(train, test, tuple(wanted))
+
+
+def leave_one_person_out(recordings: Sequence[Recording]) -> Iterator[PersonSplit]:
+    """One split per person, in the order of their ids: that person to test, all others to train.
+
+    Raises:
+        InputError: fewer than two persons. OverlapError: as `split_persons`.
+    """
+    persons = persons_of(recordings)
+    if len(persons) < 2:
+        raise InputError(
+            f"leaving one person out needs recordings of two or more, got {', '.join(persons) or 'none'}"
+            "; a folder stands for a person where files do not name one"
+        )
+    refuse_shared_between_persons(recordings)
+    return (_split(recordings, [person]) for person in persons)
+
+
+def refuse_leaks(train: Sequence[Recording], test: Sequence[Recording]) -> None:
+    """Raise if a person, a file or a recording is on both sides.
+
+    Raises:
+        OverlapError: it is named.
+    """
+    shared = sorted({r.person_id for r in train} & {r.person_id for r in test})
+    if shared:
+        raise OverlapError(
+            f"{', '.join(shared)} would be in training and test; take each person for one of them"
+        )
+    files = {r.path for r in train if r.path is not None}
+    for recording in test:
+        if recording.path in files:
+            raise OverlapError(
+                f"{label(recording)} would be in training and test, with different people in it"
+            )
+    refuse_shared_recordings(train, test)
+
+
+_SHOWN_FILES = 3
+
+
+def check_kinds(recordings: Sequence[Recording]) -> None:
+    """Raise unless all recordings mean the same by hand and head, as `collect_poses` will want.
+
+    Necks are no matter: they are converted there.
+
+    Raises:
+        InputError: no recordings. PriorError: kinds are mixed; files of each kind are named.
+    """
+    if not recordings:
+        raise InputError("expected at least one recording, got none")
+    bodies = [recording.upper_body() for recording in recordings]
+    _check("hand", recordings, [body.hand for body in bodies])
+    _check("head", recordings, [body.head for body in bodies])
+
+
+def skeleton_counts(recordings: Sequence[Recording]) -> dict[str, int]:
+    """How many recordings there are of each joint set; those of no known set under ``other``."""
+    names = sorted(r.skeleton or "other" for r in recordings)
+    return {name: names.count(name) for name in dict.fromkeys(names)}
+
+
+def _check(joint: str, recordings: Sequence[Recording], kinds: Sequence[str | None]) -> None:
+    found = sorted({kind for kind in kinds if kind is not None})
+    if len(found) < 2:
+        return
+    shown = "; ".join(f"{kind}: {_files(recordings, kinds, kind)}" for kind in found)
+    raise PriorError(
+        f"recordings must agree on what a {joint} is, got {' and '.join(found)} ({shown}); fit them "
+        "apart, or leave one kind out"
+    )
+
+
+def _files(recordings: Sequence[Recording], kinds: Sequence[str | None], kind: str) -> str:
+    files = [label(r) for r, own in zip(recordings, kinds, strict=True) if own == kind]
+    more = len(files) - _SHOWN_FILES
+    return ", ".join(files[:_SHOWN_FILES]) + (f" and {more} more" if more > 0 else "")

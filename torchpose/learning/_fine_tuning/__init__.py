@@ -1,0 +1,33 @@
+"""Fine-tuning of a prior through its filters, by gradients of log-evidence and of the 3D error.
+
+Expectation-maximisation makes a mixture a good density of poses, and Q and R are set by hand. Here
+they are moved to where the filter that uses them does best. Every parameter is free of constraints
+(logarithms, logits, triangular factors with the logarithm of their diagonal), so whatever step an
+optimiser takes, covariances stay positive definite and weights positive.
+
+`TunableKalman` tunes the filter over single poses on short sequences (`draw_sequences`),
+`TunableWindow` the mixtures over windows on single windows (`draw_windows`). Both have
+
+    loss(batch) -> Tensor      what is made small: mean 3D error and log-evidence, weighted
+    error(batch) -> Tensor     mean 3D error in metres after Procrustes, to stop early by
+    prior() -> UpperBodyPrior  with what is tuned so far
+"""
+
+from torchpose._core.facade import set_up_facade
+from torchpose.learning._fine_tuning.parameters import TunableMixture, parameter_groups, pose_error
+from torchpose.learning._fine_tuning.poses import SequenceBatch, TunableKalman, draw_sequences
+from torchpose.learning._fine_tuning.windows import TunableWindow, WindowBatch, draw_windows
+
+__all__ = [
+    "SequenceBatch",
+    "TunableKalman",
+    "TunableMixture",
+    "TunableWindow",
+    "WindowBatch",
+    "draw_sequences",
+    "draw_windows",
+    "parameter_groups",
+    "pose_error",
+]
+
+set_up_facade(__name__)

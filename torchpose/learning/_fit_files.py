@@ -1,0 +1,206 @@
+"""Write the files of a fit: the model, its card (.md) and pictures of it (.png), all by `write_fit`."""
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Any
+
+from torchpose._core.tensor_file import format_of
+from torchpose.errors import OutputError
+from torchpose.io._results import ResultsFolder
+from torchpose.learning._model_card import BodyModel, body_card, model_card
+from torchpose.learning._recipes.actions import FittedActions
+from torchpose.learning._recipes.limbs import LimbStates, fit_limbs, summary
+from torchpose.learning._recipes.manifold import ManifoldFitting
+from torchpose.priors._upper_body import UpperBodyPrior
+
+__all__ = [
+    "check_fit_file",
+    "fit_results",
+    "write_action_files",
+    "write_fit",
+    "write_limb_files",
+    "write_manifold_files",
+    "write_prior_files",
+]
+
+
+def check_fit_file(name: str | Path) -> Path:
+    """Return the path of the file that a fit is to write.
+
+    Raises:
+        OutputError: another suffix than .safetensors, or a folder.
+    """
+    out = Path(name)
+    if out.suffix != ".safetensors":
+        raise OutputError(f"{out}: expected a name that ends in .safetensors")
+    if out.is_dir():
+        raise OutputError(f"{out}: is a folder; give the name of a file")
+    return out
+
+
+def fit_results(out: Path, inputs: Iterable[str | Path], pictures: bool = True) -> ResultsFolder:
+    """Return where a fit puts its file, and those of the same name beside it.
+
+    Args:
+        out: the file, NAME.safetensors. inputs: files that are read. pictures: whether some are drawn.
+    """
+    beside = (".md", ".png") if pictures else (".md",)
+    return ResultsFolder(
+        out.parent,
+        f"fit-{out.stem}",
+        rf"{re.escape(out.stem)}\.(safetensors|md|png)",
+        [out.name, *(out.with_suffix(suffix).name for suffix in beside)],
+        inputs,
+        lambda _: out.is_file() and (format_of(out) or "").startswith("torchpose"),
+    )
+
+
+def write_fit(
+    model: UpperBodyPrior | BodyModel,
+    card: str,
+    results: ResultsFolder,
+    file: str,
+    pictures: Mapping[str, Callable[[], Any]] | None = None,
+) -> list[Path]:
+    """Write a model and its card, then pictures of it, and return where they are.
+
+    The pictures only show the model, so that it is kept where one cannot be drawn.
+
+    Args:
+        model: that was fitted. card: Markdown text on it. results: where the files go.
+        file: name of the model's. pictures: what draws each, by the name of its file; they need
+            matplotlib.
+    """
+    out = results.stage / file
+    model.save(out)
+    out.with_suffix(".md").write_text(card, encoding="utf-8")
+    written = results.commit([out, out.with_suffix(".md")])
+    if pictures:
+        from torchpose.viz._style import save_figure
+
+        drawn = [save_figure(draw(), results.stage / name) for name, draw in pictures.items()]
+        written += results.commit(drawn)
+    return written
+
+
+# --- what each kind of fit writes, and says -------------------------------------------------------
+
+
+def write_prior_files(
+    prior: UpperBodyPrior, results: ResultsFolder, file: str, picture: bool = False
+) -> str:
+    """Write a prior of the upper body, its card and a picture of its mean poses; return what was done.
+
+    Args:
+        prior: that was fitted. results: where the files go. file: name of the prior's.
+        picture: draw the mean poses, which needs matplotlib.
+    """
+
+    def draw() -> Any:
+        from torchpose import viz
+
+        return viz.plot_prior_means({"left arm": prior.left, "right arm": prior.right})
+
+    pictures = {f"{Path(file).stem}.png": draw} if picture else None
+    written = write_fit(prior, model_card(prior), results, file, pictures)
+    lines = [*_prior_lines(prior), *(f"note     {note}" for note in results.notes)]
+    return "\n".join([*lines, *(f"wrote    {path}" for path in written)])
+
+
+def write_manifold_files(
+    fitting: ManifoldFitting, results: ResultsFolder, file: str, picture: bool = False, **facts: str
+) -> str:
+    """Write a fitted manifold, its card and its latent space; return what was done.
+
+    Args:
+        fitting: at its end. results: where the files go. file: name of the manifold's.
+        picture: draw the latent space, which needs matplotlib. facts: name, licence, command.
+    """
+    manifold = fitting.manifold(**facts)
+
+    def draw() -> Any:
+        from torchpose.viz._model_pictures import plot_manifold
+
+        return plot_manifold(manifold, {"held out": list(fitting.data.watched)[:1]})
+
+    pictures = {f"{Path(file).stem}.png": draw} if picture else None
+    written = write_fit(manifold, body_card(manifold), results, file, pictures)
+    return f"{fitting.summary(manifold)}\n{_written(results, written)}"
+
+
+def write_limb_files(
+    states: LimbStates, results: ResultsFolder, file: str, least_std: float = 0.01, **facts: str
+) -> str:  # fmt: skip
+    """Fit limb conditionals, write them and their card, and return what was done.
+
+    Args:
+        states: to fit to. results: where the files go. file: name of the conditionals'.
+        least_std: see `fit_limbs`. facts: name, licence, command.
+    """
+    found, held_out = fit_limbs(states, least_std, **facts)
+    written = write_fit(found, body_card(found), results, file)
+    return f"{summary(found, held_out)}\n{_written(results, written)}"
+
+
+def write_action_files(
+    fitted: FittedActions, results: ResultsFolder, file: str, picture: bool = False, **facts: str
+) -> str:
+    """Write an action space or a bank, its card and a picture of each action; return what was done.
+
+    Args:
+        fitted: to be written. results: where the files go. file: name of the space's or bank's.
+        picture: draw the synchronised performances, which needs
+            matplotlib. facts: name, licence, command.
+    """
+    found, stem = fitted.result(**facts), Path(file).stem
+
+    def drawing(action: str) -> Callable[[], Any]:
+        from torchpose.viz._model_pictures import plot_action_space
+
+        return lambda: plot_action_space(*fitted.spaces[action])
+
+    several = len(fitted.spaces) > 1
+    names = {f"{stem}-{a}.png" if several else f"{stem}.png": a for a in fitted.spaces}
+    pictures = {name: drawing(action) for name, action in names.items()} if picture else None
+    written = write_fit(found, body_card(found, facts.get("name", "")), results, file, pictures)
+    return f"{fitted.summary()}\n{_written(results, written)}"
+
+
+def _written(results: ResultsFolder, written: Sequence[Path]) -> str:
+    return "\n".join([f"wrote {', '.join(map(str, written))}", *results.notes])
+
+
+def _prior_lines(prior: UpperBodyPrior) -> list[str]:
+    """Return what was fitted, on what, and how well it will do, a line each."""
+    info = prior.info
+    windows = [w.left.n_components for w in prior.windows.values()]
+    over = f" and {max(windows)} over windows" if windows else ""
+    lines = [
+        f"prior    {info.name}, {prior.n_components} components per arm{over}, neck: {info.neck}, "
+        f"hand: {info.hand}",
+        f"persons  {len(info.persons)}",
+        f"states   {info.n_samples} per arm from {info.n_frames} recorded frames",
+    ]
+    fit = info.extra.get("fit")
+    if fit:
+        end = "" if fit["converged"] else ", not converged"
+        lines.append(
+            f"EM       mean log-likelihood {fit['log_likelihood']:.4f} after {fit['iterations']} "
+            f"iterations{end}"
+        )
+    lines.append(f"noise    {', '.join(prior.noise) or 'not learnt'}")
+    return lines + [f"expect   {line}" for line in _expected(info.extra.get("held_out", {}))]
+
+
+def _expected(held_out: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Return what somebody new can expect, from the errors of the persons that were held out."""
+    names = {"causal": "filtered", "full": "smoothed"}
+    lines = []
+    for mode, name in names.items():
+        errors = [100 * error for error in held_out.get(mode, {}).values()]
+        if errors:
+            spread = f" +- {stdev(errors):.1f}" if len(errors) > 1 else ""
+            lines.append(f"{fmean(errors):.1f}{spread} cm {name} on somebody new")
+    return lines

@@ -1,0 +1,29 @@
+"""How priors are made: every setting of a fit in one place, and the steps from recordings to a file."""
+
+from torchpose._core.facade import set_up_facade
+from torchpose.learning._recipes.actions import ActionRecipe, Performances, fit_actions
+from torchpose.learning._recipes.calibration import fit_calibration
+from torchpose.learning._recipes.earlier import fit_recipe_2
+from torchpose.learning._recipes.limbs import LimbStates, fit_limbs
+from torchpose.learning._recipes.manifold import ManifoldFitting, ManifoldPoses, ManifoldRecipe
+from torchpose.learning._recipes.mixtures import MixtureTask
+from torchpose.learning._recipes.upper_body import VERSION, UpperBodyRecipe, fit_kinect_prior
+
+__all__ = [
+    "VERSION",
+    "ActionRecipe",
+    "LimbStates",
+    "ManifoldFitting",
+    "ManifoldPoses",
+    "ManifoldRecipe",
+    "MixtureTask",
+    "Performances",
+    "UpperBodyRecipe",
+    "fit_actions",
+    "fit_calibration",
+    "fit_kinect_prior",
+    "fit_limbs",
+    "fit_recipe_2",
+]
+
+set_up_facade(__name__)

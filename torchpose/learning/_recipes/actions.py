@@ -1,0 +1,301 @@
+"""Fit of action spaces, or of a bank of several actions, to recordings of whole bodies.
+
+The fit is in closed form. The gate is then tried on persons who were held out.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal, Self
+
+import torch
+from torch import Tensor
+
+from torchpose.body._fitting import fit_body, fit_state
+from torchpose.body._kinematics import Body
+from torchpose.body._skeleton import BODY_15
+from torchpose.errors import InputError
+from torchpose.io._recordings import Recording
+from torchpose.learning._action_spaces import Performed, fit_synchronised
+from torchpose.learning._performances import (
+    LEAST_FRAMES,
+    Synchronised,
+    repetition_axis,
+    split_repetitions,
+)
+from torchpose.learning._recipes.choosing import (
+    choose_recordings,
+    fingerprint,
+    origin_of,
+    recorded_joints,
+    recording_name,
+)
+from torchpose.priors._actions.bank import ActionBank
+from torchpose.priors._actions.file import ActionInfo, BankInfo
+from torchpose.priors._actions.postures import posture_angles, state_postures
+from torchpose.priors._actions.space import ActionSpace
+
+__all__ = ["COMMON_HEIGHT", "ActionRecipe", "FittedActions", "Performances", "fit_actions"]
+
+COMMON_HEIGHT = 1.75
+"""Metres, of the body on which everybody's postures are told."""
+
+
+@dataclass(frozen=True)
+class ActionRecipe:
+    """Settings of the fit of an action space, or of a bank.
+
+    Args:
+        n_dimensions: D. n_postures: K, by default the median length. prominence: of key frames.
+        stay, spread, background, evidence_rate, gate_dimensions: of a bank, see `ActionBank`.
+        seed: of the matching that the share of accepted postures rests on.
+    """
+
+    n_dimensions: int = 13
+    n_postures: int | None = None
+    prominence: float = 0.15
+    stay: float = BankInfo.stay
+    spread: float = BankInfo.spread
+    background: float = BankInfo.background
+    evidence_rate: float = BankInfo.evidence_rate
+    gate_dimensions: int | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Performances:
+    """Performances of one action or several, and those of persons who are held out.
+
+    Attributes:
+        actions: in the order asked for. fps: of the postures. postures: "joints" or "body".
+        train, watched: single performances. left_out: repetitions that are too short.
+        recordings: of both.
+    """
+
+    actions: tuple[str, ...]
+    fps: float
+    postures: str
+    train: list[Performed]
+    watched: list[Performed]
+    left_out: int
+    recordings: list[Recording]
+    repeated: bool
+
+    @classmethod
+    def gather(
+        cls,
+        paths: Sequence[str],
+        actions: Sequence[str],
+        *,
+        persons: Sequence[str] | None = None,
+        held_out: Sequence[str] | None = None,
+        without: Sequence[str] | None = None,
+        fps: float = 30.0,
+        repeated: bool = True,
+        postures: Literal["joints", "body"] = "joints",
+        axes: str | None = None,
+    ) -> Self:
+        """Read, turn joints into postures, and cut recordings into performances.
+
+        Args:
+            paths, actions, persons, without, axes: see `choose_recordings`.
+            held_out: persons on whom the gate is tried instead.
+            fps: frame rate that recordings are resampled to.
+            repeated: cut recordings into repetitions; false if each is a single performance.
+            postures: "joints", angles between the recorded joints; "body", of a body of average
+                proportions that is turned as a body fitted to each person, so that it makes no
+                difference where shoulders and hips are.
+
+        Raises:
+            InputError: as `choose_recordings` and `recorded_joints`, no action or one twice, or an
+                action without a performance to learn from.
+        """
+        check_actions(actions, fps)
+        chosen = choose_recordings(
+            paths, persons=persons, held_out=held_out, actions=actions, without=without, axes=axes
+        )
+        recordings = [*chosen.train, *chosen.watched]
+        told = _told(recordings, [recorded_joints(r, fps) for r in recordings], postures)
+        found, left_out = _performed(recordings, told, actions, fps, repeated, len(chosen.train))
+        out = {r.person_id for r in chosen.watched}
+        train = [p for p in found if p.person not in out]
+        for action in actions:
+            if not any(p.action == action for p in train):
+                raise InputError(
+                    f"{action}: there is no performance to learn from; everybody who did it is held "
+                    f"out or not among the persons, or no repetition lasts {LEAST_FRAMES} frames"
+                )
+        watched = [p for p in found if p.person in out]
+        return cls(
+            tuple(actions), fps, postures, train, watched, left_out, recordings, repeated
+        )  # fmt: skip
+
+    def identity(self) -> dict[str, Any]:
+        """What makes a fit to them the same one."""
+        return {
+            "fps": self.fps, "actions": list(self.actions), "repeated": self.repeated,
+            "held out": sorted({p.person for p in self.watched}), "postures": self.postures,
+            "recordings": fingerprint(self.recordings),
+        }  # fmt: skip
+
+    def facts(self, action: str) -> ActionInfo:
+        """What is known of an action before it is fitted."""
+        learnt = {p.person for p in self.train if p.action == action}
+        mine = [r for r in self.recordings if r.action == action and r.person_id in learnt]
+        return ActionInfo(
+            name=action,
+            fps=self.fps,
+            persons=tuple(sorted(learnt)),
+            sources=origin_of(mine)["sources"],
+            extra={"postures": self.postures},
+        )
+
+
+@dataclass(frozen=True)
+class FittedActions:
+    """Action spaces by name, with the performances in step, and how their gates did.
+
+    Attributes:
+        spaces: by action. accepted: share of the held-out postures that pass the gate when j is drawn
+            (AS 6), by action. performances, recipe: what they were fitted to, and how.
+    """
+
+    spaces: dict[str, tuple[ActionSpace, Synchronised]]
+    accepted: dict[str, float]
+    performances: Performances
+    recipe: ActionRecipe
+
+    def result(self, **facts: str) -> ActionSpace | ActionBank:
+        """The action space, or the bank of all actions.
+
+        Args:
+            facts: name, licence, command; in a bank the actions keep their own names.
+        """
+        given: dict[str, Any] = {k: v for k, v in facts.items() if v and k != "name"}
+        spaces = []
+        for action, (space, _) in self.spaces.items():
+            extra = {
+                **space.info.extra, "settings": asdict(self.recipe), "file": facts.get("name", "")
+            }  # fmt: skip
+            if action in self.accepted:
+                extra["accepted"] = self.accepted[action]
+            space.info = replace(space.info, **given, extra=extra)
+            spaces.append(space)
+        if len(spaces) == 1:
+            return spaces[0]
+        s = self.recipe
+        bank = ActionBank(
+            spaces, stay=s.stay, spread=s.spread, background=s.background,
+            evidence_rate=s.evidence_rate, gate_dimensions=s.gate_dimensions,
+        )  # fmt: skip
+        sources = {source for space in spaces for source in space.info.sources}
+        bank.info = replace(
+            bank.info, name=facts.get("name", ""), sources=tuple(sorted(sources)), **given,
+            extra={
+                "settings": asdict(s), "postures": self.performances.postures,
+                "accepted": self.accepted,
+            },
+        )  # fmt: skip
+        return bank
+
+    def summary(self) -> str:
+        """What was fitted, a line for each action."""
+        lines = []
+        for action, (space, _) in self.spaces.items():
+            line = (
+                f"{action}: {space.info.performances} performances of {len(space.info.persons)} persons, "
+                f"{space.n_postures} postures, {len(space.info.key_frames)} key frames, "
+                f"{space.n_dimensions} dimensions with {100 * (space.info.explained or 0):.1f} % of the "
+                "variance"
+            )
+            if action in self.accepted:
+                passed = 100 * self.accepted[action]
+                line += f"; {passed:.0f} % of held-out postures pass the gate"
+            lines.append(line)
+        left_out = self.performances.left_out
+        if left_out:
+            lines.append(f"left out {left_out} repetitions shorter than {LEAST_FRAMES} frames")
+        return "\n".join(lines)
+
+
+def fit_actions(performances: Performances, recipe: ActionRecipe) -> FittedActions:
+    """Fit every action, and try its gate on who is held out.
+
+    Raises:
+        InputError: as `fit_action_space`.
+    """
+    spaces, accepted = {}, {}
+    for action in performances.actions:
+        spaces[action] = fit_synchronised(
+            [p.postures for p in performances.train if p.action == action], recipe.n_dimensions,
+            name=action, fps=performances.fps, n_postures=recipe.n_postures,
+            prominence=recipe.prominence, info=performances.facts(action),
+        )  # fmt: skip
+        watched = [p.postures for p in performances.watched if p.action == action]
+        if watched:
+            space, generator = spaces[action][0], torch.Generator().manual_seed(recipe.seed)
+            d = recipe.gate_dimensions or space.n_dimensions
+            gated = space.with_dimensions(min(d, space.n_dimensions))
+            accepted[action] = gated.acceptance(torch.cat(watched), generator=generator).drawn
+    return FittedActions(spaces, accepted, performances, recipe)
+
+
+def check_actions(actions: Sequence[str], fps: float) -> None:
+    """Raise `InputError` unless there are actions, each once, and the rate is positive."""
+    if not actions or len(set(actions)) < len(actions):
+        raise InputError(f"actions must be names, each once, got {', '.join(actions) or 'none'}")
+    if not 0 < fps < float("inf"):
+        raise InputError(f"fps must be positive, got {fps:g}")
+
+
+def _performed(
+    recordings: Sequence[Recording],
+    told: Sequence[Tensor],
+    actions: Sequence[str],
+    fps: float,
+    repeated: bool,
+    n_train: int,
+) -> tuple[list[Performed], int]:
+    """Single performances, and how many repetitions were left out because they are too short.
+
+    Recordings are cut along an axis of the first `n_train` of them.
+    """
+    found = []
+    for action in actions:
+        mine = [i for i, r in enumerate(recordings) if r.action == action]
+        learnt = [told[i] for i in mine if i < n_train]
+        parts_of_mine = _parts([told[i] for i in mine], learnt, fps, repeated)
+        for i, parts in zip(mine, parts_of_mine, strict=True):
+            person = recordings[i].person_id
+            found += [Performed(person, action, told[i][part]) for part in parts]
+    if not repeated:  # then every recording counts, and a short one is refused
+        return found, 0
+    kept = [p for p in found if len(p.postures) >= LEAST_FRAMES]
+    return kept, len(found) - len(kept)
+
+
+def _parts(
+    told: Sequence[Tensor], learnt: Sequence[Tensor], fps: float, repeated: bool
+) -> list[list[slice]]:
+    """Frames of the single performances in each recording of an action."""
+    if not learnt or not repeated:
+        return [[slice(0, len(postures))] for postures in told]
+    axis = repetition_axis(learnt)
+    return [split_repetitions(postures, fps, axis) for postures in told]
+
+
+def _told(recordings: Sequence[Recording], joints: Sequence[Tensor], postures: str) -> list[Tensor]:
+    """Postures [T, 36] of every recording."""
+    found: list[Tensor] = [torch.empty(0)] * len(joints)
+    common = Body.of_height(BODY_15, COMMON_HEIGHT)
+    for person in sorted({r.person_id for r in recordings}):
+        mine = [i for i, r in enumerate(recordings) if r.person_id == person]
+        for i in mine:
+            try:
+                found[i] = posture_angles(joints[i])
+            except InputError as error:
+                raise InputError(f"{recording_name(recordings[i])}: {error}") from error
+        if postures == "body":
+            body = fit_body(torch.cat([joints[i] for i in mine]))
+            for i in mine:
+                found[i] = state_postures(common, fit_state(body, joints[i])).detach()
+    return found

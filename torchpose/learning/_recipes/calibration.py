@@ -1,0 +1,197 @@
+"""Covariances that hold what they say: a scale and a floor per joint, from persons held out in turn."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from torchpose.errors import InputError
+from torchpose.learning._seen_keypoints import seen_keypoints
+from torchpose.learning._training import PoseSet
+from torchpose.metrics._calibration import chi2_quantile
+from torchpose.metrics._poses import align
+from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.upper_body._fusion import calibration_mode
+from torchpose.upper_body._methods import METHODS
+from torchpose.upper_body._tracker import UpperBodyTracker
+
+__all__ = [
+    "DRAWN",
+    "MODES",
+    "HeldOut",
+    "calibration_noise",
+    "fit_calibration",
+    "folds",
+    "track_held_out",
+]
+
+MODES: dict[str, dict[str, Any]] = {
+    "pose": {"method": "mkf-fixed"},
+    "causal": {"method": "window-mixture"},
+    "full": {"method": "window-mixture", "smoothing": "full"},
+}
+"""The ways of tracking that have a calibration of their own, with their options of the tracker."""
+
+DRAWN = {
+    calibration_mode(method): {"method": method}
+    for method in METHODS
+    if method not in {options["method"] for options in MODES.values()}
+}
+"""Those that follow a sample of what is possible. They take longer, and are tried on fewer frames."""
+
+_VIEWS = 0.5  # of the training views' width: cameras are mostly in front of a person
+_FRAMES, _SEQUENCES = 8000, 48  # in all, and of each group of persons
+_PIECE = 300  # frames at most, so that one long recording does not pad all others
+_SHORT = 60  # frames of a piece for the filters that draw
+_NOISE = 3.0  # pixels
+
+
+class HeldOut(NamedTuple):
+    """What tracking persons whom a fit did not see came to.
+
+    Attributes:
+        errors: estimate minus truth after fixed-scale Procrustes, metres. covs: of the estimates.
+        persons: id of each row's person.
+    """
+
+    errors: Float[Tensor, "N 8 3"]
+    covs: Float[Tensor, "N 8 3 3"]
+    persons: list[str]
+
+    @classmethod
+    def join(cls, parts: Sequence["HeldOut"]) -> "HeldOut":
+        """Rows of all parts."""
+        errors, covs, persons = zip(*parts, strict=True)
+        return cls(torch.cat(errors), torch.cat(covs), [p for part in persons for p in part])
+
+    def error_by_person(self) -> dict[str, float]:
+        """Mean distance over joints and frames of each person, metres."""
+        distance = self.errors.norm(dim=-1).mean(-1)
+        names = sorted(set(self.persons))
+        rows = torch.tensor([names.index(person) for person in self.persons])
+        sums = torch.zeros(len(names), dtype=distance.dtype).index_add_(0, rows, distance)
+        return dict(zip(names, (sums / rows.bincount()).tolist(), strict=True))
+
+
+def folds(persons: Sequence[str], n_folds: int) -> list[set[str]]:
+    """Groups of persons to hold out in turn; none if there are not enough."""
+    distinct = sorted(set(persons))
+    n_folds = min(n_folds, len(distinct))
+    return [set(distinct[fold::n_folds]) for fold in range(n_folds)] if n_folds > 1 else []
+
+
+def track_held_out(
+    prior: UpperBodyPrior, poses: PoseSet, persons: set[str], seed: int, drawn_pieces: int = 0
+) -> dict[str, HeldOut]:
+    """Track recordings of some persons in every way that the prior allows; score complete frames.
+
+    Args:
+        prior: fitted without these persons. poses: of everybody, centred as the prior's are.
+        persons: whose recordings are tracked. seed: of viewpoints, noise and what filters draw.
+        drawn_pieces: pieces of recordings, of 60 frames at most, for the ways in `DRAWN`.
+    """
+    pieces = [
+        (piece, person)
+        for sequence, person in zip(poses.joints.split(poses.lengths), poses.persons, strict=True)
+        if person in persons
+        for piece in sequence.split(_PIECE)
+    ]
+    pieces = pieces[:: max(1, len(pieces) // _SEQUENCES)]
+    if not pieces:
+        return {}
+    usual = {mode: s for mode, s in MODES.items() if mode == "pose" or mode in prior.windows}
+    found = _track(prior, pieces, usual, seed)
+    if drawn_pieces:
+        step = max(1, len(pieces) // drawn_pieces)
+        few = [(piece[:_SHORT], person) for piece, person in pieces[::step][:drawn_pieces]]
+        found |= _track(prior, few, DRAWN, seed)
+    return found
+
+
+def _track(
+    prior: UpperBodyPrior,
+    pieces: list[tuple[Tensor, str]],
+    modes: Mapping[str, dict[str, Any]],
+    seed: int,
+) -> dict[str, HeldOut]:
+    """What tracking pieces of recordings in some ways comes to."""
+    keypoints, truth, inside = _seen(prior, [piece for piece, _ in pieces], seed)
+    scored = inside & torch.isfinite(truth).flatten(2).all(2)
+    who = [pieces[i][1] for i in scored.nonzero()[:, 0].tolist()]
+    found = {}
+    for mode, settings in modes.items() if who else ():
+        tracker = UpperBodyTracker(prior, prior.camera, calibrated=False, **settings)
+        generator = torch.Generator().manual_seed(seed)
+        with torch.inference_mode():
+            track = tracker(keypoints, lengths=inside.sum(1), generator=generator)
+        covs = track.covariance3d[scored]
+        aligned = align(track.joints3d[scored], truth[scored], covariance=covs)
+        if aligned.covariance is None:
+            raise RuntimeError("align was given covariances and returned none")
+        found[mode] = HeldOut(aligned.points - truth[scored], aligned.covariance, who)
+    return found
+
+
+def _seen(
+    prior: UpperBodyPrior, sequences: list[Tensor], seed: int
+) -> tuple[Float[Tensor, "B T 8 2"], Float[Tensor, "B T 8 3"], Bool[Tensor, "B T"]]:
+    """Noisy keypoints of head, neck and hands, each sequence from a viewpoint of its own."""
+    generator = torch.Generator().manual_seed(seed + 1)
+    lengths = torch.tensor([len(sequence) for sequence in sequences])
+    poses = pad_sequence(sequences, batch_first=True).double()
+    inside = torch.arange(poses.shape[1]) < lengths[:, None]
+    keypoints = seen_keypoints(poses, prior.info, generator, view_share=_VIEWS, noise_std=_NOISE)
+    keypoints[~inside] = torch.nan
+    return keypoints, poses, inside
+
+
+def calibration_noise(held_out: Mapping[str, HeldOut]) -> dict[str, Tensor]:
+    """Scale and floor of each way of tracking, by the names that the tracker looks for."""
+    found = {}
+    for mode, part in held_out.items():
+        scale, floor = fit_calibration(part.errors, part.covs)
+        found[f"calibration_scale_{mode}"] = scale
+        found[f"calibration_floor_{mode}"] = floor
+    return found
+
+
+def fit_calibration(
+    errors: Float[Tensor, "N J 3"],
+    covs: Float[Tensor, "N J 3 3"],
+    levels: tuple[float, ...] = (0.5, 0.9),
+) -> tuple[Float[Tensor, " J"], Float[Tensor, " J"]]:
+    """A scale s and a floor f per joint so that the ellipsoids of s C + f I cover what they say.
+
+    Of a grid of 40 scales and 40 floors, the pair with the least sum of squared differences between
+    coverage and level is taken, for each joint.
+
+    Args:
+        errors: estimate minus truth, metres. covs: C. levels: of the ellipsoids.
+
+    Returns:
+        s [J], without unit, and f [J], square metres.
+
+    Raises:
+        InputError: no errors.
+    """
+    if not len(errors):
+        raise InputError("a calibration needs at least one error, got none")
+    step = max(1, len(errors) // _FRAMES)
+    values, vectors = torch.linalg.eigh(covs[::step].double())
+    along = (vectors.mT @ errors[::step].double()[..., None])[..., 0].square()
+    values = values.clamp_min(1e-12)
+    bounds = chi2_quantile(torch.tensor(levels, dtype=torch.float64))
+    wanted = torch.tensor(levels, dtype=torch.float64)
+    scales = torch.logspace(-1.5, 1.5, 40, dtype=torch.float64)
+    floors = torch.cat([torch.zeros(1), torch.logspace(-3.5, -1, 39)]).double().square()
+    misses = []
+    for scale in scales:
+        widths = scale * values[None] + floors[:, None, None, None]
+        squared = (along / widths).sum(-1)
+        shares = torch.stack([(squared <= bound).double().mean(1) for bound in bounds])
+        misses.append((shares - wanted[:, None, None]).square().sum(0))
+    best = torch.stack(misses).flatten(0, 1).argmin(0)
+    return scales[best // len(floors)], floors[best % len(floors)]

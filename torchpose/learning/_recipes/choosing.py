@@ -1,0 +1,157 @@
+"""Which recordings of whole bodies a fit takes: files, persons, actions, and who is held out.
+
+The fits of manifolds, limbs and actions choose alike, from `torchpose fit` and from the training loop.
+"""
+
+import hashlib
+import os
+import re
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from torchpose.body._skeleton import BODY_15, body_joints
+from torchpose.errors import InputError
+from torchpose.io._mocap import resample
+from torchpose.io._recordings import Recording, find_recordings, read_recordings
+from torchpose.learning._curation.splits import pick_persons, refuse_shared_recordings
+
+__all__ = [
+    "ChosenRecordings",
+    "choose_recordings",
+    "expand_path",
+    "fingerprint",
+    "origin_of",
+    "recorded_joints",
+    "recording_name",
+]
+
+
+class ChosenRecordings(NamedTuple):
+    """Recordings to fit to, and those of persons who are held out, each in the order of the files."""
+
+    train: list[Recording]
+    watched: list[Recording]
+
+
+def choose_recordings(
+    paths: Sequence[str],
+    *,
+    persons: Sequence[str] | None = None,
+    held_out: Sequence[str] | None = None,
+    actions: Sequence[str] | None = None,
+    without: Sequence[str] | None = None,
+    axes: str | None = None,
+) -> ChosenRecordings:
+    """Read recordings and split them by person; other people in a file are on neither side.
+
+    Args:
+        paths: folders (with their subfolders) or files, see `expand_path`.
+        persons: whom to fit to, as `origin#person` or just the person; everybody if None.
+        held_out: persons of whom nothing is fitted, named in the same way.
+        actions: names, as the files give them; all if None.
+        without: names of files, without their suffix, that are on neither side.
+        axes: of all recordings: camera, kinect, y-up, z-up; by default what each file says.
+
+    Raises:
+        InputError: unknown persons, actions or files, or nobody left to learn from. OverlapError: a
+            recording that is on both sides, under another person.
+    """
+    files = find_recordings([expand_path(path) for path in paths])
+    unknown = sorted(set(without or ()) - {file.stem for file in files})
+    if unknown:
+        raise InputError(f"without: no file named {', '.join(unknown)} among the recordings")
+    recordings = read_recordings([f for f in files if f.stem not in (without or ())], axes)
+    recordings = [r for r in recordings if not r.companion]
+    known = sorted({r.person_id for r in recordings})
+    out = pick_persons(held_out or (), known)
+    wanted = (set(known) if persons is None else pick_persons(persons, known)) - out
+    if actions is not None:
+        done = sorted({r.action for r in recordings})
+        missing = [action for action in actions if action not in done]
+        if missing:
+            raise InputError(f"no recording of {', '.join(missing)}; there are {', '.join(done)}")
+        recordings = [r for r in recordings if r.action in actions]
+    found = ChosenRecordings(
+        [r for r in recordings if r.person_id in wanted],
+        [r for r in recordings if r.person_id in out],
+    )
+    if not found.train:
+        raise InputError(
+            "everybody is held out, or did none of the actions; nobody is left to learn from"
+        )
+    refuse_shared_recordings(found.train, found.watched)
+    return found
+
+
+def recording_name(recording: Recording) -> str:
+    """What messages call a recording: its file without the suffix, or its person."""
+    return recording.person_id if recording.path is None else recording.path.stem
+
+
+def recorded_joints(recording: Recording, fps: float) -> Tensor:
+    """Joints [T, 15, 3] of the body at a frame rate; those that are never there are NaN.
+
+    Raises:
+        InputError: no frame rate in the file, or a joint that is missing in some frames.
+    """
+    name = recording_name(recording)
+    if recording.fps is None:
+        raise InputError(f"{name}: the file does not say its frame rate, which is needed")
+    joints = body_joints(recording.joints, recording.names)
+    missing = joints.isnan().any(-1)
+    gaps = (missing & ~missing.all(0)).nonzero()
+    if len(gaps):
+        frame, joint = gaps[0].tolist()
+        raise InputError(
+            f"{name}: {BODY_15.names[joint]} is missing in frame {frame}; end the recording there, or "
+            "fill the gap"
+        )
+    return resample(joints, recording.fps, fps)
+
+
+def origin_of(recordings: Sequence[Recording]) -> dict[str, Any]:
+    """Persons, actions and sources of recordings, as models say what they were fitted on."""
+    return {
+        "persons": tuple(sorted({r.person_id for r in recordings})),
+        "actions": tuple(sorted({r.action for r in recordings if r.action})),
+        "sources": tuple(sorted({r.source or str(r.path) for r in recordings})),
+    }
+
+
+def expand_path(path: str) -> str:
+    """A path with its `$NAME` and `~` filled in.
+
+    Raises:
+        InputError: a variable that is not set.
+    """
+    for braced, plain in re.findall(r"\$(?:\{(\w+)\}|(\w+))", path):
+        name = braced or plain
+        if not os.environ.get(name):
+            raise InputError(
+                f"{path}: the environment variable {name} is not set; set it to the folder of the "
+                "recordings, or give the path itself"
+            )
+    return os.path.expanduser(os.path.expandvars(path))
+
+
+def fingerprint(recordings: Sequence[Recording]) -> dict[str, Any]:
+    """How many recordings, frames and persons there are, and a digest of all of it."""
+    return {
+        "count": len(recordings),
+        "frames": sum(len(r) for r in recordings),
+        "persons": sorted({r.person_id for r in recordings}),
+        "sha256": _digest(recordings),
+    }
+
+
+def _digest(recordings: Sequence[Recording]) -> str:
+    digest = hashlib.sha256()
+    for recording in recordings:
+        facts = (recording.person_id, recording.fps, recording.names, recording.joints.shape)
+        digest.update(repr(facts).encode())
+        digest.update(recording.joints.numpy().tobytes())
+        if recording.weights is not None:
+            digest.update(recording.weights.numpy().tobytes())
+    return digest.hexdigest()

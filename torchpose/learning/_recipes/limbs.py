@@ -1,0 +1,206 @@
+"""Fit of limb conditionals, and of how limbs turn from frame to frame, to recordings of whole bodies.
+
+The fit is in closed form. Persons who are held out then tell how far others are from it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.body._fitting import fit_body, fit_state
+from torchpose.body._kinematics import Body, centres_of
+from torchpose.errors import InputError
+from torchpose.io._recordings import Recording
+from torchpose.learning._limb_conditionals import fit_limb_conditionals
+from torchpose.learning._recipes.choosing import (
+    choose_recordings,
+    fingerprint,
+    origin_of,
+    recorded_joints,
+    recording_name,
+)
+from torchpose.math._rotations import compose, conjugate
+from torchpose.priors._limb_conditionals import LimbConditionals
+
+__all__ = ["HeldOut", "LimbStates", "check_least_std", "fit_limbs", "held_out_spread", "summary"]
+
+
+@dataclass(frozen=True)
+class LimbStates:
+    """Recorded states of all persons, of one body with safe centres (DX 1), at one frame rate.
+
+    Attributes:
+        body: whose frame and centres the states have. fps: of the states.
+        train, watched: [T, D] for each recording, `watched` those of persons who are held out.
+        fitted, held_out: the recordings.
+    """
+
+    body: Body
+    fps: float
+    train: list[Tensor]
+    watched: list[Tensor]
+    fitted: list[Recording]
+    held_out: list[Recording]
+
+    @classmethod
+    def gather(
+        cls,
+        paths: Sequence[str],
+        *,
+        persons: Sequence[str] | None = None,
+        held_out: Sequence[str] | None = None,
+        actions: Sequence[str] | None = None,
+        without: Sequence[str] | None = None,
+        fps: float = 60.0,
+        axes: str | None = None,
+    ) -> Self:
+        """Read, fit everybody's body, and turn joints into states.
+
+        Args:
+            paths, persons, held_out, actions, without, axes: see `choose_recordings`.
+            fps: frame rate that recordings are resampled to, best that of the frames to be tracked.
+
+        Raises:
+            InputError: as `choose_recordings` and `recorded_joints`, or a rate that is not positive.
+        """
+        if not 0 < fps < float("inf"):
+            raise InputError(f"fps must be positive, got {fps:g}")
+        learnt, watched = choose_recordings(
+            paths, persons=persons, held_out=held_out, actions=actions, without=without, axes=axes
+        )
+        both = [*learnt, *watched]
+        joints, n = [recorded_joints(r, fps) for r in both], len(learnt)
+        bodies = _bodies(both, joints)
+        first = both[0].person_id
+        centres = centres_of(bodies[first], torch.cat(_states(bodies, learnt, joints[:n])))
+        centred = {person: body.altered(centres=centres) for person, body in bodies.items()}
+        # fitted anew: the twist that joints do not tell is none about the centres
+        states = _states(centred, both, joints)
+        return cls(centred[first], fps, states[:n], states[n:], learnt, watched)
+
+    def identity(self) -> dict[str, Any]:
+        """What makes a fit to them the same one."""
+        return {
+            "fps": self.fps,
+            "recordings": fingerprint(self.fitted),
+            "held-out recordings": fingerprint(self.held_out),
+        }
+
+
+class HeldOut(NamedTuple):
+    """Persons who were held out, against those who were learnt from.
+
+    Attributes:
+        deviation: of their limbs, in deviations of the conditionals; 1 if they are as the others.
+        speed: of their limbs, in deviations of the diffusion. frames: how many there were.
+    """
+
+    deviation: float
+    speed: float
+    frames: int
+
+
+def fit_limbs(
+    states: LimbStates, least_std: float = 0.01, **facts: str
+) -> tuple[LimbConditionals, HeldOut | None]:
+    """Limb conditionals of recorded states, and how far the persons held out are from them, if any.
+
+    Args:
+        states: to fit to.
+        least_std: floor of the standard deviations of q_ij, see `fit_limb_conditionals`.
+        facts: name, licence, command; those that are empty are left out.
+
+    Raises:
+        InputError: `least_std` is negative, and as `fit_limb_conditionals`.
+    """
+    check_least_std(least_std)
+    given: dict[str, Any] = {name: value for name, value in facts.items() if value}
+    found = fit_limb_conditionals(
+        states.body, states.train, states.fps, least_std=least_std, **origin_of(states.fitted)
+    )
+    held_out = None
+    extra: dict[str, Any] = {"settings": {"least_std": least_std}}
+    if states.watched:
+        held_out = held_out_spread(found, states.body, states.watched)
+        extra["held_out"] = held_out._asdict()
+    found.info = replace(found.info, **given, extra=extra)
+    return found, held_out
+
+
+def check_least_std(least_std: float) -> None:
+    """Raise `InputError` unless it is zero or more and finite."""
+    if not 0 <= least_std < float("inf"):
+        raise InputError(f"least_std must be zero or more and finite, got {least_std:g}")
+
+
+def held_out_spread(
+    conditionals: LimbConditionals, body: Body, sequences: Sequence[Float[Tensor, "_ D"]]
+) -> HeldOut:
+    """How far states that were not learnt from are from limb conditionals.
+
+    deviation^2 = sum_ij E|x_ij - mu_ij|^2 / sum_ij tr Sigma_ij,
+    speed^2 = sum_j E|q'_j|^2 / sum_j tr Sigma'_j,
+
+    with the means E over their frames.
+
+    Args:
+        body: whose states they are, of the conditionals' centres. sequences: [T, D] each, at their
+            frame rate.
+    """
+    above, below = conditionals.edges.long().unbind(-1)
+    turns = [compose(body.centres, s[:, 3:].unflatten(-1, (-1, 3))) for s in sequences]
+    every = torch.cat(turns)
+    between = compose(conjugate(every[:, above]), every[:, below])
+    away = compose(conjugate(conditionals.edge_centres), between) - conditionals.mean
+    steps = torch.cat([compose(conjugate(q[:-1]), q[1:]) for q in turns])
+    return HeldOut(
+        _ratio(away, conditionals.covariance), _ratio(steps, conditionals.diffusion), len(every)
+    )
+
+
+def summary(conditionals: LimbConditionals, held_out: HeldOut | None) -> str:
+    """What was fitted, in a sentence."""
+    info = conditionals.info
+    text = (
+        f"{info.name}: {len(conditionals.edges)} limbs from {info.n_frames} frames of "
+        f"{len(info.persons)} persons at {info.fps:g} frames per second"
+    )
+    if held_out is None:
+        return text
+    return (
+        f"{text}; those of the persons held out deviate {held_out.deviation:.2f} times as much and "
+        f"turn {held_out.speed:.2f} times as fast"
+    )
+
+
+def _ratio(vectors: Float[Tensor, "N M 3"], covariance: Float[Tensor, "M 3 3"]) -> float:
+    learnt = covariance.diagonal(dim1=-2, dim2=-1).sum()
+    return float((vectors.square().sum((-2, -1)).mean() / learnt).sqrt())
+
+
+def _bodies(recordings: Sequence[Recording], joints: Sequence[Tensor]) -> dict[str, Body]:
+    found = {}
+    for person in dict.fromkeys(r.person_id for r in recordings):
+        own = [j for r, j in zip(recordings, joints, strict=True) if r.person_id == person]
+        try:
+            found[person] = fit_body(torch.cat(own), frame="body")
+        except InputError as error:
+            raise InputError(f"{person}: {error}") from error
+    return found
+
+
+def _states(
+    bodies: dict[str, Body], recordings: Sequence[Recording], joints: Sequence[Tensor]
+) -> list[Tensor]:
+    """States [T, D] of every recording on its person's body."""
+    found = []
+    for recording, points in zip(recordings, joints, strict=True):
+        try:
+            found.append(fit_state(bodies[recording.person_id], points).detach())
+        except InputError as error:
+            raise InputError(f"{recording_name(recording)}: {error}") from error
+    return found

@@ -1,0 +1,344 @@
+"""Fit of a manifold of poses, a back-constrained GPLVM, to recordings of whole bodies.
+
+After each step, ten iterations of the optimiser, the poses that are held out are sent to the manifold
+and back; the step that did best on them is kept, and its standard deviations come from them.
+"""
+
+import hashlib
+import math
+import os
+import pickle
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from torchpose._core.files import atomic_path
+from torchpose.body._fitting import fit_body, fit_state
+from torchpose.body._kinematics import Body
+from torchpose.errors import InputError, OutputError
+from torchpose.io._recordings import Recording
+from torchpose.learning._curation.splits import refuse_shared_recordings
+from torchpose.learning._gplvm_fit import GPLVMFit, median_gamma
+from torchpose.learning._manifolds import (
+    column_scale,
+    fit_gplvm_noise,
+    gplvm_of_fit,
+    join_sequences,
+    thin,
+)
+from torchpose.learning._recipes.choosing import (
+    choose_recordings,
+    fingerprint,
+    origin_of,
+    recorded_joints,
+    recording_name,
+)
+from torchpose.priors._manifold.file import ManifoldInfo
+from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
+
+__all__ = [
+    "ManifoldFitting",
+    "ManifoldPoses",
+    "ManifoldRecipe",
+    "check_gathering",
+    "run_to_end",
+    "taken_up",
+]
+
+
+@dataclass(frozen=True)
+class ManifoldRecipe:
+    """Settings of the fit of a manifold.
+
+    Args:
+        latent_dim: d. gamma_x: of (MR 22); by default from the median distance of the poses.
+        optimiser: "lbfgs" or "adam". learning_rate: None for the optimiser's own.
+        steps: of ten iterations, at most. patience: steps without a better held-out error after
+            which it ends.
+        start: which principal components to start from: 0 the first ones, see `principal_start`.
+        smoothness: see `GPLVMFit`. standardise: see `fit_gplvm`.
+        seed: of the frames whose distances give gamma_x, where there are very many.
+
+    Raises:
+        InputError: a setting that is not positive.
+    """
+
+    latent_dim: int = 2
+    gamma_x: float | None = None
+    optimiser: str = "lbfgs"
+    learning_rate: float | None = None
+    steps: int = 40
+    patience: int = 3
+    start: int = 0
+    smoothness: float = 0.0
+    standardise: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, least in (("steps", 1), ("patience", 1), ("start", 0)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class ManifoldPoses:
+    """Poses to fit a manifold to, and poses of other recordings that are held out.
+
+    Attributes:
+        train, watched: [T, Q] for each recording. fps: of `watched`; `train` is thinned out.
+        info: what they are of. fitted, held_out: the recordings.
+    """
+
+    train: list[Tensor]
+    watched: list[Tensor]
+    fps: float
+    info: ManifoldInfo
+    fitted: list[Recording]
+    held_out: list[Recording]
+
+    @classmethod
+    def gather(
+        cls,
+        paths: Sequence[str],
+        *,
+        persons: Sequence[str] | None = None,
+        held_out: Sequence[str] | None = None,
+        validation: int = 2,
+        actions: Sequence[str] | None = None,
+        without: Sequence[str] | None = None,
+        fps: float = 60.0,
+        frames: int = 350,
+        axes: str | None = None,
+        progress: bool = False,
+    ) -> Self:
+        """Read, split, and turn joints into poses of a body fitted to each person.
+
+        Args:
+            paths, persons, actions, without, axes: see `choose_recordings`.
+            held_out: persons whose recordings are held out, so that the standard deviations are those
+                of somebody new.
+            validation: recordings of each person that are held out instead where no persons are, the
+                last ones by name.
+            fps: frame rate of the poses. frames: that are fitted to at most, spread evenly over the
+                recordings. progress: show a bar.
+
+        Raises:
+            InputError: as `choose_recordings` and `recorded_joints`, a person with too few recordings,
+                settings out of range. OverlapError: a recording on both sides.
+        """
+        check_gathering(validation, frames, fps)
+        chosen = choose_recordings(
+            paths, persons=persons, held_out=held_out, actions=actions, without=without, axes=axes
+        )
+        fitted, watched = chosen
+        if not watched:
+            fitted, watched = _last_apart(fitted, validation)
+        bodies = _bodies(fitted, watched, fps)
+        both = tqdm([*fitted, *watched], desc="poses", disable=not progress)
+        poses = [_poses(bodies[r.person_id], r, fps) for r in both]
+        facts: dict[str, Any] = origin_of(fitted)
+        several = len(facts["persons"]) > 1
+        facts["sequences"] = tuple(r.person_id if several else recording_name(r) for r in fitted)
+        info = ManifoldInfo.of_body(bodies[fitted[0].person_id], fps=fps, **facts)
+        n = len(fitted)
+        return cls(thin(poses[:n], frames), poses[n:], fps, info, fitted, watched)
+
+    def identity(self) -> dict[str, Any]:
+        """What makes a fit to them the same one."""
+        return {
+            "fps": self.fps,
+            "poses": _digest(self.train),
+            "recordings": fingerprint(self.fitted),
+            "held-out recordings": fingerprint(self.held_out),
+        }
+
+
+class ManifoldFitting(nn.Module):
+    """A fit in its midst; all there is to know beside its arguments is in its `state_dict`.
+
+    Args:
+        poses: to fit to. recipe: settings.
+    """
+
+    def __init__(self, poses: ManifoldPoses, recipe: ManifoldRecipe) -> None:
+        super().__init__()
+        self.data, self.recipe = poses, recipe
+        joined, self._lengths = join_sequences(poses.train, poses.info.columns)
+        self._scale = column_scale(joined) if recipe.standardise else torch.ones_like(joined[0])
+        self._poses, target = joined, (joined - joined.mean(0)) / self._scale
+        gamma = median_gamma(target, recipe.seed) if recipe.gamma_x is None else recipe.gamma_x
+        self.fit = GPLVMFit(
+            target, recipe.latent_dim, gamma, recipe.optimiser, recipe.learning_rate,
+            recipe.smoothness, start=recipe.start,
+        )  # fmt: skip
+
+    def identity(self) -> dict[str, Any]:
+        """Settings and poses: what makes a fit the same one."""
+        return {"settings": asdict(self.recipe), **self.data.identity()}
+
+    def step(self) -> dict[str, float]:
+        """One step, and what it did to the held-out poses.
+
+        Returns:
+            `step`, counted from 1; `log_likelihood`, the objective (MR 16) before it, per number of
+            the poses; `held_out`, the root mean square of x - f(g(x)) over held-out poses after it.
+        """
+        value = self.fit.step()
+        self.fit.note(self.held_out_error())
+        scores = self.fit.scores
+        return {"step": len(scores), "log_likelihood": value, "held_out": scores[-1]}
+
+    @property
+    def finished(self) -> bool:
+        """Whether all steps are taken, or the last better score is too long ago."""
+        taken = len(self.fit.scores)
+        over = taken - self.fit.best_step
+        return taken >= self.recipe.steps or over >= self.recipe.patience
+
+    def held_out_error(self) -> float:
+        """Root mean square of x - f(g(x)) over the held-out poses, as the fit stands."""
+        return self._current().reconstruction_error(torch.cat(self.data.watched))
+
+    def manifold(self, **facts: str) -> BackConstrainedGPLVM:
+        """The best manifold, its standard deviations from the held-out poses.
+
+        Args:
+            facts: name, licence, command; those that are empty are left out.
+        """
+        self.fit.restore_best()
+        given: dict[str, Any] = {name: value for name, value in facts.items() if value}
+        found = self._current()
+        fit_gplvm_noise(found, self.data.watched, self.data.fps)
+        extra = {
+            "settings": asdict(self.recipe),
+            "steps": self.fit.best_step,
+            "held_out_error": min(self.fit.scores),
+            "held_out_frames": sum(len(poses) for poses in self.data.watched),
+            "held_out_persons": sorted({r.person_id for r in self.data.held_out}),
+        }
+        found.info = replace(found.info, **given, extra={**found.info.extra, **extra})
+        return found
+
+    def summary(self, manifold: BackConstrainedGPLVM) -> str:
+        """What was fitted, in a sentence."""
+        persons = ", ".join(manifold.info.persons)
+        return (
+            f"{manifold.info.name}: {len(manifold.poses)} frames of {persons}, best after "
+            f"{self.fit.best_step} of {len(self.fit.scores)} steps; held-out poses come back to within "
+            f"{min(self.fit.scores):.4f} (root mean square of a column)"
+        )
+
+    def _current(self) -> BackConstrainedGPLVM:
+        return gplvm_of_fit(self.fit, self._poses, self._lengths, self._scale, self.data.info).cpu()
+
+
+def run_to_end(
+    fitting: ManifoldFitting, kept: str | Path | None = None, progress: bool = False
+) -> ManifoldFitting:
+    """Take steps until the fit is finished.
+
+    Args:
+        fitting: at its start, or taken up. kept: file that holds the fit after every step, and is
+            removed at the end; None keeps nothing. progress: show a bar.
+    """
+    with tqdm(
+        total=fitting.recipe.steps, desc="manifold", unit="step", disable=not progress,
+        initial=len(fitting.fit.scores),
+    ) as bar:  # fmt: skip
+        while not fitting.finished:
+            found = fitting.step()
+            if kept is not None:
+                with atomic_path(kept) as temporary:
+                    torch.save({"of": fitting.identity(), "fit": fitting.state_dict()}, temporary)
+            bar.set_postfix_str(f"held-out error {found['held_out']:.5f}", refresh=False)
+            bar.update()
+    if kept is not None:
+        Path(kept).unlink(missing_ok=True)
+    return fitting
+
+
+def taken_up(fitting: ManifoldFitting, kept: str | Path) -> int:
+    """Take up a fit that `run_to_end` kept, if it is the same; return its steps so far, or 0.
+
+    Raises:
+        OutputError: the file is something else, which `run_to_end` would write over.
+    """
+    if not os.path.lexists(kept):
+        return 0
+    try:
+        found = torch.load(kept, weights_only=True)
+        if found["of"] != fitting.identity():
+            return 0
+        fitting.load_state_dict(found["fit"])
+    except (
+        OSError,
+        RuntimeError,
+        pickle.UnpicklingError,
+        EOFError,
+        LookupError,
+        TypeError,
+    ) as error:
+        raise OutputError(
+            f"{kept}: is in the place where a fit is kept, and is none; move it away"
+        ) from error
+    return len(fitting.fit.scores)
+
+
+def check_gathering(validation: int, frames: int, fps: float) -> None:
+    """Raise `InputError` unless some recordings are held out, and frames and rate suffice."""
+    if validation < 1 or frames < 10 or not 0 < fps < math.inf:
+        raise InputError(
+            "validation must be at least 1, frames at least 10 and fps positive, got "
+            f"{validation}, {frames} and {fps:g}"
+        )
+
+
+def _last_apart(
+    recordings: Sequence[Recording], count: int
+) -> tuple[list[Recording], list[Recording]]:
+    """The last recordings of each person, person after person, apart from the others."""
+    fitted: list[Recording] = []
+    watched: list[Recording] = []
+    for person in sorted({r.person_id for r in recordings}):
+        own = [r for r in recordings if r.person_id == person]
+        if len(own) <= count:
+            raise InputError(
+                f"{person} has {len(own)} recordings, and {count} of them are to be held out; hold "
+                "fewer out (validation), name persons to hold out, or add recordings"
+            )
+        refuse_shared_recordings(own[:-count], own[-count:])
+        fitted += own[:-count]
+        watched += own[-count:]
+    return fitted, watched
+
+
+def _bodies(
+    fitted: Sequence[Recording], watched: Sequence[Recording], fps: float
+) -> dict[str, Body]:
+    """A body for everybody, fitted to the recordings that are fitted to where there are any."""
+    bodies = {}
+    for person in dict.fromkeys(r.person_id for r in (*fitted, *watched)):
+        own = [r for r in fitted if r.person_id == person]
+        own = own or [r for r in watched if r.person_id == person]
+        bodies[person] = fit_body(torch.cat([recorded_joints(r, fps) for r in own]))
+    return bodies
+
+
+def _poses(body: Body, recording: Recording, fps: float) -> Tensor:
+    try:
+        return body.relative(fit_state(body, recorded_joints(recording, fps))).detach()
+    except InputError as error:
+        name = f"{recording_name(recording)}: "
+        raise InputError(name + str(error).removeprefix(name)) from error
+
+
+def _digest(poses: Sequence[Tensor]) -> str:
+    digest = hashlib.sha256()
+    for part in poses:
+        digest.update(part.numpy().round(9).tobytes())
+    return digest.hexdigest()

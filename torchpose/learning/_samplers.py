@@ -1,0 +1,353 @@
+"""Where training states come from: blocks of them, drawn on the fly, whoever asks.
+
+A source is a long list of states that is never held in memory. Its block i is a function of the
+source and of i alone, so processes and workers that share the blocks among them see the same states
+as one process that takes them all, without padding or repetition.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchpose.camera._viewpoints import ViewRange, sample_viewpoints
+from torchpose.errors import InputError, check_shape
+from torchpose.priors._arm_state import arm_state
+from torchpose.priors._window import WindowLayout, augment_bodies, mirror_bodies, window_state
+
+__all__ = [
+    "BLOCK",
+    "PRODUCT",
+    "ArmSource",
+    "CachedSource",
+    "PoseFrames",
+    "SampleSource",
+    "Samples",
+    "TensorSource",
+    "WindowSource",
+    "all_samples",
+    "block_sizes",
+    "cached",
+    "derived_seed",
+    "join_samples",
+]
+
+BLOCK = 4096
+PRODUCT = 8 * BLOCK  # states per product: single blocks take a third more time
+_CACHE_BYTES = 1 << 30
+_GOLDEN = (math.sqrt(5) - 1) / 2
+
+
+class Samples(NamedTuple):
+    """Training states and how far to trust each.
+
+    Attributes:
+        states: float64. weight: in [0, 1]; a state of weight 0.5 counts as half a state.
+    """
+
+    states: Float[Tensor, "N D"]
+    weight: Float[Tensor, " N"]
+
+
+def join_samples(parts: Sequence[Samples]) -> Samples:
+    """All samples of all parts."""
+    return Samples(*(torch.cat(values) for values in zip(*parts, strict=True)))
+
+
+@runtime_checkable
+class SampleSource(Protocol):
+    """Training states in blocks; see the module for what a block may depend on."""
+
+    @property
+    def dim(self) -> int:
+        """Dimensions D of a state."""
+        ...
+
+    @property
+    def n_samples(self) -> int:
+        """Number of states in all blocks together."""
+        ...
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of blocks of `BLOCK` states; the last may be shorter."""
+        ...
+
+    def block(self, index: int, epoch: int = 0) -> Samples:
+        """The states of a block; the epoch counts only where fresh ones are drawn for each."""
+        ...
+
+
+def block_sizes(n_samples: int) -> list[int]:
+    """Number of states in each block."""
+    return [min(BLOCK, n_samples - start) for start in range(0, n_samples, BLOCK)]
+
+
+def all_samples(source: SampleSource, epoch: int = 0) -> Samples:
+    """Every state of a source at once."""
+    blocks = [source.block(index, epoch) for index in range(source.n_blocks)]
+    return Samples(*(torch.cat(values) for values in zip(*blocks, strict=True)))
+
+
+def derived_seed(seed: int, purpose: str) -> int:
+    """A seed of its own for each purpose, so that their random numbers have nothing in common."""
+    words = np.random.SeedSequence([seed, *purpose.encode()]).generate_state(1, np.uint64)
+    return int(words[0]) >> 1
+
+
+class _Blocks:
+    """What sources share: how many blocks there are, and which of them exist."""
+
+    n_samples: int
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of blocks of `BLOCK` states; the last may be shorter."""
+        return -(-self.n_samples // BLOCK)
+
+    def _rows(self, index: int) -> tuple[int, int]:
+        if not 0 <= index < self.n_blocks:
+            raise InputError(f"block must lie in 0..{self.n_blocks - 1}, got {index}")
+        start = index * BLOCK
+        return start, min(self.n_samples, start + BLOCK)
+
+
+class TensorSource(_Blocks):
+    """States that are there already, in memory or in a memory-mapped file.
+
+    Args:
+        states: [N, D], tensor or array (`numpy.memmap` for more than memory holds).
+        weight: [N], in [0, 1]; ones if None.
+    """
+
+    def __init__(self, states: Tensor | np.ndarray, weight: Tensor | None = None) -> None:
+        if states.ndim != 2:
+            raise InputError(f"states must have shape [N, D], got {list(states.shape)}")
+        self._states = states
+        self._weight = weight
+        if weight is not None:
+            check_shape("weight", weight, (len(states),))
+        self.n_samples, self.dim = (int(n) for n in states.shape)
+
+    def block(self, index: int, epoch: int = 0) -> Samples:
+        """The states of a block."""
+        start, stop = self._rows(index)
+        rows = self._states[start:stop]
+        states = torch.from_numpy(np.array(rows)) if isinstance(rows, np.ndarray) else rows
+        if self._weight is None:
+            return Samples(states.double(), torch.ones(stop - start, dtype=torch.float64))
+        return Samples(states.double(), self._weight[start:stop].double())
+
+
+class CachedSource(_Blocks):
+    """Another source whose blocks are kept once they were drawn.
+
+    Args:
+        source: whose blocks do not change with the epoch.
+    """
+
+    def __init__(self, source: SampleSource) -> None:
+        self.source = source
+        self.n_samples, self.dim = source.n_samples, source.dim
+        self.n_poses = getattr(source, "n_poses", source.n_samples)
+        self._kept: dict[int, Samples] = {}
+
+    def block(self, index: int, epoch: int = 0) -> Samples:
+        """The states of a block, drawn once."""
+        if index not in self._kept:
+            self._kept[index] = self.source.block(index)
+        return self._kept[index]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is kept: worker processes draw their own."""
+        return self.__dict__ | {"_kept": {}}
+
+
+def cached(source: SampleSource, limit: int = _CACHE_BYTES) -> SampleSource:
+    """The source with its blocks kept in memory if all of them fit into `limit` bytes."""
+    fresh = getattr(source, "fresh", False)
+    fits = 8 * (source.dim + 1) * source.n_samples <= limit
+    return CachedSource(source) if fits and not fresh else source
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn(_Blocks):
+    """States of recorded poses seen from random viewpoints (BL section 3.1).
+
+    Attributes:
+        matrix: K, pixels. views, rotation_order: of the viewpoints. n_samples: how many states.
+        seed: of everything random. fresh: whether every epoch draws its own viewpoints.
+    """
+
+    matrix: Tensor
+    views: ViewRange
+    rotation_order: str
+    n_samples: int
+    seed: int
+    fresh: bool
+
+    def _generator(self, index: int, epoch: int) -> torch.Generator:
+        """Randomness of one block: the same wherever it is drawn."""
+        purpose = f"block {index} epoch {epoch if self.fresh else 0}"
+        return torch.Generator().manual_seed(derived_seed(self.seed, purpose))
+
+    def _poses(self, index: int, n_poses: int) -> Int[Tensor, " n"]:
+        """Which pose each state of a block is made of; every pose as often as any other up to one.
+
+        State i takes pose (a p + r) mod N of round r = i // N, p = i mod N, where a has no factor in
+        common with N and is near the golden section of it: consecutive states come from all over the
+        recordings, and no list of them is held.
+        """
+        states = torch.arange(*self._rows(index))
+        return (_stride(n_poses) * (states % n_poses) + states // n_poses) % n_poses
+
+
+def _stride(n: int) -> int:
+    stride = max(1, round(_GOLDEN * n))
+    while math.gcd(stride, n) != 1:
+        stride += 1
+    return stride
+
+
+@dataclass(frozen=True, eq=False)
+class ArmSource(_Drawn):
+    """States of one arm (`arm_state`) from random viewpoints (BL section 3.1).
+
+    Args:
+        arms: hand, elbow, shoulder, head, neck of each recorded pose, body axes, metres; complete.
+        weight: of each pose, in [0, 1].
+        matrix, views, rotation_order, n_samples, seed, fresh: see `_Drawn`.
+    """
+
+    arms: Float[Tensor, "N 5 3"]
+    weight: Float[Tensor, " N"]
+    dim: int = field(default=21, init=False)
+
+    @property
+    def n_poses(self) -> int:
+        """Number of distinct poses."""
+        return len(self.arms)
+
+    def block(self, index: int, epoch: int = 0) -> Samples:
+        """The states of a block."""
+        chosen = self._poses(index, len(self.arms))
+        views = sample_viewpoints(len(chosen), self.views, self._generator(index, epoch))
+        states = arm_state(self.arms[chosen], views, self.matrix, self.rotation_order)
+        return Samples(states, self.weight[chosen])
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFrames:
+    """Frames of all recordings in one tensor, and where each recording begins and ends.
+
+    Attributes:
+        joints: [F, 8, 3], centred, metres; NaN where missing. weight: [F, 8], in [0, 1].
+        first, last: of the recording that a frame belongs to, [F]. fps: of that recording, [F].
+    """
+
+    joints: Float[Tensor, "F 8 3"]
+    weight: Float[Tensor, "F 8"]
+    first: Int[Tensor, " F"]
+    last: Int[Tensor, " F"]
+    fps: Float[Tensor, " F"]
+
+    @classmethod
+    def join(
+        cls,
+        sequences: Sequence[Float[Tensor, "T 8 3"]],
+        rates: Sequence[float],
+        weights: Sequence[Float[Tensor, "T 8"]] | None = None,
+    ) -> "PoseFrames":
+        """Frames of several recordings.
+
+        Raises:
+            InputError: no recordings.
+        """
+        if not sequences:
+            raise InputError("training states need at least one recording, got none")
+        lengths = torch.tensor([len(sequence) for sequence in sequences])
+        last = lengths.cumsum(0) - 1
+        first = last - lengths + 1
+        joints = torch.cat(list(sequences)).double()
+        weight = torch.ones(joints.shape[:2]).double() if weights is None else torch.cat([*weights])
+        fps = torch.tensor(rates, dtype=torch.float64)
+        each = (values.repeat_interleave(lengths) for values in (first, last, fps))
+        return cls(joints, weight.double(), *each)
+
+    def at_lags(self, frames: Int[Tensor, " N"], layout: WindowLayout) -> Int[Tensor, "N W"]:
+        """Indices of the frames of each window; beyond the ends of a recording its ends are held."""
+        wanted = self.wanted(frames, layout.lags, layout.fps)
+        return torch.minimum(
+            torch.maximum(wanted, self.first[frames, None]), self.last[frames, None]
+        )
+
+    def wanted(
+        self, frames: Int[Tensor, " N"], lags: Sequence[int], fps: float
+    ) -> Int[Tensor, "N L"]:
+        """Where the frames at some lags would be, also beyond the ends of a recording.
+
+        Args:
+            frames: indices. lags: in frames at the rate `fps`; positive is the past.
+        """
+        ratio = (self.fps[frames] / fps)[:, None]
+        return frames[:, None] - torch.round(torch.tensor(lags).double() * ratio).long()
+
+    def complete(self, layout: WindowLayout) -> Int[Tensor, " N"]:
+        """Frames whose whole window has all joints."""
+        known: Bool[Tensor, " F"] = torch.isfinite(self.joints).flatten(1).all(1)
+        frames = torch.arange(len(self.joints))
+        return frames[known[self.at_lags(frames, layout)].all(1)]
+
+
+@dataclass(frozen=True, eq=False)
+class WindowSource(_Drawn):
+    """Window states of one arm, each from a viewpoint and a body of its own.
+
+    Args:
+        frames: recorded poses, centred on the neck. centres: frames whose windows are complete.
+        layout: the hands of a window. side: "left" or "right"; both sides have the same windows.
+        body_size, bone_lengths: see `augment_bodies`. mirror_share: share of windows mirrored.
+        matrix, views, rotation_order, n_samples, seed, fresh: see `_Drawn`.
+    """
+
+    frames: PoseFrames
+    centres: Int[Tensor, " C"]
+    layout: WindowLayout
+    side: str
+    body_size: float = 0.0
+    bone_lengths: float = 0.0
+    mirror_share: float = 0.0
+
+    @property
+    def dim(self) -> int:
+        """Dimensions of a window state."""
+        return self.layout.dim
+
+    @property
+    def n_poses(self) -> int:
+        """Number of distinct poses."""
+        return len(self.centres)
+
+    def centres_of(self, index: int) -> Int[Tensor, " n"]:
+        """The frames that the windows of a block are about."""
+        return self.centres[self._poses(index, len(self.centres))]
+
+    def block(self, index: int, epoch: int = 0) -> Samples:
+        """The states of a block."""
+        generator = self._generator(index, epoch)
+        centres = self.centres_of(index)
+        taken = self.frames.at_lags(centres, self.layout)
+        bodies = augment_bodies(
+            self.frames.joints[taken], generator, self.body_size, self.bone_lengths
+        )
+        bodies = mirror_bodies(bodies, generator, self.mirror_share)
+        views = sample_viewpoints(len(bodies), self.views, generator)
+        states = window_state(
+            bodies, views, self.layout, self.side, self.matrix, self.rotation_order
+        )
+        return Samples(states, self.frames.weight[taken].flatten(1).amin(1))

@@ -1,0 +1,328 @@
+"""Exact EM over states that no memory has to hold, for all or for some of their dimensions.
+
+An EM step needs of the states only a table of sums (`SufficientStatistics`). So the states come block
+by block, each process takes its share of the blocks, one exchange adds up the tables, and every
+process makes the same maximisation step. The result depends neither on the number of processes nor
+on how the blocks are shared out, up to the rounding of sums.
+
+What an estimate is to be told by and what is wanted most decide which component a state belongs to;
+dimensions that would only pull components apart, such as the camera's angles, follow afterwards by one
+maximisation step with the components' responsibilities for the others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchpose.errors import InputError, check_shape
+from torchpose.learning._blocks import (
+    ALONE,
+    Share,
+    joined_blocks,
+    spread_samples,
+    usable_block,
+    usable_samples,
+)
+from torchpose.learning._samplers import Samples, SampleSource
+from torchpose.math._gaussian import symmetrise
+from torchpose.math._mixture_em import MixtureFit, run_fit, whitening
+from torchpose.math._mixture_start import STARTS, floor_variances, start_mixture
+from torchpose.math._mixture_steps import MixtureParameters, SufficientStatistics, e_step
+from torchpose.priors._gaussian_mixture import GaussianMixture
+
+__all__ = [
+    "ALONE",
+    "START_SAMPLES",
+    "ColumnsSource",
+    "Share",
+    "StreamedEM",
+    "complete_mixture",
+    "fit_streamed",
+    "run_streamed",
+]
+
+START_SAMPLES = 100_000
+
+
+class StreamedEM(MixtureFit):
+    """The fit of a mixture to sources of states, which come block by block.
+
+    `expect` sums up samples, and `accumulate` a whole source, of which every process does its share.
+    Attributes and arguments are those of `MixtureFit`.
+
+    >>> import torch
+    >>> from torchpose.learning._samplers import TensorSource
+    >>> states = torch.randn(1000, 2, generator=torch.Generator().manual_seed(0)).double()
+    >>> em = StreamedEM.start(TensorSource(states), n_components=3)
+    >>> before = em.maximise(em.accumulate(TensorSource(states)))
+    >>> em.maximise(em.accumulate(TensorSource(states))) > before
+    True
+    >>> em.mixture().n_components
+    3
+    """
+
+    # --- where a fit begins
+
+    @classmethod
+    def start(
+        cls,
+        source: SampleSource,
+        n_components: int,
+        seed: int | torch.Generator = 0,
+        *,
+        start_samples: int = START_SAMPLES,
+        covariance_floor: float = 1e-6,
+        init: str | MixtureParameters = "k-means++",
+        dtype: torch.dtype = torch.float64,
+    ) -> StreamedEM:
+        """Units, floor and start from some samples of a source, without any exchange.
+
+        Where the source has no more than `start_samples`, these are those of `GaussianMixture.fit`.
+
+        Args:
+            source: the states.
+            n_components: number of Gaussians K.
+            seed: an integer, or the generator to draw from.
+            start_samples: how many samples to look at, spread evenly over the source; every process
+                looks at the same ones.
+            covariance_floor: added to every variance, relative to the variance of the states in that
+                dimension (relative to one unit, where they do not vary at all).
+            init: "k-means++", "random" (means at states drawn at random), or the mixture to start
+                from, in units of the states.
+            dtype: of the products over the states; the mixture is float64.
+
+        Raises:
+            InputError: fewer usable samples or distinct poses than components, samples that are not
+                finite, bad settings.
+        """
+        _check_settings(n_components, start_samples, covariance_floor, init)
+        states, weight = spread_samples(source, start_samples)
+        _check_enough(source, states, n_components)
+        sample_weight = None if bool((weight == 1).all()) else weight
+        variances = floor_variances(states, covariance_floor, sample_weight)
+        if isinstance(init, str):
+            generator = seed
+            if not isinstance(generator, torch.Generator):
+                generator = torch.Generator().manual_seed(generator)
+            init = start_mixture(states, n_components, generator, variances, sample_weight, init)
+        check_shape("init.means", init.means, (n_components, source.dim))
+        shift, _, factor = whitening(states, sample_weight, variances)
+        return cls.in_units(init, shift, factor, variances, dtype)
+
+    # --- one step
+
+    @torch.no_grad()
+    def expect(self, samples: Samples) -> SufficientStatistics:
+        """Expectation step over some samples; the sums of parts are merged or added.
+
+        Args:
+            samples: states, in their own units, and weights; those of weight zero are left out.
+
+        Raises:
+            InputError: samples that are not finite, or of another size than the mixture.
+        """
+        return self._expect(usable_samples(samples, "samples"))
+
+    def _expect(self, samples: Samples) -> SufficientStatistics:
+        states, weight = (values.to(self.means) for values in samples)
+        check_shape("states", states, ("N", self.means.shape[1]))
+        sample_weight = None if bool((weight == 1).all()) else weight
+        return e_step(self.whitened(states).T, self.parameters_tuple(), sample_weight)
+
+    @torch.no_grad()
+    def accumulate(
+        self, source: SampleSource, share: Share = ALONE, epoch: int | None = None
+    ) -> SufficientStatistics:
+        """Expectation step over a whole source, of which every process does its share.
+
+        Args:
+            source: the states.
+            share: of this process.
+            epoch: handed to the source; the number of steps taken if None.
+
+        Returns:
+            The statistics of all samples, the same in every process.
+
+        Raises:
+            InputError: samples that are not finite; the block is named.
+        """
+        n_components, dim = self.means.shape
+        total = SufficientStatistics.zeros(n_components, dim, self.means.device)
+        with share.failing_together(total.pack()):
+            epoch = int(self.steps) if epoch is None else epoch
+            mine = share.blocks(source.n_blocks)
+            blocks = ((None, usable_block(source, index, epoch)) for index in mine)
+            for _, samples in joined_blocks(blocks):
+                total = total.merge(self._expect(samples))
+        return SufficientStatistics.unpack(share.total(total.pack()), len(self.means))
+
+    def mixture(self) -> GaussianMixture:
+        """Return the mixture as it is, in units of the states; its `fit_report` says how the fit went."""
+        mixture = GaussianMixture(*self.parameters_of_points())
+        mixture.fit_report = self.report()
+        return mixture
+
+
+def fit_streamed(
+    source: SampleSource,
+    n_components: int,
+    seed: int | torch.Generator = 0,
+    *,
+    max_iter: int = 200,
+    tol: float = 1e-4,
+    share: Share = ALONE,
+    progress: bool = False,
+    **options: Any,
+) -> GaussianMixture:
+    """Fit a mixture to a source that may be larger than memory, by one process or by many.
+
+    The same mixture as that of `GaussianMixture.fit`, if all samples are those of the start.
+
+    Args:
+        source: the states.
+        n_components: number of Gaussians K.
+        seed: an integer, or the generator to draw from.
+        max_iter: largest number of steps.
+        tol: change of the mean log-likelihood at which to stop; 0 never stops early.
+        share: of this process; every process calls this function and gets the mixture.
+        progress: show a bar.
+        options: to `StreamedEM.start`.
+
+    Returns:
+        The mixture, with its `fit_report`.
+
+    Raises:
+        InputError: as `StreamedEM.start` and `StreamedEM.accumulate`.
+    """
+    em = StreamedEM.start(source, n_components, seed, **options)
+    run_streamed(em, source, max_iter=max_iter, tol=tol, share=share, progress=progress)
+    return em.mixture()
+
+
+def run_streamed(
+    em: StreamedEM,
+    source: SampleSource,
+    *,
+    max_iter: int = 200,
+    tol: float = 1e-4,
+    share: Share = ALONE,
+    progress: bool = False,
+) -> None:
+    """Take EM steps over a source until `em` has converged or taken `max_iter` of them in all."""
+    run_fit(em, lambda: em.accumulate(source, share), max_iter=max_iter, tol=tol, progress=progress)
+
+
+def _check_settings(
+    n_components: int, start_samples: int, covariance_floor: float, init: Any
+) -> None:
+    if n_components < 1:
+        raise InputError(f"n_components must be at least 1, got {n_components}")
+    if start_samples < n_components:
+        raise InputError(
+            f"start_samples must be at least the number of components, got {start_samples} for "
+            f"{n_components} components"
+        )
+    if not covariance_floor > 0 or math.isinf(covariance_floor):
+        raise InputError(f"covariance_floor must be positive, got {covariance_floor}")
+    if isinstance(init, str) and init not in STARTS:
+        raise InputError(f"init must be a mixture or one of {', '.join(STARTS)}, got {init!r}")
+
+
+def _check_enough(source: SampleSource, states: Tensor, n_components: int) -> None:
+    """Raise unless there is a pose for every component."""
+    n_poses = getattr(source, "n_poses", len(states))
+    if n_poses >= n_components and any(len(x.unique()) >= n_components for x in states.T):
+        return
+    distinct = min(n_poses, len(states.unique(dim=0)) if len(states) else 0)
+    if distinct < n_components:
+        raise InputError(
+            f"a fit needs at least as many distinct poses as components, got {len(states)} usable "
+            f"samples of {distinct} distinct poses for {n_components} components; take fewer "
+            "components, or more recordings"
+        )
+
+
+_FLOOR = 1e-6  # of the variance of each dimension, as in expectation-maximisation
+_ROWS = 1024  # states at a time, whose squares are 17 MB
+
+
+class ColumnsSource:
+    """Some dimensions of the states of another source.
+
+    Args:
+        source: of whole states. columns: which dimensions, in order.
+    """
+
+    def __init__(self, source: SampleSource, columns: Sequence[int]) -> None:
+        self.source, self.columns = source, list(columns)
+
+    @property
+    def dim(self) -> int:
+        """Number of dimensions."""
+        return len(self.columns)
+
+    @property
+    def n_samples(self) -> int:
+        """Number of states in all blocks together."""
+        return self.source.n_samples
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of blocks."""
+        return self.source.n_blocks
+
+    @property
+    def fresh(self) -> bool:
+        """Whether every epoch draws states of its own."""
+        return bool(getattr(self.source, "fresh", False))
+
+    def block(self, index: int, epoch: int = 0) -> Samples:
+        """The states of a block."""
+        samples = self.source.block(index, epoch)
+        return samples._replace(states=samples.states[:, self.columns])
+
+
+@torch.no_grad()
+def complete_mixture(
+    mixture: GaussianMixture, source: SampleSource, columns: Sequence[int]
+) -> GaussianMixture:
+    """A mixture of whole states from one of some of their dimensions.
+
+    mu_k = sum_n r_nk x_n / n_k,  Sigma_k = sum_n r_nk (x_n - mu_k)(x_n - mu_k)^T / n_k + floor,
+
+    where r_nk is the share of component k in the given dimensions of state n (BL 53-56).
+
+    Args:
+        mixture: over the dimensions `columns`. source: of whole states.
+
+    Raises:
+        InputError: another number of dimensions.
+    """
+    if mixture.dim != len(columns):
+        raise InputError(
+            f"the mixture must be over the {len(columns)} dimensions that decide, got {mixture.dim}"
+        )
+    columns = list(columns)
+    first = usable_block(source, 0, 0).states
+    shift, scale = first.mean(0), first.std(0).clamp_min(1e-9)
+    k, dim = mixture.n_components, source.dim
+    count = torch.zeros(k, dtype=torch.float64)
+    total, squares = torch.zeros(k, dim).double(), torch.zeros(k, dim * dim).double()
+    for index in range(source.n_blocks):
+        samples = usable_block(source, index, 0)
+        for states, weight in zip(*(value.split(_ROWS) for value in samples), strict=True):
+            share = mixture.component_log_prob(states[:, columns]).softmax(1) * weight[:, None]
+            unit = (states - shift) / scale
+            count += share.sum(0)
+            total += share.T @ unit
+            squares += share.T @ (unit[:, :, None] * unit[:, None]).flatten(1)
+    count = count.clamp_min(1e-9)
+    means = total / count[:, None]
+    covs = squares.unflatten(1, (dim, dim)) / count[:, None, None]
+    covs = symmetrise(covs - means[:, :, None] * means[:, None])
+    covs = covs + _FLOOR * torch.eye(dim, dtype=torch.float64)
+    return GaussianMixture(mixture.weights, means * scale + shift, covs * scale * scale[:, None])

@@ -1,0 +1,297 @@
+"""From recorded poses to sources of training states: which frames, which neck, which viewpoints."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.camera._viewpoints import ViewRange
+from torchpose.errors import InputError, PriorError
+from torchpose.learning._samplers import ArmSource, PoseFrames, derived_seed
+from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.skeleton._torso import learn_neck_offset, place_neck
+from torchpose.skeleton._upper_body import LEFT_ARM, NECK_KINDS, RIGHT_ARM, upper_body_indices
+
+__all__ = [
+    "TRAINING_VIEWS",
+    "ArmSources",
+    "PoseSet",
+    "RecordingLike",
+    "arm_sources",
+    "collect_poses",
+]
+
+TRAINING_VIEWS = ViewRange(
+    roll=math.radians(15),
+    pitch=math.radians(15),
+    yaw=math.radians(15),
+    tx=(-0.2, 0.2),
+    ty=(-0.45, -0.05),
+    tz=(1.5, 2.5),
+)
+"""Viewpoints of the shipped priors: a person about 2 m in front of the camera."""
+
+DEFAULT_SAMPLES = 100_000
+DEFAULT_RATE = 30.0  # of recordings that do not say
+_HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
+
+
+@runtime_checkable
+class RecordingLike(Protocol):
+    """What is used of a `torchpose.io.Recording`."""
+
+    names: tuple[str, ...]
+    fps: float | None
+    source: str
+
+    @property
+    def person_id(self) -> str: ...
+
+    def upper_body(self, nose_as_head: bool = False) -> Any: ...
+
+
+class PoseSet(NamedTuple):
+    """Centred poses of many recordings, with one kind of neck.
+
+    Attributes:
+        joints: [N, 8, 3], metres, camera axes; NaN where a joint is missing.
+        facts: what `PriorInfo` has to say about them, by the names of its fields.
+        weight: how far to trust each joint, [N, 8] in [0, 1]; one where a recording does not say.
+        lengths: frames of each recording. rates: their frames per second. persons: their ids.
+    """
+
+    joints: Float[Tensor, "N 8 3"]
+    facts: dict[str, Any]
+    weight: Float[Tensor, "N 8"]
+    lengths: list[int]
+    rates: list[float]
+    persons: list[str]
+
+    def frames(self) -> PoseFrames:
+        """The frames with where each recording begins and ends."""
+        joints, weight = (values.split(self.lengths) for values in (self.joints, self.weight))
+        return PoseFrames.join(joints, self.rates, weight)
+
+
+class ArmSources(NamedTuple):
+    """Sources of the states that the mixtures over poses are fitted to.
+
+    Attributes:
+        left: states of the left arm, with those of the mirrored right arm among them if `mirror`.
+        right: states of the right arm, None if it is to be the mirror image of the left one.
+        facts: as in `PoseSet`, with counts of frames that were used and left out.
+    """
+
+    left: ArmSource
+    right: ArmSource | None
+    facts: dict[str, Any]
+
+
+def collect_poses(
+    recordings: Sequence[RecordingLike],
+    neck: str | None = None,
+    centre: str = "neck",
+    nose_as_head: bool = False,
+) -> PoseSet:
+    """Centred upper-body poses of recordings, converted to one kind of neck.
+
+    Necks of other kinds, and missing ones, are put where the recordings of the wanted kind have
+    theirs (`learn_neck_offset`). Hands and wrists are not converted: mixed, they are refused.
+
+    Args:
+        recordings: in camera axes.
+        neck: kind of neck wanted; the highest kind among the recordings if None.
+        centre: "neck" or "head": every pose is centred on that joint; "sequence": every recording
+            on the mean of its neck.
+        nose_as_head: take the nose where a joint set has no head.
+
+    Raises:
+        InputError: no recordings. PriorError: hands and wrists (or heads and noses) mixed, a neck
+            that cannot be learnt, an unknown `centre`.
+    """
+    if not recordings:
+        raise InputError("a prior needs at least one recording, got none")
+    bodies = [r.upper_body(nose_as_head) for r in recordings]
+    hand = _one_kind("hand", [b.hand for b in bodies])
+    head = _one_kind("head", [b.head for b in bodies])
+    kinds = [b.neck for b in bodies]
+    wanted = neck or min((k for k in kinds if k in NECK_KINDS), key=NECK_KINDS.index, default=None)
+    if wanted not in NECK_KINDS:
+        raise PriorError(
+            f"a prior needs recordings with a neck ({', '.join(NECK_KINDS)}), got {wanted!r}"
+        )
+    joints = [b.joints.to(torch.float64) for b in bodies]
+    extra: dict[str, Any] = {"head": head}
+    if any(kind != wanted for kind in kinds):
+        genuine = [j for j, kind in zip(joints, kinds, strict=True) if kind == wanted]
+        offset = learn_neck_offset(torch.cat(genuine) if genuine else joints[0][:0])
+        joints = [
+            j if kind == wanted else place_neck(j, offset)
+            for j, kind in zip(joints, kinds, strict=True)
+        ]
+        extra["neck_offset"] = offset._asdict()
+        extra["frames_with_converted_neck"] = sum(
+            len(j) for j, kind in zip(joints, kinds, strict=True) if kind != wanted
+        )
+    rate = _frame_rate(recordings, joints)
+    facts = {
+        "neck": wanted,
+        "hand": hand,
+        "centre": centre,
+        "fps": rate,
+        "persons": tuple(sorted({r.person_id for r in recordings})),
+        "sources": tuple(sorted({_origin(r) for r in recordings})),
+        "extra": extra | {"recordings": len(recordings)},
+    }
+    return PoseSet(
+        torch.cat([_centred(j, centre) for j in joints]),
+        facts,
+        torch.cat([_weights(r, nose_as_head) for r in recordings]),
+        [len(j) for j in joints],
+        [float(r.fps or rate or DEFAULT_RATE) for r in recordings],
+        [r.person_id for r in recordings],
+    )
+
+
+def arm_sources(
+    poses: PoseSet,
+    matrix: Float[Tensor, "3 3"],
+    seed: int = 0,
+    view_range: ViewRange = TRAINING_VIEWS,
+    rotation_order: str = "zxy",
+    mirror: bool = True,
+    n_samples: int | None = None,
+    views_per_pose: int | None = None,
+) -> ArmSources:
+    """States of both arms from random viewpoints, every pose as often as any other.
+
+    An arm leaves out the frames in which one of its five joints is missing; `facts` says how many.
+    A state weighs as much as the least trusted joint of its pose.
+
+    Args:
+        poses: from `collect_poses`.
+        matrix: K, pixels.
+        seed: of the viewpoints.
+        view_range: limits of the viewpoints.
+        rotation_order: "zxy" (paper) or "zyx" (released priors).
+        mirror: pool left arms and mirrored right arms; the right mixture is then to be the mirror
+            image of the left one.
+        n_samples: states per arm; 100,000 if neither this nor `views_per_pose` is given.
+        views_per_pose: viewpoints for each pose, instead of `n_samples`.
+
+    Raises:
+        InputError: no usable frames, both counts given, or viewpoints to one side with `mirror`.
+    """
+    if n_samples is not None and views_per_pose is not None:
+        raise InputError("give n_samples or views_per_pose, not both")
+    if mirror and not math.isclose(-view_range.tx[0], view_range.tx[1], abs_tol=1e-9):
+        raise InputError(
+            f"mirrored arms need views with tx the same to both sides, got {view_range.tx}; "
+            "make it symmetric or use mirror=False"
+        )
+    left, right = (_arm(poses, arm) for arm in (LEFT_ARM, RIGHT_ARM))
+    dropped = {"left": int((~left.known).sum()), "right": int((~right.known).sum())}
+    arms = {"left": left.usable(), "right": right.usable()}
+    if mirror:
+        flip = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
+        (own, trust), (other, also) = arms["left"], arms["right"]
+        arms = {"left": (torch.cat([own, other * flip]), torch.cat([trust, also]))}
+    sources = {}
+    for side, (points, weight) in arms.items():
+        if not len(points):
+            raise InputError(
+                f"no frame has all five joints of the {side} arm (hand, elbow, shoulder, head, "
+                "neck); the prior needs recordings that do"
+            )
+        count = _count(len(points), n_samples, views_per_pose)
+        own_seed = derived_seed(seed, f"poses {side}")
+        sources[side] = ArmSource(
+            matrix, view_range, rotation_order, count, own_seed, False, points, weight
+        )
+    facts = poses.facts | {
+        "n_frames": int((left.known | right.known).sum()),
+        "n_samples": sources["left"].n_samples,
+        "mirrored": mirror,
+        "extra": poses.facts["extra"] | {"frames_left_out": dropped},
+    }
+    return ArmSources(sources["left"], sources.get("right"), facts)
+
+
+class _Arm(NamedTuple):
+    """Poses [N, 5, 3] of an arm, which of them are complete and trusted at all, and weights [N]."""
+
+    points: Tensor
+    known: Tensor
+    weight: Tensor
+
+    def usable(self) -> tuple[Tensor, Tensor]:
+        return self.points[self.known], self.weight[self.known]
+
+
+def _arm(poses: PoseSet, arm: tuple[int, ...]) -> _Arm:
+    points, weight = poses.joints[:, list(arm)], poses.weight[:, list(arm)].amin(1)
+    return _Arm(points, torch.isfinite(points).flatten(1).all(1) & (weight > 0), weight)
+
+
+def _weights(recording: RecordingLike, nose_as_head: bool) -> Float[Tensor, "T 8"]:
+    """Trust in the eight joints; a joint that the recording does not have needs none."""
+    given = getattr(recording, "weights", None)
+    frames = len(recording.upper_body(nose_as_head).joints)
+    weight = torch.ones(frames, len(UPPER_BODY), dtype=torch.float64)
+    if given is None:
+        return weight
+    indices = upper_body_indices(recording.names, nose_as_head).indices
+    there = [i for i, index in enumerate(indices) if index >= 0]
+    weight[:, there] = given[:, [indices[i] for i in there]].to(weight)
+    return weight
+
+
+def _one_kind(joint: str, kinds: Sequence[str | None]) -> str | None:
+    found = sorted({k for k in kinds if k is not None})
+    if len(found) > 1:
+        raise PriorError(
+            f"recordings must agree on what a {joint} is, got {' and '.join(found)}; "
+            "fit them apart, or leave one kind out"
+        )
+    return found[0] if found else None
+
+
+def _origin(recording: RecordingLike) -> str:
+    """Where a recording comes from, without the path inside that place."""
+    repository, at, rest = recording.source.partition("@")
+    if not repository:
+        return recording.person_id.partition("#")[0]
+    return f"{repository}{at}{rest.partition(':')[0]}"
+
+
+def _frame_rate(recordings: Sequence[RecordingLike], joints: Sequence[Tensor]) -> float | None:
+    """The frame rate of most frames."""
+    frames: dict[float, int] = {}
+    for recording, poses in zip(recordings, joints, strict=True):
+        if recording.fps:
+            rate = round(float(recording.fps), 3)
+            frames[rate] = frames.get(rate, 0) + len(poses)
+    return max(frames, key=lambda rate: frames[rate], default=None)
+
+
+def _centred(joints: Tensor, centre: str) -> Tensor:
+    if centre == "sequence":
+        return joints - joints[:, _NECK].nanmean(0)
+    if centre not in ("neck", "head"):
+        raise PriorError(f"centre must be neck, head or sequence, got {centre!r}")
+    joint = _NECK if centre == "neck" else _HEAD
+    return joints - joints[:, joint : joint + 1]
+
+
+def _count(n: int, n_samples: int | None, views_per_pose: int | None) -> int:
+    if views_per_pose is not None:
+        n_samples = n * views_per_pose
+    count = DEFAULT_SAMPLES if n_samples is None else n_samples
+    if count < 1:
+        raise InputError(f"the number of samples must be at least 1, got {count}")
+    return count

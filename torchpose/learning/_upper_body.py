@@ -1,0 +1,227 @@
+"""Fit an upper-body prior (BL 3): a mixture per arm, and the noise of its motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.camera._pinhole import PinholeCamera
+from torchpose.camera._viewpoints import Viewpoints, ViewRange, sample_viewpoints
+from torchpose.errors import PriorError
+from torchpose.learning._samplers import ArmSource, all_samples, derived_seed
+from torchpose.learning._training import (
+    DEFAULT_RATE,
+    TRAINING_VIEWS,
+    PoseSet,
+    RecordingLike,
+    arm_sources,
+    collect_poses,
+)
+from torchpose.math._rotations import RotationOrder, euler_to_matrix
+from torchpose.priors._arm_state import (
+    ANGLES,
+    STATE_DIM,
+    arm_state,
+    check_rotation_order,
+    mirror_covariance,
+    mirror_mixture,
+)
+from torchpose.priors._gaussian_mixture import GaussianMixture
+from torchpose.priors._prior_file import PriorInfo
+from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM
+
+__all__ = ["fit_upper_body_prior", "increment_covs", "prior_of_arms"]
+
+_KINECT_CAMERA = (525.0, 525.0, 319.5, 239.5)
+
+
+def fit_upper_body_prior(
+    recordings: Sequence[RecordingLike],
+    n_components: int = 30,
+    seed: int = 0,
+    views: ViewRange = TRAINING_VIEWS,
+    *,
+    camera: PinholeCamera | None = None,
+    rotation_order: str = "zxy",
+    centre: str = "neck",
+    neck: str | None = None,
+    mirror: bool = True,
+    n_samples: int | None = None,
+    views_per_pose: int | None = None,
+    nose_as_head: bool = False,
+    name: str = "",
+    licence: str = "",
+    command: str = "",
+    progress: bool = False,
+    **fit_options: Any,
+) -> UpperBodyPrior:
+    """Fit a prior to recorded 3D poses seen from random viewpoints (BL section 3.1).
+
+    Args:
+        recordings: in camera axes (`torchpose.io.read_recordings`).
+        n_components: Gaussians per arm.
+        seed: of viewpoints and start.
+        views: limits of the random viewpoints.
+        camera: whose pixels the states are in; Kinect's (f = 525, 640 x 480) if None.
+        rotation_order: "zxy" (paper) or "zyx" (released priors).
+        centre: "neck", "head" or "sequence" (`PriorInfo`).
+        neck: kind of neck; the highest among the recordings if None. Others are converted.
+        mirror: fit one mixture to left arms and mirrored right arms, and mirror it.
+        n_samples, views_per_pose: how many training states (`arm_sources`).
+        nose_as_head: take the nose where a joint set has no head.
+        name, licence, command: for `info`.
+        progress: show bars.
+        fit_options: to `GaussianMixture.fit`: n_init, max_iter, tol, covariance_floor, init.
+
+    Raises:
+        InputError: no recordings or no complete frames. PriorError: kinds of joints that cannot be
+            mixed, unknown rotation order.
+    """
+    check_rotation_order(rotation_order)
+    camera = camera or PinholeCamera(*_KINECT_CAMERA, width=640, height=480)
+    (fx, skew, cx), (_, fy, cy), _ = camera.matrix.tolist()
+    if skew:
+        raise PriorError(f"the camera of a prior must have no skew, got {skew:g} pixels")
+    poses = collect_poses(recordings, neck, centre, nose_as_head)
+    sources = arm_sources(
+        poses, camera.matrix, seed, views, rotation_order, mirror, n_samples, views_per_pose
+    )
+    options: dict[str, Any] = {"n_components": n_components, "seed": seed}
+    options |= {"progress": progress} | fit_options
+    left = _fit_arm(sources.left, options)
+    right = None if sources.right is None else _fit_arm(sources.right, options)
+    info = PriorInfo(
+        name=name, rotation_order=rotation_order, fx=fx, fy=fy, cx=cx, cy=cy, licence=licence,
+        command=command, views=asdict(views), **sources.facts,
+    )  # fmt: skip
+    return prior_of_arms(left, right, info, seed)
+
+
+def _fit_arm(source: ArmSource, options: dict[str, Any]) -> GaussianMixture:
+    states, weight = all_samples(source)
+    return GaussianMixture.fit(states, sample_weight=weight, **options)
+
+
+def prior_of_arms(
+    left: GaussianMixture, right: GaussianMixture | None, info: PriorInfo, seed: int
+) -> UpperBodyPrior:
+    """Prior of fitted mixtures over poses; a right arm of None is the left one's mirror image.
+
+    Args:
+        left, right: mixtures with their `fit_report`, if they were fitted. info: what they were
+            fitted on. seed: of the fit.
+    """
+    info = replace(info, extra=info.extra | _fit_facts(left, seed))
+    return UpperBodyPrior(left, mirror_mixture(left, info.cx) if right is None else right, info)
+
+
+def _fit_facts(mixture: GaussianMixture, seed: int) -> dict[str, Any]:
+    report = mixture.fit_report
+    if report is None:
+        return {"seed": seed}
+    return {
+        "seed": seed,
+        "fit": {
+            "iterations": report.iterations,
+            "log_likelihood": report.log_likelihood[-1],
+            "converged": report.converged,
+            "reseeded": report.reseeded,
+        },
+    }
+
+
+_NECK = UPPER_BODY.index("neck")
+_STEPS = 50_000  # at least so many viewpoints, where there are recorded steps at all
+# rad in 1/30 s. The camera of a recording stands still; what it is believed to be has to move.
+_ANGLE_STEP = 0.03
+
+
+def increment_covs(
+    poses: PoseSet,
+    matrix: Float[Tensor, "3 3"],
+    views: ViewRange,
+    rotation_order: str,
+    mirror: bool,
+    seed: int,
+) -> dict[str, Float[Tensor, "21 21"]]:
+    """Return the second moment of the steps of each arm's state, per frame, by side.
+
+    S = E[(x_t - x_{t-1}) (x_t - x_{t-1})^T] + diag(0, .., a^2, a^2, a^2, 0, 0, 0), where x_t and x_{t-1}
+    are the states (BL 3) of consecutive frames of a recording, seen by a camera that stands still at
+    a random viewpoint; the neck's path through the room moves t. a = 0.03 rad in 1/30 s explores the
+    camera's angles, which no recorded step shows.
+
+    Args:
+        poses: centred on each recording's mean neck ("sequence"); steps of recordings at another rate
+            than that of most frames count in proportion to the interval.
+        matrix: K, pixels. views, rotation_order: of the viewpoints. seed: of these.
+        mirror: pool left arms and mirrored right ones.
+
+    Returns:
+        S in pixels, metres and radians for the sides that have steps at all.
+    """
+    order = check_rotation_order(rotation_order)
+    rate = poses.facts["fps"] or DEFAULT_RATE
+    found = {}
+    flip = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
+    for side, arm in (("left", LEFT_ARM), ("right", RIGHT_ARM)):
+        used = _usable(poses, arm)
+        if len(used):
+            generator = torch.Generator().manual_seed(derived_seed(seed, f"increments {side}"))
+            used = used.repeat(-(-_STEPS // len(used)))
+            sampled = sample_viewpoints(len(used), views, generator)
+            joints = poses.joints * flip if mirror and side == "right" else poses.joints
+            steps = _states(joints[used], arm, sampled, matrix, order)
+            steps = steps - _states(joints[used - 1], arm, sampled, matrix, order)
+            trust = _trust(poses, arm, used)
+            weight = trust * _rates(poses)[used] / rate
+            found[side] = (steps * weight[:, None]).mT @ steps / trust.sum()
+    if mirror and len(found) == 2:
+        pooled = (found["left"] + found["right"]) / 2
+        found = {"left": pooled, "right": mirror_covariance(pooled)}
+    turning = torch.zeros(STATE_DIM, dtype=torch.float64)
+    turning[ANGLES] = _ANGLE_STEP**2 * 30.0 / rate
+    return {side: cov + torch.diag(turning) for side, cov in found.items()}
+
+
+def _usable(poses: PoseSet, arm: tuple[int, ...]) -> Tensor:
+    """Frames that have a frame before them in their recording, with the whole arm in both."""
+    whole = torch.isfinite(poses.joints[:, list(arm)]).flatten(1).all(1)
+    whole = whole & (poses.weight[:, list(arm)].amin(1) > 0)
+    lengths = torch.tensor(poses.lengths)
+    begins = torch.zeros_like(whole)
+    begins[(lengths.cumsum(0) - lengths)[lengths > 0]] = True
+    return (whole & whole.roll(1) & ~begins).nonzero()[:, 0]
+
+
+def _trust(poses: PoseSet, arm: tuple[int, ...], frames: Tensor) -> Tensor:
+    weight = poses.weight[:, list(arm)].amin(1)
+    return torch.minimum(weight[frames], weight[frames - 1])
+
+
+def _rates(poses: PoseSet) -> Float[Tensor, " N"]:
+    return torch.tensor(poses.rates, dtype=torch.float64).repeat_interleave(
+        torch.tensor(poses.lengths)
+    )
+
+
+def _states(
+    joints: Float[Tensor, "n 8 3"],
+    arm: tuple[int, ...],
+    views: Viewpoints,
+    matrix: Tensor,
+    order: RotationOrder,
+) -> Float[Tensor, "n 21"]:
+    """States of poses that are centred on their neck, whose place is the camera's translation."""
+    neck = joints[:, _NECK]
+    rotation = euler_to_matrix(views.angles, order)
+    place = views.translation + (rotation @ neck[..., None])[..., 0]
+    points = joints[:, list(arm)] - neck[:, None]
+    return arm_state(points, Viewpoints(views.angles, place), matrix, order)

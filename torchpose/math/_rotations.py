@@ -1,0 +1,351 @@
+"""Convert rotations: Euler angles, Rodrigues vectors, vector parts of unit quaternions, rigid alignment.
+
+Angles are radians. A rotation matrix takes body (or world) axes to camera axes.
+
+Every rotation is one such vector in the unit ball, except those by pi, which are two (v and -v). A
+vector longer than 1 is scaled back to the unit sphere. Quaternions [..., 4] are (x, y, z, w); the
+product of two rotations turns by the right one first. Gradients are finite everywhere."""
+
+import math
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchpose._core.arguments import as_pair
+from torchpose.errors import InputError, check_shape
+
+__all__ = [
+    "ROTATION_ORDERS",
+    "RigidMotion",
+    "RotationOrder",
+    "compose",
+    "conjugate",
+    "cross_matrix",
+    "euler_to_matrix",
+    "matrix_to_euler",
+    "matrix_to_quaternion_vector",
+    "mean_rotation",
+    "minimal_rotation",
+    "procrustes",
+    "quaternion_to_vector",
+    "quaternion_vector_to_matrix",
+    "rotvec_to_matrix",
+    "vector_to_quaternion",
+    "within_unit_ball",
+]
+
+RotationOrder = Literal["zxy", "zyx"]
+ROTATION_ORDERS: tuple[RotationOrder, ...] = ("zxy", "zyx")
+
+
+def euler_to_matrix(
+    angles: Float[Tensor, "*batch 3"], order: RotationOrder = "zxy"
+) -> Float[Tensor, "*batch 3 3"]:
+    """Return the rotation matrix of roll, pitch and yaw.
+
+    ``zxy``: R = Rz(roll) Rx(pitch) Ry(yaw), the paper's (BL 3).
+    ``zyx``: R = Rz(roll) Ry(yaw) Rx(pitch), the authors' released code and priors.
+
+    Args:
+        angles: [..., 3], (roll, pitch, yaw) in radians, in this order for both.
+        order: ``"zxy"`` or ``"zyx"``.
+
+    Returns:
+        R [..., 3, 3], body axes to camera axes.
+
+    Raises:
+        ShapeError: the last dimension is not 3. InputError: another order.
+
+    Reference: Burke & Lasenby, equation (3).
+
+    >>> euler_to_matrix(torch.tensor([0.0, 0.0, 0.5]))[2]  # yaw turns about y
+    tensor([-0.4794,  0.0000,  0.8776])
+    """
+    check_shape("angles", angles, ["...", 3])
+    _check_order(order)
+    (sr, sp, sy), (cr, cp, cy) = angles.sin().unbind(-1), angles.cos().unbind(-1)
+    if order == "zxy":
+        rows = [
+            [cr * cy - sr * sp * sy, -sr * cp, cr * sy + sr * sp * cy],
+            [sr * cy + cr * sp * sy, cr * cp, sr * sy - cr * sp * cy],
+            [-cp * sy, sp, cp * cy],
+        ]
+    else:
+        rows = [
+            [cr * cy, cr * sy * sp - sr * cp, cr * sy * cp + sr * sp],
+            [sr * cy, sr * sy * sp + cr * cp, sr * sy * cp - cr * sp],
+            [-sy, cy * sp, cy * cp],
+        ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def matrix_to_euler(
+    rotation: Float[Tensor, "*batch 3 3"], order: RotationOrder = "zxy"
+) -> Float[Tensor, "*batch 3"]:
+    """Return the roll, pitch and yaw of a rotation matrix; the inverse of `euler_to_matrix`.
+
+    The middle angle (pitch for ``zxy``, yaw for ``zyx``) comes back in [-pi/2, pi/2]. Where it is
+    a right angle the other two are not unique: roll is then 0 and gradients are undefined.
+
+    Args:
+        rotation: R [..., 3, 3], orthonormal with determinant 1.
+        order: ``"zxy"`` (the paper) or ``"zyx"`` (released code).
+
+    Returns:
+        (roll, pitch, yaw) [..., 3] in radians.
+    """
+    check_shape("rotation", rotation, ["...", 3, 3])
+    _check_order(order)
+    R = rotation
+    if order == "zxy":
+        cos_mid = torch.hypot(R[..., 2, 0], R[..., 2, 2])
+        locked = cos_mid < 8 * torch.finfo(R.dtype).eps
+        pitch = torch.atan2(R[..., 2, 1], cos_mid)
+        roll = torch.where(locked, 0.0, torch.atan2(-R[..., 0, 1], R[..., 1, 1]))
+        free = torch.atan2(-R[..., 2, 0], R[..., 2, 2])
+        yaw = torch.where(locked, torch.atan2(R[..., 0, 2], R[..., 0, 0]), free)
+    else:
+        cos_mid = torch.hypot(R[..., 2, 1], R[..., 2, 2])
+        locked = cos_mid < 8 * torch.finfo(R.dtype).eps
+        yaw = torch.atan2(-R[..., 2, 0], cos_mid)
+        roll = torch.where(locked, 0.0, torch.atan2(R[..., 1, 0], R[..., 0, 0]))
+        free = torch.atan2(R[..., 2, 1], R[..., 2, 2])
+        pitch = torch.where(locked, torch.atan2(-R[..., 1, 2], R[..., 1, 1]), free)
+    return torch.stack([roll, pitch, yaw], -1)
+
+
+def rotvec_to_matrix(rotvec: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Return the rotation matrix of a Rodrigues vector (axis times angle, radians), as in camera files.
+
+    R = I + (sin a / a) [v]x + ((1 - cos a) / a^2) [v]x^2,   a = |v|, by series near zero.
+    """
+    check_shape("rotvec", rotvec, ["...", 3])
+    x, y, z = rotvec.unbind(-1)
+    o = torch.zeros_like(x)
+    skew = torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
+    squared = rotvec.square().sum(-1)[..., None, None]
+    near_zero = squared < 1e-8  # the next terms of the series are below the rounding of float64
+    angle = torch.where(near_zero, torch.ones_like(squared), squared).sqrt()
+    first = torch.where(near_zero, 1 - squared / 6, angle.sin() / angle)
+    half = (angle / 2).sin() / angle
+    second = torch.where(near_zero, 0.5 - squared / 24, 2 * half.square())
+    eye = torch.eye(3, dtype=rotvec.dtype, device=rotvec.device)
+    return eye + first * skew + second * (skew @ skew)
+
+
+def _check_order(order: str) -> None:
+    if order not in ROTATION_ORDERS:
+        raise InputError(
+            f"rotation order must be one of {', '.join(ROTATION_ORDERS)}, got {order!r}"
+        )
+
+
+def within_unit_ball(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Scale vectors longer than 1 back to the unit sphere; others stay as they are."""
+    return vector * _squared_length(vector).clamp_min(1).rsqrt()
+
+
+def vector_to_quaternion(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
+    """Return the unit quaternion (x, y, z, w), w >= 0, of a quaternion vector.
+
+    w = sqrt(1 - |v|^2), whose slope is infinite at |v| = 1: within the rounding of the dtype w is 0
+    there and has no slope.
+    """
+    vector = within_unit_ball(vector)
+    squared = 1 - _squared_length(vector)
+    on_sphere = squared <= 2 * torch.finfo(vector.dtype).eps
+    w = torch.where(on_sphere, torch.ones_like(squared), squared).sqrt()
+    return torch.cat([vector, torch.where(on_sphere, torch.zeros_like(w), w)], -1)
+
+
+def _squared_length(vector: Tensor) -> Tensor:
+    """|v|^2 [..., 1]; a sum over a dimension of three takes five times as long."""
+    x, y, z = vector.split(1, -1)
+    return x * x + y * y + z * z
+
+
+def quaternion_to_vector(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
+    """Return the vector part of q or of -q, whichever has w >= 0; q and -q are the same rotation."""
+    vector, w = quaternion[..., :3], quaternion[..., 3:]
+    return torch.where(w < 0, -vector, vector)
+
+
+def quaternion_vector_to_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Return the rotation matrix R = I + 2 w [v]x + 2 [v]x^2 of a quaternion vector.
+
+    >>> quaternion_vector_to_matrix(torch.tensor([0.0, 1.0, 0.0])).diagonal()  # by pi about y
+    tensor([-1.,  1., -1.])
+    """
+    check_shape("vector", vector, ["...", 3])
+    x, y, z, w = vector_to_quaternion(vector).unbind(-1)
+    xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
+    xy, xz, yz = 2 * x * y, 2 * x * z, 2 * y * z
+    wx, wy, wz = 2 * w * x, 2 * w * y, 2 * w * z
+    rows = [
+        1 - yy - zz, xy - wz, xz + wy,
+        xy + wz, 1 - xx - zz, yz - wx,
+        xz - wy, yz + wx, 1 - xx - yy,
+    ]  # fmt: skip
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def matrix_to_quaternion_vector(
+    rotation: Float[Tensor, "*batch 3 3"],
+) -> Float[Tensor, "*batch 3"]:
+    """Return the quaternion vector of a rotation matrix; the inverse of `quaternion_vector_to_matrix`.
+
+    R determines the matrix 4 q q^T; its row with the largest diagonal entry, at least 1, is q up to
+    its length, which is stable at every angle, 0 and pi included.
+
+    Args:
+        rotation: [..., 3, 3], orthonormal with determinant 1.
+    """
+    check_shape("rotation", rotation, ["...", 3, 3])
+    a, b, c, d, e, f, g, h, i = rotation.flatten(-2).unbind(-1)
+    xy, xz, yz, wx, wy, wz = b + d, c + g, f + h, h - f, c - g, d - b
+    rows = [
+        1 + a - e - i, xy, xz, wx,
+        xy, 1 - a + e - i, yz, wy,
+        xz, yz, 1 - a - e + i, wz,
+        wx, wy, wz, 1 + a + e + i,
+    ]  # fmt: skip
+    outer = torch.stack(rows, -1).unflatten(-1, (4, 4))
+    best = outer.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)
+    row = outer.gather(-2, best[..., None, None].expand(*best.shape, 1, 4)).squeeze(-2)
+    return quaternion_to_vector(row / row.norm(dim=-1, keepdim=True))
+
+
+def conjugate(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Return the inverse rotation: -v."""
+    return -vector
+
+
+def compose(
+    first: Float[Tensor, "*#batch 3"], second: Float[Tensor, "*#batch 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """Return the quaternion vector of the product R(first) R(second).
+
+    v = w_1 v_2 + w_2 v_1 + v_1 x v_2, with the sign that makes w_1 w_2 - v_1 . v_2 >= 0.
+
+    >>> quarter = torch.tensor([0.0, 0.5**0.5, 0.0])
+    >>> compose(quarter, -quarter)
+    tensor([0., 0., 0.])
+    """
+    return quaternion_to_vector(_product(vector_to_quaternion(first), vector_to_quaternion(second)))
+
+
+def cross_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Return the matrix of the cross product, [v]x a = v x a."""
+    x, y, z = vector.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    a, b = torch.broadcast_tensors(a, b)
+    (va, wa), (vb, wb) = (q.split([3, 1], -1) for q in (a, b))
+    vector = wa * vb + wb * va + torch.linalg.cross(va, vb)
+    return torch.cat([vector, wa * wb - (va * vb).sum(-1, keepdim=True)], -1)
+
+
+def minimal_rotation(
+    start: Float[Tensor, "*#batch 3"], end: Float[Tensor, "*#batch 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """Return the rotation by the smallest angle that turns one direction into another: swing, no twist.
+
+    v = a x h,   h = (a + b) / |a + b|, the direction half way.
+
+    Opposite directions have no single such rotation: one by pi about an axis across them is taken.
+
+    Args:
+        start, end: directions a and b, of any length but zero.
+    """
+    a = torch.nn.functional.normalize(start, dim=-1)
+    b = torch.nn.functional.normalize(end, dim=-1)
+    a, b = torch.broadcast_tensors(a, b)
+    middle = a + b
+    opposite = middle.square().sum(-1, keepdim=True) <= 16 * torch.finfo(a.dtype).eps ** 2
+    middle = torch.where(opposite, _across(a), middle)
+    return torch.linalg.cross(a, torch.nn.functional.normalize(middle, dim=-1))
+
+
+def _across(direction: Tensor) -> Tensor:
+    """Return a direction at right angles to another: across its smallest coordinate's axis."""
+    least = direction.detach().abs().argmin(-1, keepdim=True)
+    axis = torch.zeros_like(direction).scatter(-1, least, 1.0)
+    return torch.linalg.cross(direction, axis)
+
+
+def mean_rotation(
+    vectors: Float[Tensor, "*batch N 3"], weights: Float[Tensor, "*#batch N"] | None = None
+) -> Float[Tensor, "*batch 3"]:
+    """Return the mean of rotations: the quaternion q that maximises sum_n w_n (q . q_n)^2.
+
+    It is the leading eigenvector of sum_n w_n q_n q_n^T, so that q and -q count alike.
+
+    Args:
+        vectors: [..., N, 3].
+        weights: [..., N], not negative; equal ones by default.
+
+    Reference: Markley, Cheng, Crassidis & Oshman, Averaging quaternions, 2007, equation (12).
+    """
+    check_shape("vectors", vectors, ["...", None, 3])
+    quaternions = vector_to_quaternion(vectors)
+    weighted = quaternions if weights is None else quaternions * weights[..., None]
+    _, axes = torch.linalg.eigh(weighted.mT @ quaternions)
+    return quaternion_to_vector(axes[..., -1])
+
+
+class RigidMotion(NamedTuple):
+    """x -> R x + t. rotation [*batch, 3, 3] (det +1), translation [*batch, 3], metres."""
+
+    rotation: Tensor
+    translation: Tensor
+
+
+def procrustes(
+    source: Float[Tensor, "*batch N 3"],
+    target: Float[Tensor, "*batch N 3"],
+    mask: Bool[Tensor, "*batch N"] | None = None,
+) -> RigidMotion:
+    """Return the rigid motion without scale or reflection that brings each source closest to its target.
+
+    min over R in SO(3), t of sum_n |R s_n + t - x_n|^2; with the centred cross-covariance
+    U S V^T = sum_n x_n s_n^T, R = U diag(1, 1, det(U V^T)) V^T and t = mean x - R mean s.
+
+    Args:
+        source, target: [*batch, N, 3], metres; a point with a NaN in either is left out.
+        mask: [*batch, N], True = use the point.
+
+    Returns:
+        `RigidMotion`; NaN for an element with fewer than three points. With points on one line the
+        turn about that line is not determined, and one of the best is returned.
+
+    Reference: Schoenemann (1966), DOI 10.1007/BF02289451; Kabsch (1976) for the sign.
+
+    >>> square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    >>> procrustes(square, square + 1).translation
+    tensor([1., 1., 1.])
+    """
+    source, target = as_pair(source, target, mask, ["...", None, 3], ("source", "target"))
+    use = torch.isfinite(source).all(-1) & torch.isfinite(target).all(-1)
+    if mask is not None:
+        use = use & mask
+    weight = use[..., None].to(source.dtype)
+    count = weight.sum(-2, keepdim=True)
+    s = torch.where(use[..., None], source, torch.zeros_like(source))
+    x = torch.where(use[..., None], target, torch.zeros_like(target))
+    s_mean = s.sum(-2, keepdim=True) / count.clamp_min(1)
+    x_mean = x.sum(-2, keepdim=True) / count.clamp_min(1)
+    u, _, vh = torch.linalg.svd(((x - x_mean) * weight).mT @ ((s - s_mean) * weight))
+    sign = torch.linalg.det(u @ vh)
+    last = torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1)
+    rotation = (u * last[..., None, :]) @ vh
+    translation = (x_mean - s_mean @ rotation.mT).squeeze(-2)
+    few = (count < 3).reshape(count.shape[:-2])
+    return RigidMotion(
+        rotation.masked_fill(few[..., None, None], math.nan),
+        translation.masked_fill(few[..., None], math.nan),
+    )

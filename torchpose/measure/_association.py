@@ -1,0 +1,191 @@
+"""Whether a person's hands have been taken for each other (Burke & Lasenby, section 5.3)."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from torchpose.errors import InputError, check_shape
+from torchpose.measure._edges import ARM_LIMBS, Segments, limb_votes, segments_of_arms
+from torchpose.measure._face import Image
+from torchpose.measure._hand_prior import HandPrior
+from torchpose.measure._persons import match_rows
+from torchpose.skeleton._joint_sets import UPPER_BODY
+
+__all__ = ["AssociationState", "HandAssociation", "arm_hypotheses"]
+
+_HANDS = UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")
+_SIDES = tuple(
+    (UPPER_BODY.index(f"hand_{side}"), UPPER_BODY.index(f"elbow_{side}"))
+    for side in ("left", "right")
+)
+# Joints about the face's centre, in its sizes: those that do not depend on the hands count.
+_PLACES = {"shoulder_left": (0.97, 1.35), "shoulder_right": (-0.97, 1.35), "neck": (0.0, 1.08)}
+_USUAL = tuple(_PLACES.get(name, (0.0, 0.0)) for name in UPPER_BODY)
+
+
+class AssociationState(NamedTuple):
+    """What edges have said about N persons' hands.
+
+    Attributes:
+        votes: for the hands as they are given, and swapped, by length of the limbs, remembered [N, 2].
+        swapped: [N]. identity: who the persons are [N].
+    """
+
+    votes: Float[Tensor, "N 2"]
+    swapped: Bool[Tensor, " N"]
+    identity: Int[Tensor, " N"]
+
+
+class HandAssociation(nn.Module):
+    """Says whether a person's hands have been taken for each other, from the edges of the arms.
+
+    For the hands as given (h = 0) and swapped (h = 1) a pose tracker has inferred elbows and
+    shoulders. The segments that support the four limbs of each are counted (BL 50), n_h, and
+    remembered for each unit of the limbs' length,
+
+        v_h <- d v_h + n_h / sum_limbs |limb|;
+
+    arms across the body are longer, and would have more votes by that alone. The hands are swapped
+    when v_1 > (1 + m) v_0 + l, and back when v_0 > (1 + m) v_1 + l.
+
+    Args:
+        decay: d, per frame. margin: m. least: l.
+        apart: where the hands are nearer to each other, in sizes of the face, edges cannot tell, and
+            the frame changes nothing.
+        position_std: in sizes of the face. angle_std: radians. threshold, along: see `limb_votes`.
+
+    Raises:
+        InputError: settings that make no sense.
+
+    Reference:
+        Burke & Lasenby, section 5.3.
+    """
+
+    def __init__(
+        self,
+        decay: float = 0.8,
+        margin: float = 0.5,
+        least: float = 0.5,
+        apart: float = 1.0,
+        position_std: float = 0.4,
+        angle_std: float = 0.4,
+        threshold: float = 0.3,
+        along: bool = True,
+    ) -> None:
+        super().__init__()
+        if not (0 <= decay < 1 and min(margin, least, apart) >= 0):
+            raise InputError(
+                "decay must be in [0, 1), margin, least and apart not negative, got "
+                f"{decay}, {margin}, {least} and {apart}"
+            )
+        self.decay, self.margin, self.least, self.apart = decay, margin, least, apart
+        self.position_std, self.angle_std = position_std, angle_std
+        self.threshold, self.along = threshold, along
+        self.register_buffer("limbs", torch.tensor(ARM_LIMBS))
+
+    limbs: Tensor
+
+    def init(self) -> AssociationState:
+        """Return the state without persons."""
+        none = torch.zeros(0, dtype=torch.long)
+        return AssociationState(torch.zeros(0, 2), none > 0, none)
+
+    def step(
+        self,
+        state: AssociationState,
+        grey: Image,
+        joints: Float[Tensor, "N 2 8 2"],
+        size: Float[Tensor, " N"],
+        identity: Int[Tensor, " N"],
+    ) -> AssociationState:
+        """What the edges of the next frame say.
+
+        Args:
+            state: from `init` or the step before. grey: [H, W], uint8.
+            joints: inferred with the hands as given and with the hands swapped, order of
+                `UPPER_BODY`, each with its own sides, pixels; NaN where not known.
+            size: of the faces, pixels. identity: who the persons are.
+
+        Raises:
+            ShapeError: wrong shapes.
+        """
+        check_shape("joints", joints, ["N", 2, 8, 2])
+        check_shape("size", size, [len(joints)])
+        check_shape("identity", identity, [len(joints)])
+        state = _matched(state, identity)
+        if not len(joints):
+            return state
+        between = (joints[:, 0, _HANDS[0]] - joints[:, 0, _HANDS[1]]).norm(dim=1)
+        tells = between >= self.apart * size.to(between)
+        if not bool(tells.any()):
+            return state
+        segments = segments_of_arms(grey, joints[tells], float(size[tells].median()))
+        votes = self.decay * state.votes + self.votes(segments, joints, size).to(state.votes)
+        votes = torch.where(tells[:, None], votes, state.votes)
+        given, other = votes.unbind(1)
+        factor = 1 + self.margin
+        swapped = torch.where(
+            state.swapped,
+            ~(given > factor * other + self.least),
+            other > factor * given + self.least,
+        )
+        return AssociationState(votes, swapped, state.identity)
+
+    def votes(
+        self, segments: Segments, joints: Float[Tensor, "N 2 8 2"], size: Float[Tensor, " N"]
+    ) -> Float[Tensor, "N 2"]:
+        """Segments that support the limbs of each hypothesis, by their length in sizes of the face."""
+        limbs = joints[:, :, self.limbs]  # [N, 2, limb, end, 2]
+        spread = (self.position_std * size.to(joints))[:, None, None].expand(limbs.shape[:3])
+        starts, ends = limbs[..., 0, :], limbs[..., 1, :]
+        found = limb_votes(
+            segments, starts, ends, spread, self.angle_std, self.threshold, self.along
+        )
+        length = (ends - starts).norm(dim=-1).nan_to_num(0.0).sum(-1) / size.to(joints)[:, None]
+        return found.sum(-1) / length.clamp_min(1.0)
+
+    def exchange(self, state: AssociationState, which: Bool[Tensor, " N"]) -> AssociationState:
+        """Return the state after somebody has exchanged these persons' hands upstream."""
+        votes = torch.where(which[:, None], state.votes.flip(1), state.votes)
+        return state._replace(votes=votes, swapped=state.swapped ^ which)
+
+
+def _matched(state: AssociationState, identity: Tensor) -> AssociationState:
+    """Return the state's rows in the order of `identity`; newcomers have no votes."""
+    rows = match_rows(state.identity, identity)
+    votes = torch.cat([state.votes, state.votes.new_zeros(1, 2)])[rows]
+    swapped = torch.cat([state.swapped, state.swapped.new_zeros(1)])[rows]
+    return AssociationState(votes, swapped, identity.to(state.identity))
+
+
+def arm_hypotheses(
+    prior: HandPrior, faces: Float[Tensor, "N 3"], hands: Float[Tensor, "N 2 2"]
+) -> Float[Tensor, "N 2 8 2"]:
+    """Arms with the hands as given and swapped, from the prior alone, without a pose tracker.
+
+    Elbows are where the prior expects them given hand and face; shoulders, head and neck are at
+    usual places about the face.
+
+    Args:
+        prior: of hands and elbows. faces: centre (x, y) and size, pixels. hands: left, right, pixels.
+
+    Returns:
+        Joints in the order of `UPPER_BODY`, pixels; NaN for the arm of a hand that is NaN.
+    """
+    check_shape("faces", faces, ["N", 3])
+    check_shape("hands", hands, [len(faces), 2, 2])
+    faces = faces.to(hands)
+    both = torch.stack([hands, hands.flip(1)], 1)  # [N, hypothesis, side, 2]
+    centre, size = faces[:, None, None, :2], faces[:, None, None, 2:]
+    known = torch.isfinite(both).all(-1, keepdim=True)
+    offset = torch.where(known, (both - centre) / size, torch.nan)
+    _, expected = prior(offset.nan_to_num(0.0))  # [side, 2, N, hypothesis, side]
+    elbow = torch.stack([expected[k, :, :, :, k] for k in range(2)], -1).permute(1, 2, 3, 0)
+    elbow = torch.where(known, elbow.to(hands), torch.nan)
+    usual = hands.new_tensor(_USUAL).expand(*both.shape[:2], -1, -1)
+    joints = usual.clone()
+    joints[:, :, list(_SIDES[0])] = torch.stack([offset[:, :, 0], elbow[:, :, 0]], 2)
+    joints[:, :, list(_SIDES[1])] = torch.stack([offset[:, :, 1], elbow[:, :, 1]], 2)
+    return joints * size + centre

@@ -1,0 +1,364 @@
+"""Find what has changed: against a static background, between frames, against a running median."""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from torchpose.errors import InputError, check_rgb, check_shape
+from torchpose.measure._body_window import CELLS, EVIDENCE, move_maps
+
+__all__ = ["BackgroundModel", "Motion", "MotionState", "dense_flow", "person_region"]
+
+Image = NDArray[np.uint8]
+_LARGEST = (320, 240)  # width and height at which the model works
+# A person's region, in sizes of the face from its centre: (half the width, height).
+_TOP, _WIDEST = (1.0, -1.2), (2.8, 2.0)  # and so wide from there to the bottom of the image
+_BODY = (1.4, 1.2)  # the same for head and torso alone
+_ANOTHER, _SAME = 30, 16  # grey levels between what is something else, and within what is at rest
+_UNKNOWN = (255, 0, 255)  # stands for what nobody has seen yet
+
+
+def person_region(
+    faces: Float[Tensor, "N 3"],
+    height: int,
+    width: int,
+    scale: float = 1.0,
+    widest: tuple[float, float] = _WIDEST,
+) -> NDArray[np.bool_]:
+    """Return where the bodies below these faces may be: generous trapezoids, bool [height, width].
+
+    Args:
+        faces: centre (x, y) and size, pixels. scale: pixels of the result for one of theirs.
+        widest: half the width below the shoulders, and the height from which it is reached, in
+            sizes of the face from its centre.
+    """
+    region = np.zeros((height, width), dtype=bool)
+    if not len(faces):
+        return region
+    x, y, size = (scale * faces.detach().cpu().double().numpy()).T[..., None, None]
+    across = np.abs(np.arange(width) - x) / size
+    down = (np.arange(height)[:, None] - y) / size
+    slope = (widest[0] - _TOP[0]) / (widest[1] - _TOP[1])
+    half = np.minimum(_TOP[0] + slope * (down - _TOP[1]), widest[0])
+    return np.asarray(((down > _TOP[1]) & (across < half)).any(0))
+
+
+class BackgroundModel:
+    """OpenCV's MOG2 for cameras that stand still and persons who are there from the first frame.
+
+    A mixture of Gaussians per pixel takes what stays for background, also a person who stands still.
+    Therefore
+
+    - the persons' regions of the first frame are not known: they count as foreground until a pixel
+      has shown something else, at rest, for `settle` frames and for longer than what was there
+      before, and head and torso are elsewhere; then this is the background there;
+    - foreground in a person's region is never learnt: the model is shown its own background there;
+    - before the first face nothing is learnt; after `wait` frames without one the scene is empty.
+
+    Unlike the rest of the package this object keeps its state inside, since OpenCV's does: use one
+    for each video, in the order of its frames, or call `reset`.
+
+    Args:
+        history: frames over which it learns. threshold: squared distance to a Gaussian, in
+            variances, up to which a pixel is background.
+        settle: frames; see above. wait: frames; see above, and how long a region is kept when its
+            face is lost.
+        shadows: whether shadows are looked for, and counted as background. Skin in front of a
+            brighter wall may be taken for one.
+
+    Raises:
+        InputError: settings that make no sense.
+
+    Reference:
+        Z. Zivkovic (2004), as cited by Burke & Lasenby, section 5.2. What is done about persons in
+        view is an addition.
+
+    Example:
+        >>> import numpy as np, torch
+        >>> from torchpose.measure._background import BackgroundModel
+        >>> model, frame = BackgroundModel(), np.full((120, 160, 3), 90, np.uint8)
+        >>> face = torch.tensor([[130.0, 20.0, 10.0]])
+        >>> for _ in range(20):
+        ...     mask = model.step(frame, face)
+        >>> frame[50:70, 40:60] = 200  # something appears
+        >>> mask = model.step(frame, face)
+        >>> int(mask[60, 50]), int(mask[60, 20]), int(mask[60, 130])
+        (255, 0, 255)
+    """
+
+    def __init__(
+        self,
+        history: int = 500,
+        threshold: float = 16.0,
+        settle: int = 60,
+        wait: int = 30,
+        shadows: bool = False,
+    ) -> None:
+        if min(history, settle, wait) < 1 or not threshold > 0:
+            raise InputError(
+                "history, settle and wait must be at least 1 and threshold positive, got "
+                f"{history}, {settle}, {wait} and {threshold}"
+            )
+        self.history, self.threshold, self.settle = history, threshold, settle
+        self.wait, self.shadows = wait, shadows
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything, for another video."""
+        import cv2
+
+        self._mixture = cv2.createBackgroundSubtractorMOG2(
+            self.history, self.threshold, self.shadows
+        )
+        self._learnt = 0  # frames
+        self._faceless = 0  # frames in a row without a face
+        self._region: Any = None
+        self._shape: tuple[int, ...] | None = None
+
+    def step(self, frame: Image, faces: Float[Tensor, "N 3"]) -> Image:
+        """Foreground of the next frame: uint8 [H, W], 255 where there is, 0 elsewhere.
+
+        Args:
+            frame: RGB, [H, W, 3], uint8. faces: centre (x, y) and size, pixels.
+
+        Raises:
+            InputError: another kind of image, or another size than before.
+        """
+        import cv2
+
+        self._check(frame, faces)
+        height, width = frame.shape[:2]
+        scale = min(1.0, _LARGEST[0] / width, _LARGEST[1] / height)
+        size = (max(round(width * scale), 1), max(round(height * scale), 1))
+        small = np.asarray(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), np.uint8)
+        self._faceless = 0 if len(faces) else self._faceless + 1
+        if not self._learnt and self._faceless and self._faceless <= self.wait:
+            return np.full((height, width), 255, np.uint8)
+        if len(faces) or self._region is None or self._faceless > self.wait:
+            self._region = person_region(faces, size[1], size[0], scale)
+            self._body = person_region(faces, size[1], size[0], scale, _BODY)
+        if not self._learnt:
+            self._start(small)
+        found = cv2.medianBlur(self._apply(small), 5)
+        return np.asarray(cv2.resize(found, (width, height), interpolation=cv2.INTER_NEAREST))
+
+    def _start(self, small: Image) -> None:
+        self._unknown = self._region.copy()
+        self._first, self._candidate = small.copy(), small.copy()
+        self._rest = np.zeros(small.shape[:2], np.int16)  # frames at rest
+        self._before = np.zeros(small.shape[:2], np.int16)  # frames with what was there first
+        self._taught = np.zeros(small.shape[:2], np.int16)  # frames that are left to be taught
+        self._learn(small, np.zeros(small.shape[:2], bool))
+
+    def _apply(self, small: Image) -> Image:
+        self._uncover(small)
+        taught = self._taught > 0
+        foreground = self._mixture.apply(small, None, 0.0) == 255
+        if taught.any():
+            foreground[taught] = _distance(small, self._candidate)[taught] > _ANOTHER
+        foreground |= self._unknown
+        self._learn(small, foreground & self._region)
+        return foreground.astype(np.uint8) * np.uint8(255)
+
+    def _uncover(self, small: Image) -> None:
+        """Pixels that the person has left, and what is to be seen there now."""
+        if not self._unknown.any():
+            return
+        still = _distance(small, self._candidate) <= _SAME
+        other = _distance(small, self._first) > _ANOTHER
+        _paste(small, ~still & self._unknown, self._candidate)
+        self._rest = (self._rest + 1) * (still & other)
+        self._before += ~other
+        uncovered = self._unknown & ~self._body
+        uncovered &= self._rest >= np.maximum(self.settle, self._before)
+        self._unknown &= ~uncovered
+        # MOG2 takes a colour for background when it has a tenth of the weight
+        self._taught[uncovered] = max(self.history // 4, 8)
+
+    def _learn(self, small: Image, blocked: NDArray[np.bool_]) -> None:
+        """Show the mixture what is background for sure, elsewhere what it believes already."""
+        shown = small.copy()
+        taught = self._taught > 0
+        if self._learnt and blocked.any():
+            believed = np.asarray(self._mixture.getBackgroundImage(), np.uint8)
+            _paste(believed, blocked, shown)
+        if taught.any():
+            _paste(self._candidate, taught, shown)
+            self._taught -= taught
+        _paste(np.full_like(small, _UNKNOWN), self._unknown, shown)
+        self._learnt += 1
+        # slowly from the start, so that what moves in the first frames is not learnt
+        rate = 1 / self.history if self._learnt > 1 else 1.0
+        self._mixture.apply(shown, None, rate)
+
+    def _check(self, frame: Image, faces: Tensor) -> None:
+        check_rgb("frame", frame, empty=False)
+        check_shape("faces", faces, ["N", 3])
+        if self._shape not in (None, frame.shape):
+            raise InputError(
+                f"frame must have the size of those before, {self._shape}, got {frame.shape}; "
+                "call reset for another video"
+            )
+        self._shape = frame.shape
+
+
+def _distance(a: Image, b: Image) -> Image:
+    """Return the largest difference over the channels."""
+    import cv2
+
+    channels = cv2.split(cv2.absdiff(a, b))
+    return np.asarray(cv2.max(cv2.max(channels[0], channels[1]), channels[2]))
+
+
+def _paste(source: Image, where: NDArray[np.bool_], target: Image) -> None:
+    """Copy pixels into `target`; numpy's masked copies take ten times as long."""
+    import cv2
+
+    cv2.copyTo(source, where.view(np.uint8), target)
+
+
+_DIFFERENCE, _UNUSUAL = (2.0, 20.0), (4.0, 30.0)  # below: noise; range above it; steps of Lab
+
+
+class MotionState(NamedTuple):
+    """The last frame of N persons.
+
+    Attributes:
+        last, median: Lab in bytes [N, 3, 160, 192], smoothed. grey: [N, 160, 192].
+        flow: from the last frame back to the one before, pixels of `grey` [N, 160, 192, 2].
+        frames: seen so far [N].
+    """
+
+    last: Float[Tensor, "N 3 h w"]
+    median: Float[Tensor, "N 3 h w"]
+    grey: UInt8[Tensor, "N H W"]
+    flow: Float[Tensor, "N H W 2"]
+    frames: Int[Tensor, " N"]
+
+
+class Motion(nn.Module):
+    """Difference from the last frame, difference from the median of all, and optical flow.
+
+        moving = clip((|x_t - x_{t-1}|_w - 2) / 20, 0, 1),   m_t = m_{t-1} + clip(x_t - m_{t-1}, +-s)
+
+    The second stands for a background model: a hand at rest for a second is still unusual.
+
+    Args:
+        step: s, in steps of Lab in bytes per frame at 30 frames per second.
+        rate: frames at 30 per second that pass in one step. flow: whether to compute it.
+    """
+
+    def __init__(self, step: float = 0.7, rate: float = 1.0, flow: bool = True) -> None:
+        super().__init__()
+        self.limit, self.with_flow = step * rate, flow
+        self.register_buffer("channel_weights", torch.tensor([0.6, 1.0, 1.0]))
+
+    channel_weights: Tensor
+
+    def init(self, persons: int) -> MotionState:
+        """Return the state before the first frame."""
+        rows, columns = CELLS
+        small = torch.zeros(persons, 3, rows * EVIDENCE, columns * EVIDENCE)
+        grey = torch.zeros(persons, rows * EVIDENCE, columns * EVIDENCE, dtype=torch.uint8)
+        flow = torch.zeros(*grey.shape, 2)
+        return MotionState(small, small, grey, flow, torch.zeros(persons, dtype=torch.long))
+
+    def move(
+        self,
+        state: MotionState,
+        old: Float[Tensor, "N 3"],
+        new: Float[Tensor, "N 3"],
+        moved: Bool[Tensor, " N"],
+    ) -> MotionState:
+        """The same for windows that have moved; only those are computed anew."""
+        if not bool(moved.any()):
+            return state
+        old, new = old[moved], new[moved]
+        small = torch.cat([state.last[moved], state.median[moved]], 1)
+        small = move_maps(small, old, new, replicate=True)
+        grey = move_maps(state.grey[moved][:, None].float(), old, new, replicate=True)
+        scale = (old[:, 2] / new[:, 2]).to(state.flow)[:, None, None, None]
+        flow = move_maps(state.flow[moved].permute(0, 3, 1, 2), old, new) * scale
+        last, median, greys, flows = (
+            x.clone() for x in (state.last, state.median, state.grey, state.flow)
+        )
+        last[moved], median[moved] = small[:, :3], small[:, 3:]
+        greys[moved] = grey[:, 0].round().to(torch.uint8)
+        flows[moved] = flow.permute(0, 2, 3, 1)
+        return state._replace(last=last, median=median, grey=greys, flow=flows)
+
+    def step(
+        self,
+        state: MotionState,
+        small: Float[Tensor, "N 3 h w"],
+        grey: UInt8[Tensor, "N H W"],
+    ) -> tuple[
+        MotionState, Float[Tensor, "N h w"], Float[Tensor, "N h w"], Float[Tensor, "N r c 2"]
+    ]:
+        """Compare with the frames before.
+
+        Args:
+            state: from `init` or the step before. small: windows in Lab, smoothed [N, 3, 160, 192].
+            grey: windows [N, 160, 192], lightness in bytes.
+
+        Returns:
+            The next state; moving and unusual [N, 160, 192], 0 to 1; flow from this frame back to
+            the last one, in cells [N, 72, 96, 2].
+        """
+        new = (state.frames == 0)[:, None, None, None]
+        last = torch.where(new, small, state.last)
+        median = torch.where(new, small, state.median)
+        median = median + (small - median).clamp(-self.limit, self.limit)
+        moving = self._difference(small, last, *_DIFFERENCE)
+        unusual = self._difference(small, median, *_UNUSUAL)
+        flow, cells = state.flow, small.new_zeros(len(small), *CELLS, 2)
+        if self.with_flow and len(small):
+            flow, cells = dense_flow(grey, state.grey, state.flow, state.frames > 0)
+        return MotionState(small, median, grey, flow, state.frames + 1), moving, unusual, cells
+
+    def _difference(self, small: Tensor, other: Tensor, noise: float, most: float) -> Tensor:
+        weighted = (small - other).abs_().mul_(self.channel_weights[:, None, None]).sum(1)
+        return weighted.sub_(noise).div_(most).clamp_(0, 1)
+
+
+def dense_flow(
+    grey: UInt8[Tensor, "N H W"],
+    before: UInt8[Tensor, "N H W"],
+    start: Float[Tensor, "N H W 2"],
+    known: Bool[Tensor, " N"],
+) -> tuple[Float[Tensor, "N H W 2"], Float[Tensor, "N r c 2"]]:
+    """Compute the flow from `grey` back to `before` by DIS, in pixels, and its means over cells, in cells.
+
+    OpenCV's algorithm takes one pair of images at a time, hence the loop; persons without a frame
+    before (`known`) get zeros.
+
+    Reference:
+        T. Kroeger, R. Timofte, D. Dai, L. Van Gool, Fast optical flow using dense inverse search,
+        2016, https://doi.org/10.1007/978-3-319-46493-0_29
+    """
+    import cv2
+
+    method = _method()
+    flow = torch.zeros_like(start)
+    cells = start.new_zeros(len(grey), *CELLS, 2)
+    for n in torch.nonzero(known)[:, 0].tolist():
+        found = method.calc(grey[n].numpy(), before[n].numpy(), start[n].numpy().copy())
+        flow[n] = torch.from_numpy(np.ascontiguousarray(found))
+        small = cv2.resize(found, CELLS[::-1], interpolation=cv2.INTER_AREA)
+        cells[n] = torch.from_numpy(small) / EVIDENCE
+    return flow, cells
+
+
+@cache
+def _method() -> Any:
+    """Making one takes longer than a frame; it keeps buffers only. Down to half the resolution."""
+    import cv2
+
+    method = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]
+    method.setFinestScale(1)
+    return method

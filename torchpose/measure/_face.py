@@ -1,0 +1,356 @@
+"""Faces in video: found by a detector, followed by Kalman filters (Burke & Lasenby, section 5.1).
+
+A detector misses faces and sees some where there are none. Tracks bridge the first, and are used only
+once they have lasted, which the second rarely do.
+"""
+
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from torchpose.errors import InputError, check_finite, check_grey, check_shape
+from torchpose.math._gaussian import kalman_predict, kalman_update
+
+__all__ = ["FaceDetector", "FaceTracker", "FaceTracks", "HaarFaceDetector", "Region"]
+
+Image = NDArray[np.uint8]
+_ROI = 1.1  # half the side of the region searched about a known face, in its sizes
+_SMALLER, _LARGER = 0.75, 1.4  # sizes searched for there
+_SAME_SIZE = 1.25  # a face that differs by less from the size wanted is taken as it is
+
+
+def check_faces(faces: Float[Tensor, "N 3"], count: int | None = None) -> None:
+    """Raise unless these are faces (x, y, size), `count` of them, that have a size.
+
+    Raises:
+        ShapeError: another shape. InputError: a size that is not positive.
+    """
+    check_shape("faces", faces, ["N" if count is None else count, 3])
+    if not bool((faces[:, 2] > 0).all()):
+        raise InputError(f"faces must have a positive size, got {faces[:, 2].tolist()}")
+
+
+class Region(NamedTuple):
+    """Part of an image in which faces of some sizes are looked for, pixels."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+    smallest: float
+    largest: float
+
+
+@runtime_checkable
+class FaceDetector(Protocol):
+    """Anything that finds faces in a grey image."""
+
+    def __call__(self, image: Image, region: Region | None = None) -> Float[Tensor, "N 3"]:
+        """Centre (x, y) and size (side of the square box) of every face, pixels.
+
+        Args:
+            image: [H, W], uint8. region: where to look; None is everywhere.
+        """
+        ...
+
+
+def _frontal_faces() -> Any:
+    """OpenCV's cascade for frontal faces."""
+    import cv2
+
+    path = f"{cv2.data.haarcascades}haarcascade_frontalface_default.xml"  # type: ignore[attr-defined]
+    cascade = cv2.CascadeClassifier(path)
+    if cascade.empty():
+        raise InputError(
+            f"{path}: expected OpenCV's face cascade; install opencv-python-headless>=4.10,<5"
+        )
+    return cascade
+
+
+class HaarFaceDetector:
+    """The cascade of Viola & Jones that comes with OpenCV, for frontal faces.
+
+    Args:
+        scale_factor: between the sizes that are tried. min_neighbours: boxes that must agree.
+        min_size: of a face, pixels.
+
+    Raises:
+        InputError: settings that make no sense, or an OpenCV without its cascades.
+
+    Reference:
+        P. Viola, M. Jones (2001), as cited by Burke & Lasenby, section 5.1.
+    """
+
+    def __init__(
+        self, scale_factor: float = 1.1, min_neighbours: int = 3, min_size: int = 40
+    ) -> None:
+        if not scale_factor > 1 or min_neighbours < 0 or min_size < 1:
+            raise InputError(
+                "scale_factor must be above 1, min_neighbours at least 0 and min_size at least 1, "
+                f"got {scale_factor}, {min_neighbours} and {min_size}"
+            )
+        self.scale_factor, self.min_neighbours, self.min_size = (
+            scale_factor,
+            min_neighbours,
+            min_size,
+        )
+        self._cascade = _frontal_faces()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {
+            "_cascade": None
+        }  # OpenCV's classifier can be neither copied nor pickled
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__ = state | {"_cascade": _frontal_faces()}
+
+    def __call__(self, image: Image, region: Region | None = None) -> Float[Tensor, "N 3"]:
+        """See `FaceDetector`."""
+        check_grey("image", image)
+        left, top, sizes = 0, 0, {"minSize": (self.min_size, self.min_size)}
+        if region is not None:
+            left, top = region.left, region.top
+            image = image[top : region.bottom, left : region.right]
+            smallest = max(self.min_size, int(region.smallest))
+            sizes = {
+                "minSize": (smallest,) * 2,
+                "maxSize": (max(smallest, int(region.largest)),) * 2,
+            }
+        if image.size == 0:
+            return torch.zeros(0, 3, dtype=torch.float64)
+        boxes = self._cascade.detectMultiScale(
+            np.ascontiguousarray(image), self.scale_factor, self.min_neighbours, **sizes
+        )
+        found = torch.from_numpy(np.asarray(boxes, dtype=np.float64).reshape(-1, 4))
+        centres = found[:, :2] + found[:, 2:] / 2 + torch.tensor([left, top])
+        return torch.cat([centres, found[:, 2:3]], 1)
+
+
+class FaceTracks(NamedTuple):
+    """Faces that are followed, N of them.
+
+    Attributes:
+        mean: (x, y, size) and their velocities per frame [N, 6], pixels. cov: [N, 6, 6].
+        hits: evidence for a face, in detections, bounded [N]. age: frames since its birth [N].
+        unseen: frames since it was last detected [N].
+        identity: number of each face [N]; a number is never used twice. frame: frames seen.
+        next_identity: of the next face.
+    """
+
+    mean: Float[Tensor, "N 6"]
+    cov: Float[Tensor, "N 6 6"]
+    hits: Float[Tensor, " N"]
+    age: Int[Tensor, " N"]
+    unseen: Int[Tensor, " N"]
+    identity: Int[Tensor, " N"]
+    frame: int
+    next_identity: int
+
+
+class FaceTracker(nn.Module):
+    """Follows any number of faces by constant-velocity Kalman filters over place and size.
+
+        (p, v)_t = [I I; 0 d I] (p, v)_{t-1} + N(0, Q),   z_t = p_t + N(0, R),   p = (x, y, size)
+
+    A detection belongs to the nearest track, by Euclidean distance over (x, y, size), if that is
+    within `gate` sizes of the face; every other one gives birth to a track. A track may be used when
+    it has `min_hits`, loses a part of a hit for every frame in which it should have been seen and was
+    not, and dies when none is left. All deviations below are in sizes of the face.
+
+    Args:
+        detector: by default `HaarFaceDetector`.
+        every: look for known faces in every n-th frame, in the region about them; while none may be
+            used yet, in every frame.
+        whole_every: look for new faces, in the whole image, in every n-th frame.
+        search_every: the same while no face may be used.
+        gate: largest distance. min_hits: detections before a track is used.
+        memory: most hits that a track can have; it survives three times as many misses.
+        std: of a detection's place and size. acceleration: of the process, per frame and frame.
+        damping: d, of the velocity per frame.
+        detail: size, in pixels, to which known faces are brought before they are looked for again:
+            cascades draw larger boxes about small faces, and large ones cost time.
+
+    Raises:
+        InputError: settings that make no sense.
+
+    Reference:
+        Burke & Lasenby, section 5.1.
+
+    Example:
+        >>> import numpy as np
+        >>> from torchpose.measure import FaceTracker
+        >>> tracker = FaceTracker()
+        >>> tracks = tracker.step(tracker.init(), np.zeros((120, 160), np.uint8))
+        >>> len(tracks.mean)
+        0
+    """
+
+    def __init__(
+        self,
+        detector: FaceDetector | None = None,
+        every: int = 2,
+        whole_every: int = 45,
+        search_every: int = 5,
+        gate: float = 0.5,
+        min_hits: int = 3,
+        memory: int = 30,
+        std: float = 0.04,
+        acceleration: float = 0.013,
+        damping: float = 0.9,
+        detail: float = 80.0,
+    ) -> None:
+        super().__init__()
+        if min(every, whole_every, search_every, min_hits, memory) < 1 or memory < min_hits:
+            raise InputError(
+                "every, whole_every, search_every, min_hits and memory must be at least 1, and memory "
+                f"at least min_hits, got {every}, {whole_every}, {search_every}, {min_hits}, {memory}"
+            )
+        if not (min(gate, std, acceleration, detail) > 0 and 0 <= damping <= 1):
+            raise InputError(
+                "gate, std, acceleration and detail must be positive and damping in [0, 1], got "
+                f"{gate}, {std}, {acceleration}, {detail} and {damping}"
+            )
+        self.detector = HaarFaceDetector() if detector is None else detector
+        self.every, self.whole_every, self.search_every = every, whole_every, search_every
+        self.gate, self.min_hits, self.memory = gate, min_hits, memory
+        self.std, self.acceleration, self.detail = std, acceleration, detail
+        eye, zero = torch.eye(3, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
+        matrix = torch.cat([torch.cat([eye, eye], 1), torch.cat([zero, damping * eye], 1)])
+        self.register_buffer("matrix", matrix)
+        self.register_buffer("observed", torch.arange(3))
+
+    matrix: Tensor
+    observed: Tensor
+
+    def init(self) -> FaceTracks:
+        """No faces yet."""
+        real, whole = self.matrix.new_zeros(0), torch.zeros(0, dtype=torch.long)
+        return FaceTracks(
+            real.view(0, 6), real.view(0, 6, 6), real, whole, whole.clone(), whole.clone(), 0, 0
+        )
+
+    def usable(self, tracks: FaceTracks) -> Bool[Tensor, " N"]:
+        """Return which tracks have lasted long enough to be used."""
+        return tracks.hits >= self.min_hits
+
+    def step(self, tracks: FaceTracks, image: Image) -> FaceTracks:
+        """Return the faces of the next frame.
+
+        Args:
+            tracks: from `init` or the step before. image: grey, [H, W], uint8.
+
+        Raises:
+            InputError: another kind of image.
+        """
+        known = bool(self.usable(tracks).any())
+        everywhere = tracks.frame % (self.whole_every if known else self.search_every) == 0
+        predicted = self._predict(tracks)
+        if known and not everywhere and tracks.frame % self.every:
+            return predicted
+        found = [self._look_near(image, face) for face in predicted.mean[:, :3].tolist()]
+        if everywhere:  # after those that are known, whose sizes are measured better so
+            found.append(self.detector(image))
+        if not found:
+            return predicted
+        return self.update(predicted, _without_doubles(torch.cat(found), self.gate))
+
+    def _look_near(self, image: Image, face: list[float]) -> Float[Tensor, "N 3"]:
+        """Detections about a known face, which is brought to a size that the detector likes."""
+        import cv2
+
+        region = _region(face, image.shape)
+        scale = self.detail / max(face[2], 1.0)
+        if 1 / _SAME_SIZE < scale < _SAME_SIZE:
+            return self.detector(image, region)
+        part = image[region.top : region.bottom, region.left : region.right]
+        if part.size == 0:
+            return torch.zeros(0, 3, dtype=torch.float64)
+        way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+        part = np.asarray(cv2.resize(part, None, fx=scale, fy=scale, interpolation=way), np.uint8)
+        sizes = (region.smallest * scale, region.largest * scale)
+        found = self.detector(part, Region(0, 0, part.shape[1], part.shape[0], *sizes))
+        corner = torch.tensor([region.left, region.top], dtype=found.dtype)
+        centres = (found[:, :2] + 0.5) / scale - 0.5 + corner
+        return torch.cat([centres, found[:, 2:] / scale], 1)
+
+    def _predict(self, tracks: FaceTracks) -> FaceTracks:
+        noise = torch.zeros_like(tracks.cov)
+        spread = (self.acceleration * tracks.mean[:, 2, None]).square().expand(-1, 6)
+        noise = noise + torch.diag_embed(spread)
+        offset = torch.zeros_like(tracks.mean)
+        mean, cov = kalman_predict(tracks.mean, tracks.cov, self.matrix, offset, noise)
+        return tracks._replace(
+            mean=mean, cov=cov, age=tracks.age + 1, unseen=tracks.unseen + 1, frame=tracks.frame + 1
+        )
+
+    def update(self, tracks: FaceTracks, found: Float[Tensor, "n 3"]) -> FaceTracks:
+        """Predicted tracks after the detections (x, y, size) of their frame; births and deaths too."""
+        check_shape("found", found, ["n", 3])
+        check_finite("found", found)
+        found = found.to(self.matrix)
+        owner = _nearest(tracks.mean[:, :3], found, self.gate)
+        seen = torch.zeros(len(tracks.mean), dtype=torch.bool)
+        seen[owner[owner >= 0]] = True
+        z = tracks.mean[:, :3].clone()
+        z[owner[owner >= 0]] = found[owner >= 0]
+        noise = self._noise(tracks.mean[:, 2])
+        mask = seen[:, None].expand(-1, 3)
+        mean, cov, _ = kalman_update(tracks.mean, tracks.cov, z, noise, self.observed, mask)
+        hits = torch.where(seen, (tracks.hits + 1).clamp_max(self.memory), tracks.hits - 1 / 3)
+        unseen = torch.where(seen, 0, tracks.unseen)
+        alive = hits > 0
+        kept = [x[alive] for x in (mean, cov, hits, tracks.age, unseen, tracks.identity)]
+        born = self._births(found[owner < 0], tracks.next_identity)
+        mean, cov, hits, age, unseen, identity = (
+            torch.cat(pair) for pair in zip(kept, born, strict=True)
+        )
+        following = tracks.next_identity + len(born[0])
+        return FaceTracks(mean, cov, hits, age, unseen, identity, tracks.frame, following)
+
+    def _births(self, found: Tensor, first: int) -> tuple[Tensor, ...]:
+        n = len(found)
+        size = found[:, 2]
+        spread = self.std * found.new_tensor([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+        cov = torch.diag_embed((spread * size[:, None]).square())
+        count = torch.zeros(n, dtype=torch.long)
+        mean = torch.cat([found, torch.zeros_like(found)], 1)
+        return mean, cov, torch.ones_like(size), count, count.clone(), first + torch.arange(n)
+
+    def _noise(self, size: Tensor) -> Tensor:
+        return torch.diag_embed((self.std * size[:, None]).square().expand(-1, 3))
+
+
+def _region(face: list[float], shape: tuple[int, ...]) -> Region:
+    x, y, size = face[0], face[1], max(face[2], 1.0)
+    reach = _ROI * size
+    return Region(
+        max(0, int(x - reach)),
+        max(0, int(y - reach)),
+        min(shape[1], int(x + reach)),
+        min(shape[0], int(y + reach)),
+        _SMALLER * size,
+        _LARGER * size,
+    )
+
+
+def _nearest(faces: Tensor, found: Tensor, gate: float) -> Int[Tensor, " n"]:
+    """For each detection the track that it belongs to, -1 if none; nearest pairs first."""
+    owner = torch.full((len(found),), -1)
+    distance = torch.cdist(found, faces)
+    distance = torch.where(distance <= gate * faces[:, 2], distance, torch.inf)
+    while distance.numel() and bool(torch.isfinite(distance.min())):
+        detection, track = divmod(int(distance.argmin()), distance.shape[1])
+        owner[detection] = track
+        distance[detection], distance[:, track] = torch.inf, torch.inf
+    return owner
+
+
+def _without_doubles(found: Tensor, gate: float) -> Tensor:
+    """Detections, each once though regions of neighbouring faces overlap."""
+    near = torch.cdist(found, found) <= gate * found[:, 2]
+    earlier = torch.tril(near, -1).any(1)
+    return found[~earlier]

@@ -1,0 +1,175 @@
+"""Histogram filter over a grid for two hands: prediction, exclusion of each other, read-out."""
+
+import math
+from functools import cache
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchpose.measure._body_window import gaussian_matrix
+
+_LEAST = 1e-12  # belief in a cell: smaller numbers slow the processor down
+
+__all__ = ["GridEstimate", "blur", "exclude", "gaussian_bump", "predict", "read_out"]
+
+
+class GridEstimate(NamedTuple):
+    """What a belief over a grid says, in cells.
+
+    Attributes:
+        place: mean about the mode. covariance: there. mass: probability near the mode.
+        mode: the cell, column and row.
+    """
+
+    place: Float[Tensor, "N 2 2"]
+    covariance: Float[Tensor, "N 2 2 2"]
+    mass: Float[Tensor, "N 2"]
+    mode: Int[Tensor, "N 2 2"]
+
+
+def blur(
+    maps: Float[Tensor, "*batch h w"], sigma: float, shift: Float[Tensor, "*batch 2"] | None = None
+) -> Float[Tensor, "*batch h w"]:
+    """Blur by a Gaussian, by two products with matrices, and move by `shift` (x, y), in cells."""
+    if sigma == 0 and shift is None:
+        return maps
+    height, width = maps.shape[-2:]
+    if shift is None:
+        return gaussian_matrix(height, sigma) @ maps @ gaussian_matrix(width, sigma).mT
+    x, y = shift.unbind(-1)
+    return gaussian_matrix(height, sigma, y) @ maps @ gaussian_matrix(width, sigma, x).mT
+
+
+def gaussian_bump(
+    mean: Float[Tensor, "*batch 2"], cov: Float[Tensor, "*batch 2 2"], size: tuple[int, int]
+) -> Float[Tensor, "*batch h w"]:
+    """Return Gaussians over a grid, each of which sums to one.
+
+    Args:
+        mean: (x, y), in cells. cov: cells squared. size: rows and columns.
+    """
+    x = torch.arange(size[1], dtype=mean.dtype) - mean[..., :1]
+    y = torch.arange(size[0], dtype=mean.dtype) - mean[..., 1:]
+    precision = torch.linalg.inv(cov)[..., None, None]
+    xx = precision[..., 0, 0, :, :] * x[..., None, :].square()
+    yy = precision[..., 1, 1, :, :] * y[..., :, None].square()
+    xy = 2 * precision[..., 0, 1, :, :] * x[..., None, :] * y[..., :, None]
+    return torch.softmax(-0.5 * (xx + yy + xy).flatten(-2), -1).view(*mean.shape[:-1], *size)
+
+
+def predict(
+    belief: Float[Tensor, "N 2 h w"],
+    rebirth: Float[Tensor, "N 2 h w"],
+    speed: Float[Tensor, "N 2 2"],
+    flow: Float[Tensor, "N h w 2"] | None,
+    moves: Float[Tensor, " N"],
+    near: float,
+    far: float,
+    near_share: float,
+    flow_share: float,
+    flow_blur: float,
+    jump: float,
+    rest: float = 0.35,
+) -> Float[Tensor, "N 2 h w"]:
+    """Predict p(x_t | z_1..t-1): diffusion, velocity, optical flow, and rebirth.
+
+        p' = m [(1 - j) ((1 - f) (s G_near(v) + (1 - s) G_far) p + f flow p) + j q] + (1 - m) G_rest p
+
+    Args:
+        belief: p. rebirth: q, sums to one. speed: v, cells per step. flow: from each cell back to
+            where its content was, cells. moves: m, how much moves at all, 0 to 1.
+        near, far, flow_blur, rest: standard deviations, cells. near_share: s. flow_share: f. jump: j.
+    """
+    out = near_share * blur(belief, near, speed) + (1 - near_share) * blur(belief, far)
+    if flow is not None and flow_share > 0:
+        out = (1 - flow_share) * out + flow_share * _carry(blur(belief, flow_blur), flow)
+    out = (1 - jump) * out + jump * rebirth
+    m = moves[:, None, None, None]
+    return m * out + (1 - m) * blur(belief, rest)
+
+
+def _carry(belief: Tensor, flow: Tensor) -> Tensor:
+    height, width = belief.shape[-2:]
+    x, y = torch.arange(width, device=flow.device), torch.arange(height, device=flow.device)
+    place = torch.stack(torch.broadcast_tensors(x, y[:, None]), -1) + flow
+    grid = (2 * place + 1) / place.new_tensor([width, height]) - 1
+    return torch.nn.functional.grid_sample(belief, grid, align_corners=False)
+
+
+def exclude(
+    base: Float[Tensor, "N 2 h w"],
+    exclusion: float,
+    radius: float,
+    crossing: float,
+    soft: float,
+    rounds: int = 2,
+) -> Float[Tensor, "N 2 h w"]:
+    """Return the beliefs of the left and the right hand after each has told the other where it is.
+
+        p_k(x) ~ b_k(x) (1 - (1 - e^-X) taken_l(x)) (1 - (1 - e^-C) wrong_l(x))
+
+    taken_l is how probable the other hand l is within about `radius` of x, wrong_l how probable it is
+    on the side of x where it does not belong: the person's left hand is seldom to the left of the
+    right hand in the image.
+
+    Args:
+        base: beliefs before, any scale. exclusion: X. crossing: C. radius, soft: cells.
+        rounds: of telling each other.
+    """
+    base = (base / base.sum((2, 3), keepdim=True).clamp_min(1e-30)).clamp_min_(_LEAST)
+    message = [torch.ones_like(base[:, 0]), torch.ones_like(base[:, 0])]
+    for turn in range(2 * rounds):  # one hand after the other: both at once would swing
+        k = turn % 2
+        other = base[:, 1 - k] * message[1 - k]
+        taken, wrong = _told(other, k, radius, soft)
+        message[k] = (1 + math.expm1(-exclusion) * taken) * (1 + math.expm1(-crossing) * wrong)
+    belief = base * torch.stack(message, 1)
+    return (belief / belief.sum((2, 3), keepdim=True)).clamp_min_(_LEAST)
+
+
+def _told(
+    other: Tensor, hand: int, radius: float, soft: float
+) -> tuple[Float[Tensor, "N h w"], Float[Tensor, "N 1 w"]]:
+    """Return where the other hand is near, and the columns that lie on its wrong side."""
+    columns = other.sum(1, keepdim=True)
+    scale = 1.2 * 2 * math.pi * radius * radius / columns.sum(2, keepdim=True)
+    near = (blur(other, radius) * scale).clamp_(0, 1)
+    wrong = columns @ _side_matrix(other.shape[2], soft, hand) / columns.sum(2, keepdim=True)
+    return near, wrong
+
+
+@cache
+def _side_matrix(size: int, soft: float, hand: int) -> Tensor:
+    """From where the other hand may be to how much each column is on its wrong side."""
+    left_of = gaussian_matrix(size, soft) @ torch.ones(size, size).tril()
+    return (1 - left_of if hand == 0 else left_of).mT.contiguous()
+
+
+def read_out(belief: Float[Tensor, "N 2 h w"], smooth: float, within: float) -> GridEstimate:
+    """Return the mean, covariance and mass about the highest place of each smoothed belief.
+
+    Args:
+        belief: sums to one. smooth: standard deviation before the mode is looked for, cells.
+        within: radius about the mode that counts, cells.
+    """
+    n, hands, height, width = belief.shape
+    best = blur(belief, smooth).flatten(2).argmax(2)
+    mode = torch.stack([best % width, best // width], 2)
+    powers_x, powers_y = _powers(width), _powers(height)
+    dx, dy = powers_x[1] - mode[..., :1], powers_y[1] - mode[..., 1:]
+    inside = dx.square()[:, :, None] + dy.square()[..., None] < within * within
+    moments = (powers_y @ (belief * inside).double() @ powers_x.mT).flatten(2)
+    mass, mx, xx, my, xy, _, yy, *_ = moments.unbind(2)
+    mx, my = mx / mass, my / mass
+    xx, xy, yy = xx / mass - mx * mx, xy / mass - mx * my, yy / mass - my * my
+    covariance = torch.stack([xx, xy, xy, yy], 2).view(n, hands, 2, 2)
+    return GridEstimate(torch.stack([mx, my], 2), covariance, mass, mode)
+
+
+@cache
+def _powers(size: int) -> Tensor:
+    """1, x and x squared of every cell."""
+    place = torch.arange(size, dtype=torch.float64)
+    return torch.stack([torch.ones_like(place), place, place.square()])

@@ -1,0 +1,247 @@
+"""Likelihood of a hand in each cell of a person's window; its constants, and what hand trackers return."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from torchpose.errors import check_finite, check_rgb, check_shape
+from torchpose.measure._body_window import CELL, CELLS, EVIDENCE, cell_centres
+from torchpose.measure._face import Image, check_faces
+
+__all__ = ["HandLikelihood", "HandMeasurements", "HandSettings", "check_frame"]
+
+
+class HandLikelihood(nn.Module):
+    """Log likelihood of a hand at every cell, from skin, motion, and the shape of a hand.
+
+        l(x) = a D(x) + c S(x) + m M(x) + u U(x)
+             - b S(x - 0.9 e) + t S(x + 0.65 e) - s (S(x - 0.55 n) + S(x + 0.55 n))
+
+    D, M and U are the means of skin, motion and the unusual over a hand, S that of skin over a palm; e
+    is the unit vector towards the elbow that the pose prior expects, n the one across. A hand has the
+    forearm on one side and nothing of skin beyond its fingers; a point on a bare forearm has skin on
+    both. What lies outside of the image is skin with a fixed probability, so that neither a hand at
+    the border nor the lack of one is invented there.
+
+    Args:
+        disc: a. core: c. motion: m. unusual: u. beyond: b. towards: t. beside: s.
+        beyond_at, towards_at, beside_at: distances in B.
+        hand, palm: their widths, in B; a hand counts less towards its edges.
+        unknown: probability of skin where nothing is known.
+    """
+
+    def __init__(
+        self,
+        disc: float = 5.0,
+        core: float = 4.0,
+        motion: float = 4.0,
+        unusual: float = 0.8,
+        beyond: float = 3.0,
+        towards: float = 0.75,
+        beside: float = 1.2,
+        beyond_at: float = 0.9,
+        towards_at: float = 0.65,
+        beside_at: float = 0.55,
+        hand: float = 0.8,
+        palm: float = 0.35,
+        unknown: float = 0.15,
+    ) -> None:
+        super().__init__()
+        self.unknown = unknown
+        self.register_buffer("cues", torch.tensor([core, disc, motion, unusual]))
+        weights = [-beyond, towards, -beside, -beside]
+        offsets = [
+            [-beyond_at, 0.0],
+            [towards_at, 0.0],
+            [0.0, -beside_at],
+            [0.0, beside_at],
+        ]
+        used = [i for i, weight in enumerate(weights) if weight]
+        self.register_buffer("shape_weights", torch.tensor([weights[i] for i in used]))
+        self.register_buffer(
+            "shape_offsets", torch.tensor([offsets[i] for i in used]).reshape(-1, 2)
+        )
+        for name, count in (("rows", CELLS[0]), ("columns", CELLS[1])):
+            self.register_buffer(f"palm_{name}", _palm_matrix(count, palm))
+            self.register_buffer(f"hand_{name}", _hand_matrix(count, hand))
+
+    cues: Tensor
+    shape_weights: Tensor
+    shape_offsets: Tensor
+    palm_rows: Tensor
+    palm_columns: Tensor
+    hand_rows: Tensor
+    hand_columns: Tensor
+
+    def means(self, maps: Float[Tensor, "N 3 h w"]) -> Float[Tensor, "N 4 r c"]:
+        """Means about the centre of every cell: skin over a palm, then all three over a hand.
+
+        Args:
+            maps: skin, motion and the unusual, per pixel of evidence. Beyond the window its border
+                counts.
+        """
+        for _ in range(EVIDENCE // 2):
+            maps = maps[..., ::2, :] + maps[..., 1::2, :]
+            maps = (maps[..., ::2] + maps[..., 1::2]) / 4
+        palm = self.palm_rows @ maps[:, :1] @ self.palm_columns.T
+        return torch.cat([palm, self.hand_rows @ maps @ self.hand_columns.T], 1)
+
+    def forward(
+        self, means: Float[Tensor, "N 4 r c"], elbow: Float[Tensor, "N 2 2 r c"]
+    ) -> Float[Tensor, "N 2 r c"]:
+        """Log likelihood for the left and the right hand, up to a constant.
+
+        Args:
+            means: see `means`.
+            elbow: (x, y) of the expected elbow of each arm, in B from the anchor.
+        """
+        check_shape("means", means, ["N", 4, *CELLS])
+        common = torch.tensordot(self.cues, means.movedim(1, 0), 1)[:, None]
+        if not len(self.shape_weights):
+            return common.expand(-1, 2, -1, -1)
+        places, middle, half = _grid()
+        to_elbow = elbow.movedim(2, -1) - places
+        along = to_elbow / (to_elbow.square().sum(-1, keepdim=True).sqrt_() + 1e-3)
+        across = along.flip(-1) * along.new_tensor([-1.0, 1.0])
+        along, across = along / half, across / half
+        start = (places - middle) / half
+        a, b = (self.shape_offsets[:, i].view(-1, 1, 1, 1) for i in (0, 1))
+        grid = start + a * along[:, :, None] + b * across[:, :, None]
+        n, hands, points = grid.shape[:3]
+        found = nn.functional.grid_sample(
+            means[:, :1] - self.unknown, grid.flatten(1, 3), align_corners=False
+        ).view(n, hands, points, -1)
+        found = torch.einsum("p,nkpc->nkc", self.shape_weights, found + self.unknown)
+        return common + found.view(n, hands, *CELLS)
+
+
+@cache
+def _grid() -> tuple[Tensor, Tensor, Tensor]:
+    """Return the places of the cells, the middle of the window, and half its width and height, in B."""
+    places = cell_centres()
+    half = (places[-1, -1] - places[0, 0] + CELL) / 2
+    return places, (places[-1, -1] + places[0, 0]) / 2, half
+
+
+def _palm_matrix(cells: int, palm: float) -> Tensor:
+    """Means over `palm` about the middle of each cell."""
+    centre = (torch.arange(cells)[:, None] + 0.5) * CELL
+    edge = torch.arange(cells + 1) * CELL
+    edge[0], edge[-1] = -palm, edge[-1] + palm  # the border counts for what is beyond it
+    part = edge[None].clamp(min=centre - palm / 2, max=centre + palm / 2).diff(dim=1)
+    return part / part.sum(1, keepdim=True)
+
+
+def _hand_matrix(cells: int, hand: float) -> Tensor:
+    """The same over a hand: flat over half of it, falling off to both sides."""
+    return sum(  # type: ignore[return-value]
+        _palm_matrix(cells, hand * (0.5 + (i + 0.5) / n)) / n for n in (8,) for i in range(n)
+    )
+
+
+@dataclass(frozen=True)
+class HandSettings:
+    """Constants of `HandTracker`; lengths in face heights B, rates for 30 frames per second.
+
+    Attributes:
+        skin_slope, skin_bias, skin_decay, skin_floor, clothes_share: see `SkinModel`.
+        unknown_skin: probability of skin where the image has ended.
+        face_memory: a hand in front of the face is a change of it; without, the face hides hands.
+        face_alignment, face_deviations, face_floor, face_median, face_scale: see `FaceMemory`.
+        disc, core, motion, unusual, beyond, towards, beside: weights of the cues, see `HandLikelihood`.
+        prior: weight of the log density of a hand given the face.
+        jump: share of belief that is born anew from the prior in each frame.
+        face_rebirth: cost of that in front of the face, in nats.
+        expected_share: of the rebirth about the expected hands, where these are given.
+        near, far, near_share: the two widths of diffusion, and the share of the first.
+        flow, flow_blur: share of belief that optical flow carries, and its blur.
+        rest: diffusion where nothing moves.
+        velocity: share of the last displacement that goes on.
+        exclusion, exclusion_radius: cost of both hands at one place, in nats, and how far it reaches.
+        crossing, crossing_soft: cost of hands on each other's side, in nats, and its softness.
+        still: weight of a frame in which nothing moves; what is seen again is old news.
+        still_motion: moving area, in B squared, from which a frame counts fully.
+        covariance_scale, covariance_floor: the reported covariance is the belief's times the scale,
+            plus the floor (a standard deviation).
+        least_mass, least_skin: below these a hand is not `seen`.
+        stray, rescale: see `follow_faces`.
+        face_follow: share of a face's new size that is taken over; face_change: ratio of sizes from
+            which all of it is.
+    """
+
+    skin_slope: float = 1.5
+    skin_bias: float = 0.8
+    skin_decay: float = 0.95
+    skin_floor: float = 2e-4
+    clothes_share: float = 0.5
+    unknown_skin: float = 0.15
+    face_memory: bool = True
+    face_alignment: bool = True
+    face_deviations: float = 1.5
+    face_floor: float = 2.0
+    face_median: float = 0.1
+    face_scale: float = 4.0
+    disc: float = 5.0
+    core: float = 4.0
+    motion: float = 4.0
+    unusual: float = 0.8
+    beyond: float = 3.0
+    towards: float = 0.75
+    beside: float = 1.2
+    prior: float = 1.0
+    jump: float = 0.015
+    face_rebirth: float = 6.0
+    expected_share: float = 0.5
+    near: float = 0.06
+    far: float = 0.25
+    near_share: float = 0.7
+    flow: float = 0.5
+    flow_blur: float = 0.06
+    rest: float = 0.035
+    velocity: float = 0.8
+    exclusion: float = 2.5
+    exclusion_radius: float = 0.34
+    crossing: float = 2.8
+    crossing_soft: float = 0.15
+    still: float = 0.12
+    still_motion: float = 0.8
+    covariance_scale: float = 2.0
+    covariance_floor: float = 0.05
+    least_mass: float = 0.3
+    least_skin: float = 0.15
+    stray: float = 0.5
+    rescale: float = 1.15
+    face_follow: float = 0.05
+    face_change: float = 1.3
+
+
+class HandMeasurements(NamedTuple):
+    """Hands of N persons: left, right (the person's own), in pixels of the frame.
+
+    Attributes:
+        points: centres of the hands (x, y); NaN where there is nothing to say.
+        covariance: of the points, pixels squared.
+        mass: probability that the hand is there.
+        seen: False where a hand is lost, to be taken as missing.
+    """
+
+    points: Float[Tensor, "N 2 2"]
+    covariance: Float[Tensor, "N 2 2 2"]
+    mass: Float[Tensor, "N 2"]
+    seen: Bool[Tensor, "N 2"]
+
+
+def check_frame(frame: Image, faces: Float[Tensor, "N 3"], identity: Int[Tensor, " N"]) -> None:
+    """Raise unless these are a frame, faces with a size, and who they are.
+
+    Raises:
+        ShapeError, InputError: see above.
+    """
+    check_rgb("frame", frame)
+    check_finite("faces", faces, hint="leave out persons without a face")
+    check_faces(faces)
+    check_shape("identity", identity, [len(faces)])

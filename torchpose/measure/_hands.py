@@ -1,0 +1,382 @@
+"""Both hands of every person in colour video, by a histogram filter (after Burke & Lasenby, 5.2)."""
+
+import math
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from torchpose.errors import InputError
+from torchpose.measure._background import Motion, MotionState
+from torchpose.measure._body_window import (
+    CELL,
+    CELLS,
+    COLOURS,
+    EVIDENCE,
+    cell_centres,
+    cells_to_pixels,
+    cut_colours,
+    cut_mask,
+    faces_in_evidence,
+    follow_faces,
+    inside_image,
+    move_maps,
+    pixels_to_cells,
+    place_windows,
+)
+from torchpose.measure._grid_filter import exclude, gaussian_bump, predict, read_out
+from torchpose.measure._hand_likelihood import (
+    HandLikelihood,
+    HandMeasurements,
+    HandSettings,
+    check_frame,
+)
+from torchpose.measure._hand_prior import HandPrior
+from torchpose.measure._head import FaceMemory, FaceMemoryState, head_part
+from torchpose.measure._persons import match_rows
+from torchpose.measure._skin import SkinModel, SkinState
+
+__all__ = ["HandState", "HandTracker"]
+
+Image = NDArray[np.uint8]
+_REACH = -5.2  # log density per B squared above which a hand may be in a place
+_FACE = (0.7, 0.9)  # half the width and height of a face with what is about it, in B
+_NEAR = 4  # cells about a hand that are believed to be its own
+
+
+class HandState(NamedTuple):
+    """What is known of N persons; every tensor has them as its first dimension.
+
+    Attributes:
+        identity: who is who. anchors: of the windows (x, y, B), pixels.
+        skin, memory, motion: of the parts.
+        belief: probability of each hand in each cell, sums to one [N, 2, 80, 96].
+        size: B, slowly averaged, pixels.
+        place: of the hands in the last frame, pixels. speed: pixels per frame.
+        frames: seen so far.
+    """
+
+    identity: Int[Tensor, " N"]
+    anchors: Float[Tensor, "N 3"]
+    skin: SkinState
+    memory: FaceMemoryState
+    motion: MotionState
+    belief: Float[Tensor, "N 2 h w"]
+    size: Float[Tensor, " N"]
+    place: Float[Tensor, "N 2 2"]
+    speed: Float[Tensor, "N 2 2"]
+    frames: Int[Tensor, " N"]
+
+
+class HandTracker(nn.Module):
+    """Follows both hands of every person by a histogram filter in a window about the face.
+
+    The likelihood of a hand comes from skin (against clothes and background), motion and the shape
+    of a hand at the end of its forearm (`HandLikelihood`); where it may be at all from the prior over
+    poses, given the face (`HandPrior`). The face is taken out of the skin unless it changes
+    (`FaceMemory`). Belief moves with the optical flow, with its own speed, and by diffusion, and the
+    two hands exclude each other (`predict`, `exclude`). A frame in which nothing moves says little
+    that is new, so it counts little. There is no delay: a frame in, its hands out.
+
+    Args:
+        prior: of hands given the face.
+        settings: constants. fps: frames per second of the video.
+
+    Raises:
+        InputError: a frame rate that is not positive.
+
+    Reference:
+        Burke & Lasenby, section 5.2, for the task and the skin; the filter goes beyond it.
+
+    Example:
+        >>> import numpy as np, torch, torchpose
+        >>> from torchpose.measure import HandPrior, HandTracker
+        >>> tracker = HandTracker(HandPrior.from_prior(torchpose.load_prior("kinect-upper-body")))
+        >>> frame = np.full((120, 160, 3), 90, np.uint8)
+        >>> face, number = torch.tensor([[80.0, 30.0, 20.0]]), torch.tensor([0])
+        >>> state, hands = tracker.step(tracker.init(), frame, face, number)
+        >>> hands.points.shape
+        torch.Size([1, 2, 2])
+    """
+
+    def __init__(
+        self, prior: HandPrior, settings: HandSettings | None = None, fps: float = 30.0
+    ) -> None:
+        super().__init__()
+        if not (math.isfinite(fps) and fps > 0):
+            raise InputError(f"fps must be positive, got {fps}")
+        self.prior, self.settings, self.fps = prior, settings or HandSettings(), fps
+        s, rate = self.settings, 30.0 / fps
+        self.rate = rate
+        self.skin = SkinModel(
+            s.skin_slope, s.skin_bias, s.skin_decay**rate, s.skin_floor, s.clothes_share
+        )
+        self.memory = FaceMemory(
+            s.face_deviations, s.face_floor, s.face_median, s.face_scale,
+            align=s.face_alignment, rate=rate, remember=s.face_memory,
+        )  # fmt: skip
+        self.motion = Motion(rate=rate, flow=s.flow > 0)
+        self.likelihood = HandLikelihood(
+            s.disc, s.core, s.motion, s.unusual, s.beyond, s.towards, s.beside,
+            unknown=s.unknown_skin,
+        )  # fmt: skip
+
+    def init(self) -> HandState:
+        """Return the state without persons."""
+        return _rows(self._fresh(torch.zeros(1, 3)), slice(0, 0))
+
+    @torch.no_grad()
+    def step(
+        self,
+        state: HandState,
+        frame: Image,
+        faces: Float[Tensor, "N 3"],
+        identity: Int[Tensor, " N"],
+        foreground: Image | None = None,
+        expected: tuple[Float[Tensor, "N 2 2"], Float[Tensor, "N 2 2 2"]] | None = None,
+    ) -> tuple[HandState, HandMeasurements]:
+        """Return the hands in the next frame.
+
+        Args:
+            state: from `init` or the step before; its persons are matched by number.
+            frame: RGB [H, W, 3].
+            faces: (x, y, B), pixels. identity: number of each face.
+            foreground: [H, W], 255 where the image is not background.
+            expected: mean and covariance of the hands as a pose filter predicts them, pixels; NaN
+                where it says nothing. Belief is born anew there too.
+
+        Returns:
+            The next state, with the persons of this frame, and their hands.
+
+        Raises:
+            InputError: another kind of image, or faces without a size. ShapeError: wrong shapes.
+        """
+        _check(frame, faces, identity, foreground)
+        faces = faces.double()
+        if not len(faces):
+            return self.init(), _nothing(faces)
+        state, new = self._persons(state, faces, identity)
+        state, faces = self._steady(state, faces)
+        state = self._follow(state, faces)
+        inside = inside_image(state.anchors, frame.shape[1], frame.shape[0], EVIDENCE)
+        state, means, flow = self._evidence(state, frame, faces, inside, foreground)
+        log_prior, elbow = self._prior(faces, state.anchors)
+        log_likelihood = self.likelihood(means, elbow) + self.settings.prior * log_prior
+        rebirth = self._rebirth(log_prior, faces, state.anchors, expected)
+        belief = torch.where(new[:, None, None, None], rebirth, state.belief)
+        reach = log_prior.amax(1) > _REACH
+        moving = (means[:, 2] * reach).sum((1, 2)) * CELL**2 / self.settings.still_motion
+        still = self.settings.still
+        moves = still + (1 - still) * moving.clamp(0, 1)
+        belief = self._filter(state, belief, rebirth, log_likelihood, moves, flow)
+        return self._measure(state._replace(belief=belief), means[:, 1], frame.shape)
+
+    def _persons(
+        self, state: HandState, faces: Tensor, identity: Tensor
+    ) -> tuple[HandState, Tensor]:
+        """Rows for the persons of this frame, and which of them are new."""
+        if not torch.equal(state.identity, identity):
+            row = match_rows(state.identity, identity)  # the fresh one is behind all
+            new = row == len(state.identity)
+            anchors = place_windows(faces)
+            state = _map(
+                lambda old, made: torch.cat([old, made])[row], state, self._fresh(anchors[:1])
+            )
+            anchors = torch.where(new[:, None], anchors, state.anchors)
+            state = state._replace(identity=identity.clone(), anchors=anchors)
+        return state, state.frames == 0
+
+    def _steady(self, state: HandState, faces: Tensor) -> tuple[HandState, Tensor]:
+        """Faces with sizes averaged over time: a hand before a face changes its box, not the head."""
+        follow = torch.clamp(1 / (state.frames + 1.0), min=self.settings.face_follow * self.rate)
+        off = (faces[:, 2] / state.size).log().abs() > math.log(self.settings.face_change)
+        follow = torch.where(off, 1.0, follow.clamp(max=1.0))
+        size = state.size.lerp(faces[:, 2], follow.to(faces))
+        return state._replace(size=size), torch.cat([faces[:, :2], size[:, None]], 1)
+
+    def _fresh(self, anchors: Tensor) -> HandState:
+        n = len(anchors)
+        number = torch.zeros(n, dtype=torch.long)
+        nowhere = torch.full((n, 2, 2), torch.nan, dtype=torch.float64)
+        even = torch.full((n, 2, *CELLS), 1 / math.prod(CELLS))
+        return HandState(
+            number, anchors.double(), self.skin.init(n), self.memory.init(n), self.motion.init(n),
+            even, anchors[:, 2].double(), nowhere, torch.zeros_like(nowhere), number.clone(),
+        )  # fmt: skip
+
+    def _follow(self, state: HandState, faces: Tensor) -> HandState:
+        """Return the windows that go with their faces, and belief and images that go with the windows."""
+        s = self.settings
+        anchors, moved = follow_faces(state.anchors, faces, s.stray, s.rescale)
+        if not bool(moved.any()):
+            return state
+        motion = self.motion.move(state.motion, state.anchors, anchors, moved)
+        belief = state.belief.clone()
+        kept = move_maps(belief[moved], state.anchors[moved], anchors[moved]) + 1e-9
+        belief[moved] = kept / kept.sum((2, 3), keepdim=True)
+        return state._replace(anchors=anchors, motion=motion, belief=belief)
+
+    def _evidence(
+        self,
+        state: HandState,
+        frame: Image,
+        faces: Tensor,
+        inside: Tensor,
+        foreground: Image | None,
+    ) -> tuple[HandState, Tensor, Tensor]:
+        """Means of skin, motion and the unusual in every cell, and the flow."""
+        lab, smooth, head = cut_colours(frame, state.anchors, head_part(COLOURS))
+        hands = _hands_near(state.belief) * (state.frames > 0)[:, None, None]
+        bins = self.skin.byte_bins(lab)
+        learnt = self.skin.learn(
+            state.skin,
+            bins,
+            faces_in_evidence(faces, state.anchors),
+            hands.repeat_interleave(EVIDENCE, 1).repeat_interleave(EVIDENCE, 2),
+            inside > 0.5,
+        )
+        skin = self.skin.find(learnt, bins)
+        memory, hidden = self.memory.step(state.memory, head, faces, state.anchors, hands)
+        rows, columns = head_part(EVIDENCE)
+        skin[:, rows, columns] *= 1 - hidden
+        if foreground is not None:
+            skin = skin * cut_mask(foreground, state.anchors)
+        motion, moving, unusual, flow = self.motion.step(state.motion, smooth, lab[:, 0])
+        maps = torch.stack([skin, moving, unusual], 1)
+        if bool((inside < 1).any()):
+            maps = maps * inside[:, None]
+            maps[:, 0] += self.likelihood.unknown * (1 - inside)
+        means = self.likelihood.means(maps)
+        return state._replace(skin=learnt, memory=memory, motion=motion), means, flow
+
+    def _prior(self, faces: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor]:
+        """Log density [N, 2, r, c] and expected elbow [N, 2, 2, r, c], in B from the anchor."""
+        at = (faces[:, :2] - anchors[:, :2]) / anchors[:, 2:]
+        size = faces[:, 2] / anchors[:, 2]
+        at, size = at.float()[:, None, None], size.float()[:, None, None, None]
+        log_density, elbow = self.prior((cell_centres() - at) / size)
+        elbow = elbow.movedim(2, 0) * size[:, None] + at.permute(0, 3, 1, 2)[:, None]
+        return log_density.movedim(1, 0), elbow
+
+    def _rebirth(
+        self,
+        log_prior: Tensor,
+        faces: Tensor,
+        anchors: Tensor,
+        expected: tuple[Tensor, Tensor] | None,
+    ) -> Tensor:
+        """Return where a hand may be that was lost: before the face it would be seen to come."""
+        cost = self.settings.face_rebirth * _before_face(faces, anchors)[:, None]
+        born = torch.softmax((log_prior - cost).flatten(2), 2).view_as(log_prior)
+        if expected is None:
+            return born
+        mean, cov = (x.double() for x in expected)
+        known = torch.isfinite(mean).all(-1) & torch.isfinite(cov).all((-1, -2))
+        mean = torch.where(known[..., None], mean, 0.0)
+        unit = (anchors[:, 2] * CELL).square()[:, None, None, None]
+        eye = torch.eye(2, dtype=cov.dtype)
+        cov = torch.where(known[..., None, None], cov / unit, eye) + 0.25 * eye
+        bump = gaussian_bump(pixels_to_cells(mean, anchors), cov, CELLS).to(born)
+        share = self.settings.expected_share * known[..., None, None]
+        return born + share.to(born) * (bump - born)
+
+    def _filter(
+        self,
+        state: HandState,
+        belief: Tensor,
+        rebirth: Tensor,
+        log_likelihood: Tensor,
+        moves: Tensor,
+        flow: Tensor,
+    ) -> Tensor:
+        s, rate = self.settings, self.rate
+        speed = (state.speed / (state.anchors[:, 2:, None] * CELL)).float()
+        predicted = predict(
+            belief, rebirth, speed, flow, moves,
+            near=s.near / CELL * rate, far=s.far / CELL * rate, near_share=s.near_share,
+            flow_share=s.flow, flow_blur=s.flow_blur / CELL, jump=1 - (1 - s.jump) ** rate,
+            rest=s.rest / CELL,
+        )  # fmt: skip
+        best = log_likelihood.amax((2, 3), keepdim=True)
+        weight = (moves[:, None, None, None] * (log_likelihood - best)).clamp_min(-30).exp()
+        return exclude(
+            predicted * weight,
+            s.exclusion, s.exclusion_radius / CELL, s.crossing, s.crossing_soft / CELL,
+        )  # fmt: skip
+
+    def _measure(
+        self, state: HandState, skin: Tensor, shape: tuple[int, ...]
+    ) -> tuple[HandState, HandMeasurements]:
+        s, anchors = self.settings, state.anchors
+        found = read_out(state.belief, smooth=1.5, within=5.0)
+        points = cells_to_pixels(found.place, anchors)
+        unit = (anchors[:, 2] * CELL).square()[:, None, None, None]
+        floor = (s.covariance_floor / CELL) ** 2 * torch.eye(2, dtype=unit.dtype)
+        covariance = (s.covariance_scale * found.covariance + floor) * unit
+        high = points.new_tensor([shape[1] - 0.5, shape[0] - 0.5])
+        there = ((points >= -0.5) & (points <= high)).all(-1)
+        cell = found.mode[..., 1] * CELLS[1] + found.mode[..., 0]
+        here = skin.flatten(1).gather(1, cell)
+        seen = there & (found.mass >= s.least_mass) & (here >= s.least_skin)
+        step = points - state.place
+        most = 5 * CELL * anchors[:, 2, None, None] * self.rate
+        step = torch.minimum(torch.maximum(step, -most), most).nan_to_num_(0.0)  # none at first
+        speed = state.speed.lerp(step * s.velocity, 0.5)
+        shown = torch.where(there[..., None], points, torch.nan)
+        state = state._replace(place=points, speed=speed, frames=state.frames + 1)
+        return state, HandMeasurements(shown, covariance, found.mass, seen)
+
+
+def _check(frame: Image, faces: Tensor, identity: Tensor, foreground: Image | None) -> None:
+    check_frame(frame, faces, identity)
+    if foreground is not None and (
+        foreground.shape != frame.shape[:2] or foreground.dtype != np.uint8
+    ):
+        raise InputError(
+            f"foreground must be [{frame.shape[0]}, {frame.shape[1]}] of uint8, got "
+            f"{list(foreground.shape)} of {foreground.dtype}"
+        )
+
+
+def _nothing(faces: Tensor) -> HandMeasurements:
+    empty = faces.new_zeros(0, 2, 2)
+    return HandMeasurements(
+        empty, faces.new_zeros(0, 2, 2, 2), faces.new_zeros(0, 2), torch.zeros(0, 2).bool()
+    )
+
+
+def _before_face(faces: Tensor, anchors: Tensor) -> Tensor:
+    """One in the cells on the face, zero away from it [N, r, c]."""
+    at = (torch.cat([faces[:, :2] - anchors[:, :2], faces[:, 2:]], 1) / anchors[:, 2:]).float()
+    offset = (cell_centres() - at[:, None, None, :2]) / (at[:, 2:] * at.new_tensor(_FACE))[
+        :, None, None
+    ]
+    return torch.sigmoid(6 * (1 - offset.square().sum(-1)))
+
+
+def _hands_near(belief: Tensor) -> Tensor:
+    """Return the probability that a cell belongs to a hand [N, r, c]."""
+    rows, columns = (_band(n) for n in CELLS)
+    return (rows @ belief.sum(1) @ columns).clamp(0, 1)
+
+
+@cache
+def _band(size: int) -> Tensor:
+    place = torch.arange(size)
+    return ((place[:, None] - place).abs() <= _NEAR).float()
+
+
+def _map(function: Any, *states: Any) -> Any:
+    """Return a NamedTuple of tensors (or of such tuples) from several of its kind."""
+    if isinstance(states[0], Tensor):
+        return function(*states)
+    parts = (_map(function, *part) for part in zip(*states, strict=True))
+    return type(states[0])(*parts)
+
+
+def _rows(state: Any, rows: Any) -> Any:
+    return _map(lambda x: x[rows], state)

@@ -1,0 +1,314 @@
+"""Measure head and neck from the face (BL section 5), and remember faces without hands in front."""
+
+from functools import cache
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor, nn
+
+from torchpose.errors import InputError, check_shape
+from torchpose.measure._body_window import CELL, COLOURS, EVIDENCE, cell_centres
+
+__all__ = [
+    "FACE_OFFSETS",
+    "FaceMemory",
+    "FaceMemoryState",
+    "FaceOffsets",
+    "HeadNeck",
+    "head_mask",
+    "head_part",
+]
+
+
+class FaceOffsets(NamedTuple):
+    """Head and neck below the centre of the face, in sizes B of the face's box.
+
+    head = centre + B (0, a) + N(0, B^2 s_a^2),   neck = centre + B (0, b) + N(0, B^2 s_b^2)
+
+    Attributes:
+        head, neck: a and b. head_std, neck_std: (across, down), s_a and s_b.
+    """
+
+    head: float
+    neck: float
+    head_std: tuple[float, float]
+    neck_std: tuple[float, float]
+
+
+# Silhouettes of eight persons beside their Kinect skeletons put the head joint 0.47 of the way from
+# the crown to the narrowest part of the neck, and the neck joint 0.89 of it further down; faces of
+# three persons put crown and neck at -0.71 and 0.55 B. That gives a = -0.12 and b = 1.01. A webcam
+# close by, which looks up, shortens the neck beside the arms: elbows of such persons come out best at
+# (-0.4, 1.1). The values are between the two; benchmarks/face_offsets.py prints what they cost.
+FACE_OFFSETS = FaceOffsets(-0.2, 1.1, (0.05, 0.08), (0.07, 0.12))
+
+
+class HeadNeck(nn.Module):
+    """Head and neck from the face, with covariances.
+
+    Args:
+        offsets: of the prior's head and neck from the centre of the box that the detector draws.
+
+    Raises:
+        InputError: standard deviations that are not positive.
+
+    Reference:
+        Burke & Lasenby, section 5.1: the face gives the head. Their sign-language tracker puts the
+        neck 45 pixels below it.
+
+    Example:
+        >>> import torch
+        >>> points, covariance = HeadNeck()(torch.tensor([[320.0, 100.0, 80.0]]))
+        >>> points[0].tolist()
+        [[320.0, 84.0], [320.0, 188.0]]
+    """
+
+    def __init__(self, offsets: FaceOffsets = FACE_OFFSETS) -> None:
+        super().__init__()
+        stds = (offsets.head_std, offsets.neck_std)
+        if not all(std > 0 for pair in stds for std in pair):
+            raise InputError(f"standard deviations of the offsets must be positive, got {stds}")
+        down = torch.tensor([[0.0, offsets.head], [0.0, offsets.neck]], dtype=torch.float64)
+        self.register_buffer("offset", down)
+        self.register_buffer("std", torch.tensor(stds, dtype=torch.float64))
+
+    offset: Tensor
+    std: Tensor
+
+    def forward(
+        self, faces: Float[Tensor, "N 3"], face_cov: Float[Tensor, "N 3 3"] | None = None
+    ) -> tuple[Float[Tensor, "N 2 2"], Float[Tensor, "N 2 2 2"]]:
+        """Return the head and neck, in this order, and their covariances, pixels.
+
+        Args:
+            faces: centre (x, y) and size B, pixels. face_cov: how well these are known.
+        """
+        check_shape("faces", faces, ["N", 3])
+        faces = faces.to(self.offset)
+        centre, size = faces[:, None, :2], faces[:, None, 2:]
+        cov = torch.diag_embed((size * self.std).square())
+        if face_cov is not None:
+            slope = torch.eye(2, 3).to(faces).repeat(2, 1, 1)
+            slope[:, :, 2] = self.offset
+            cov = cov + slope @ face_cov.to(faces)[:, None] @ slope.mT
+        return centre + size * self.offset, cov
+
+
+_ROWS, _COLUMNS = 104, 72  # of the remembered patch: head and neck
+_HALF_WIDTH, _TOP, _HEIGHT = 1.0, -1.0, 2.6  # of the patch, in B from the face's centre
+_SEARCH = 8  # pixels of the patch to each side
+_MODEL, _INNER = (slice(4, 58), slice(2, 70)), (slice(12, 50), slice(10, 62))
+_EYES = (slice(14, 56, 2), slice(18, 56, 2))
+_BLUR = 13  # pixels of the patch: about a third of a face, half a hand
+_LEAST_MATCH = 0.6
+_FIRST = 7  # frames that are averaged plainly
+_HAND = 0.2  # probability of a hand above which little is learnt
+# Ellipse of the head, and rectangle of the neck, in B from the face's centre.
+_HEAD_AXES, _HEAD_DOWN, _NECK, _SOFT = (0.575, 0.8), -0.05, (0.42, 0.4, 1.05), 0.06
+_PART_ROWS, _PART_COLUMNS = slice(0, 54), slice(24, 72)  # cells of the window where a head can be
+
+
+def head_part(per_cell: int) -> tuple[slice, slice]:
+    """Return the rows and columns of a map of the window in which head and neck lie."""
+    return tuple(  # type: ignore[return-value]
+        slice(part.start * per_cell, part.stop * per_cell) for part in (_PART_ROWS, _PART_COLUMNS)
+    )
+
+
+class FaceMemoryState(NamedTuple):
+    """Faces of N persons.
+
+    Attributes:
+        mean: Lab in bytes, usual look [N, 3, 104, 72]. deviation: usual difference [N, 104, 72].
+        frames: seen so far [N].
+    """
+
+    mean: Float[Tensor, "N 3 104 72"]
+    deviation: Float[Tensor, "N 104 72"]
+    frames: Int[Tensor, " N"]
+
+
+class FaceMemory(nn.Module):
+    """Change of head and neck against what they usually look like.
+
+        d = blur |Lab - mean|_1,   change = clip((d - (k s + f + m median_eyes d)) / scale, 0, 1)
+
+    The patch is first laid on the remembered upper half of the face by normalised correlation. Mean
+    and deviation s follow slowly, and more slowly where a hand is believed to be. The median over the
+    eyes takes out what changes the whole face: its motion, the light.
+
+    Args:
+        deviations: k. floor: f. median: m. scale: of the change; all in steps of Lab in bytes.
+        align: whether to look for the shift. remember: if not, head and neck are always hidden.
+        rate: frames at 30 per second that pass in one step.
+    """
+
+    def __init__(
+        self,
+        deviations: float = 1.5,
+        floor: float = 2.0,
+        median: float = 0.1,
+        scale: float = 4.0,
+        align: bool = True,
+        rate: float = 1.0,
+        remember: bool = True,
+    ) -> None:
+        super().__init__()
+        self.deviations, self.floor, self.median, self.scale = deviations, floor, median, scale
+        self.align, self.rate, self.remember = align, rate, remember
+        self.register_buffer("channel_weights", torch.tensor([0.5, 1.0, 1.0]).view(3, 1, 1))
+        self.register_buffer("blur_rows", _box(_ROWS, _BLUR))
+        self.register_buffer("blur_columns", _box(_COLUMNS, _BLUR).T.contiguous())
+        self.register_buffer("pixel", torch.tensor([2 * _HALF_WIDTH / _COLUMNS, _HEIGHT / _ROWS]))
+
+    channel_weights: Tensor
+    blur_rows: Tensor
+    blur_columns: Tensor
+    pixel: Tensor
+
+    def init(self, persons: int) -> FaceMemoryState:
+        """Return the state before the first frame."""
+        zero = self.blur_rows.new_zeros(persons)
+        return FaceMemoryState(
+            zero.view(-1, 1, 1, 1).repeat(1, 3, _ROWS, _COLUMNS),
+            zero.view(-1, 1, 1).repeat(1, _ROWS, _COLUMNS) + 2,
+            zero.long(),
+        )
+
+    def step(
+        self,
+        state: FaceMemoryState,
+        lab: UInt8[Tensor, "N 3 h w"],
+        faces: Float[Tensor, "N 3"],
+        anchors: Float[Tensor, "N 3"],
+        hands: Float[Tensor, "N r c"],
+    ) -> tuple[FaceMemoryState, Float[Tensor, "N R C"]]:
+        """Compare a frame with the memory, and learn from it.
+
+        Args:
+            state: from `init` or the step before.
+            lab: `head_part` of the windows, bytes as OpenCV has them [N, 3, 216, 192].
+            faces: (x, y, B), pixels, B steady. anchors: of the windows, pixels.
+            hands: probability that a cell belongs to a hand [N, 80, 96].
+
+        Returns:
+            The next state, and how far head and neck hide what is skin, at every pixel of evidence of
+            `head_part` [N, 108, 96]: one on head and neck, zero elsewhere and where they have changed.
+        """
+        rows, columns = head_part(COLOURS)
+        check_shape(
+            "lab", lab, [len(faces), 3, rows.stop - rows.start, columns.stop - columns.start]
+        )
+        new = state.frames == 0
+        at = (torch.cat([faces[:, :2] - anchors[:, :2], faces[:, 2:]], 1) / anchors[:, 2:]).float()
+        if not self.remember:
+            return state, _to_window(head_mask().expand(len(at), -1, -1), at)
+        near = lab.to(at)
+        patch = _sample(near, at)
+        if self.align:
+            shift = _best_shift(state.mean[:, 0], patch[:, 0]).masked_fill_(new[:, None], 0)
+            at = torch.cat([at[:, :2] + shift * self.pixel * at[:, 2:], at[:, 2:]], 1)
+            patch = _sample(near, at)
+        mean = torch.where(new[:, None, None, None], patch, state.mean)
+        error = patch - mean
+        difference = (error.abs() * self.channel_weights).sum(1)
+        difference = self.blur_rows @ difference @ self.blur_columns
+        eyes = difference[:, _EYES[0], _EYES[1]].flatten(1).median(1).values[:, None, None]
+        usual = self.deviations * state.deviation + self.floor + self.median * eyes
+        change = ((difference - usual) / self.scale).clamp_(0, 1)
+        in_front = _sample(hands[:, None, _PART_ROWS, _PART_COLUMNS], at) > _HAND
+        state = self._learn(state._replace(mean=mean), error, difference, in_front)
+        return state, _to_window(head_mask() * (1 - change), at)
+
+    def _learn(
+        self, state: FaceMemoryState, error: Tensor, difference: Tensor, in_front: Tensor
+    ) -> FaceMemoryState:
+        frames = state.frames + 1
+        limit = torch.where(in_front, 0.05 * self.rate, 0.15 * self.rate)
+        step = torch.minimum(torch.maximum(error, -limit), limit)
+        if bool((frames <= _FIRST).any()):
+            share = torch.where(in_front, 0.004, 1 / (frames + 1.0)[:, None, None, None])
+            step = torch.where((frames <= _FIRST)[:, None, None, None], share * error, step)
+        excess = (difference - state.deviation).clamp_(-0.2, 0.2)
+        deviation = state.deviation.add(excess, alpha=0.05 * self.rate)
+        return state._replace(mean=state.mean + step, deviation=deviation, frames=frames)
+
+
+@cache
+def head_mask() -> Float[Tensor, "104 72"]:
+    """One on head and neck, zero elsewhere, with soft edges, over the patch."""
+    x, y = _patch_places().unbind(-1)
+    half_x, half_y = _HEAD_AXES
+    radius = ((x / half_x).square() + ((y - _HEAD_DOWN) / half_y).square()).sqrt()
+    head = 0.5 + (1 - radius) * (0.5 * (half_x + half_y) / (2 * _SOFT))
+    half, top, bottom = _NECK
+    across = (0.5 + (half - x.abs()) / (2 * _SOFT)).clamp(0, 1)
+    down = (0.5 + torch.minimum(y - top, bottom - y) / (2 * _SOFT)).clamp(0, 1)
+    return torch.maximum(head.clamp(0, 1), down * across)
+
+
+def _box(size: int, width: int) -> Tensor:
+    """Return the matrix of a mean over `width` neighbours; beyond the ends the row is mirrored."""
+    place = torch.arange(size)[:, None] + torch.arange(width) - width // 2
+    place = place.abs()
+    place = torch.where(place >= size, 2 * (size - 1) - place, place)
+    return torch.zeros(size, size).scatter_add_(1, place, torch.ones(size, width)) / width
+
+
+@cache
+def _patch_places() -> Tensor:
+    x = (torch.arange(_COLUMNS) + 0.5) * (2 * _HALF_WIDTH / _COLUMNS) - _HALF_WIDTH
+    y = (torch.arange(_ROWS) + 0.5) * (_HEIGHT / _ROWS) + _TOP
+    return torch.stack(torch.broadcast_tensors(x, y[:, None]), -1).contiguous()
+
+
+def _sample(part: Tensor, at: Tensor) -> Tensor:
+    """Return the patch of head and neck from `head_part` of a map."""
+    places, middle, half = _part_grid()
+    centre = (at[:, None, None, :2] - middle) / half
+    grid = places * at[:, 2, None, None, None] + centre
+    return nn.functional.grid_sample(part, grid, padding_mode="border", align_corners=False)
+
+
+@cache
+def _part_grid() -> tuple[Tensor, Tensor, Tensor]:
+    """Return the places of the patch in halves of `head_part`, its middle, and its half width and height."""
+    part = cell_centres()[_PART_ROWS, _PART_COLUMNS]
+    half = (part[-1, -1] - part[0, 0] + CELL) / 2
+    return _patch_places() / half, (part[-1, -1] + part[0, 0]) / 2, half
+
+
+def _best_shift(model: Tensor, patch: Tensor) -> Tensor:
+    """Return how far the face has moved from the middle of its patch [N, 2], in pixels of it.
+
+    By normalised correlation at every shift, over every second pixel.
+    """
+    model = model[:, _MODEL[0], _MODEL[1]].contiguous()
+    inner = patch[:, _INNER[0], _INNER[1]][:, ::2, ::2]
+    (n, height, width), shifts = inner.shape, 2 * _SEARCH + 1
+    per_model, per_row, _ = model.stride()
+    windows = model.as_strided(
+        (n, shifts, shifts, height, width), (per_model, per_row, 1, 2 * per_row, 2)
+    ).reshape(n, shifts * shifts, height * width)
+    windows = windows - windows.mean(2, keepdim=True)
+    inner = inner.reshape(n, -1, 1) - inner.mean((1, 2), keepdim=True)
+    norm = windows.square().sum(2) * inner.square().sum(1)
+    score, best = ((windows @ inner)[..., 0] * norm.clamp_min(1.0).rsqrt()).max(1)
+    shift = _SEARCH - torch.stack([best % shifts, best // shifts], 1)
+    return torch.where((score > _LEAST_MATCH)[:, None], shift, 0)
+
+
+def _to_window(patch: Tensor, at: Tensor) -> Tensor:
+    places, middle, half = _window_grid()
+    size = at[:, 2:]
+    grid = (places - (at[:, :2] / half)[:, None, None]) / size[:, None, None] - middle / half
+    return nn.functional.grid_sample(patch[:, None], grid, align_corners=False)[:, 0]
+
+
+@cache
+def _window_grid() -> tuple[Tensor, Tensor, Tensor]:
+    """Return the places of `head_part` in halves of the patch, its middle, and its half width and height."""
+    half = torch.tensor([_HALF_WIDTH, _HEIGHT / 2])
+    places = cell_centres(EVIDENCE)[head_part(EVIDENCE)] / half
+    return places, torch.tensor([0.0, _TOP + _HEIGHT / 2]), half

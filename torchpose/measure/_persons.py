@@ -1,0 +1,136 @@
+"""Who is who in a video: faces that leave and come back."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from torchpose.errors import InputError
+from torchpose.measure._face import Image
+
+__all__ = ["PersonRegister", "Persons", "clothes_colours", "match_rows"]
+
+_BINS = 8
+_CLOTHES = (0.8, 1.3, 2.6)  # half the width, top and bottom below the face, in its sizes
+_LEARNING = 0.05
+
+
+class Persons(NamedTuple):
+    """Everybody who was seen so far, P of them.
+
+    Attributes:
+        face: identity of the face that each had last [P]. colours: of their clothes [P, 512].
+        last_seen: frame [P].
+    """
+
+    face: Int[Tensor, " P"]
+    colours: Float[Tensor, "P 512"]
+    last_seen: Int[Tensor, " P"]
+
+
+def match_rows(known: Int[Tensor, " K"], wanted: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
+    """Return the row of each wanted person among the known ones, K for a newcomer.
+
+    >>> match_rows(torch.tensor([7, 4]), torch.tensor([4, 9])).tolist()
+    [1, 2]
+    """
+    same = torch.nn.functional.pad(wanted[:, None] == known, (0, 1), value=True)
+    return same.int().argmax(1)  # the first that is the same, or the one behind all
+
+
+def clothes_colours(image: Image, faces: Float[Tensor, "N 3"]) -> Float[Tensor, "N 512"]:
+    """Return the shares of the colours below each face, 8 x 8 x 8 bins of RGB; zero where nothing is seen."""
+    found = [_histogram(image, face) for face in faces.tolist()]
+    return torch.from_numpy(np.stack(found)) if found else torch.zeros(0, _BINS**3).double()
+
+
+def _histogram(image: Image, face: list[float]) -> np.ndarray:
+    x, y, size = face
+    rows, columns = image.shape[:2]
+    half, top, bottom = (share * size for share in _CLOTHES)
+    left, right = int(max(0, x - half)), int(min(columns, x + half))
+    part = image[int(max(0, y + top)) : int(min(rows, y + bottom)), max(0, left) : max(0, right)]
+    step = max(1, int(size / 20))
+    bins = (part[::step, ::step].reshape(-1, 3) >> 5).astype(np.int64)
+    counts = np.bincount(bins @ np.array([64, 8, 1]), minlength=_BINS**3).astype(np.float64)
+    return np.asarray(counts / max(counts.sum(), 1.0))
+
+
+class PersonRegister(nn.Module):
+    """Numbers persons in the order of their coming, and knows them again by their clothes.
+
+    A new face belongs to somebody who left if the colours below it are like theirs,
+    sum_k sqrt(p_k q_k) >= `likeness` (Bhattacharyya), and it comes within `within` frames.
+
+    Args:
+        within: frames after which nobody is expected back. likeness: in [0, 1].
+
+    Raises:
+        InputError: settings that make no sense.
+    """
+
+    def __init__(self, within: int = 900, likeness: float = 0.75) -> None:
+        super().__init__()
+        if within < 0 or not 0 < likeness <= 1:
+            raise InputError(
+                f"within must be at least 0 frames and likeness in (0, 1], got {within}, {likeness}"
+            )
+        self.within, self.likeness = within, likeness
+
+    def init(self) -> Persons:
+        """Return the state without persons."""
+        nobody = torch.zeros(0, dtype=torch.long)
+        return Persons(nobody, torch.zeros(0, _BINS**3, dtype=torch.float64), nobody.clone())
+
+    def step(
+        self,
+        persons: Persons,
+        image: Image,
+        faces: Float[Tensor, "N 3"],
+        identity: Int[Tensor, " N"],
+        frame: int,
+        detected: Bool[Tensor, " N"] | None = None,
+    ) -> tuple[Persons, Int[Tensor, " N"]]:
+        """Tell whose faces these are: the state with newcomers, and the number of each face's person.
+
+        Args:
+            image: RGB. faces: (x, y, size), pixels. identity: of the tracked faces. frame: number.
+            detected: False where a face was not found of late and is only followed blindly: what is
+                below it may be the wall. None trusts all.
+        """
+        colours = clothes_colours(image, faces)
+        same = identity[:, None] == persons.face
+        owner = torch.where(same.any(1), same.long().argmax(1), -1) if len(persons.face) else None
+        owner = torch.full((len(faces),), -1) if owner is None else owner
+        for row in torch.nonzero(owner < 0).flatten().tolist():  # newcomers, seldom any
+            persons, owner[row] = self._admit(persons, colours[row], identity, owner, row, frame)
+        known = persons.colours.clone()
+        rate = _LEARNING if detected is None else _LEARNING * detected.to(colours)[:, None]
+        known[owner] += rate * (colours - known[owner])
+        last_seen = persons.last_seen.clone()
+        last_seen[owner] = frame
+        return persons._replace(colours=known, last_seen=last_seen), owner
+
+    def _admit(
+        self,
+        persons: Persons,
+        colours: Tensor,
+        identity: Tensor,
+        owner: Tensor,
+        row: int,
+        frame: int,
+    ) -> tuple[Persons, int]:
+        alike = (persons.colours * colours).sqrt().sum(1)
+        away = ~torch.isin(persons.face, identity) & (frame - persons.last_seen <= self.within)
+        away[owner[owner >= 0]] = False
+        alike = torch.where(away & (alike >= self.likeness), alike, -torch.ones_like(alike))
+        if len(alike) and float(alike.max()) > 0:
+            number = int(alike.argmax())
+            face = persons.face.clone()
+            face[number] = identity[row]
+            return persons._replace(face=face), number
+        face = torch.cat([persons.face, identity[row : row + 1]])
+        last_seen = torch.cat([persons.last_seen, persons.last_seen.new_tensor([frame])])
+        return Persons(face, torch.cat([persons.colours, colours[None]]), last_seen), len(face) - 1

@@ -1,0 +1,269 @@
+"""From a frame of video to measured head, neck and hands of everybody in it."""
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from torchpose.errors import InputError, check_rgb
+from torchpose.measure._background import BackgroundModel
+from torchpose.measure._face import FaceDetector, FaceTracker, FaceTracks, Image
+from torchpose.measure._hand_likelihood import HandMeasurements
+from torchpose.measure._hand_prior import HandPrior
+from torchpose.measure._hands import HandTracker
+from torchpose.measure._head import HeadNeck
+from torchpose.measure._mean_shift_hands import MeanShiftHandTracker
+from torchpose.measure._persons import PersonRegister, Persons
+from torchpose.measure._skin import SkinState, rgb_to_lab
+from torchpose.measure._torso import TorsoElbows, clothes_likelihood, elbows_from_torso
+from torchpose.priors._upper_body import UpperBodyPrior
+
+__all__ = [
+    "HAND_TRACKERS",
+    "MEASURED",
+    "Candidates",
+    "FrameMeasurements",
+    "MeasurerState",
+    "UpperBodyMeasurer",
+    "rounded_covariance",
+]
+
+MEASURED = ("head", "neck", "hand_left", "hand_right")
+"""Names and order of the measured joints; elbows follow if they are measured."""
+_ELBOWS = ("elbow_left", "elbow_right")
+HAND_TRACKERS = ("grid", "mean-shift")
+
+_LARGEST_SIDE = 960  # of the image in which faces are looked for, pixels
+_UNSEEN = 1.0  # seconds over which a face that is not detected counts as measured
+_LEVEL = math.sqrt(2.0)
+_MOVES = 0.15  # sizes of the face that a hand moves in a frame
+_TORSO_FACE = 24.0  # size of a face in the image in which elbows are looked for, pixels
+
+
+class FrameMeasurements(NamedTuple):
+    """What is measured of N persons in a frame; pixels.
+
+    Attributes:
+        person: their numbers, in the order of their coming [N].
+        keypoints: of the measurer's `names` [N, J, 2], NaN where missing. covariance: [N, J, 2, 2].
+        faces: (x, y, size) [N, 3]. hands: what the hand tracker says.
+    """
+
+    person: Int[Tensor, " N"]
+    keypoints: Float[Tensor, "N J 2"]
+    covariance: Float[Tensor, "N J 2 2"]
+    faces: Float[Tensor, "N 3"]
+    hands: HandMeasurements
+
+
+class Candidates(NamedTuple):
+    """Hands, left and right, as a pose filter has them: mean [..., 2, 2] and covariance, pixels."""
+
+    mean: Tensor
+    covariance: Tensor
+
+
+class MeasurerState(NamedTuple):
+    """What is known from the frames before: faces, persons, hands, and how many frames those were."""
+
+    faces: FaceTracks
+    persons: Persons
+    hands: Any
+    frame: int
+
+
+class UpperBodyMeasurer(nn.Module):
+    """Measures head, neck and hands of everybody in a video, frame by frame.
+
+    Faces are found and followed; they give head and neck, tell what colour skin has, and where hands
+    may be.
+
+    Args:
+        prior: of poses; says where hands may be.
+        fps: frames per second.
+        hands: "grid" (`HandTracker`) or "mean-shift" (`MeanShiftHandTracker`, the paper's recipe).
+        background: whether to tell the moving foreground from the background, for a camera that
+            stands still.
+        elbows: whether to measure elbows where the torso with its sleeves is widest.
+        face_detector: by default Haar's. max_persons: the largest faces are taken.
+        head_neck: where head and neck are beside the face.
+
+    Raises:
+        InputError: settings that make no sense.
+
+    Reference:
+        Burke & Lasenby, section 5. Several persons are what they leave open.
+    """
+
+    def __init__(
+        self,
+        prior: UpperBodyPrior,
+        fps: float = 30.0,
+        hands: str = "grid",
+        background: bool = False,
+        elbows: bool = False,
+        face_detector: FaceDetector | None = None,
+        max_persons: int | None = None,
+        head_neck: HeadNeck | None = None,
+    ) -> None:
+        super().__init__()
+        if hands not in HAND_TRACKERS:
+            raise InputError(f"hands must be one of {', '.join(HAND_TRACKERS)}, got {hands!r}")
+        if max_persons is not None and max_persons < 1:
+            raise InputError(f"max_persons must be at least 1, got {max_persons}")
+        if not fps > 0:
+            raise InputError(f"fps must be positive, got {fps}")
+        self.fps, self.max_persons = float(fps), max_persons
+        self.names = MEASURED + _ELBOWS if elbows else MEASURED
+        self.face_tracker = FaceTracker(face_detector)
+        self.head_neck = HeadNeck() if head_neck is None else head_neck
+        self.register = PersonRegister(within=round(30 * fps))
+        self.hand_tracker: HandTracker | MeanShiftHandTracker
+        if hands == "grid":
+            self.hand_tracker = HandTracker(HandPrior.from_prior(prior), fps=fps)
+        else:
+            self.hand_tracker = MeanShiftHandTracker()
+        self.background = BackgroundModel() if background else None
+
+    def init(self) -> MeasurerState:
+        """Return the state before the first frame, and let the background model begin anew."""
+        if self.background is not None:
+            self.background.reset()
+        return MeasurerState(
+            self.face_tracker.init(), self.register.init(), self.hand_tracker.init(), 0
+        )
+
+    def follow_faces(self, tracks: FaceTracks, image: Image) -> FaceTracks:
+        """The faces of the next frame, in the pixels of a smaller image where the frame is large.
+
+        They depend on nothing else, so this part of `step` may be done ahead, in a thread of its own.
+        """
+        import cv2
+
+        check_rgb("a frame", image)
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        scale = _face_scale(image)
+        if scale < 1:
+            grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        return self.face_tracker.step(tracks, np.asarray(grey, dtype=np.uint8))
+
+    def step(
+        self,
+        state: MeasurerState,
+        image: Image,
+        tracks: FaceTracks | None = None,
+        candidates: Mapping[int, Candidates] | None = None,
+    ) -> tuple[MeasurerState, FrameMeasurements]:
+        """Measure the next frame.
+
+        Args:
+            state: from `init` or the step before. image: RGB, uint8 [H, W, 3].
+            tracks: faces of this frame by `follow_faces`, if that was done already.
+            candidates: where a pose filter believes the hands of these persons; only for "grid".
+
+        Raises:
+            InputError: another kind of image; candidates for a tracker that takes none.
+        """
+        if tracks is None:
+            tracks = self.follow_faces(state.faces, image)
+        faces, face_cov, identity, unseen = self._used(tracks, _face_scale(image))
+        detected = unseen <= 2 * self.face_tracker.every
+        persons, number = self.register.step(
+            state.persons, image, faces, identity, state.frame, detected
+        )
+        foreground = None if self.background is None else self.background.step(image, faces)
+        arguments = (state.hands, image, faces, number, foreground)
+        if candidates is None:
+            hand_state, hands = self.hand_tracker.step(*arguments)
+        elif isinstance(self.hand_tracker, HandTracker):
+            expected = _expected(candidates, number, faces[:, 2])
+            hand_state, hands = self.hand_tracker.step(*arguments, expected)
+        else:
+            raise InputError("candidates need hands='grid': mean shift takes none")
+        parts = [self.head_neck(faces, face_cov), (_where_seen(hands), hands.covariance)]
+        if len(self.names) > len(MEASURED):
+            found = self._elbows(image, faces, hand_state.skin)
+            parts.append((_where_seen(found), found.covariance))
+        keypoints = torch.cat([points.to(faces) for points, _ in parts], 1)
+        cov = torch.cat([own.to(faces) for _, own in parts], 1)
+        eye = torch.eye(2, dtype=cov.dtype)
+        cov = torch.where(keypoints.isfinite().all(-1)[..., None, None], cov, eye)
+        measured = FrameMeasurements(number, keypoints, rounded_covariance(cov), faces, hands)
+        return MeasurerState(tracks, persons, hand_state, state.frame + 1), measured
+
+    def _elbows(self, image: Image, faces: Tensor, skin: SkinState) -> TorsoElbows:
+        """Return the elbows from the extent of everybody's clothes, in images in which faces have one size.
+
+        A person's image depends on that person's face alone.
+        """
+        scales, group = (_TORSO_FACE / faces[:, 2]).clamp_max(1.0).unique(return_inverse=True)
+        rows = [torch.nonzero(group == k).flatten() for k in range(len(scales))]
+        if not rows:
+            rows, scales = [group], faces.new_ones(1)
+        found = [
+            self._elbows_at(image, scale, faces[own], SkinState(*(x[own] for x in skin)))
+            for scale, own in zip(scales.tolist(), rows, strict=True)
+        ]
+        order = torch.cat(rows).argsort()
+        return TorsoElbows(*(torch.cat(parts)[order] for parts in zip(*found, strict=True)))
+
+    def _elbows_at(self, image: Image, scale: float, faces: Tensor, skin: SkinState) -> TorsoElbows:
+        """Return the elbows of persons in an image that is made smaller by this factor."""
+        import cv2
+
+        shape = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+        small = cv2.resize(image, shape, interpolation=cv2.INTER_AREA)
+        pixels = torch.from_numpy(np.asarray(small)).permute(2, 0, 1)[None].float() / 255
+        model = self.hand_tracker.skin
+        bins = model.bins(rgb_to_lab(pixels)).expand(len(faces), -1, -1)
+        shrunk = torch.cat([(faces[:, :2] + 0.5) * scale - 0.5, faces[:, 2:] * scale], 1)
+        found = elbows_from_torso(clothes_likelihood(model, skin, bins), shrunk)
+        return TorsoElbows(
+            (found.points + 0.5) / scale - 0.5, found.covariance / scale**2, found.seen
+        )
+
+    def _used(self, tracks: FaceTracks, scale: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Faces that count, in pixels of the frame, with covariances, identities, frames unseen."""
+        used = self.face_tracker.usable(tracks) & (tracks.unseen <= _UNSEEN * self.fps)
+        rows = torch.nonzero(used).flatten()
+        if self.max_persons is not None and len(rows) > self.max_persons:
+            largest = tracks.mean[rows, 2].argsort(descending=True)[: self.max_persons]
+            rows = rows[largest.sort().values]
+        faces = tracks.mean[rows, :3]
+        faces = torch.cat([(faces[:, :2] + 0.5) / scale - 0.5, faces[:, 2:] / scale], 1)
+        cov = tracks.cov[rows, :3, :3] / scale**2
+        return faces, cov, tracks.identity[rows], tracks.unseen[rows]
+
+
+def _expected(
+    candidates: Mapping[int, Candidates], number: Int[Tensor, " N"], size: Float[Tensor, " N"]
+) -> Candidates:
+    """Candidates of the persons of a frame, NaN without any, widened by what a hand moves in it."""
+    nothing = Candidates(torch.full((2, 2), torch.nan), torch.full((2, 2, 2), torch.nan))
+    found = [candidates.get(n, nothing) for n in number.tolist()]
+    mean = torch.stack([each.mean.to(size) for each in found]) if found else size.new_zeros(0, 2, 2)
+    cov = [each.covariance.to(size) for each in found]
+    moved = (_MOVES * size).square()[:, None, None, None] * torch.eye(2).to(size)
+    return Candidates(mean, torch.stack(cov) + moved if cov else size.new_zeros(0, 2, 2, 2))
+
+
+def _where_seen(found: HandMeasurements | TorsoElbows) -> Float[Tensor, "N 2 2"]:
+    return torch.where(found.seen[..., None], found.points, torch.nan)
+
+
+def rounded_covariance(cov: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:
+    """The same uncertainty in all directions, in steps of a factor sqrt(2) of the deviation.
+
+    Filters share their gains between frames whose covariances are equal.
+    """
+    variance = cov.diagonal(dim1=-2, dim2=-1).mean(-1)
+    std = _LEVEL ** (0.5 * variance.log() / math.log(_LEVEL)).round()
+    return std.square()[..., None, None] * torch.eye(2, dtype=cov.dtype, device=cov.device)
+
+
+def _face_scale(image: Image) -> float:
+    return min(1.0, _LARGEST_SIDE / max(image.shape[:2]))

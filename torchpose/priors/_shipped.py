@@ -1,0 +1,128 @@
+"""Models that come with the package, by their names: manifolds, limb conditionals, actions."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+from torchpose._core.tensor_file import format_of
+from torchpose.errors import OverlapError, PriorError
+from torchpose.priors._actions.bank import ActionBank
+from torchpose.priors._actions.space import ActionSpace
+from torchpose.priors._limb_conditionals import LimbConditionals
+from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
+
+__all__ = [
+    "KINDS",
+    "find_model",
+    "known_models",
+    "load_action",
+    "load_limb_conditionals",
+    "load_manifold",
+    "persons_of_model",
+    "refuse_seen",
+]
+
+WEIGHTS = Path(__file__).parent.parent / "weights"
+
+KINDS = {
+    "manifolds": "a manifold",
+    "conditionals": "limb conditionals",
+    "actions": "an action space or bank",
+}
+"""Kinds of models, as their folders are called, and in words."""
+
+
+def known_models(kind: str) -> list[str]:
+    """Names of the models of a kind, among `KINDS`, that come with the package."""
+    return sorted(path.stem for path in (WEIGHTS / kind).glob("*.safetensors"))
+
+
+def find_model(kind: str, name_or_path: str | Path) -> Path:
+    """File of a model that comes with the package, by its name, or the file of this path.
+
+    Args:
+        kind: among `KINDS`. name_or_path: a name (`known_models`), or a file.
+
+    Raises:
+        PriorError: neither a known name nor a file.
+    """
+    if str(name_or_path) in known_models(kind):
+        return WEIGHTS / kind / f"{name_or_path}.safetensors"
+    if Path(name_or_path).is_file():
+        return Path(name_or_path)
+    names = ", ".join(known_models(kind)) or "none in this installation"
+    raise PriorError(
+        f"{name_or_path}: no such file, and no such model of this package; expected the name of "
+        f"{KINDS[kind]} ({names}), or a .safetensors file"
+    )
+
+
+def load_manifold(name_or_path: str | Path) -> BackConstrainedGPLVM:
+    """Load a manifold of poses that comes with the package, by its name, or one from a file.
+
+    Args:
+        name_or_path: a name (``known_models("manifolds")``), or a file of `torchpose fit manifold`.
+
+    Raises:
+        PriorError: neither a known name nor a file. FileFormatError: a damaged or foreign file.
+
+    >>> manifold = load_manifold("walk")
+    >>> manifold.info.actions, manifold.info.fps
+    (('walk',), 60.0)
+    """
+    return BackConstrainedGPLVM.load(find_model("manifolds", name_or_path))
+
+
+def load_limb_conditionals(name_or_path: str | Path) -> LimbConditionals:
+    """Load limb conditionals that come with the package, by their name, or some from a file.
+
+    Args:
+        name_or_path: a name (``known_models("conditionals")``), or a file of `torchpose fit limbs`.
+
+    Raises:
+        PriorError: neither a known name nor a file. FileFormatError: a damaged or foreign file.
+
+    >>> load_limb_conditionals("walk").info.fps
+    60.0
+    """
+    return LimbConditionals.load(find_model("conditionals", name_or_path))
+
+
+def load_action(name_or_path: str | Path) -> ActionSpace | ActionBank:
+    """Load an action space or bank that comes with the package, by its name, or one from a file.
+
+    Args:
+        name_or_path: a name (``known_models("actions")``), or a file of `torchpose fit actions`.
+
+    Raises:
+        PriorError: neither a known name nor a file. FileFormatError: a damaged or foreign file.
+
+    >>> load_action("exercises").names[:2]
+    ('bend', 'jumping_jacks')
+    """
+    path = find_model("actions", name_or_path)
+    bank = format_of(path) == "torchpose-action-bank"
+    return ActionBank.load(path) if bank else ActionSpace.load(path)
+
+
+def persons_of_model(model: Any) -> set[str]:
+    """Ids of all persons that a model has anything of: fitted to, or held out for a manifold's noise."""
+    return {*model.info.persons, *model.info.extra.get("held_out_persons", ())}
+
+
+def refuse_seen(model: Any, persons: Collection[str], name: str = "") -> None:
+    """Raise `OverlapError` if a model has anything of one of these persons.
+
+    Args:
+        model: any with `info`. persons: ids, as `Recording.person_id`. name: of the model, if it does
+            not say.
+    """
+    seen = sorted(set(persons) & persons_of_model(model))
+    if seen:
+        named = getattr(model.info, "name", "") or name
+        raise OverlapError(
+            f"the model {named!r} was fitted on {', '.join(seen)}; score it on other persons, or fit "
+            "one without these"
+        )

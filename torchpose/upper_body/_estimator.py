@@ -1,0 +1,246 @@
+"""The interface of the estimators: measured joints in, the states of both arms out."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from torchpose.camera._pinhole import PinholeCamera
+from torchpose.camera._virtual_camera import BodyView
+from torchpose.errors import CameraError, PriorError, check_rate
+from torchpose.filters._base import Generators
+from torchpose.filters._outputs import FilterOutput, StepOutput
+from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.skeleton._upper_body import ARM_JOINTS, LEFT_ARM, RIGHT_ARM
+from torchpose.upper_body._measurements import MeasuredJoints
+
+__all__ = [
+    "ARMS",
+    "ArmJoints",
+    "Estimates",
+    "Estimator",
+    "MotionRatios",
+    "TrackerModel",
+    "arm_joints",
+    "check_model",
+    "first_failure",
+    "generators_of_arms",
+    "in_double",
+    "joints_of_arm",
+    "mending_notes",
+    "require_cov",
+]
+
+ArmJoints = dict[str, tuple[str, ...]]
+"""For each arm, "left" and "right", those of `ARM_JOINTS` that are measured."""
+
+
+class TrackerModel(NamedTuple):
+    """What an estimator is made from, beside its own options.
+
+    Attributes:
+        owner: the module with which filters are kept between calls.
+        prior: mixtures and noise. measurement_cov: R of the eight joints, [8, 2, 2], prior's pixels.
+        fps: frame rate, or None. smoothing: None, the number of later frames that an estimate may
+            use, or "full".
+    """
+
+    owner: nn.Module
+    prior: UpperBodyPrior
+    measurement_cov: Float[Tensor, "8 2 2"]
+    fps: float | None
+    smoothing: int | str | None = None
+
+    @property
+    def rate(self) -> float:
+        """Frames per second, 30 where nobody says."""
+        return self.fps or 30.0
+
+
+def check_model(
+    prior: UpperBodyPrior, camera: PinholeCamera | None, fps: float | None
+) -> PinholeCamera:
+    """Return the camera, if what a tracker works with is all there.
+
+    Raises:
+        PriorError: no prior of the upper body. CameraError: no camera. InputError: a frame rate that is
+            not positive.
+    """
+    if not isinstance(prior, UpperBodyPrior):
+        raise PriorError(
+            f"prior must be an UpperBodyPrior, got {type(prior).__name__}; see torchpose.load_prior"
+        )
+    if fps is not None:
+        check_rate("fps", fps)
+    if camera is None:
+        raise CameraError(
+            "a camera is needed, got None; pass camera=PinholeCamera(fx, fy, cx, cy), "
+            "PinholeCamera.from_image_size(width, height), or prior.camera if it is the same"
+        )
+    return camera
+
+
+class Estimates(NamedTuple):
+    """The states of both arms in T frames.
+
+    Attributes:
+        left, right: with covariances, float64; the first 21 dimensions are those of
+            `torchpose.priors._arm_state`.
+        view: the virtual camera in whose pixels the states are; None is the prior's camera.
+    """
+
+    left: FilterOutput
+    right: FilterOutput
+    view: BodyView | None = None
+
+
+class MotionRatios(NamedTuple):
+    """q/r, 1/s^3, of the constant-velocity filters over joints, their pixels and the placement."""
+
+    joint: float
+    pixel: float
+    placement: float
+
+
+class Estimator(ABC):
+    """Estimates the states of both arms from the measured joints; each entry of `METHODS` makes one.
+
+    The constructor takes a `TrackerModel` and, by name, the options of the method. An estimator holds
+    no state: what changes from frame to frame is the value that `init` makes and `advance` returns.
+
+    Attributes:
+        smooths: whether estimates can use later frames. particles: whether estimates rest on
+            weighted points, which can collapse onto one of them (`note_collapse`).
+        calibration: the name under which a prior keeps its calibration of the covariances; None goes
+            by the name of the method.
+        steadied_by: of the motion stage that frames need, None where they follow each other smoothly.
+        ahead: number of later frames that an estimate uses by itself.
+        reads_rays: whether pixels and joints in space are two readings (`on_their_rays`).
+    """
+
+    smooths: ClassVar[bool] = False
+    particles: ClassVar[bool] = False
+    calibration: str | None = None
+    steadied_by: MotionRatios | None = None
+    ahead: int = 0
+    reads_rays: bool = False
+
+    def check(self) -> None:  # noqa: B027  # most estimators have nothing to refuse
+        """Raise what does not fit, before any work; estimators may leave it out."""
+
+    @abstractmethod
+    def init(self, batch_size: int, joints: ArmJoints, generators: dict[str, Generators]) -> Any:
+        """Return the state before the first frame of B streams.
+
+        Args:
+            batch_size: B. joints: that may be measured. generators: of each arm, for what draws.
+        """
+
+    @abstractmethod
+    def advance(self, state: Any, measured: MeasuredJoints) -> tuple[Any, Estimates]:
+        """Return the next state and the estimates of T more frames, which later frames do not change.
+
+        Args:
+            state: from `init` or the call before; it is not changed. measured: [B, T, ...].
+        """
+
+    @abstractmethod
+    def forward(
+        self,
+        measured: MeasuredJoints,
+        joints: ArmJoints,
+        generators: dict[str, Generators],
+        lengths: Tensor | None = None,
+        progress: bool = False,
+    ) -> Estimates:
+        """Return the estimates of whole sequences: those of `init` and `advance`, or smoothed ones.
+
+        Args:
+            measured: [B, T, ...]. joints, generators: as in `init`. lengths: frames of each sequence,
+                [B]; past them the last estimate is repeated. progress: whether to show a bar.
+        """
+
+
+ARMS = {"left": LEFT_ARM, "right": RIGHT_ARM}
+"""Indices into `UPPER_BODY` of each arm, in the order of `ARM_JOINTS`."""
+
+_USUAL = ("hand", "head", "neck")
+
+
+def joints_of_arm(side: str, there: Sequence[bool]) -> tuple[str, ...]:
+    """Return hand, head and neck of an arm, and those of its other joints that are there.
+
+    Args:
+        side: "left" or "right". there: whether each of `UPPER_BODY` is.
+
+    >>> joints_of_arm("left", [True, True, False, True, False, False, False, True])
+    ('hand', 'elbow', 'head', 'neck')
+    """
+    rows = zip(ARM_JOINTS, ARMS[side], strict=True)
+    return tuple(joint for joint, row in rows if joint in _USUAL or there[row])
+
+
+def arm_joints(there: Sequence[bool]) -> dict[str, tuple[str, ...]]:
+    """Return `joints_of_arm` of both arms.
+
+    Args:
+        there: whether each of `UPPER_BODY` is.
+    """
+    return {side: joints_of_arm(side, there) for side in ARMS}
+
+
+def generators_of_arms(generator: Generators) -> dict[str, Generators]:
+    """Return a generator for each arm, so that neither's numbers depend on how many the other drew."""
+    return dict(zip(ARMS, _pair(generator), strict=True))
+
+
+def _pair(generator: Generators) -> tuple[Generators, Generators]:
+    if generator is None:
+        return None, None
+    if isinstance(generator, torch.Generator):
+        left, right = torch.randint(2**62, (2,), generator=generator, device=generator.device)
+        device = generator.device
+        return (
+            torch.Generator(device).manual_seed(int(left)),
+            torch.Generator(device).manual_seed(int(right)),
+        )
+    pairs = [_pair(g) for g in generator]
+    lefts = [left for left, _ in pairs if isinstance(left, torch.Generator)]
+    return lefts, [right for _, right in pairs if isinstance(right, torch.Generator)]
+
+
+def first_failure(left: FilterOutput, right: FilterOutput) -> Tensor:
+    """Return the first frame at which either arm degenerated, -1 where none did, [B]."""
+    n_frames = left.mean.shape[1]
+    failures = torch.stack([left.failed_at, right.failed_at])
+    first = failures.where(failures >= 0, n_frames).amin(0)
+    return torch.where((failures >= 0).any(0), first, -1)
+
+
+def in_double(out: FilterOutput) -> FilterOutput:
+    """Return the estimates in float64, in which poses are read out of them."""
+    wide = [v.double() if v is not None and v.is_floating_point() else v for v in out]
+    return FilterOutput(*wide)  # type: ignore[arg-type]
+
+
+def mending_notes(left: FilterOutput, right: FilterOutput) -> tuple[str, ...]:
+    """Return a note about covariances that were mended; nothing where none was."""
+    outputs = [out for out in (left, right) if out.mended is not None and out.jitter is not None]
+    count = sum(int(out.mended.sum()) for out in outputs if out.mended is not None)
+    if not count:
+        return ()
+    most = max(float(out.jitter.max()) for out in outputs if out.jitter is not None)
+    return (
+        f"{count} covariances were not positive definite in rounding and were mended: their "
+        f"variances grew by at most {most:.0e} of themselves",
+    )
+
+
+def require_cov(out: FilterOutput | StepOutput) -> Tensor:
+    """Return the covariances, which the filter was asked for."""
+    if out.cov is None:
+        raise RuntimeError("the filter was run without return_cov=True")
+    return out.cov

@@ -1,0 +1,259 @@
+"""From the estimates of both arms to poses, and their motion made steady.
+
+A filter over windows estimates every frame for itself, so that the noise of keypoints and the change
+from one component to the next show as trembling. `MotionStage` filters (or smooths) what is read out.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from torchpose.camera._projection import (
+    arm_in_body_frame,
+    join_arms,
+    lift,
+    pixel_covariances,
+    project,
+)
+from torchpose.camera._virtual_camera import from_view, view_jacobian
+from torchpose.filters._constant_velocity import ConstantVelocityFilter, ConstantVelocityState
+from torchpose.filters._outputs import FilterOutput
+from torchpose.math._rotations import RotationOrder, euler_to_matrix, matrix_to_euler
+from torchpose.priors._arm_state import STATE_DIM
+from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.skeleton._torso import onto_torso
+from torchpose.upper_body._estimator import Estimates, require_cov
+
+__all__ = [
+    "MotionStage",
+    "MotionState",
+    "ReadOut",
+    "calibration_mode",
+    "in_camera_axes",
+    "on_their_rays",
+    "read_out",
+    "recalibrated",
+]
+
+_LIMB_ENDS = tuple(
+    UPPER_BODY.index(f"{j}_{s}") for j in ("hand", "elbow") for s in ("left", "right")
+)
+_HAND_OF = tuple(
+    UPPER_BODY.index(f"hand_{'right' if 'right' in j else 'left'}") for j in UPPER_BODY
+)
+_WINDOWS = ("causal", "full")
+_NEAREST = 0.1  # metres before the camera, from where a projection means something
+
+
+class ReadOut(NamedTuple):
+    """Poses, and where their bodies are.
+
+    Attributes:
+        joints: in the body's frame [B, T, 8, 3], metres. covs: [B, T, 8, 3, 3].
+        angles: roll, pitch, yaw that turn the body's axes into the camera's [B, T, 3], radians.
+        place: of the body's centre in camera axes [B, T, 3], metres.
+        uv: [B, T, 8, 2], pixels of the prior's camera. uv_covs: [B, T, 8, 2, 2].
+    """
+
+    joints: Tensor
+    covs: Tensor
+    angles: Tensor
+    place: Tensor
+    uv: Tensor
+    uv_covs: Tensor
+
+
+def read_out(estimates: Estimates, matrix: Float[Tensor, "3 3"], order: RotationOrder) -> ReadOut:
+    """Return both arms lifted into the body's frame (BL 5) and joined; what they share is averaged.
+
+    Args:
+        estimates: of both arms. matrix: K of the prior's camera. order: of roll, pitch and yaw.
+    """
+    left, right, view = estimates
+    outputs = left, right
+    means = [out.mean[..., :STATE_DIM] for out in outputs]
+    covs = [require_cov(out)[..., :STATE_DIM, :STATE_DIM] for out in outputs]
+    if left.mean.shape[-1] > STATE_DIM:
+        joints, joint_covs = _on_torso(left, right, matrix, order)
+    else:
+        lifted = [
+            arm_in_body_frame(mean, cov, matrix, order)
+            for mean, cov in zip(means, covs, strict=True)
+        ]
+        joints = join_arms(*(joints for joints, _ in lifted))
+        joint_covs = join_arms(*(cov for _, cov in lifted))
+    camera = (means[0][..., 15:] + means[1][..., 15:]) / 2
+    angles, place = camera[..., :3], camera[..., 3:]
+    uv = join_arms(*(mean[..., :15].unflatten(-1, (5, 3))[..., :2] for mean in means))
+    uv_covs = join_arms(*(pixel_covariances(cov) for cov in covs))
+    if view is not None:
+        back = view.rotation.mT
+        angles = matrix_to_euler(back @ euler_to_matrix(angles, order), order)
+        place = (back @ place[..., None])[..., 0] * view.zoom[..., None]
+        slopes = view_jacobian(uv, view, matrix)
+        uv, uv_covs = from_view(uv, view, matrix), slopes @ uv_covs @ slopes.mT
+    return ReadOut(joints, joint_covs, angles, place, uv, uv_covs)
+
+
+def _on_torso(
+    left: FilterOutput, right: FilterOutput, matrix: Tensor, order: RotationOrder
+) -> tuple[Float[Tensor, "B T 8 3"], Float[Tensor, "B T 8 3 3"]]:
+    """Return joints that were estimated in the axes of the torso, in those of the body.
+
+    The states say where head, neck and shoulders are there (BL 5), which takes no covariances.
+    """
+    lifted, pose, covs = [], [], []
+    for out in (left, right):
+        rotation = euler_to_matrix(out.mean[..., 15:18], order)
+        joints = out.mean[..., :15].unflatten(-1, (5, 3))
+        lifted.append(lift(joints, matrix, rotation, out.mean[..., 18:STATE_DIM]))
+        pose.append(out.mean[..., STATE_DIM:].unflatten(-1, (5, 3)))
+        blocks = require_cov(out)[..., STATE_DIM:, STATE_DIM:].unflatten(-1, (5, 3))
+        blocks = blocks.unflatten(-3, (5, 3))
+        covs.append(blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3))
+    return onto_torso(join_arms(*pose), join_arms(*covs), join_arms(*lifted))
+
+
+def on_their_rays(
+    reading: ReadOut,
+    matrix: Float[Tensor, "3 3"],
+    order: RotationOrder,
+    observed: Bool[Tensor, "B T 8"],
+) -> ReadOut:
+    """Return measured limbs on their rays, and the other joints' pixels where they project to.
+
+    Pixels and the joints in space are two readings of one mixture, linear each, and differ where a
+    camera is unlike those of the prior: on webcams that look up at somebody near, by 40 pixels for a
+    hand. A measured joint keeps its depth and goes to where it was seen; a joint that was inferred is
+    seen where it is in space, if the hand of its arm was measured: without, its pixels know better.
+    Head, neck and shoulders stay, since the body hangs on them.
+
+    Args:
+        reading: of windows. matrix: K of its pixels. order: of its angles. observed: what was measured.
+    """
+    rotation = euler_to_matrix(reading.angles, order)
+    seen = project(reading.joints, matrix, rotation, reading.place)
+    before = seen[..., 2:] > _NEAREST
+    hand = observed[..., list(_HAND_OF)]
+    projected = (hand & ~observed)[..., None] & before
+    uv = torch.where(projected, seen[..., :2], reading.uv)
+    moved = lift(torch.cat([uv, seen[..., 2:]], -1), matrix, rotation, reading.place)
+    limb = torch.zeros(uv.shape[-2], 1, dtype=torch.bool, device=uv.device)
+    limb[list(_LIMB_ENDS)] = True
+    joints = torch.where(limb & observed[..., None] & before, moved, reading.joints)
+    return reading._replace(joints=joints, uv=uv)
+
+
+def in_camera_axes(
+    reading: ReadOut, order: RotationOrder, place: Float[Tensor, "*batch 3"] | None = None
+) -> ReadOut:
+    """Return the joints and their covariances turned into the camera's axes and put where they are.
+
+    Args:
+        reading: in the body's frame. order: of its angles. place: of every body, metres, in place of
+            the estimated one.
+    """
+    rotation = euler_to_matrix(reading.angles, order)[..., None, :, :]
+    at = reading.place if place is None else place.to(reading.place).expand_as(reading.place)
+    joints = (rotation @ reading.joints[..., None])[..., 0] + at[..., None, :]
+    return reading._replace(joints=joints, covs=rotation @ reading.covs @ rotation.mT)
+
+
+def calibration_mode(method: str) -> str:
+    """Return the name under which a prior keeps the calibration of a method over single poses."""
+    return "pose" if method == "mkf-fixed" else method.replace("-", "_")
+
+
+def recalibrated(
+    covs: Float[Tensor, "B T 8 3 3"], noise: Mapping[str, Tensor], mode: str
+) -> Float[Tensor, "B T 8 3 3"]:
+    """Return s C + f I for each joint, as a prior's training persons showed; C if it does not say.
+
+    Args:
+        covs: C, metres squared. noise: of a prior. mode: name of the window, or `calibration_mode`;
+            without a calibration of its own, a method over single poses has that of "pose".
+    """
+    if f"calibration_scale_{mode}" not in noise and mode not in _WINDOWS:
+        mode = "pose"
+    scale = noise.get(f"calibration_scale_{mode}")
+    floor = noise.get(f"calibration_floor_{mode}")
+    if scale is None or floor is None:
+        return covs
+    eye = torch.eye(3, dtype=covs.dtype, device=covs.device)
+    return covs * scale.to(covs)[:, None, None] + floor.to(covs)[:, None, None] * eye
+
+
+class MotionState(NamedTuple):
+    """States of the filters of joints in metres, in pixels, and of the body's placement."""
+
+    joints: ConstantVelocityState
+    pixels: ConstantVelocityState
+    placement: ConstantVelocityState
+
+
+class MotionStage(nn.Module):
+    """Constant-velocity filters over joints, their pixels and the body's placement.
+
+    Covariances stay as they are.
+
+    Args:
+        joint_ratio, pixel_ratio, placement_ratio: q/r of `ConstantVelocityFilter`, 1/s^3. Pixels are
+            known better than joints in space, and a body moves less briskly than its hands.
+        fps: frames per second.
+    """
+
+    def __init__(
+        self, joint_ratio: float, pixel_ratio: float, placement_ratio: float, fps: float
+    ) -> None:
+        super().__init__()
+        self.joints = ConstantVelocityFilter(joint_ratio, fps)
+        self.pixels = ConstantVelocityFilter(pixel_ratio, fps)
+        self.placement = ConstantVelocityFilter(placement_ratio, fps)
+
+    def forward(
+        self, reading: ReadOut, lengths: Int[Tensor, " B"] | None = None, lag: int | None = 0
+    ) -> ReadOut:
+        """Return the steady reading.
+
+        Args:
+            reading: of whole sequences. lengths: [B]; frames past them are not used.
+            lag: number of later frames that each may use; None is all, 0 only filters.
+        """
+        pairs = zip(self._filters(), _numbers(reading), strict=True)
+        if lag == 0:
+            return _with_numbers(reading, *(model(values) for model, values in pairs))
+        return _with_numbers(
+            reading, *(model.smooth(values, lengths, lag) for model, values in pairs)
+        )
+
+    def init(self, reading: ReadOut) -> MotionState:
+        """Return the state before the first frame, that of `reading` [B, T, ...]."""
+        pairs = zip(self._filters(), _numbers(reading), strict=True)
+        return MotionState(*(model.init(values[:, 0]) for model, values in pairs))
+
+    def advance(self, state: MotionState, reading: ReadOut) -> tuple[MotionState, ReadOut]:
+        """Return the next state and some more frames [B, T, ...]: the numbers of `forward` with lag 0."""
+        triples = zip(self._filters(), state, _numbers(reading), strict=True)
+        advanced = [model.advance(own, values) for model, own, values in triples]
+        steady = _with_numbers(reading, *(values for _, values in advanced))
+        return MotionState(*(own for own, _ in advanced)), steady
+
+    def _filters(self) -> tuple[ConstantVelocityFilter, ...]:
+        return self.joints, self.pixels, self.placement
+
+
+def _numbers(reading: ReadOut) -> tuple[Tensor, Tensor, Tensor]:
+    placement = torch.cat([reading.angles, reading.place], -1)
+    return reading.joints.flatten(2), reading.uv.flatten(2), placement
+
+
+def _with_numbers(reading: ReadOut, joints: Tensor, pixels: Tensor, placement: Tensor) -> ReadOut:
+    return reading._replace(
+        joints=joints.unflatten(-1, (8, 3)),
+        uv=pixels.unflatten(-1, (8, 2)),
+        angles=placement[..., :3],
+        place=placement[..., 3:],
+    )

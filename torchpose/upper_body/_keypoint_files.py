@@ -1,0 +1,261 @@
+"""Track files of 2D keypoints: the settings, and one tracker for each camera and frame rate."""
+
+import sys
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from torchpose.camera._choice import resolve_camera
+from torchpose.camera._pinhole import PinholeCamera
+from torchpose.errors import DegenerateFilterWarning, InputError
+from torchpose.io._keypoints import Keypoints
+from torchpose.priors._upper_body import load_prior
+from torchpose.skeleton._joint_sets import canonical_names
+from torchpose.skeleton._upper_body import NECK_KINDS
+from torchpose.upper_body._methods import METHODS, WINDOWS, method_options, options_of_before
+from torchpose.upper_body._pose_track import PoseTrack
+from torchpose.upper_body._tracker import UpperBodyTracker
+
+__all__ = ["KeypointFileTracker", "Prepared", "TrackSettings"]
+
+_KEPT_TRACKERS = 8
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """How recordings are tracked; every setting is the option of `torchpose track` of that name.
+
+    Args:
+        prior: a prior that comes with torchpose, or a .safetensors file.
+        method: window-mixture, mkf-fixed, mkf-sampled, mkf-split, pf-mixture, pf-walk or
+            pf-walk-unscaled; null is window-mixture where the prior brings windows that suit.
+        camera: a TOML file or fx,fy,cx,cy in pixels; without it K or the image size of each file.
+        camera_name: which camera of a file with several.
+        measurement_std: pixels, one number or five: hand, elbow, shoulder, head, neck.
+        smoothing: later frames that an estimate may use, or "full".
+        n_particles: of the pf methods. n_tracks: of mkf-sampled and mkf-split.
+        frame: axes of the 3D poses: camera or body.
+        static_camera: let the body turn in front of a camera that stays where it is.
+        window: deprecated, see `method`. steady: take out the trembling of windows.
+        neck: kind of the keypoints' neck if their names do not tell.
+        nose_as_head: take a nose for the head where there is none.
+        fps: frames per second, if the files do not say or err.
+        max_gap: longest stretch without any keypoint, seconds; null for no bound.
+        seed: of the methods that draw; every recording starts from it.
+    """
+
+    prior: str = "kinect-upper-body"
+    method: str | None = None
+    camera: str | None = None
+    camera_name: str | None = None
+    measurement_std: float | list[float] | None = None
+    smoothing: int | str | None = None
+    n_particles: int | None = None
+    n_tracks: int | None = None
+    frame: str = "camera"
+    static_camera: bool = False
+    window: bool | None = None
+    steady: bool | None = None
+    neck: str | None = None
+    nose_as_head: bool = False
+    fps: float | None = None
+    max_gap: float | None = 5.0
+    seed: int = 0
+
+    def tracker_options(self) -> dict[str, Any]:
+        """Return method, smoothing, frame and the filter's options, as `UpperBodyTracker` takes them.
+
+        Raises:
+            InputError: an option that the method does not have.
+        """
+        method, steady = self.method, self.steady
+        if self.window is not None:
+            print(
+                "torchpose: --window is deprecated; say --method window-mixture or mkf-fixed, or leave "
+                "both out",
+                file=sys.stderr,
+            )
+            method, steady = options_of_before(method, self.window, steady)
+        names = ("smoothing", "frame", "static_camera")
+        options = {name: getattr(self, name) for name in names}
+        options |= {"method": method, "steady": steady}
+        for name in ("n_particles", "n_tracks"):
+            value = getattr(self, name)
+            if value is not None:
+                _check_count(name, value, method)
+                options[name] = value
+        return options
+
+
+class Prepared(NamedTuple):
+    """What a file of keypoints is tracked with.
+
+    Attributes:
+        tracker: for its camera, frame rate and neck. camera: of the tracker.
+        names: of the joints, as the tracker takes them. notes: what was assumed.
+    """
+
+    tracker: UpperBodyTracker
+    camera: PinholeCamera
+    names: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+class _Key(NamedTuple):
+    """What a tracker depends on beside the settings."""
+
+    matrix: tuple[float, ...]
+    size: tuple[int, int] | None
+    fps: float | None
+    neck: str | None
+
+
+class KeypointFileTracker:
+    """Tracks one file of keypoints after the other with one prior.
+
+    Trackers are kept by camera, frame rate and kind of neck, the last eight of them.
+
+    Args:
+        settings: how to track. device: where, such as "cpu", "cuda" or "cuda:1".
+
+    Attributes:
+        settings: as given. prior: that was loaded.
+
+    Raises:
+        InputError, PriorError: settings that suit no recording, a device that cannot be used.
+    """
+
+    def __init__(self, settings: TrackSettings, device: str = "cpu") -> None:
+        self.settings = settings
+        self.prior = load_prior(settings.prior)
+        try:
+            self.device = torch.device(device)
+            torch.empty(0, device=self.device)
+        except (RuntimeError, AssertionError) as error:
+            reason = str(error).splitlines()[0]
+            raise InputError(f"device {device!r} cannot be used: {reason}") from error
+        self._options = {
+            "measurement_std": settings.measurement_std,
+            "max_gap": settings.max_gap,
+            **settings.tracker_options(),
+        }
+        self._trackers: dict[_Key, UpperBodyTracker] = {}
+
+    def check(self) -> None:
+        """Raise what would be raised for every recording, whatever it holds.
+
+        Raises:
+            InputError, PriorError, CameraError: settings that suit no recording.
+        """
+        settings = self.settings
+        UpperBodyTracker(self.prior, self.prior.camera, **self._options, neck=settings.neck)
+        if settings.camera:
+            resolve_camera(settings.camera, settings.camera_name, None, None, settings.camera)
+
+    def prepare(self, keypoints: Keypoints) -> Prepared:
+        """Return the tracker of a file, and what was assumed.
+
+        Raises:
+            TorchposeError: keypoints that the settings do not suit.
+        """
+        settings = self.settings
+        camera, notes = resolve_camera(
+            settings.camera,
+            settings.camera_name,
+            keypoints.image_size,
+            keypoints.K,
+            keypoints.path,
+        )
+        names, more = _joint_names(keypoints, settings.nose_as_head)
+        fps = settings.fps or keypoints.fps
+        if fps is None:
+            rate = self.prior.info.fps or 30
+            more += (f"the keypoint file states no frame rate: {rate:g} fps assumed",)
+        key = _Key(
+            tuple(camera.matrix.flatten().tolist()),
+            camera.image_size,
+            fps,
+            _kind_of_neck(settings.neck, keypoints),
+        )
+        notes += tuple(keypoints.notes) + more
+        return Prepared(self._tracker(key, camera), camera, names, notes)
+
+    def track(
+        self, keypoints: Keypoints, prepared: Prepared | None = None, progress: bool = False
+    ) -> PoseTrack:
+        """Return the poses of a file; a filter that degenerates is told by `failed_at`.
+
+        Args:
+            keypoints: of the file. prepared: what `prepare` returned for it, if that was called.
+            progress: show a bar.
+
+        Raises:
+            TorchposeError: keypoints that the settings do not suit.
+        """
+        tracker, _, names, notes = prepared or self.prepare(keypoints)
+        confidence = keypoints.confidence
+        with warnings.catch_warnings(), torch.no_grad():
+            warnings.simplefilter("ignore", DegenerateFilterWarning)
+            track = tracker(
+                keypoints.keypoints[None],
+                None if confidence is None else confidence[None].to(self.device),
+                names,
+                generator=torch.Generator(self.device).manual_seed(self.settings.seed),
+                progress=progress,
+            )
+        return replace(track, notes=notes + track.notes)
+
+    @property
+    def camera_file(self) -> Path | None:
+        """The file of the camera that was given, if it is a file."""
+        given = self.settings.camera
+        return Path(given) if given and Path(given).is_file() else None
+
+    def _tracker(self, key: _Key, camera: PinholeCamera) -> UpperBodyTracker:
+        if key not in self._trackers:
+            while len(self._trackers) >= _KEPT_TRACKERS:
+                del self._trackers[next(iter(self._trackers))]
+            tracker = UpperBodyTracker(
+                self.prior, camera, fps=key.fps, neck=key.neck, **self._options
+            )
+            self._trackers[key] = tracker.to(self.device)
+        return self._trackers[key]
+
+
+def _check_count(name: str, value: int, method: str | None) -> None:
+    """Raise `InputError` unless the method has such a number, and it is positive."""
+    option = f"--{name.replace('_', '-')}"
+    having = [other for other in METHODS if name in method_options(other)]
+    if method is None or (method in METHODS and method not in having):
+        raise InputError(
+            f"{option} does not apply to --method {method or WINDOWS}; it is of {', '.join(having)}"
+        )
+    if value < 1:
+        raise InputError(f"{option} must be at least 1, got {value}")
+
+
+def _joint_names(
+    keypoints: Keypoints, nose_as_head: bool
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return names for the tracker, with the nose as head if asked for, and notes."""
+    canonical = canonical_names(keypoints.names)
+    if "head" in canonical:
+        return keypoints.names, ()
+    if not nose_as_head:
+        hint = ("there is no head among the keypoints; --nose-as-head true takes the nose for it",)
+        return keypoints.names, hint if "nose" in canonical else ()
+    if "nose" not in canonical:
+        raise InputError(f"--nose-as-head needs a nose, got {', '.join(keypoints.names)}")
+    names = tuple(
+        "head" if c == "nose" else name for c, name in zip(canonical, keypoints.names, strict=True)
+    )
+    return names, ("the nose stands for the head",)
+
+
+def _kind_of_neck(given: str | None, keypoints: Keypoints) -> str | None:
+    if given is not None and given not in NECK_KINDS:
+        raise InputError(f"--neck must be one of {', '.join(NECK_KINDS)}, got {given!r}")
+    return given or keypoints.neck

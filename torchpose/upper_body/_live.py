@@ -1,0 +1,77 @@
+"""Live streams: what is known between two frames, and the poses of one frame."""
+
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from torchpose.upper_body._fusion import MotionState
+from torchpose.upper_body._measurements import Picked
+from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
+
+__all__ = ["LivePose", "StreamState", "live_pose", "unseen_frames"]
+
+
+class StreamState(NamedTuple):
+    """What `UpperBodyTracker.step` needs to know of the frames before.
+
+    Attributes:
+        estimator: state of the method's estimator.
+        motion: state of the motion stage; None before the first frame, and where there is no stage.
+        unseen: number of frames since any joint was measured, [B].
+        n_keypoints: J. picked: where the eight joints are among them, and what was assumed.
+    """
+
+    estimator: Any
+    motion: MotionState | None
+    unseen: Int[Tensor, " B"]
+    n_keypoints: int
+    picked: Picked
+
+
+class LivePose(NamedTuple):
+    """The poses of one frame of B streams, under the names that `PoseTrack` has for all frames.
+
+    Attributes:
+        joints2d: [B, 8, 2], pixels of the camera; joints in the order of `UPPER_BODY`.
+        joints3d: [B, 8, 3], metres, in the tracker's frame.
+        covariance2d: [B, 8, 2, 2]. covariance3d: [B, 8, 3, 3].
+        observed: [B, 8], True where the joint was measured in this frame.
+        log_evidence: of the left and the right arm, [B, 2].
+        effective_sample_size: of the particles or tracks of each arm, [B, 2]; see `PoseTrack`.
+        unseen: seconds since any joint was measured, [B]; 0 where one is.
+        failed: [B], True where the filter degenerated: poses are NaN until the stream is begun anew.
+    """
+
+    joints2d: Tensor
+    joints3d: Tensor
+    covariance2d: Tensor
+    covariance3d: Tensor
+    observed: Tensor
+    log_evidence: Tensor
+    effective_sample_size: Tensor
+    unseen: Tensor
+    failed: Tensor
+
+
+def live_pose(track: PoseTrack, unseen: Tensor) -> LivePose:
+    """Return the poses of a track of one frame.
+
+    Args:
+        track: [B, 1, ...]. unseen: seconds since any joint was measured, [B].
+    """
+    fields = {name: getattr(track, name)[:, 0] for name in FRAME_FIELDS}
+    return LivePose(**fields, unseen=unseen, failed=track.failed)
+
+
+def unseen_frames(before: Int[Tensor, " B"], seen: Bool[Tensor, "B T"]) -> Int[Tensor, " B"]:
+    """Return the number of frames since anything was seen, after T more.
+
+    Args:
+        before: that number before them. seen: whether anything was seen in each.
+    """
+    n_frames = seen.shape[1]
+    frames = torch.arange(1, n_frames + 1, device=seen.device)
+    last = torch.where(seen, frames, torch.zeros_like(frames)).amax(1)
+    return torch.where(last > 0, n_frames - last, before + n_frames)

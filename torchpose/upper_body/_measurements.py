@@ -1,0 +1,375 @@
+"""From the keypoints that a caller has to the measured joints that estimators take."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchpose.camera._pinhole import PinholeCamera
+from torchpose.camera._projection import map_pixel_covariance, map_pixels
+from torchpose.errors import InputError, check_covariance, check_finite, check_floating, check_shape
+from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.skeleton._torso import KINECT_NECK, NeckFraction
+from torchpose.skeleton._upper_body import ARM_JOINTS, upper_body_indices
+
+__all__ = [
+    "MeasuredJoints",
+    "Picked",
+    "append_blocks",
+    "arm_measurements",
+    "check_gaps",
+    "in_prior_pixels",
+    "joint_covariances",
+    "known_covariances",
+    "measure_joints",
+    "pick_joints",
+    "pixel_indices",
+    "pixels_per_metre",
+    "place_measured_neck",
+]
+
+_DEFAULT_STD = 3.0  # pixels
+_LEAST_CONFIDENCE = 0.05
+_LEFT, _HEAD, _NECK, _RIGHT = (
+    UPPER_BODY.index(name) for name in ("shoulder_left", "head", "neck", "shoulder_right")
+)
+
+
+class MeasuredJoints(NamedTuple):
+    """Measurements of the eight joints of `UPPER_BODY`.
+
+    Attributes:
+        uv: [B, T, 8, 2], zero where missing. mask: [B, T, 8], True where measured.
+        cov: R of each joint, [8, 2, 2], or [B, T, 8, 2, 2] if it changes.
+    """
+
+    uv: Tensor
+    mask: Tensor
+    cov: Tensor
+
+
+class Picked(NamedTuple):
+    """Where the eight joints are among the keypoints.
+
+    Attributes:
+        indices: of each, -1 if absent; with `middle`, that of the neck is the keypoint that lies in
+            the middle of the shoulders.
+        middle: whether the neck is to be put between that, or else the middle of the measured
+            shoulders, and the head (`place_measured_neck`).
+        notes: what was assumed.
+    """
+
+    indices: tuple[int, ...]
+    middle: bool
+    notes: tuple[str, ...]
+
+
+def pick_joints(
+    n_joints: int,
+    names: Sequence[str] | None,
+    neck: str | None,
+    wanted_neck: str | None,
+    wanted_hand: str | None,
+) -> Picked:
+    """Find the eight joints among the keypoints.
+
+    Args:
+        n_joints: number of keypoints. names: of them, None if they are the eight in order.
+        neck: kind of neck of the keypoints where the names do not tell; one of another kind than
+            `wanted_neck` is not measured as it is. wanted_neck, wanted_hand: the prior's kinds.
+
+    Raises:
+        InputError: names missing, or not as many as keypoints. SkeletonError: unknown names.
+    """
+    if names is None:
+        if n_joints != len(UPPER_BODY):
+            raise InputError(
+                f"names may be left out only for the {len(UPPER_BODY)} joints "
+                f"{', '.join(UPPER_BODY)}; got {n_joints} keypoints without names"
+            )
+        names = UPPER_BODY
+    if len(names) != n_joints:
+        raise InputError(
+            f"names must name each of the {n_joints} keypoints, got {len(names)} names"
+        )
+    found = upper_body_indices(names)
+    indices = list(found.indices)
+    kind = neck or found.neck
+    middle, notes = False, []
+    other = indices[_NECK] >= 0 and None not in (kind, wanted_neck) and kind != wanted_neck
+    if other or indices[_NECK] < 0:
+        indices[_NECK] = indices[_NECK] if kind == "mid-shoulder" else -1
+        shoulders = min(indices[_LEFT], indices[_RIGHT]) >= 0
+        middle = (
+            wanted_neck == "neck" and indices[_HEAD] >= 0 and (shoulders or indices[_NECK] >= 0)
+        )
+        if not middle:
+            indices[_NECK] = -1
+        notes += _neck_notes(kind if other else None, wanted_neck, middle)
+    if found.hand is not None and wanted_hand is not None and found.hand != wanted_hand:
+        notes.append(f"the keypoints' {found.hand}s stand for the prior's {wanted_hand}s")
+    return Picked(tuple(indices), middle, tuple(notes))
+
+
+def _neck_notes(kind: str | None, wanted: str | None, middle: bool) -> list[str]:
+    """Return what is done about a neck of another kind, or about one that is missing (None)."""
+    if middle:
+        own = (
+            "there is no neck among the keypoints"
+            if kind is None
+            else (f"the keypoints' neck ({kind}) is not the prior's ({wanted})")
+        )
+        share = f"{100 * KINECT_NECK.fraction:.0f} %"
+        return [f"{own}: put {share} of the way from the middle of the shoulders to the head"]
+    if kind is None:
+        return []
+    return [f"the keypoints' neck ({kind}) is not the prior's ({wanted}): not measured"]
+
+
+def pixels_per_metre(prior: UpperBodyPrior) -> float:
+    """Return the scale of the prior's camera at the neck of its mean pose."""
+    depth = float(prior.left.moments()[0][14] + prior.right.moments()[0][14]) / 2
+    return math.sqrt(prior.info.fx * prior.info.fy) / depth
+
+
+def place_measured_neck(
+    measured: MeasuredJoints, pixels_per_metre: float, neck: NeckFraction = KINECT_NECK
+) -> MeasuredJoints:
+    """Put the neck between the middle of the shoulders and the head.
+
+    n = m + f (h - m),   R_n = (1 - f)^2 R_m + f^2 R_h + s^2 I
+
+    Where head or middle is missing, so is the neck. Its errors go with those of the head, which the
+    filter does not know.
+
+    Args:
+        measured: whose neck is a keypoint in the middle of the shoulders; where that is missing, the
+            middle of two measured shoulders does. pixels_per_metre: at the body's usual distance.
+        neck: f and s.
+    """
+    uv, mask, cov = (x.clone() for x in measured)
+    both = mask[..., _LEFT] & mask[..., _RIGHT] & ~mask[..., _NECK]
+    middle = torch.where(
+        both[..., None], (uv[..., _LEFT, :] + uv[..., _RIGHT, :]) / 2, uv[..., _NECK, :]
+    )
+    known = (mask[..., _NECK] | both) & mask[..., _HEAD]
+    place = middle + neck.fraction * (uv[..., _HEAD, :] - middle)
+    uv[..., _NECK, :] = torch.where(known[..., None], place, torch.zeros_like(place))
+    mask[..., _NECK] = known
+    spread = (neck.spread * pixels_per_metre) ** 2 * torch.eye(
+        2, dtype=cov.dtype, device=cov.device
+    )
+    share = neck.fraction
+    of_middle = cov[..., _NECK, :, :]
+    if cov.ndim > 3:
+        of_shoulders = (cov[..., _LEFT, :, :] + cov[..., _RIGHT, :, :]) / 4
+        of_middle = torch.where(both[..., None, None], of_shoulders, of_middle)
+    cov[..., _NECK, :, :] = (1 - share) ** 2 * of_middle + share**2 * cov[..., _HEAD, :, :] + spread
+    return MeasuredJoints(uv, mask, cov)
+
+
+def known_covariances(
+    covariance: Float[Tensor, "B T J 2 2"], keypoints: Float[Tensor, "B T J 2"]
+) -> Float[Tensor, "B T J 2 2"]:
+    """Return the covariances of the keypoints that are there, and the identity for the others."""
+    check_shape("covariance", covariance, [*keypoints.shape, 2])
+    eye = torch.eye(2).to(keypoints)
+    there = keypoints.isfinite().all(-1)[..., None, None]
+    covariance = torch.where(there, covariance.to(keypoints), eye)
+    check_covariance("covariance", covariance)
+    return covariance
+
+
+def measure_joints(
+    keypoints: Float[Tensor, "B T J 2"],
+    confidence: Tensor | None,
+    mask: Tensor | None,
+    indices: Sequence[int],
+    cov: Float[Tensor, "8 2 2"],
+    own_cov: Float[Tensor, "B T J 2 2"] | None = None,
+) -> MeasuredJoints:
+    """Return the eight joints among the keypoints, in the pixels of the keypoints.
+
+    Args:
+        keypoints: NaN where missing. confidence: [B, T, J] in 0..1, or None: at 0 or NaN a keypoint is
+            missing, and between, R is divided by it. mask: [B, T, J], False = ignore, or None.
+        indices: of the eight joints among the keypoints, -1 if absent. cov: R at full confidence.
+        own_cov: R of every single keypoint in place of that.
+
+    Raises:
+        InputError: infinite values, or the confidence of a measured keypoint is outside 0..1.
+        ShapeError: confidence or mask do not fit the keypoints.
+    """
+    check_finite("keypoints", keypoints, ~keypoints.isnan(), "missing keypoints are NaN")
+    measured = torch.isfinite(keypoints).all(-1)
+    if mask is not None:
+        check_shape("mask", mask, list(measured.shape))
+        measured = measured & mask.to(measured.device, torch.bool)
+    if confidence is not None:
+        check_floating("confidence", confidence)
+        check_shape("confidence", confidence, list(measured.shape))
+        confidence = confidence.to(measured.device)
+        _check_confidence(confidence, measured)
+        measured = measured & (confidence > 0)
+    picked = [max(i, 0) for i in indices]
+    present = torch.tensor([i >= 0 for i in indices], device=measured.device)
+    measured = measured[:, :, picked] & present
+    uv = torch.where(measured[..., None], keypoints[:, :, picked], keypoints.new_zeros(()))
+    if own_cov is not None:
+        cov = torch.where(measured[..., None, None], own_cov.to(cov)[:, :, picked], cov)
+    if confidence is not None:
+        weight = confidence.to(uv)[:, :, picked].nan_to_num(1.0).clamp(_LEAST_CONFIDENCE, 1.0)
+        weight = torch.where(measured, weight, torch.ones_like(weight))
+        if bool((weight < 1).any()):
+            cov = cov / weight[..., None, None]
+    return MeasuredJoints(uv, measured, cov)
+
+
+def in_prior_pixels(
+    keypoints: Float[Tensor, "B T J 2"],
+    confidence: Float[Tensor, "B T J"] | None,
+    mask: Bool[Tensor, "B T J"] | None,
+    covariance: Float[Tensor, "B T J 2 2"] | None,
+    picked: Picked,
+    prior: UpperBodyPrior,
+    camera: PinholeCamera,
+    measurement_cov: Float[Tensor, "8 2 2"],
+) -> MeasuredJoints:
+    """Return the eight joints among the keypoints, in the pixels of the prior's camera.
+
+    Args:
+        keypoints, confidence, mask, covariance: as in `UpperBodyTracker.forward`.
+        picked: where the joints are among them. prior, camera: whose pixels are wanted and given.
+        measurement_cov: R where `covariance` does not say, in the prior's pixels.
+
+    Raises:
+        ShapeError, InputError: as `measure_joints`. CovarianceError: a covariance that is none.
+    """
+    own, wanted = camera.matrix.to(keypoints), prior.info.matrix.to(keypoints)
+    if covariance is not None:
+        covariance = known_covariances(covariance, keypoints)
+        covariance = map_pixel_covariance(covariance, own, wanted)
+    measured = measure_joints(
+        keypoints, confidence, mask, picked.indices, measurement_cov, covariance
+    )
+    measured = measured._replace(uv=map_pixels(measured.uv, own, wanted))
+    if not picked.middle:
+        return measured
+    return place_measured_neck(measured, pixels_per_metre(prior))
+
+
+def _check_confidence(confidence: Tensor, measured: Bool[Tensor, "B T J"]) -> None:
+    """Refuse a confidence outside [0, 1] of a keypoint that is there; NaN is missing."""
+    outside = measured & ((confidence < 0) | (confidence > 1))
+    if bool(outside.any()):
+        b, t, j = outside.nonzero()[0].tolist()
+        raise InputError(
+            f"confidence must lie in [0, 1] (0 or NaN is missing), got {float(confidence[b, t, j]):g} "
+            f"of keypoint {j} in frame {t} of sequence {b}; scale scores of another range to it"
+        )
+
+
+def check_gaps(
+    measured: Bool[Tensor, "B T 8"],
+    lengths: Int[Tensor, " B"] | None,
+    max_gap: float | None,
+    fps: float,
+) -> None:
+    """Refuse sequences in which nothing at all is measured, wholly or for too long.
+
+    Args:
+        measured: True where a joint is measured. lengths: frames of each sequence, or None.
+        max_gap: seconds over which nothing may be measured, None for no bound. fps: frame rate.
+
+    Raises:
+        InputError: the sequence and the frames are named.
+    """
+    batch, n_frames, _ = measured.shape
+    frames = torch.arange(n_frames, device=measured.device).expand(batch, -1)
+    inside = torch.ones_like(frames, dtype=torch.bool)
+    if lengths is not None:
+        check_shape("lengths", lengths, [batch])
+        inside = frames < lengths.to(measured.device)[:, None]
+    seen = measured.any(-1) & inside
+    empty = torch.nonzero(~seen.any(1)).flatten().tolist()
+    if empty:
+        raise InputError(
+            f"no joint is measured in any frame of sequence {empty[0]} "
+            f"({len(empty)} such sequences); expected keypoints of some of {', '.join(UPPER_BODY)}"
+        )
+    if max_gap is None:
+        return
+    last_seen = torch.where(seen, frames, torch.full_like(frames, -1)).cummax(1).values
+    gap = torch.where(inside, frames - last_seen, torch.zeros_like(frames))
+    if bool((gap > max_gap * fps).any()):
+        b, t = (int(i) for i in torch.nonzero(gap == gap.max())[0])
+        raise InputError(
+            f"nothing is measured for {int(gap[b, t])} frames, from frame "
+            f"{int(last_seen[b, t]) + 1} of sequence {b} on, longer than max_gap = {max_gap} s; "
+            "cut the recording there, or raise max_gap to have the prior fill it"
+        )
+
+
+def joint_covariances(
+    prior: UpperBodyPrior,
+    std: float | Sequence[float] | Tensor | None,
+    matrix: Float[Tensor, "3 3"],
+) -> Float[Tensor, "8 2 2"]:
+    """Return R of each of the eight joints in the prior's pixels.
+
+    Args:
+        prior: whose pixels are meant, and whose noise is taken where none is stated.
+        std: of a keypoint, pixels of the camera: None, one number, or one for each of `ARM_JOINTS`.
+        matrix: K of that camera.
+
+    Raises:
+        ShapeError, InputError: another number of deviations, or some that are not positive.
+    """
+    learnt = prior.noise.get("measurement_std") if std is None else None
+    if learnt is None:
+        given = torch.as_tensor(_DEFAULT_STD if std is None else std, dtype=torch.float64)
+    else:
+        given = learnt.double()
+    by_joint = given.expand(5) if given.ndim == 0 else given
+    check_shape("measurement_std", by_joint, [5])
+    check_finite("measurement_std", by_joint)
+    if bool((by_joint <= 0).any()):
+        raise InputError(f"measurement_std must be positive, got {by_joint.tolist()}")
+    cov = torch.diag_embed(by_joint.square()[:, None].expand(5, 2))
+    if learnt is None:
+        cov = map_pixel_covariance(cov, matrix, prior.info.matrix)
+    return cov[[ARM_JOINTS.index(joint.split("_")[0]) for joint in UPPER_BODY]]
+
+
+def pixel_indices(joints: Sequence[str]) -> list[int]:
+    """Return the state dimensions of u and v of these joints of an arm."""
+    return [3 * ARM_JOINTS.index(joint) + axis for joint in joints for axis in (0, 1)]
+
+
+def arm_measurements(
+    arm: tuple[int, ...], joints: tuple[str, ...], measured: MeasuredJoints
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return z, mask and R of an arm's joints; R is [Z, Z], or [B, T, Z, Z] if it changes."""
+    rows = [arm[ARM_JOINTS.index(joint)] for joint in joints]
+    z = measured.uv[:, :, rows].flatten(-2)
+    mask = measured.mask[:, :, rows].repeat_interleave(2, -1)
+    return z, mask, _block_diagonal(measured.cov[..., rows, :, :])
+
+
+def _block_diagonal(blocks: Float[Tensor, "*batch N 2 2"]) -> Float[Tensor, "*batch Z Z"]:
+    n = blocks.shape[-3]
+    eye = torch.eye(n, dtype=blocks.dtype, device=blocks.device)
+    return torch.einsum("...nij,nm->...nimj", blocks, eye).flatten(-2).flatten(-3, -2)
+
+
+def append_blocks(cov: Float[Tensor, "*batch Z Z"], block: Tensor, count: int) -> Tensor:
+    """Return R with `count` more diagonal blocks."""
+    blocks = torch.block_diag(*[block] * count)
+    n, extra = cov.shape[-1], blocks.shape[-1]
+    whole = cov.new_zeros(*cov.shape[:-2], n + extra, n + extra)
+    whole[..., :n, :n], whole[..., n:, n:] = cov, blocks
+    return whole

@@ -1,0 +1,248 @@
+"""The methods of the upper-body tracker: one table of estimators by name, and which of them runs."""
+
+import inspect
+import warnings
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from torchpose.errors import InputError, refuse_unused
+from torchpose.filters._fixed_tracks import FixedTrackFilter
+from torchpose.filters._mkf import MixtureKalmanFilter
+from torchpose.filters._particle import BootstrapParticleFilter
+from torchpose.filters._sampled_tracks import SampledTrackFilter
+from torchpose.filters._split_tracks import SplitTrackFilter
+from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.upper_body._estimator import Estimator
+from torchpose.upper_body._single_poses import PoseFilter, ProcessNoise
+from torchpose.upper_body._windows import WindowMixture, suitable_window
+
+__all__ = [
+    "METHODS",
+    "SINGLE_POSES",
+    "WINDOWS",
+    "Chosen",
+    "Method",
+    "check_options",
+    "choose_method",
+    "method_options",
+    "noise_options",
+    "options_of_before",
+    "process_cov",
+    "register_method",
+]
+
+WINDOWS = "window-mixture"
+"""The mixture over short windows of motion, in each of which every frame is estimated anew."""
+
+SINGLE_POSES = "mkf-fixed"
+"""The bank of Kalman filters over single poses."""
+
+Method = type[Estimator] | PoseFilter
+"""What makes an estimator from a `TrackerModel` and, by name, the options in its signature."""
+
+
+def _kalman_bank(
+    kind: type[MixtureKalmanFilter], factor: float, brought: tuple[str, ...]
+) -> PoseFilter:
+    fixed = kind is FixedTrackFilter
+    settings = {"medians": ()} if fixed else {}
+    return PoseFilter(kind, settings, noise=ProcessNoise(factor), brought=brought, smooths=fixed)
+
+
+def _particles(proposal: str, noise: ProcessNoise) -> PoseFilter:
+    settings, defaults = {"proposal": proposal}, {"start": "measured"}
+    return PoseFilter(BootstrapParticleFilter, settings, defaults, noise=noise, particles=True)
+
+
+METHODS: dict[str, Method] = {
+    WINDOWS: WindowMixture,
+    SINGLE_POSES: _kalman_bank(FixedTrackFilter, 100.0, ("transition", "gamma", "uniform_weight")),
+    "mkf-sampled": _kalman_bank(SampledTrackFilter, 10.0, ("transition", "gamma")),
+    "mkf-split": _kalman_bank(SplitTrackFilter, 10.0, ("transition", "gamma")),
+    "pf-mixture": _particles("mixture", ProcessNoise(10.0, tuned=False)),
+    "pf-walk": _particles("random-walk", ProcessNoise(1.0, walks=True)),
+    "pf-walk-unscaled": _particles("random-walk-unscaled", ProcessNoise(1.0, walks=True)),
+}
+"""Every method by its name: `UpperBodyTracker`, the command line and the benchmarks take them from here."""
+
+# Without a method these options mean single poses, as they did before windows had a name.
+_POSE_OPTIONS = {"transition", "gamma", "subspace", "initial_cov", "process_cov"}
+
+
+def register_method(name: str, method: Method) -> None:
+    """Add a method, which `UpperBodyTracker`, the command line and the benchmarks then know.
+
+    Args:
+        name: a new one. method: a subclass of `Estimator`, or a filter over single poses as a
+            `PoseFilter`; its options are those of its signature.
+
+    Raises:
+        InputError: there is a method of that name.
+    """
+    if name in METHODS:
+        raise InputError(f"method {name!r} exists; take another name")
+    METHODS[name] = method
+
+
+def method_options(method: str) -> tuple[str, ...]:
+    """Return the options of a method: the arguments of what makes its estimator.
+
+    Args:
+        method: one of `METHODS`.
+
+    Raises:
+        InputError: no such method.
+
+    >>> method_options("window-mixture")
+    ('likelihood_power', 'dtype')
+    >>> "n_tracks" in method_options("mkf-split"), "n_tracks" in method_options("mkf-fixed")
+    (True, False)
+    """
+    made_by = _find(method)
+    if isinstance(made_by, PoseFilter):
+        return made_by.options
+    return tuple(inspect.signature(made_by).parameters)[1:]  # without the model
+
+
+def process_cov(prior: UpperBodyPrior, side: str, method: str) -> Tensor:
+    """Return Q of a method, per frame at the prior's own rate; see `ProcessNoise`.
+
+    Args:
+        prior: whose noise is taken. side: "left" or "right". method: over single poses.
+
+    Raises:
+        InputError: no such method, or one that has no process noise.
+    """
+    return _find_filter(method).noise.cov(prior, side)
+
+
+def noise_options(
+    prior: UpperBodyPrior,
+    side: str,
+    method: str,
+    fps: float | None,
+    options: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Return the caller's options, and for the others the noise and transition of the prior.
+
+    Args:
+        method: over single poses. prior, side, fps, options: as in `PoseFilter.arguments`.
+
+    Raises:
+        InputError: as `process_cov`, or process_cov for the transition "ou", which has no Q.
+    """
+    return _find_filter(method).arguments(prior, side, fps, options)
+
+
+def check_options(method: str, options: Iterable[str]) -> None:
+    """Refuse options that a method does not use, and say which method does.
+
+    Raises:
+        InputError: such an option.
+    """
+    said = f"does not apply to method {method!r}"
+    refuse_unused(options, said, method, METHODS, method_options)
+
+
+class Chosen(NamedTuple):
+    """The estimator that runs, and what is to be said about the choice."""
+
+    method: str
+    notes: tuple[str, ...]
+
+
+def choose_method(
+    prior: UpperBodyPrior,
+    method: str | None,
+    smoothing: int | str | None,
+    fps: float | None,
+    options: Iterable[str],
+) -> Chosen:
+    """Return the method that was named, else windows where the prior's suit, else single poses.
+
+    Args:
+        prior: with its windows. method: one of `METHODS`, or None. smoothing, fps: as in
+            `suitable_window`. options: names of those that were given to the filter.
+
+    Raises:
+        InputError: no such method, one that cannot do what was asked for, an option that it does not
+            use, or a smoothing that is none.
+    """
+    wrong_lag = isinstance(smoothing, int) and smoothing < 0
+    if wrong_lag or (isinstance(smoothing, str) and smoothing != "full"):
+        raise InputError(f"smoothing must be None, a number of frames or 'full', got {smoothing!r}")
+    chosen = _default(prior, smoothing, fps, options) if method is None else Chosen(method, ())
+    if smoothing is not None and not _find(chosen.method).smooths:
+        able = [repr(name) for name, other in METHODS.items() if other.smooths]
+        raise InputError(f"smoothing needs method {' or '.join(able)}, got {chosen.method!r}")
+    if method == WINDOWS and suitable_window(prior, smoothing, fps or 30.0) is None:
+        raise InputError(
+            f"method {WINDOWS!r} cannot be used: {_missing(prior, smoothing, fps)}; use method "
+            f"{SINGLE_POSES!r}"
+        )
+    check_options(chosen.method, options)
+    return chosen
+
+
+def _find(method: str) -> Method:
+    if method not in METHODS:
+        raise InputError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    return METHODS[method]
+
+
+def _find_filter(method: str) -> PoseFilter:
+    found = _find(method)
+    if not isinstance(found, PoseFilter):
+        raise InputError(f"method {method!r} has no process noise: it follows no single poses")
+    return found
+
+
+def _default(
+    prior: UpperBodyPrior, smoothing: int | str | None, fps: float | None, options: Iterable[str]
+) -> Chosen:
+    """Return the choice where no method was named."""
+    poses = sorted(_POSE_OPTIONS & set(options))
+    if poses:
+        warnings.warn(
+            f"{', '.join(poses)} without a method is deprecated: pass method={SINGLE_POSES!r}, which "
+            "is what runs",
+            DeprecationWarning,
+            stacklevel=4,
+        )
+        return Chosen(SINGLE_POSES, ())
+    if suitable_window(prior, smoothing, fps or 30.0) is not None:
+        return Chosen(WINDOWS, ())
+    if not prior.windows:
+        return Chosen(SINGLE_POSES, ())
+    reason = _missing(prior, smoothing, fps)
+    return Chosen(SINGLE_POSES, (f"single poses are tracked ({SINGLE_POSES}), since {reason}",))
+
+
+def _missing(prior: UpperBodyPrior, smoothing: int | str | None, fps: float | None) -> str:
+    """Return why the prior has no window that suits."""
+    name = "causal" if smoothing is None else "full"
+    if name not in prior.windows:
+        use = "filtering" if smoothing is None else "smoothing"
+        return f"the prior brings no mixtures over windows for {use}"
+    ahead = prior.windows[name].layout.at_rate(fps or 30.0).ahead
+    return f"the prior's windows look {ahead} frames ahead, and smoothing may use {smoothing}"
+
+
+def options_of_before(
+    method: str | None, window: bool, steady: bool | None
+) -> tuple[str | None, bool | None]:
+    """Return the method and `steady` that the former argument `window` stands for.
+
+    "mkf-fixed" stood for both, windows unless `window` was False; other methods took `window` and
+    `steady` and did without.
+
+    Raises:
+        InputError: "window-mixture" with window=False.
+    """
+    if method == WINDOWS and not window:
+        raise InputError(f"method {WINDOWS!r} and window=False contradict each other")
+    if method in (None, SINGLE_POSES):
+        method = None if window else SINGLE_POSES
+    return method, None if steady else steady

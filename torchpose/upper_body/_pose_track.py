@@ -1,0 +1,207 @@
+"""The result of tracking: poses with covariances, and their file."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpose._core.estimates import check_estimates, check_number_range, frame_facts, to_tensor
+from torchpose._core.files import write_npz
+from torchpose._core.reading import check_arrays, one_text, read_npz, texts
+from torchpose.camera._projection import check_intrinsics
+from torchpose.errors import CameraError, FileFormatError
+from torchpose.skeleton._joint_sets import UPPER_BODY
+
+__all__ = ["FRAME_FIELDS", "PoseTrack"]
+
+FRAME_FIELDS = (
+    "joints2d",
+    "joints3d",
+    "covariance2d",
+    "covariance3d",
+    "observed",
+    "log_evidence",
+    "effective_sample_size",
+)
+"""What a `PoseTrack` holds for every frame."""
+
+_ADDED = "effective_sample_size"  # files of older releases have none
+_FIELDS = {
+    "joints2d": ("f", "T 8 2"),
+    "joints3d": ("f", "T 8 3"),
+    "covariance2d": ("f", "T 8 2 2"),
+    "covariance3d": ("f", "T 8 3 3"),
+    "observed": ("b", "T 8"),
+    "log_evidence_arms": ("f", "T 2"),
+    _ADDED: ("f", "T 2"),
+    "lengths": ("i", ""),
+    "failed_at": ("i", ""),
+    "K": ("f", "3 3"),
+}  # kinds and sizes in a file, of several sequences behind that of the batch
+
+
+@dataclass
+class PoseTrack:
+    """Upper-body poses of B sequences of T frames; J = 8 joints in the order of `UPPER_BODY`.
+
+    Past the length of a sequence its last pose is repeated.
+
+    Attributes:
+        joints2d: [B, T, 8, 2], pixels of the input's camera.
+        joints3d: [B, T, 8, 3], metres, in `frame`.
+        covariance2d: [B, T, 8, 2, 2], pixels squared. covariance3d: [B, T, 8, 3, 3], metres squared.
+        observed: [B, T, 8], True where the joint was measured, False where it was inferred.
+        log_evidence: increments log p(z_t | z_1:t-1) of the left and of the right arm, [B, T, 2].
+            Both arms contain head and neck, so their sum is a score and not an evidence.
+        names: of the joints. fps: frames per second, or None. lengths: [B].
+        matrix: camera matrix K [3, 3] of the input.
+        frame: "camera" (x right, y down, z forward) or "body" (that of the prior's recordings).
+        failed_at: [B], the first frame that is NaN because the filter degenerated, -1 if none.
+        notes: what was assumed about camera, neck and hands, and whether covariances had to be
+            mended, in plain words.
+        method: the estimator that ran, one of `torchpose.upper_body.METHODS`; "unknown" in files of
+            older releases.
+        first_frame: of the video or recording, that of the first pose.
+        effective_sample_size: 1 / sum_j w_j^2 (BL 25) of the particles or tracks of the left and of the
+            right arm, [B, T, 2]; NaN in files of older releases. One particle that has all the weight
+            is no estimate; one track that has it is a Gaussian, sure of its component.
+    """
+
+    joints2d: Tensor
+    joints3d: Tensor
+    covariance2d: Tensor
+    covariance3d: Tensor
+    observed: Tensor
+    log_evidence: Tensor
+    lengths: Tensor
+    matrix: Tensor
+    failed_at: Tensor
+    names: tuple[str, ...] = UPPER_BODY
+    fps: float | None = None
+    frame: str = "camera"
+    notes: tuple[str, ...] = field(default_factory=tuple)
+    first_frame: int = 0
+    method: str = "unknown"
+    effective_sample_size: Tensor = field(default_factory=lambda: torch.empty(0))
+
+    def __post_init__(self) -> None:
+        if self.effective_sample_size.numel() == 0:
+            self.effective_sample_size = torch.full_like(self.log_evidence, torch.nan)
+
+    def __len__(self) -> int:
+        return self.joints3d.shape[0]
+
+    @property
+    def failed(self) -> Tensor:
+        """Whether the filter degenerated, [B], as `LivePose.failed`."""
+        return self.failed_at >= 0
+
+    def sequence(self, index: int) -> "PoseTrack":
+        """Return one sequence, cut to its own length, as a batch of one."""
+        n = int(self.lengths[index])
+        rows = slice(index, index + 1) if index != -1 else slice(-1, None)
+        cut: dict[str, Any] = {name: getattr(self, name)[rows, :n] for name in FRAME_FIELDS}
+        cut |= {name: getattr(self, name)[rows] for name in ("lengths", "failed_at")}
+        return replace(self, **cut)
+
+    def in_precision(self, dtype: torch.dtype) -> Self:
+        """Return the same poses with floating-point numbers of a dtype; this track if they are."""
+        if self.joints3d.dtype == dtype:
+            return self
+        fields = {name: getattr(self, name) for name in FRAME_FIELDS}
+        narrowed = {n: v.to(dtype) for n, v in fields.items() if v.is_floating_point()}
+        return replace(self, **narrowed)
+
+    def save(self, path: str | Path) -> None:
+        """Write an .npz: one sequence without its batch dimension, several with it.
+
+        `log_evidence` in the file is the score, the sum over both arms; `log_evidence_arms` has them
+        apart. Keys: joints2d, joints3d, covariance2d, covariance3d, observed, log_evidence,
+        log_evidence_arms, effective_sample_size, names, fps (NaN if unknown), K, frame, failed_at,
+        lengths, notes, first_frame, method.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        single = len(self) == 1
+
+        def array(value: Tensor) -> np.ndarray:
+            value = value.detach().cpu()
+            return (value[0] if single else value).numpy()
+
+        arrays: dict[str, Any] = {
+            name: array(getattr(self, name)) for name in (*FRAME_FIELDS, "failed_at", "lengths")
+        }
+        arrays["log_evidence"] = array(self.log_evidence.sum(-1))
+        arrays["log_evidence_arms"] = array(self.log_evidence)
+        arrays["names"] = np.array(self.names)
+        arrays["fps"] = np.array(np.nan if self.fps is None else self.fps)
+        arrays["K"] = self.matrix.detach().cpu().numpy()
+        arrays["frame"] = np.array(self.frame)
+        arrays["notes"] = np.array(self.notes, dtype=str)
+        arrays["first_frame"] = np.array(self.first_frame)
+        arrays["method"] = np.array(self.method)
+        write_npz(path, arrays)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read what `save` wrote.
+
+        Raises:
+            InputError: no such file. FileFormatError: truncated, not poses, or fields that do not
+                agree: other shapes or types, joints without a covariance, values out of range.
+            CameraError: K is no camera matrix.
+        """
+        required = (*(key for key in _FIELDS if key != _ADDED), "names", "frame", "fps", "notes")
+        arrays = read_npz(path, required, ("first_frame", "method", _ADDED))
+        fields = {key: size for key, size in _FIELDS.items() if key in arrays}
+        single = arrays["joints3d"].ndim == 3
+        batch = "" if single else "B "
+        sizes = check_arrays(
+            path,
+            arrays,
+            {k: f"{kind} {batch * (k != 'K')}{size}" for k, (kind, size) in fields.items()},
+        )
+        if not all(sizes.values()):
+            raise FileFormatError(f"{path}: expected poses of one frame or more, got none")
+        tensors: dict[str, Any] = {key: to_tensor(arrays[key]) for key in fields}
+        tensors = {k: v[None] if single and k != "K" else v for k, v in tensors.items()}
+        tensors["log_evidence"] = tensors.pop("log_evidence_arms")
+        tensors["matrix"] = tensors.pop("K")
+        names = texts(path, "names", arrays["names"])
+        if names != UPPER_BODY:
+            raise FileFormatError(
+                f"{path}: expected the joints {', '.join(UPPER_BODY)}, got {', '.join(names)}"
+            )
+        track = cls(
+            **tensors, names=names, frame=one_text(path, "frame", arrays["frame"]),
+            method=one_text(path, "method", arrays.get("method", np.array("unknown"))),
+            **frame_facts(path, arrays),
+        )  # fmt: skip
+        track._check(path)
+        return track
+
+    def _check(self, path: str | Path) -> None:
+        """Raise unless the values agree with one another; the types and shapes do."""
+        if self.frame not in ("camera", "body"):
+            raise FileFormatError(
+                f"{path}: frame must be 'camera' or 'body', got {self.frame!r:.60}"
+            )
+        try:
+            check_intrinsics("K", self.matrix)
+        except CameraError as error:
+            raise CameraError(f"{path}: {error}") from error
+        n_frames = self.joints3d.shape[1]
+        check_number_range(path, "lengths", self.lengths, 1, n_frames)
+        check_number_range(path, "failed_at", self.failed_at, -1, n_frames - 1)
+        check_estimates(path, "joints2d", self.joints2d, self.covariance2d)
+        check_estimates(path, "joints3d", self.joints3d, self.covariance3d)
+        failed = torch.nonzero(self.failed_at >= 0).reshape(-1)
+        whole = self.joints3d[failed, self.failed_at[failed]].isfinite().flatten(1).all(-1)
+        if bool(whole.any()) or bool(self.log_evidence.isposinf().any()):
+            raise FileFormatError(
+                f"{path}: expected NaN in the frame of failed_at and no infinite log_evidence_arms"
+            )

@@ -1,0 +1,195 @@
+"""Read a `PoseTrack` off the estimates of both arms, and note particles that have collapsed."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchpose.camera._pinhole import PinholeCamera
+from torchpose.camera._projection import map_pixel_covariance, map_pixels
+from torchpose.errors import InputError
+from torchpose.math._rotations import RotationOrder
+from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.upper_body._estimator import Estimates, Estimator, first_failure, mending_notes
+from torchpose.upper_body._fusion import (
+    MotionStage,
+    MotionState,
+    ReadOut,
+    calibration_mode,
+    in_camera_axes,
+    on_their_rays,
+    read_out,
+    recalibrated,
+)
+from torchpose.upper_body._methods import METHODS
+from torchpose.upper_body._pose_track import PoseTrack
+
+__all__ = ["PoseReader", "check_frame", "note_collapse"]
+
+
+class PoseReader(NamedTuple):
+    """Reads the poses out of the estimates of both arms.
+
+    Attributes:
+        prior, camera: whose pixels the estimates and the results are in.
+        method, estimator: where the estimates come from.
+        stage: steadies the motion; None leaves it as it is.
+        lag: number of later frames that the stage may use, None for all.
+        frame, static_camera, calibrated, fps: as in `UpperBodyTracker`.
+    """
+
+    prior: UpperBodyPrior
+    camera: PinholeCamera
+    method: str
+    estimator: Estimator
+    stage: MotionStage | None
+    lag: int | None
+    frame: str
+    static_camera: bool
+    calibrated: bool
+    fps: float | None
+
+    @property
+    def order(self) -> RotationOrder:
+        """Order of roll, pitch and yaw in the prior."""
+        order: RotationOrder = self.prior.info.rotation_order  # type: ignore[assignment]
+        return order
+
+    def whole(self, estimates: Estimates, lengths: Int[Tensor, " B"] | None) -> ReadOut:
+        """Return the poses of whole sequences, steadied; frames from a failure on play no part.
+
+        Args:
+            estimates: of both arms, [B, T, ...]. lengths: frames of each sequence, [B].
+        """
+        reading = self._read_out(estimates)
+        if self.stage is None:
+            return reading
+        batch, n_frames = reading.uv.shape[:2]
+        ends = torch.full((batch,), n_frames) if lengths is None else lengths
+        ends = ends.to(reading.uv.device)
+        failed_at = first_failure(estimates.left, estimates.right)
+        ends = torch.where(failed_at >= 0, torch.minimum(ends, failed_at.clamp_min(1)), ends)
+        return self.stage(reading, ends, self.lag)
+
+    def more(
+        self, motion: MotionState | None, estimates: Estimates
+    ) -> tuple[MotionState | None, ReadOut]:
+        """Return the next state of the motion stage, and the poses of some more frames, steadied.
+
+        Args:
+            motion: from the call before, None before the first frame. estimates: [B, T, ...].
+        """
+        reading = self._read_out(estimates)
+        if self.stage is None:
+            return None, reading
+        return self.stage.advance(motion or self.stage.init(reading), reading)
+
+    def _read_out(self, estimates: Estimates) -> ReadOut:
+        return read_out(estimates, self.prior.info.matrix.to(estimates.left.mean), self.order)
+
+    def track(
+        self,
+        reading: ReadOut,
+        estimates: Estimates,
+        observed: Bool[Tensor, "B T 8"],
+        lengths: Int[Tensor, " B"] | None = None,
+        notes: tuple[str, ...] = (),
+    ) -> PoseTrack:
+        """Return the result.
+
+        Args:
+            reading: of the poses. estimates: that it was read from. observed: what was measured.
+            lengths: frames of each sequence, None for all. notes: what was assumed.
+        """
+        left, right = estimates.left, estimates.right
+        matrix, own = (m.to(reading.uv) for m in (self.prior.info.matrix, self.camera.matrix))
+        reading = self._placed(reading, matrix, observed)
+        if lengths is None:
+            batch, n_frames = reading.uv.shape[:2]
+            lengths = torch.full((batch,), n_frames, device=reading.uv.device)
+        return PoseTrack(
+            joints2d=map_pixels(reading.uv, matrix, own),
+            joints3d=reading.joints,
+            covariance2d=map_pixel_covariance(reading.uv_covs, matrix, own),
+            covariance3d=reading.covs,
+            observed=observed,
+            log_evidence=torch.stack([left.log_evidence, right.log_evidence], -1),
+            effective_sample_size=torch.stack(
+                [out.effective_sample_size.double() for out in (left, right)], -1
+            ),
+            lengths=lengths,
+            matrix=self.camera.matrix,
+            failed_at=first_failure(left, right),
+            fps=self.fps,
+            frame=self.frame,
+            notes=(*notes, *mending_notes(left, right)),
+            method=self.method,
+        )
+
+    def _placed(
+        self, reading: ReadOut, matrix: Float[Tensor, "3 3"], observed: Bool[Tensor, "B T 8"]
+    ) -> ReadOut:
+        """Return the poses with calibrated covariances, in the frame that was asked for."""
+        if self.estimator.reads_rays:
+            reading = on_their_rays(reading, matrix, self.order, observed)
+        if self.calibrated:
+            mode = self.estimator.calibration or calibration_mode(self.method)
+            reading = reading._replace(covs=recalibrated(reading.covs, self.prior.noise, mode))
+        if self.frame == "body":
+            return reading
+        fixed = self.prior.left.moments()[0][18:] if self.static_camera else None
+        return in_camera_axes(reading, self.order, fixed)
+
+
+def check_frame(frame: str, static_camera: bool) -> None:
+    """Raise unless the axes of the results are known, and the camera can stand still in them.
+
+    Raises:
+        InputError: another frame, or a static camera in the axes of the body.
+    """
+    if frame not in ("camera", "body"):
+        raise InputError(f"frame must be 'camera' or 'body', got {frame!r}")
+    if static_camera and frame == "body":
+        raise InputError("static_camera needs frame='camera': the body's axes know no camera")
+
+
+_FEW = 2.0  # particles: below that, one of them has most of the weight
+_SHARE = 0.25  # of the frames of an arm; quick movements alone lose the others in fewer
+
+
+def note_collapse(track: PoseTrack) -> PoseTrack:
+    """Return the track with a note if its particles have collapsed, else the track itself.
+
+    An arm has collapsed where its effective sample size (BL 25) is below 2 in more than a quarter of the
+    frames of a sequence. Banks of Kalman filters have no such note: one track that has all the weight
+    still is a Gaussian.
+
+    Args:
+        track: of any method; frames that failed or do not know their sample size are not counted.
+    """
+    method = METHODS.get(track.method)
+    if method is None or not method.particles:
+        return track
+    size = track.effective_sample_size
+    frames = torch.arange(size.shape[1], device=size.device)
+    counted = size.isfinite() & (frames < track.lengths.to(size.device)[:, None])[..., None]
+    few = (counted & (size < _FEW)).sum(1)
+    collapsed = few > _SHARE * counted.sum(1)
+    if not bool(collapsed.any()):
+        return track
+    arms = " and ".join(
+        f"{name} arm" for name, lost in zip(("left", "right"), collapsed.any(0).tolist(), strict=True)
+        if lost
+    )  # fmt: skip
+    where = ""
+    if len(track) > 1:
+        where = f" of {int(collapsed.any(1).sum())} of {len(track)} sequences"
+    share = 100 * float(few[collapsed].sum() / counted.sum(1)[collapsed].sum())
+    note = (
+        f"particles collapsed ({arms}{where}): fewer than two of them carry the weight in {share:.0f} % "
+        "of the frames, so that estimate and covariance are those of a single one; process noise much "
+        "wider than the motion, too few particles or a camera unlike the prior's do that"
+    )
+    return replace(track, notes=(*track.notes, note))

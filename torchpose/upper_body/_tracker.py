@@ -1,0 +1,400 @@
+"""The main job: 2D keypoints of head, neck and hands to 2D and 3D poses of eight joints."""
+
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchpose._core.module_state import (
+    WideModule,
+    derived,
+    one_run,
+    register_given,
+    wide_or_parameter,
+    working_precision,
+)
+from torchpose.camera._pinhole import PinholeCamera
+from torchpose.errors import InputError, check_floating, check_shape, refuse_export
+from torchpose.filters._base import Generators
+from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.upper_body._estimator import (
+    Estimator,
+    TrackerModel,
+    arm_joints,
+    check_model,
+    generators_of_arms,
+)
+from torchpose.upper_body._fusion import MotionStage
+from torchpose.upper_body._live import LivePose, StreamState, live_pose, unseen_frames
+from torchpose.upper_body._measurements import (
+    MeasuredJoints,
+    Picked,
+    check_gaps,
+    in_prior_pixels,
+    joint_covariances,
+    pick_joints,
+)
+from torchpose.upper_body._methods import (
+    METHODS,
+    SINGLE_POSES,
+    WINDOWS,
+    choose_method,
+    options_of_before,
+)
+from torchpose.upper_body._pose_track import PoseTrack
+from torchpose.upper_body._reading import PoseReader, check_frame, note_collapse
+
+__all__ = ["METHODS", "PoseTrack", "UpperBodyTracker"]
+
+
+class UpperBodyTracker(WideModule):
+    """Tracks eight joints in 2D and 3D from the keypoints of any of them, typically head and hands.
+
+    Each arm, with head and neck, is estimated from the same measurements (BL section 3.1); head, neck
+    and camera of the two are averaged and their covariances bounded, never fused as if they were
+    independent. `forward` tracks whole sequences, `init` and `step` live streams.
+
+    The method is an estimator, one of `METHODS` (`register_method` adds others):
+
+    - ``window-mixture``: the prior's mixture over short windows of motion is conditioned on every
+      frame and the hands round it, each frame by itself; filters of constant velocity follow. The body
+      is seen through a virtual camera that follows it, so that it may move about, farther away or
+      beside the views that the prior was fitted to.
+    - ``mkf-fixed``, ``mkf-sampled``, ``mkf-split``: banks of Kalman filters over single poses (BL
+      section 3.4), see `MixtureKalmanFilter`.
+    - ``pf-mixture``, ``pf-walk``, ``pf-walk-unscaled``: particles over single poses (BL section 3.3),
+      see `BootstrapParticleFilter`.
+
+    A frame passes through four stages, each of which takes and returns values: the keypoints become
+    `MeasuredJoints` in the prior's pixels, an `Estimator` turns these into the `Estimates` of both
+    arms, `read_out` joins them into a `ReadOut` of the body, which `MotionStage` steadies, and that
+    becomes a `PoseTrack`.
+
+    Args:
+        prior: from `load_prior` or `fit_upper_body_prior`.
+        camera: of the keypoints. One other than the prior's is mapped to it.
+        method: one of `METHODS`; by default "window-mixture" where the prior has windows that suit, else
+            "mkf-fixed". The attribute `method` and `PoseTrack.method` say which one runs.
+        measurement_std: standard deviation of a keypoint in the camera's pixels, one number or one
+            for each of hand, elbow, shoulder, head, neck; by default what the prior brings, else 3.
+        fps: frame rate of the keypoints; by default that of the prior. Process noise is scaled.
+        smoothing: None, the number of later frames that an estimate may use, or "full"; only for
+            "window-mixture", whose windows then look a few frames ahead, and "mkf-fixed".
+        frame: "camera" (axes of the camera) or "body" (of the prior's recordings).
+        static_camera: put the body, turned by the estimated rotation, in front of a camera that
+            stays at the prior's mean place, as the authors' released demo does.
+        window: deprecated; False stands for method "mkf-fixed", True for the default.
+        steady: pass what windows give through filters of constant velocity (`MotionStage`), which take
+            the trembling out; smoothers if `smoothing` is asked for. By default where there are windows.
+        calibrated: recalibrate `covariance3d` as the prior's training persons showed, if it says how.
+        neck: kind of neck of the keypoints, where their names do not tell it (see
+            `torchpose.skeleton.NECK_KINDS`). A neck of another kind than the prior's is put where the
+            prior has it, between the middle of the shoulders and the head, or else not measured.
+        max_gap: seconds over which nothing at all may be measured; None is no bound.
+        options: of the method (`torchpose.upper_body.method_options`), such as n_particles,
+            n_tracks, uniform_weight or transition.
+
+    Raises:
+        InputError: an unknown method, or an option that the method does not use. CameraError: no
+            camera. PriorError: no such prior.
+
+    Example:
+        >>> import torch, torchpose
+        >>> prior = torchpose.load_prior("kinect-upper-body")
+        >>> tracker = torchpose.UpperBodyTracker(prior, camera=prior.camera)
+        >>> keypoints = torch.full((1, 10, 3, 2), 240.0)
+        >>> keypoints[..., 0] = torch.tensor([320.0, 420.0, 220.0])
+        >>> track = tracker(keypoints, names=["head", "hand_left", "hand_right"])
+        >>> track.joints3d.shape
+        torch.Size([1, 10, 8, 3])
+    """
+
+    def __init__(
+        self,
+        prior: UpperBodyPrior,
+        camera: PinholeCamera | None = None,
+        method: str | None = None,
+        *,
+        measurement_std: float | Sequence[float] | Tensor | None = None,
+        fps: float | None = None,
+        smoothing: int | str | None = None,
+        frame: str = "camera",
+        static_camera: bool = False,
+        window: bool | None = None,
+        steady: bool | None = None,
+        calibrated: bool = True,
+        neck: str | None = None,
+        max_gap: float | None = 5.0,
+        **options: Any,
+    ) -> None:
+        super().__init__()
+        self.camera = check_model(prior, camera, fps)
+        check_frame(frame, static_camera)
+        if window is not None:
+            warnings.warn(
+                f"window={window} is deprecated: method={WINDOWS!r} follows windows of motion, "
+                f"{SINGLE_POSES!r} single poses, and without a method the tracker chooses",
+                DeprecationWarning,
+                stacklevel=2,
+            )
+            method, steady = options_of_before(method, window, steady)
+        self.prior = prior
+        self.fps = fps or prior.info.fps
+        self.method, self.notes = choose_method(prior, method, smoothing, self.fps, options)
+        self.smoothing = smoothing
+        self.calibrated = calibrated
+        self.frame = frame
+        self.static_camera = static_camera
+        self.neck = neck
+        self.max_gap = max_gap
+        self.dtype = working_precision("dtype", options.get("dtype", torch.float64))
+        register_given(self, "measurement_std", wide_or_parameter(measurement_std))
+        self.options = options
+        for name, value in options.items():
+            if isinstance(value, Tensor):
+                register_given(self, name, wide_or_parameter(value))
+        estimator = self.estimator
+        can_steady = estimator.steadied_by is not None
+        self.steady = can_steady if steady is None else steady
+        if self.steady and not can_steady:
+            raise InputError(
+                f"steady=True needs method {WINDOWS!r} and a prior that says how brisk its motions "
+                f"are, got method {self.method!r}; leave it out"
+            )
+        estimator.check()
+
+    measurement_std: Tensor | None
+
+    @property
+    def measurement_cov(self) -> Float[Tensor, "8 2 2"]:
+        """R of each of the eight joints, the prior's pixels."""
+        info, learnt = self.prior.info, getattr(self.prior, "noise_measurement_std", None)
+        sources = (self.measurement_std, learnt, self.camera.matrix)
+        return derived(
+            self,
+            ("measurement_cov", info.fx, info.fy, info.cx, info.cy),
+            sources,
+            lambda: joint_covariances(self.prior, self.measurement_std, self.camera.matrix),
+        )
+
+    @property
+    def given_options(self) -> dict[str, Any]:
+        """The options of the method, with tensors as they are registered."""
+        return {name: getattr(self, name, value) if isinstance(value, Tensor) else value
+                for name, value in self.options.items()}  # fmt: skip
+
+    @property
+    def estimator(self) -> Estimator:
+        """The estimator of the method, on prior, noise and options as they are now."""
+        make: Callable[..., Estimator] = METHODS[self.method]
+        model = TrackerModel(self, self.prior, self.measurement_cov, self.fps, self.smoothing)
+        return make(model, **self.given_options)
+
+    def forward(
+        self,
+        keypoints: Float[Tensor, "B T J 2"],
+        confidence: Float[Tensor, "B T J"] | None = None,
+        names: Sequence[str] | None = None,
+        mask: Bool[Tensor, "B T J"] | None = None,
+        generator: Generators = None,
+        lengths: Int[Tensor, " B"] | None = None,
+        progress: bool = False,
+        covariance: Float[Tensor, "B T J 2 2"] | None = None,
+    ) -> PoseTrack:
+        """Track a batch of sequences.
+
+        Args:
+            keypoints: [B, T, J, 2], pixels of the camera; NaN = missing.
+            confidence: [B, T, J] in 0..1; 0 or NaN is missing, and the measurement covariance is
+                divided by what is between.
+            names: of the J joints, in any order and spelling that `torchpose.skeleton` knows; may be
+                left out if J = 8 and they are in the order of `UPPER_BODY`.
+            mask: [B, T, J], False = ignore the keypoint.
+            generator: for the methods that draw: one, or a list of one for each sequence.
+            lengths: [B], frames of each sequence. progress: whether to show a bar.
+            covariance: of every single keypoint, pixels squared, in place of `measurement_std`; that
+                of a missing keypoint is not looked at. Frames with the same covariances share work.
+
+        Returns:
+            `PoseTrack`.
+
+        Raises:
+            ShapeError, InputError: wrong shapes, infinite values, nothing measured in a sequence or
+            for longer than `max_gap`. SkeletonError: unknown names.
+        """
+        _refuse_export()
+        with one_run(self.measurement_cov.device):
+            keypoints = self._checked(keypoints)
+            picked = self._pick(keypoints.shape[2], names)
+            measured = self._measure(keypoints, confidence, mask, covariance, picked)
+            check_gaps(measured.mask, lengths, self.max_gap, self.fps or 30.0)
+            joints = arm_joints(measured.mask.flatten(0, 1).any(0).tolist())
+            estimator = self.estimator
+            estimates = estimator.forward(
+                measured, joints, generators_of_arms(generator), lengths, progress
+            )
+            reader, notes = self._reader(estimator), self.notes + picked.notes
+            reading = reader.whole(estimates, lengths)
+            track = reader.track(reading, estimates, measured.mask, lengths, notes)
+        return note_collapse(track.in_precision(self.dtype))
+
+    def init(
+        self, batch_size: int, names: Sequence[str] | None = None, generator: Generators = None
+    ) -> StreamState:
+        """Begin to track live streams, frame by frame (`step`).
+
+        Args:
+            batch_size: B, number of streams. names: of the keypoints, as in `forward`; any of them
+                may be missing in any frame. generator: as in `forward`; the state holds it.
+
+        Raises:
+            InputError: a tracker that smooths, no stream. SkeletonError: unknown names.
+
+        Example:
+            >>> import torch, torchpose
+            >>> prior = torchpose.load_prior("kinect-upper-body")
+            >>> tracker = torchpose.UpperBodyTracker(prior, camera=prior.camera)
+            >>> state = tracker.init(1, names=["head", "hand_left", "hand_right"])
+            >>> frame = torch.tensor([[[320.0, 120.0], [420.0, 240.0], [220.0, 240.0]]])
+            >>> state, pose = tracker.step(state, frame)
+            >>> pose.joints3d.shape
+            torch.Size([1, 8, 3])
+        """
+        if self.smoothing is not None:
+            raise InputError(
+                "frame by frame an estimate cannot use later frames: expected smoothing=None, got "
+                f"{self.smoothing!r}"
+            )
+        if batch_size < 1:
+            raise InputError(f"batch_size must be at least 1, got {batch_size}")
+        n_keypoints = len(UPPER_BODY) if names is None else len(names)
+        picked = self._pick(n_keypoints, names)
+        joints = arm_joints([i >= 0 for i in picked.indices])
+        with one_run(self.measurement_cov.device):
+            state = self.estimator.init(batch_size, joints, generators_of_arms(generator))
+        unseen = torch.zeros(batch_size, dtype=torch.long, device=self.measurement_cov.device)
+        return StreamState(state, None, unseen, n_keypoints, picked)
+
+    def step(
+        self,
+        state: StreamState,
+        keypoints: Float[Tensor, "B J 2"],
+        confidence: Float[Tensor, "B J"] | None = None,
+        mask: Bool[Tensor, "B J"] | None = None,
+        covariance: Float[Tensor, "B J 2 2"] | None = None,
+    ) -> tuple[StreamState, LivePose]:
+        """Track one more frame of each stream: the same numbers as that frame of `forward`.
+
+        A camera does not stop, so `max_gap` raises nothing here: while nothing is measured the prior
+        fills in, covariances grow, and `LivePose.unseen` says for how long it has been so. Frames
+        that were dropped are to be passed as missing (NaN), since a step is one frame at `fps`.
+
+        Args:
+            state: from `init` or the step before; it is not changed, so a step may be repeated
+                (but a generator goes on). keypoints, confidence, mask, covariance: of one frame, as
+                in `forward`.
+
+        Returns:
+            The next state, and the `LivePose` of this frame.
+
+        Raises:
+            ShapeError, InputError: wrong shapes, infinite values.
+        """
+        check_shape("keypoints", keypoints, [len(state.unseen), state.n_keypoints, 2])
+        given = (None if x is None else x[:, None] for x in (confidence, mask, covariance))
+        state, track = self.advance(state, keypoints[:, None], *given)
+        return state, live_pose(track, state.unseen / (self.fps or 30.0))
+
+    def advance(
+        self,
+        state: StreamState,
+        keypoints: Float[Tensor, "B T J 2"],
+        confidence: Float[Tensor, "B T J"] | None = None,
+        mask: Bool[Tensor, "B T J"] | None = None,
+        covariance: Float[Tensor, "B T J 2 2"] | None = None,
+    ) -> tuple[StreamState, PoseTrack]:
+        """Track some more frames of each stream: the same numbers as `step` for one after the other.
+
+        Long recordings are tracked so in bounded memory, and quicker than frame by frame.
+
+        Args:
+            state: as in `step`. keypoints, confidence, mask, covariance: as in `forward`.
+
+        Returns:
+            The next state, and the poses of these frames.
+
+        Raises:
+            ShapeError, InputError: wrong shapes, no frames, infinite values.
+        """
+        _refuse_export()
+        check_floating("keypoints", keypoints)
+        check_shape("keypoints", keypoints, [len(state.unseen), "T", state.n_keypoints, 2])
+        if keypoints.shape[1] == 0:
+            raise InputError("keypoints must hold at least one frame, got none")
+        with one_run(self.measurement_cov.device):
+            keypoints = keypoints.to(self.measurement_cov)
+            measured = self._measure(keypoints, confidence, mask, covariance, state.picked)
+            estimator = self.estimator
+            own, estimates = estimator.advance(state.estimator, measured)
+            reader = self._reader(estimator)
+            motion, reading = reader.more(state.motion, estimates)
+            track = reader.track(reading, estimates, measured.mask, notes=self.notes)
+        unseen = unseen_frames(state.unseen, measured.mask.any(-1))
+        state = state._replace(estimator=own, motion=motion, unseen=unseen)
+        return state, track.in_precision(self.dtype)
+
+    def _checked(self, keypoints: Tensor) -> Float[Tensor, "B T J 2"]:
+        """Return the keypoints of whole sequences, where and as wide as the tracker's own tensors."""
+        check_floating("keypoints", keypoints)
+        check_shape("keypoints", keypoints, ["B", "T", "J", 2])
+        if keypoints.shape[0] == 0 or keypoints.shape[1] == 0:
+            raise InputError(
+                f"keypoints must hold at least one sequence of one frame, got {list(keypoints.shape)}"
+            )
+        return keypoints.to(self.measurement_cov)
+
+    def _pick(self, n_keypoints: int, names: Sequence[str] | None) -> Picked:
+        info = self.prior.info
+        return pick_joints(n_keypoints, names, self.neck, info.neck, info.hand)
+
+    def _measure(
+        self,
+        keypoints: Tensor,
+        confidence: Tensor | None,
+        mask: Tensor | None,
+        covariance: Tensor | None,
+        picked: Picked,
+    ) -> MeasuredJoints:
+        return in_prior_pixels(
+            keypoints, confidence, mask, covariance, picked, self.prior, self.camera,
+            self.measurement_cov,
+        )  # fmt: skip
+
+    def _reader(self, estimator: Estimator) -> PoseReader:
+        """Return what makes poses of the estimates, as the settings ask for."""
+        stage, ratios, cov = None, estimator.steadied_by, self.measurement_cov
+        if self.steady and ratios is not None:
+            stage = derived(
+                self,
+                ("stage", *ratios),
+                (cov,),
+                lambda: MotionStage(*ratios, self.fps or 30.0).to(cov.device),
+            )
+        lag: int | None = 0
+        if self.smoothing is not None:
+            lag = None if self.smoothing == "full" else int(self.smoothing) - estimator.ahead
+        return PoseReader(
+            self.prior, self.camera, self.method, estimator, stage, lag, self.frame,
+            self.static_camera, self.calibrated, self.fps,
+        )  # fmt: skip
+
+
+def _refuse_export() -> None:
+    refuse_export(
+        "UpperBodyTracker, which chooses its filters by what was measured,",
+        "a step of a filter of torchpose.filters",
+    )

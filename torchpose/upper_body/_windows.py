@@ -1,0 +1,363 @@
+"""The estimator over windows of motion: each frame by itself, with the hands shortly round it.
+
+Mixtures over windows see the body through a virtual camera that follows it
+(`torchpose.camera._virtual_camera`).
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchpose._core.module_state import derived
+from torchpose.camera._virtual_camera import (
+    BodyView,
+    PathModel,
+    body_path,
+    memory_frames,
+    to_view,
+    view_body,
+    view_jacobian,
+)
+from torchpose.errors import InputError
+from torchpose.filters._base import Generators
+from torchpose.filters._mkf import MixtureKalmanFilter
+from torchpose.filters._outputs import FilterOutput
+from torchpose.priors._arm_state import STATE_DIM
+from torchpose.priors._gaussian_mixture import GaussianMixture
+from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._window import WindowLayout, WindowPrior, window_measurements
+from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.skeleton._upper_body import ARM_JOINTS
+from torchpose.upper_body._estimator import (
+    ARMS,
+    ArmJoints,
+    Estimates,
+    Estimator,
+    MotionRatios,
+    TrackerModel,
+    in_double,
+    require_cov,
+)
+from torchpose.upper_body._measurements import (
+    MeasuredJoints,
+    append_blocks,
+    arm_measurements,
+    pixel_indices,
+    pixels_per_metre,
+)
+
+__all__ = ["SeenInView", "WindowMixture", "WindowState", "see_in_view", "suitable_window"]
+
+_BIMODAL = 2  # hand and elbow, which may be before or behind the body
+_HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
+_HANDS = [UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")]
+
+
+class SeenInView(NamedTuple):
+    """Measurements for a filter over windows, in the pixels of a virtual camera.
+
+    Attributes:
+        measured: the eight joints of each frame.
+        hands: values and mask [B, T, 2 H] of the hands of each frame's window, for both arms.
+        view: the virtual camera of each frame.
+        log_scale: log of the area that a pixel of the camera has in the virtual one, [B, T, 8].
+    """
+
+    measured: MeasuredJoints
+    hands: dict[str, tuple[Tensor, Tensor]]
+    view: BodyView
+    log_scale: Tensor
+
+
+def suitable_window(
+    prior: UpperBodyPrior, smoothing: int | str | None, fps: float
+) -> tuple[str, WindowLayout] | None:
+    """Return the name of the window that suits the smoothing, and its lags at this frame rate.
+
+    It is None where the prior has none, or where it looks farther ahead than estimates may.
+
+    Args:
+        prior: with its windows. smoothing: None, the number of later frames that an estimate may
+            use, or "full". fps: frame rate.
+    """
+    name = "causal" if smoothing is None else "full"
+    if name not in prior.windows:
+        return None
+    layout = prior.windows[name].layout.at_rate(fps)
+    too_far = isinstance(smoothing, int) and smoothing < layout.ahead
+    return None if too_far else (name, layout)
+
+
+def see_in_view(
+    measured: MeasuredJoints,
+    prior: UpperBodyPrior,
+    layout: WindowLayout,
+    measurement_cov: Float[Tensor, "8 2 2"],
+    lengths: Int[Tensor, " B"] | None = None,
+    start: int = 0,
+) -> SeenInView:
+    """Return the measurements of windows in a virtual camera that follows the body, from a frame on.
+
+    Args:
+        measured: the eight joints in the prior's pixels. prior: what is expected. layout: of a
+            window, at the frame rate of the measurements.
+        measurement_cov: R of the eight joints where it is not told frame by frame.
+        lengths: frames of each sequence, [B]. start: first frame that is wanted; may be negative.
+    """
+    uv, mask, matrix = measured.uv, measured.mask, prior.info.matrix.to(measured.uv)
+    if lengths is not None:
+        frames = torch.arange(mask.shape[1], device=mask.device)
+        mask = mask & (frames < lengths.to(mask.device)[:, None])[..., None]
+    start = start % mask.shape[1]
+    model = _path_model(prior, measurement_cov, uv)
+    noise = None
+    if measured.cov.ndim > 3:
+        noise = _of_anchors(measured.cov)
+    else:
+        model = model._replace(variance=_of_anchors(measured.cov))
+    path = body_path(uv, mask, layout.lags, layout.ahead, layout.fps, model, start, noise)
+    neck, height = path.at(0)
+    apart = (uv[:, start:, _HANDS] - neck[:, :, None]).norm(dim=-1)
+    reach = torch.where(mask[:, start:, _HANDS], apart, torch.zeros_like(apart)).amax(-1)
+    view = view_body(neck, height, model, matrix, reach)
+    hands = {}
+    for side in ARMS:
+        values, known = window_measurements(uv, mask, layout, side, path, start)
+        hands[side] = to_view(values, view, matrix).flatten(-2), known.repeat_interleave(2, -1)
+    now = to_view(uv[:, start:], view, matrix)
+    now = torch.where(mask[:, start:, :, None], now, torch.zeros_like(now))
+    cov = measured.cov if measured.cov.ndim == 3 else measured.cov[:, start:]
+    log_scale = -view_jacobian(now, view, matrix).det().abs().log()
+    return SeenInView(MeasuredJoints(now, mask[:, start:], cov), hands, view, log_scale)
+
+
+def _path_model(prior: UpperBodyPrior, measurement_cov: Tensor, like: Tensor) -> PathModel:
+    """Return head and neck of the prior's mean pose, and their measurement noise."""
+    both = (prior.left.moments()[0] + prior.right.moments()[0]) / 2
+    head, neck = both[9:11].to(like), both[12:14].to(like)
+    return PathModel(neck, head - neck, _of_anchors(measurement_cov), pixels_per_metre(prior))
+
+
+def _of_anchors(cov: Float[Tensor, "*batch 8 2 2"]) -> Float[Tensor, "*batch 2"]:
+    """Return the variance of a coordinate of head and neck, pixels squared."""
+    return cov[..., [_HEAD, _NECK], :, :].diagonal(dim1=-2, dim2=-1).mean(-1)
+
+
+class WindowState(NamedTuple):
+    """What the next frame needs to know of the frames before.
+
+    Attributes:
+        recent: the eight joints of the last N frames in the prior's pixels, the latest last, with R of
+            each frame [B, N, 8, 2, 2]. joints: that each arm's filter measures.
+    """
+
+    recent: MeasuredJoints
+    joints: ArmJoints
+
+
+class WindowMixture(Estimator):
+    """Conditions the prior's mixture over windows on each frame by itself and the hands round it.
+
+    The motion stage follows, since the noise of keypoints and the change from one component to the
+    next show as trembling.
+
+    Args:
+        model: of the tracker; its prior has a window that suits (`suitable_window`).
+        likelihood_power: exponent of the likelihood in the weights; by default that of the window.
+        dtype: of means and measurements; covariances are always float64.
+
+    Raises:
+        InputError: no window suits.
+    """
+
+    smooths = True
+    reads_rays = True
+
+    def __init__(
+        self,
+        model: TrackerModel,
+        likelihood_power: float | None = None,
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        found = suitable_window(model.prior, model.smoothing, model.rate)
+        if found is None:
+            raise InputError("the prior has no mixture over windows that suits the smoothing")
+        self.model, self.dtype = model, dtype
+        self.calibration, self.layout = found
+        self.window = model.prior.windows[self.calibration]
+        self.ahead = self.layout.ahead
+        settings = self.window.settings
+        self.power = settings["likelihood_power"] if likelihood_power is None else likelihood_power
+        if "joint_ratio" in settings:  # how brisk the motions were that the prior learnt
+            self.steadied_by = MotionRatios(
+                *(settings[f"{kind}_ratio"] for kind in MotionRatios._fields)
+            )
+
+    def check(self) -> None:
+        """Make the filters of hand, head and neck, whose options are checked."""
+        for side in ARMS:
+            for joints in (("hand", "head", "neck"), ()):
+                self._filter(side, joints)
+
+    def init(
+        self, batch_size: int, joints: ArmJoints, generators: dict[str, Generators]
+    ) -> WindowState:
+        """Return the state before the first frame; see `Estimator`."""
+        like, n_frames = self.model.measurement_cov, self._n_recent
+        recent = MeasuredJoints(
+            like.new_zeros(batch_size, n_frames, 8, 2),
+            torch.zeros(batch_size, n_frames, 8, dtype=torch.bool, device=like.device),
+            like.expand(batch_size, n_frames, -1, -1, -1),
+        )
+        return WindowState(recent, joints)
+
+    @property
+    def _n_recent(self) -> int:
+        return 1 + memory_frames(self.layout.lags, self.layout.fps)
+
+    def advance(
+        self, state: WindowState, measured: MeasuredJoints
+    ) -> tuple[WindowState, Estimates]:
+        """Return the next state and the estimates of T more frames; see `Estimator`."""
+        n_frames = measured.uv.shape[1]
+        frames = _append(state.recent, measured)
+        seen = self._see(frames, None, -n_frames)
+        seen = seen._replace(measured=seen.measured._replace(cov=measured.cov))
+        recent = MeasuredJoints(*(x[:, n_frames:] for x in frames))
+        return WindowState(recent, state.joints), self._estimate(seen, state.joints)
+
+    def forward(
+        self,
+        measured: MeasuredJoints,
+        joints: ArmJoints,
+        generators: dict[str, Generators],
+        lengths: Tensor | None = None,
+        progress: bool = False,
+    ) -> Estimates:
+        """Return the estimates of whole sequences; see `Estimator`."""
+        return self._estimate(self._see(measured, lengths, 0), joints, lengths, progress)
+
+    def _see(self, measured: MeasuredJoints, lengths: Tensor | None, start: int) -> SeenInView:
+        model = self.model
+        return see_in_view(
+            measured, model.prior, self.layout, model.measurement_cov, lengths, start
+        )
+
+    def _estimate(
+        self,
+        seen: SeenInView,
+        joints: ArmJoints,
+        lengths: Tensor | None = None,
+        progress: bool = False,
+    ) -> Estimates:
+        """Return the estimates of frames; their evidence is that of each frame given its window."""
+        arms = {}
+        for side, arm in ARMS.items():
+            both, noise, hands = _window_inputs(
+                seen, self.window, side, joints[side], self.model.measurement_cov
+            )
+            model = self._filter(side, joints[side])
+            out = model(*both, noise, lengths, return_cov=True, progress=progress)
+            context = self._filter(side, ())(*hands, None, lengths)
+            arms[side] = _pose_of_window(in_double(out), context, seen, arm, self.window.layout)
+        return Estimates(arms["left"], arms["right"], seen.view)
+
+    def _filter(self, side: str, joints: tuple[str, ...]) -> MixtureKalmanFilter:
+        """Return the filter of an arm; the same one as long as it holds."""
+        window, cov = self.window, self.model.measurement_cov
+        mixture: GaussianMixture = getattr(window, side)
+        return derived(
+            self.model.owner,
+            (
+                self.calibration,
+                side,
+                joints,
+                window.layout,
+                *window.settings.items(),
+                self.power,
+                self.dtype,
+            ),
+            (*mixture.parameters_tuple(), cov),
+            lambda: _window_filter(window, side, joints, cov, self.power, self.dtype),
+        )
+
+
+def _append(frames: MeasuredJoints, new: MeasuredJoints) -> MeasuredJoints:
+    """Return the last frames, and the new ones after them."""
+    cov = new.cov.expand(*new.uv.shape[:2], *new.cov.shape[-3:])
+    pairs = zip(frames, new._replace(cov=cov), strict=True)
+    return MeasuredJoints(*(torch.cat([old, latest], 1) for old, latest in pairs))
+
+
+def _window_filter(
+    window: WindowPrior,
+    side: str,
+    joints: tuple[str, ...],
+    measurement_cov: Float[Tensor, "8 2 2"],
+    likelihood_power: float,
+    dtype: torch.dtype,
+) -> MixtureKalmanFilter:
+    """Return fixed tracks over window states that measure these joints and all hands of the window."""
+    arm, layout = ARMS[side], window.layout
+    blocks = [measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
+    blocks += [_hand_cov(window, side, measurement_cov)] * layout.n_hands
+    # Poses of consecutive frames are tied by the window itself: no memory beyond it.
+    return MixtureKalmanFilter(
+        getattr(window, side),
+        torch.ones(layout.dim, dtype=torch.float64),
+        torch.block_diag(*blocks),
+        pixel_indices(joints) + list(layout.hands),
+        transition="ou",
+        gamma=0.0,
+        weighting="frame",
+        medians=layout.in_torso[: 3 * _BIMODAL : 3] if joints else (),
+        likelihood_power=likelihood_power,
+        dtype=dtype,
+    )
+
+
+def _hand_cov(window: WindowPrior, side: str, measurement_cov: Tensor) -> Tensor:
+    """Return the noise of a hand of the window: that of a hand now, and what moving it here adds."""
+    own = measurement_cov[ARMS[side][0]]
+    return own + window.settings["hand_std"] ** 2 * torch.eye(2, dtype=own.dtype, device=own.device)
+
+
+def _window_inputs(
+    seen: SeenInView,
+    window: WindowPrior,
+    side: str,
+    joints: tuple[str, ...],
+    measurement_cov: Float[Tensor, "8 2 2"],
+) -> tuple[
+    tuple[Float[Tensor, "B T Z"], Bool[Tensor, "B T Z"]],
+    Tensor,
+    tuple[Float[Tensor, "B T H"], Bool[Tensor, "B T H"]],
+]:
+    """Return values and mask of joints and hands, their R, and values and mask of the hands alone."""
+    z, mask, cov = arm_measurements(ARMS[side], joints, seen.measured)
+    hands, known = seen.hands[side]
+    noise = append_blocks(cov, _hand_cov(window, side, measurement_cov), hands.shape[-1] // 2)
+    return (torch.cat([z, hands], -1), torch.cat([mask, known], -1)), noise, (hands, known)
+
+
+def _pose_of_window(
+    out: FilterOutput,
+    context: FilterOutput,
+    seen: SeenInView,
+    arm: tuple[int, ...],
+    layout: WindowLayout,
+) -> FilterOutput:
+    """Return the arm's part of a window's estimate, with its evidence beyond that of the hands.
+
+    The arm's joints in the axes of the torso follow, where the window has them. The evidence is a
+    density over pixels of the prior's camera, not of the virtual one.
+    """
+    measured = seen.measured.mask[:, :, list(arm)]
+    evidence = out.log_evidence - context.log_evidence
+    evidence = evidence + (seen.log_scale[:, :, list(arm)] * measured).sum(-1)
+    evidence = torch.where(measured.any(-1), evidence, torch.zeros_like(evidence))
+    kept = torch.tensor([*range(STATE_DIM), *layout.in_torso], device=out.mean.device)
+    cov = require_cov(out)[..., kept[:, None], kept]
+    return out._replace(mean=out.mean[..., kept], cov=cov, log_evidence=evidence)

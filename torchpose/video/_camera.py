@@ -1,0 +1,132 @@
+"""Cameras, read by OpenCV."""
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol, runtime_checkable
+
+from torchpose.errors import FileFormatError, InputError, check_rate
+from torchpose.video._base import VideoFrame, VideoSource
+
+__all__ = ["CameraSource", "Capture"]
+
+_WARM_UP = 10  # frames that are read and left out: exposure settles, and the rate can be measured
+_PATIENCE = 5  # reads without a frame, one after another, before a camera counts as gone
+_PAUSE = 0.02  # seconds between them
+
+
+@runtime_checkable
+class Capture(Protocol):
+    """The part of `cv2.VideoCapture` that is used."""
+
+    def isOpened(self) -> bool: ...
+
+    def read(self) -> tuple[bool, Any]: ...
+
+    def get(self, prop: int) -> float: ...
+
+    def set(self, prop: int, value: float) -> bool: ...
+
+    def release(self) -> None: ...
+
+
+class CameraSource(VideoSource):
+    """Frames of a camera, until it is closed or unplugged.
+
+    The rate is measured while the first frames, left out, let the exposure settle. Frames pass as they
+    come; their times are those of the clock.
+
+    Args:
+        index: number of the camera, from 0. fps: the rate to ask the camera for.
+        capture: makes the reader from the index; `cv2.VideoCapture` by default.
+
+    Raises:
+        InputError: no such camera, one that gives no frames, or a rate that is not positive.
+    """
+
+    def __init__(
+        self,
+        index: int,
+        fps: float | None = None,
+        capture: Callable[[int], Capture] | None = None,
+    ) -> None:
+        super().__init__(f"camera {index}")
+        if index < 0:
+            raise InputError(f"the number of a camera is 0 or more, got {index}")
+        if fps is not None:
+            check_rate("fps", fps)
+        self._capture = (capture or _open)(index)
+        try:
+            self._prepare(index, fps)
+        except BaseException:
+            self.close()
+            raise
+
+    def _prepare(self, index: int, fps: float | None) -> None:
+        import cv2
+
+        if not self._capture.isOpened():
+            raise InputError(
+                f"camera {index} cannot be opened: there is none, another program uses it, or "
+                "reading it is not permitted; cameras are numbered from 0"
+            )
+        self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # late frames are worth little
+        if fps is not None:
+            self._capture.set(cv2.CAP_PROP_FPS, fps)
+        reported = float(self._capture.get(cv2.CAP_PROP_FPS))
+        moments: list[float] = []
+        for _ in range(_WARM_UP):
+            image = self._grab()
+            if image is None:
+                raise InputError(f"camera {index} opens but gives no frames; is it in use?")
+            moments.append(time.monotonic())
+            self.size = (image.shape[1], image.shape[0])
+        span = moments[-1] - moments[2]  # the first frames take their time
+        measured = (len(moments) - 3) / span if span > 0 else 0.0
+        self.fps = reported if 1 <= reported <= 1000 else fps or 30.0
+        if 1 <= measured <= 1000 and abs(measured / self.fps - 1) > 0.2:
+            self.notes.append(
+                f"the camera says {self.fps:.4g} frames per second and gave {measured:.4g}, "
+                "which are used; little light makes cameras slow"
+            )
+            self.fps = measured
+
+    def _grab(self) -> Any:
+        for attempt in range(_PATIENCE):
+            found, image = self._capture.read()
+            if found and image is not None:
+                return image
+            if attempt + 1 < _PATIENCE:
+                time.sleep(_PAUSE)
+        return None
+
+    def _read(self) -> Iterator[VideoFrame]:
+        import cv2
+
+        start, index = None, 0
+        while (image := self._grab()) is not None:
+            now = time.monotonic()
+            start = now if start is None else start
+            if image.ndim != 3 or (image.shape[1], image.shape[0]) != self.size:
+                raise FileFormatError(
+                    f"{self.name}: expected frames of {self.size[0]}x{self.size[1]}, got an array "
+                    f"of shape {list(image.shape)}"
+                )
+            yield VideoFrame(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), now - start, index)
+            index += 1
+        self.notes.append(
+            f"{self.name} gave no more frames after {index}: unplugged, or taken by another program"
+        )
+
+    def _release(self) -> None:
+        self._capture.release()
+
+
+def _open(index: int) -> Capture:
+    import cv2
+
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the typed error says it
+    try:
+        return cv2.VideoCapture(index)
+    finally:
+        cv2.utils.logging.setLogLevel(level)

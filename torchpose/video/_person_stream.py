@@ -1,0 +1,176 @@
+"""The poses of one person of a video, and whether their hands have been taken for each other."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from torchpose.measure._association import AssociationState, HandAssociation
+from torchpose.measure._face import Image
+from torchpose.measure._upper_body import FrameMeasurements
+from torchpose.upper_body._live import StreamState
+from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
+from torchpose.upper_body._tracker import UpperBodyTracker
+
+__all__ = ["Measured", "PersonStream", "PersonStreamState", "measured_of", "unmeasured"]
+
+
+class Measured(NamedTuple):
+    """What was measured of one person in T frames.
+
+    Attributes:
+        keypoints: pixels, NaN where missing [T, J, 2]. covariance: [T, J, 2, 2].
+        size: of the face, NaN where there is none [T].
+    """
+
+    keypoints: Float[Tensor, "T J 2"]
+    covariance: Float[Tensor, "T J 2 2"]
+    size: Float[Tensor, " T"]
+
+    def frames(self, rows: slice) -> "Measured":
+        """Return some of the frames."""
+        return Measured(*(x[rows] for x in self))
+
+
+def measured_of(block: Sequence[FrameMeasurements], number: int, n_joints: int) -> Measured:
+    """Return what was measured of one person in each frame of a block."""
+    keypoints, cov, size = found = unmeasured(len(block), n_joints)
+    for t, frame in enumerate(block):
+        row = torch.nonzero(frame.person == number).flatten()
+        if len(row):
+            keypoints[t], cov[t] = frame.keypoints[row[0]], frame.covariance[row[0]]
+            size[t] = frame.faces[row[0], 2]
+    return found
+
+
+def unmeasured(n_frames: int, n_joints: int) -> Measured:
+    """Return frames in which nothing is measured."""
+    return Measured(
+        torch.full((n_frames, n_joints, 2), torch.nan, dtype=torch.float64),
+        torch.eye(2, dtype=torch.float64).repeat(n_frames, n_joints, 1, 1),
+        torch.full((n_frames,), torch.nan, dtype=torch.float64),
+    )
+
+
+class PersonStreamState(NamedTuple):
+    """Of the tracker (with `association`, of hands as given and of hands swapped), and of the votes."""
+
+    stream: StreamState
+    votes: AssociationState | None
+
+    @property
+    def unseen(self) -> int:
+        """Frames since anything was measured."""
+        return int(self.stream.unseen[0])
+
+
+class PersonStream(nn.Module):
+    """Tracks one person; with `association`, both as measured and with the hands swapped.
+
+    Which of the two the edges of the arms support is asked in every frame (BL 50), and the poses,
+    and the hands that were measured, are those of the better hypothesis.
+
+    Args:
+        tracker: of poses. names: of the measured joints. seed: of methods that draw.
+        association: of the hands; None trusts what is measured.
+
+    Reference:
+        Burke & Lasenby, section 5.3.
+    """
+
+    def __init__(
+        self,
+        tracker: UpperBodyTracker,
+        names: Sequence[str],
+        seed: int = 0,
+        association: HandAssociation | None = None,
+    ) -> None:
+        super().__init__()
+        self.tracker, self.association = tracker, association
+        self.names, self.seed = tuple(names), seed
+        self.hands = [self.names.index(name) for name in ("hand_left", "hand_right")]
+        self.exchanged = [self.names.index(_other_side(name)) for name in self.names]
+
+    def init(self, number: int) -> PersonStreamState:
+        """Return the state before the first frame of the person of this number."""
+        generator = torch.Generator().manual_seed(self.seed + number)
+        batch = 1 if self.association is None else 2
+        stream = self.tracker.init(batch, self.names, generator)
+        votes = None if self.association is None else self.association.init()
+        return PersonStreamState(stream, votes)
+
+    @torch.no_grad()
+    def advance(
+        self, state: PersonStreamState, measured: Measured, images: Sequence[Image] = ()
+    ) -> tuple[PersonStreamState, PoseTrack, Measured]:
+        """Track some more frames.
+
+        Args:
+            state: from `init` or the call before. measured: in these frames.
+            images: the frames, RGB; only looked at with `association`.
+
+        Returns:
+            The next state, the poses, and what was measured, with hands exchanged where they had
+            been taken for each other.
+        """
+        if self.association is None or state.votes is None:
+            stream, poses = self.tracker.advance(
+                state.stream, measured.keypoints[None], covariance=measured.covariance[None]
+            )
+            return state._replace(stream=stream), poses, measured
+        swapped = Measured(
+            measured.keypoints[:, self.exchanged],
+            measured.covariance[:, self.exchanged],
+            measured.size,
+        )
+        both = [torch.stack(pair) for pair in zip(measured[:2], swapped[:2], strict=True)]
+        stream, poses = self.tracker.advance(state.stream, both[0], covariance=both[1])
+        votes, which = _vote(self.association, state.votes, poses, measured, images, self.hands)
+        keypoints, cov = (hypotheses[which, torch.arange(len(which))] for hypotheses in both)
+        chosen = Measured(keypoints, cov, measured.size)
+        return PersonStreamState(stream, votes), _choose(poses, which), chosen
+
+
+def _vote(
+    association: HandAssociation,
+    votes: AssociationState,
+    poses: PoseTrack,
+    measured: Measured,
+    images: Sequence[Image],
+    hands: list[int],
+) -> tuple[AssociationState, Tensor]:
+    """Return which hypothesis holds in each frame, 0 or 1 [T]."""
+    import cv2
+
+    number = torch.zeros(1, dtype=torch.long)
+    tells = measured.keypoints[:, hands].isfinite().flatten(1).all(1).tolist()
+    which = []
+    for t, image in enumerate(images):
+        if tells[t]:
+            grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+            joints, size = poses.joints2d[None, :, t], measured.size[t : t + 1]
+            votes = association.step(votes, grey, joints, size, number)
+        which.append(int(votes.swapped.any()))
+    return votes, torch.tensor(which)
+
+
+def _choose(poses: PoseTrack, which: Tensor) -> PoseTrack:
+    """Return one sequence of two, chosen frame by frame."""
+    frames = torch.arange(len(which))
+    fields = {name: getattr(poses, name)[which, frames][None] for name in FRAME_FIELDS}
+    failed = poses.failed_at[which]
+    lost = (failed >= 0) & (frames >= failed)
+    first = int(lost.long().argmax()) if bool(lost.any()) else -1
+    return replace(
+        poses, **fields, lengths=poses.lengths[:1], failed_at=poses.failed_at.new_tensor([first])
+    )
+
+
+def _other_side(name: str) -> str:
+    swap = {"left": "right", "right": "left"}
+    joint, _, side = name.partition("_")
+    return f"{joint}_{swap[side]}" if side in swap else name

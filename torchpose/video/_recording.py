@@ -1,0 +1,306 @@
+"""Put the poses of everybody in a recording together block by block, kept on disk meanwhile."""
+
+import shutil
+import tempfile
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from torchpose._core.facade import set_up_facade
+from torchpose.errors import InputError, OutputError
+from torchpose.measure._face import Image
+from torchpose.measure._upper_body import FrameMeasurements
+from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
+from torchpose.upper_body._reading import note_collapse
+from torchpose.upper_body._tracker import UpperBodyTracker
+from torchpose.video._person_stream import (
+    Measured,
+    PersonStream,
+    PersonStreamState,
+    measured_of,
+    unmeasured,
+)
+
+__all__ = ["PoseSpool", "TrackedPerson", "TrackedRecording", "smoothed"]
+
+
+class PoseSpool:
+    """Appends blocks of poses of one sequence to files, and reads them as one `PoseTrack`.
+
+    The files go with the spool; poses that were read from it stay readable as long as they are held.
+
+    Args:
+        folder: where the files are; None is the system's folder for temporary files.
+
+    Raises:
+        OutputError: the folder cannot be written to.
+    """
+
+    def __init__(self, folder: str | Path | None = None) -> None:
+        try:
+            self._folder = Path(tempfile.mkdtemp(prefix=".poses-", dir=folder))
+        except OSError as error:
+            raise OutputError(
+                f"{folder}: poses cannot be kept here ({error.strerror or error})"
+            ) from error
+        weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+        self._like: PoseTrack | None = None
+        self._n_frames = 0
+        self.failed_at = -1
+
+    def __len__(self) -> int:
+        return self._n_frames
+
+    def append(self, block: PoseTrack) -> None:
+        """Add the frames of one sequence.
+
+        Raises:
+            InputError: not one sequence. OutputError: the disk is full.
+        """
+        if len(block) != 1:
+            raise InputError(f"a spool holds one sequence, got a block of {len(block)}")
+        try:
+            for name in FRAME_FIELDS:
+                with self._path(name).open("ab") as file:
+                    file.write(_array(getattr(block, name)).tobytes())
+        except OSError as error:
+            raise OutputError(
+                f"{self._folder}: poses cannot be kept here ({error.strerror or error})"
+            ) from error
+        if self.failed_at < 0 <= int(block.failed_at[0]):
+            self.failed_at = self._n_frames + int(block.failed_at[0])
+        self._like = block if self._like is None else self._like
+        self._n_frames += block.joints3d.shape[1]
+
+    def track(self, n_frames: int | None = None) -> PoseTrack:
+        """Return the poses so far, or the first of them, read from the files as they are used.
+
+        Raises:
+            InputError: there are none.
+        """
+        like, count = self._like, self._n_frames if n_frames is None else n_frames
+        if like is None or not 0 < count <= self._n_frames:
+            raise InputError(f"expected 1 to {self._n_frames} poses, got {count}")
+        fields: dict[str, Any] = {}
+        for name in FRAME_FIELDS:
+            sample = _array(getattr(like, name))
+            shape = (self._n_frames, *sample.shape[1:])
+            stored = np.memmap(self._path(name), sample.dtype, mode="c", shape=shape)
+            fields[name] = torch.from_numpy(stored[:count])[None]
+        fields["lengths"] = torch.tensor([count])
+        fields["failed_at"] = torch.tensor([self.failed_at])
+        return note_collapse(replace(like, **fields))
+
+    def _path(self, name: str) -> Path:
+        return self._folder / f"{name}.bin"
+
+
+def _array(values: Tensor) -> np.ndarray:
+    return values[0].detach().cpu().contiguous().numpy()
+
+
+set_up_facade(__name__)
+
+_LEAST_SECONDS = 0.5  # for which somebody has to be seen to be reported
+
+
+@dataclass
+class TrackedPerson:
+    """Poses of one person of a video.
+
+    Attributes:
+        number: in the order of coming. first_frame: of the video, that of the first pose.
+        track: poses as a batch of one; NaN where the person was away for longer than `max_gap`.
+        keypoints: what was measured [T, J, 2], pixels, NaN where missing, in the order of the
+            measurer's `names`. covariance: of that [T, J, 2, 2].
+    """
+
+    number: int
+    first_frame: int
+    track: PoseTrack
+    keypoints: Tensor
+    covariance: Tensor
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+
+@dataclass
+class _Person:
+    """One person while a recording is read.
+
+    `state` is None while nobody is there; the frames of that time are counted in `absent`, and
+    written only if the person returns.
+    """
+
+    number: int
+    first_frame: int
+    poses: PoseSpool
+    state: PersonStreamState | None = None
+    measured: list[Measured] = field(default_factory=list)
+    n_frames: int = 0
+    absent: int = 0
+    last_seen: int = 0
+    n_seen: int = 0
+
+
+class TrackedRecording:
+    """Tracks everybody whose measurements are appended, each with a stream of its own.
+
+    Args:
+        stream: of every person.
+        gap: frames after which somebody who is not seen has no pose any more, and is tracked anew
+            when they come back.
+        folder: for temporary files.
+    """
+
+    def __init__(self, stream: PersonStream, gap: int, folder: str | Path | None = None) -> None:
+        self.stream, self.gap, self.folder = stream, gap, folder
+        self.n_frames = 0
+        self._people: dict[int, _Person] = {}
+
+    def append(
+        self, block: Sequence[FrameMeasurements], images: Sequence[Image] = ()
+    ) -> dict[int, PoseTrack]:
+        """Track the next frames, with their images if the stream looks at them.
+
+        Returns:
+            The poses of everybody who was there before the block or is in it, by number: those of
+            the last frames of the block.
+
+        Raises:
+            OutputError: the disk is full.
+        """
+        newcomers = {number for measured in block for number in measured.person.tolist()}
+        poses = {}
+        for number in sorted(self._people.keys() | newcomers):  # each with a state of its own
+            measured, first = measured_of(block, number, len(self.stream.names)), 0
+            if number not in self._people:
+                first = int(_seen(measured).long().argmax())
+                self._people[number] = _Person(
+                    number, self.n_frames + first, PoseSpool(self.folder)
+                )
+            rows = slice(first, None)
+            poses[number] = self._extend(self._people[number], measured.frames(rows), images[rows])
+        self.n_frames += len(block)
+        return poses
+
+    def _extend(self, person: _Person, measured: Measured, images: Sequence[Image]) -> PoseTrack:
+        """Track some frames; where nobody is there yet, or any more, poses are NaN."""
+        seen = _seen(measured)
+        frames, count = torch.nonzero(seen).flatten(), len(seen)
+        if len(frames):
+            person.last_seen = person.n_frames + int(frames[-1])
+            person.n_seen += len(frames)
+        person.n_frames += count
+        start = 0
+        if person.state is None:
+            start = int(frames[0]) if len(frames) else count
+        person.absent += start
+        if start == count:
+            return _nobody(count, self.stream.tracker)
+        if person.absent:
+            person.measured.append(unmeasured(person.absent, len(self.stream.names)))
+            person.poses.append(_nobody(person.absent, self.stream.tracker))
+            person.absent = 0
+        state = person.state or self.stream.init(person.number)
+        unseen, rows = state.unseen, slice(start, None)
+        state, poses, chosen = self.stream.advance(state, measured.frames(rows), images[rows])
+        poses = _without_long_gaps(poses, seen[rows], unseen, self.gap)
+        person.poses.append(poses)
+        person.measured.append(chosen)
+        person.state = None if state.unseen > self.gap else state
+        return poses
+
+    def finish(self, smoother: UpperBodyTracker | None = None) -> list[TrackedPerson]:
+        """Return everybody who was seen for half a second, the one seen longest first.
+
+        Args:
+            smoother: gives the poses anew, from all frames.
+        """
+        least = _LEAST_SECONDS * (self.stream.tracker.fps or 30.0)
+        lasting = [person for person in self._people.values() if person.n_seen >= least]
+        lasting.sort(key=lambda person: -person.n_seen)
+        return [self._finish(person, smoother) for person in lasting]
+
+    def _finish(self, person: _Person, smoother: UpperBodyTracker | None) -> TrackedPerson:
+        """Return the poses until the person was last seen."""
+        count = person.last_seen + 1
+        keypoints = torch.cat([part.keypoints for part in person.measured])[:count]
+        cov = torch.cat([part.covariance for part in person.measured])[:count]
+        track = person.poses.track(count)
+        track = replace(track, first_frame=person.first_frame)
+        found = TrackedPerson(person.number, person.first_frame, track, keypoints, cov)
+        if smoother is None:
+            return found
+        return replace(found, track=smoothed(found, smoother, self.stream.names, self.gap))
+
+
+def smoothed(
+    person: TrackedPerson, smoother: UpperBodyTracker, names: Sequence[str], gap: int
+) -> PoseTrack:
+    """Return the poses of a person anew, from all measurements together.
+
+    Args:
+        names: of the measured joints. gap: frames after which there is no pose.
+    """
+    with torch.no_grad():
+        track = smoother(person.keypoints[None], names=names, covariance=person.covariance[None])
+    seen = person.keypoints.isfinite().flatten(1).any(1)
+    track = _without_long_gaps(track, seen, 0, gap)
+    return replace(track, first_frame=person.first_frame)
+
+
+def _seen(measured: Measured) -> Bool[Tensor, " T"]:
+    return measured.keypoints.isfinite().flatten(1).any(1)
+
+
+def _without_long_gaps(
+    poses: PoseTrack, seen: Bool[Tensor, " T"], unseen: int, gap: int
+) -> PoseTrack:
+    """Return the poses, NaN where nothing was seen for more than `gap` frames.
+
+    Args:
+        unseen: number of frames without measurements before these.
+    """
+    frames = torch.arange(len(seen))
+    last = torch.where(seen, frames, torch.full_like(frames, -1 - unseen)).cummax(0).values
+    away = frames - last > gap
+    if not bool(away.any()):
+        return poses
+    changed = {}
+    for name in ("joints2d", "joints3d", "covariance2d", "covariance3d"):
+        value = getattr(poses, name).clone()
+        value[:, away] = torch.nan
+        changed[name] = value
+    return replace(poses, **changed)
+
+
+def _nobody(n_frames: int, tracker: UpperBodyTracker) -> PoseTrack:
+    """Return frames in which somebody has no pose."""
+
+    def nothing(*shape: int) -> Tensor:
+        return torch.full((1, n_frames, *shape), torch.nan, dtype=torch.float64)
+
+    return PoseTrack(
+        joints2d=nothing(8, 2),
+        joints3d=nothing(8, 3),
+        covariance2d=nothing(8, 2, 2),
+        covariance3d=nothing(8, 3, 3),
+        observed=torch.zeros(1, n_frames, 8, dtype=torch.bool),
+        log_evidence=torch.zeros(1, n_frames, 2, dtype=torch.float64),
+        lengths=torch.tensor([n_frames]),
+        matrix=tracker.camera.matrix,
+        failed_at=torch.tensor([-1]),
+        fps=tracker.fps,
+        frame=tracker.frame,
+        notes=tracker.notes,
+        method=tracker.method,
+    )

@@ -1,0 +1,332 @@
+"""One person's silhouettes in the synchronised videos of calibrated cameras."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, UInt8
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchpose.camera._pinhole import PinholeCamera
+from torchpose.camera._projection import intrinsics
+from torchpose.camera._rig import scale_matrix, undistortion_maps
+from torchpose.errors import CameraError, InputError, check_rgb
+from torchpose.measure._brightness_background import BrightnessBackground, PixelKind
+from torchpose.video._base import VideoFrame, VideoSource
+
+__all__ = [
+    "SilhouetteMeasurer",
+    "SilhouetteView",
+    "clean_silhouette",
+    "fit_view",
+    "fit_views",
+    "frames_in_step",
+    "read_silhouettes",
+]
+
+Image = NDArray[np.uint8]
+_BLOCK = 16  # pixels: codecs store multiples of it, and some calibrations are of what is stored
+_PART = 0.03  # of the largest piece: a smaller one is not a part of the person that was cut off
+_HOLE = 0.02  # of the silhouette: a larger hole is what one sees between arm and body
+_STILL, _SAME = 0.9, 18  # share of the frames, and grey levels, for what always looks the same
+_LEARNING_FRAMES = 120  # of a video without an empty scene, spread over all of it
+
+
+class SilhouetteView(NamedTuple):
+    """How a camera's images become silhouettes of a common size.
+
+    Attributes:
+        camera: of the silhouettes, without distortion. size: (width, height) of a frame of the video.
+        padding: columns and rows that calibration has to the right and below, and the video has not.
+        inner: (width, height) of the image in the silhouette, the rest being empty.
+        source: the camera as it was calibrated.
+    """
+
+    camera: PinholeCamera
+    size: tuple[int, int]
+    padding: tuple[int, int]
+    inner: tuple[int, int]
+    source: PinholeCamera
+
+
+def fit_view(
+    camera: PinholeCamera, size: tuple[int, int], height: int, width: int
+) -> SilhouetteView:
+    """Scale a camera so that its image fits into height x width; pixel centres are integers.
+
+    Args:
+        camera: calibrated for `size`, or for that with up to 15 columns and rows more at the right
+            and below, as codecs store them.
+        size: (width, height) of the video, pixels. height, width: of the silhouettes.
+
+    Raises:
+        CameraError: the calibration is for images of another size.
+
+    >>> view = fit_view(PinholeCamera(1000, 1000, 499.5, 499.5, 1000, 1000), (1000, 1000), 120, 160)
+    >>> view.inner, [round(float(x), 2) for x in view.camera.matrix[0]]
+    ((120, 120), [120.0, 0.0, 59.5])
+    """
+    calibrated = size if camera.image_size is None else camera.image_size
+    padding = (calibrated[0] - size[0], calibrated[1] - size[1])
+    if not all(0 <= p < _BLOCK for p in padding):
+        raise CameraError(
+            f"camera {camera.name!r} is calibrated for {calibrated[0]} x {calibrated[1]} pixels, and "
+            f"its video has {size[0]} x {size[1]}: calibrate at the size of the video, or give a "
+            "camera file whose matrix and size are scaled to it"
+        )
+    scale = min(width / calibrated[0], height / calibrated[1])
+    inner = (min(width, round(calibrated[0] * scale)), min(height, round(calibrated[1] * scale)))
+    x, y = inner[0] / calibrated[0], inner[1] / calibrated[1]
+    fx, fy, skew, cx, cy = map(float, intrinsics(scale_matrix(camera.matrix, x, y)))
+    scaled = PinholeCamera(
+        fx, fy, cx, cy, width, height, camera.name, skew=skew,
+        rotation=camera.rotation.tolist(), translation=camera.translation.tolist(),
+    )  # fmt: skip
+    return SilhouetteView(scaled, size, padding, inner, camera)
+
+
+def fit_views(
+    cameras: Sequence[PinholeCamera], sizes: Sequence[tuple[int, int]], rows: int
+) -> list[SilhouetteView]:
+    """`fit_view` of each camera, in images of so many rows that are wide enough for all of them."""
+    shapes = [camera.image_size or size for camera, size in zip(cameras, sizes, strict=True)]
+    width = max(round(w * rows / h) for w, h in shapes)
+    return [
+        fit_view(camera, size, rows, width) for camera, size in zip(cameras, sizes, strict=True)
+    ]
+
+
+def clean_silhouette(mask: NDArray[np.bool_], largest_hole: float = _HOLE) -> NDArray[np.bool_]:
+    """Without specks and small holes: what a background model leaves of one person.
+
+    A median filter takes single pixels, a closing joins what is a pixel apart; of the pieces those
+    stay that have 3 % of the largest one's pixels, and holes are filled that have less than
+    `largest_hole` of the silhouette's.
+
+    Args:
+        mask: True where there is something [H, W]. largest_hole: share of the silhouette.
+    """
+    import cv2
+
+    smooth = cv2.medianBlur(mask.astype(np.uint8), 3)
+    closed = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    kept = _pieces(np.asarray(closed, np.uint8), _PART)
+    area = int(kept.sum())
+    holes = _areas(1 - kept)
+    fill = np.flatnonzero(holes.areas < largest_hole * area)
+    return np.asarray((kept > 0) | np.isin(holes.labels, fill[fill > 0]))
+
+
+class _Areas(NamedTuple):
+    labels: NDArray[np.int32]
+    areas: NDArray[np.int64]
+
+
+def _areas(mask: NDArray[np.uint8]) -> _Areas:
+    """Connected pieces by number, 0 being none, and how many pixels each has."""
+    import cv2
+
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
+    areas = stats[:, cv2.CC_STAT_AREA].astype(np.int64)
+    return _Areas(np.asarray(labels, np.int32), areas)
+
+
+def _pieces(mask: NDArray[np.uint8], share: float) -> NDArray[np.uint8]:
+    pieces = _areas(mask)
+    if len(pieces.areas) < 2:
+        return np.zeros_like(mask)
+    kept = np.flatnonzero(pieces.areas >= share * pieces.areas[1:].max())
+    return np.isin(pieces.labels, kept[kept > 0]).astype(np.uint8)
+
+
+class SilhouetteMeasurer:
+    """Silhouettes of one camera: undistorted, scaled, told from the background, cleaned.
+
+    Args:
+        view: from `fit_view`.
+        empty: RGB frames of the empty scene [N, H, W, 3], uint8, with or without the padding; then
+            the background is a `BrightnessBackground`, which knows shadows. None takes `frames`.
+        frames: RGB frames spread over the video itself. With `empty`, what looks the same in nine of
+            ten of them is something that was moved since the scene was empty, and no person; without
+            `empty`, OpenCV's MOG2 learns what stays, and whoever does not move becomes background.
+
+    Raises:
+        InputError: neither. ShapeError, InputError: frames of another size or kind.
+    """
+
+    def __init__(
+        self,
+        view: SilhouetteView,
+        empty: Iterable[Image] | None = None,
+        frames: Iterable[Image] | None = None,
+    ) -> None:
+        self.view = view
+        self._maps = _undistortion(view)
+        # large frames pass one by one, what is kept of them is small
+        without = [self._prepare(frame) for frame in (() if empty is None else empty)]
+        shown = [self._prepare(frame) for frame in (() if frames is None else frames)]
+        if not without and not shown:
+            raise InputError("give frames of the empty scene, or frames of the video itself")
+        self._background: BrightnessBackground | None = None
+        self._moved: _Moved | None = None
+        if without:
+            self._background = BrightnessBackground().fit(_stack(without))
+            if shown:
+                self._moved = _find_moved(_stack(shown))
+        else:
+            self._mixture = _learn(shown)
+
+    def __call__(self, frame: Image) -> NDArray[np.bool_]:
+        """The silhouette in a frame: bool, of the size of the view's camera [height, width].
+
+        Args:
+            frame: RGB, of the size of the video.
+        """
+        small = self._prepare(frame)
+        width, height = self.view.camera.image_size or self.view.inner
+        found = np.zeros((int(height), int(width)), dtype=bool)
+        found[: small.shape[0], : small.shape[1]] = clean_silhouette(self._foreground(small))
+        return found
+
+    def _foreground(self, small: Image) -> NDArray[np.bool_]:
+        if self._background is not None:
+            image = _tensor(small)
+            found = self._background(image) == PixelKind.FOREGROUND
+            if self._moved is not None:
+                found &= ~(self._moved.still & _alike(image, self._moved.colour))
+            return found.numpy()
+        return np.asarray(self._mixture.apply(small, None, 0.0) == 255)
+
+    def _prepare(self, frame: Image) -> Image:
+        """Padded, undistorted and scaled in one go."""
+        import cv2
+
+        check_rgb("frame", frame, empty=False)
+        (width, height), (right, below) = self.view.size, self.view.padding
+        whole: Any = frame
+        if frame.shape[1::-1] == (width, height):
+            whole = cv2.copyMakeBorder(frame, 0, below, 0, right, cv2.BORDER_REPLICATE)
+        elif frame.shape[1::-1] != (width + right, height + below):
+            raise InputError(
+                f"frames of camera {self.view.camera.name!r} must have {width} x {height} pixels, "
+                f"got {frame.shape[1]} x {frame.shape[0]}"
+            )
+        if self._maps is not None:
+            whole = cv2.remap(whole, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(cv2.resize(whole, self.view.inner, interpolation=cv2.INTER_AREA))
+
+
+def _tensor(image: Image) -> UInt8[Tensor, "3 H W"]:
+    return torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)
+
+
+def _stack(images: Sequence[Image]) -> UInt8[Tensor, "N 3 H W"]:
+    return torch.stack([_tensor(image) for image in images])
+
+
+def _learn(images: Sequence[Image]) -> Any:
+    """OpenCV's MOG2 of what stays in all of the images."""
+    import cv2
+
+    mixture = cv2.createBackgroundSubtractorMOG2(len(images), 16.0, True)
+    for image in images:
+        mixture.apply(image, None, 1 / len(images))
+    return mixture
+
+
+class _Moved(NamedTuple):
+    """What a video shows nearly all the time: its colour [3, H, W], and where [H, W]."""
+
+    colour: Tensor
+    still: Tensor
+
+
+def _find_moved(frames: UInt8[Tensor, "N 3 H W"]) -> _Moved:
+    colour = frames.median(0).values
+    return _Moved(colour, _alike(frames, colour).double().mean(0) >= _STILL)
+
+
+def _alike(images: Tensor, colour: Tensor) -> Tensor:
+    return (images.int() - colour.int()).abs().amax(-3) <= _SAME
+
+
+def _undistortion(view: SilhouetteView) -> tuple[np.ndarray, np.ndarray] | None:
+    """`undistortion_maps` of the image with its padding."""
+    camera = view.source
+    size = (view.size[0] + view.padding[0], view.size[1] + view.padding[1])
+    return undistortion_maps(camera.matrix, camera.distortions, camera.fisheye, size)
+
+
+def learning_frames(source: VideoSource) -> Iterator[Image]:
+    """Some frames spread over a video, for what it shows all the time."""
+    count = source.n_frames or _LEARNING_FRAMES
+    stride = max(1, count // _LEARNING_FRAMES)
+    spread = (frame.image for frame in source if frame.index % stride == 0)
+    return islice(spread, 2 * _LEARNING_FRAMES)
+
+
+def read_empty_scene(path: str | Path) -> list[Image]:
+    """Frames of the empty scene: of a picture, a folder of pictures or a video.
+
+    Raises:
+        InputError: no such file. FileFormatError: neither a picture nor a video.
+    """
+    import cv2
+
+    from torchpose.video._source import open_video
+
+    if Path(path).is_file():
+        picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if picture is not None:
+            return [np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)]
+    with open_video(str(path)) as source:
+        return list(learning_frames(source))
+
+
+def frames_in_step(
+    sources: Sequence[VideoSource], delays: Sequence[int]
+) -> Iterator[tuple[VideoFrame, ...]]:
+    """The frames of all videos side by side, until the first one ends.
+
+    Args:
+        delays: frames by which each video began too early, which are passed over.
+    """
+    for source, delay in zip(sources, delays, strict=True):
+        for _ in range(delay):
+            next(source, None)
+    yield from zip(*sources, strict=False)
+
+
+def read_silhouettes(
+    sources: Sequence[VideoSource],
+    measurers: Sequence[Callable[[Image], NDArray[np.bool_]]],
+    delays: Sequence[int] | None = None,
+) -> Iterator[Bool[Tensor, "C H W"]]:
+    """The silhouettes of all cameras, frame by frame, until the first video ends.
+
+    Args:
+        sources: one video per camera, of one frame rate.
+        measurers: one per camera, such as a `SilhouetteMeasurer`.
+        delays: frames by which each video began too early, which are passed over.
+
+    Raises:
+        InputError: numbers that do not match, or videos of different frame rates.
+    """
+    starts = [0] * len(sources) if delays is None else list(delays)
+    if not len(sources) == len(measurers) == len(starts) or not sources or min(starts) < 0:
+        raise InputError(
+            f"expected as many videos, measurers and delays of 0 or more, got {len(sources)}, "
+            f"{len(measurers)} and {starts}"
+        )
+    rates = {round(source.fps, 3) for source in sources}
+    if len(rates) > 1:
+        raise InputError(
+            f"videos must have one frame rate, got {sorted(rates)}; open them with a common fps"
+        )
+    for frames in frames_in_step(sources, starts):
+        masks = [m(frame.image) for m, frame in zip(measurers, frames, strict=True)]
+        yield torch.from_numpy(np.stack(masks))

@@ -1,0 +1,270 @@
+"""The whole way from video to poses of everybody in it."""
+
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from torchpose._core.module_state import derived
+from torchpose.camera._pinhole import PinholeCamera
+from torchpose.errors import InputError, check_rgb
+from torchpose.measure._association import HandAssociation
+from torchpose.measure._face import FaceDetector, FaceTracks, Image
+from torchpose.measure._head import HeadNeck
+from torchpose.measure._upper_body import (
+    Candidates,
+    FrameMeasurements,
+    MeasurerState,
+    UpperBodyMeasurer,
+)
+from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.upper_body._pose_track import PoseTrack
+from torchpose.upper_body._tracker import UpperBodyTracker
+from torchpose.video._person_stream import Measured, PersonStream, PersonStreamState, measured_of
+from torchpose.video._prefetch import prefetch
+from torchpose.video._recording import TrackedPerson, TrackedRecording
+
+__all__ = ["LivePerson", "TrackedPerson", "VideoState", "VideoTracker", "Watcher"]
+
+Watcher = Callable[[Image, FrameMeasurements, dict[int, PoseTrack]], None]
+"""Is shown a frame, what was measured in it, and the poses of everybody there by number."""
+
+_HANDS = [UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")]
+_BLOCK = 32  # frames of a recording that are filtered together
+
+
+class VideoState(NamedTuple):
+    """What `VideoTracker.step` knows of the frames before: of measuring, streams, the last poses."""
+
+    measurer: MeasurerState
+    streams: dict[int, PersonStreamState]
+    poses: dict[int, PoseTrack]
+
+
+class LivePerson(NamedTuple):
+    """The pose of somebody in one frame: number, pose (a track of one frame), and what was measured."""
+
+    number: int
+    pose: PoseTrack
+    measured: Measured
+
+
+class VideoTracker(nn.Module):
+    """Tracks everybody in a video: `UpperBodyMeasurer`, then an `UpperBodyTracker` for each person.
+
+    `forward` tracks a recording, `init` and `step` a camera.
+
+    Args:
+        prior: from `load_prior` or `fit_upper_body_prior`.
+        camera: of the video.
+        fps: frames per second. All frames are taken to be equally far apart.
+        hands, background, elbows, face_detector, max_persons, head_neck: see
+            `UpperBodyMeasurer`.
+        edges: correct hands that were taken for each other by the edges of the arms
+            (`HandAssociation`); takes about twice the time of the poses.
+        candidates: let the hand tracker look where the last pose has the hands; frames are then
+            measured and filtered in turn, which is slower.
+        max_gap: seconds after which somebody who is not seen has no pose any more; None is never.
+        seed: of methods that draw; every person has a generator of their own.
+        options: to `UpperBodyTracker`, such as method, smoothing or frame.
+
+    Raises:
+        InputError, CameraError, PriorError: as those.
+
+    Example:
+        >>> import numpy as np, torchpose
+        >>> prior = torchpose.load_prior("kinect-upper-body")
+        >>> camera = torchpose.PinholeCamera.from_image_size(160, 120)
+        >>> tracker = torchpose.VideoTracker(prior, camera)
+        >>> tracker(np.zeros((5, 120, 160, 3), np.uint8))  # nobody there
+        []
+    """
+
+    def __init__(
+        self,
+        prior: UpperBodyPrior,
+        camera: PinholeCamera | None = None,
+        *,
+        fps: float = 30.0,
+        hands: str = "grid",
+        background: bool = False,
+        elbows: bool = False,
+        edges: bool = False,
+        candidates: bool = False,
+        face_detector: FaceDetector | None = None,
+        max_persons: int | None = None,
+        head_neck: HeadNeck | None = None,
+        max_gap: float | None = 5.0,
+        seed: int = 0,
+        **options: Any,
+    ) -> None:
+        super().__init__()
+        if max_gap is not None and not max_gap > 0:
+            raise InputError(f"max_gap must be positive, got {max_gap}")
+        self.measurer = UpperBodyMeasurer(
+            prior, fps, hands, background, elbows, face_detector, max_persons, head_neck
+        )
+        if candidates and hands != "grid":
+            raise InputError(f"candidates need hands='grid', got {hands!r}")
+        self.candidates = candidates
+        smoothing = options.pop("smoothing", None)
+        tracker = UpperBodyTracker(prior, camera, fps=fps, max_gap=None, **options)
+        association = HandAssociation() if edges else None
+        self.stream = PersonStream(tracker, self.measurer.names, seed, association)
+        self.smoothing = smoothing
+        self._options = {"fps": fps, "max_gap": None, **options}
+        _ = self.smoother  # raises what does not fit before any work
+        self.fps = float(fps)
+        self.gap = sys.maxsize if max_gap is None else round(max_gap * fps)
+
+    @property
+    def tracker(self) -> UpperBodyTracker:
+        """The tracker of every person's poses."""
+        return self.stream.tracker
+
+    @property
+    def smoother(self) -> UpperBodyTracker | None:
+        """The tracker of whole recordings, on the same prior and camera; None without smoothing."""
+        if self.smoothing is None:
+            return None
+        own = self.tracker
+        given = self._options | own.given_options
+        given |= {"measurement_std": own.measurement_std, "smoothing": self.smoothing}
+        sources = (*own.parameters(), *own.buffers())
+        return derived(
+            self, "smoother", sources, lambda: UpperBodyTracker(own.prior, own.camera, **given)
+        )
+
+    def init(self) -> VideoState:
+        """Return the state before the first frame, when nobody was seen yet."""
+        return VideoState(self.measurer.init(), {}, {})
+
+    def step(self, state: VideoState, image: Image | Tensor) -> tuple[VideoState, list[LivePerson]]:
+        """Track one more frame of a camera.
+
+        Args:
+            state: from `init` or the step before. image: RGB, uint8, an array [H, W, 3] or a tensor
+                [3, H, W].
+
+        Returns:
+            The next state, and everybody who is there or was until `max_gap` ago.
+
+        Raises:
+            InputError: another kind of image, or a tracker that smooths.
+        """
+        if self.smoother is not None:
+            raise InputError("a camera is tracked frame by frame: expected smoothing=None")
+        image = as_image(image)
+        candidates = _candidates(state.poses) if self.candidates else None
+        measurer, measured = self.measurer.step(state.measurer, image, None, candidates)
+        streams, people = {}, []
+        there = set(measured.person.tolist())
+        for number in sorted(state.streams.keys() | there):  # each with a state of its own
+            stream = state.streams.get(number) or self.stream.init(number)
+            own = measured_of([measured], number, len(self.stream.names))
+            stream, pose, chosen = self.stream.advance(stream, own, [image])
+            if stream.unseen <= self.gap:
+                streams[number] = stream
+                people.append(LivePerson(number, pose, chosen))
+        return VideoState(measurer, streams, {p.number: p.pose for p in people}), people
+
+    def forward(
+        self,
+        frames: Iterable[Any] | Tensor,
+        progress: bool = False,
+        n_frames: int | None = None,
+        folder: str | Path | None = None,
+        watch: Watcher | None = None,
+    ) -> list[TrackedPerson]:
+        """Track a recording, however long: memory does not grow with it.
+
+        Args:
+            frames: RGB, uint8, arrays [H, W, 3], or what has such an `image` (a `VideoSource`); or a
+                tensor [T, 3, H, W].
+            progress: whether to show a bar. n_frames: for the bar.
+            folder: for temporary files, some 1.2 kB for every pose.
+            watch: is called for every frame; frames are then filtered one by one, which is slower.
+
+        Returns:
+            Everybody who was seen for half a second, the one seen longest first.
+
+        Raises:
+            InputError: another kind of image. OutputError: the disk is full.
+        """
+        recording = TrackedRecording(self.stream, self.gap, folder)
+        size = _BLOCK if watch is None and not self.candidates else 1
+        last: dict[int, PoseTrack] = {}
+        block: list[FrameMeasurements] = []
+        images: list[Image] = []
+        measured = self._measure(frames, last)
+        if not self.candidates:
+            measured = prefetch(measured, size)  # while the block before is filtered
+        for image, now in tqdm(measured, total=n_frames, disable=not progress, unit="frame"):
+            block.append(now)
+            images.append(image)
+            if len(block) < size:
+                continue
+            poses = recording.append(block, images)
+            block, images = [], []
+            last.clear()
+            last.update({n: pose for n, pose in poses.items() if _is_pose(pose)})
+            if watch is not None:
+                watch(image, now, dict(last))
+        if block:
+            recording.append(block, images)
+        return recording.finish(self.smoother)
+
+    def _measure(
+        self, frames: Iterable[Any] | Tensor, last: dict[int, PoseTrack]
+    ) -> Iterator[tuple[Image, FrameMeasurements]]:
+        """Yield frames and what is measured in them; faces are found ahead, in another thread.
+
+        `last` holds the poses of the frame before, for candidates.
+        """
+        state = self.measurer.init()
+
+        def with_faces() -> Iterator[tuple[Image, FaceTracks]]:
+            tracks = state.faces
+            for frame in frames:
+                image = as_image(getattr(frame, "image", frame))
+                with torch.no_grad():
+                    tracks = self.measurer.follow_faces(tracks, image)
+                yield image, tracks
+
+        current = state
+        for image, tracks in prefetch(with_faces()):
+            with torch.no_grad():
+                candidates = _candidates(last) if self.candidates else None
+                current, measured = self.measurer.step(current, image, tracks, candidates)
+            yield image, measured
+
+
+def as_image(image: Any) -> Image:
+    """Return a frame as an array [H, W, 3]; tensors are [3, H, W]."""
+    if isinstance(image, Tensor):
+        if image.ndim != 3 or image.shape[0] != 3 or image.dtype != torch.uint8:
+            raise InputError(
+                "a frame must be an RGB tensor [3, H, W] of uint8, got "
+                f"{list(image.shape)} of {image.dtype}"
+            )
+        return np.ascontiguousarray(image.permute(1, 2, 0).cpu().numpy())
+    check_rgb("a frame", image)
+    return np.asarray(image)
+
+
+def _candidates(poses: dict[int, PoseTrack]) -> dict[int, Candidates]:
+    """Return where the poses of a frame have the hands, by person."""
+    return {
+        n: Candidates(pose.joints2d[0, -1, _HANDS], pose.covariance2d[0, -1, _HANDS])
+        for n, pose in poses.items()
+    }
+
+
+def _is_pose(track: PoseTrack) -> bool:
+    return bool(track.joints3d.isfinite().all())

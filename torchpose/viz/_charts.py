@@ -1,0 +1,327 @@
+"""Curves and bars: joints and errors over time, PCP, calibration, error per joint."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchpose.errors import InputError, check_shape
+from torchpose.metrics._calibration import Coverage, chi2_quantile
+from torchpose.metrics._poses import PCP
+from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.viz._style import (
+    INK,
+    MUTED,
+    NORMAL,
+    PALE,
+    add_legend,
+    join_unit,
+    joint_colors,
+    method_styles,
+    new_figure,
+    readable,
+    require_matplotlib,
+    style_axes,
+    to_numpy,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+else:
+    Figure = Any
+
+__all__ = [
+    "plot_error_bars",
+    "plot_errors_over_time",
+    "plot_joint_curves",
+    "plot_pcp",
+    "plot_reliability",
+]
+
+CURVE_JOINTS = ("hand_left", "elbow_left", "hand_right", "elbow_right")
+ERROR_JOINTS = ("hand_left", "hand_right", "elbow_left", "elbow_right", "shoulder_left",
+                "shoulder_right")  # fmt: skip
+_GAP = "#F1E9D2"
+
+
+def plot_joint_curves(
+    joints: Float[Tensor, "T 8 D"],
+    covariance: Float[Tensor, "T 8 D D"] | None = None,
+    observed: Bool[Tensor, "T 8"] | None = None,
+    truth: Float[Tensor, "T 8 D"] | None = None,
+    fps: float = 30.0,
+    show: Sequence[str] = CURVE_JOINTS,
+    level: float = 0.9,
+    title: str | None = None,
+) -> Figure:
+    """Coordinates of some joints over time, with bands, and the gaps in which one was inferred.
+
+    Args:
+        joints: [T, 8, 3], camera axes, metres, or [T, 8, 2], pixels.
+        covariance: [T, 8, D, D]; the band holds each coordinate with probability `level`.
+        observed: [T, 8], True = measured. Gaps of a joint that is measured at times are shaded;
+            one that never is says so beside its name.
+        truth: [T, 8, D], drawn in dark grey.
+        fps: frames per second. show: names of the joints, one row each.
+        level: probability of the bands. title: above the picture.
+    """
+    check_shape("joints", joints, [None, 8, None])
+    require_matplotlib()
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    rows, dims = _indices(show), joints.shape[-1]
+    axes_names = (
+        ("x, right (m)", "y, down (m)", "z, away (m)") if dims == 3 else ("u (px)", "v (px)")
+    )
+    figure = new_figure(4.0 * dims, 1.65 * len(rows) + 0.9, title)
+    grid = figure.subplots(len(rows), dims, sharex=True, squeeze=False)
+    time = torch.arange(joints.shape[0]).numpy() / fps
+    half = float(chi2_quantile(torch.tensor(level, dtype=torch.float64), 1).sqrt())
+    colors = joint_colors(UPPER_BODY)
+    for row, joint in enumerate(rows):
+        never = observed is not None and not bool(observed[:, joint].any())
+        for d in range(dims):
+            ax = style_axes(grid[row, d], "time (s)" if row == len(rows) - 1 else "")
+            if row == 0:
+                ax.set_title(axes_names[d], fontsize=NORMAL, color=INK)
+            middle = to_numpy(joints[:, joint, d])
+            if observed is not None and not never:
+                for start, stop in _spans(~observed[:, joint]):
+                    ax.axvspan(start / fps, stop / fps, color=_GAP, linewidth=0, zorder=0)
+            if covariance is not None:
+                spread = half * to_numpy(covariance[:, joint, d, d]) ** 0.5
+                ax.fill_between(
+                    time, middle - spread, middle + spread, color=colors[joint], alpha=0.2,
+                    linewidth=0,
+                )  # fmt: skip
+            if truth is not None:
+                ax.plot(time, to_numpy(truth[:, joint, d]), color=INK, linewidth=1.1,
+                        linestyle=(0, (3, 1.5)))  # fmt: skip
+            ax.plot(time, middle, color=colors[joint], linewidth=1.5)
+            ax.margins(x=0)
+            if dims == 2 and d == 1:
+                ax.invert_yaxis()
+        note = "\n(inferred throughout)" if never else ""
+        label = readable(UPPER_BODY[joint]) + note
+        grid[row, 0].set_ylabel(label, fontsize=NORMAL, color=INK)
+    entries: list[Any] = [Line2D([], [], color=MUTED, linewidth=1.5, label="estimate")]
+    if covariance is not None:
+        entries.append(Patch(color=PALE, label=f"{100 * level:.0f} % band"))
+    if truth is not None:
+        entries.append(
+            Line2D([], [], color=INK, linewidth=1.1, linestyle=(0, (3, 1.5)), label="truth")
+        )
+    if observed is not None:
+        entries.append(Patch(color=_GAP, label="not measured here: inferred"))
+    figure.align_ylabels(grid[:, 0])
+    add_legend(figure, entries)
+    return figure
+
+
+def _indices(names: Sequence[str]) -> list[int]:
+    unknown = [name for name in names if name not in UPPER_BODY]
+    if unknown or not names:
+        raise InputError(f"expected names among {', '.join(UPPER_BODY)}, got {list(names)}")
+    return [UPPER_BODY.index(name) for name in names]
+
+
+def _spans(flag: Tensor) -> list[tuple[float, float]]:
+    """Stretches of True as (start, stop) in frames, half a frame wider on each side."""
+    padded = torch.nn.functional.pad(flag.detach().cpu().int(), (1, 1))
+    edges = torch.nonzero(padded.diff()).flatten().tolist()
+    return [(a - 0.5, b - 0.5) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def plot_errors_over_time(
+    errors: Mapping[str, Float[Tensor, "T 8"]],
+    fps: float = 30.0,
+    show: Sequence[str] = ERROR_JOINTS,
+    unit: str = "cm",
+    scale: float = 100.0,
+    bound: float | None = None,
+    title: str | None = None,
+) -> Figure:
+    """Return the error of each joint over time, one line for each method (paper's Figures 5 and 11).
+
+    Args:
+        errors: by method, [T, 8], from `torchpose.metrics.joint_errors`; NaN leaves a hole.
+        fps: frames per second. show: names of the joints, one panel each; those in one row (the
+            left and the right one, by default) share a scale.
+        unit, scale: errors are multiplied by `scale` and called `unit`: ("cm", 100) for metres,
+            ("px", 1) for pixels.
+        bound: a thin line at this error, in `unit`, e.g. 20 for the paper's 20 cm.
+        title: above the picture.
+    """
+    styles = method_styles(list(errors))
+    rows = _indices(show)
+    columns = 2 if len(rows) > 1 else 1
+    lines = math.ceil(len(rows) / columns)
+    figure = new_figure(5.6 * columns, 1.75 * lines + 0.9, title)
+    grid = figure.subplots(lines, columns, sharex=True, sharey="row", squeeze=False)
+    for place, joint in enumerate(rows):
+        ax = style_axes(grid.flat[place], title=readable(UPPER_BODY[joint]))
+        for name, values in errors.items():
+            check_shape(f"errors[{name!r}]", values, [None, 8])
+            time = torch.arange(values.shape[0]).numpy() / fps
+            ax.plot(time, scale * to_numpy(values[:, joint]), linewidth=1.3, **styles[name])
+        ax.margins(x=0)
+        ax.set_ylim(bottom=0)
+    if bound is not None:
+        for ax in grid.flat[: len(rows)]:
+            ax.set_ylim(0, ax.get_ylim()[1])  # so that the line does not widen the scale
+            ax.axhline(bound, color=MUTED, linewidth=0.9, zorder=1)
+    for ax in grid[-1]:
+        ax.set_xlabel("time (s)", fontsize=NORMAL, color=INK)
+    for ax in grid[:, 0]:
+        ax.set_ylabel(join_unit("error", unit), fontsize=NORMAL, color=INK)
+    for ax in grid.flat[len(rows) :]:
+        ax.set_visible(False)
+    add_legend(figure, _line_entries(styles, f"{bound:g} {unit}" if bound is not None else None))
+    return figure
+
+
+def _line_entries(styles: Mapping[str, Mapping[str, Any]], bound: str | None = None) -> list[Any]:
+    from matplotlib.lines import Line2D
+
+    entries = [Line2D([], [], linewidth=1.8, label=name, **s) for name, s in styles.items()]
+    if bound is not None:
+        entries.append(Line2D([], [], color=MUTED, linewidth=0.9, label=bound))
+    return entries
+
+
+def plot_error_bars(
+    errors: Mapping[str, Float[Tensor, "... 8"]],
+    unit: str = "cm",
+    scale: float = 100.0,
+    title: str | None = None,
+) -> Figure:
+    """Return the mean error of each joint, one bar for each method (paper's Figures 3 and 10).
+
+    The thin line on a bar runs from the first to the third quartile.
+
+    Args:
+        errors: by method, [..., 8], from `torchpose.metrics.joint_errors`; NaN are left out.
+        unit, scale: as in `plot_errors_over_time`.
+        title: above the picture.
+    """
+    require_matplotlib()
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    styles = method_styles(list(errors))
+    figure = new_figure(9.2, 4.2, title)
+    ax = style_axes(figure.add_subplot(), y=join_unit("mean error", unit))
+    ax.grid(False, axis="x")
+    width = 0.8 / len(errors)
+    entries: list[Any] = []
+    for i, (name, values) in enumerate(errors.items()):
+        check_shape(f"errors[{name!r}]", values, ["...", 8])
+        flat = scale * values.detach().cpu().double().reshape(-1, 8)
+        mean = to_numpy(flat.nanmean(0))
+        levels = torch.tensor([0.25, 0.75], dtype=torch.float64)
+        low, high = to_numpy(torch.nanquantile(flat, levels, dim=0))
+        place = torch.arange(8).numpy() - 0.4 + (i + 0.5) * width
+        ax.bar(place, mean, 0.9 * width, color=styles[name]["color"], alpha=0.85)
+        ax.vlines(place, low, high, color=INK, linewidth=1.1)
+        average = float(flat.nanmean())
+        label = f"{name} (mean {average:.1f} {unit})"
+        entries.append(Patch(color=styles[name]["color"], alpha=0.85, label=label))
+    entries.append(Line2D([], [], color=INK, linewidth=1.1, label="middle half of the errors"))
+    ax.set_xticks(range(8), [readable(n).replace(" ", "\n") for n in UPPER_BODY])
+    ax.tick_params(axis="x", length=0, labelsize=NORMAL, labelcolor=INK)
+    ax.set_ylim(bottom=0)
+    add_legend(figure, entries)
+    return figure
+
+
+def plot_pcp(curves: Mapping[str, PCP], by_limb: bool = False, title: str | None = None) -> Figure:
+    """Return the percentage of correct parts over the threshold (paper's Figures 4 and 13).
+
+    Args:
+        curves: by method, from `torchpose.metrics.pcp`.
+        by_limb: panels for upper arms and forearms beside the one for all four; the curves must
+            then have the limbs of `torchpose.metrics.ARM_LIMBS`.
+        title: above the picture.
+    """
+    styles = method_styles(list(curves))
+    parts: dict[str, list[int] | None] = {"upper arms and forearms": None}
+    if by_limb:
+        parts |= {"upper arms": [0, 2], "forearms": [1, 3]}
+    figure = new_figure(4.2 * len(parts) + 1.4 * (len(parts) == 1), 4.1, title)
+    panels = figure.subplots(1, len(parts), sharey=True, squeeze=False)[0]
+    for ax, (part, limbs) in zip(panels, parts.items(), strict=True):
+        style_axes(ax, "threshold (fraction of the limb's true length)", title=part)
+        for name, curve in curves.items():
+            share = curve.overall
+            if limbs is not None:
+                if curve.per_limb.shape[0] != 4:
+                    raise InputError(
+                        f"by_limb needs the four limbs of ARM_LIMBS, got {curve.per_limb.shape[0]}"
+                    )
+                n = curve.counts[limbs].to(curve.per_limb.dtype)
+                share = (curve.per_limb[limbs].nan_to_num() * n[:, None]).sum(0) / n.sum()
+            ax.plot(
+                to_numpy(curve.thresholds), 100 * to_numpy(share), linewidth=1.9, **styles[name]
+            )
+        ax.set(ylim=(0, 101), xlim=(0, None))
+        ax.axvline(0.5, color=PALE, linewidth=0.9, zorder=1)
+    panels[0].set_ylabel("correct limbs (%)", fontsize=NORMAL, color=INK)
+    add_legend(figure, _line_entries(styles))
+    return figure
+
+
+def plot_reliability(
+    curves: Coverage | Mapping[str, Coverage],
+    names: Sequence[str] = UPPER_BODY,
+    tolerance: float = 0.05,
+    title: str | None = None,
+) -> Figure:
+    """Reliability diagram of each joint: share inside the ellipsoid over its nominal probability.
+
+    On the diagonal a covariance is right; below it is too small (overconfident), above too large.
+
+    Args:
+        curves: from `torchpose.metrics.reliability`, one or several by name.
+        names: of the joints, one panel each.
+        tolerance: half width of the grey band about the diagonal (0.05 = 5 points).
+        title: above the picture.
+    """
+    require_matplotlib()
+    from matplotlib.patches import Patch
+
+    by_name = {"estimate": curves} if isinstance(curves, Coverage) else dict(curves)
+    styles = method_styles(list(by_name))
+    columns = min(4, len(names))
+    lines = math.ceil(len(names) / columns)
+    figure = new_figure(2.5 * columns, 2.6 * lines + 0.8, title)
+    grid = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
+    for place, joint in enumerate(names):
+        ax = style_axes(grid.flat[place], title=readable(joint))
+        ax.fill_between(
+            [0, 100], [-100 * tolerance, 100 - 100 * tolerance],
+            [100 * tolerance, 100 + 100 * tolerance], color="#EDEDED", linewidth=0, zorder=0,
+        )  # fmt: skip
+        ax.plot([0, 100], [0, 100], color=MUTED, linewidth=0.9, zorder=1)
+        for name, curve in by_name.items():
+            check_shape(f"curves[{name!r}].per_joint", curve.per_joint, [None, len(names)])
+            ax.plot(
+                100 * to_numpy(curve.levels), 100 * to_numpy(curve.per_joint[:, place]),
+                linewidth=1.9, **styles[name],
+            )  # fmt: skip
+        ax.set(xlim=(0, 100), ylim=(0, 100), xticks=[0, 50, 100], yticks=[0, 50, 100])
+        ax.set_aspect("equal")
+        if place % columns == 0:
+            ax.set_ylabel("true joints\ninside (%)", fontsize=NORMAL, color=INK)
+        if place // columns == lines - 1:
+            ax.set_xlabel("nominal (%)", fontsize=NORMAL, color=INK)
+    for ax in grid.flat[len(names) :]:
+        ax.set_visible(False)
+    band = Patch(color="#EDEDED", label=f"within {100 * tolerance:g} points")
+    add_legend(figure, [*_line_entries(styles), band])
+    return figure

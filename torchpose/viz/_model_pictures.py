@@ -1,0 +1,318 @@
+"""Draw what body models have learnt: the latent space of a manifold, the space of an action."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from torchpose.errors import InputError, ShapeError
+from torchpose.viz._style import (
+    INK,
+    LEFT,
+    MIDDLE,
+    MUTED,
+    PALE,
+    RIGHT,
+    SMALL,
+    add_legend,
+    method_styles,
+    new_figure,
+    style_axes,
+    to_numpy,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from torchpose.body._kinematics import Body
+    from torchpose.priors._actions.file import Synchronised
+    from torchpose.priors._actions.space import ActionSpace
+    from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
+else:
+    Axes = Figure = ActionSpace = BackConstrainedGPLVM = Body = Synchronised = Any
+
+__all__ = ["plot_action_space", "plot_manifold"]
+
+_MARGIN, _ARROWS = 0.18, 5
+_SIDE, _UP = 2, 1  # part axes: z forward, y up
+
+
+def plot_manifold(
+    manifold: BackConstrainedGPLVM,
+    others: Mapping[str, Tensor | Sequence[Tensor]] | None = None,
+    body: Body | None = None,
+    n_poses: int = 8,
+    resolution: int = 160,
+    title: str | None = None,
+) -> Figure:
+    """Return the first two latent dimensions, the trajectories in them, and the predictive deviation.
+
+    White is where the manifold is as sure of a pose as it gets, dark where it falls back on the mean
+    pose. A line is a sequence, with arrows in the direction of time and a dot where it starts;
+    sequences of one name share a colour. With a body, poses along the first sequence stand below,
+    seen from the side, walking to the right; their numbers are in the latent space as well.
+
+    Args:
+        manifold: of two latent dimensions or more; the others are held at zero.
+        others: more poses by name, such as of a validation trial, drawn dashed.
+        body: whose states the poses are of. n_poses: that are shown of it.
+        resolution: points of the grey picture along either axis.
+        title: above the picture; by default the manifold's name and size.
+
+    Raises:
+        InputError: one latent dimension only, or fewer than two points or poses asked for.
+        PriorError: a body of another skeleton. ShapeError: poses with other columns.
+
+    Reference: Gonczarek & Tomczak, Figure 5.
+    """
+    if manifold.latent_dim < 2:
+        raise InputError("a picture of the latent space needs two dimensions or more, got 1")
+    if resolution < 2 or n_poses < 2:
+        raise InputError(
+            f"resolution and n_poses must be at least 2, got {resolution} and {n_poses}"
+        )
+    if body is not None:
+        manifold.check_for(body)
+    fitted = _by_name(manifold)
+    watched = {name: _latents(manifold, poses) for name, poses in (others or {}).items()}
+    everything = torch.cat(
+        [z[:, :2] for paths in (fitted, watched) for p in paths.values() for z in p]
+    )
+    figure = new_figure(7.6, 6.2 if body is None else 8.4, title or _title(manifold))
+    if body is None:
+        ax = figure.subplots()
+    else:
+        top, below = figure.subfigures(2, 1, height_ratios=[6.2, 2.2], squeeze=False)[:, 0]
+        ax = top.subplots()
+        places = _draw_poses(below, manifold, body, n_poses)
+        _number(ax, places)
+    style_axes(ax, "first latent dimension", "second latent dimension", grid=False)
+    _draw_deviation(ax, manifold, everything, resolution)
+    styles = method_styles([*fitted, *watched])
+    for name, paths in fitted.items():
+        for path in paths:
+            _draw_path(ax, path, styles[name]["color"], "-")
+    for name, paths in watched.items():
+        for path in paths:
+            _draw_path(ax, path, styles[name]["color"], (0, (4, 1.5)), hollow=True)
+    ax.set_aspect("equal")
+    add_legend(figure, _legend(fitted, watched, styles))
+    return figure
+
+
+def _title(manifold: BackConstrainedGPLVM) -> str:
+    name = manifold.info.name or "manifold"
+    return f"{name}: {len(manifold.poses)} frames of {manifold.dim} columns"
+
+
+def _by_name(manifold: BackConstrainedGPLVM) -> dict[str, list[Tensor]]:
+    """Latent points of the sequences that were fitted to."""
+    names, paths = manifold.info.sequences, manifold.trajectories()
+    if len(names) != len(paths):
+        names = tuple(f"sequence {i + 1}" for i in range(len(paths)))
+    found: dict[str, list[Tensor]] = {}
+    for name, path in zip(names, paths, strict=True):
+        found.setdefault(name, []).append(path.detach().cpu())
+    return found
+
+
+def _latents(manifold: BackConstrainedGPLVM, poses: Tensor | Sequence[Tensor]) -> list[Tensor]:
+    parts = [poses] if isinstance(poses, Tensor) else list(poses)
+    return [manifold.to_latent(part.to(manifold.poses)).detach().cpu() for part in parts]
+
+
+def _draw_deviation(
+    ax: Axes, manifold: BackConstrainedGPLVM, points: Tensor, resolution: int
+) -> None:
+    room = _MARGIN * (points.amax(0) - points.amin(0)).max()
+    left, bottom = (points.amin(0) - room).tolist()
+    right, top = (points.amax(0) + room).tolist()
+    x = torch.linspace(left, right, resolution, dtype=torch.float64)
+    y = torch.linspace(bottom, top, resolution, dtype=torch.float64)
+    grid = torch.zeros(resolution, resolution, manifold.latent_dim, dtype=torch.float64)
+    grid[..., 0], grid[..., 1] = x, y[:, None]
+    with torch.no_grad():
+        _, variance = manifold.to_pose(grid.to(manifold.poses))
+    deviation = variance.sqrt() * manifold.scale.square().mean().sqrt()
+    image = ax.imshow(
+        to_numpy(deviation), extent=(left, right, bottom, top), origin="lower",
+        cmap="Greys", vmin=0.0, vmax=1.6 * float(deviation.max()), interpolation="bilinear",
+    )  # fmt: skip
+    bar = ax.figure.colorbar(image, ax=ax, shrink=0.7, pad=0.02)
+    bar.ax.set_ylim(float(deviation.min()), float(deviation.max()))
+    bar.set_label("standard deviation of a column of the pose", fontsize=SMALL, color=INK)
+    bar.ax.tick_params(labelsize=SMALL, colors=MUTED, length=3)
+    bar.outline.set_edgecolor(PALE)
+
+
+def _draw_path(ax: Axes, path: Tensor, color: str, dashes: Any, hollow: bool = False) -> None:
+    x, y = to_numpy(path[:, 0]), to_numpy(path[:, 1])
+    ax.plot(x, y, color=color, linestyle=dashes, linewidth=1.3, alpha=0.9)
+    ax.plot(
+        x[:1], y[:1], color=color, marker="o", markersize=7, linestyle="", markeredgewidth=1.6,
+        markerfacecolor="white" if hollow else color,
+    )  # fmt: skip
+    for i in range(_ARROWS):
+        at = round((i + 0.5) / _ARROWS * (len(x) - 2))
+        if len(x) > 2 and (x[at] != x[at + 1] or y[at] != y[at + 1]):
+            ax.annotate(
+                "", (x[at + 1], y[at + 1]), (x[at], y[at]),
+                arrowprops={"arrowstyle": "-|>", "color": color, "mutation_scale": 13},
+            )  # fmt: skip
+
+
+def _draw_poses(part: Any, manifold: BackConstrainedGPLVM, body: Body, n_poses: int) -> Tensor:
+    """Return the poses along the first sequence, beside each other; returns their latent points."""
+    path = manifold.trajectories()[0]
+    cycle = path[: _cycle(path)]
+    at = torch.linspace(0, len(cycle) - 1, n_poses + 1)[:-1].round().long()
+    with torch.no_grad():
+        poses = manifold.pose_mean(cycle[at]).detach().cpu().double()
+    rest = torch.zeros(n_poses, body.dim, dtype=torch.float64)
+    joints = body.joints(body.with_relative(rest.to(body.offsets), poses.to(body.offsets)))
+    joints = joints.detach().cpu().double()
+    ax = part.subplots()
+    ax.set_axis_off()
+    ax.set_aspect("equal")
+    wide = 0.62 * body.height
+    for i, pose in enumerate(joints):
+        _draw_figure(ax, body, pose, i * wide)
+        ax.text(i * wide, float(joints[..., _UP].max()) + 0.12, str(i + 1), ha="center",
+                fontsize=SMALL, color=INK)  # fmt: skip
+    return cycle[at]
+
+
+def _draw_figure(ax: Axes, body: Body, pose: Tensor, shift: float) -> None:
+    for joint, parent in enumerate(body.skeleton.parents):
+        if parent < 0:
+            continue
+        name = body.skeleton.names[joint]
+        left, right = name.startswith("left_"), name.startswith("right_")
+        color = LEFT if left else RIGHT if right else MIDDLE
+        ends = to_numpy(pose[[parent, joint]])
+        ax.plot(
+            ends[:, _SIDE] + shift, ends[:, _UP], color=color, linewidth=2.4,
+            solid_capstyle="round", zorder=1 if left else 3 if right else 2,
+        )  # fmt: skip
+
+
+def _cycle(path: Tensor) -> int:
+    """Return the frames until a trajectory is back where it started; all of them if it never is."""
+    distance = (path - path[0]).norm(dim=-1)
+    away = int((distance > 0.6 * distance.max()).long().argmax())
+    for frame in range(away, len(path) - 1):
+        nearest = distance[frame] <= distance[frame - 1 : frame + 2].min()
+        if nearest and distance[frame] < 0.35 * distance.max():
+            return frame
+    return len(path)
+
+
+def _number(ax: Axes, places: Tensor) -> None:
+    for i, place in enumerate(to_numpy(places[:, :2])):
+        ax.annotate(
+            str(i + 1), place, fontsize=SMALL, color=INK, ha="center", va="center", zorder=6,
+            bbox={"boxstyle": "circle,pad=0.2", "facecolor": "white", "edgecolor": INK, "lw": 0.8},
+        )  # fmt: skip
+
+
+def _legend(
+    fitted: Mapping[str, Any], watched: Mapping[str, Any], styles: Mapping[str, dict[str, Any]]
+) -> list[Any]:
+    from matplotlib.lines import Line2D
+
+    def entry(name: str, dashes: Any, face: str | None) -> Any:
+        color = styles[name]["color"]
+        return Line2D(
+            [], [], color=color, linestyle=dashes, linewidth=1.3, marker="o", markersize=6,
+            markerfacecolor=face or color, label=name,
+        )  # fmt: skip
+
+    entries = [entry(name, "-", None) for name in fitted]
+    return entries + [entry(name, (0, (4, 1.5)), "white") for name in watched]
+
+
+_MOST_LINES = 60
+
+
+def plot_action_space(
+    space: ActionSpace,
+    synchronised: Synchronised,
+    n_dimensions: int = 4,
+    deviations: float = 3.0,
+    title: str | None = None,
+) -> Figure:
+    """Return the first dimensions over time: above with lengths normalised only, below synchronised.
+
+    Thin lines are performances, the thick one is their mean, dashed lines are so many deviations to
+    either side of it; upright lines stand at the key frames.
+
+    Args:
+        space: the fitted action. synchronised: its performances, of `fit_synchronised`.
+        n_dimensions: that are shown, as many as there are at most. deviations: of the dashed lines.
+        title: above the picture; by default the action's name and size.
+
+    Raises:
+        InputError: no dimension is asked for. ShapeError: performances of another action space.
+
+    Reference: Rius, Varona, Roca & Gonzalez, 2006, Figure 1.
+    """
+    if n_dimensions < 1:
+        raise InputError(f"n_dimensions must be at least 1, got {n_dimensions}")
+    if synchronised.after.shape[1:] != space.performance.shape:
+        raise ShapeError(
+            f"the performances have {list(synchronised.after.shape[1:])} postures and dimensions, the "
+            f"action space has {list(space.performance.shape)}"
+        )
+    shown = min(n_dimensions, space.n_dimensions)
+    figure = new_figure(2.4 * shown + 0.6, 5.2, title or _action_title(space))
+    axes = figure.subplots(2, shown, sharex=True, sharey="col", squeeze=False)
+    stages = (synchronised.before, synchronised.after)
+    for row, (stage, name) in enumerate(
+        zip(stages, ("length normalised", "synchronised"), strict=True)
+    ):
+        mean, std = stage.mean(0), stage.std(0)
+        if row == 1:
+            mean, std = space.performance, space.std
+        for d in range(shown):
+            ax = style_axes(
+                axes[row, d], "posture k" if row else "", f"{name}\ndegrees" if d == 0 else "",
+                "" if row else f"dimension {d + 1}",
+            )  # fmt: skip
+            _draw(ax, stage[..., d], mean[:, d], deviations * std[:, d])
+            if row == 1:
+                for key in synchronised.key_frames[1:-1]:
+                    ax.axvline(key, color=MUTED, linewidth=0.8, linestyle=":")
+    add_legend(figure, _action_legend(deviations))
+    return figure
+
+
+def _draw(ax: Axes, lines: Tensor, mean: Tensor, reach: Tensor) -> None:
+    every = max(1, len(lines) // _MOST_LINES)
+    ax.plot(to_numpy(lines[::every].mT), color=LEFT, linewidth=0.5, alpha=0.45)
+    for edge in (mean - reach, mean + reach):
+        ax.plot(to_numpy(edge), color=INK, linewidth=1.1, linestyle=(0, (4, 2)))
+    ax.plot(to_numpy(mean), color=RIGHT, linewidth=2.4)
+    ax.set_xlim(0, len(mean) - 1)
+    ax.tick_params(labelsize=SMALL)
+    ax.spines["left"].set_color(PALE)
+
+
+def _action_legend(deviations: float) -> list[Any]:
+    from matplotlib.lines import Line2D
+
+    return [
+        Line2D([], [], color=LEFT, linewidth=0.8, alpha=0.7, label="performances"),
+        Line2D([], [], color=RIGHT, linewidth=2.4, label="mean performance"),
+        Line2D([], [], color=INK, linewidth=1.1, linestyle=(0, (4, 2)),
+               label=f"{deviations:g} standard deviations"),
+        Line2D([], [], color=MUTED, linewidth=0.8, linestyle=":", label="key frames"),
+    ]  # fmt: skip
+
+
+def _action_title(space: ActionSpace) -> str:
+    name = space.info.name or "action"
+    return f"{name}: {space.info.performances} performances in {space.n_dimensions} dimensions"

@@ -1,0 +1,416 @@
+"""What a prior has learnt: its components as bodies, draws from it, its likelihood over EM."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.camera._projection import lift
+from torchpose.errors import InputError
+from torchpose.math._rotations import RotationOrder, euler_to_matrix
+from torchpose.viz._skeletons import ARM_LIMBS, _limits, _set_view, draw_skeleton
+from torchpose.viz._style import (
+    INK,
+    LEFT,
+    MIDDLE,
+    MUTED,
+    NORMAL,
+    RIGHT,
+    SMALL,
+    add_legend,
+    new_figure,
+    style_axes,
+    to_numpy,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+    from torchpose.priors._upper_body import UpperBodyPrior
+else:
+    Axes = Figure = SubFigure = UpperBodyPrior = Any
+
+__all__ = ["plot_log_likelihood", "plot_prior_components", "plot_prior_samples"]
+
+_FRONT, _SIDE = (0, 1), (2, 1)
+_VIEWS = {"front": _FRONT, "side": _SIDE}
+_COLORS = {"left": LEFT, "right": RIGHT}
+_PER_ROW, _PANEL = 6, 1.9  # panels and their width in inches
+_DRAWS_OF_A_COMPONENT = 25
+_TRACK = "#E4E4E4"
+_SEEN, _UNSEEN = "#0072B2", "#D55E00"
+
+
+class _Component(NamedTuple):
+    """One Gaussian as arms in body axes: by side, the mean [5, 3] and draws [N, 5, 3]."""
+
+    weight: float
+    means: dict[str, Tensor]
+    draws: dict[str, Tensor]
+
+
+def plot_prior_components(
+    prior: UpperBodyPrior,
+    mixture: str = "pose",
+    n_shown: int = 30,
+    seed: int = 0,
+    title: str | None = None,
+) -> Figure:
+    """Return the components of a prior as bodies from the front and the side, heaviest first.
+
+    A strong line is a component's mean, turned and moved back from its camera's view to the body
+    (BL 5); the thin ones are draws from that component, so that its spread is seen too. The heavier a
+    component, the stronger its line; the number is its weight, the bar its weight relative to the
+    heaviest one. Where the right arm is the mirror image of the left one both are drawn on one body,
+    else each arm has a block of its own.
+
+    Args:
+        prior: whose components are drawn.
+        mixture: "pose", or the name of a window ("causal", "full").
+        n_shown: at most this many components of each arm. seed: of the draws.
+        title: above the picture; by default what is shown.
+
+    Raises:
+        InputError: no such mixture, or nothing to be shown.
+
+    Reference: Burke & Lasenby, Figure 6.
+    """
+    if n_shown < 1:
+        raise InputError(f"n_shown must be at least 1, got {n_shown}")
+    blocks = _components(prior, mixture, n_shown, seed)
+    n_columns = min(_PER_ROW, max(len(block) for block in blocks.values()))
+    n_rows = [math.ceil(len(block) / n_columns) for block in blocks.values()]
+    spread = torch.cat(
+        [arm.flatten(0, 1) for block in blocks.values() for c in block for arm in c.draws.values()]
+    )
+    levels = torch.tensor([0.01, 0.99], dtype=torch.float64)
+    low, high = _limits(torch.quantile(spread, levels, dim=0), margin=0.06)
+    if title is None:
+        title = _components_title(prior, mixture, blocks)
+    size = (high - low).tolist()
+    tall = _PANEL * size[1] / (size[0] + size[2])
+    figure = new_figure(_PANEL * n_columns, (tall + 0.45) * sum(n_rows) + 0.8, title)
+    parts = figure.subfigures(len(blocks), 1, height_ratios=n_rows, squeeze=False)[:, 0]
+    for part, (name, block), rows in zip(parts, blocks.items(), n_rows, strict=True):
+        if len(blocks) > 1:
+            part.suptitle(name, fontsize=NORMAL, color=INK)
+        _draw_components(part, block, rows, n_columns, low, high)
+    add_legend(figure, _component_legend(_on_one_body(prior, mixture)))
+    return figure
+
+
+def _components_title(
+    prior: UpperBodyPrior, mixture: str, blocks: Mapping[str, list[_Component]]
+) -> str:
+    total = (prior.left if mixture == "pose" else prior.windows[mixture].left).n_components
+    shown = max(len(block) for block in blocks.values())
+    count = f"{shown} heaviest of {total}" if shown < total else f"{total}"
+    of = "" if mixture == "pose" else f', windows "{mixture}"'
+    return f"{prior.info.name or 'prior'}{of}: {count} components, from the front and the side"
+
+
+def _components(
+    prior: UpperBodyPrior, name: str, n_shown: int, seed: int
+) -> dict[str, list[_Component]]:
+    """Blocks of components, heaviest first: one of both arms, or one for each arm."""
+    if name == "pose":
+        arms = {"left": prior.left, "right": prior.right}
+    elif name in prior.windows:
+        arms = {side: getattr(prior.windows[name], side) for side in _COLORS}
+    else:
+        known = ", ".join(["pose", *prior.windows])
+        raise InputError(f"mixture must be one of {known}, got {name!r}")
+    if _on_one_body(prior, name):
+        groups = {"both arms": ["left", "right"]}
+    else:
+        groups = {"left arm": ["left"], "right arm": ["right"]}
+    blocks = {}
+    for label, sides in groups.items():
+        weights = arms[sides[0]].weights.detach().cpu().double()
+        means, draws = {}, {}
+        for side in sides:
+            mean = arms[side].means.detach().cpu().double()[:, :21]
+            root = arms[side].cholesky().detach().cpu().double()[:, :21]
+            generator = torch.Generator().manual_seed(seed)
+            noise = torch.randn(
+                len(mean), _DRAWS_OF_A_COMPONENT, root.shape[-1], generator=generator,
+                dtype=torch.float64,
+            )  # fmt: skip
+            means[side] = _in_body(prior, mean)
+            draws[side] = _in_body(prior, mean[:, None] + noise @ root.mT)
+        blocks[label] = [
+            _Component(
+                float(weights[k]),
+                {side: value[k] for side, value in means.items()},
+                {side: value[k] for side, value in draws.items()},
+            )
+            for k in weights.argsort(descending=True)[:n_shown].tolist()
+        ]
+    return blocks
+
+
+def _on_one_body(prior: UpperBodyPrior, mixture: str) -> bool:
+    """Return whether the k-th components of both arms are mirror images of each other."""
+    return prior.info.mirrored and mixture == "pose"
+
+
+def _in_body(prior: UpperBodyPrior, states: Float[Tensor, "*batch 21"]) -> Tensor:
+    """Return the hand, elbow, shoulder, head and neck of states in body axes, metres, from the neck."""
+    order: RotationOrder = prior.info.rotation_order  # type: ignore[assignment]
+    rotation = euler_to_matrix(states[..., 15:18], order)
+    joints = states[..., :15].unflatten(-1, (5, 3))
+    joints = lift(joints, prior.info.matrix, rotation, states[..., 18:21])
+    return joints - joints[..., 4:, :]
+
+
+def _draw_components(
+    part: SubFigure,
+    block: list[_Component],
+    n_rows: int,
+    n_columns: int,
+    low: Tensor,
+    high: Tensor,
+) -> None:
+    """A panel for each component: the front view beside the side view."""
+    size = (high - low).tolist()
+    middle = float((low + high)[2]) / 2
+    aside = float(high[0]) - middle + size[2] / 2  # where the side view has its z = 0
+    panels = part.subplots(n_rows, n_columns, squeeze=False)
+    for ax in panels.flat:
+        ax.set_axis_off()
+    heaviest = block[0].weight
+    for ax, component in zip(panels.flat, block, strict=False):
+        share = component.weight / heaviest
+        for pick, shift in ((_FRONT, 0.0), (_SIDE, aside)):
+            offset = torch.tensor([shift, 0.0], dtype=torch.float64)
+            for side, mean in component.means.items():
+                if pick == _SIDE and side == "right" and len(component.means) > 1:
+                    continue  # seen from the side the mirror image is the same
+                _draw_arms(ax, component.draws[side][..., pick] + offset, side)
+                colors = [_COLORS[side]] * 3 + [MIDDLE] * 2
+                draw_skeleton(
+                    ax, mean[:, pick] + offset, colors=colors, limbs=ARM_LIMBS,
+                    linewidth=1.0 + 1.4 * share, alpha=0.35 + 0.65 * share,
+                )  # fmt: skip
+        ax.set_aspect("equal")
+        ax.set(
+            xlim=(float(low[0]), float(high[0]) + size[2]),
+            ylim=(float(high[1]), float(low[1])),
+        )
+        ax.plot(2 * [float(high[0])], [float(low[1]), float(high[1])], color=_TRACK, linewidth=0.8)
+        _weight_bar(ax, component.weight, share)
+
+
+def _draw_arms(
+    ax: Axes, arms: Float[Tensor, "N 5 2"], side: str, linewidth: float = 0.6, alpha: float = 0.22
+) -> None:
+    """Thin lines from shoulder to hand."""
+    flat = to_numpy(arms[:, :3])
+    ax.plot(
+        flat[..., 0].T,
+        flat[..., 1].T,
+        color=_COLORS[side],
+        linewidth=linewidth,
+        alpha=alpha,
+        zorder=1,
+    )
+
+
+def _weight_bar(ax: Axes, weight: float, share: float) -> None:
+    percent = 100 * weight
+    text = f"{percent:.1f} %" if percent >= 0.05 else "< 0.1 %"
+    ax.set_title(text, fontsize=SMALL, color=INK, pad=7)
+    for length, color in ((1.0, _TRACK), (share, INK)):
+        ax.plot(
+            [0, length], [1.03, 1.03], transform=ax.transAxes, color=color, linewidth=3,
+            clip_on=False, solid_capstyle="butt",
+        )  # fmt: skip
+
+
+def _component_legend(on_one_body: bool) -> list[Any]:
+    from matplotlib.lines import Line2D
+
+    right = "right arm, the mirror image" if on_one_body else "person's right arm"
+    return [
+        Line2D([], [], color=LEFT, linewidth=3, label="person's left arm"),
+        Line2D([], [], color=RIGHT, linewidth=3, label=right),
+        Line2D([], [], color=MUTED, linewidth=2.4, marker="o", label="mean"),
+        Line2D([], [], color=MUTED, linewidth=0.6, alpha=0.6, label="draws from the component"),
+    ]
+
+
+def plot_prior_samples(
+    prior: UpperBodyPrior,
+    n_samples: int = 12,
+    seed: int = 0,
+    n_cloud: int = 300,
+    title: str | None = None,
+) -> Figure:
+    """Draws from a prior as bodies from the front and the side, one by one and all on top.
+
+    The arms are drawn independently, as the prior has them, each from a camera of its own, and put
+    on one neck; arms that could not be one person's show how far that independence is from the truth.
+
+    Args:
+        prior: to draw from.
+        n_samples: bodies that are shown one by one. seed: of the draws.
+        n_cloud: draws in the two large panels.
+        title: above the picture; by default the prior's name.
+
+    Raises:
+        InputError: fewer than one draw.
+    """
+    if n_samples < 1 or n_cloud < 1:
+        raise InputError(f"n_samples and n_cloud must be at least 1, got {n_samples} and {n_cloud}")
+    generator = torch.Generator().manual_seed(seed)
+    count = max(n_samples, n_cloud)
+    arms = {
+        side: _in_body(prior, mixture.sample((count,), generator).detach().cpu().double())
+        for side, mixture in (("left", prior.left), ("right", prior.right))
+    }
+    shared = (arms["left"][:, 3:] + arms["right"][:, 3:]) / 2
+    bodies = torch.cat([arms["left"][:, :3], shared, arms["right"][:, :3].flip(1)], 1)
+    limits = _limits(bodies[:n_samples], margin=0.06)
+    columns = min(6, n_samples)
+    lines = math.ceil(n_samples / columns)
+    size = (limits[1] - limits[0]).tolist()
+    tall = 1.25 * size[1] / size[0]
+    title = title or f"{prior.info.name or 'prior'}: draws from the front and the side"
+    height = max(6.4, lines * (2 * tall + 0.25) + 0.8)
+    figure = new_figure(1.25 * columns + 4.2, height, title)
+    widths = [1.25 * columns, 4.2]
+    strip, cloud = figure.subfigures(1, 2, width_ratios=widths, squeeze=False)[0]
+    grid = strip.subplots(2 * lines, columns, squeeze=False)
+    for ax in grid.flat:
+        ax.set_axis_off()
+    for place, body in enumerate(bodies[:n_samples]):
+        line, column = divmod(place, columns)
+        for row, (name, pick) in enumerate(_VIEWS.items()):
+            ax = grid[2 * line + row, column]
+            draw_skeleton(ax, body[:, pick], linewidth=2.2)
+            _set_view(ax, *limits, pick)
+            if column == 0:
+                ax.text(0.0, 0.5, name, transform=ax.transAxes, rotation=90, va="center",
+                        ha="right", fontsize=SMALL, color=MUTED)  # fmt: skip
+    _draw_cloud(cloud, bodies[:n_cloud])
+    add_legend(figure, _sample_legend())
+    return figure
+
+
+def _draw_cloud(part: SubFigure, bodies: Float[Tensor, "N 8 3"]) -> None:
+    """Every draw on top of the others, the hands as dots."""
+    levels = torch.tensor([0.005, 0.995], dtype=torch.float64)
+    low, high = _limits(torch.quantile(bodies.flatten(0, 1), levels, dim=0), margin=0.08)
+    panels = part.subplots(2, 1, sharey=True)
+    for ax, (name, pick) in zip(panels, _VIEWS.items(), strict=True):
+        axis = "x, to the right (m)" if name == "front" else "z, away (m)"
+        style_axes(ax, axis, "y, down (m)", f"{len(bodies)} draws, {name}")
+        for side, joints in (("left", [0, 1, 2, 4, 3]), ("right", [7, 6, 5, 4, 3])):
+            arms = bodies[:, joints][..., pick]
+            _draw_arms(ax, arms, side, alpha=0.12)
+            trunk = to_numpy(arms[:, 2:])
+            ax.plot(trunk[..., 0].T, trunk[..., 1].T, color=MIDDLE, linewidth=0.6, alpha=0.06)
+            hands = to_numpy(arms[:, 0])
+            ax.scatter(hands[:, 0], hands[:, 1], s=7, color=_COLORS[side], linewidths=0, alpha=0.6)
+        ax.set_aspect("equal")
+        ax.set_xlim(float(low[pick[0]]), float(high[pick[0]]))
+    panels[0].set_ylim(float(high[1]), float(low[1]))
+
+
+def _sample_legend() -> list[Any]:
+    from matplotlib.lines import Line2D
+
+    dot: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 4}
+    return [
+        Line2D([], [], color=LEFT, linewidth=3, label="person's left arm"),
+        Line2D([], [], color=RIGHT, linewidth=3, label="person's right arm"),
+        Line2D([], [], color=MUTED, label="hands of all draws", **dot),
+    ]
+
+
+def plot_log_likelihood(
+    training: Mapping[str, Sequence[float] | Tensor],
+    held_out: Mapping[str, Sequence[float] | Tensor] | None = None,
+    title: str | None = "Log-likelihood over EM steps",
+) -> Figure:
+    """Return the mean log-likelihood over the steps of EM, a panel for each mixture.
+
+    The best step of a curve is marked. The scale leaves out the first steps, whose values are far
+    below the rest.
+
+    Args:
+        training: by mixture, a value for each step, counted from 1, in nats per state; NaN where a
+            step was not scored. held_out: the same of held-out persons, of any of the mixtures.
+        title: above the picture.
+
+    Raises:
+        InputError: no mixture, held-out values of an unknown one, or a curve without finite value.
+    """
+    held_out = held_out or {}
+    unknown = sorted(set(held_out) - set(training))
+    if not training or unknown:
+        got = f"held-out values of {', '.join(unknown)}" if unknown else "none"
+        raise InputError(
+            f"training must hold the curve of every mixture and at least one, got {got}"
+        )
+    columns = min(3, len(training))
+    rows = math.ceil(len(training) / columns)
+    figure = new_figure(3.7 * columns + 0.6, 2.7 * rows + 0.9, title)
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for ax in grid.flat[len(training) :]:
+        ax.set_visible(False)
+    for place, (ax, name) in enumerate(zip(grid.flat, training, strict=False)):
+        style_axes(ax, "EM step" if place + columns >= len(training) else "", title=name)
+        bounds = [_draw_likelihood(ax, f"training curve of {name}", training[name])]
+        if name in held_out:
+            bounds.append(
+                _draw_likelihood(ax, f"held-out curve of {name}", held_out[name], unseen=True)
+            )
+        low, high = min(b[0] for b in bounds), max(b[1] for b in bounds)
+        room = max(0.08 * (high - low), 1e-6)
+        ax.set_ylim(low - room, high + 2 * room)
+    for ax in grid[:, 0]:
+        ax.set_ylabel("mean log-likelihood (nats)", fontsize=NORMAL, color=INK)
+    add_legend(figure, _likelihood_legend(bool(held_out)))
+    return figure
+
+
+def _likelihood_legend(held_out: bool) -> list[Any]:
+    from matplotlib.lines import Line2D
+
+    dots: dict[str, Any] = {"marker": "o", "markersize": 4, "linewidth": 1.8}
+    entries = [Line2D([], [], color=_SEEN, linewidth=1.8, label="training persons")]
+    if held_out:
+        entries.append(Line2D([], [], color=_UNSEEN, label="held-out persons", **dots))
+    best = Line2D([], [], color=INK, marker="D", markersize=5, linestyle="", label="best step")
+    return [*entries, best]
+
+
+def _draw_likelihood(
+    ax: Axes, name: str, values: Sequence[float] | Tensor, unseen: bool = False
+) -> tuple[float, float]:
+    """One curve; returns the lowest and highest value that the scale is to show."""
+    y = torch.as_tensor(values, dtype=torch.float64).detach().cpu().flatten()
+    steps = torch.arange(1, len(y) + 1)
+    finite = torch.isfinite(y)
+    if not bool(finite.any()):
+        raise InputError(f"the {name} has no finite value")
+    y, steps = y[finite], steps[finite]
+    style = {"color": _UNSEEN, "marker": "o", "markersize": 3} if unseen else {"color": _SEEN}
+    ax.plot(steps.numpy(), y.numpy(), linewidth=1.8, **style)
+    at = int(y.argmax())
+    ax.plot([int(steps[at])], [float(y[at])], color=INK, marker="D", markersize=5, zorder=5)
+    ax.annotate(
+        f"{float(y[at]):.2f}".replace("-", "\N{MINUS SIGN}"), (int(steps[at]), float(y[at])),
+        xytext=(0, -8 if unseen else 6), textcoords="offset points", ha="right",
+        va="top" if unseen else "bottom", fontsize=SMALL, color=INK,
+    )  # fmt: skip
+    kept = y[steps > max(2, len(steps) // 20)]
+    shown = kept if len(kept) > 1 else y
+    return float(shown.min()), float(y.max())

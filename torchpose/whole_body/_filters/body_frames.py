@@ -1,0 +1,205 @@
+"""What a filter over body poses sees: frames of silhouettes, checked, and how well states explain them."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from torchpose.errors import InputError, ShapeError, check_shape
+from torchpose.filters._base import Generators
+from torchpose.whole_body._silhouettes.likelihood import silhouette_log_likelihood
+from torchpose.whole_body._silhouettes.rendering import (
+    PreparedSilhouettes,
+    count_pixels,
+    prepare_silhouettes,
+)
+
+__all__ = [
+    "Frame",
+    "Likelihood",
+    "Score",
+    "check_frame",
+    "check_lengths",
+    "check_sequences",
+    "is_seen",
+    "see_frame",
+    "seen_until",
+    "silhouette_score",
+]
+
+Score = Callable[[Tensor], Tensor]
+Likelihood = Callable[[Tensor, Tensor], Tensor]
+
+
+class Frame(NamedTuple):
+    """What is seen in one frame, and how well states explain it.
+
+    Attributes:
+        score: states [B, N, D] -> sharpened log-likelihood [B, N], float64; 0 in elements that nobody
+            sees.
+        seen: [B], False where the frame is empty.
+        silhouettes: `PreparedSilhouettes` of [B, C, H, W]; with a callable as the likelihood, what it
+            is given. cameras: as handed to the filter.
+    """
+
+    score: Score
+    seen: Bool[Tensor, " B"]
+    silhouettes: Any
+    cameras: Any
+
+
+def silhouette_score(
+    body: Any,
+    silhouettes: Tensor | PreparedSilhouettes,
+    cameras: Any,
+    likelihood: str,
+    limb_shape: str = "cylinders",
+) -> Score:
+    """Return the function from states [B, N, D] to the log-likelihood [B, N] of one frame's silhouettes.
+
+    Args:
+        silhouettes: [B, C, H, W]. cameras: the C cameras. likelihood: "bidirectional" or "overlap".
+        limb_shape: "cylinders" or "rectangles".
+    """
+    if not isinstance(silhouettes, PreparedSilhouettes):
+        silhouettes = prepare_silhouettes(silhouettes)
+
+    def score(states: Tensor) -> Tensor:
+        counts = count_pixels(body, states, cameras, silhouettes, limb_shape=limb_shape)
+        return silhouette_log_likelihood(counts, likelihood)
+
+    return score
+
+
+def see_frame(
+    body: Any,
+    observed: Tensor,
+    cameras: Any,
+    likelihood: str | Likelihood,
+    sharpness: float = 1.0,
+    limb_shape: str = "cylinders",
+) -> Frame:
+    """Return the frame of some observations, with the exponent of the likelihood.
+
+    Args:
+        observed: silhouettes [B, C, H, W], or what a callable takes. cameras: the C cameras.
+        likelihood, sharpness, limb_shape: as `SilhouetteParticleFilter`.
+    """
+    seen = is_seen(observed)
+    if callable(likelihood):
+        raw: Score = lambda states: likelihood(states, observed)  # noqa: E731
+        return Frame(_sharpened(raw, sharpness, seen), seen, observed, cameras)
+    prepared = prepare_silhouettes(observed)
+    raw = silhouette_score(body, prepared, cameras, likelihood, limb_shape)
+    return Frame(_sharpened(raw, sharpness, seen), seen, prepared, cameras)
+
+
+def _sharpened(raw: Score, sharpness: float, seen: Bool[Tensor, " B"]) -> Score:
+    """Return the likelihood with its exponent, and 0 for elements that nobody sees."""
+    nobody = not bool(seen.any())
+
+    def score(states: Tensor) -> Tensor:
+        if nobody:
+            return states.new_zeros(states.shape[:2], dtype=torch.float64)
+        value = sharpness * raw(states).double()
+        value = torch.where(torch.isfinite(value), value, -torch.inf)
+        return torch.where(seen[:, None], value, 0.0)
+
+    return score
+
+
+def is_seen(observed: Tensor) -> Bool[Tensor, " B"]:
+    """Tell whether anything is observed: a True pixel, or a number that is not NaN."""
+    known = observed if observed.dtype == torch.bool else ~torch.isnan(observed)
+    return known.flatten(1).any(1)
+
+
+def seen_until(inside: Bool[Tensor, " B"], observed: Tensor) -> Tensor:
+    """Return the observations [B, ...] with nothing seen in the sequences that are over."""
+    over = ~inside.to(observed.device).view(-1, *[1] * (observed.ndim - 1))
+    return observed.masked_fill(over, False if observed.dtype == torch.bool else torch.nan)
+
+
+def check_sequences(
+    observed: Tensor, initial_state: Tensor, generator: Generators, dim: int, *, plain: bool
+) -> tuple[Tensor, Tensor, bool]:
+    """Return observations [B, T, ...], initial states [B, D], and whether a batch was given.
+
+    Args:
+        observed, initial_state, generator: as `SilhouetteParticleFilter.forward`. dim: D.
+        plain: whether the observations are silhouettes; otherwise any tensor that a callable takes.
+
+    Raises:
+        ShapeError, InputError: as `SilhouetteParticleFilter.forward`.
+    """
+    check_shape("initial_state", initial_state, ["...", dim])
+    if initial_state.ndim > 2:
+        raise ShapeError(f"initial_state must be [D] or [B, D], got {list(initial_state.shape)}")
+    batched = initial_state.ndim == 2
+    if plain:
+        if observed.ndim not in (4, 5):
+            raise ShapeError(
+                "silhouettes must have shape [T, C, H, W] or [B, T, C, H, W], "
+                f"got {list(observed.shape)}"
+            )
+        several = observed.ndim == 5
+        _check_silhouettes(observed)
+    else:
+        several = batched
+    frames = observed if several else observed[None]
+    start = initial_state if batched else initial_state[None]
+    sizes = {len(frames), len(start)} - {1}
+    if len(sizes) > 1 or 0 in sizes or 0 in frames.shape[:2]:
+        raise ShapeError(
+            "silhouettes and initial_state must hold the same number of sequences, at least one "
+            f"of one frame; got {list(observed.shape)} and {list(initial_state.shape)}"
+        )
+    batch = max(len(frames), len(start))
+    if isinstance(generator, Sequence) and len(generator) != batch:
+        raise InputError(
+            f"a list of generators must hold one for each of the {batch} sequences, "
+            f"got {len(generator)}"
+        )
+    frames, start = frames.expand(batch, *frames.shape[1:]), start.expand(batch, -1)
+    return frames, start, batched or several
+
+
+def check_lengths(lengths: Tensor | None, batch: int, n_frames: int) -> Int[Tensor, " B"] | None:
+    """Return the frames of each sequence, None where all have as many.
+
+    Raises:
+        ShapeError: not [B]. InputError: not whole numbers from 1 to T.
+    """
+    if lengths is None:
+        return None
+    lengths = torch.as_tensor(lengths)
+    check_shape("lengths", lengths, [batch])
+    whole = not (lengths.dtype.is_floating_point or lengths.is_complex())
+    if not whole or bool(((lengths < 1) | (lengths > n_frames)).any()):
+        raise InputError(f"lengths must be integers from 1 to {n_frames}, got {lengths.tolist()}")
+    return lengths.long()
+
+
+def check_frame(observed: Tensor, batch: int, *, plain: bool) -> None:
+    """Raise unless this is one frame [B, ...] of B sequences.
+
+    Raises:
+        ShapeError, InputError: as `SilhouetteParticleFilter.step`.
+    """
+    if len(observed) != batch:
+        raise ShapeError(
+            f"silhouettes must hold one frame for each of the {batch} elements of the state, "
+            f"[B, C, H, W]; got {list(observed.shape)}"
+        )
+    if plain:
+        check_shape("silhouettes", observed, ["B", "C", "H", "W"])
+        _check_silhouettes(observed)
+
+
+def _check_silhouettes(silhouettes: Tensor) -> None:
+    if silhouettes.dtype != torch.bool:
+        raise InputError(
+            f"silhouettes must be bool (True = person), got {silhouettes.dtype}; pass mask > 0"
+        )

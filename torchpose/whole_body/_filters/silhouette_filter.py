@@ -1,0 +1,404 @@
+"""What the particle filters over body poses share: likelihood, limits, coasting, failure, estimates.
+
+A filter is its `move`: how the particles of one frame become weighted particles of the next. Batches,
+empty silhouettes, dead particles and the loop over time are handled here.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from torchpose.errors import InputError, check_finite, check_shape
+from torchpose.filters._base import Generators, standard_normal
+from torchpose.filters._outputs import effective_sample_size
+from torchpose.filters._resampling import RESAMPLING
+from torchpose.whole_body._filters.body_frames import (
+    Frame,
+    Likelihood,
+    check_frame,
+    check_lengths,
+    check_sequences,
+    see_frame,
+    seen_until,
+)
+from torchpose.whole_body._filters.body_particles import (
+    BodyFilterState,
+    BodyTrack,
+    PoseSpace,
+    WeightedParticles,
+    best_particle,
+    check_choice,
+    joint_covariance,
+    particle_std,
+    resample_state,
+    stack_tracks,
+    warn_of_frames,
+)
+from torchpose.whole_body._filters.motion import (
+    as_step_std,
+    check_leg_swap,
+    default_step_std,
+    extra_copies,
+    swap_legs,
+)
+from torchpose.whole_body._silhouettes.likelihood import LIKELIHOODS
+from torchpose.whole_body._silhouettes.outlines import check_limb_shape
+
+__all__ = ["SilhouetteParticleFilter"]
+
+_MOST_SPREAD = 10  # frames over which the noise of a filter that stays lost keeps growing
+_SHARPNESS = 100.0  # exponent of a likelihood in [-2, 0] that tells poses apart
+_DIED = (
+    "all particles died {times} times ({frames}) and were spread about the last mean; use more "
+    "particles, a larger step_std, a smaller sharpness or wider joint limits"
+)
+
+
+class SilhouetteParticleFilter(nn.Module, ABC):
+    """Base of the particle filters over body poses; a subclass is its `move`.
+
+    `forward` tracks whole sequences, `init` and `step` frame by frame, with the same numbers. Estimates have
+    no gradients: nothing runs through particles.
+
+    Args:
+        body: whose poses are tracked; anything with the methods of `PoseSpace`.
+        n_particles: N.
+        step_std: standard deviation of the diffusion per frame, [D] or one number (metres for the
+            root, sines of half angles for rotations); `default_step_std` if None. (MR 29)
+        likelihood: "bidirectional" (MR 12), "overlap" (log of AS 7), or a callable
+            (states [B, N, D], frame [B, ...]) -> log-likelihood [B, N] for observations of another
+            kind.
+        sharpness: exponent of the likelihood; 1 is the published form. See `fit_sharpness`.
+        limits: joint limits with `clamp(states)` and `inside(states)` [..., P], or None.
+        limit_mode: "clamp" moves particles to the limits, "discard" gives those outside no weight.
+        resampling: "systematic", "stratified", "multinomial" or "residual".
+        resample_threshold: share of N below which the effective sample size leads to resampling;
+            1 is in every frame, as published.
+        estimate: "mean", weighted before resampling, or "map", the particle of the largest weight.
+        leg_swap: for a person whose legs may have been taken for each other: an extra copy that
+            resampling makes of a particle goes on with its legs exchanged with this probability times
+            the angle between its upper legs over pi (Daubney & Xie, section 8); 0 for never.
+        limb_shape: of the body in silhouettes, "cylinders" or "rectangles" (AS, section 3.2).
+        respread_scale: particles that all died are drawn about the last mean with this many times
+            `step_std`, twice that in the second such frame, and so on.
+
+    Raises:
+        InputError, ShapeError: an argument is not as described.
+    """
+
+    least_particles: ClassVar[int] = 1  # of a layer if there are several: two or more survive
+    unused: ClassVar[frozenset[str]] = frozenset()  # options that make no difference
+    step_std: Tensor
+
+    def __init__(
+        self,
+        body: PoseSpace,
+        n_particles: int = 500,
+        *,
+        step_std: Tensor | float | None = None,
+        likelihood: str | Likelihood = "bidirectional",
+        sharpness: float = 1.0,
+        limits: Any | None = None,
+        limit_mode: str = "clamp",
+        resampling: str = "systematic",
+        resample_threshold: float = 1.0,
+        estimate: str = "mean",
+        leg_swap: float = 0.0,
+        limb_shape: str = "cylinders",
+        respread_scale: float = 5.0,
+    ) -> None:
+        super().__init__()
+        if not callable(likelihood):
+            check_choice("likelihood", likelihood, LIKELIHOODS)
+        check_choice("limit_mode", limit_mode, ("clamp", "discard"))
+        check_choice("resampling", resampling, RESAMPLING)
+        check_choice("estimate", estimate, ("mean", "map"))
+        if n_particles < 1:
+            raise InputError(f"n_particles must be at least 1, got {n_particles}")
+        if not 0 <= resample_threshold <= 1:
+            raise InputError(f"resample_threshold must be from 0 to 1, got {resample_threshold}")
+        check_leg_swap(body, leg_swap)
+        check_limb_shape(limb_shape)
+        for name, value in (("sharpness", sharpness), ("respread_scale", respread_scale)):
+            if not 0 < value < math.inf:
+                raise InputError(f"{name} must be positive and finite, got {value}")
+        self.body, self.limits, self.limit_mode = body, limits, limit_mode
+        self.n_particles, self.sharpness = n_particles, float(sharpness)
+        self.likelihood, self.limb_shape, self.estimate = likelihood, limb_shape, estimate
+        self.resampling, self.resample_threshold = resampling, resample_threshold
+        self.leg_swap, self.respread_scale = leg_swap, respread_scale
+        self.register_buffer("step_std", as_step_std(body, step_std))
+
+    # --- what a subclass adds
+
+    @abstractmethod
+    def move(
+        self, state: BodyFilterState, frame: Frame, generator: Generators
+    ) -> WeightedParticles:
+        """Return weighted particles of the next frame from those of the last.
+
+        Args:
+            state: of the last frame, its particles resampled if that was due, with what was remembered
+                of them. frame: what is seen. generator: for what is drawn.
+        """
+
+    def first_memory(self, particles: Float[Tensor, "B N D"]) -> Tensor | None:
+        """Return what is remembered of new particles, [B, N, ...]; nothing by default."""
+        return None
+
+    def first_trend(self, mean: Float[Tensor, "B D"]) -> Tensor | None:
+        """Return what is remembered of an element before its first frame, [B, ...]; nothing by default."""
+        return None
+
+    def swap_memory(self, memory: Tensor, swapped: Bool[Tensor, "B N"]) -> Tensor:
+        """Return the memory of particles of which some have exchanged their legs; the same by default."""
+        return memory
+
+    def spread(
+        self,
+        particles: Float[Tensor, "B N D"],
+        log_weights: Float[Tensor, "B N"],
+        mean: Float[Tensor, "B D"],
+        memory: Tensor | None,
+    ) -> Float[Tensor, "B D"]:
+        """Return the standard deviation about the estimate, in the units of a step."""
+        return particle_std(self.body, particles, log_weights, mean)
+
+    def joint_covariance(
+        self, state: BodyFilterState, mean: Float[Tensor, "B D"]
+    ) -> Float[Tensor, "B J 3 3"]:
+        """Return the second moment of the joints of a `Body` about those of an estimate, metres squared."""
+        return joint_covariance(self.body, state, mean)  # type: ignore[arg-type]
+
+    def warn(self, track: BodyTrack) -> None:
+        """Warn of the frames of a track [B, T] in which the filter degenerated."""
+        warn_of_frames(track.respread, _DIED)
+
+    # --- how `BodyTracker` sets a filter up; a subclass may say otherwise
+
+    @classmethod
+    def likelihoods_per_particle(cls, options: Mapping[str, Any]) -> int:
+        """Return how many likelihoods of whole bodies one particle costs in a frame."""
+        return 1
+
+    @classmethod
+    def tracking_options(cls, body: Any, fps: float, learnt: Any = None) -> dict[str, Any]:
+        """Return the options that `BodyTracker` gives the filter where it is given none itself.
+
+        Args:
+            body: that is tracked. fps: frames per second. learnt: what the filter needs, if anything.
+        """
+        return {"step_std": default_step_std(body, fps), "sharpness": _SHARPNESS}
+
+    def start_std(self) -> Float[Tensor, " D"]:
+        """Return the spread of particles about a first pose that was found in images."""
+        return 2 * self.step_std
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """Names of the columns of ``details["actions"]``, of a filter that tells actions apart."""
+        return ()
+
+    def notes(self, track: BodyTrack, first_frame: int = 0) -> tuple[str, ...]:
+        """Return what is to be said of a track [T], whose first frame has this number."""
+        return ()
+
+    # --- running
+
+    @torch.no_grad()
+    def forward(
+        self,
+        silhouettes: Tensor,
+        cameras: Any,
+        initial_state: Tensor,
+        generator: Generators = None,
+        lengths: Tensor | None = None,
+        progress: bool = False,
+        initial_std: Tensor | None = None,
+    ) -> BodyTrack:
+        """Track one person through a sequence, or several through a batch of sequences.
+
+        Args:
+            silhouettes: bool [T, C, H, W] or [B, T, C, H, W], undistorted; with a callable as the
+                likelihood any observations [T, ...], or [B, T, ...] with an initial state [B, D].
+            cameras: the C cameras (`CameraRig`, or what makes one); handed to the likelihood.
+            initial_state: the pose one frame before the first, [D] or [B, D].
+            generator: one generator, or a list of one for each sequence, which makes a sequence's
+                numbers independent of its batch.
+            lengths: [B], frames of each sequence; past them its last estimate is repeated.
+            progress: whether to show a progress bar.
+            initial_std: [D], spread of the first particles; none if None, as published.
+
+        Returns:
+            `BodyTrack`, with the dimension of the batch if there was one.
+
+        Raises:
+            ShapeError: sizes that do not match. InputError: no frames, values that are not finite,
+            silhouettes that are not bool, lengths outside 1..T. CameraError: as the likelihood.
+        """
+        frames, start, batched = check_sequences(
+            silhouettes,
+            initial_state,
+            generator,
+            self.body.dim,
+            plain=not callable(self.likelihood),
+        )
+        lengths = check_lengths(lengths, *frames.shape[:2])
+        state = self.init(start, generator, initial_std)
+        steps = []
+        for t in tqdm(range(frames.shape[1]), disable=not progress, unit="frame"):
+            shown = frames[:, t] if lengths is None else seen_until(lengths > t, frames[:, t])
+            state, out = self.advance(state, shown, cameras, generator)
+            steps.append(out)
+        track = stack_tracks(steps, lengths)
+        self.warn(track)
+        return track if batched else track.element(0)
+
+    @torch.no_grad()
+    def init(
+        self,
+        initial_state: Float[Tensor, "*B D"],
+        generator: Generators = None,
+        initial_std: Tensor | None = None,
+    ) -> BodyFilterState:
+        """Return N copies of the initial state, spread if `initial_std` [D] is given.
+
+        Reference: MR, Algorithm 1, step 1.
+        """
+        start = initial_state.to(self.step_std).reshape(-1, initial_state.shape[-1])
+        check_shape("initial_state", start, ["B", self.body.dim])
+        check_finite("initial_state", start)
+        particles = start[:, None].expand(-1, self.n_particles, -1).contiguous()
+        if initial_std is not None:
+            spread = torch.as_tensor(initial_std).to(self.step_std)
+            particles = self.diffuse(particles, spread, generator)
+        uniform = torch.full(particles.shape[:2], -math.log(self.n_particles))
+        uniform = uniform.to(start.device, torch.float64)
+        lost = torch.zeros(len(start), dtype=torch.long, device=start.device)
+        memory, trend = self.first_memory(particles), self.first_trend(start)
+        return BodyFilterState(particles, uniform, start, lost, memory, trend)
+
+    @torch.no_grad()
+    def step(
+        self,
+        state: BodyFilterState,
+        silhouettes: Tensor,
+        cameras: Any,
+        generator: Generators = None,
+    ) -> tuple[BodyFilterState, BodyTrack]:
+        """Track one more frame: the same numbers as the same frame of `forward`.
+
+        Args:
+            state: from `init` or the step before. silhouettes: [B, C, H, W], bool.
+            cameras, generator: as in `forward`.
+
+        Returns:
+            The next state, and a `BodyTrack` without the dimension of time.
+        """
+        check_frame(silhouettes, len(state.mean), plain=not callable(self.likelihood))
+        state, out = self.advance(state, silhouettes, cameras, generator)
+        self.warn(stack_tracks([out]))
+        return state, out
+
+    def advance(
+        self, state: BodyFilterState, silhouettes: Tensor, cameras: Any, generator: Generators
+    ) -> tuple[BodyFilterState, BodyTrack]:
+        """Track one more frame, as `step`, of silhouettes that were checked; without warnings."""
+        frame = see_frame(
+            self.body, silhouettes.to(self.step_std.device), cameras, self.likelihood,
+            self.sharpness, self.limb_shape,
+        )  # fmt: skip
+        moved = self.move(self._resample(state, generator), frame, generator)
+        dead = ~torch.isfinite(moved.log_weights.amax(-1))
+        lost = torch.where(dead, state.lost + 1, 0)
+        if bool(dead.any()):
+            moved = self._respread(moved, state.mean, lost, generator)
+        particles, log_weights = moved.particles, moved.log_weights
+        mean = self._estimate(particles, log_weights)
+        mean = torch.where(dead[:, None], state.mean, mean)
+        evidence = torch.where(frame.seen, moved.log_evidence, 0.0)  # exactly: without rounding
+        out = BodyTrack(
+            mean,
+            torch.where(dead & ~evidence.isnan(), -torch.inf, evidence),
+            self.spread(particles, log_weights, mean, moved.memory),
+            effective_sample_size(log_weights),
+            ~frame.seen,
+            dead,
+            moved.details or {},
+        )
+        after = BodyFilterState(particles, log_weights, mean, lost, moved.memory, moved.trend)
+        return after, out
+
+    # --- pieces that `move` uses
+
+    def diffuse(
+        self,
+        particles: Float[Tensor, "B N D"],
+        std: Float[Tensor, "*B D"],
+        generator: Generators,
+    ) -> Float[Tensor, "B N D"]:
+        """Return x + N(0, diag(std^2)) (MR 29), within the joint limits; orientations are composed."""
+        batch, n, dim = particles.shape
+        noise = standard_normal(batch, (n, dim), generator, particles)
+        return self.constrain(self.body.perturb(particles, noise * std))
+
+    def constrain(self, particles: Float[Tensor, "B N D"]) -> Float[Tensor, "B N D"]:
+        """Return particles moved to the joint limits, where `limit_mode` says so."""
+        if self.limits is None or self.limit_mode != "clamp":
+            return particles
+        return self.limits.clamp(particles)
+
+    def log_limits(self, particles: Float[Tensor, "B N D"]) -> Float[Tensor, "B N"]:
+        """Return -inf for particles outside joint limits that discard, else 0; float64."""
+        zero = particles.new_zeros(particles.shape[:2], dtype=torch.float64)
+        if self.limits is None or self.limit_mode != "discard":
+            return zero
+        return zero.masked_fill(~self.limits.inside(particles).all(-1), -torch.inf)
+
+    # --- helpers
+
+    def _resample(self, state: BodyFilterState, generator: Generators) -> BodyFilterState:
+        """Resample where it is due, and exchange the legs of some extra copies."""
+        state, ancestors = resample_state(
+            state, self.resampling, self.resample_threshold, generator
+        )
+        if self.leg_swap == 0:
+            return state
+        extra = extra_copies(ancestors)  # of elements that were not resampled: none
+        particles, swapped = swap_legs(self.body, state.particles, extra, self.leg_swap, generator)
+        memory = None if state.memory is None else self.swap_memory(state.memory, swapped)
+        return state._replace(particles=particles, memory=memory)
+
+    def _respread(
+        self,
+        moved: WeightedParticles,
+        mean: Float[Tensor, "B D"],
+        lost: Int[Tensor, " B"],
+        generator: Generators,
+    ) -> WeightedParticles:
+        """Draw new particles about the last mean in the elements whose particles died."""
+        rows = torch.nonzero(lost > 0).reshape(-1)
+        if isinstance(generator, Sequence):
+            generator = [generator[i] for i in rows.tolist()]
+        start = mean[rows, None].expand(-1, self.n_particles, -1)
+        growth = lost[rows].clamp_max(_MOST_SPREAD)[:, None, None]
+        particles, log_weights = moved.particles.clone(), moved.log_weights.clone()
+        std = self.respread_scale * growth * self.step_std
+        particles[rows] = self.diffuse(start, std, generator)
+        log_weights[rows] = -math.log(self.n_particles)
+        memory = self.first_memory(particles)
+        if memory is not None and moved.memory is not None:
+            fresh, memory = memory, moved.memory.clone()
+            memory[rows] = fresh[rows]
+        return moved._replace(particles=particles, log_weights=log_weights, memory=memory)
+
+    def _estimate(self, particles: Tensor, log_weights: Tensor) -> Float[Tensor, "B D"]:
+        if self.estimate == "mean":
+            return self.body.mean(particles, log_weights.to(particles.dtype))
+        return best_particle(particles, log_weights)

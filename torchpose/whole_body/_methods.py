@@ -1,0 +1,287 @@
+"""The filters over whole bodies by name: which one tracks, what it has to have learnt, which options it has.
+
+`METHODS` is the table of all of them. A filter of your own is a subclass of `SilhouetteParticleFilter`
+and one call of `register_body_filter`.
+"""
+
+import inspect
+from collections.abc import Callable, Collection, Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from torchpose.body._kinematics import Body
+from torchpose.errors import InputError, PriorError, refuse_unused
+from torchpose.priors._limb_conditionals import LimbConditionals
+from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
+from torchpose.priors._shipped import load_action, load_limb_conditionals, load_manifold
+from torchpose.whole_body._filters.annealed import AnnealedParticleFilter
+from torchpose.whole_body._filters.body_particles import BodyFilterOptions
+from torchpose.whole_body._filters.constrained import ConstrainedParticleFilter
+from torchpose.whole_body._filters.manifold import ManifoldParticleFilter
+from torchpose.whole_body._filters.root_uncertainty import RootUncertaintyTracker
+from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
+from torchpose.whole_body._filters.sir import SIRParticleFilter
+
+__all__ = [
+    "LEARNT",
+    "METHODS",
+    "BodyMethod",
+    "LearntKind",
+    "check_options",
+    "choose_method",
+    "make_filter",
+    "method_options",
+    "rebased",
+    "register_body_filter",
+]
+
+_DEFAULT = "apf"  # needs nothing
+
+
+class BodyMethod(NamedTuple):
+    """A filter that `BodyTracker` tracks with.
+
+    Attributes:
+        filter: its class. needs: the kind of model that it tracks with, among `LEARNT`, which is also
+            the name of the argument that takes it; None if it needs nothing.
+    """
+
+    filter: type[SilhouetteParticleFilter]
+    needs: str | None = None
+
+
+METHODS: dict[str, BodyMethod] = {
+    "mrpf": BodyMethod(ManifoldParticleFilter, needs="manifold"),
+    "apf": BodyMethod(AnnealedParticleFilter),
+    "sir": BodyMethod(SIRParticleFilter),
+    "root": BodyMethod(RootUncertaintyTracker, needs="conditionals"),
+    "constrained": BodyMethod(ConstrainedParticleFilter, needs="action"),
+}
+"""Every filter by the name of its method; see `register_body_filter`."""
+
+
+def register_body_filter(
+    name: str, filter_class: type[SilhouetteParticleFilter], needs: str | None = None
+) -> None:
+    """Add a filter to `METHODS`, for `BodyTracker`, `torchpose track-body` and the benchmarks.
+
+    Its options are the arguments of its constructor, whose first two are `body` and `n_particles`; a
+    model that it needs and `fps` are given by name where the constructor takes them.
+
+    Args:
+        name: of the method. filter_class: the filter. needs: "manifold", "conditionals" or "action", if
+            it tracks with one of these.
+
+    Raises:
+        InputError: not a filter over body poses, a name that another one has, or a need of another kind.
+    """
+    if not (isinstance(filter_class, type) and issubclass(filter_class, SilhouetteParticleFilter)):
+        raise InputError(
+            f"expected a subclass of SilhouetteParticleFilter, got {filter_class!r:.80}"
+        )
+    if name in METHODS and METHODS[name].filter is not filter_class:
+        raise InputError(f"method {name!r} is {METHODS[name].filter.__name__}; choose another name")
+    if needs is not None and needs not in LEARNT:
+        raise InputError(f"needs must be one of {', '.join(LEARNT)} or None, got {needs!r}")
+    METHODS[name] = BodyMethod(filter_class, needs)
+
+
+# --- what filters have learnt ---------------------------------------------------------------------
+
+
+class LearntKind(NamedTuple):
+    """A kind of model that filters track with.
+
+    Attributes:
+        load: (name or file) -> model. words: what it is, and the command that makes one.
+        body: (upright body, model) -> the same person in the frame and about the centres of the model;
+            refuses a model of another skeleton.
+        at_rate: (model, frames per second) -> the model with its noise for this rate.
+        rescaled: (model, frames per second) -> what to say of a model that was learnt at another rate.
+    """
+
+    load: Callable[[str | Path], Any]
+    words: str
+    body: Callable[[Body, Any], Body]
+    at_rate: Callable[[Any, float], Any]
+    rescaled: Callable[[Any, float], str]
+
+
+def rebased(body: Body, frame: Any, centres: Any) -> Body:
+    """Return a person in another frame and about other centres, none for None; itself if it is."""
+    wanted = torch.zeros_like(body.centres) if centres is None else torch.as_tensor(centres)
+    wanted = wanted.to(body.centres)
+    if body.frame == frame and torch.equal(body.centres, wanted):
+        return body
+    return body.altered(frame=frame, centres=wanted)
+
+
+def _body_of_manifold(upright: Body, manifold: BackConstrainedGPLVM) -> Body:
+    info = manifold.info
+    if info.skeleton == upright.skeleton.names:  # else it is refused below
+        upright = rebased(upright, info.frame, info.centres or None)
+    manifold.check_for(upright)
+    return upright
+
+
+def _body_of_conditionals(upright: Body, conditionals: LimbConditionals) -> Body:
+    info, parts = conditionals.info, upright.skeleton.parts
+    if info.parts != parts:
+        raise PriorError(
+            f"expected limb conditionals of the parts {', '.join(parts)}, got "
+            f"{', '.join(info.parts)} ({info.name}); fit them with `torchpose fit limbs`"
+        )
+    return rebased(upright, "body", conditionals.centres)
+
+
+def _rescaled(what: str, verb: str) -> Callable[[Any, float], str]:
+    def say(model: Any, fps: float) -> str:
+        fitted = model.info.fps
+        if fitted is None or fitted == fps:
+            return ""
+        return f"{what} was {verb} at {fitted:g} frames per second and rescaled to {fps:g}"
+
+    return say
+
+
+def _rescaled_actions(action: Any, fps: float) -> str:
+    several = bool(getattr(action, "names", ()))
+    return _rescaled("how long actions last", "set")(action, fps) if several else ""
+
+
+LEARNT = {
+    "manifold": LearntKind(
+        load_manifold,
+        "a manifold of the action's poses (such as walk, or of torchpose fit manifold)",
+        _body_of_manifold,
+        lambda manifold, fps: manifold.at_rate(fps),
+        _rescaled("the manifold's noise", "learnt"),
+    ),
+    "conditionals": LearntKind(
+        load_limb_conditionals,
+        "limb conditionals (such as walk, or of torchpose fit limbs)",
+        _body_of_conditionals,
+        lambda conditionals, fps: conditionals,  # the filter rescales them
+        _rescaled("the limbs' diffusion", "learnt"),
+    ),
+    "action": LearntKind(
+        load_action,
+        "an action space or a bank of several (such as exercises, or of torchpose fit actions)",
+        lambda upright, action: upright,
+        lambda action, fps: action,  # the filter rescales a bank's transitions
+        _rescaled_actions,
+    ),
+}
+"""Kinds of models that filters track with, by the arguments that take them."""
+
+
+# --- which filter, with which options -------------------------------------------------------------
+
+
+def choose_method(method: str | None, given: Collection[str]) -> str:
+    """Return the method that tracks: the one named, else that of the model given, else "apf".
+
+    A manifold goes with every method: the first pose is looked for with it.
+
+    Args:
+        method: a name of `METHODS`, or None. given: the kinds of models that were given.
+
+    Raises:
+        InputError: an unknown method, one whose model is missing, models of several methods, or one that
+            the method does not use.
+
+    >>> choose_method(None, ["conditionals"]), choose_method(None, []), choose_method("sir", ["manifold"])
+    ('root', 'apf', 'sir')
+    """
+    first = {one.needs: name for name, one in reversed(METHODS.items())}
+    if method is None:
+        wanted = [first[kind] for kind in LEARNT if kind in given]
+        if len(wanted) > 1:
+            raise InputError(
+                f"{' and '.join(kind for kind in LEARNT if kind in given)} belong to different "
+                f"filters; choose by method {' or '.join(wanted)}"
+            )
+        return wanted[0] if wanted else _DEFAULT
+    _check_method(method)
+    needs = METHODS[method].needs
+    if needs is not None and needs not in given:
+        raise InputError(f"method {method} needs {needs}, {LEARNT[needs].words}")
+    for kind in given:
+        if kind not in (needs, "manifold"):
+            raise InputError(
+                f"{kind} does nothing for method {method}; leave it out or take method {first[kind]}"
+            )
+    return method
+
+
+def method_options(method: str) -> tuple[str, ...]:
+    """Return the options of a method's filter, from its constructor.
+
+    Args:
+        method: a name of `METHODS`.
+
+    Raises:
+        InputError: no such method.
+
+    >>> "n_layers" in method_options("apf"), "n_layers" in method_options("sir")
+    (True, False)
+    """
+    _check_method(method)
+    filter_class = METHODS[method].filter
+    parameters = inspect.signature(filter_class).parameters.values()
+    names = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY and p.name != "fps"]
+    if any(p.kind is p.VAR_KEYWORD for p in parameters):
+        names += [name for name in BodyFilterOptions.__annotations__ if name not in names]
+    return tuple(name for name in names if name not in filter_class.unused)
+
+
+def check_options(method: str, options: Iterable[str]) -> None:
+    """Refuse options that a method does not use, and say which method does.
+
+    Raises:
+        InputError: such an option.
+    """
+    said = f"does nothing for method {method}"
+    refuse_unused(options, said, method, METHODS, method_options)
+
+
+def make_filter(
+    method: str,
+    body: Body,
+    learnt: Any,
+    fps: float,
+    n_particles: int,
+    options: Mapping[str, Any],
+) -> SilhouetteParticleFilter:
+    """Return the filter of a method, with its usual noise and sharpness for tracking from images.
+
+    Args:
+        method: a name of `METHODS`. body: in the frame of `learnt`. learnt: the model that the method
+            needs. fps: frames per second. n_particles: likelihoods of a frame, of all layers or places
+            of the parts together. options: of the filter, before the usual ones.
+
+    Raises:
+        InputError: an option that the filter does not use, or too few particles.
+    """
+    check_options(method, options)
+    filter_class, needs = METHODS[method]
+    cost = filter_class.likelihoods_per_particle(options)
+    least = cost * filter_class.least_particles
+    if n_particles < least:
+        raise InputError(
+            f"n_particles must be at least {least} for method {method}, so that several survive a "
+            f"frame, got {n_particles}"
+        )
+    settings = {**filter_class.tracking_options(body, fps, learnt), **options}
+    if needs is not None:
+        settings[needs] = learnt
+    if "fps" in inspect.signature(filter_class).parameters:
+        settings["fps"] = fps
+    return filter_class(body, n_particles=n_particles // cost, **settings)
+
+
+def _check_method(method: str) -> None:
+    if method not in METHODS:
+        raise InputError(f"method must be one of {', '.join(METHODS)}, got {method!r}")

@@ -1,0 +1,244 @@
+"""The poses of a tracked whole body, with their uncertainty, and their file."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpose._core.estimates import check_estimates, frame_facts, to_tensor
+from torchpose._core.files import write_npz
+from torchpose._core.reading import check_arrays, npz_keys, one_text, read_npz, texts
+from torchpose.body._kinematics import Body
+from torchpose.body._skeleton import BODY_15
+from torchpose.camera._pinhole import PinholeCamera
+from torchpose.errors import FileFormatError, InputError, ShapeError, SkeletonError
+from torchpose.whole_body._filters.body_particles import first_true
+
+__all__ = ["BodyPoses", "load_body"]
+
+_FRAMES = {
+    "state": "f T 36",
+    "state_std": "f T 36",
+    "joints3d": "f T 15 3",
+    "covariance3d": "f T 15 3 3",
+    "log_evidence": "f T",
+    "effective_sample_size": "f T",
+    "coasting": "b T",
+    "respread": "b T",
+}  # kinds and sizes in a file
+_DETAIL = "detail_"  # of the keys of what only some filters report
+_BODY = {
+    "bone_lengths": "f 15",
+    "offsets": "f 15 3",
+    "tips": "f K 3",
+    "radii": "f L 2",
+    "centres": "f P 3",
+}
+_APART = 1e-3  # metres between joints and where the states put them
+_HEIGHTS = (0.3, 5.0)  # metres; between them is everybody, and what is no person is outside
+
+
+@dataclass
+class BodyPoses:
+    """Poses of one person in T frames; J joints and states of D numbers, as their body has.
+
+    Attributes:
+        body: whose states they are.
+        state: [T, D], the estimates. state_std: [T, D], in the units of a step (`Body.difference`).
+        joints3d: [T, J, 3], joints of the estimates, metres, world axes.
+        covariance3d: [T, J, 3, 3], second moment of the particles' joints about them, metres squared;
+            with the Gaussians within particles, of a filter that has them.
+        log_evidence, effective_sample_size: [T]. coasting: [T], True where no camera saw the person.
+        respread: [T], True where all particles had died and were spread about the last estimate.
+        fps: frames per second, or None. notes: what was assumed, in plain words.
+        first_frame: of the videos, that of the first pose.
+        details: what only some filters report, by name, [T, ...] each (`BodyTrack.details`): of
+            `ConstrainedParticleFilter` "acceptance", "clamped", "actions" and so on.
+        action_names: of the columns of ``details["actions"]``.
+        method: the filter that ran, one of `torchpose.whole_body.METHODS`; "unknown" in files of older
+            releases.
+    """
+
+    body: Body
+    state: Tensor
+    state_std: Tensor
+    joints3d: Tensor
+    covariance3d: Tensor
+    log_evidence: Tensor
+    effective_sample_size: Tensor
+    coasting: Tensor
+    respread: Tensor
+    fps: float | None = None
+    notes: tuple[str, ...] = field(default_factory=tuple)
+    first_frame: int = 0
+    details: dict[str, Tensor] = field(default_factory=dict)
+    action_names: tuple[str, ...] = field(default_factory=tuple)
+    method: str = "unknown"
+
+    def __len__(self) -> int:
+        return len(self.state)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the joints."""
+        return self.body.skeleton.names
+
+    @property
+    def failed_at(self) -> int:
+        """First frame in which all particles had died, -1 if there is none; tracking went on from it."""
+        return int(first_true(self.respread))
+
+    def save(self, path: str | Path) -> None:
+        """Write an .npz: what holds for each frame, `names`, `fps` (NaN if unknown), `notes`,
+        `first_frame`, `method`, `action_names`, details as `detail_acceptance` and so on, and the body as
+        `body_bone_lengths`, `body_radii` and so on.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        arrays: dict[str, Any] = {
+            name: getattr(self, name).detach().cpu().numpy() for name in _FRAMES
+        }
+        arrays |= {f"body_{n}": getattr(self.body, n).detach().cpu().numpy() for n in _BODY}
+        for name, value in self.details.items():
+            arrays[_DETAIL + name] = value.detach().cpu().numpy()
+        arrays["action_names"] = np.array(self.action_names, dtype=str)
+        arrays["body_skeleton"] = np.array(self.body.skeleton.name)
+        arrays["body_frame"] = np.array(self.body.frame)
+        arrays["names"] = np.array(self.names)
+        arrays["fps"] = np.array(np.nan if self.fps is None else self.fps)
+        arrays["notes"] = np.array(self.notes, dtype=str)
+        arrays["first_frame"] = np.array(self.first_frame)
+        arrays["method"] = np.array(self.method)
+        write_npz(path, arrays)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read what `save` wrote.
+
+        Raises:
+            InputError: no such file. FileFormatError: not such poses, or fields that do not agree: other
+                shapes or types, details of other frames, joints elsewhere than the states put them.
+            SkeletonError: another skeleton.
+        """
+        there = npz_keys(path)
+        details = [key for key in there if key.startswith(_DETAIL)]
+        required = (*_FRAMES, "names", "fps", "notes")
+        arrays = read_npz(path, required, ("first_frame", "method", "action_names", *details))
+        n_frames = check_arrays(path, arrays, _FRAMES)["T"]
+        if n_frames == 0:
+            raise FileFormatError(f"{path}: expected poses of one frame or more, got none")
+        names = texts(path, "names", arrays["names"])
+        if names != BODY_15.names:
+            raise FileFormatError(f"{path}: expected the joints {', '.join(BODY_15.names)}")
+        for key in details:
+            value = arrays[key]
+            if value.dtype.kind not in "fiub" or value.ndim < 1 or len(value) != n_frames:
+                raise FileFormatError(
+                    f"{path}: expected {key} of {n_frames} frames, got {value.dtype!s:.40} of the sizes "
+                    f"{list(value.shape)!s:.60}"
+                )
+        frames: dict[str, Any] = {name: to_tensor(arrays[name]) for name in _FRAMES}
+        poses = cls(
+            load_body(path),
+            **frames,
+            details={key.removeprefix(_DETAIL): to_tensor(arrays[key]) for key in details},
+            action_names=texts(path, "action_names", arrays.get("action_names", np.array(()))),
+            method=one_text(path, "method", arrays.get("method", np.array("unknown"))),
+            **frame_facts(path, arrays),
+        )
+        poses._check(path)
+        return poses
+
+    def _check(self, path: str | Path) -> None:
+        """Raise unless the values agree with one another; the types and shapes do."""
+        check_estimates(path, "joints3d", self.joints3d, self.covariance3d)
+        for name in ("state", "state_std", "joints3d"):
+            if not bool(getattr(self, name).isfinite().all()):
+                raise FileFormatError(f"{path}: {name} must be finite")
+        bad = self.log_evidence.isposinf().any() or self.effective_sample_size.isinf().any()
+        if bool(bad) or bool((self.state_std < 0).any()):
+            raise FileFormatError(
+                f"{path}: expected state_std that is not negative, and no infinite log_evidence or "
+                "effective_sample_size"
+            )
+        joints = self.body.joints(self.state.to(self.body.bone_lengths))
+        apart = float((joints - self.joints3d.to(joints)).abs().amax())
+        if not apart <= _APART:
+            raise FileFormatError(
+                f"{path}: expected joints3d where state puts them, they are {apart:.3g} m apart"
+            )
+        actions = self.details.get("actions")
+        if actions is not None and tuple(actions.shape[1:]) != (len(self.action_names),):
+            raise FileFormatError(
+                f"{path}: expected {_DETAIL}actions of {len(self.action_names)} actions, got the sizes "
+                f"{list(actions.shape)}"
+            )
+
+    def seen_by(self, camera: PinholeCamera) -> "CameraPoses":
+        """Return the joints in a camera's axes, for `torchpose.viz._report.write_report`."""
+        R, t = (m.to(self.joints3d) for m in (camera.rotation_matrix, camera.translation))
+        return CameraPoses(
+            joints3d=(self.joints3d @ R.mT + t)[None],
+            covariance3d=(R @ self.covariance3d @ R.mT)[None],
+            observed=~self.coasting[None, :, None].expand(1, -1, len(self.names)),
+            failed_at=torch.full((1,), -1),
+            names=self.names,
+            fps=self.fps,
+        )
+
+
+@dataclass
+class CameraPoses:
+    """Poses in the axes of a camera; see `torchpose.viz._report.packing.ReportedTrack`."""
+
+    joints3d: Tensor
+    covariance3d: Tensor
+    observed: Tensor
+    failed_at: Tensor
+    names: tuple[str, ...]
+    fps: float | None
+    frame: str = "camera"
+
+    def __len__(self) -> int:
+        return len(self.joints3d)
+
+
+def load_body(path: str | Path) -> Body:
+    """Read the body of poses that were saved: bone lengths, limbs and centres of a person.
+
+    Raises:
+        InputError: no such file. FileFormatError: not such poses, or no body of a person.
+        SkeletonError: another skeleton.
+    """
+    keys = {f"body_{name}": field for name, field in _BODY.items()}
+    arrays = read_npz(path, (*keys, "body_skeleton", "body_frame"), ())
+    skeleton, frame = (one_text(path, key, arrays[key]) for key in ("body_skeleton", "body_frame"))
+    if skeleton != BODY_15.name:
+        raise SkeletonError(f"{path}: expected a body of {BODY_15.name!r}, got {skeleton!r:.60}")
+    if frame not in ("parent", "body"):
+        raise FileFormatError(f"{path}: expected body_frame 'parent' or 'body', got {frame!r:.60}")
+    check_arrays(path, arrays, keys)
+    tensors = {name: to_tensor(arrays[f"body_{name}"]) for name in _BODY}
+    try:
+        body = Body(
+            BODY_15,
+            tensors["bone_lengths"],
+            tensors["radii"],
+            directions=torch.nn.functional.normalize(tensors["offsets"], dim=-1),
+            centres=tensors["centres"],
+            frame="parent" if frame == "parent" else "body",
+            tips=tensors["tips"],
+        )
+    except (InputError, ShapeError) as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    largest = max(float(tensors[name].abs().amax()) for name in _BODY)
+    if not _HEIGHTS[0] < body.height < _HEIGHTS[1] or largest > _HEIGHTS[1]:
+        raise FileFormatError(
+            f"{path}: expected the body of a person in metres, got one of {body.height:.3g} m with parts "
+            f"of up to {largest:.3g} m"
+        )
+    return body

@@ -1,0 +1,245 @@
+"""Silhouette pixels under single limbs, those that the opposing limb may explain counted half."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchpose.body._limbs import Limbs, check_limbs
+from torchpose.camera._rig import Cameras, as_rig
+from torchpose.errors import ShapeError
+from torchpose.whole_body._silhouettes.limb_batches import (
+    checked_limbs,
+    count_intervals,
+    flatten_limbs,
+    in_chunks,
+    intervals_of,
+    which_silhouette,
+)
+from torchpose.whole_body._silhouettes.outlines import NEAR, RowIntervals, Strip
+from torchpose.whole_body._silhouettes.rendering import PreparedSilhouettes, prepare_silhouettes
+
+__all__ = ["PartCounts", "count_limbs", "count_parts"]
+
+
+class PartCounts(NamedTuple):
+    """What each position of a part weighs in each camera.
+
+    Attributes:
+        weight: [..., S, C], float64, silhouette pixels under the part, 1/2 where the opposing part may
+            be (DX 4). area: [..., S, C], all pixels under the part within the image.
+    """
+
+    weight: Float[Tensor, "*batch S C"]
+    area: Int[Tensor, "*batch S C"]
+
+    def share(self) -> Float[Tensor, "*batch S C"]:
+        """The weight as a share of the part's own pixels, which no scale of the image changes.
+
+        0 where the part is out of sight.
+        """
+        return self.weight / self.area.clamp_min(1)
+
+
+def count_parts(
+    parts: Limbs,
+    opposing: Limbs | None,
+    cameras: Cameras,
+    silhouettes: Tensor | PreparedSilhouettes,
+    *,
+    chunk: int | None = None,
+    near: float = NEAR,
+) -> PartCounts:
+    """Return each position's weight: the sum of a silhouette that is 1/2 under the opposing part.
+
+    sum_{l in L} B_opp(l) = |L and fg| - 1/2 |L and fg and U|   (DX 4)
+
+    with L the pixels of one position, the union of the part's K limbs, fg the silhouette, and U the
+    union of the positions at which the opposing part (of the other arm or leg) is expected. No image
+    is formed: with F(x) the silhouette pixels of U before a place x, an interval [a, b) of L shares
+    F(b) - F(a) with it.
+
+    Args:
+        parts: S positions of a part of K limbs, each position counted apart: [*batch, S, K, 3], radii
+            [K, 2] or [*batch, S, K, 2]. The leading dimensions may hold hypotheses and parts.
+        opposing: O positions of the opposing part's K' limbs, [*batch, O, K', 3]; None if there is
+            none.
+        cameras: C of them, with images of the silhouettes' size.
+        silhouettes: as for `count_pixels`; their leading dimensions are the first of the batch.
+        chunk: batch items at a time; chosen by the size of the images if None (some 10 MB).
+        near: metres.
+
+    Returns:
+        `PartCounts`, each [*batch, S, C].
+
+    Raises:
+        ShapeError: the leading dimensions differ; others as `count_pixels`.
+
+    Reference: Daubney & Xie, section 5 and equation (4).
+    """
+    rig, parts = as_rig(cameras), _positions("parts", parts, near)
+    if not isinstance(silhouettes, PreparedSilhouettes):
+        silhouettes = prepare_silhouettes(silhouettes)
+    rig.check_images("silhouettes", silhouettes.shape)
+    batch, n_positions = tuple(parts.start.shape[:-3]), parts.start.shape[-3]
+    n, strip = math.prod(batch), Strip(*silhouettes.shape)
+    which = which_silhouette(n, _shared(silhouettes, batch), silhouettes.before)
+    before = silhouettes.before.to(parts.start.device)
+    mine = flatten_limbs(parts)
+    theirs = None if opposing is None else _union(opposing, batch, near)
+    counts = torch.zeros(3, n, n_positions, strip.cameras, device=parts.start.device)
+    counts = counts.to(torch.int64)
+
+    def count(items: slice) -> None:
+        begin = None if which is None else which[items]
+        each = None if begin is None else begin.repeat_interleave(n_positions)
+        some = slice(items.start * n_positions, items.stop * n_positions)
+        rows = intervals_of(mine, some, rig, strip, near, "cylinders")
+        counts[:2, items] = count_intervals(rows, before.view(-1), each, strip).unflatten(
+            1, (-1, n_positions)
+        )
+        if theirs is not None:
+            other = intervals_of(theirs, items, rig, strip, near, "cylinders")
+            union = _Union.of(other, before, begin, strip)
+            shared = _shared_pixels(rows, union, n_positions, strip)
+            counts[2, items] = shared.unflatten(0, (-1, n_positions))
+
+    per_item = (n, n_positions * parts.start.shape[-2], 3)
+    sizes = Limbs(parts.start.reshape(per_item), parts.end.reshape(per_item), parts.radii)
+    in_chunks(count, sizes, strip, chunk)
+    area, inside, shared = counts.view(3, *batch, n_positions, strip.cameras)
+    return PartCounts(inside.double() - shared.double() / 2, area)
+
+
+def count_limbs(
+    limbs: Limbs,
+    opposing: Limbs | None,
+    cameras: Cameras,
+    silhouettes: Tensor | PreparedSilhouettes,
+    *,
+    chunk: int | None = None,
+    near: float = NEAR,
+) -> Float[Tensor, "*batch S C"]:
+    """Weight of each position of a single limb: `count_parts` with parts of one limb.
+
+    Args:
+        limbs: S positions of a limb, each counted apart: [*batch, S, 3], radii [S, 2] or
+            [*batch, S, 2].
+        opposing: O positions of the opposing limb, [*batch, O, 3]; None if there is none.
+        cameras, silhouettes, chunk, near: as `count_parts`.
+
+    Returns:
+        [*batch, S, C], float64, pixels.
+
+    Raises:
+        ShapeError: the leading dimensions differ; others as `count_pixels`.
+
+    Reference: Daubney & Xie, section 5 and equation (4).
+    """
+    check_limbs(limbs)
+    radii = limbs.radii.expand(*limbs.start.shape[:-1], 2).unsqueeze(-2)
+    alone = Limbs(limbs.start.unsqueeze(-2), limbs.end.unsqueeze(-2), radii)
+    if opposing is not None:
+        check_limbs(opposing)
+        radii = opposing.radii.expand(*opposing.start.shape[:-1], 2).unsqueeze(-2)
+        opposing = Limbs(opposing.start.unsqueeze(-2), opposing.end.unsqueeze(-2), radii)
+    return count_parts(alone, opposing, cameras, silhouettes, chunk=chunk, near=near).weight
+
+
+# --- helpers --------------------------------------------------------------------------------------
+
+
+class _Union(NamedTuple):
+    """Where the opposing parts may be: disjoint intervals in rising order, the first one empty.
+
+    Attributes:
+        start, stop: [R], packed item and place. before: [R], silhouette pixels of the union before
+            each start. silhouette: [R], those of all pixels. running: the silhouettes' running sums.
+    """
+
+    start: Tensor
+    stop: Tensor
+    before: Tensor
+    silhouette: Tensor
+    running: Tensor
+    begin: Tensor | None
+    strip: Strip
+
+    @classmethod
+    def of(
+        cls, rows: RowIntervals, running: Tensor, begin: Tensor | None, strip: Strip
+    ) -> "_Union":
+        filled = rows.start < rows.stop
+        start, stop = (pad(x[filled].long(), (1, 0)) for x in (rows.start, rows.stop))
+        running = running.view(-1)
+        first, last = (_look_up(x, running, begin, strip) for x in (start, stop))
+        before = pad((last - first).cumsum(0)[:-1], (1, 0))
+        return cls(start, stop, before, first, running, begin, strip)
+
+    def silhouette_before(self, places: Int[Tensor, " Q"]) -> Int[Tensor, " Q"]:
+        """Return F: silhouette pixels of the union before packed places."""
+        last = torch.searchsorted(self.start, places, right=True) - 1
+        end = torch.minimum(places, self.stop.index_select(0, last))
+        within = _look_up(end, self.running, self.begin, self.strip)
+        base = self.before - self.silhouette
+        return within + base.index_select(0, last)
+
+
+def _look_up(packed: Tensor, running: Tensor, begin: Tensor | None, strip: Strip) -> Tensor:
+    """Return the silhouette pixels before packed places."""
+    place = packed & ((1 << strip.bits) - 1)
+    if begin is not None:
+        place = place + begin.index_select(0, packed >> strip.bits)
+    return running.index_select(0, place)
+
+
+def _shared_pixels(
+    rows: RowIntervals, union: _Union, n_positions: int, strip: Strip
+) -> Int[Tensor, "N C"]:
+    """Return |L and fg and U| of every position and camera."""
+    filled = torch.nonzero(rows.start < rows.stop).squeeze(-1)
+    # items of the union by those of the rows: a table, since to divide takes longer
+    items = torch.arange(len(rows.per_image), device=filled.device)
+    owner = items.div(n_positions, rounding_mode="floor") << strip.bits
+    ends = torch.stack([rows.start, rows.stop]).index_select(1, filled).long()
+    place = ends & ((1 << strip.bits) - 1)
+    places = owner.index_select(0, (ends >> strip.bits).view(-1)).view_as(ends) | place
+    first, last = union.silhouette_before(places.view(-1)).view_as(ends)
+    pixels = torch.zeros_like(rows.start, dtype=torch.int64).index_copy_(0, filled, last - first)
+    ends = pad(rows.per_image.flatten().cumsum(0), (1, 0))
+    total = pad(pixels.cumsum(0), (1, 0)).index_select(0, ends)
+    return total.diff().view(rows.per_image.shape)
+
+
+def _positions(name: str, parts: Limbs, near: float) -> Limbs:
+    """Return limbs [*batch, S, K] of which each position is one item."""
+    if parts.start.ndim < 4:
+        raise ShapeError(f"{name} must have shape [..., S, K, 3], got {list(parts.start.shape)}")
+    return checked_limbs(parts, near)
+
+
+def _union(opposing: Limbs, batch: tuple[int, ...], near: float) -> Limbs:
+    """Return all positions of the opposing part as limbs of one item."""
+    opposing = _positions("opposing parts", opposing, near)
+    if tuple(opposing.start.shape[:-3]) != batch:
+        raise ShapeError(
+            f"the opposing part must have the leading dimensions {list(batch)} of the part, got "
+            f"{list(opposing.start.shape[:-3])}"
+        )
+    radii = opposing.radii.expand(*opposing.start.shape[:-1], 2)
+    flat = (x.flatten(-3, -2).flatten(0, -3) for x in (opposing.start, opposing.end, radii))
+    return Limbs(*flat)
+
+
+def _shared(silhouettes: PreparedSilhouettes, batch: tuple[int, ...]) -> int:
+    """Return how many silhouettes the batch has; 1 if it shares one."""
+    leading = tuple(silhouettes.area.shape[:-1])
+    if batch[: len(leading)] != leading:
+        raise ShapeError(
+            f"silhouettes must have the leading dimensions of the parts, {list(batch)} or the first "
+            f"of them, got {list(leading)} before [C, H, W]"
+        )
+    return math.prod(leading)

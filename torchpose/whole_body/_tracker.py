@@ -1,0 +1,393 @@
+"""The main job for whole bodies: silhouettes of calibrated cameras to the poses of one person."""
+
+from collections.abc import Iterable
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from torchpose.body._kinematics import Body
+from torchpose.body._skeleton import BODY_15
+from torchpose.camera._rig import CameraRig, Cameras, as_rig
+from torchpose.errors import InputError, NobodySeenError, check_rate, check_shape
+from torchpose.filters._base import Generators
+from torchpose.priors._actions.bank import ActionBank
+from torchpose.priors._actions.space import ActionSpace
+from torchpose.priors._limb_conditionals import LimbConditionals
+from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
+from torchpose.whole_body._filters.body_frames import check_frame
+from torchpose.whole_body._filters.body_particles import BodyFilterState, stack_tracks
+from torchpose.whole_body._filters.motion import std_of_covariance
+from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
+from torchpose.whole_body._first_pose import find_first_pose
+from torchpose.whole_body._methods import LEARNT, METHODS, choose_method, make_filter, rebased
+from torchpose.whole_body._poses import BodyPoses, load_body
+
+__all__ = ["BodyStream", "BodyTracker", "all_see", "track_body"]
+
+_LOOK_AHEAD = 0.5  # seconds that decide where the person looks at first
+_SEEN = 0.002  # of the image: fewer pixels are nobody
+
+
+class BodyStream(NamedTuple):
+    """What `BodyTracker.step` needs to know of the frames before.
+
+    Attributes:
+        filter: state of the filter. frame: number of the next frame. generator: for what is drawn.
+    """
+
+    filter: BodyFilterState
+    frame: int
+    generator: torch.Generator | None
+
+
+class BodyTracker(nn.Module):
+    """Tracks one person's whole body through the silhouettes of calibrated cameras, in 3D.
+
+    `forward` tracks a whole sequence and finds the first pose by itself; `init` and `step` track live,
+    `advance` some frames at a time, with the same numbers.
+
+    The method is a particle filter:
+
+    - ``mrpf``: also weighted by the distance from a manifold of poses of the same action
+      (`ManifoldParticleFilter`); needs `manifold`.
+    - ``apf``: annealed, five layers from a broad to a peaked likelihood (`AnnealedParticleFilter`).
+    - ``sir``: drawn, weighted, resampled (`SIRParticleFilter`).
+    - ``root``: a Gaussian per limb for every hypothesis of the root (`RootUncertaintyTracker`); needs
+      `conditionals`.
+    - ``constrained``: only postures of a known action, or of several (`ConstrainedParticleFilter`);
+      needs `action`.
+
+    Args:
+        cameras: of the silhouettes, undistorted: a `CameraRig`, or what makes one.
+        method: a name of `torchpose.whole_body.METHODS`; by default that of the model given, else "apf".
+        body: of the person, or a file of `BodyPoses` that has it. height: metres, of a body of average
+            proportions where `body` is not given.
+        manifold, conditionals, action: what the method has learnt: a model, the name of one that comes
+            with the package, or a file. The first pose is looked for with a manifold by every method.
+        n_particles: likelihoods of a frame, of all layers together; a hypothesis of "root" counts seven.
+        fps: frames per second; noise grows with the time between frames.
+        process_cov: variances of the diffusion per frame [D], or [D, D] without entries off the diagonal,
+            in squares of metres for the root and of sines of half angles for rotations; by default what
+            suits the method.
+        initial_cov: the same of the particles about the first pose; by default four times `process_cov`.
+        options: of the method's filter (`torchpose.whole_body._methods.method_options`), such as sharpness,
+            limits, leg_swap or n_layers.
+
+    Attributes:
+        filter: that runs. method: its name. upright: the body on which the first pose is looked for.
+
+    Raises:
+        InputError: an unknown method, a model or an option that it does not use, too few particles.
+        PriorError: no such model, or one of another skeleton or frame rate. CameraError: no cameras.
+
+    Example:
+        >>> import torch, torchpose
+        >>> from torchpose.body import BODY_15, Body
+        >>> from torchpose.camera import PinholeCamera
+        >>> from torchpose.whole_body import render
+        >>> camera = PinholeCamera(
+        ...     80, 80, 39.5, 29.5, 80, 60, rotation=(torch.pi, 0, 0), translation=(0, 0, 3)
+        ... )
+        >>> standing = torch.zeros(36, dtype=torch.float64)
+        >>> silhouettes = render(Body.of_height(BODY_15, 1.8), standing.expand(3, -1), camera, 60, 80)
+        >>> tracker = torchpose.BodyTracker(camera, "sir", height=1.8, n_particles=50)
+        >>> poses = tracker(silhouettes, standing, torch.Generator().manual_seed(0))
+        >>> poses.joints3d.shape
+        torch.Size([3, 15, 3])
+    """
+
+    cameras: CameraRig
+
+    def __init__(
+        self,
+        cameras: Cameras,
+        method: str | None = None,
+        *,
+        body: Body | str | Path | None = None,
+        height: float = 1.75,
+        manifold: BackConstrainedGPLVM | str | Path | None = None,
+        conditionals: LimbConditionals | str | Path | None = None,
+        action: ActionSpace | ActionBank | str | Path | None = None,
+        n_particles: int = 1000,
+        fps: float = 60.0,
+        process_cov: Tensor | None = None,
+        initial_cov: Tensor | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__()
+        check_rate("fps", fps)
+        given = {"manifold": manifold, "conditionals": conditionals, "action": action}
+        given = {kind: value for kind, value in given.items() if value is not None}
+        self.method = choose_method(method, given)
+        models = {kind: _model(kind, value, fps) for kind, value in given.items()}
+        needs = METHODS[self.method].needs
+        person = rebased(_person(body, height), "parent", None)
+        upright, tracked, learnt = person, person, None
+        if "manifold" in models:
+            upright = LEARNT["manifold"].body(person, models["manifold"][0])
+        if needs is not None:
+            learnt = models[needs][0]
+            tracked = upright if needs == "manifold" else LEARNT[needs].body(person, learnt)
+        if process_cov is not None:
+            if "step_std" in options:
+                raise InputError("process_cov and step_std say the same; leave one of them out")
+            options["step_std"] = std_of_covariance("process_cov", process_cov, tracked.dim)
+        self.filter = make_filter(self.method, tracked, learnt, fps, n_particles, options)
+        self.cameras, self.fps, self.n_particles = as_rig(cameras), float(fps), n_particles
+        self.notes = tuple(filter(None, (note for _, note in models.values())))
+        # of the filter where these are the same, lest its tensors be in the state twice
+        self._upright = None if upright is tracked else upright
+        self._search = (
+            models["manifold"][0] if "manifold" in models and needs != "manifold" else None
+        )
+        std = (
+            None
+            if initial_cov is None
+            else std_of_covariance("initial_cov", initial_cov, tracked.dim)
+        )
+        self.register_buffer("_initial_std", std, persistent=std is not None)
+
+    _initial_std: Tensor | None
+
+    @property
+    def body(self) -> Body:
+        """The body that is tracked, in the frame and about the centres that the method needs."""
+        return self.filter.body  # type: ignore[return-value]
+
+    @property
+    def upright(self) -> Body:
+        """The same person, on whom the first pose is looked for."""
+        return self.body if self._upright is None else self._upright
+
+    @property
+    def process_cov(self) -> Float[Tensor, " D"]:
+        """Variances of the diffusion per frame."""
+        return self.filter.step_std.square()
+
+    @property
+    def initial_std(self) -> Float[Tensor, " D"]:
+        """Standard deviation of the particles about the first pose."""
+        return self.filter.start_std() if self._initial_std is None else self._initial_std
+
+    @torch.no_grad()
+    def forward(
+        self,
+        silhouettes: Iterable[Bool[Tensor, "C H W"]],
+        initial_state: Float[Tensor, " D"] | None = None,
+        generator: torch.Generator | None = None,
+        progress: bool = False,
+        *,
+        facing: Float[Tensor, "3"] | None = None,
+        n_frames: int | None = None,
+    ) -> BodyPoses:
+        """Track one person from the first frame in which all cameras see somebody.
+
+        Args:
+            silhouettes: bool [T, C, H, W], or frames [C, H, W] one after the other, of which memory then
+                holds those that the first pose is found in, and one more.
+            initial_state: the pose before that frame [D], of `body`; found in half a second of frames
+                (`find_first_pose`) if None. generator: for what is drawn.
+            progress: whether to show a bar. facing: [3], the world direction that the person looks in at
+                first, if it is known. n_frames: how many frames to expect, for the bar.
+
+        Returns:
+            `BodyPoses`, from frame `first_frame`.
+
+        Raises:
+            NobodySeenError: by all cameras in any frame. InputError: silhouettes that are not bool.
+            ShapeError, CameraError: of other sizes than the cameras' images.
+        """
+        frames = iter(silhouettes)
+        seen = next(((t, masks) for t, masks in enumerate(frames) if all_see(masks)), None)
+        if seen is None:
+            raise NobodySeenError(
+                "nobody is seen by all cameras in any frame; check the silhouettes, or leave out the "
+                "camera that sees nobody"
+            )
+        begun, first = seen
+        looked_at = 1 if initial_state is not None else max(1, round(_LOOK_AHEAD * self.fps))
+        begin = [first, *islice(frames, looked_at - 1)]
+        state = self.init(torch.stack(begin), initial_state, generator, facing=facing)
+        state = state._replace(frame=begun)
+        expected = None if n_frames is None else max(1, n_frames - begun)
+        bar = tqdm(chain(begin, frames), total=expected, disable=not progress, unit="frame")
+        poses = self.advance(state, iter(bar))[1]
+        if begun:
+            poses.notes += (
+                f"the first {begun} frames, in which not all cameras saw somebody, have no pose",
+            )
+        return poses
+
+    @torch.no_grad()
+    def init(
+        self,
+        silhouettes: Bool[Tensor, "T C H W"] | None = None,
+        initial_state: Float[Tensor, " D"] | None = None,
+        generator: torch.Generator | None = None,
+        *,
+        facing: Float[Tensor, "3"] | None = None,
+    ) -> BodyStream:
+        """Begin to track a live stream, whose first frame is the first of these, or the one after a pose.
+
+        Args:
+            silhouettes: bool, half a second in which the first pose is found; they are to be tracked
+                afterwards, with `step` or `advance`. initial_state: the pose before the first frame [D], of
+                `body`, instead. generator: for what is drawn; the state holds it. facing: as in `forward`.
+
+        Raises:
+            InputError: neither silhouettes nor a pose, nobody seen in the first frame. ShapeError,
+            CameraError: as `forward`.
+        """
+        if initial_state is None:
+            if silhouettes is None:
+                raise InputError(
+                    "tracking begins with silhouettes or an initial_state, got neither"
+                )
+            found = find_first_pose(
+                self.upright, silhouettes, self.cameras, self._first_prior(), generator, fps=self.fps,
+                facing=facing,
+            ).state  # fmt: skip
+            initial_state = (
+                found if self._upright is None else self.upright.convert(found, self.body)
+            )
+        check_shape("initial_state", initial_state, [self.body.dim])
+        state = self.filter.init(initial_state[None], generator, self.initial_std)
+        return BodyStream(state, 0, generator)
+
+    @torch.no_grad()
+    def step(
+        self, state: BodyStream, silhouettes: Bool[Tensor, "C H W"]
+    ) -> tuple[BodyStream, BodyPoses]:
+        """Track one more frame: the same numbers as that frame of `forward`.
+
+        Args:
+            state: from `init` or the step before; it is not changed (but a generator goes on).
+            silhouettes: of one frame, bool [C, H, W].
+
+        Returns:
+            The next state, and the `BodyPoses` of this one frame.
+
+        Raises:
+            ShapeError, InputError, CameraError: as `forward`.
+        """
+        return self.advance(state, [silhouettes])
+
+    @torch.no_grad()
+    def advance(
+        self, state: BodyStream, silhouettes: Iterable[Bool[Tensor, "C H W"]]
+    ) -> tuple[BodyStream, BodyPoses]:
+        """Track some more frames: the same numbers as `step` for one after the other.
+
+        Args:
+            state: as in `step`. silhouettes: bool [T, C, H, W], or one frame [C, H, W] after the other.
+
+        Returns:
+            The next state, and the `BodyPoses` of these frames.
+
+        Raises:
+            ShapeError, InputError, CameraError: as `forward`.
+        """
+        after, poses = _follow(
+            self.filter, state.filter, silhouettes, self.cameras, state.generator, state.frame
+        )
+        poses.fps, poses.method = self.fps, self.method
+        poses.notes = (*self.notes, *poses.notes)
+        return BodyStream(after, state.frame + len(poses), state.generator), poses
+
+    def extra_repr(self) -> str:
+        return f"method={self.method!r}, n_particles={self.n_particles}, fps={self.fps:g}"
+
+    def _first_prior(self) -> Any:
+        """Return the manifold with which the first pose is looked for, or None."""
+        return getattr(self.filter, "manifold", None) if self._search is None else self._search
+
+
+def all_see(silhouettes: Bool[Tensor, "C H W"]) -> bool:
+    """Tell whether every camera sees somebody in a frame: more than 0.2 % of its pixels."""
+    return bool((silhouettes.double().mean((-2, -1)) > _SEEN).all())
+
+
+@torch.no_grad()
+def track_body(
+    model: SilhouetteParticleFilter,
+    frames: Iterable[Bool[Tensor, "C H W"]],
+    cameras: Cameras,
+    initial_state: Float[Tensor, " D"],
+    generator: Generators = None,
+    *,
+    initial_std: Float[Tensor, " D"] | None = None,
+    fps: float | None = None,
+    n_frames: int | None = None,
+    progress: bool = False,
+) -> BodyPoses:
+    """Track one person with a filter of your own making; memory holds the poses and a single frame.
+
+    Args:
+        model: a filter over silhouettes, whose body is a `torchpose.body.Body`.
+        frames: silhouettes of the C cameras, frame after frame. cameras: theirs.
+        initial_state: the pose before the first frame [D], recorded or from `find_first_pose`.
+        generator: for what is drawn. initial_std: spread of the first particles [D]; none if None.
+        fps: of the frames, for the result. n_frames: how many to expect, for the progress bar.
+        progress: whether to show it.
+
+    Returns:
+        `BodyPoses` of as many frames as came, with the covariances that the filter gives their joints
+        (`SilhouetteParticleFilter.joint_covariance`).
+
+    Raises:
+        InputError: no frame, or a filter without a body. CameraError, ShapeError: as the filter.
+    """
+    if not isinstance(model.body, Body):
+        raise InputError(f"the filter must track a Body, got {type(model.body).__name__}")
+    state = model.init(initial_state[None], generator, initial_std)
+    bar = tqdm(frames, total=n_frames, disable=not progress, unit="frame")
+    poses = _follow(model, state, iter(bar), cameras, generator)[1]
+    poses.fps = fps
+    return poses
+
+
+def _follow(
+    model: SilhouetteParticleFilter,
+    state: BodyFilterState,
+    frames: Iterable[Tensor],
+    cameras: Cameras,
+    generator: Generators,
+    first_frame: int = 0,
+) -> tuple[BodyFilterState, BodyPoses]:
+    """Return the state after some frames, and their poses."""
+    steps, covs = [], []
+    body: Any = model.body
+    for silhouettes in frames:
+        check_frame(silhouettes[None], 1, plain=not callable(model.likelihood))
+        state, out = model.advance(state, silhouettes[None], cameras, generator)
+        steps.append(out)
+        covs.append(model.joint_covariance(state, out.mean)[0])
+    if not steps:
+        raise InputError("there must be at least one frame of silhouettes, got none")
+    batch = stack_tracks(steps)
+    model.warn(batch)
+    track = batch.element(0)
+    poses = BodyPoses(
+        body, track.mean, track.std, body.joints(track.mean), torch.stack(covs), track.log_evidence,
+        track.effective_sample_size, track.coasting, track.respread,
+        notes=model.notes(track, first_frame), first_frame=first_frame, details=track.details,
+        action_names=model.action_names,
+    )  # fmt: skip
+    return state, poses
+
+
+def _person(body: Body | str | Path | None, height: float) -> Body:
+    if isinstance(body, Body):
+        return body
+    return Body.of_height(BODY_15, height) if body is None else load_body(body)
+
+
+def _model(kind: str, value: Any, fps: float) -> tuple[Any, str]:
+    """Return a model with its noise for a frame rate, and what is to be said of that."""
+    model = LEARNT[kind].load(value) if isinstance(value, str | Path) else value
+    return LEARNT[kind].at_rate(model, fps), LEARNT[kind].rescaled(model, fps)
