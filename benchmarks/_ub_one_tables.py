@@ -9,9 +9,10 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from torchpose.evaluation import Report, Table
+from torchpose.evaluation import Report
 from torchpose.evaluation.common import HANDS, Scores, Trials, add_picture
 from torchpose.evaluation.people_tables import SHORT_NAMES
+from torchpose.evaluation.report import Table
 from torchpose.metrics import jitter
 from torchpose.metrics._poses import share_below
 from torchpose.priors import UpperBodyPrior

@@ -25,9 +25,9 @@ from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, read_clip
 from benchmarks.speed._timing import markdown_table, processor_model
-from torchpose.measure import SkinMixtureModel, SkinModel
+from torchpose.measure import SkinMixtureModel
 from torchpose.measure._face import FaceTracker
-from torchpose.measure._skin import rgb_to_lab
+from torchpose.measure._skin import SkinModel, rgb_to_lab
 from torchpose.video import open_video
 
 SCALE = 4

@@ -12,8 +12,10 @@ from tests.gradients import assert_differentiable, assert_without_gradient
 from tests.whole_body.filters.bending_body import BODY
 from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walker
 from torchpose import body, filters, priors, whole_body
-from torchpose.camera import backproject, lift, map_pixels, project
-from torchpose.math import euler_to_matrix, matrix_to_euler
+from torchpose.camera import lift, map_pixels, project
+from torchpose.camera._projection import backproject
+from torchpose.math import euler_to_matrix
+from torchpose.math._rotations import matrix_to_euler
 from torchpose.priors._actions.part_postures import PartPostures
 from torchpose.upper_body._fusion import MotionStage, ReadOut
 

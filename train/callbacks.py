@@ -133,8 +133,11 @@ class FitPictures(Callback):
 def _pictures(
     module: MixtureEM, prior: UpperBodyPrior, n_shown: int
 ) -> dict[str, Callable[[], Any]]:
-    from torchpose.viz import plot_prior_components, plot_prior_samples
-    from torchpose.viz._prior_pictures import plot_log_likelihood
+    from torchpose.viz._prior_pictures import (
+        plot_log_likelihood,
+        plot_prior_components,
+        plot_prior_samples,
+    )
 
     found: dict[str, Callable[[], Any]] = {
         "likelihood": lambda: plot_log_likelihood(module.histories, module.held_out_history),

@@ -8,7 +8,8 @@ from typing import Any
 from lightning.pytorch import LightningDataModule
 
 from torchpose.errors import InputError, OverlapError
-from torchpose.io import Recording, find_recordings, read_recordings
+from torchpose.io import Recording, read_recordings
+from torchpose.io._recordings import find_recordings
 from torchpose.learning._curation import (
     CurationReport,
     CurationSettings,

@@ -3,10 +3,8 @@ import math
 import torch
 
 from torchpose.body import BODY_15, Body, body_joints
-from torchpose.learning import fit_action_space
-from torchpose.learning._performances import repetition_axis, split_repetitions
-from torchpose.priors import ActionBank
-from torchpose.priors._actions.postures import posture_angles, posture_to_state
+from torchpose.learning import fit_action_space, repetition_axis, split_repetitions
+from torchpose.priors import ActionBank, posture_angles, posture_to_state
 
 
 def somebody(

@@ -5,7 +5,7 @@ import torch
 from torchpose.body import BODY_15, Body
 from torchpose.camera import PinholeCamera
 from torchpose.learning import fit_action_space
-from torchpose.priors._actions.postures import state_postures
+from torchpose.priors import state_postures
 from torchpose.whole_body import ConstrainedParticleFilter, constant_velocity_std, render
 
 body = Body.of_height(BODY_15, 1.75)

@@ -4,7 +4,6 @@ import torch
 
 from torchpose.body import BODY_15, Body, fit_body, fit_state
 from torchpose.learning import fit_gplvm, fit_gplvm_noise
-from torchpose.learning._manifolds import thin
 from torchpose.priors import ManifoldInfo
 
 # recordings of one person; here legs that walk, in yours joints [T, 15, 3] of `read_mocap`
@@ -19,7 +18,9 @@ trials = [body.joints(scale * states) for scale in (1.0, 0.9, 1.1)]
 body = fit_body(torch.cat(trials))
 poses = [body.relative(fit_state(body, joints)) for joints in trials]
 manifold = fit_gplvm(
-    thin(poses[:-1], 60), validation=poses[-1:], info=ManifoldInfo.of_body(body, name="walk")
+    [pose[::3] for pose in poses[:-1]],
+    validation=poses[-1:],
+    info=ManifoldInfo.of_body(body, name="walk"),
 )
 fit_gplvm_noise(manifold, poses[-1:], fps=60.0)  # the three standard deviations
 

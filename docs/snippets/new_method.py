@@ -9,8 +9,13 @@ from torchpose.cli import main
 from torchpose.filters import FilterOutput
 from torchpose.math import kalman_update
 from torchpose.skeleton import LEFT_ARM, RIGHT_ARM
-from torchpose.upper_body import Estimates, Estimator, register_method
-from torchpose.upper_body._measurements import arm_measurements, pixel_indices
+from torchpose.upper_body import (
+    Estimates,
+    Estimator,
+    arm_measurements,
+    pixel_indices,
+    register_method,
+)
 
 
 class Alone(NamedTuple):

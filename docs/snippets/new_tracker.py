@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 import torchpose
-from torchpose.filters import RecursiveFilter, StepOutput
-from torchpose.filters._transition import make_transition
+from torchpose.filters import RecursiveFilter, StepOutput, make_transition
 from torchpose.math import kalman_predict, kalman_update
 from torchpose.priors import GaussianMixture
 from torchpose.upper_body import PoseFilter, register_method

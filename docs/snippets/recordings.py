@@ -4,7 +4,7 @@ import numpy as np
 
 from torchpose.demo import performer
 from torchpose.io import read_recordings
-from torchpose.learning._curation import curate, leave_one_person_out
+from torchpose.learning import curate, leave_one_person_out
 from torchpose.skeleton import UPPER_BODY
 
 for seed, person in enumerate(("alice", "bob", "carol")):  # yours: files in a folder per person

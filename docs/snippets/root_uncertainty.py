@@ -5,7 +5,7 @@ import torch
 from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.learning import fit_limb_conditionals
-from torchpose.priors._limb_conditionals import in_body_frame
+from torchpose.priors import in_body_frame
 from torchpose.whole_body import RootUncertaintyTracker, render
 
 # recorded states of a person; here legs that walk, in yours `fit_state` of `read_mocap`

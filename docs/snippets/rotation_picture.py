@@ -1,8 +1,7 @@
 import torch
 
 from torchpose.math import compose, gaussian_rotate, rotate_gaussian
-from torchpose.viz import save_figure
-from torchpose.viz._rotation_picture import plot_rotations
+from torchpose.viz import plot_rotations, save_figure
 
 # a knee that bends: 60 degrees from straight, deviations of 25 degrees about the knee, 6 and 3
 centre, mean = torch.tensor([0.5, 0.0, 0.0]).double(), torch.zeros(3).double()

@@ -1,9 +1,7 @@
 import torchpose
-from torchpose.upper_body._pose_files import write_bvh
-from torchpose.video import VideoWriter, open_video
-from torchpose.video._overlay import draw_overlay
-from torchpose.video._prefetch import prefetch
-from torchpose.viz._report import write_report
+from torchpose.upper_body import write_bvh
+from torchpose.video import VideoWriter, draw_overlay, open_video
+from torchpose.viz import write_report
 
 prior = torchpose.load_prior("kinect-upper-body")
 with open_video("clip.mp4") as video:
@@ -13,7 +11,7 @@ with open_video("clip.mp4") as video:
 track = person.track
 
 with open_video("clip.mp4") as video, VideoWriter("mine.mp4", video.fps, video.size) as writer:
-    for image, _, index in prefetch(video):  # decodes in a thread
+    for image, _, index in video:
         t = index - person.first_frame
         if 0 <= t < len(person):  # one row for each person
             image = draw_overlay(

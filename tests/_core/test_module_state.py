@@ -21,12 +21,14 @@ from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig, walk, walk
 from torchpose import body, filters, measure, priors, whole_body
 from torchpose.body import Body, JointLimits
 from torchpose.camera import PinholeCamera
+from torchpose.filters._constant_velocity import ConstantVelocityFilter
 from torchpose.learning import fit_action_space, fit_gplvm, fit_gplvm_noise, fit_limb_conditionals
 from torchpose.measure._association import HandAssociation
 from torchpose.measure._brightness_background import BrightnessBackground
 from torchpose.measure._face import FaceTracker
 from torchpose.measure._hand_prior import HandPrior
 from torchpose.measure._persons import PersonRegister
+from torchpose.measure._skin import SkinModel
 from torchpose.priors import ActionBank
 from torchpose.priors._actions.part_postures import PartPostures
 from torchpose.priors._limb_conditionals import in_body_frame
@@ -166,7 +168,7 @@ def state_of(module):
 STATE_ONLY = {
     kind.__name__: kind
     for kind in (FaceTracker, HandAssociation, measure.HeadNeck, measure.MeanShiftHandTracker,
-                 PersonRegister, measure.SkinMixtureModel, measure.SkinModel)
+                 PersonRegister, measure.SkinMixtureModel, SkinModel)
 } | {
     "HandTracker": lambda: measure.HandTracker(CASES["HandPrior"][0](1)),
     "UpperBodyMeasurer": lambda: measure.UpperBodyMeasurer(upper_body_prior(1)),
@@ -187,7 +189,7 @@ CASES = {
         lambda m: m(points(7, 5, BODY.dim).float().tanh()),
     ),
     "ConstantVelocityFilter": (
-        lambda s: filters.ConstantVelocityFilter(10.0**s, 30.0 + s),
+        lambda s: ConstantVelocityFilter(10.0**s, 30.0 + s),
         lambda m: (m(points(7, 2, 9, 3)), m.smooth(points(7, 2, 9, 3))),
     ),
     "MotionStage": (

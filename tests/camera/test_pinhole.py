@@ -12,7 +12,6 @@ from tests.data import data_dir_or_skip
 from torchpose.camera import (
     PinholeCamera,
     ViewRange,
-    backproject,
     lift,
     load_cameras,
     map_pixels,
@@ -20,7 +19,7 @@ from torchpose.camera import (
     sample_viewpoints,
     save_cameras,
 )
-from torchpose.camera._projection import check_intrinsics, map_pixel_covariance
+from torchpose.camera._projection import backproject, check_intrinsics, map_pixel_covariance
 from torchpose.camera._viewpoints import PAPER_VIEWS
 from torchpose.errors import CameraError, FileFormatError, InputError, OutputError, ShapeError
 from torchpose.math import euler_to_matrix

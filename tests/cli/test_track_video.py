@@ -14,7 +14,8 @@ from torchpose.cli.common import UntilInterrupted
 from torchpose.errors import OutputError
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack
-from torchpose.video import CameraSource, VideoWriter, open_video
+from torchpose.video import VideoWriter, open_video
+from torchpose.video._camera import CameraSource
 
 N = 45
 SUFFIXES = (".npz", ".csv", ".bvh")

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchpose.errors import InputError, ShapeError
-from torchpose.filters import ConstantVelocityFilter
+from torchpose.filters._constant_velocity import ConstantVelocityFilter
 
 RATIO, FPS = 2e3, 30.0
 

@@ -7,7 +7,8 @@ import torch
 from tests.filters.oracles import random_covariance, tensor
 from tests.filters.small_problem import DIM, OBSERVED, Problem
 from tests.gradients import assert_differentiable, assert_without_gradient
-from torchpose.filters import BootstrapParticleFilter, ConstantVelocityFilter, MixtureKalmanFilter
+from torchpose.filters import BootstrapParticleFilter, MixtureKalmanFilter
+from torchpose.filters._constant_velocity import ConstantVelocityFilter
 from torchpose.priors import GaussianMixture
 
 FRAMES = 18  # more than are computed anew at a time

@@ -20,8 +20,7 @@ from torchpose.filters import BootstrapParticleFilter, RecursiveFilter
 from torchpose.filters._particle import PROPOSALS
 from torchpose.filters._transition import make_transition
 from torchpose.filters._walk import MixtureWalk, Moves, grouped_affine
-from torchpose.math import log_prob
-from torchpose.math._gaussian import mixture_moments, safe_cholesky
+from torchpose.math._gaussian import log_prob, mixture_moments, safe_cholesky
 from torchpose.priors import GaussianMixture
 
 WIDE = torch.float64

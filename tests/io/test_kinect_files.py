@@ -14,7 +14,8 @@ from tests.io.skeleton_files import (
     to_kinect,
 )
 from torchpose.errors import FileFormatError, InputError
-from torchpose.io import find_recordings, read_recording, read_recordings
+from torchpose.io import read_recording, read_recordings
+from torchpose.io._recordings import find_recordings
 from torchpose.skeleton import SKELETONS
 
 V1 = SKELETONS["kinect-v1-20"].joints

@@ -12,8 +12,9 @@ from tests.upper_body import bvh_reader
 from tests.upper_body.test_bvh import track_of
 from torchpose.demo import performer
 from torchpose.errors import FileFormatError, MissingDependencyError, SkeletonError
-from torchpose.io import find_recordings, read_recording
+from torchpose.io import read_recording
 from torchpose.io._formats.mocap_files import bvh_joint_names
+from torchpose.io._recordings import find_recordings
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body._pose_files import write_bvh
 

@@ -8,7 +8,8 @@ import torch
 
 from tests.data import data_dir_or_skip
 from torchpose.errors import FileFormatError, InputError, SkeletonError
-from torchpose.io import find_recordings, read_recording, read_recordings
+from torchpose.io import read_recording, read_recordings
+from torchpose.io._recordings import find_recordings
 from torchpose.skeleton import SKELETONS, UPPER_BODY
 
 V2 = SKELETONS["kinect-v2-25"].joints

@@ -10,14 +10,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from torchpose.errors import ShapeError
-from torchpose.math import (
-    compose,
-    conjugate,
-    matrix_to_quaternion_vector,
-    mean_rotation,
-    quaternion_vector_to_matrix,
-)
+from torchpose.math import compose, conjugate, mean_rotation, quaternion_vector_to_matrix
 from torchpose.math._rotations import (
+    matrix_to_quaternion_vector,
     minimal_rotation,
     quaternion_to_vector,
     vector_to_quaternion,

@@ -9,8 +9,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from torchpose.errors import InputError, ShapeError
-from torchpose.math import euler_to_matrix, matrix_to_euler
-from torchpose.math._rotations import ROTATION_ORDERS, rotvec_to_matrix
+from torchpose.math import euler_to_matrix
+from torchpose.math._rotations import ROTATION_ORDERS, matrix_to_euler, rotvec_to_matrix
 
 ANGLE = st.floats(-3.1, 3.1)
 MIDDLE = st.floats(-1.5, 1.5)

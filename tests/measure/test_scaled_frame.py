@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchpose.measure import SkinModel
 from torchpose.measure._body_window import scale_frame, scales_of_faces
+from torchpose.measure._skin import SkinModel
 
 pytest.importorskip("cv2")
 

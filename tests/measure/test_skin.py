@@ -6,8 +6,7 @@ import torch
 
 from tests.data import data_dir_or_skip
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure import SkinModel
-from torchpose.measure._skin import rgb_to_lab
+from torchpose.measure._skin import SkinModel, rgb_to_lab
 
 SKIN, CLOTH, WALL = (0.80, 0.60, 0.50), (0.15, 0.20, 0.45), (0.75, 0.75, 0.70)
 FACE = torch.tensor([[80.0, 40.0, 32.0]])

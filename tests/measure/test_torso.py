@@ -9,9 +9,9 @@ import torch
 import torchpose
 from tests.data import data_dir_or_skip
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure import SkinModel, UpperBodyMeasurer
+from torchpose.measure import UpperBodyMeasurer
 from torchpose.measure._face import FaceTracker
-from torchpose.measure._skin import SkinState
+from torchpose.measure._skin import SkinModel, SkinState
 from torchpose.measure._torso import _supported, clothes_likelihood, elbows_from_torso
 
 cv2 = pytest.importorskip("cv2")

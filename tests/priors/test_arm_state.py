@@ -12,8 +12,8 @@ from torchpose.camera import sample_viewpoints
 from torchpose.camera._viewpoints import Viewpoints
 from torchpose.errors import InputError, PriorError, ShapeError
 from torchpose.learning import TRAINING_VIEWS
-from torchpose.priors import GaussianMixture, arm_state
-from torchpose.priors._arm_state import arm_states, mirror_arm_state, mirror_mixture
+from torchpose.priors import GaussianMixture
+from torchpose.priors._arm_state import arm_state, arm_states, mirror_arm_state, mirror_mixture
 
 MATRIX = torch.tensor([[525.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]], dtype=torch.float64)
 LEFT, RIGHT = [0, 1, 2, 3, 4], [7, 6, 5, 3, 4]

@@ -16,11 +16,10 @@ from torchpose.skeleton import (
     SKELETONS,
     UPPER_BODY,
     canonical_name,
-    identify_skeleton,
     to_upper_body,
     upper_body_indices,
 )
-from torchpose.skeleton._joint_sets import canonical_names
+from torchpose.skeleton._joint_sets import canonical_names, identify_skeleton
 from torchpose.skeleton._upper_body import ARM_JOINTS, LIMBS, measure_neck_kind
 
 SPELLINGS = [

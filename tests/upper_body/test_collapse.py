@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchpose.camera import PinholeCamera, backproject, project
+from torchpose.camera import PinholeCamera, project
+from torchpose.camera._projection import backproject
 from torchpose.demo import performer
 from torchpose.priors import load_prior
 from torchpose.priors._upper_body import released_process_cov

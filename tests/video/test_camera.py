@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from torchpose.errors import FileFormatError, InputError
-from torchpose.video import CameraSource, open_video
 from torchpose.video import _camera as module
+from torchpose.video import open_video
+from torchpose.video._camera import CameraSource
 
 WARM_UP = 10
 

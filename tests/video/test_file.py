@@ -9,8 +9,9 @@ import pytest
 
 from tests.video.make import add_sound, make_video, number_of, numbered
 from torchpose.errors import FileFormatError, InputError
-from torchpose.video import FileSource, open_video
 from torchpose.video import _timing as probe
+from torchpose.video import open_video
+from torchpose.video._file import FileSource
 
 
 def read(path, **options):

@@ -6,8 +6,8 @@ import pytest
 
 from tests.video.make import number_of, numbered
 from torchpose.errors import FileFormatError, InputError
-from torchpose.video import FolderSource, open_video
-from torchpose.video._images import find_images, natural_key
+from torchpose.video import open_video
+from torchpose.video._images import FolderSource, find_images, natural_key
 
 
 def save(path, image, *options):

@@ -6,8 +6,11 @@ import pytest
 
 from tests.video.make import make_video
 from torchpose.errors import InputError
-from torchpose.video import CameraSource, FileSource, FolderSource, open_video
 from torchpose.video import _source as module
+from torchpose.video import open_video
+from torchpose.video._camera import CameraSource
+from torchpose.video._file import FileSource
+from torchpose.video._images import FolderSource
 
 
 @pytest.fixture

@@ -14,8 +14,11 @@ from torchpose.priors import GaussianMixture, UpperBodyPrior
 from torchpose.priors._arm_state import arm_states, mirror_mixture
 from torchpose.priors._prior_file import PriorInfo
 from torchpose.priors._window import WindowLayout, WindowPrior
-from torchpose.viz import plot_prior_components, plot_prior_samples
-from torchpose.viz._prior_pictures import plot_log_likelihood
+from torchpose.viz._prior_pictures import (
+    plot_log_likelihood,
+    plot_prior_components,
+    plot_prior_samples,
+)
 
 WEIGHTS = torch.tensor([0.2, 0.5, 0.3], dtype=torch.float64)
 RAISED = REST.clone()

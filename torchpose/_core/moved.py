@@ -231,7 +231,7 @@ NAMES: dict[str, dict[str, str]] = {
     },
     "torchpose.camera": {
         "camera._projection": (
-            "arm_in_body_frame arm_in_camera_frame check_intrinsics intrinsics join_arms "
+            "arm_in_body_frame arm_in_camera_frame backproject check_intrinsics intrinsics join_arms "
             "map_pixel_covariance pixel_covariances"
         ),
         "camera._rig": "RigView as_rig undistortion_maps",
@@ -245,7 +245,7 @@ NAMES: dict[str, dict[str, str]] = {
         "demo._performer": "Performance hip_sway minimum_jerk performer_angles stage sway",
     },
     "torchpose.filters": {
-        "filters._constant_velocity": "ConstantVelocityState",
+        "filters._constant_velocity": "ConstantVelocityFilter ConstantVelocityState",
         "filters._mkf": "MKFState",
         "filters._particle": "ParticleState",
         "whole_body": (
@@ -260,6 +260,7 @@ NAMES: dict[str, dict[str, str]] = {
     "torchpose.io": {
         "_core.files": "atomic_path check_output_folder read_npz require_file write_npz",
         "io._formats.axes": "AXES",
+        "io._recordings": "find_recordings",
         "io._results": "ResultsFolder",
     },
     "torchpose.learning": {
@@ -268,7 +269,7 @@ NAMES: dict[str, dict[str, str]] = {
     },
     "torchpose.math": {
         "math._gaussian": (
-            "Gain condition kalman_correct kalman_gain least_exponent marginal mended_cholesky "
+            "Gain condition kalman_correct kalman_gain least_exponent log_prob marginal mended_cholesky "
             "mixture_moments product safe_cholesky symmetrise"
         ),
         "math._mixture_em": "FitReport MixtureParameters SufficientStatistics e_step m_step",
@@ -276,8 +277,9 @@ NAMES: dict[str, dict[str, str]] = {
             "left_matrix quaternion_moments right_matrix sigma_quaternions turn_gaussian"
         ),
         "math._rotations": (
-            "ROTATION_ORDERS RotationOrder cross_matrix minimal_rotation quaternion_to_vector "
-            "rotvec_to_matrix vector_to_quaternion within_unit_ball"
+            "ROTATION_ORDERS RotationOrder cross_matrix matrix_to_euler matrix_to_quaternion_vector "
+            "minimal_rotation quaternion_to_vector rotvec_to_matrix vector_to_quaternion "
+            "within_unit_ball"
         ),
         "math._unscented": "DIRECTIONS Directions floor_eigenvalues moments sigma_points",
     },
@@ -295,7 +297,7 @@ NAMES: dict[str, dict[str, str]] = {
         "measure._mean_shift_hands": "MeanShiftHandState",
         "measure._mediapipe": "PoseLandmarks",
         "measure._persons": "PersonRegister Persons",
-        "measure._skin": "SkinState rgb_to_lab",
+        "measure._skin": "SkinModel SkinState rgb_to_lab",
         "measure._skin_mixture": "SkinMixtureState",
         "measure._torso": "TorsoElbows clothes_likelihood elbows_from_torso",
         "measure._upper_body": "FrameMeasurements MEASURED MeasurerState",
@@ -315,20 +317,20 @@ NAMES: dict[str, dict[str, str]] = {
             "FitReport MixtureParameters SufficientStatistics e_step expectation_maximisation m_step"
         ),
         "priors._actions.file": "ActionInfo",
-        "priors._arm_state": "arm_states mirror_arm_state mirror_mixture",
+        "priors._arm_state": "arm_state arm_states mirror_arm_state mirror_mixture",
         "priors._prior_file": "PriorInfo",
         "skeleton._torso": (
             "NeckFraction NeckOffset learn_neck_fraction learn_neck_offset place_neck"
         ),
     },
     "torchpose.skeleton": {
-        "skeleton._joint_sets": "canonical_names",
+        "skeleton._joint_sets": "canonical_names identify_skeleton",
         "skeleton._torso": (
             "NeckFraction NeckOffset learn_neck_fraction learn_neck_offset place_neck"
         ),
         "skeleton._upper_body": (
-            "ARM_JOINTS BONES LIMBS NECK_KINDS OTHER_SIDE UpperBodyMap measure_neck_kind mirror_pose "
-            "scale_bones"
+            "ARM_JOINTS BONES LIMBS NECK_KINDS OTHER_SIDE UpperBody UpperBodyMap measure_neck_kind "
+            "mirror_pose scale_bones"
         ),
     },
     "torchpose.upper_body": {
@@ -336,6 +338,9 @@ NAMES: dict[str, dict[str, str]] = {
     },
     "torchpose.video": {
         "video._base": "Image",
+        "video._camera": "CameraSource",
+        "video._file": "FileSource",
+        "video._images": "FolderSource",
         "video._prefetch": "prefetch",
         "video._silhouettes": "fit_view",
     },
@@ -343,7 +348,7 @@ NAMES: dict[str, dict[str, str]] = {
         "video._recording": "Recording=TrackedRecording",
     },
     "torchpose.viz": {
-        "viz._prior_pictures": "plot_log_likelihood",
+        "viz._prior_pictures": "plot_log_likelihood plot_prior_components plot_prior_samples",
     },
     "torchpose.whole_body": {
         "whole_body._filters.body_particles": "BodyFilterState joint_covariance",

@@ -2,7 +2,7 @@
 
 from torchpose._core.facade import set_up_facade
 from torchpose.camera._pinhole import PinholeCamera, load_cameras, save_cameras
-from torchpose.camera._projection import backproject, lift, map_pixels, project
+from torchpose.camera._projection import lift, map_pixels, project
 from torchpose.camera._rig import CameraRig
 from torchpose.camera._viewpoints import ViewRange, sample_viewpoints
 
@@ -10,7 +10,6 @@ __all__ = [
     "CameraRig",
     "PinholeCamera",
     "ViewRange",
-    "backproject",
     "lift",
     "load_cameras",
     "map_pixels",

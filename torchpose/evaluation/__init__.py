@@ -9,8 +9,8 @@ Every one returns a `Report`, which is also written into the folder ``out``.
 """
 
 from torchpose._core.facade import set_up_facade
-from torchpose.evaluation.report import Report, Table
+from torchpose.evaluation.report import Report
 
-__all__ = ["Report", "Table"]
+__all__ = ["Report"]
 
 set_up_facade(__name__)

@@ -1,8 +1,7 @@
 """Recursive Bayesian filters over learned motion priors."""
 
 from torchpose._core.facade import set_up_facade
-from torchpose.filters._base import RecursiveFilter
-from torchpose.filters._constant_velocity import ConstantVelocityFilter
+from torchpose.filters._base import RecursiveFilter, standard_normal, uniform
 from torchpose.filters._fixed_tracks import FixedTrackFilter
 from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._outputs import FilterOutput, StepOutput
@@ -10,11 +9,10 @@ from torchpose.filters._particle import BootstrapParticleFilter
 from torchpose.filters._resampling import resample
 from torchpose.filters._sampled_tracks import SampledTrackFilter
 from torchpose.filters._split_tracks import SplitTrackFilter
-from torchpose.filters._transition import fit_gamma
+from torchpose.filters._transition import fit_gamma, make_transition
 
 __all__ = [
     "BootstrapParticleFilter",
-    "ConstantVelocityFilter",
     "FilterOutput",
     "FixedTrackFilter",
     "MixtureKalmanFilter",
@@ -23,7 +21,10 @@ __all__ = [
     "SplitTrackFilter",
     "StepOutput",
     "fit_gamma",
+    "make_transition",
     "resample",
+    "standard_normal",
+    "uniform",
 ]
 
 set_up_facade(__name__)

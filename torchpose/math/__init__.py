@@ -1,7 +1,7 @@
 """Mathematics without words of the domain: Gaussians, rotations, unscented transforms, EM."""
 
 from torchpose._core.facade import set_up_facade
-from torchpose.math._gaussian import kalman_predict, kalman_update, log_prob
+from torchpose.math._gaussian import kalman_predict, kalman_update
 from torchpose.math._mixture_em import expectation_maximisation
 from torchpose.math._rotation_gaussians import (
     angle_to_edge,
@@ -14,8 +14,6 @@ from torchpose.math._rotations import (
     compose,
     conjugate,
     euler_to_matrix,
-    matrix_to_euler,
-    matrix_to_quaternion_vector,
     mean_rotation,
     quaternion_vector_to_matrix,
 )
@@ -31,9 +29,6 @@ __all__ = [
     "gaussian_rotate",
     "kalman_predict",
     "kalman_update",
-    "log_prob",
-    "matrix_to_euler",
-    "matrix_to_quaternion_vector",
     "mean_rotation",
     "quaternion_vector_to_matrix",
     "rotate_gaussian",

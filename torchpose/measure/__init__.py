@@ -6,7 +6,6 @@ from torchpose.measure._hands import HandTracker
 from torchpose.measure._head import HeadNeck
 from torchpose.measure._mean_shift_hands import MeanShiftHandTracker
 from torchpose.measure._mediapipe import MediaPipeFaceDetector, MediaPipePose
-from torchpose.measure._skin import SkinModel
 from torchpose.measure._skin_mixture import SkinMixtureModel
 from torchpose.measure._upper_body import UpperBodyMeasurer
 
@@ -19,7 +18,6 @@ __all__ = [
     "MediaPipeFaceDetector",
     "MediaPipePose",
     "SkinMixtureModel",
-    "SkinModel",
     "UpperBodyMeasurer",
 ]
 

@@ -1,20 +1,8 @@
 """Joint sets, their names and trees, and the eight joints of the upper body."""
 
 from torchpose._core.facade import set_up_facade
-from torchpose.skeleton._joint_sets import (
-    SKELETONS,
-    UPPER_BODY,
-    Skeleton,
-    canonical_name,
-    identify_skeleton,
-)
-from torchpose.skeleton._upper_body import (
-    LEFT_ARM,
-    RIGHT_ARM,
-    UpperBody,
-    to_upper_body,
-    upper_body_indices,
-)
+from torchpose.skeleton._joint_sets import SKELETONS, UPPER_BODY, Skeleton, canonical_name
+from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM, to_upper_body, upper_body_indices
 
 __all__ = [
     "LEFT_ARM",
@@ -22,9 +10,7 @@ __all__ = [
     "SKELETONS",
     "UPPER_BODY",
     "Skeleton",
-    "UpperBody",
     "canonical_name",
-    "identify_skeleton",
     "to_upper_body",
     "upper_body_indices",
 ]

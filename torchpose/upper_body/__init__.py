@@ -3,7 +3,9 @@
 from torchpose._core.facade import set_up_facade
 from torchpose.upper_body._estimator import Estimates, Estimator
 from torchpose.upper_body._live import LivePose
+from torchpose.upper_body._measurements import arm_measurements, pixel_indices
 from torchpose.upper_body._methods import METHODS, method_options, register_method
+from torchpose.upper_body._pose_files import write_bvh
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._single_poses import PoseFilter, ProcessNoise
 from torchpose.upper_body._tracker import UpperBodyTracker
@@ -17,8 +19,11 @@ __all__ = [
     "PoseTrack",
     "ProcessNoise",
     "UpperBodyTracker",
+    "arm_measurements",
     "method_options",
+    "pixel_indices",
     "register_method",
+    "write_bvh",
 ]
 
 set_up_facade(__name__)

@@ -15,8 +15,8 @@ from torchpose.viz._charts import (
     plot_reliability,
 )
 from torchpose.viz._model_pictures import plot_action_space, plot_manifold
-from torchpose.viz._prior_pictures import plot_prior_components, plot_prior_samples
 from torchpose.viz._report.page import write_report
+from torchpose.viz._rotation_picture import plot_rotations
 from torchpose.viz._skeletons import (
     draw_skeleton,
     plot_pose,
@@ -37,10 +37,9 @@ __all__ = [
     "plot_pose",
     "plot_pose_3d",
     "plot_pose_strip",
-    "plot_prior_components",
     "plot_prior_means",
-    "plot_prior_samples",
     "plot_reliability",
+    "plot_rotations",
     "save_figure",
     "write_report",
 ]

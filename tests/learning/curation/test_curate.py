@@ -9,7 +9,8 @@ import torch
 from tests.data import data_dir_or_skip
 from tests.learning.curation.bodies import moving, recording
 from torchpose.errors import InputError, OverlapError, PriorError
-from torchpose.io import find_recordings, read_recordings
+from torchpose.io import read_recordings
+from torchpose.io._recordings import find_recordings
 from torchpose.learning._curation import CurationSettings, complete_runs, curate
 from torchpose.skeleton import UPPER_BODY
 

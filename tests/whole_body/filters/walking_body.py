@@ -6,7 +6,7 @@ import torch
 
 from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, PinholeCamera
-from torchpose.math import matrix_to_quaternion_vector
+from torchpose.math._rotations import matrix_to_quaternion_vector
 
 HEIGHT, WIDTH = 60, 80
 
