@@ -2210,10 +2210,8 @@ def measure_edges(folder):
     record(
         out,
         state=state,
-        exchanged=model.exchange(state, state.swapped),
         hand_prior=hands.table[:, :, ::5, ::5],
         offsets=hands(torch.randn(9, 2, generator=gen(1))),
-        arm_hypotheses=tp.arm_hypotheses(hands, faces, both[:1, 0][:, [0, 7]]),
     )
     maps = torch.rand(3, 60, 80, generator=gen(2)).double() ** 4
     for kernel in ("box", "gaussian"):

@@ -7,11 +7,9 @@ import pytest
 import torch
 
 from tests.measure.drawn_arms import drawing, pose
-from torchpose import load_prior
 from torchpose.errors import InputError, ShapeError
-from torchpose.measure._association import HandAssociation, arm_hypotheses
+from torchpose.measure._association import HandAssociation
 from torchpose.measure._edges import limb_votes, segments_of_arms
-from torchpose.measure._hand_prior import HandPrior
 from torchpose.skeleton import UPPER_BODY
 
 pytest.importorskip("cv2")
@@ -49,35 +47,9 @@ def test_hands_that_were_taken_for_each_other_are_found_and_put_right():
     for _ in range(5):
         state = model.step(state, image, both, size, identity)
     assert state.swapped.tolist() == [False, True]
-    state = model.exchange(state, state.swapped)
     for _ in range(5):
         state = model.step(state, image, torch.stack([right_way] * 2), size, identity)
-        assert not state.swapped.any()
-
-
-def test_hypotheses_from_the_prior_alone_tell_hands_apart():
-    prior = HandPrior.from_prior(load_prior("kinect-upper-body"))
-    faces = torch.tensor([[160.0, 30.0, 40.0], [160.0, 30.0, 40.0]])
-    hands = torch.tensor([[[215.0, 150.0], [75.0, 150.0]], [[215.0, math.nan], [75.0, 150.0]]])
-    joints = arm_hypotheses(prior, faces, hands)
-    exchanged = arm_hypotheses(prior, faces, hands.flip(1))
-    torch.testing.assert_close(joints, exchanged.flip(1), equal_nan=True)
-    at = {name: UPPER_BODY.index(name) for name in UPPER_BODY}
-    torch.testing.assert_close(joints[0, 0, at["hand_left"]], hands[0, 0])
-    torch.testing.assert_close(joints[0, 1, at["hand_left"]], hands[0, 1])
-    for k, side in enumerate(("left", "right")):
-        _, elbow = prior((hands[0, k] - faces[0, :2]) / 40)
-        torch.testing.assert_close(joints[0, 0, at[f"elbow_{side}"]], elbow[k] * 40 + faces[0, :2])
-    assert torch.isnan(joints[1, 0, [at["hand_left"], at["elbow_left"]]]).all()
-    assert torch.isfinite(joints[1, 0, [at["hand_right"], at["elbow_right"]]]).all()
-    elbows = {f"elbow_{s}": joints[0, 0, at[f"elbow_{s}"]].tolist() for s in ("left", "right")}
-    ends = {"hand_left": (215, 150), "hand_right": (75, 150)}
-    image = drawing(pose(**elbows, **ends, shoulder_left=(195, 84), shoulder_right=(125, 84)))
-    model, identity = HandAssociation(), torch.tensor([0])
-    state = model.init()
-    for _ in range(5):
-        state = model.step(state, image, exchanged[:1], faces[:1, 2], identity)
-    assert state.swapped.tolist() == [True]
+    assert not state.swapped.any()
 
 
 def test_one_odd_frame_does_not_swap_and_persons_keep_their_votes():

@@ -337,7 +337,7 @@ NAMES: dict[str, dict[str, str]] = {
         "upper_body._live": "StreamState",
     },
     "torchpose.video": {
-        "video._base": "Image",
+        "_core.images": "Image",
         "video._camera": "CameraSource",
         "video._file": "FileSource",
         "video._images": "FolderSource",

@@ -6,23 +6,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.images import Image
 from torchpose.errors import InputError, check_shape
 from torchpose.measure._edges import ARM_LIMBS, Segments, limb_votes, segments_of_arms
-from torchpose.measure._face import Image
-from torchpose.measure._hand_prior import HandPrior
-from torchpose.measure._persons import match_rows
+from torchpose.measure._persons import match_states
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
-__all__ = ["AssociationState", "HandAssociation", "arm_hypotheses"]
+__all__ = ["AssociationState", "HandAssociation"]
 
 _HANDS = UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")
-_SIDES = tuple(
-    (UPPER_BODY.index(f"hand_{side}"), UPPER_BODY.index(f"elbow_{side}"))
-    for side in ("left", "right")
-)
-# Joints about the face's centre, in its sizes: those that do not depend on the hands count.
-_PLACES = {"shoulder_left": (0.97, 1.35), "shoulder_right": (-0.97, 1.35), "neck": (0.0, 1.08)}
-_USUAL = tuple(_PLACES.get(name, (0.0, 0.0)) for name in UPPER_BODY)
 
 
 class AssociationState(NamedTuple):
@@ -89,8 +81,7 @@ class HandAssociation(nn.Module):
 
     def init(self) -> AssociationState:
         """Return the state without persons."""
-        none = torch.zeros(0, dtype=torch.long)
-        return AssociationState(torch.zeros(0, 2), none > 0, none)
+        return _unknown(0)
 
     def step(
         self,
@@ -114,7 +105,7 @@ class HandAssociation(nn.Module):
         check_shape("joints", joints, ["N", 2, 8, 2])
         check_shape("size", size, [len(joints)])
         check_shape("identity", identity, [len(joints)])
-        state = _matched(state, identity)
+        state = match_states(state, _unknown(1), identity)
         if not len(joints):
             return state
         between = (joints[:, 0, _HANDS[0]] - joints[:, 0, _HANDS[1]]).norm(dim=1)
@@ -146,46 +137,8 @@ class HandAssociation(nn.Module):
         length = (ends - starts).norm(dim=-1).nan_to_num(0.0).sum(-1) / size.to(joints)[:, None]
         return found.sum(-1) / length.clamp_min(1.0)
 
-    def exchange(self, state: AssociationState, which: Bool[Tensor, " N"]) -> AssociationState:
-        """Return the state after somebody has exchanged these persons' hands upstream."""
-        votes = torch.where(which[:, None], state.votes.flip(1), state.votes)
-        return state._replace(votes=votes, swapped=state.swapped ^ which)
 
-
-def _matched(state: AssociationState, identity: Tensor) -> AssociationState:
-    """Return the state's rows in the order of `identity`; newcomers have no votes."""
-    rows = match_rows(state.identity, identity)
-    votes = torch.cat([state.votes, state.votes.new_zeros(1, 2)])[rows]
-    swapped = torch.cat([state.swapped, state.swapped.new_zeros(1)])[rows]
-    return AssociationState(votes, swapped, identity.to(state.identity))
-
-
-def arm_hypotheses(
-    prior: HandPrior, faces: Float[Tensor, "N 3"], hands: Float[Tensor, "N 2 2"]
-) -> Float[Tensor, "N 2 8 2"]:
-    """Arms with the hands as given and swapped, from the prior alone, without a pose tracker.
-
-    Elbows are where the prior expects them given hand and face; shoulders, head and neck are at
-    usual places about the face.
-
-    Args:
-        prior: of hands and elbows. faces: centre (x, y) and size, pixels. hands: left, right, pixels.
-
-    Returns:
-        Joints in the order of `UPPER_BODY`, pixels; NaN for the arm of a hand that is NaN.
-    """
-    check_shape("faces", faces, ["N", 3])
-    check_shape("hands", hands, [len(faces), 2, 2])
-    faces = faces.to(hands)
-    both = torch.stack([hands, hands.flip(1)], 1)  # [N, hypothesis, side, 2]
-    centre, size = faces[:, None, None, :2], faces[:, None, None, 2:]
-    known = torch.isfinite(both).all(-1, keepdim=True)
-    offset = torch.where(known, (both - centre) / size, torch.nan)
-    _, expected = prior(offset.nan_to_num(0.0))  # [side, 2, N, hypothesis, side]
-    elbow = torch.stack([expected[k, :, :, :, k] for k in range(2)], -1).permute(1, 2, 3, 0)
-    elbow = torch.where(known, elbow.to(hands), torch.nan)
-    usual = hands.new_tensor(_USUAL).expand(*both.shape[:2], -1, -1)
-    joints = usual.clone()
-    joints[:, :, list(_SIDES[0])] = torch.stack([offset[:, :, 0], elbow[:, :, 0]], 2)
-    joints[:, :, list(_SIDES[1])] = torch.stack([offset[:, :, 1], elbow[:, :, 1]], 2)
-    return joints * size + centre
+def _unknown(persons: int) -> AssociationState:
+    """Return the state of persons without votes."""
+    number = torch.zeros(persons, dtype=torch.long)
+    return AssociationState(torch.zeros(persons, 2), number > 0, number)

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpose._core.images import Image
 from torchpose.errors import InputError, check_shape
 from torchpose.measure._skin import SkinModel
 
@@ -30,8 +31,10 @@ __all__ = [
     "cut_mask",
     "cut_windows",
     "faces_in_evidence",
+    "faces_in_window",
     "follow_faces",
     "gaussian_matrix",
+    "halve",
     "inside_image",
     "move_maps",
     "pixels_to_cells",
@@ -40,7 +43,6 @@ __all__ = [
     "scales_of_faces",
 ]
 
-Image = NDArray[np.uint8]
 CELL = 0.1  # side of a cell, in B
 CELLS = (80, 96)  # rows and columns of cells
 EVIDENCE, COLOURS = 2, 4  # pixels of the finer maps for each cell
@@ -153,12 +155,12 @@ def cut_mask(mask: Image, anchors: Float[Tensor, "N 3"]) -> Float[Tensor, "N h w
     Args:
         mask: [H, W]. anchors: from `place_windows`.
     """
-    return _halved(torch.from_numpy(np.stack(cut_windows(mask, anchors))).float()) / 255
+    return halve(torch.from_numpy(np.stack(cut_windows(mask, anchors))).float()) / 255
 
 
-def _halved(maps: Tensor) -> Tensor:
-    """Means of two by two."""
-    maps = maps[:, ::2] + maps[:, 1::2]
+def halve(maps: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch r c"]:
+    """Return the means of two by two cells."""
+    maps = maps[..., ::2, :] + maps[..., 1::2, :]
     return (maps[..., ::2] + maps[..., 1::2]) / 4
 
 
@@ -239,6 +241,13 @@ def cells_to_pixels(
     """Convert places in cells to places in the image."""
     first = places.new_tensor([_LEFT, _TOP]) + CELL / 2
     return anchors[:, None, :2] + (places * CELL + first) * anchors[:, None, 2:]
+
+
+def faces_in_window(
+    faces: Float[Tensor, "N 3"], anchors: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N 3"]:
+    """Return the faces (x, y, size), pixels, in B from the anchors of their windows."""
+    return (torch.cat([faces[:, :2] - anchors[:, :2], faces[:, 2:]], 1) / anchors[:, 2:]).float()
 
 
 def faces_in_evidence(

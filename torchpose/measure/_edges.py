@@ -6,15 +6,14 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpose._core.images import Image
 from torchpose.errors import InputError, check_shape
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
 __all__ = ["ARM_LIMBS", "Segments", "edge_map", "find_segments", "limb_votes", "segments_of_arms"]
 
-Image = NDArray[np.uint8]
 Backend = Literal["auto", "opencv", "kornia"]
 ARM_LIMBS = tuple(
     (UPPER_BODY.index(f"{upper}_{side}"), UPPER_BODY.index(f"{lower}_{side}"))

@@ -9,15 +9,21 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from torchpose._core.images import Image
 from torchpose.errors import InputError, check_finite, check_grey, check_shape
 from torchpose.math._gaussian import kalman_predict, kalman_update
 
-__all__ = ["FaceDetector", "FaceTracker", "FaceTracks", "HaarFaceDetector", "Region"]
+__all__ = [
+    "FaceDetector",
+    "FaceTracker",
+    "FaceTracks",
+    "HaarFaceDetector",
+    "Region",
+    "check_faces",
+]
 
-Image = NDArray[np.uint8]
 _ROI = 1.1  # half the side of the region searched about a known face, in its sizes
 _SMALLER, _LARGER = 0.75, 1.4  # sizes searched for there
 _SAME_SIZE = 1.25  # a face that differs by less from the size wanted is taken as it is
@@ -93,17 +99,13 @@ class HaarFaceDetector:
                 "scale_factor must be above 1, min_neighbours at least 0 and min_size at least 1, "
                 f"got {scale_factor}, {min_neighbours} and {min_size}"
             )
-        self.scale_factor, self.min_neighbours, self.min_size = (
-            scale_factor,
-            min_neighbours,
-            min_size,
-        )
+        self.scale_factor, self.min_size = scale_factor, min_size
+        self.min_neighbours = min_neighbours
         self._cascade = _frontal_faces()
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {
-            "_cascade": None
-        }  # OpenCV's classifier can be neither copied nor pickled
+        # OpenCV's classifier can be neither copied nor pickled
+        return self.__dict__ | {"_cascade": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__ = state | {"_cascade": _frontal_faces()}
@@ -218,9 +220,8 @@ class FaceTracker(nn.Module):
         self.every, self.whole_every, self.search_every = every, whole_every, search_every
         self.gate, self.min_hits, self.memory = gate, min_hits, memory
         self.std, self.acceleration, self.detail = std, acceleration, detail
-        eye, zero = torch.eye(3, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64)
-        matrix = torch.cat([torch.cat([eye, eye], 1), torch.cat([zero, damping * eye], 1)])
-        self.register_buffer("matrix", matrix)
+        motion = torch.tensor([[1.0, 1.0], [0.0, damping]], dtype=torch.float64)
+        self.register_buffer("matrix", torch.kron(motion, torch.eye(3, dtype=torch.float64)))
         self.register_buffer("observed", torch.arange(3))
 
     matrix: Tensor
@@ -278,9 +279,8 @@ class FaceTracker(nn.Module):
         return torch.cat([centres, found[:, 2:] / scale], 1)
 
     def _predict(self, tracks: FaceTracks) -> FaceTracks:
-        noise = torch.zeros_like(tracks.cov)
         spread = (self.acceleration * tracks.mean[:, 2, None]).square().expand(-1, 6)
-        noise = noise + torch.diag_embed(spread)
+        noise = torch.diag_embed(spread)
         offset = torch.zeros_like(tracks.mean)
         mean, cov = kalman_predict(tracks.mean, tracks.cov, self.matrix, offset, noise)
         return tracks._replace(

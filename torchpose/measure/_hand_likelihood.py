@@ -4,15 +4,17 @@ from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from torchpose.errors import check_finite, check_rgb, check_shape
-from torchpose.measure._body_window import CELL, CELLS, EVIDENCE, cell_centres
-from torchpose.measure._face import Image, check_faces
+from torchpose._core.images import Image
+from torchpose.errors import InputError, check_finite, check_rgb, check_shape
+from torchpose.measure._body_window import CELL, CELLS, EVIDENCE, cell_centres, halve
+from torchpose.measure._face import check_faces
 
-__all__ = ["HandLikelihood", "HandMeasurements", "HandSettings", "check_frame"]
+__all__ = ["HandLikelihood", "HandMeasurements", "HandSettings", "check_frame", "no_hands"]
 
 
 class HandLikelihood(nn.Module):
@@ -85,8 +87,7 @@ class HandLikelihood(nn.Module):
                 counts.
         """
         for _ in range(EVIDENCE // 2):
-            maps = maps[..., ::2, :] + maps[..., 1::2, :]
-            maps = (maps[..., ::2] + maps[..., 1::2]) / 4
+            maps = halve(maps)
         palm = self.palm_rows @ maps[:, :1] @ self.palm_columns.T
         return torch.cat([palm, self.hand_rows @ maps @ self.hand_columns.T], 1)
 
@@ -235,8 +236,20 @@ class HandMeasurements(NamedTuple):
     seen: Bool[Tensor, "N 2"]
 
 
-def check_frame(frame: Image, faces: Float[Tensor, "N 3"], identity: Int[Tensor, " N"]) -> None:
-    """Raise unless these are a frame, faces with a size, and who they are.
+def no_hands(faces: Float[Tensor, "0 3"]) -> HandMeasurements:
+    """Return the measurements of a frame without persons, in the precision of `faces`."""
+    points = faces.new_zeros(0, 2, 2)
+    mass = points[..., 0]
+    return HandMeasurements(points, faces.new_zeros(0, 2, 2, 2), mass, mass > 0)
+
+
+def check_frame(
+    frame: Image,
+    faces: Float[Tensor, "N 3"],
+    identity: Int[Tensor, " N"],
+    foreground: Image | None,
+) -> None:
+    """Raise unless these are a frame, faces with a size, who they are, and a mask of the frame.
 
     Raises:
         ShapeError, InputError: see above.
@@ -245,3 +258,10 @@ def check_frame(frame: Image, faces: Float[Tensor, "N 3"], identity: Int[Tensor,
     check_finite("faces", faces, hint="leave out persons without a face")
     check_faces(faces)
     check_shape("identity", identity, [len(faces)])
+    if foreground is not None and (
+        foreground.shape != frame.shape[:2] or foreground.dtype != np.uint8
+    ):
+        raise InputError(
+            f"foreground must be [H, W] of uint8 like the frame, {list(frame.shape[:2])}, got "
+            f"{list(foreground.shape)} of {foreground.dtype}"
+        )

@@ -2,14 +2,13 @@
 
 import math
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from torchpose._core.images import Image
 from torchpose.errors import InputError
 from torchpose.measure._background import Motion, MotionState
 from torchpose.measure._body_window import (
@@ -22,6 +21,7 @@ from torchpose.measure._body_window import (
     cut_colours,
     cut_mask,
     faces_in_evidence,
+    faces_in_window,
     follow_faces,
     inside_image,
     move_maps,
@@ -34,15 +34,15 @@ from torchpose.measure._hand_likelihood import (
     HandMeasurements,
     HandSettings,
     check_frame,
+    no_hands,
 )
 from torchpose.measure._hand_prior import HandPrior
 from torchpose.measure._head import FaceMemory, FaceMemoryState, head_part
-from torchpose.measure._persons import match_rows
+from torchpose.measure._persons import match_states, take_rows
 from torchpose.measure._skin import SkinModel, SkinState
 
 __all__ = ["HandState", "HandTracker"]
 
-Image = NDArray[np.uint8]
 _REACH = -5.2  # log density per B squared above which a hand may be in a place
 _FACE = (0.7, 0.9)  # half the width and height of a face with what is about it, in B
 _NEAR = 4  # cells about a hand that are believed to be its own
@@ -127,7 +127,7 @@ class HandTracker(nn.Module):
 
     def init(self) -> HandState:
         """Return the state without persons."""
-        return _rows(self._fresh(torch.zeros(1, 3)), slice(0, 0))
+        return take_rows(self._fresh(torch.zeros(1, 3)), slice(0, 0))
 
     @torch.no_grad()
     def step(
@@ -155,10 +155,10 @@ class HandTracker(nn.Module):
         Raises:
             InputError: another kind of image, or faces without a size. ShapeError: wrong shapes.
         """
-        _check(frame, faces, identity, foreground)
+        check_frame(frame, faces, identity, foreground)
         faces = faces.double()
         if not len(faces):
-            return self.init(), _nothing(faces)
+            return self.init(), no_hands(faces)
         state, new = self._persons(state, faces, identity)
         state, faces = self._steady(state, faces)
         state = self._follow(state, faces)
@@ -180,14 +180,11 @@ class HandTracker(nn.Module):
     ) -> tuple[HandState, Tensor]:
         """Rows for the persons of this frame, and which of them are new."""
         if not torch.equal(state.identity, identity):
-            row = match_rows(state.identity, identity)  # the fresh one is behind all
-            new = row == len(state.identity)
+            new = ~torch.isin(identity, state.identity)
             anchors = place_windows(faces)
-            state = _map(
-                lambda old, made: torch.cat([old, made])[row], state, self._fresh(anchors[:1])
-            )
+            state = match_states(state, self._fresh(anchors[:1]), identity)
             anchors = torch.where(new[:, None], anchors, state.anchors)
-            state = state._replace(identity=identity.clone(), anchors=anchors)
+            state = state._replace(anchors=anchors)
         return state, state.frames == 0
 
     def _steady(self, state: HandState, faces: Tensor) -> tuple[HandState, Tensor]:
@@ -255,9 +252,8 @@ class HandTracker(nn.Module):
 
     def _prior(self, faces: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor]:
         """Log density [N, 2, r, c] and expected elbow [N, 2, 2, r, c], in B from the anchor."""
-        at = (faces[:, :2] - anchors[:, :2]) / anchors[:, 2:]
-        size = faces[:, 2] / anchors[:, 2]
-        at, size = at.float()[:, None, None], size.float()[:, None, None, None]
+        near = faces_in_window(faces, anchors)
+        at, size = near[:, None, None, :2], near[:, 2, None, None, None]
         log_density, elbow = self.prior((cell_centres() - at) / size)
         elbow = elbow.movedim(2, 0) * size[:, None] + at.permute(0, 3, 1, 2)[:, None]
         return log_density.movedim(1, 0), elbow
@@ -331,27 +327,9 @@ class HandTracker(nn.Module):
         return state, HandMeasurements(shown, covariance, found.mass, seen)
 
 
-def _check(frame: Image, faces: Tensor, identity: Tensor, foreground: Image | None) -> None:
-    check_frame(frame, faces, identity)
-    if foreground is not None and (
-        foreground.shape != frame.shape[:2] or foreground.dtype != np.uint8
-    ):
-        raise InputError(
-            f"foreground must be [{frame.shape[0]}, {frame.shape[1]}] of uint8, got "
-            f"{list(foreground.shape)} of {foreground.dtype}"
-        )
-
-
-def _nothing(faces: Tensor) -> HandMeasurements:
-    empty = faces.new_zeros(0, 2, 2)
-    return HandMeasurements(
-        empty, faces.new_zeros(0, 2, 2, 2), faces.new_zeros(0, 2), torch.zeros(0, 2).bool()
-    )
-
-
 def _before_face(faces: Tensor, anchors: Tensor) -> Tensor:
     """One in the cells on the face, zero away from it [N, r, c]."""
-    at = (torch.cat([faces[:, :2] - anchors[:, :2], faces[:, 2:]], 1) / anchors[:, 2:]).float()
+    at = faces_in_window(faces, anchors)
     offset = (cell_centres() - at[:, None, None, :2]) / (at[:, 2:] * at.new_tensor(_FACE))[
         :, None, None
     ]
@@ -368,15 +346,3 @@ def _hands_near(belief: Tensor) -> Tensor:
 def _band(size: int) -> Tensor:
     place = torch.arange(size)
     return ((place[:, None] - place).abs() <= _NEAR).float()
-
-
-def _map(function: Any, *states: Any) -> Any:
-    """Return a NamedTuple of tensors (or of such tuples) from several of its kind."""
-    if isinstance(states[0], Tensor):
-        return function(*states)
-    parts = (_map(function, *part) for part in zip(*states, strict=True))
-    return type(states[0])(*parts)
-
-
-def _rows(state: Any, rows: Any) -> Any:
-    return _map(lambda x: x[rows], state)

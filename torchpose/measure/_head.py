@@ -8,7 +8,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from torchpose.errors import InputError, check_shape
-from torchpose.measure._body_window import CELL, COLOURS, EVIDENCE, cell_centres
+from torchpose.measure._body_window import CELL, COLOURS, EVIDENCE, cell_centres, faces_in_window
 
 __all__ = [
     "FACE_OFFSETS",
@@ -201,7 +201,7 @@ class FaceMemory(nn.Module):
             "lab", lab, [len(faces), 3, rows.stop - rows.start, columns.stop - columns.start]
         )
         new = state.frames == 0
-        at = (torch.cat([faces[:, :2] - anchors[:, :2], faces[:, 2:]], 1) / anchors[:, 2:]).float()
+        at = faces_in_window(faces, anchors)
         if not self.remember:
             return state, _to_window(head_mask().expand(len(at), -1, -1), at)
         near = lab.to(at)

@@ -3,27 +3,24 @@
 The paper's own recipe, for all persons and both of their hands at once.
 """
 
-from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from torchpose._core.images import Image
 from torchpose.errors import InputError
 from torchpose.math._gaussian import kalman_predict, kalman_update
 from torchpose.measure._body_window import ScaledFrame, scale_frame, scales_of_faces
-from torchpose.measure._hand_likelihood import HandMeasurements, check_frame
+from torchpose.measure._hand_likelihood import HandMeasurements, check_frame, no_hands
 from torchpose.measure._hand_prior import HandPrior
 from torchpose.measure._mean_shift import mean_shift
-from torchpose.measure._persons import match_rows
+from torchpose.measure._persons import match_states, measure_by_scale, take_rows
 from torchpose.measure._skin import SkinModel, SkinState
 
 __all__ = ["MeanShiftHandState", "MeanShiftHandTracker"]
 
-Image = NDArray[np.uint8]
 Likelihood = Literal["back-projection", "ratio"]
 _THRESHOLDS = {"back-projection": 0.1, "ratio": 0.25}
 # Lengths in sizes of the face.
@@ -139,10 +136,8 @@ class MeanShiftHandTracker(nn.Module):
         self.acceleration, self.spread = acceleration, spread
         self.skin = SkinModel() if skin is None else skin
         self.prior = prior
-        eye, zero = torch.eye(2), torch.zeros(2, 2)
-        self.register_buffer(
-            "matrix", torch.cat([torch.cat([eye, eye], 1), torch.cat([zero, eye], 1)])
-        )
+        eye = torch.eye(2)
+        self.register_buffer("matrix", torch.kron(torch.tensor([[1.0, 1.0], [0.0, 1.0]]), eye))
         drive = torch.cat([0.5 * eye, eye])  # a constant acceleration within a frame
         self.register_buffer("drive", drive @ drive.mT)
         self.register_buffer("observed", torch.arange(2))
@@ -153,12 +148,13 @@ class MeanShiftHandTracker(nn.Module):
 
     def init(self) -> MeanShiftHandState:
         """Return the state without persons."""
-        real, flags = self.matrix.new_zeros(0), torch.zeros(0, 2, dtype=torch.bool)
-        whole = torch.zeros(0, 2, dtype=torch.long)
-        none = SkinState(*(table[:0] for table in self.skin.init(1)))
-        return MeanShiftHandState(
-            real.view(0, 2, 4), real.view(0, 2, 4, 4), flags, whole, whole[:, 0].clone(), none
-        )
+        return take_rows(self._fresh(), slice(0, 0))
+
+    def _fresh(self) -> MeanShiftHandState:
+        """Return the state of one newcomer, who has neither hands nor colours yet."""
+        mean, weak = self.matrix.new_zeros(1, 2, 4), torch.zeros(1, 2, dtype=torch.long)
+        cov = self.matrix.new_zeros(1, 2, 4, 4)
+        return MeanShiftHandState(mean, cov, weak > 0, weak, weak[:, 0], self.skin.init(1))
 
     def step(
         self,
@@ -178,21 +174,19 @@ class MeanShiftHandTracker(nn.Module):
         Raises:
             ShapeError, InputError: frames, faces or masks of another kind.
         """
-        _check(frame, faces, identity, foreground)
+        check_frame(frame, faces, identity, foreground)
         faces = faces.to(self.matrix)
-        state = self._matched(state, identity)
+        state = match_states(state, self._fresh(), identity)
         if not len(faces):
-            return state, _measurements(state, *_nothing(faces))
+            return state, no_hands(faces)
         state = self._predict(state, faces)
-        divisors, group = scales_of_faces(faces, frame).unique(return_inverse=True)
-        rows = [torch.nonzero(group == k).flatten() for k in range(len(divisors))]
-        looks = [
-            self._look(state, scale_frame(frame, foreground, faces, divisor, self.skin), own)
-            for divisor, own in zip(divisors.tolist(), rows, strict=True)
-        ]
-        order = torch.cat(rows).argsort()
-        skin = SkinState(*_merged([look.skin for look in looks], order))
-        centre, noise, average, seen = _merged([look[1:] for look in looks], order)
+
+        def look(divisor: float, rows: Tensor) -> _Look:
+            view = scale_frame(frame, foreground, faces, int(divisor), self.skin)
+            return self._look(state, view, rows)
+
+        skin, *found = measure_by_scale(scales_of_faces(faces, frame), look)
+        centre, noise, average, seen = found
         state = self._update(state, centre, noise, seen, faces)._replace(skin=skin)
         return state, _measurements(state, centre, noise, average, seen)
 
@@ -200,7 +194,7 @@ class MeanShiftHandTracker(nn.Module):
         """Return the hands of some persons in an image that suits the size of their faces."""
         faces, tracked = view.faces[rows], state.tracked[rows]
         predicted = view.from_frame(state.mean[rows, :, :2])
-        colours = SkinState(*(table[rows] for table in state.skin))
+        colours = take_rows(state.skin, rows)
         colours, skin = self._skin(colours, view.bins, faces, predicted, tracked)
         maps = self._without_the_other(skin * view.usable, predicted, tracked, faces)
         start, found = predicted, tracked
@@ -215,19 +209,6 @@ class MeanShiftHandTracker(nn.Module):
         noise = self._noise(rest.covariance.view(-1, 2, 2, 2), faces)
         noise = noise / view.scale / view.scale[:, None]
         return _Look(colours, view.to_frame(centre), noise, average, seen)
-
-    def _matched(self, state: MeanShiftHandState, identity: Tensor) -> MeanShiftHandState:
-        """Return the state's rows in the order of `identity`; who is new has neither hands nor colours."""
-        identity = identity.to(state.identity)
-        rows = match_rows(state.identity, identity)
-        new = state.mean.new_zeros(1)
-
-        def chosen(x: Tensor, other: Tensor = new) -> Tensor:
-            return torch.cat([x, other.to(x.dtype).expand(1, *x.shape[1:])])[rows]
-
-        skin = SkinState(*map(chosen, state.skin, self.skin.init(1)))
-        mean, cov, tracked, weak = map(chosen, state[:4])
-        return MeanShiftHandState(mean, cov, tracked, weak, identity, skin)
 
     def _predict(self, state: MeanShiftHandState, faces: Tensor) -> MeanShiftHandState:
         noise = (self.acceleration * faces[:, 2]).square()[:, None, None, None] * self.drive
@@ -335,17 +316,6 @@ def _measurements(
     return HandMeasurements(points, covariance, average.clamp(0, 1), seen)
 
 
-def _merged(parts: Sequence[tuple[Tensor, ...]], order: Tensor) -> list[Tensor]:
-    """Return the tensors of all groups of persons, in the order of the persons."""
-    return [torch.cat(tensors)[order] for tensors in zip(*parts, strict=True)]
-
-
-def _nothing(faces: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the centres, noise, average likelihood and `seen` of no persons."""
-    centre = faces.new_zeros(0, 2, 2)
-    return centre, faces.new_zeros(0, 2, 2, 2), centre[..., 0], centre[..., 0] > 0
-
-
 def _squared_distance(points: Tensor, shape: Any) -> Tensor:
     """Of every pixel of [H, W] from the points [N, 2, 2], as [N, 2, H, W]."""
     x, y = points[..., None, None].unbind(2)
@@ -365,12 +335,3 @@ def _area_inside(centre: Tensor, size: Tensor, shape: Any) -> Tensor:
     last = torch.tensor([shape[1], shape[0]]).to(centre) - 0.5
     low, high = (centre - size / 2).clamp_min(-0.5), torch.minimum(centre + size / 2, last)
     return torch.maximum((high - low).clamp_min(0).prod(-1), _LEAST_INSIDE * size.prod(-1))
-
-
-def _check(frame: Image, faces: Tensor, identity: Tensor, foreground: Image | None) -> None:
-    check_frame(frame, faces, identity)
-    if foreground is not None and foreground.shape != frame.shape[:2]:
-        raise InputError(
-            f"foreground must be [H, W] like the frame, {list(frame.shape[:2])}, "
-            f"got {list(foreground.shape)}"
-        )

@@ -13,16 +13,14 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpose._core.images import Image
 from torchpose.errors import InputError, MissingDependencyError, check_grey, check_rgb
 from torchpose.measure._face import Region
 from torchpose.skeleton._mediapipe_landmarks import DERIVED_JOINTS, LANDMARKS, derive_joints
 
 __all__ = ["MediaPipeFaceDetector", "MediaPipePose", "PoseLandmarks"]
-
-Image = NDArray[np.uint8]
 
 
 class _Task:

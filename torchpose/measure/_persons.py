@@ -1,17 +1,27 @@
 """Who is who in a video: faces that leave and come back."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.images import Image
 from torchpose.errors import InputError
-from torchpose.measure._face import Image
 
-__all__ = ["PersonRegister", "Persons", "clothes_colours", "match_rows"]
+__all__ = [
+    "PersonRegister",
+    "Persons",
+    "clothes_colours",
+    "match_rows",
+    "match_states",
+    "measure_by_scale",
+    "take_rows",
+]
 
+State = TypeVar("State", bound=tuple[Any, ...])
 _BINS = 8
 _CLOTHES = (0.8, 1.3, 2.6)  # half the width, top and bottom below the face, in its sizes
 _LEARNING = 0.05
@@ -38,6 +48,49 @@ def match_rows(known: Int[Tensor, " K"], wanted: Int[Tensor, " N"]) -> Int[Tenso
     """
     same = torch.nn.functional.pad(wanted[:, None] == known, (0, 1), value=True)
     return same.int().argmax(1)  # the first that is the same, or the one behind all
+
+
+def match_states(state: State, fresh: State, identity: Int[Tensor, " N"]) -> State:
+    """Return the rows of a state in the order of `identity`, a fresh row for each newcomer.
+
+    Args:
+        state: with a field `identity`; every tensor has the persons as its first dimension.
+        fresh: the state of one newcomer.
+    """
+    known: Any = state
+    identity = identity.to(known.identity)
+    rows = match_rows(known.identity, identity)
+    matched: Any = _map(lambda old, new: torch.cat([old, new])[rows], state, fresh)
+    return matched._replace(identity=identity.clone())  # type: ignore[no-any-return]
+
+
+def take_rows(state: State, rows: slice | Tensor) -> State:
+    """Return some persons of a state; every tensor has the persons as its first dimension."""
+    return _map(lambda tensor: tensor[rows], state)
+
+
+def measure_by_scale(scales: Tensor, measure: Callable[[float, Int[Tensor, " n"]], State]) -> State:
+    """Measure the persons of each scale together, and return all of them in their own order.
+
+    Args:
+        scales: of the persons [N].
+        measure: is called with a scale and the rows of its persons; with no persons, once.
+    """
+    values, group = scales.unique(return_inverse=True)
+    rows = [torch.nonzero(group == k).flatten() for k in range(len(values))]
+    if not rows:
+        rows, values = [group], scales.new_ones(1)
+    found = [measure(value, own) for value, own in zip(values.tolist(), rows, strict=True)]
+    order = torch.cat(rows).argsort()
+    return _map(lambda *parts: torch.cat(parts)[order], *found)
+
+
+def _map(function: Callable[..., Tensor], *states: Any) -> Any:
+    """Return the state whose tensors are those of a function of the states' tensors."""
+    if isinstance(states[0], Tensor):
+        return function(*states)
+    fields = (_map(function, *values) for values in zip(*states, strict=True))
+    return type(states[0])(*fields)
 
 
 def clothes_colours(image: Image, faces: Float[Tensor, "N 3"]) -> Float[Tensor, "N 512"]:
@@ -101,9 +154,8 @@ class PersonRegister(nn.Module):
                 below it may be the wall. None trusts all.
         """
         colours = clothes_colours(image, faces)
-        same = identity[:, None] == persons.face
-        owner = torch.where(same.any(1), same.long().argmax(1), -1) if len(persons.face) else None
-        owner = torch.full((len(faces),), -1) if owner is None else owner
+        owner = match_rows(persons.face, identity)
+        owner = torch.where(owner < len(persons.face), owner, -1)
         for row in torch.nonzero(owner < 0).flatten().tolist():  # newcomers, seldom any
             persons, owner[row] = self._admit(persons, colours[row], identity, owner, row, frame)
         known = persons.colours.clone()

@@ -14,13 +14,13 @@ from torch import Tensor, nn
 from torchpose.errors import InputError, check_shape
 from torchpose.measure._face import check_faces
 
-__all__ = ["SkinModel", "SkinState", "rgb_to_lab"]
+__all__ = ["FACE_PATCH", "SkinModel", "SkinState", "rgb_to_lab"]
 
 BINS = (8, 32, 32)  # of L, a and b
 _LOWEST, _WIDTH = (0.0, -24.0, -24.0), (12.5, 2.0, 3.0)
 _KERNELS = ((0.1, 0.8, 0.1), (0.05, 0.24, 0.42, 0.24, 0.05), (0.05, 0.24, 0.42, 0.24, 0.05))
 # Parts of the image, in sizes of the face from its centre.
-_FACE = (0.25, -0.2, 0.35)  # half the width, top, bottom
+FACE_PATCH = (0.25, -0.2, 0.35)  # half the width, top, bottom
 _CLOTHES = (0.75, 1.15)  # half the width, top
 _FAR = (2.6, -0.9)  # beyond this to either side, or above this
 _LEAST_FACE, _LEAST_PIXELS = 0.3, 50.0  # share of the patch, and pixels of the others
@@ -264,7 +264,7 @@ def _labels(faces: Tensor, shape: torch.Size) -> Float[Tensor, "B H W"]:
     across = ((torch.arange(width, device=faces.device) - x) / size).abs()
     down = (torch.arange(height, device=faces.device) - y) / size
     above, aside = down < _FAR[1], across > _FAR[0]
-    rows = [(down > _FACE[1]) & (down < _FACE[2]), down > _CLOTHES[1], above, ~above]
-    columns = [across < _FACE[0], across < _CLOTHES[0], torch.ones_like(aside), aside]
+    rows = [(down > FACE_PATCH[1]) & (down < FACE_PATCH[2]), down > _CLOTHES[1], above, ~above]
+    columns = [across < FACE_PATCH[0], across < _CLOTHES[0], torch.ones_like(aside), aside]
     values = faces.new_tensor([1.0, 3.0, 4.0, 4.0])
     return torch.stack(rows, 2).to(faces) @ (torch.stack(columns, 1) * values[:, None])

@@ -12,10 +12,11 @@ from torch import Tensor, nn
 from torchpose.errors import InputError, check_shape
 from torchpose.math._mixture_steps import MixtureParameters, natural_parameters
 from torchpose.measure._face import check_faces
+from torchpose.measure._skin import FACE_PATCH
 
 __all__ = ["SkinMixtureModel", "SkinMixtureState"]
 
-_PATCH, _SAMPLES = (0.25, -0.2, 0.35), 16  # half the width, top, bottom, in sizes of the face
+_SAMPLES = 16  # across the middle of the face, and down
 _HAND = 0.3  # a pixel that is more likely to be a hand teaches nothing
 _LEAST = 0.3  # share of the patch that has to be left
 _ROWS, _COLUMNS = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)  # upper triangle of a 3 x 3 matrix
@@ -93,8 +94,8 @@ class SkinMixtureModel(nn.Module):
         self.n_components, self.every, self.steps = n_components, every, steps
         self.decay, self.floor, self.even = decay, floor, even
         place = (torch.arange(_SAMPLES) + 0.5) / _SAMPLES
-        across = (2 * place - 1) * _PATCH[0]
-        down = _PATCH[1] + place * (_PATCH[2] - _PATCH[1])
+        across = (2 * place - 1) * FACE_PATCH[0]
+        down = FACE_PATCH[1] + place * (FACE_PATCH[2] - FACE_PATCH[1])
         grid = torch.stack(torch.broadcast_tensors(across, down[:, None]), -1)
         self.register_buffer("samples", grid.reshape(-1, 2))
 

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.errors import InputError, check_shape
+from torchpose.measure._face import check_faces
 from torchpose.measure._skin import SkinModel, SkinState
 
 __all__ = ["TorsoElbows", "clothes_likelihood", "elbows_from_torso"]
@@ -95,12 +96,9 @@ def elbows_from_torso(
         ([[True, True]], [111, 60])
     """
     check_shape("likelihood", likelihood, ["N", "H", "W"])
-    check_shape("faces", faces, [len(likelihood), 3])
-    if not bool((faces[:, 2] > 0).all()) or not 0 < threshold < 1:
-        raise InputError(
-            "faces must have a positive size and threshold be in (0, 1), got "
-            f"{faces[:, 2].tolist()} and {threshold}"
-        )
+    check_faces(faces, len(likelihood))
+    if not 0 < threshold < 1:
+        raise InputError(f"threshold must be in (0, 1), got {threshold}")
     faces = faces.to(likelihood)
     body = likelihood > threshold
     sides = [_outline(body, faces, 1), _outline(body, faces, -1)]

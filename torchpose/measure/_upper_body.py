@@ -9,15 +9,16 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.images import Image
 from torchpose.errors import InputError, check_rgb
 from torchpose.measure._background import BackgroundModel
-from torchpose.measure._face import FaceDetector, FaceTracker, FaceTracks, Image
+from torchpose.measure._face import FaceDetector, FaceTracker, FaceTracks
 from torchpose.measure._hand_likelihood import HandMeasurements
 from torchpose.measure._hand_prior import HandPrior
 from torchpose.measure._hands import HandTracker
 from torchpose.measure._head import HeadNeck
 from torchpose.measure._mean_shift_hands import MeanShiftHandTracker
-from torchpose.measure._persons import PersonRegister, Persons
+from torchpose.measure._persons import PersonRegister, Persons, measure_by_scale, take_rows
 from torchpose.measure._skin import SkinState, rgb_to_lab
 from torchpose.measure._torso import TorsoElbows, clothes_likelihood, elbows_from_torso
 from torchpose.priors._upper_body import UpperBodyPrior
@@ -200,16 +201,11 @@ class UpperBodyMeasurer(nn.Module):
 
         A person's image depends on that person's face alone.
         """
-        scales, group = (_TORSO_FACE / faces[:, 2]).clamp_max(1.0).unique(return_inverse=True)
-        rows = [torch.nonzero(group == k).flatten() for k in range(len(scales))]
-        if not rows:
-            rows, scales = [group], faces.new_ones(1)
-        found = [
-            self._elbows_at(image, scale, faces[own], SkinState(*(x[own] for x in skin)))
-            for scale, own in zip(scales.tolist(), rows, strict=True)
-        ]
-        order = torch.cat(rows).argsort()
-        return TorsoElbows(*(torch.cat(parts)[order] for parts in zip(*found, strict=True)))
+
+        def measure(scale: float, rows: Tensor) -> TorsoElbows:
+            return self._elbows_at(image, scale, faces[rows], take_rows(skin, rows))
+
+        return measure_by_scale((_TORSO_FACE / faces[:, 2]).clamp_max(1.0), measure)
 
     def _elbows_at(self, image: Image, scale: float, faces: Tensor, skin: SkinState) -> TorsoElbows:
         """Return the elbows of persons in an image that is made smaller by this factor."""

@@ -5,14 +5,10 @@ from collections.abc import Iterator
 from types import TracebackType
 from typing import NamedTuple, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
+from torchpose._core.images import Image
 from torchpose.errors import InputError
 
 __all__ = ["Image", "VideoFrame", "VideoSource"]
-
-Image = NDArray[np.uint8]
 
 
 class VideoFrame(NamedTuple):

@@ -11,14 +11,11 @@ from collections.abc import Iterator
 from types import TracebackType
 from typing import Any, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
+from torchpose._core.images import Image
 from torchpose.errors import InputError, OutputError, check_rgb
 
 __all__ = ["LiveView"]
 
-Image = NDArray[np.uint8]
 _HOST = "127.0.0.1"  # this machine only; nobody else sees the camera
 _BOUNDARY = "torchpose-frame"
 _PATIENCE = 1.0  # seconds after which a waiting browser gets the last picture again

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpose._core.images import Image
 from torchpose.body._skeleton import BODY_15, BodySkeleton
 from torchpose.errors import InputError, check_rgb, check_shape
 from torchpose.metrics._calibration import chi2_quantile
@@ -23,7 +24,6 @@ from torchpose.viz._style import LEFT, RIGHT
 
 __all__ = ["PERSON_TINTS", "Color", "Pen", "draw_body", "draw_overlay", "rgb"]
 
-Image = NDArray[np.uint8]
 Color = tuple[int, int, int]
 
 _LIGHT, _DARK = (255, 255, 255), (20, 20, 20)

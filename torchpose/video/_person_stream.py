@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from torchpose._core.images import Image
 from torchpose.measure._association import AssociationState, HandAssociation
-from torchpose.measure._face import Image
 from torchpose.measure._upper_body import FrameMeasurements
 from torchpose.upper_body._live import StreamState
 from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack

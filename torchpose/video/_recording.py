@@ -14,8 +14,8 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from torchpose._core.facade import set_up_facade
+from torchpose._core.images import Image
 from torchpose.errors import InputError, OutputError
-from torchpose.measure._face import Image
 from torchpose.measure._upper_body import FrameMeasurements
 from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
 from torchpose.upper_body._reading import note_collapse

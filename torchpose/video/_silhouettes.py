@@ -11,6 +11,7 @@ from jaxtyping import Bool, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpose._core.images import Image
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import intrinsics
 from torchpose.camera._rig import scale_matrix, undistortion_maps
@@ -28,7 +29,6 @@ __all__ = [
     "read_silhouettes",
 ]
 
-Image = NDArray[np.uint8]
 _BLOCK = 16  # pixels: codecs store multiples of it, and some calibrations are of what is stored
 _PART = 0.03  # of the largest piece: a smaller one is not a part of the person that was cut off
 _HOLE = 0.02  # of the silhouette: a larger hole is what one sees between arm and body

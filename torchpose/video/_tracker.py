@@ -10,11 +10,12 @@ import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
+from torchpose._core.images import Image
 from torchpose._core.module_state import derived
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.errors import InputError, check_rgb
 from torchpose.measure._association import HandAssociation
-from torchpose.measure._face import FaceDetector, FaceTracks, Image
+from torchpose.measure._face import FaceDetector, FaceTracks
 from torchpose.measure._head import HeadNeck
 from torchpose.measure._upper_body import (
     Candidates,

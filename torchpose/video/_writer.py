@@ -9,8 +9,8 @@ from typing import Any, Self
 import numpy as np
 
 from torchpose._core.files import atomic_path
+from torchpose._core.images import Image
 from torchpose.errors import InputError, MissingDependencyError, OutputError, ShapeError
-from torchpose.video._base import Image
 
 __all__ = ["VideoWriter"]
 

@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpose.demo._rendering.paint import Capsule, paint_capsule
-from torchpose.demo._rendering.portrait import Portrait, Sprite, load_portrait
+from torchpose.demo._rendering.portrait import Array, Portrait, Sprite, load_portrait
 from torchpose.errors import InputError
 
 __all__ = ["LOOKS", "TORSO_TEXTURE", "Look", "Wardrobe", "wardrobe"]
 
-Array = NDArray[np.float32]
 Colour = tuple[float, float, float]
 
 # Left, top (metres on the torso, from the neck) and pixels per metre of the torso's texture.

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpose.demo._rendering.portrait import Sprite
+from torchpose.demo._rendering.portrait import Array, Sprite
 
 __all__ = [
     "LIGHT",
@@ -18,7 +18,6 @@ __all__ = [
     "polygon_box",
 ]
 
-Array = NDArray[np.float32]
 LIGHT = (-0.38, -0.52, 0.765)
 """Direction to the lamp: x right, y down in the image, z towards the camera."""
 

@@ -22,7 +22,7 @@ from torchpose.demo._rendering.paint import (
     polygon_box,
     warp_sprite,
 )
-from torchpose.demo._rendering.portrait import Sprite
+from torchpose.demo._rendering.portrait import Array, Sprite
 from torchpose.math._rotations import euler_to_matrix
 
 __all__ = ["FACE_FROM_HEAD", "Bodies", "Part", "Pose", "bodies", "body_parts"]
@@ -93,9 +93,6 @@ def bodies(performance: Performance) -> Bodies:
     head = torso @ euler_to_matrix(performance.angles.head.double())
     parts = (performance.joints, performance.wrists, torso, head, upright.expand_as(torso))
     return Bodies(*(torch.as_tensor(x).double().numpy() for x in parts))
-
-
-Array = NDArray[np.float32]
 
 
 class Brush(Protocol):

@@ -12,20 +12,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpose._core.files import write_npz
+from torchpose._core.images import Image
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import project
 from torchpose.demo._performer import Performance
 from torchpose.demo._rendering.look import LOOKS, Look, Wardrobe, wardrobe
 from torchpose.demo._rendering.paint import Box
 from torchpose.demo._rendering.parts import Bodies, Part, bodies, body_parts
+from torchpose.demo._rendering.portrait import Array
 from torchpose.demo._rendering.scene import Scene, Sensor, room
 from torchpose.errors import CameraError, InputError
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
 __all__ = ["Image", "Truth", "performance_truth", "render_performance", "render_video"]
 
-Image = NDArray[np.uint8]
-Array = NDArray[np.float32]
 _STEP = 2.0  # pixels of movement for one picture of the motion blur
 _MOST = 8  # pictures of the motion blur
 _STILL = 0.5  # pixels: what moves less is painted once

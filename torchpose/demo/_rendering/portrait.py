@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchpose._core.images import Image
 from torchpose.errors import InputError, MissingDependencyError
 
 __all__ = ["FACE_BOX", "Portrait", "Sprite", "load_portrait"]
 
-Image = NDArray[np.uint8]
 Array = NDArray[np.float32]
 
 FACE_BOX = 0.165

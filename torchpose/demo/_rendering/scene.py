@@ -6,13 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from torchpose._core.images import Image
 from torchpose.demo._rendering.look import smooth_noise
+from torchpose.demo._rendering.portrait import Array
 from torchpose.errors import InputError
 
 __all__ = ["Scene", "Sensor", "room"]
-
-Image = NDArray[np.uint8]
-Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from torchpose._core.images import Image
 from torchpose.body._kinematics import Body
 from torchpose.body._limbs import Limbs
 from torchpose.body._skeleton import BODY_15
@@ -25,6 +26,7 @@ from torchpose.camera._pinhole import PinholeCamera
 from torchpose.demo._rendering.clothed_body import TrueShape, limb_kinds, true_limbs
 from torchpose.demo._rendering.look import smooth_noise
 from torchpose.demo._rendering.paint import Capsule, paint_capsule
+from torchpose.demo._rendering.portrait import Array
 from torchpose.errors import InputError
 from torchpose.io._mocap import MocapClip
 
@@ -213,9 +215,6 @@ def _curve(
         + (3 * s**2 - 2 * s**3) * value[2:][k] + (s**3 - s**2) * h * slope[k + 1]
     )  # fmt: skip
 
-
-Image = NDArray[np.uint8]
-Array = NDArray[np.float32]
 
 _SHIRT, _SKIN, _TROUSERS, _SHOES = (44, 84, 158), (206, 150, 120), (34, 58, 108), (236, 236, 240)
 _WORN = {
