@@ -1,4 +1,4 @@
-"""Measurements from images: faces, skin, hands, edges, background, silhouettes."""
+"""Measure faces, skin, hands, edges and foreground in images."""
 
 from torchpose._core.facade import set_up_facade
 from torchpose.measure._face import FaceDetector, HaarFaceDetector

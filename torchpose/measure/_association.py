@@ -1,4 +1,4 @@
-"""Whether a person's hands have been taken for each other (Burke & Lasenby, section 5.3)."""
+"""Decide from edges whether left and right hand are swapped (Burke & Lasenby, section 5.3)."""
 
 from typing import NamedTuple
 
@@ -18,11 +18,12 @@ _HANDS = UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")
 
 
 class AssociationState(NamedTuple):
-    """What edges have said about N persons' hands.
+    """Holds the edge votes for the association of N persons' hands.
 
     Attributes:
-        votes: for the hands as they are given, and swapped, by length of the limbs, remembered [N, 2].
-        swapped: [N]. identity: who the persons are [N].
+        votes: for the hands as measured and for the hands swapped, per length of the limbs, decayed
+            over time [N, 2].
+        swapped: whether the hands are swapped [N]. identity: number of each person [N].
     """
 
     votes: Float[Tensor, "N 2"]
@@ -31,25 +32,25 @@ class AssociationState(NamedTuple):
 
 
 class HandAssociation(nn.Module):
-    """Says whether a person's hands have been taken for each other, from the edges of the arms.
+    """Decides from the edges of the arms whether left and right hand are swapped.
 
-    For the hands as given (h = 0) and swapped (h = 1) a pose tracker has inferred elbows and
-    shoulders. The segments that support the four limbs of each are counted (BL 50), n_h, and
-    remembered for each unit of the limbs' length,
+    For the hands as measured (h = 0) and swapped (h = 1) a pose tracker has inferred elbows and
+    shoulders. The edge segments that support the four limbs of each hypothesis are counted (BL 50),
+    n_h, divided by the length of the limbs, and averaged over time:
 
         v_h <- d v_h + n_h / sum_limbs |limb|;
 
-    arms across the body are longer, and would have more votes by that alone. The hands are swapped
-    when v_1 > (1 + m) v_0 + l, and back when v_0 > (1 + m) v_1 + l.
+    Without the division longer arms would have more votes. The hands become swapped when
+    v_1 > (1 + m) v_0 + l, and become unswapped when v_0 > (1 + m) v_1 + l.
 
     Args:
         decay: d, per frame. margin: m. least: l.
-        apart: where the hands are nearer to each other, in sizes of the face, edges cannot tell, and
-            the frame changes nothing.
+        apart: least distance of the hands, in sizes of the face; a frame in which they are nearer
+            leaves the votes as they were.
         position_std: in sizes of the face. angle_std: radians. threshold, along: see `limb_votes`.
 
     Raises:
-        InputError: settings that make no sense.
+        InputError: settings out of range.
 
     Reference:
         Burke & Lasenby, section 5.3.
@@ -91,13 +92,13 @@ class HandAssociation(nn.Module):
         size: Float[Tensor, " N"],
         identity: Int[Tensor, " N"],
     ) -> AssociationState:
-        """What the edges of the next frame say.
+        """Return the votes after the next frame.
 
         Args:
             state: from `init` or the step before. grey: [H, W], uint8.
             joints: inferred with the hands as given and with the hands swapped, order of
                 `UPPER_BODY`, each with its own sides, pixels; NaN where not known.
-            size: of the faces, pixels. identity: who the persons are.
+            size: of the faces, pixels. identity: number of each person.
 
         Raises:
             ShapeError: wrong shapes.
@@ -127,7 +128,7 @@ class HandAssociation(nn.Module):
     def votes(
         self, segments: Segments, joints: Float[Tensor, "N 2 8 2"], size: Float[Tensor, " N"]
     ) -> Float[Tensor, "N 2"]:
-        """Segments that support the limbs of each hypothesis, by their length in sizes of the face."""
+        """Return the number of supporting segments of each hypothesis per length of its limbs."""
         limbs = joints[:, :, self.limbs]  # [N, 2, limb, end, 2]
         spread = (self.position_std * size.to(joints))[:, None, None].expand(limbs.shape[:3])
         starts, ends = limbs[..., 0, :], limbs[..., 1, :]

@@ -1,4 +1,4 @@
-"""Find what has changed: against a static background, between frames, against a running median."""
+"""Detect foreground against a static background, and motion between frames."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -30,7 +30,9 @@ def person_region(
     scale: float = 1.0,
     widest: tuple[float, float] = _WIDEST,
 ) -> NDArray[np.bool_]:
-    """Return where the bodies below these faces may be: generous trapezoids, bool [height, width].
+    """Return a mask of the regions in which the bodies below these faces may be, bool [height, width].
+
+    The region of a person is a trapezoid that is wider than the body.
 
     Args:
         faces: centre (x, y) and size, pixels. scale: pixels of the result for one of theirs.
@@ -49,34 +51,35 @@ def person_region(
 
 
 class BackgroundModel:
-    """OpenCV's MOG2 for cameras that stand still and persons who are there from the first frame.
+    """Detects foreground by OpenCV's MOG2, for a static camera and persons present from the first frame.
 
-    A mixture of Gaussians per pixel takes what stays for background, also a person who stands still.
-    Therefore
+    MOG2, a mixture of Gaussians per pixel, learns whatever stays in place as background, also a
+    person who stands still. Three rules prevent that:
 
-    - the persons' regions of the first frame are not known: they count as foreground until a pixel
-      has shown something else, at rest, for `settle` frames and for longer than what was there
-      before, and head and torso are elsewhere; then this is the background there;
-    - foreground in a person's region is never learnt: the model is shown its own background there;
-    - before the first face nothing is learnt; after `wait` frames without one the scene is empty.
+    - The background in the persons' regions of the first frame is unknown. A pixel there counts as
+      foreground until it has shown another colour at rest for `settle` frames, for longer than the
+      first colour, and outside of head and torso. That colour then becomes its background.
+    - Foreground in a person's region is not learnt: MOG2 is given its own background there.
+    - Nothing is learnt before the first face. After `wait` frames without a face the scene counts as
+      empty.
 
-    Unlike the rest of the package this object keeps its state inside, since OpenCV's does: use one
-    for each video, in the order of its frames, or call `reset`.
+    The state is kept inside, because OpenCV keeps its own: use one object for each video, in the
+    order of its frames, or call `reset`.
 
     Args:
-        history: frames over which it learns. threshold: squared distance to a Gaussian, in
+        history: frames over which MOG2 learns. threshold: squared distance to a Gaussian, in
             variances, up to which a pixel is background.
         settle: frames; see above. wait: frames; see above, and how long a region is kept when its
             face is lost.
-        shadows: whether shadows are looked for, and counted as background. Skin in front of a
-            brighter wall may be taken for one.
+        shadows: whether shadows are detected, and counted as background. Skin in front of a
+            brighter wall may be classified as shadow.
 
     Raises:
-        InputError: settings that make no sense.
+        InputError: settings out of range.
 
     Reference:
-        Z. Zivkovic (2004), as cited by Burke & Lasenby, section 5.2. What is done about persons in
-        view is an addition.
+        Z. Zivkovic (2004), as cited by Burke & Lasenby, section 5.2. The rules for persons in
+        view are an addition.
 
     Example:
         >>> import numpy as np, torch
@@ -109,7 +112,7 @@ class BackgroundModel:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything, for another video."""
+        """Reset the state, for another video."""
         import cv2
 
         self._mixture = cv2.createBackgroundSubtractorMOG2(
@@ -121,7 +124,7 @@ class BackgroundModel:
         self._shape: tuple[int, ...] | None = None
 
     def step(self, frame: Image, faces: Float[Tensor, "N 3"]) -> Image:
-        """Foreground of the next frame: uint8 [H, W], 255 where there is, 0 elsewhere.
+        """Return the foreground of the next frame: uint8 [H, W], 255 on the foreground, 0 elsewhere.
 
         Args:
             frame: RGB, [H, W, 3], uint8. faces: centre (x, y) and size, pixels.
@@ -166,7 +169,7 @@ class BackgroundModel:
         return foreground.astype(np.uint8) * np.uint8(255)
 
     def _uncover(self, small: Image) -> None:
-        """Pixels that the person has left, and what is to be seen there now."""
+        """Mark the pixels that the person has left, whose present colour is the background."""
         if not self._unknown.any():
             return
         still = _distance(small, self._candidate) <= _SAME
@@ -181,7 +184,7 @@ class BackgroundModel:
         self._taught[uncovered] = max(self.history // 4, 8)
 
     def _learn(self, small: Image, blocked: NDArray[np.bool_]) -> None:
-        """Show the mixture what is background for sure, elsewhere what it believes already."""
+        """Update the mixture with the frame, in blocked pixels with its own background."""
         shown = small.copy()
         taught = self._taught > 0
         if self._learnt and blocked.any():
@@ -216,7 +219,7 @@ def _distance(a: Image, b: Image) -> Image:
 
 
 def _paste(source: Image, where: NDArray[np.bool_], target: Image) -> None:
-    """Copy pixels into `target`; numpy's masked copies take ten times as long."""
+    """Copy pixels into `target`; a masked copy by NumPy takes ten times as long."""
     import cv2
 
     cv2.copyTo(source, where.view(np.uint8), target)
@@ -226,7 +229,7 @@ _DIFFERENCE, _UNUSUAL = (2.0, 20.0), (4.0, 30.0)  # below: noise; range above it
 
 
 class MotionState(NamedTuple):
-    """The last frame of N persons.
+    """Holds the last frame of N persons.
 
     Attributes:
         last, median: Lab in bytes [N, 3, 160, 192], smoothed. grey: [N, 160, 192].
@@ -242,11 +245,12 @@ class MotionState(NamedTuple):
 
 
 class Motion(nn.Module):
-    """Difference from the last frame, difference from the median of all, and optical flow.
+    """Computes difference from the last frame, difference from the running median, and optical flow.
 
         moving = clip((|x_t - x_{t-1}|_w - 2) / 20, 0, 1),   m_t = m_{t-1} + clip(x_t - m_{t-1}, +-s)
 
-    The second stands for a background model: a hand at rest for a second is still unusual.
+    m_t is the running median. The difference from it replaces a background model: a hand that has been
+    at rest for a second still differs.
 
     Args:
         step: s, in steps of Lab in bytes per frame at 30 frames per second.
@@ -275,7 +279,7 @@ class Motion(nn.Module):
         new: Float[Tensor, "N 3"],
         moved: Bool[Tensor, " N"],
     ) -> MotionState:
-        """The same for windows that have moved; only those are computed anew."""
+        """Return the state for windows that have moved, by interpolation."""
         if not bool(moved.any()):
             return state
         old, new = old[moved], new[moved]
@@ -300,15 +304,15 @@ class Motion(nn.Module):
     ) -> tuple[
         MotionState, Float[Tensor, "N h w"], Float[Tensor, "N h w"], Float[Tensor, "N r c 2"]
     ]:
-        """Compare with the frames before.
+        """Compare the next frame with the frames before.
 
         Args:
             state: from `init` or the step before. small: windows in Lab, smoothed [N, 3, 160, 192].
             grey: windows [N, 160, 192], lightness in bytes.
 
         Returns:
-            The next state; moving and unusual [N, 160, 192], 0 to 1; flow from this frame back to
-            the last one, in cells [N, 72, 96, 2].
+            The next state; difference from the last frame and from the median [N, 160, 192], 0 to 1;
+            flow from this frame back to the last one, in cells [N, 80, 96, 2].
         """
         new = (state.frames == 0)[:, None, None, None]
         last = torch.where(new, small, state.last)
@@ -332,7 +336,7 @@ def dense_flow(
     start: Float[Tensor, "N H W 2"],
     known: Bool[Tensor, " N"],
 ) -> tuple[Float[Tensor, "N H W 2"], Float[Tensor, "N r c 2"]]:
-    """Compute the flow from `grey` back to `before` by DIS, in pixels, and its means over cells, in cells.
+    """Return the optical flow from `grey` back to `before` (DIS), in pixels, and its means, in cells.
 
     OpenCV's algorithm takes one pair of images at a time, hence the loop; persons without a frame
     before (`known`) get zeros.
@@ -356,7 +360,7 @@ def dense_flow(
 
 @cache
 def _method() -> Any:
-    """Making one takes longer than a frame; it keeps buffers only. Down to half the resolution."""
+    """Return OpenCV's DIS at half the resolution, made once: making it takes longer than a frame."""
     import cv2
 
     method = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)  # type: ignore[attr-defined]

@@ -1,10 +1,10 @@
-"""Cut windows about persons, in units of their faces, and frames scaled to their faces.
+"""Cut windows about persons in units of their faces, and scale frames to their faces.
 
-All that looks for hands works in a window that goes with the person: a face height B is always ten
-cells, so the cost of a frame does not depend on its size, and constants hold for every distance. A
-window stays where it is while the face is near its anchor, so what rests in the image rests in the
-window. Coordinates of a window are in B from its anchor; those of a map of the window in its cells,
-the first cell's centre being 0."""
+Hands are searched for in a window that goes with the person. A face height B is always ten cells, so
+the cost of a frame does not depend on its size, and constants hold for every distance. A window stays
+in place while the face is near its anchor, so that what rests in the image rests in the window.
+Coordinates of a window are in B from its anchor. Coordinates of a map of the window are in its cells,
+the centre of the first cell being 0."""
 
 from functools import cache, lru_cache
 from typing import NamedTuple
@@ -51,10 +51,10 @@ _FINEST = 3  # up to this many pixels to one are averaged; of more, some are lef
 
 
 def place_windows(faces: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """Anchors (x, y, B) near faces, such that the window is made of whole pixels.
+    """Return anchors (x, y, B) near faces, such that the window consists of whole pixels.
 
-    Place and size differ by less than 1 % of B and about 1 % from the face's. The window then is a
-    plain part of the image, which is quicker to cut than one between the pixels.
+    The place differs from the face's by less than 1 % of B, the size by about 1 %. A window of whole
+    pixels is quicker to cut than one between the pixels.
     """
     check_shape("faces", faces, ["N", 3])
     if not bool((torch.isfinite(faces).all(1) & (faces[:, 2] > 0)).all()):
@@ -74,12 +74,12 @@ def follow_faces(
     stray: float = 0.5,
     rescale: float = 1.15,
 ) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, " N"]]:
-    """Anchors for the next frame: the same unless the face has gone too far.
+    """Return the anchors for the next frame: unchanged unless the face has moved too far.
 
     Args:
         anchors: (x, y, B) of the windows, pixels. faces: (x, y, B), pixels.
         stray: how far a face may be from its anchor, in B.
-        rescale: ratio of sizes that is borne.
+        rescale: largest ratio of the sizes of face and window.
 
     Returns:
         Anchors, and which ones were moved.
@@ -96,7 +96,7 @@ def follow_faces(
 def cut_windows(
     image: Image, anchors: Float[Tensor, "N 3"], replicate: bool = True
 ) -> list[NDArray[np.uint8]]:
-    """What lies in each window, [320, 384] (or with channels), four pixels for a cell.
+    """Return the image in each window, [320, 384] (or with channels), four pixels for a cell.
 
     OpenCV cuts and resizes, one person at a time: parts of an image of different sizes are no tensor.
     The image is averaged over whole blocks of pixels, then resized by bilinear interpolation.
@@ -207,7 +207,7 @@ def inside_image(
 
 @lru_cache(maxsize=16)
 def _inside(anchors: tuple[float, ...], width: int, height: int, per_cell: int) -> Tensor:
-    """Kept, since windows mostly stay where they are."""
+    """Return `inside_image` of flat anchors; cached, since windows mostly stay in place."""
     place, share = torch.tensor(anchors, dtype=torch.float64).view(-1, 3), []
     sizes = ((CELLS[0], _TOP, 1, height), (CELLS[1], _LEFT, 0, width))
     for count, first, axis, pixels in sizes:
@@ -265,7 +265,7 @@ def move_maps(
     new: Float[Tensor, "N 3"],
     replicate: bool = False,
 ) -> Float[Tensor, "N C h w"]:
-    """Maps of the old windows as maps of the new ones; zero (or the border) where nothing was known."""
+    """Return maps of the old windows as maps of the new ones; zero (or the border) outside of the old."""
     per_cell = maps.shape[-2] // CELLS[0]
     middle = maps.new_tensor([0.0, _TOP + 0.5 * CELLS[0] * CELL])
     half = maps.new_tensor([-_LEFT, 0.5 * CELLS[0] * CELL])
@@ -282,7 +282,7 @@ def move_maps(
 def gaussian_matrix(
     size: int, sigma: float, shift: Float[Tensor, "*batch"] | None = None
 ) -> Float[Tensor, "*batch size size"]:
-    """Return the matrix G that blurs a row of `size` cells, and moves it by `shift` cells: out = G in.
+    """Return the matrix G that blurs a row of `size` cells and shifts it by `shift` cells: out = G in.
 
     Two of them blur a map: G_y map G_x^T. Every column sums to one, so no mass is lost at the border.
 
@@ -296,6 +296,7 @@ def gaussian_matrix(
 
 @cache
 def _still_matrix(size: int, sigma: float) -> Tensor:
+    """Return `gaussian_matrix` without a shift, cached."""
     return _gaussian(size, sigma, torch.zeros(()))
 
 
@@ -314,11 +315,11 @@ _NECK = (0.4, 1.1)  # half the width, bottom
 
 
 class ScaledFrame(NamedTuple):
-    """What is looked at to find hands.
+    """Holds the scaled frame in which hands are searched for.
 
     Attributes:
         bins: number of each pixel's colour (`SkinModel.byte_bins`).
-        usable: which pixels may be a hand: neither face, neck nor background.
+        usable: which pixels may show a hand: neither face, neck nor background.
         faces: (x, y) and size of all N faces, pixels of this image.
         scale: pixels of this image for one of the frame, across and down.
     """
@@ -351,7 +352,7 @@ def scale_frame(
     divisor: int,
     skin: SkinModel,
 ) -> ScaledFrame:
-    """Make the frame smaller by a divisor, and see which of its pixels may be hands.
+    """Return the frame scaled down by a divisor, with the pixels that may show hands.
 
     Args:
         frame: RGB [H, W, 3]. foreground: [H, W], 0 where there is background; None is foreground
@@ -382,7 +383,7 @@ def _resized(image: Image, height: int, width: int) -> Image:
 
 
 def _not_head(faces: Tensor, shape: tuple[int, int]) -> Tensor:
-    """False on the faces and necks of all persons, [H, W]."""
+    """Return a mask that is False on the faces and necks of all persons, [H, W]."""
     x, y, size = faces[:, :, None, None].unbind(1)
     across = ((torch.arange(shape[1]).to(faces) - x) / size).abs()
     down = (torch.arange(shape[0]).to(faces)[:, None] - y) / size

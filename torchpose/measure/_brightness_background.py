@@ -1,4 +1,4 @@
-"""Foreground, shadow and highlight by brightness and chromaticity against a learnt background."""
+"""Detect foreground, shadow and highlight by brightness and chromaticity against a learnt background."""
 
 from collections.abc import Iterable, Mapping
 from enum import IntEnum
@@ -12,14 +12,14 @@ from torchpose.errors import InputError, ShapeError
 
 __all__ = ["BrightnessBackground", "Distortion", "PixelKind"]
 
-_NOISE = 3.0  # grey levels: what a camera's pixel trembles by at least, rounding and codec included
-_LEAST_BRIGHTNESS = 0.01  # of the rms of alpha - 1, where a background hardly trembles
+_NOISE = 3.0  # grey levels: least deviation of a camera's pixel, rounding and codec included
+_LEAST_BRIGHTNESS = 0.01  # of the rms of alpha - 1, where a background hardly varies
 _DARK = 12.0  # grey levels: a background darker than this has no chromaticity to speak of
 _CHUNK = 1 << 22  # values at a time while fitting
 
 
 class PixelKind(IntEnum):
-    """What a pixel was found to be."""
+    """Names the class of a pixel."""
 
     BACKGROUND = 0
     SHADOW = 1
@@ -28,7 +28,7 @@ class PixelKind(IntEnum):
 
 
 class Distortion(NamedTuple):
-    """How a colour differs from the background's, in units of what the background itself does.
+    """Holds the distortions of a colour against the background, in units of the background's own.
 
     Attributes:
         brightness: (alpha - 1) / a [..., H, W]; negative is darker.
@@ -40,16 +40,16 @@ class Distortion(NamedTuple):
 
 
 class BrightnessBackground(nn.Module):
-    """A background that knows shadows: the same chromaticity, less brightness.
+    """Classifies pixels against a background, where a shadow has its chromaticity and less brightness.
 
     With the mean E and standard deviation s of a pixel's colour channels c, the brightness distortion
-    alpha = sum_c(I_c E_c / s_c^2) / sum_c(E_c^2 / s_c^2) is how bright the expected colour has to be
-    to come nearest to I, and the chromaticity distortion
-    CD = sqrt(sum_c ((I_c - alpha E_c) / s_c)^2) how far it stays away. Both are divided by their root
-    mean squares a and b over the frames that were learnt. A pixel is foreground if CD / b exceeds
+    alpha = sum_c(I_c E_c / s_c^2) / sum_c(E_c^2 / s_c^2) scales the expected colour to be nearest to I.
+    The chromaticity distortion is the distance that remains,
+    CD = sqrt(sum_c ((I_c - alpha E_c) / s_c)^2). Both are divided by their root mean squares a and b
+    over the learnt frames. A pixel is foreground if CD / b exceeds
     `chromaticity` or the pixel is darker than `darkest` times the background, else background if
     |alpha - 1| / a is at most `brightness`, else shadow if it is darker and highlight if brighter.
-    Dark grey clothes before a grey wall are a shadow to this model: there is no telling them apart.
+    Dark grey clothes in front of a grey wall are classified as shadow.
 
     Args:
         chromaticity, brightness: thresholds, in the units above. darkest: least alpha of a shadow.
@@ -57,7 +57,7 @@ class BrightnessBackground(nn.Module):
     Buffers: mean, std [3, H, W] (grey levels of 0 to 255), brightness_rms, chromaticity_rms [H, W].
 
     Raises:
-        InputError: thresholds that make no sense.
+        InputError: thresholds out of range.
 
     Reference:
         T. Horprasert, D. Harwood, L. Davis, "A statistical approach for real-time robust background
@@ -93,7 +93,7 @@ class BrightnessBackground(nn.Module):
         self.register_load_state_dict_pre_hook(_make_room)
 
     def fit(self, frames: UInt8[Tensor, "N 3 H W"]) -> "BrightnessBackground":
-        """Learn an empty scene from one frame or more; some tens are better.
+        """Learn the empty scene from one frame or more; several tens are better.
 
         Args:
             frames: RGB, without the person.
@@ -118,7 +118,7 @@ class BrightnessBackground(nn.Module):
             alpha, chroma = self._distort(part)
             alpha_squares = alpha_squares + (alpha - 1).square().sum(0)
             chroma_squares = chroma_squares + chroma.square().sum(0)
-        # of a background that never trembles: what noise of `std` alone would do
+        # for a background without variation: the rms that noise of `std` alone would cause
         signal = (self.mean / self.std).square().sum(0).sqrt().clamp_min(1e-6)
         floor = (0.5 / signal).clamp_min(_LEAST_BRIGHTNESS)
         self.brightness_rms = (alpha_squares / n).sqrt().maximum(floor)
@@ -126,7 +126,7 @@ class BrightnessBackground(nn.Module):
         return self
 
     def distortion(self, images: UInt8[Tensor, "*batch 3 H W"]) -> Distortion:
-        """Normalised distortions of images of the size that was learnt.
+        """Return the normalised distortions of images of the learnt size.
 
         Raises:
             ShapeError: another size. InputError: nothing was learnt.
@@ -180,7 +180,7 @@ def _sum(parts: Iterable[Tensor]) -> Tensor:
 
 
 def _make_room(module: nn.Module, state_dict: Mapping[str, Any], prefix: str, *_: object) -> None:
-    """Give buffers the size of those to be loaded: a scene has the size of its images."""
+    """Resize the buffers to those that are loaded: their size is that of the learnt images."""
     for name, buffer in module.named_buffers(recurse=False):
         loaded = state_dict.get(prefix + name)
         if isinstance(loaded, Tensor):

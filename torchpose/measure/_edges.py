@@ -1,4 +1,4 @@
-"""Edges vote for limbs (Burke & Lasenby, section 5.3, BL 50)."""
+"""Find straight edges, and count those that support a limb (Burke & Lasenby, section 5.3, BL 50)."""
 
 import math
 from typing import Literal, NamedTuple
@@ -23,12 +23,12 @@ ARM_LIMBS = tuple(
 """Pairs of `UPPER_BODY` indices: upper arm and forearm, left and right."""
 
 _BLUR = (5, 1.0)  # size and deviation of the Gaussian before the gradient, pixels
-_FACE_PIXELS = 32.0  # size of a face where segments are looked for
+_FACE_PIXELS = 32.0  # size of a face where segments are searched for
 _MARGIN = 0.6  # about the arms, in sizes of the face
 
 
 class Segments(NamedTuple):
-    """Straight edges of an image, S of them.
+    """Holds the S straight edge segments of an image.
 
     Attributes:
         midpoint: (x, y), pixels [S, 2]. angle: against the x axis, in [0, pi) [S].
@@ -46,7 +46,7 @@ def edge_map(
     high: float = 100.0,
     backend: Backend = "auto",
 ) -> Bool[Tensor, "H W"]:
-    """Canny's edges of a grey image.
+    """Return the edges of a grey image by Canny's detector.
 
     Args:
         image: grey levels 0 to 255. low, high: thresholds of the gradient by Sobel's kernels,
@@ -106,7 +106,7 @@ def find_segments(
     least_length: float = 8.0,
     largest_gap: float = 3.0,
 ) -> Segments:
-    """Straight edges by Canny's detector and the probabilistic Hough transform.
+    """Return straight edges by Canny's detector and the probabilistic Hough transform.
 
     Kornia has no Hough transform: its edges go to OpenCV's.
 
@@ -173,7 +173,7 @@ def limb_votes(
 
     Raises:
         ShapeError: starts and ends that do not fit together. InputError: deviations or a threshold
-            without sense.
+            out of range.
 
     Example:
         >>> import torch
@@ -209,7 +209,7 @@ def limb_votes(
 def segments_of_arms(
     grey: Image, joints: Float[Tensor, "*b 8 2"], size: float, **options: float
 ) -> Segments:
-    """Segments of the part of the image about the arms, where a face has 32 pixels, in its pixels.
+    """Return the segments about the arms, found where a face has 32 pixels, in pixels of the frame.
 
     Args:
         grey: [H, W], uint8. joints: all hypotheses of all arms, order of `UPPER_BODY`, pixels.

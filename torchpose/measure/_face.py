@@ -1,7 +1,7 @@
-"""Faces in video: found by a detector, followed by Kalman filters (Burke & Lasenby, section 5.1).
+"""Detect faces, and track them by Kalman filters (Burke & Lasenby, section 5.1).
 
-A detector misses faces and sees some where there are none. Tracks bridge the first, and are used only
-once they have lasted, which the second rarely do.
+A detector has misses and false detections. Tracks bridge the misses. A track is used only once it has
+enough detections, which false ones rarely reach.
 """
 
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -41,7 +41,7 @@ def check_faces(faces: Float[Tensor, "N 3"], count: int | None = None) -> None:
 
 
 class Region(NamedTuple):
-    """Part of an image in which faces of some sizes are looked for, pixels."""
+    """Holds a part of an image and the sizes of the faces to search for, pixels."""
 
     left: int
     top: int
@@ -53,19 +53,19 @@ class Region(NamedTuple):
 
 @runtime_checkable
 class FaceDetector(Protocol):
-    """Anything that finds faces in a grey image."""
+    """Finds faces in a grey image."""
 
     def __call__(self, image: Image, region: Region | None = None) -> Float[Tensor, "N 3"]:
-        """Centre (x, y) and size (side of the square box) of every face, pixels.
+        """Return centre (x, y) and size (side of the square bounding box) of every face, pixels.
 
         Args:
-            image: [H, W], uint8. region: where to look; None is everywhere.
+            image: [H, W], uint8. region: where to search; None is the whole image.
         """
         ...
 
 
 def _frontal_faces() -> Any:
-    """OpenCV's cascade for frontal faces."""
+    """Return OpenCV's cascade for frontal faces."""
     import cv2
 
     path = f"{cv2.data.haarcascades}haarcascade_frontalface_default.xml"  # type: ignore[attr-defined]
@@ -78,14 +78,14 @@ def _frontal_faces() -> Any:
 
 
 class HaarFaceDetector:
-    """The cascade of Viola & Jones that comes with OpenCV, for frontal faces.
+    """Detects frontal faces by the cascade of Viola & Jones that comes with OpenCV.
 
     Args:
         scale_factor: between the sizes that are tried. min_neighbours: boxes that must agree.
         min_size: of a face, pixels.
 
     Raises:
-        InputError: settings that make no sense, or an OpenCV without its cascades.
+        InputError: settings out of range, or an OpenCV without its cascades.
 
     Reference:
         P. Viola, M. Jones (2001), as cited by Burke & Lasenby, section 5.1.
@@ -111,7 +111,7 @@ class HaarFaceDetector:
         self.__dict__ = state | {"_cascade": _frontal_faces()}
 
     def __call__(self, image: Image, region: Region | None = None) -> Float[Tensor, "N 3"]:
-        """See `FaceDetector`."""
+        """Return the faces of a grey image; see `FaceDetector`."""
         check_grey("image", image)
         left, top, sizes = 0, 0, {"minSize": (self.min_size, self.min_size)}
         if region is not None:
@@ -133,11 +133,11 @@ class HaarFaceDetector:
 
 
 class FaceTracks(NamedTuple):
-    """Faces that are followed, N of them.
+    """Holds the tracks of N faces.
 
     Attributes:
         mean: (x, y, size) and their velocities per frame [N, 6], pixels. cov: [N, 6, 6].
-        hits: evidence for a face, in detections, bounded [N]. age: frames since its birth [N].
+        hits: detections so far less misses, bounded [N]. age: frames since the first detection [N].
         unseen: frames since it was last detected [N].
         identity: number of each face [N]; a number is never used twice. frame: frames seen.
         next_identity: of the next face.
@@ -154,30 +154,30 @@ class FaceTracks(NamedTuple):
 
 
 class FaceTracker(nn.Module):
-    """Follows any number of faces by constant-velocity Kalman filters over place and size.
+    """Tracks any number of faces by constant-velocity Kalman filters over place and size.
 
         (p, v)_t = [I I; 0 d I] (p, v)_{t-1} + N(0, Q),   z_t = p_t + N(0, R),   p = (x, y, size)
 
-    A detection belongs to the nearest track, by Euclidean distance over (x, y, size), if that is
-    within `gate` sizes of the face; every other one gives birth to a track. A track may be used when
-    it has `min_hits`, loses a part of a hit for every frame in which it should have been seen and was
-    not, and dies when none is left. All deviations below are in sizes of the face.
+    A detection is associated with the nearest track, by Euclidean distance over (x, y, size), if that
+    is within `gate` sizes of the face; otherwise it starts a track. A track is used once it has
+    `min_hits`. It loses a third of a hit for every missed detection, and ends when none is left. All
+    deviations below are in sizes of the face.
 
     Args:
         detector: by default `HaarFaceDetector`.
-        every: look for known faces in every n-th frame, in the region about them; while none may be
+        every: search for known faces in every n-th frame, in the region about them; while no track is
             used yet, in every frame.
-        whole_every: look for new faces, in the whole image, in every n-th frame.
-        search_every: the same while no face may be used.
+        whole_every: search the whole image for new faces in every n-th frame.
+        search_every: the same while no track is used.
         gate: largest distance. min_hits: detections before a track is used.
-        memory: most hits that a track can have; it survives three times as many misses.
+        memory: most hits of a track; it lasts for three times as many misses.
         std: of a detection's place and size. acceleration: of the process, per frame and frame.
         damping: d, of the velocity per frame.
-        detail: size, in pixels, to which known faces are brought before they are looked for again:
-            cascades draw larger boxes about small faces, and large ones cost time.
+        detail: size, in pixels, to which known faces are scaled before the search: cascades draw
+            larger boxes about small faces, and large faces cost time.
 
     Raises:
-        InputError: settings that make no sense.
+        InputError: settings out of range.
 
     Reference:
         Burke & Lasenby, section 5.1.
@@ -228,14 +228,14 @@ class FaceTracker(nn.Module):
     observed: Tensor
 
     def init(self) -> FaceTracks:
-        """No faces yet."""
+        """Return the state without faces."""
         real, whole = self.matrix.new_zeros(0), torch.zeros(0, dtype=torch.long)
         return FaceTracks(
             real.view(0, 6), real.view(0, 6, 6), real, whole, whole.clone(), whole.clone(), 0, 0
         )
 
     def usable(self, tracks: FaceTracks) -> Bool[Tensor, " N"]:
-        """Return which tracks have lasted long enough to be used."""
+        """Return which tracks have enough detections to be used."""
         return tracks.hits >= self.min_hits
 
     def step(self, tracks: FaceTracks, image: Image) -> FaceTracks:
@@ -253,14 +253,14 @@ class FaceTracker(nn.Module):
         if known and not everywhere and tracks.frame % self.every:
             return predicted
         found = [self._look_near(image, face) for face in predicted.mean[:, :3].tolist()]
-        if everywhere:  # after those that are known, whose sizes are measured better so
+        if everywhere:  # last, since sizes of known faces are measured better near them
             found.append(self.detector(image))
         if not found:
             return predicted
         return self.update(predicted, _without_doubles(torch.cat(found), self.gate))
 
     def _look_near(self, image: Image, face: list[float]) -> Float[Tensor, "N 3"]:
-        """Detections about a known face, which is brought to a size that the detector likes."""
+        """Return the detections about a known face, scaled to the size `detail`."""
         import cv2
 
         region = _region(face, image.shape)
@@ -288,7 +288,7 @@ class FaceTracker(nn.Module):
         )
 
     def update(self, tracks: FaceTracks, found: Float[Tensor, "n 3"]) -> FaceTracks:
-        """Predicted tracks after the detections (x, y, size) of their frame; births and deaths too."""
+        """Update predicted tracks with the detections (x, y, size) of their frame; start and end tracks."""
         check_shape("found", found, ["n", 3])
         check_finite("found", found)
         found = found.to(self.matrix)
@@ -304,14 +304,14 @@ class FaceTracker(nn.Module):
         unseen = torch.where(seen, 0, tracks.unseen)
         alive = hits > 0
         kept = [x[alive] for x in (mean, cov, hits, tracks.age, unseen, tracks.identity)]
-        born = self._births(found[owner < 0], tracks.next_identity)
+        new = self._new_tracks(found[owner < 0], tracks.next_identity)
         mean, cov, hits, age, unseen, identity = (
-            torch.cat(pair) for pair in zip(kept, born, strict=True)
+            torch.cat(pair) for pair in zip(kept, new, strict=True)
         )
-        following = tracks.next_identity + len(born[0])
+        following = tracks.next_identity + len(new[0])
         return FaceTracks(mean, cov, hits, age, unseen, identity, tracks.frame, following)
 
-    def _births(self, found: Tensor, first: int) -> tuple[Tensor, ...]:
+    def _new_tracks(self, found: Tensor, first: int) -> tuple[Tensor, ...]:
         n = len(found)
         size = found[:, 2]
         spread = self.std * found.new_tensor([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
@@ -338,7 +338,7 @@ def _region(face: list[float], shape: tuple[int, ...]) -> Region:
 
 
 def _nearest(faces: Tensor, found: Tensor, gate: float) -> Int[Tensor, " n"]:
-    """For each detection the track that it belongs to, -1 if none; nearest pairs first."""
+    """Return the track of each detection, -1 for none, associating the nearest pairs first."""
     owner = torch.full((len(found),), -1)
     distance = torch.cdist(found, faces)
     distance = torch.where(distance <= gate * faces[:, 2], distance, torch.inf)
@@ -350,7 +350,7 @@ def _nearest(faces: Tensor, found: Tensor, gate: float) -> Int[Tensor, " n"]:
 
 
 def _without_doubles(found: Tensor, gate: float) -> Tensor:
-    """Detections, each once though regions of neighbouring faces overlap."""
+    """Return the detections without repetitions, which overlapping regions give."""
     near = torch.cdist(found, found) <= gate * found[:, 2]
     earlier = torch.tril(near, -1).any(1)
     return found[~earlier]

@@ -1,4 +1,4 @@
-"""Histogram filter over a grid for two hands: prediction, exclusion of each other, read-out."""
+"""Filter the places of two hands over a grid: prediction, mutual exclusion, estimate."""
 
 import math
 from functools import cache
@@ -10,13 +10,13 @@ from torch import Tensor
 
 from torchpose.measure._body_window import gaussian_matrix
 
-_LEAST = 1e-12  # belief in a cell: smaller numbers slow the processor down
+_LEAST = 1e-12  # belief in a cell: denormal numbers are slow
 
 __all__ = ["GridEstimate", "blur", "exclude", "gaussian_bump", "predict", "read_out"]
 
 
 class GridEstimate(NamedTuple):
-    """What a belief over a grid says, in cells.
+    """Holds the estimate that is read from a belief over a grid, in cells.
 
     Attributes:
         place: mean about the mode. covariance: there. mass: probability near the mode.
@@ -32,7 +32,7 @@ class GridEstimate(NamedTuple):
 def blur(
     maps: Float[Tensor, "*batch h w"], sigma: float, shift: Float[Tensor, "*batch 2"] | None = None
 ) -> Float[Tensor, "*batch h w"]:
-    """Blur by a Gaussian, by two products with matrices, and move by `shift` (x, y), in cells."""
+    """Return maps blurred by a Gaussian and shifted by `shift` (x, y), in cells."""
     if sigma == 0 and shift is None:
         return maps
     height, width = maps.shape[-2:]
@@ -73,13 +73,14 @@ def predict(
     jump: float,
     rest: float = 0.35,
 ) -> Float[Tensor, "N 2 h w"]:
-    """Predict p(x_t | z_1..t-1): diffusion, velocity, optical flow, and rebirth.
+    """Return the prediction p(x_t | z_1..t-1): diffusion, velocity, optical flow, reinitialisation.
 
         p' = m [(1 - j) ((1 - f) (s G_near(v) + (1 - s) G_far) p + f flow p) + j q] + (1 - m) G_rest p
 
     Args:
-        belief: p. rebirth: q, sums to one. speed: v, cells per step. flow: from each cell back to
-            where its content was, cells. moves: m, how much moves at all, 0 to 1.
+        belief: p. rebirth: q, where hands are reinitialised, sums to one. speed: v, cells per step.
+            flow: from each cell back to the place of its content, cells. moves: m, the amount of
+            motion in the frame, 0 to 1.
         near, far, flow_blur, rest: standard deviations, cells. near_share: s. flow_share: f. jump: j.
     """
     out = near_share * blur(belief, near, speed) + (1 - near_share) * blur(belief, far)
@@ -106,33 +107,33 @@ def exclude(
     soft: float,
     rounds: int = 2,
 ) -> Float[Tensor, "N 2 h w"]:
-    """Return the beliefs of the left and the right hand after each has told the other where it is.
+    """Return the beliefs of the left and the right hand after mutual exclusion.
 
         p_k(x) ~ b_k(x) (1 - (1 - e^-X) taken_l(x)) (1 - (1 - e^-C) wrong_l(x))
 
-    taken_l is how probable the other hand l is within about `radius` of x, wrong_l how probable it is
-    on the side of x where it does not belong: the person's left hand is seldom to the left of the
-    right hand in the image.
+    taken_l is the probability of the other hand l within about `radius` of x. wrong_l is its
+    probability on the wrong side of x: the person's left hand is seldom to the left of the right
+    hand in the image.
 
     Args:
         base: beliefs before, any scale. exclusion: X. crossing: C. radius, soft: cells.
-        rounds: of telling each other.
+        rounds: of messages from each hand to the other.
     """
     base = (base / base.sum((2, 3), keepdim=True).clamp_min(1e-30)).clamp_min_(_LEAST)
     message = [torch.ones_like(base[:, 0]), torch.ones_like(base[:, 0])]
-    for turn in range(2 * rounds):  # one hand after the other: both at once would swing
+    for turn in range(2 * rounds):  # one hand after the other: both at once would oscillate
         k = turn % 2
         other = base[:, 1 - k] * message[1 - k]
-        taken, wrong = _told(other, k, radius, soft)
+        taken, wrong = _occupied(other, k, radius, soft)
         message[k] = (1 + math.expm1(-exclusion) * taken) * (1 + math.expm1(-crossing) * wrong)
     belief = base * torch.stack(message, 1)
     return (belief / belief.sum((2, 3), keepdim=True)).clamp_min_(_LEAST)
 
 
-def _told(
+def _occupied(
     other: Tensor, hand: int, radius: float, soft: float
 ) -> tuple[Float[Tensor, "N h w"], Float[Tensor, "N 1 w"]]:
-    """Return where the other hand is near, and the columns that lie on its wrong side."""
+    """Return taken_l and wrong_l of `exclude`."""
     columns = other.sum(1, keepdim=True)
     scale = 1.2 * 2 * math.pi * radius * radius / columns.sum(2, keepdim=True)
     near = (blur(other, radius) * scale).clamp_(0, 1)
@@ -142,7 +143,7 @@ def _told(
 
 @cache
 def _side_matrix(size: int, soft: float, hand: int) -> Tensor:
-    """From where the other hand may be to how much each column is on its wrong side."""
+    """Return the matrix from columns of the other hand to how far each column is on its wrong side."""
     left_of = gaussian_matrix(size, soft) @ torch.ones(size, size).tril()
     return (1 - left_of if hand == 0 else left_of).mT.contiguous()
 
@@ -151,7 +152,7 @@ def read_out(belief: Float[Tensor, "N 2 h w"], smooth: float, within: float) -> 
     """Return the mean, covariance and mass about the highest place of each smoothed belief.
 
     Args:
-        belief: sums to one. smooth: standard deviation before the mode is looked for, cells.
+        belief: sums to one. smooth: standard deviation of the blur before the search for the mode, cells.
         within: radius about the mode that counts, cells.
     """
     n, hands, height, width = belief.shape
@@ -170,6 +171,6 @@ def read_out(belief: Float[Tensor, "N 2 h w"], smooth: float, within: float) -> 
 
 @cache
 def _powers(size: int) -> Tensor:
-    """1, x and x squared of every cell."""
+    """Return 1, x and x squared of every cell."""
     place = torch.arange(size, dtype=torch.float64)
     return torch.stack([torch.ones_like(place), place, place.square()])

@@ -1,4 +1,4 @@
-"""Likelihood of a hand in each cell of a person's window; its constants, and what hand trackers return."""
+"""Compute the likelihood map of a hand in a person's window; hold its constants and hand measurements."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -18,16 +18,16 @@ __all__ = ["HandLikelihood", "HandMeasurements", "HandSettings", "check_frame", 
 
 
 class HandLikelihood(nn.Module):
-    """Log likelihood of a hand at every cell, from skin, motion, and the shape of a hand.
+    """Computes the log-likelihood of a hand at every cell from skin, motion, and the shape of a hand.
 
         l(x) = a D(x) + c S(x) + m M(x) + u U(x)
              - b S(x - 0.9 e) + t S(x + 0.65 e) - s (S(x - 0.55 n) + S(x + 0.55 n))
 
-    D, M and U are the means of skin, motion and the unusual over a hand, S that of skin over a palm; e
-    is the unit vector towards the elbow that the pose prior expects, n the one across. A hand has the
-    forearm on one side and nothing of skin beyond its fingers; a point on a bare forearm has skin on
-    both. What lies outside of the image is skin with a fixed probability, so that neither a hand at
-    the border nor the lack of one is invented there.
+    D, M and U are the means over a hand of skin, of the difference from the last frame and of that from
+    the median; S is the mean of skin over a palm. e is the unit vector towards the elbow that the pose
+    prior expects, n the one across. A hand has the forearm on one side and no skin beyond its fingers;
+    a point on a bare forearm has skin on both sides. Outside of the image skin has a fixed
+    probability, which favours neither a hand at the border nor its absence.
 
     Args:
         disc: a. core: c. motion: m. unusual: u. beyond: b. towards: t. beside: s.
@@ -80,11 +80,11 @@ class HandLikelihood(nn.Module):
     hand_columns: Tensor
 
     def means(self, maps: Float[Tensor, "N 3 h w"]) -> Float[Tensor, "N 4 r c"]:
-        """Means about the centre of every cell: skin over a palm, then all three over a hand.
+        """Return means about the centre of every cell: skin over a palm, then all maps over a hand.
 
         Args:
-            maps: skin, motion and the unusual, per pixel of evidence. Beyond the window its border
-                counts.
+            maps: skin, difference from the last frame and from the median, per pixel of evidence;
+                the border is repeated beyond the window.
         """
         for _ in range(EVIDENCE // 2):
             maps = halve(maps)
@@ -94,7 +94,7 @@ class HandLikelihood(nn.Module):
     def forward(
         self, means: Float[Tensor, "N 4 r c"], elbow: Float[Tensor, "N 2 2 r c"]
     ) -> Float[Tensor, "N 2 r c"]:
-        """Log likelihood for the left and the right hand, up to a constant.
+        """Return the log-likelihood of the left and the right hand, up to a constant.
 
         Args:
             means: see `means`.
@@ -129,7 +129,7 @@ def _grid() -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _palm_matrix(cells: int, palm: float) -> Tensor:
-    """Means over `palm` about the middle of each cell."""
+    """Return the matrix of means over `palm` about the middle of each cell."""
     centre = (torch.arange(cells)[:, None] + 0.5) * CELL
     edge = torch.arange(cells + 1) * CELL
     edge[0], edge[-1] = -palm, edge[-1] + palm  # the border counts for what is beyond it
@@ -138,7 +138,7 @@ def _palm_matrix(cells: int, palm: float) -> Tensor:
 
 
 def _hand_matrix(cells: int, hand: float) -> Tensor:
-    """The same over a hand: flat over half of it, falling off to both sides."""
+    """Return the matrix of means over a hand, whose weights fall off over its outer half."""
     return sum(  # type: ignore[return-value]
         _palm_matrix(cells, hand * (0.5 + (i + 0.5) / n)) / n for n in (8,) for i in range(n)
     )
@@ -146,32 +146,33 @@ def _hand_matrix(cells: int, hand: float) -> Tensor:
 
 @dataclass(frozen=True)
 class HandSettings:
-    """Constants of `HandTracker`; lengths in face heights B, rates for 30 frames per second.
+    """Holds the constants of `HandTracker`; lengths in face heights B, rates at 30 frames per second.
 
     Attributes:
         skin_slope, skin_bias, skin_decay, skin_floor, clothes_share: see `SkinModel`.
         unknown_skin: probability of skin where the image has ended.
-        face_memory: a hand in front of the face is a change of it; without, the face hides hands.
+        face_memory: whether a change of the face reveals a hand in front of it; without, head and neck
+            are never skin.
         face_alignment, face_deviations, face_floor, face_median, face_scale: see `FaceMemory`.
         disc, core, motion, unusual, beyond, towards, beside: weights of the cues, see `HandLikelihood`.
         prior: weight of the log density of a hand given the face.
-        jump: share of belief that is born anew from the prior in each frame.
-        face_rebirth: cost of that in front of the face, in nats.
-        expected_share: of the rebirth about the expected hands, where these are given.
+        jump: share of belief that is reinitialised from the prior in each frame.
+        face_rebirth: cost of reinitialisation in front of the face, in nats.
+        expected_share: of the reinitialisation about the expected hands, where these are given.
         near, far, near_share: the two widths of diffusion, and the share of the first.
         flow, flow_blur: share of belief that optical flow carries, and its blur.
         rest: diffusion where nothing moves.
-        velocity: share of the last displacement that goes on.
+        velocity: share of the last displacement that continues.
         exclusion, exclusion_radius: cost of both hands at one place, in nats, and how far it reaches.
         crossing, crossing_soft: cost of hands on each other's side, in nats, and its softness.
-        still: weight of a frame in which nothing moves; what is seen again is old news.
+        still: weight of a frame without motion, whose likelihood depends on that of the frame before.
         still_motion: moving area, in B squared, from which a frame counts fully.
         covariance_scale, covariance_floor: the reported covariance is the belief's times the scale,
             plus the floor (a standard deviation).
         least_mass, least_skin: below these a hand is not `seen`.
         stray, rescale: see `follow_faces`.
-        face_follow: share of a face's new size that is taken over; face_change: ratio of sizes from
-            which all of it is.
+        face_follow: weight of a face's new size in the average; face_change: ratio of sizes from
+            which the new size replaces the average.
     """
 
     skin_slope: float = 1.5
@@ -221,10 +222,10 @@ class HandSettings:
 
 
 class HandMeasurements(NamedTuple):
-    """Hands of N persons: left, right (the person's own), in pixels of the frame.
+    """Holds the hands of N persons: left, right (the person's own), in pixels of the frame.
 
     Attributes:
-        points: centres of the hands (x, y); NaN where there is nothing to say.
+        points: centres of the hands (x, y); NaN where unknown.
         covariance: of the points, pixels squared.
         mass: probability that the hand is there.
         seen: False where a hand is lost, to be taken as missing.
@@ -249,7 +250,7 @@ def check_frame(
     identity: Int[Tensor, " N"],
     foreground: Image | None,
 ) -> None:
-    """Raise unless these are a frame, faces with a size, who they are, and a mask of the frame.
+    """Raise unless these are a frame, faces with a size, their numbers, and a mask of the frame.
 
     Raises:
         ShapeError, InputError: see above.

@@ -1,4 +1,4 @@
-"""Where hands are, given a face: the prior over poses as a table (after Burke & Lasenby, section 3)."""
+"""Tabulate where hands and elbows are relative to the face (after Burke & Lasenby, section 3)."""
 
 import math
 from weakref import WeakKeyDictionary
@@ -13,7 +13,7 @@ from torchpose.priors._upper_body import UpperBodyPrior
 
 __all__ = ["FACE_HEIGHT", "HandPrior"]
 
-FACE_HEIGHT = 0.165  # metres: side of the box that the face detector draws, B
+FACE_HEIGHT = 0.165  # metres: side of the bounding box of the face detector, B
 _STEP, _LEFT, _TOP, _SIZE = 0.1, -5.0, -2.5, (91, 101)  # the tables, in B from the face
 _HAND, _ELBOW, _HEAD, _DEPTH = slice(0, 2), slice(3, 5), slice(9, 11), 11
 _NEAREST = 0.3  # metres: a depth below it is a tail of a Gaussian, not a person
@@ -24,12 +24,12 @@ _made: WeakKeyDictionary[UpperBodyPrior, "HandPrior"] = WeakKeyDictionary()
 
 
 class HandPrior(nn.Module):
-    """Log density of a hand relative to the face, and the elbow to be expected, as tables.
+    """Holds the log density of a hand relative to the face, and the expected elbow, as tables.
 
         o = (h - f) lambda / (focal FACE_HEIGHT),   log p(o) and E[e | o]
 
     with hand h, head f (the face's centre), elbow e in pixels and the head's depth lambda; o is in
-    face heights B. A share of 5 % lies anywhere in the table: the prior has not seen everything.
+    face heights B. A share of 5 % is uniform over the table, for poses that the prior has not seen.
 
     Args:
         table: log density, x and y of the elbow, for the left and the right arm [2, 3, 91, 101].
@@ -55,7 +55,7 @@ class HandPrior(nn.Module):
 
     @classmethod
     def from_prior(cls, prior: UpperBodyPrior) -> "HandPrior":
-        """Return the tables of a prior over poses, whatever its camera; kept for the next call.
+        """Return the tables of a prior over poses, for any camera; cached.
 
         The depth of the head is summed over five nodes of Gauss-Hermite quadrature; given it, the
         offsets are Gaussian for every component, so nothing is sampled.
@@ -72,7 +72,7 @@ class HandPrior(nn.Module):
     def forward(
         self, offsets: Float[Tensor, "*batch 2"]
     ) -> tuple[Float[Tensor, "2 *batch"], Float[Tensor, "2 2 *batch"]]:
-        """Look up places; beyond the table its border counts.
+        """Look up places; beyond the table its border is repeated.
 
         Args:
             offsets: (x, y) from the face's centre, in B.
@@ -155,7 +155,7 @@ def _density_and_elbow(
     cross: Float[Tensor, "M 2 2"],
     spread: Float[Tensor, "M 2 2"],
 ) -> tuple[Float[Tensor, " P"], Float[Tensor, "P 2"]]:
-    """p(o), and p(o) E[e | o], at every place.
+    """Return p(o) and p(o) E[e | o] at every place.
 
     Both are sums over components of exp(quadratic) times (1, affine), so they are products of
     matrices with the monomials of the places.

@@ -1,4 +1,4 @@
-"""Both hands of every person in colour video, by a histogram filter (after Burke & Lasenby, 5.2)."""
+"""Track both hands of every person in colour video by a histogram filter (after Burke & Lasenby, 5.2)."""
 
 import math
 from functools import cache
@@ -44,15 +44,15 @@ from torchpose.measure._skin import SkinModel, SkinState
 __all__ = ["HandState", "HandTracker"]
 
 _REACH = -5.2  # log density per B squared above which a hand may be in a place
-_FACE = (0.7, 0.9)  # half the width and height of a face with what is about it, in B
-_NEAR = 4  # cells about a hand that are believed to be its own
+_FACE = (0.7, 0.9)  # half the width and height of a face with its surroundings, in B
+_NEAR = 4  # cells about a hand that belong to it
 
 
 class HandState(NamedTuple):
-    """What is known of N persons; every tensor has them as its first dimension.
+    """Holds the state of N persons, the first dimension of every tensor.
 
     Attributes:
-        identity: who is who. anchors: of the windows (x, y, B), pixels.
+        identity: number of each person. anchors: of the windows (x, y, B), pixels.
         skin, memory, motion: of the parts.
         belief: probability of each hand in each cell, sums to one [N, 2, 80, 96].
         size: B, slowly averaged, pixels.
@@ -73,14 +73,14 @@ class HandState(NamedTuple):
 
 
 class HandTracker(nn.Module):
-    """Follows both hands of every person by a histogram filter in a window about the face.
+    """Tracks both hands of every person by a histogram filter in a window about the face.
 
     The likelihood of a hand comes from skin (against clothes and background), motion and the shape
-    of a hand at the end of its forearm (`HandLikelihood`); where it may be at all from the prior over
-    poses, given the face (`HandPrior`). The face is taken out of the skin unless it changes
-    (`FaceMemory`). Belief moves with the optical flow, with its own speed, and by diffusion, and the
-    two hands exclude each other (`predict`, `exclude`). A frame in which nothing moves says little
-    that is new, so it counts little. There is no delay: a frame in, its hands out.
+    of a hand at the end of its forearm (`HandLikelihood`). Its prior is that over poses, given the face
+    (`HandPrior`). The face is removed from the skin unless it changes (`FaceMemory`). The belief is
+    predicted by optical flow, by its own velocity and by diffusion, and the two hands exclude each
+    other (`predict`, `exclude`). A frame without motion has little weight. The hands of a frame are
+    returned with that frame, without delay.
 
     Args:
         prior: of hands given the face.
@@ -139,7 +139,7 @@ class HandTracker(nn.Module):
         foreground: Image | None = None,
         expected: tuple[Float[Tensor, "N 2 2"], Float[Tensor, "N 2 2 2"]] | None = None,
     ) -> tuple[HandState, HandMeasurements]:
-        """Return the hands in the next frame.
+        """Return the next state and the hands in the next frame.
 
         Args:
             state: from `init` or the step before; its persons are matched by number.
@@ -147,7 +147,7 @@ class HandTracker(nn.Module):
             faces: (x, y, B), pixels. identity: number of each face.
             foreground: [H, W], 255 where the image is not background.
             expected: mean and covariance of the hands as a pose filter predicts them, pixels; NaN
-                where it says nothing. Belief is born anew there too.
+                where unknown. Hands are reinitialised there too.
 
         Returns:
             The next state, with the persons of this frame, and their hands.
@@ -178,7 +178,7 @@ class HandTracker(nn.Module):
     def _persons(
         self, state: HandState, faces: Tensor, identity: Tensor
     ) -> tuple[HandState, Tensor]:
-        """Rows for the persons of this frame, and which of them are new."""
+        """Return the state of the persons of this frame, and which of them are new."""
         if not torch.equal(state.identity, identity):
             new = ~torch.isin(identity, state.identity)
             anchors = place_windows(faces)
@@ -188,7 +188,7 @@ class HandTracker(nn.Module):
         return state, state.frames == 0
 
     def _steady(self, state: HandState, faces: Tensor) -> tuple[HandState, Tensor]:
-        """Faces with sizes averaged over time: a hand before a face changes its box, not the head."""
+        """Return the faces with averaged sizes: a hand in front of a face changes its bounding box only."""
         follow = torch.clamp(1 / (state.frames + 1.0), min=self.settings.face_follow * self.rate)
         off = (faces[:, 2] / state.size).log().abs() > math.log(self.settings.face_change)
         follow = torch.where(off, 1.0, follow.clamp(max=1.0))
@@ -206,7 +206,7 @@ class HandTracker(nn.Module):
         )  # fmt: skip
 
     def _follow(self, state: HandState, faces: Tensor) -> HandState:
-        """Return the windows that go with their faces, and belief and images that go with the windows."""
+        """Return the state in windows that follow their faces."""
         s = self.settings
         anchors, moved = follow_faces(state.anchors, faces, s.stray, s.rescale)
         if not bool(moved.any()):
@@ -225,7 +225,7 @@ class HandTracker(nn.Module):
         inside: Tensor,
         foreground: Image | None,
     ) -> tuple[HandState, Tensor, Tensor]:
-        """Means of skin, motion and the unusual in every cell, and the flow."""
+        """Return the next state, the means of the likelihood in every cell, and the optical flow."""
         lab, smooth, head = cut_colours(frame, state.anchors, head_part(COLOURS))
         hands = _hands_near(state.belief) * (state.frames > 0)[:, None, None]
         bins = self.skin.byte_bins(lab)
@@ -251,7 +251,7 @@ class HandTracker(nn.Module):
         return state._replace(skin=learnt, memory=memory, motion=motion), means, flow
 
     def _prior(self, faces: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor]:
-        """Log density [N, 2, r, c] and expected elbow [N, 2, 2, r, c], in B from the anchor."""
+        """Return log density [N, 2, r, c] and expected elbow [N, 2, 2, r, c], in B from the anchor."""
         near = faces_in_window(faces, anchors)
         at, size = near[:, None, None, :2], near[:, 2, None, None, None]
         log_density, elbow = self.prior((cell_centres() - at) / size)
@@ -265,7 +265,7 @@ class HandTracker(nn.Module):
         anchors: Tensor,
         expected: tuple[Tensor, Tensor] | None,
     ) -> Tensor:
-        """Return where a hand may be that was lost: before the face it would be seen to come."""
+        """Return the density from which lost hands are reinitialised, low in front of the face."""
         cost = self.settings.face_rebirth * _before_face(faces, anchors)[:, None]
         born = torch.softmax((log_prior - cost).flatten(2), 2).view_as(log_prior)
         if expected is None:
@@ -328,7 +328,7 @@ class HandTracker(nn.Module):
 
 
 def _before_face(faces: Tensor, anchors: Tensor) -> Tensor:
-    """One in the cells on the face, zero away from it [N, r, c]."""
+    """Return a map that is one on the face and zero away from it [N, r, c]."""
     at = faces_in_window(faces, anchors)
     offset = (cell_centres() - at[:, None, None, :2]) / (at[:, 2:] * at.new_tensor(_FACE))[
         :, None, None

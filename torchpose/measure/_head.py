@@ -1,4 +1,4 @@
-"""Measure head and neck from the face (BL section 5), and remember faces without hands in front."""
+"""Measure head and neck from the face (BL section 5), and detect hands in front of faces."""
 
 from functools import cache
 from typing import NamedTuple
@@ -22,7 +22,7 @@ __all__ = [
 
 
 class FaceOffsets(NamedTuple):
-    """Head and neck below the centre of the face, in sizes B of the face's box.
+    """Holds the offsets of head and neck below the centre of the face, in sizes B of its bounding box.
 
     head = centre + B (0, a) + N(0, B^2 s_a^2),   neck = centre + B (0, b) + N(0, B^2 s_b^2)
 
@@ -36,19 +36,19 @@ class FaceOffsets(NamedTuple):
     neck_std: tuple[float, float]
 
 
-# Silhouettes of eight persons beside their Kinect skeletons put the head joint 0.47 of the way from
-# the crown to the narrowest part of the neck, and the neck joint 0.89 of it further down; faces of
-# three persons put crown and neck at -0.71 and 0.55 B. That gives a = -0.12 and b = 1.01. A webcam
-# close by, which looks up, shortens the neck beside the arms: elbows of such persons come out best at
-# (-0.4, 1.1). The values are between the two; benchmarks/face_offsets.py prints what they cost.
+# Silhouettes of eight persons and their Kinect skeletons put the head joint 0.47 of the way from the
+# crown to the narrowest part of the neck, and the neck joint 0.89 of it further down; faces of three
+# persons put crown and neck at -0.71 and 0.55 B. That gives a = -0.12 and b = 1.01. A near webcam that
+# looks up shortens the neck relative to the arms: the errors of elbows are then least at (-0.4, 1.1).
+# The values are between the two; benchmarks/face_offsets.py prints the errors.
 FACE_OFFSETS = FaceOffsets(-0.2, 1.1, (0.05, 0.08), (0.07, 0.12))
 
 
 class HeadNeck(nn.Module):
-    """Head and neck from the face, with covariances.
+    """Measures head and neck from the face, with covariances.
 
     Args:
-        offsets: of the prior's head and neck from the centre of the box that the detector draws.
+        offsets: of the prior's head and neck from the centre of the detector's bounding box.
 
     Raises:
         InputError: standard deviations that are not positive.
@@ -82,7 +82,7 @@ class HeadNeck(nn.Module):
         """Return the head and neck, in this order, and their covariances, pixels.
 
         Args:
-            faces: centre (x, y) and size B, pixels. face_cov: how well these are known.
+            faces: centre (x, y) and size B, pixels. face_cov: their covariance.
         """
         check_shape("faces", faces, ["N", 3])
         faces = faces.to(self.offset)
@@ -102,8 +102,8 @@ _MODEL, _INNER = (slice(4, 58), slice(2, 70)), (slice(12, 50), slice(10, 62))
 _EYES = (slice(14, 56, 2), slice(18, 56, 2))
 _BLUR = 13  # pixels of the patch: about a third of a face, half a hand
 _LEAST_MATCH = 0.6
-_FIRST = 7  # frames that are averaged plainly
-_HAND = 0.2  # probability of a hand above which little is learnt
+_FIRST = 7  # frames that are averaged with equal weights
+_HAND = 0.2  # probability of a hand above which the average adapts slowly
 # Ellipse of the head, and rectangle of the neck, in B from the face's centre.
 _HEAD_AXES, _HEAD_DOWN, _NECK, _SOFT = (0.575, 0.8), -0.05, (0.42, 0.4, 1.05), 0.06
 _PART_ROWS, _PART_COLUMNS = slice(0, 54), slice(24, 72)  # cells of the window where a head can be
@@ -117,10 +117,10 @@ def head_part(per_cell: int) -> tuple[slice, slice]:
 
 
 class FaceMemoryState(NamedTuple):
-    """Faces of N persons.
+    """Holds the remembered faces of N persons.
 
     Attributes:
-        mean: Lab in bytes, usual look [N, 3, 104, 72]. deviation: usual difference [N, 104, 72].
+        mean: Lab in bytes, averaged [N, 3, 104, 72]. deviation: averaged difference [N, 104, 72].
         frames: seen so far [N].
     """
 
@@ -130,17 +130,17 @@ class FaceMemoryState(NamedTuple):
 
 
 class FaceMemory(nn.Module):
-    """Change of head and neck against what they usually look like.
+    """Computes the change of head and neck against their average appearance.
 
         d = blur |Lab - mean|_1,   change = clip((d - (k s + f + m median_eyes d)) / scale, 0, 1)
 
-    The patch is first laid on the remembered upper half of the face by normalised correlation. Mean
-    and deviation s follow slowly, and more slowly where a hand is believed to be. The median over the
-    eyes takes out what changes the whole face: its motion, the light.
+    The patch is first aligned with the remembered upper half of the face by normalised correlation.
+    Mean and deviation s adapt slowly, and more slowly where a hand is probable. The median over the
+    eyes removes changes of the whole face, such as motion or illumination.
 
     Args:
         deviations: k. floor: f. median: m. scale: of the change; all in steps of Lab in bytes.
-        align: whether to look for the shift. remember: if not, head and neck are always hidden.
+        align: whether to align the patch. remember: if not, head and neck always count as unchanged.
         rate: frames at 30 per second that pass in one step.
     """
 
@@ -184,7 +184,7 @@ class FaceMemory(nn.Module):
         anchors: Float[Tensor, "N 3"],
         hands: Float[Tensor, "N r c"],
     ) -> tuple[FaceMemoryState, Float[Tensor, "N R C"]]:
-        """Compare a frame with the memory, and learn from it.
+        """Compare a frame with the remembered faces, and update these.
 
         Args:
             state: from `init` or the step before.
@@ -193,8 +193,8 @@ class FaceMemory(nn.Module):
             hands: probability that a cell belongs to a hand [N, 80, 96].
 
         Returns:
-            The next state, and how far head and neck hide what is skin, at every pixel of evidence of
-            `head_part` [N, 108, 96]: one on head and neck, zero elsewhere and where they have changed.
+            The next state, and a mask at every pixel of evidence of `head_part` [N, 108, 96]: one on
+            head and neck, zero elsewhere and where they have changed.
         """
         rows, columns = head_part(COLOURS)
         check_shape(
@@ -237,7 +237,7 @@ class FaceMemory(nn.Module):
 
 @cache
 def head_mask() -> Float[Tensor, "104 72"]:
-    """One on head and neck, zero elsewhere, with soft edges, over the patch."""
+    """Return a map over the patch that is one on head and neck and zero elsewhere, with soft edges."""
     x, y = _patch_places().unbind(-1)
     half_x, half_y = _HEAD_AXES
     radius = ((x / half_x).square() + ((y - _HEAD_DOWN) / half_y).square()).sqrt()

@@ -1,4 +1,4 @@
-"""Mean shift in likelihood maps, many windows at once (Burke & Lasenby, section 5.2)."""
+"""Climb likelihood maps by mean shift, many windows at once (Burke & Lasenby, section 5.2)."""
 
 from typing import Literal, NamedTuple
 
@@ -12,18 +12,18 @@ __all__ = ["MeanShift", "mean_shift"]
 
 Kernel = Literal["box", "gaussian"]
 _SIDES_PER_STD = 4.0  # of the Gaussian kernel: its window reaches two deviations to either side
-_LEAST_MASS = 1e-6  # per pixel of the window; below it there is nothing to climb
+_LEAST_MASS = 1e-6  # per pixel of the window; below it the map has no maximum to climb to
 
 
 class MeanShift(NamedTuple):
-    """Where N windows have come to rest.
+    """Holds the result of N mean-shift windows.
 
     Attributes:
         centre: (x, y), pixels [N, 2]. size: width and height of the window, pixels [N, 2].
         mass: likelihood in the window, summed with the kernel's weights [N].
         covariance: second central moments of the likelihood under the kernel, pixels squared
             [N, 2, 2]; zeros where the mass is zero.
-        iterations: steps taken by each window [N]. converged: it came to rest on some mass [N].
+        iterations: steps taken by each window [N]. converged: whether it has converged on some mass [N].
     """
 
     centre: Float[Tensor, "N 2"]
@@ -44,7 +44,7 @@ def mean_shift(
     adapt: float | None = None,
     size_limits: tuple[float, float] = (0.5, 2.0),
 ) -> MeanShift:
-    """Move windows to the nearest maxima of their likelihood maps.
+    """Return windows moved to the nearest maxima of their likelihood maps.
 
         c <- sum_x k(x - c) l(x) x / sum_x k(x - c) l(x)
 
@@ -57,16 +57,16 @@ def mean_shift(
         centre: (x, y) where the windows start, pixels; (0, 0) is the centre of the first pixel.
         size: width and height of the windows, pixels.
         kernel: "box" or "gaussian". max_iterations: at most so many steps.
-        tolerance: a window that moves less has come to rest, pixels.
-        adapt: if given, the size changes with what is in the window, to adapt * sqrt(mass) in the
+        tolerance: a window that moves less has converged, pixels.
+        adapt: if given, the size adapts to the mass in the window, to adapt * sqrt(mass) in the
             geometric mean of its sides (2 in Bradski's paper); the proportions stay.
         size_limits: smallest and largest size, in sizes at the start.
 
     Returns:
-        See `MeanShift`. A window without any mass stays and is not converged.
+        The windows after the last step. A window without mass stays and is not converged.
 
     Raises:
-        ShapeError: wrong shapes. InputError: negative or infinite values, settings without sense.
+        ShapeError: wrong shapes. InputError: negative or infinite values, settings out of range.
 
     Reference:
         G. Bradski (1998), "Computer vision face tracking for use in a perceptual user interface",
@@ -105,7 +105,7 @@ def mean_shift(
 def _moments(
     likelihood: Tensor, centre: Tensor, size: Tensor, kernel: Kernel
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Mass [N], mean [N, 2] and covariance [N, 2, 2] of the maps under their kernels."""
+    """Return mass [N], mean [N, 2] and covariance [N, 2, 2] of the maps under their kernels."""
     height, width = likelihood.shape[1:]
     axes = _axes(max(height, width), centre, size, kernel)
     across, down = axes[:, 0, :, :width], axes[:, 1, :, :height]
@@ -120,7 +120,7 @@ def _moments(
 
 
 def _axes(length: int, centre: Tensor, size: Tensor, kernel: Kernel) -> Tensor:
-    """Kernel times the powers 0 to 2 of the distance to the centre, on both axes [N, 2, 3, length]."""
+    """Return kernels times powers 0 to 2 of the distance to the centre, by axis [N, 2, 3, length]."""
     place = torch.arange(length, dtype=centre.dtype, device=centre.device)
     away, side = place - centre[..., None], size[..., None]
     if kernel == "box":

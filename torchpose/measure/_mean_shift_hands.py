@@ -1,6 +1,6 @@
-"""Hands by skin colour, mean shift and Kalman filters (Burke & Lasenby, section 5.2).
+"""Track hands by skin colour, mean shift and Kalman filters (Burke & Lasenby, section 5.2).
 
-The paper's own recipe, for all persons and both of their hands at once.
+This is the paper's method, for all persons and both of their hands at once.
 """
 
 from typing import Any, Literal, NamedTuple
@@ -28,17 +28,17 @@ _REACH = 4.5  # farthest hand from the face
 _PLAUSIBLE = -4.5  # log density of the prior per squared size of the face
 _VELOCITY = 0.1  # deviation of a new hand's, per frame
 _LEAST_INSIDE = 0.25  # of a window, that must lie in the image
-_HAND_RADIUS = 0.45  # of the disc that teaches no colours
+_HAND_RADIUS = 0.45  # of the disc whose colours are not learnt
 
 
 class MeanShiftHandState(NamedTuple):
-    """Hands of N persons, left and right, pixels of the frame.
+    """Holds the hands of N persons, left and right, pixels of the frame.
 
     Attributes:
-        mean: (x, y) and velocity per frame [N, 2, 4]. cov: [N, 2, 4, 4]; both zero for a hand that is
-            lost.
+        mean: (x, y) and velocity per frame [N, 2, 4]. cov: [N, 2, 4, 4]; both zero for a lost
+            hand.
         tracked: [N, 2]. weak: frames in a row in which the likelihood was too low [N, 2].
-        identity: who the persons are [N]. skin: their colours.
+        identity: number of each person [N]. skin: their colours.
     """
 
     mean: Float[Tensor, "N 2 4"]
@@ -50,7 +50,7 @@ class MeanShiftHandState(NamedTuple):
 
 
 class _Look(NamedTuple):
-    """What N persons' hands look like in a frame; lengths in its pixels."""
+    """Holds what mean shift finds of N persons in a frame; lengths in its pixels."""
 
     skin: SkinState
     centre: Float[Tensor, "N 2 2"]
@@ -60,11 +60,11 @@ class _Look(NamedTuple):
 
 
 class MeanShiftHandTracker(nn.Module):
-    """Follows hands by mean shift in the likelihood of skin.
+    """Tracks hands by mean shift in likelihood maps of skin.
 
     1. Likelihood: the histogram h of the face's colours is averaged over time and back-projected,
-       l(x) = h(c(x)) / max h; face and neck, and what is background, are taken out.
-    2. A hand that is not tracked is looked for in its initialisation area: the person's left hand in
+       l(x) = h(c(x)) / max h; face, neck and background are removed.
+    2. A hand that is not tracked is searched for in its initialisation area: the person's left hand in
        the image to the right of the face, the right hand to the left of it.
     3. A constant-velocity Kalman filter predicts the window from which mean shift starts. The area
        predicted for the other hand is masked.
@@ -77,18 +77,17 @@ class MeanShiftHandTracker(nn.Module):
         threshold: least average likelihood; by default 0.1 for the first kind and 0.25 for the second.
         patience: frames in a row below the threshold after which a hand is lost.
         window: side of the window. mask_radius: of the other hand's predicted area; 0 masks nothing.
-        acceleration: deviation of the Kalman filter's process, per frame and frame.
+        acceleration: deviation of the Kalman filter's process, per frame squared.
         spread: deviation of a found centre, in deviations of the likelihood in the window.
-        skin: by default `SkinModel`. prior: look for lost hands wherever it finds them plausible,
-            the likelier the sooner, instead of in the initialisation areas.
+        skin: by default `SkinModel`. prior: search for lost hands wherever this density is high,
+            weighted by it, instead of in the initialisation areas.
 
-    All lengths are in sizes of the face. Every person is looked for in the frame made so small that
-    the own face has some 19 pixels; persons for whom that is the same image are one batch. Of the
-    others only the heads, which are no hands, and the columns nearer to them, in which no hand of
-    this person begins, play a part.
+    All lengths are in sizes of the face. The frame is scaled down for every person such that the face
+    has about 19 pixels; persons of one scale are one batch. Two things depend on the other persons:
+    their heads are removed, and hands are initialised only in columns nearest to the own face.
 
     Raises:
-        InputError: settings that make no sense.
+        InputError: settings out of range.
 
     Reference:
         Burke & Lasenby, section 5.2. The ratio, the prior and the reach about the face are additions.
@@ -164,11 +163,11 @@ class MeanShiftHandTracker(nn.Module):
         identity: Int[Tensor, " N"],
         foreground: Image | None = None,
     ) -> tuple[MeanShiftHandState, HandMeasurements]:
-        """Return the hands in the next frame.
+        """Return the next state and the hands in the next frame.
 
         Args:
             state: from `init` or the step before. frame: RGB [H, W, 3], uint8.
-            faces: centre (x, y) and size of the faces, pixels. identity: who they are.
+            faces: centre (x, y) and size of the faces, pixels. identity: their numbers.
             foreground: [H, W], 0 where there is background; None is foreground everywhere.
 
         Raises:
@@ -239,7 +238,7 @@ class MeanShiftHandTracker(nn.Module):
     def _without_the_other(
         self, skin: Tensor, predicted: Tensor, tracked: Tensor, faces: Tensor
     ) -> Tensor:
-        """For each hand the likelihood without the area predicted for the other [N, 2, H, W]."""
+        """Return the likelihood of each hand without the area predicted for the other [N, 2, H, W]."""
         other = _squared_distance(predicted, skin.shape[1:]).flip(1)
         masked = other < (self.mask_radius * faces[:, 2]).square()[:, None, None, None]
         masked = masked & tracked.flip(1)[..., None, None]
@@ -250,7 +249,7 @@ class MeanShiftHandTracker(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Return the best window where each hand may begin [N, 2, 2], and whether it is good enough.
 
-        `faces` are those of everybody, and `rows` whose maps these are.
+        `faces` are of all persons, `rows` the persons of the maps.
         """
         height, width = maps.shape[2:]
         side = self.window * faces[rows, 2, None]
@@ -271,7 +270,7 @@ class MeanShiftHandTracker(nn.Module):
         of_all = (torch.arange(shape[1]).to(faces) - x) / size
         across = of_all[rows]
         down = (torch.arange(shape[0]).to(faces) - y[rows]) / size[rows]
-        # everybody has the columns nearest to the own face
+        # a person has the columns that are nearest to the own face
         own = (across.abs() == of_all.abs().amin(0))[:, None, None]
         if self.prior is None:
             halves = torch.stack([across > 0, across < 0], 1)[:, :, None]
@@ -285,7 +284,7 @@ class MeanShiftHandTracker(nn.Module):
         return torch.where(own & (log_density > _PLAUSIBLE), likely, 0.0)
 
     def _noise(self, moments: Tensor, faces: Tensor) -> Tensor:
-        """Covariance of a centre found with these second moments of the likelihood."""
+        """Return the covariance of a centre from the second moments of the likelihood."""
         floor = (0.05 * faces[:, 2]).square()[:, None, None, None] * torch.eye(2).to(faces)
         return self.spread**2 * moments + floor
 
@@ -310,28 +309,28 @@ class MeanShiftHandTracker(nn.Module):
 def _measurements(
     state: MeanShiftHandState, centre: Tensor, noise: Tensor, average: Tensor, seen: Tensor
 ) -> HandMeasurements:
-    """Return where mean shift came to rest, with its covariance and that of the Kalman filter."""
+    """Return the result of mean shift, with the sum of its covariance and the Kalman filter's."""
     points = torch.where(seen[..., None], centre, torch.nan)
     covariance = noise + torch.where(seen[..., None, None], state.cov[..., :2, :2], 0.0)
     return HandMeasurements(points, covariance, average.clamp(0, 1), seen)
 
 
 def _squared_distance(points: Tensor, shape: Any) -> Tensor:
-    """Of every pixel of [H, W] from the points [N, 2, 2], as [N, 2, H, W]."""
+    """Return the squared distance of every pixel from the points [N, 2, 2], as [N, 2, H, W]."""
     x, y = points[..., None, None].unbind(2)
     across = torch.arange(shape[1]).to(points) - x
     return across.square() + (torch.arange(shape[0]).to(points)[:, None] - y).square()
 
 
 def _box_sums(length: int, side: Tensor) -> Tensor:
-    """Matrices [N, length, length] that sum over windows of the given sides [N, 1]."""
+    """Return matrices [N, length, length] that sum over windows of the given sides [N, 1]."""
     place = torch.arange(length).to(side)
     away = (place[:, None] - place).abs()
     return (side[..., None] / 2 + 0.5 - away).clamp(0, 1)
 
 
 def _area_inside(centre: Tensor, size: Tensor, shape: Any) -> Tensor:
-    """Part of each window that lies in the image, pixels, at least a quarter of the window."""
+    """Return the area of each window inside the image, pixels, at least a quarter of the window."""
     last = torch.tensor([shape[1], shape[0]]).to(centre) - 0.5
     low, high = (centre - size / 2).clamp_min(-0.5), torch.minimum(centre + size / 2, last)
     return torch.maximum((high - low).clamp_min(0).prod(-1), _LEAST_INSIDE * size.prod(-1))

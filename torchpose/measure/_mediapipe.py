@@ -1,7 +1,7 @@
-"""MediaPipe as a measuring front end: its face detector, and all landmarks of its pose models.
+"""Detect faces and measure landmarks by MediaPipe.
 
-Both take a model file that the user names, for nothing is downloaded here. `mediapipe` is imported
-only when one of them is made.
+Both take a model file that the user gives; nothing is downloaded. `mediapipe` is imported only when one
+of them is made.
 """
 
 import importlib
@@ -24,12 +24,12 @@ __all__ = ["MediaPipeFaceDetector", "MediaPipePose", "PoseLandmarks"]
 
 
 class _Task:
-    """A task of MediaPipe that is closed when it is no longer needed."""
+    """Closes a task of MediaPipe at the end of a `with` block."""
 
     _task: Any
 
     def close(self) -> None:
-        """Free the model; it cannot be used afterwards."""
+        """Close the model, which cannot be used afterwards."""
         self._task.close()
 
     def __enter__(self) -> Self:
@@ -45,7 +45,7 @@ class _Task:
 
 
 class MediaPipeFaceDetector(_Task):
-    """Faces by a model of MediaPipe's face detector, as boxes of the Haar cascade's kind.
+    """Detects faces by a model of MediaPipe, with bounding boxes like those of the Haar cascade.
 
     MediaPipe's box is smaller than the cascade's, and lower:
         size = 1.15 b,   centre = box's centre - (0, 0.13 b),   b: side of MediaPipe's box.
@@ -54,7 +54,7 @@ class MediaPipeFaceDetector(_Task):
     size varies by 5 %.
 
     Args:
-        model: file of a face detector (.tflite). The short-range model knows faces that fill a good
+        model: file of a face detector (.tflite). The short-range model detects faces that fill a good
             part of what it is shown; in whole frames of 640x480 it misses most that are 80 pixels wide.
         min_confidence: of a detection, 0 to 1.
         tiles: a whole frame is also searched in overlapping squares, this many side by side along its
@@ -98,7 +98,7 @@ class MediaPipeFaceDetector(_Task):
         self.tiles, self.scale, self.raise_by = tiles, scale, raise_by
 
     def __call__(self, image: Image, region: Region | None = None) -> Float[Tensor, "N 3"]:
-        """See `torchpose.measure.FaceDetector`."""
+        """Return the faces of a grey image; see `torchpose.measure.FaceDetector`."""
         check_grey("image", image)
         height, width = image.shape
         if region is None:
@@ -112,7 +112,7 @@ class MediaPipeFaceDetector(_Task):
         return _strongest(faces)
 
     def _search(self, image: Image, left: int, top: int, right: int, bottom: int) -> Tensor:
-        """(x, y, size, confidence) of the faces in a part of the image, [n, 4]."""
+        """Return (x, y, size, confidence) of the faces in a part of the image, [n, 4]."""
         image = image[top:bottom, left:right]
         if image.size == 0:
             return torch.zeros(0, 4, dtype=torch.float64)
@@ -128,7 +128,7 @@ class MediaPipeFaceDetector(_Task):
 
 
 def _squares(width: int, height: int, tiles: int) -> list[tuple[int, int, int, int]]:
-    """Return the squares that cover an image, overlapping by half or more; none if one would be enough."""
+    """Return squares that cover an image and overlap by at least half; none for one tile."""
     if tiles == 1:
         return []
     side = -(-min(width, height) // tiles)
@@ -140,7 +140,7 @@ def _squares(width: int, height: int, tiles: int) -> list[tuple[int, int, int, i
 
 
 def _strongest(faces: Float[Tensor, "n 4"]) -> Float[Tensor, "m 3"]:
-    """Each face once: without those within half the size of a more confident one, or half their own."""
+    """Return the faces without those within half a size of a more confident one."""
     faces = faces[faces[:, 3].argsort(descending=True)]
     size = faces[:, 2]
     near = torch.cdist(faces[:, :2], faces[:, :2]) <= torch.maximum(size, size[:, None]) / 2
@@ -148,12 +148,12 @@ def _strongest(faces: Float[Tensor, "n 4"]) -> Float[Tensor, "m 3"]:
 
 
 class PoseLandmarks(NamedTuple):
-    """Landmarks of the N persons in a frame.
+    """Holds the landmarks of the N persons in a frame.
 
     Attributes:
         points: pixels, [N, 37, 2]: the 33 landmarks and the head, neck and hands that
             `torchpose.skeleton._mediapipe_landmarks.derive_joints` makes of them. Those outside of the
-            image are MediaPipe's guesses, of low visibility.
+            image are extrapolated by MediaPipe and have a low visibility.
         visibility: 0 to 1, [N, 37].
         joints3d: of the 33 landmarks, [N, 33, 3], metres, camera axes, from the middle of the hips:
             MediaPipe's own estimate from a single frame.
@@ -165,13 +165,13 @@ class PoseLandmarks(NamedTuple):
 
 
 class MediaPipePose(_Task):
-    """All joints of one person or several, by a model of MediaPipe's pose landmarker.
+    """Measures the joints of one person or several by a model of MediaPipe's pose landmarker.
 
-    MediaPipe follows people itself, and may list them in another order in the next frame.
+    MediaPipe tracks persons itself, and may return them in another order in the next frame.
 
     Args:
         model: file of a pose landmarker (.task): lite, full or heavy.
-        max_people: most persons that are looked for.
+        max_people: most persons that are detected.
         min_confidence: of a person, 0 to 1.
 
     Attributes:
@@ -214,7 +214,7 @@ class MediaPipePose(_Task):
         self._time, self._stamp = -math.inf, -1
 
     def __call__(self, image: Image, time: float) -> PoseLandmarks:
-        """Return the landmarks of everybody in a frame.
+        """Return the landmarks of all persons in a frame.
 
         Args:
             image: RGB, [H, W, 3], uint8. time: seconds, later than that of the frame before.
@@ -239,7 +239,7 @@ class MediaPipePose(_Task):
         return PoseLandmarks(points, _given(visibility), joints3d)
 
     def of_one(self, found: PoseLandmarks) -> tuple[Tensor, Tensor]:
-        """Keypoints [1, 37, 2] and confidence [1, 37] of the first person, missing if there is none."""
+        """Return keypoints [1, 37, 2] and confidence [1, 37] of the first person, missing without one."""
         if len(found.points):
             return found.points[:1], found.visibility[:1]
         return torch.full((1, len(self.names), 2), torch.nan), torch.zeros(1, len(self.names))

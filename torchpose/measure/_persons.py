@@ -1,4 +1,4 @@
-"""Who is who in a video: faces that leave and come back."""
+"""Number the persons of a video, and recognise those who return."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
@@ -28,7 +28,7 @@ _LEARNING = 0.05
 
 
 class Persons(NamedTuple):
-    """Everybody who was seen so far, P of them.
+    """Holds the P persons seen so far.
 
     Attributes:
         face: identity of the face that each had last [P]. colours: of their clothes [P, 512].
@@ -94,7 +94,7 @@ def _map(function: Callable[..., Tensor], *states: Any) -> Any:
 
 
 def clothes_colours(image: Image, faces: Float[Tensor, "N 3"]) -> Float[Tensor, "N 512"]:
-    """Return the shares of the colours below each face, 8 x 8 x 8 bins of RGB; zero where nothing is seen."""
+    """Return the histogram of the colours below each face, 8 x 8 x 8 bins of RGB; zero without pixels."""
     found = [_histogram(image, face) for face in faces.tolist()]
     return torch.from_numpy(np.stack(found)) if found else torch.zeros(0, _BINS**3).double()
 
@@ -112,16 +112,16 @@ def _histogram(image: Image, face: list[float]) -> np.ndarray:
 
 
 class PersonRegister(nn.Module):
-    """Numbers persons in the order of their coming, and knows them again by their clothes.
+    """Numbers persons in the order of their appearance, and recognises them by their clothes.
 
-    A new face belongs to somebody who left if the colours below it are like theirs,
-    sum_k sqrt(p_k q_k) >= `likeness` (Bhattacharyya), and it comes within `within` frames.
+    A new face is associated with a person who left within `within` frames if the histograms of their
+    clothes are similar, sum_k sqrt(p_k q_k) >= `likeness` (Bhattacharyya).
 
     Args:
-        within: frames after which nobody is expected back. likeness: in [0, 1].
+        within: frames. likeness: in (0, 1].
 
     Raises:
-        InputError: settings that make no sense.
+        InputError: settings out of range.
     """
 
     def __init__(self, within: int = 900, likeness: float = 0.75) -> None:
@@ -146,12 +146,12 @@ class PersonRegister(nn.Module):
         frame: int,
         detected: Bool[Tensor, " N"] | None = None,
     ) -> tuple[Persons, Int[Tensor, " N"]]:
-        """Tell whose faces these are: the state with newcomers, and the number of each face's person.
+        """Return the next state, and the number of the person of each face.
 
         Args:
             image: RGB. faces: (x, y, size), pixels. identity: of the tracked faces. frame: number.
-            detected: False where a face was not found of late and is only followed blindly: what is
-                below it may be the wall. None trusts all.
+            detected: False where a face has not been detected lately and its place is predicted: the
+                clothes below it are not learnt. None means all are detected.
         """
         colours = clothes_colours(image, faces)
         owner = match_rows(persons.face, identity)

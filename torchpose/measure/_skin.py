@@ -1,7 +1,7 @@
-"""Skin in colour images, from a histogram of the face (Burke & Lasenby, section 5.2).
+"""Detect skin in colour images from a histogram of the face (Burke & Lasenby, section 5.2).
 
 The paper back-projects the colours of a detected face. Clothes and walls may have colours of skin, so
-the face is compared with what is not skin: the clothes below it, and what is far from the person.
+the face is compared with the clothes below it and with the image far from the person.
 """
 
 from typing import NamedTuple
@@ -29,7 +29,7 @@ _LARGEST_RATIO = 4.0
 
 
 class SkinState(NamedTuple):
-    """Colours of B persons, exponentially averaged; each sums to one.
+    """Holds the histograms of B persons, exponentially averaged; each sums to one.
 
     Attributes:
         face, clothes, far: [B, 8, 32, 32] over L, a and b. frames: seen so far [B].
@@ -61,19 +61,19 @@ def rgb_to_lab(images: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 H W"]:
 
 
 class SkinModel(nn.Module):
-    """Probability of skin from the colours of the face, the clothes and the background.
+    """Computes the probability of skin from the colours of the face, the clothes and the background.
 
         r(c) = log (p(c | face) + f) / (s p(c | clothes) + (1 - s) p(c | far) + f)
         p(skin | c) = sigmoid(slope (r - bias))
 
-    Every histogram is averaged over time, h <- d h + (1 - d) h_now. Hair and glasses, and hands in
-    front of the face, teach no skin; hands in front of the clothes teach no clothes.
+    Every histogram is averaged over time, h <- d h + (1 - d) h_now. Hair, glasses and hands in front of
+    the face are left out of the face's histogram, hands in front of the clothes out of the clothes'.
 
     Args:
         slope, bias: of the sigmoid. decay: d. floor: f. clothes_share: s.
 
     Raises:
-        InputError: settings that make no sense.
+        InputError: settings out of range.
 
     Reference:
         Burke & Lasenby, section 5.2: histogram of the face and its exponential average. The
@@ -133,12 +133,12 @@ class SkinModel(nn.Module):
         faces: Float[Tensor, "B 3"],
         hands: Float[Tensor, "B H W"] | None = None,
     ) -> tuple[SkinState, Float[Tensor, "B H W"]]:
-        """Learn from a frame, and find the skin in it.
+        """Learn from a frame, and return the probability of skin in it.
 
         Args:
             state: from `init` or the step before. lab: see `rgb_to_lab`.
             faces: centre (x, y) and size of each image's face, pixels.
-            hands: probability that a pixel belongs to a hand, as far as it is known.
+            hands: probability that a pixel belongs to a hand, where known.
 
         Returns:
             The next state, and the probability of skin.
@@ -177,7 +177,7 @@ class SkinModel(nn.Module):
         return (light * BINS[1] + a) * BINS[2] + b
 
     def log_ratio(self, state: SkinState) -> Float[Tensor, "B 8 32 32"]:
-        """r of every colour."""
+        """Return the log ratio r of every colour."""
         share = self.clothes_share
         other = share * state.clothes + (1 - share) * state.far
         return ((state.face + self.floor) / (other + self.floor)).log()
@@ -195,12 +195,12 @@ class SkinModel(nn.Module):
         hands: Float[Tensor, "B H W"] | None = None,
         valid: Bool[Tensor, "B H W"] | None = None,
     ) -> SkinState:
-        """Return what is known after a frame.
+        """Return the state after a frame.
 
         Args:
             state, faces, hands: see `step`. bins: of every pixel, or of every second one; faces are
                 in pixels of this tensor.
-            valid: which pixels belong to the image; the others teach nothing.
+            valid: which pixels belong to the image; the others are left out.
         """
         known = state.frames > 0
         patch, clothes, far = self._parts(bins, faces, hands, valid)
@@ -255,7 +255,7 @@ def _band(size: int, kernel: tuple[float, ...]) -> Tensor:
 
 
 def _labels(faces: Tensor, shape: torch.Size) -> Float[Tensor, "B H W"]:
-    """1 in the middle of the face, 3 on the clothes, 4 far from the person, else 0.
+    """Return 1 in the middle of the face, 3 on the clothes, 4 far from the person, else 0.
 
     All four are rectangles, so the labels are a product of two thin matrices.
     """

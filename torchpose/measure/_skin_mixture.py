@@ -1,6 +1,6 @@
-"""Skin in colour images, from a Gaussian mixture of the face's colours (Burke & Lasenby, section 5.2).
+"""Detect skin in colour images by a Gaussian mixture of the face's colours (Burke & Lasenby, 5.2).
 
-What the paper tried before the histogram: "computationally expensive, and provided little improvement".
+The paper tried it before the histogram: "computationally expensive, and provided little improvement".
 """
 
 from typing import NamedTuple
@@ -17,13 +17,13 @@ from torchpose.measure._skin import FACE_PATCH
 __all__ = ["SkinMixtureModel", "SkinMixtureState"]
 
 _SAMPLES = 16  # across the middle of the face, and down
-_HAND = 0.3  # a pixel that is more likely to be a hand teaches nothing
-_LEAST = 0.3  # share of the patch that has to be left
+_HAND = 0.3  # a pixel that is more probably a hand is not learnt
+_LEAST = 0.3  # least share of the samples that are learnt
 _ROWS, _COLUMNS = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)  # upper triangle of a 3 x 3 matrix
 
 
 class SkinMixtureState(NamedTuple):
-    """Colours of B faces.
+    """Holds the mixtures of B faces.
 
     Attributes:
         weights: [B, K]. means: L, a, b [B, K, 3]. covariances: [B, K, 3, 3].
@@ -39,7 +39,7 @@ class SkinMixtureState(NamedTuple):
 
 
 class SkinMixtureModel(nn.Module):
-    """Probability of skin from a mixture over L, a and b of the face.
+    """Computes the probability of skin from a Gaussian mixture over L, a and b of the face.
 
         p(c) = sum_k pi_k N(c | mu_k, Sigma_k),   p(skin | c) = p(c) / (p(c) + u)
 
@@ -54,7 +54,7 @@ class SkinMixtureModel(nn.Module):
         even: u, density of colours that are not skin.
 
     Raises:
-        InputError: settings that make no sense.
+        InputError: settings out of range.
 
     Reference:
         Burke & Lasenby, section 5.2, and appendix A for EM; O. Cappé, E. Moulines (2009) for
@@ -123,12 +123,12 @@ class SkinMixtureModel(nn.Module):
         faces: Float[Tensor, "B 3"],
         hands: Float[Tensor, "B H W"] | None = None,
     ) -> tuple[SkinMixtureState, Float[Tensor, "B H W"]]:
-        """Learn from a frame, and find the skin in it.
+        """Learn from a frame, and return the probability of skin in it.
 
         Args:
             state: from `init` or the step before. lab: see `rgb_to_lab`.
             faces: centre (x, y) and size of each image's face, pixels.
-            hands: probability that a pixel belongs to a hand, as far as it is known.
+            hands: probability that a pixel belongs to a hand, where known.
 
         Returns:
             The next state, and the probability of skin.
@@ -169,7 +169,7 @@ class SkinMixtureModel(nn.Module):
     def _fit(
         self, state: SkinMixtureState, colours: Tensor, weight: Tensor, due: Tensor
     ) -> SkinMixtureState:
-        """Run a few steps of EM for the faces that are due."""
+        """Return the state after a few steps of EM for the faces that are due."""
         first = (state.frames == 0)[:, None, None]
         features = _features(colours)
         fitted = self._started(state, colours, weight)
@@ -185,7 +185,7 @@ class SkinMixtureModel(nn.Module):
     def _started(
         self, state: SkinMixtureState, colours: Tensor, weight: Tensor
     ) -> SkinMixtureState:
-        """Start the components of new faces at quantiles of the lightness."""
+        """Return the state with components of new faces started at quantiles of the lightness."""
         order = torch.where(weight > 0, colours[..., 0], torch.inf).argsort(1)
         count = weight.sum(1, keepdim=True)
         share = (torch.arange(self.n_components).to(colours) + 0.5) / self.n_components
@@ -199,7 +199,7 @@ class SkinMixtureModel(nn.Module):
         return _where(state.frames == 0, new, state)
 
     def _mixture(self, state: SkinMixtureState, statistics: Tensor) -> SkinMixtureState:
-        """Maximisation step (BL 54-56)."""
+        """Return the mixture of the statistics: the maximisation step (BL 54-56)."""
         count = statistics[..., 0].clamp_min(1e-3)
         means = statistics[..., 1:4] / count[..., None]
         second = torch.zeros_like(state.covariances)
@@ -220,7 +220,7 @@ def _where(rows: Tensor, new: SkinMixtureState, old: SkinMixtureState) -> SkinMi
 
 
 def _features(colours: Tensor) -> Tensor:
-    """(1, c_i, c_i c_j with i <= j), [B, P, 10]."""
+    """Return (1, c_i, c_i c_j with i <= j), [B, P, 10]."""
     squares = colours[..., _ROWS] * colours[..., _COLUMNS]
     return torch.cat([torch.ones_like(colours[..., :1]), colours, squares], -1)
 

@@ -1,4 +1,4 @@
-"""Elbows from the extent of the torso, as in the released tracker of sign language."""
+"""Measure elbows from the outline of the torso, as in the released tracker of sign language."""
 
 from typing import NamedTuple
 
@@ -13,23 +13,23 @@ from torchpose.measure._skin import SkinModel, SkinState
 __all__ = ["TorsoElbows", "clothes_likelihood", "elbows_from_torso"]
 
 # Lengths in sizes of the face, heights from its centre.
-_ROWS = (1.5, 4.2)  # where elbows are looked for
+_ROWS = (1.5, 4.2)  # where elbows are searched for
 _GAP = 0.3  # holes of this width do not end the torso: badges, prints, shadows
 _INSET = 0.2  # from the outline to the joint
 _SUPPORT = 0.15  # height over which the outline has to reach so far
 _SOFT = 0.06  # rows that reach less far by this count a third
 _PLAUSIBLE = (0.9, 2.4)  # how far the outline is from the face's axis at an elbow
-_LARGEST_SPREAD = 0.7  # of the rows: an outline that is straight says nothing about the height
+_LARGEST_SPREAD = 0.7  # of the rows: a straight outline does not determine the height
 _STD = (0.25, 0.4)  # least deviation of an elbow, across and down
 _REACH = 2.6
 _FLOOR, _SLOPE, _BIAS = 2e-4, 1.5, 0.5
 
 
 class TorsoElbows(NamedTuple):
-    """Elbows of N persons: left, right (the person's own), pixels of the map.
+    """Holds the elbows of N persons: left, right (the person's own), pixels of the map.
 
     Attributes:
-        points: (x, y), NaN where there is nothing to say [N, 2, 2].
+        points: (x, y), NaN where unknown [N, 2, 2].
         covariance: pixels squared [N, 2, 2, 2].
         seen: where the outline is plausible [N, 2].
     """
@@ -66,16 +66,16 @@ def elbows_from_torso(
 
         y = sum_r w_r y_r,   w_r ~ exp(x_r / s),   x = max_r x_r - inset,
 
-    with the variance of y_r under w as covariance: an arm that hangs straight down has a vague one.
+    with the variance of y_r under w as covariance, which is large for an arm that hangs straight down.
     An elbow is missing where the outline is nearer or farther than arms are, where it meets the
-    border of the image, and where the rows do not say where it is widest.
+    border of the image, and where the widest row is not distinct.
 
     Args:
         likelihood: of clothes, such as `clothes_likelihood`. faces: centre (x, y) and size, pixels
             of the map. threshold: above it a pixel belongs to the torso.
 
     Returns:
-        See `TorsoElbows`.
+        Elbows with covariances.
 
     Raises:
         ShapeError: wrong shapes. InputError: a face without a size, a threshold outside (0, 1).
@@ -146,7 +146,7 @@ def _supported(far: Float[Tensor, "N S H"], size: Float[Tensor, " N"]) -> Float[
 
 
 def _at_the_end(far: Tensor, searched: Tensor) -> Tensor:
-    """Return whether the torso is widest in the last of the searched rows: the elbow is further down."""
+    """Return whether the torso is widest in the last searched row, so that the elbow is below it."""
     place = torch.arange(far.shape[2], device=far.device)
     last = torch.where(searched, place, -1).amax(2)
     return far.argmax(2) >= last - 1

@@ -1,4 +1,4 @@
-"""From a frame of video to measured head, neck and hands of everybody in it."""
+"""Measure head, neck and hands of all persons in a video, frame by frame."""
 
 import math
 from collections.abc import Mapping
@@ -38,20 +38,20 @@ MEASURED = ("head", "neck", "hand_left", "hand_right")
 _ELBOWS = ("elbow_left", "elbow_right")
 HAND_TRACKERS = ("grid", "mean-shift")
 
-_LARGEST_SIDE = 960  # of the image in which faces are looked for, pixels
+_LARGEST_SIDE = 960  # of the image in which faces are detected, pixels
 _UNSEEN = 1.0  # seconds over which a face that is not detected counts as measured
 _LEVEL = math.sqrt(2.0)
-_MOVES = 0.15  # sizes of the face that a hand moves in a frame
-_TORSO_FACE = 24.0  # size of a face in the image in which elbows are looked for, pixels
+_MOVES = 0.15  # deviation of a hand's motion in a frame, in sizes of the face
+_TORSO_FACE = 24.0  # size of a face in the image in which elbows are measured, pixels
 
 
 class FrameMeasurements(NamedTuple):
-    """What is measured of N persons in a frame; pixels.
+    """Holds the measurements of N persons in a frame; pixels.
 
     Attributes:
-        person: their numbers, in the order of their coming [N].
+        person: their numbers, in the order of appearance [N].
         keypoints: of the measurer's `names` [N, J, 2], NaN where missing. covariance: [N, J, 2, 2].
-        faces: (x, y, size) [N, 3]. hands: what the hand tracker says.
+        faces: (x, y, size) [N, 3]. hands: of the hand tracker.
     """
 
     person: Int[Tensor, " N"]
@@ -62,14 +62,14 @@ class FrameMeasurements(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """Hands, left and right, as a pose filter has them: mean [..., 2, 2] and covariance, pixels."""
+    """Holds the hands, left and right, by a pose filter: mean [..., 2, 2] and covariance, pixels."""
 
     mean: Tensor
     covariance: Tensor
 
 
 class MeasurerState(NamedTuple):
-    """What is known from the frames before: faces, persons, hands, and how many frames those were."""
+    """Holds faces, persons and hands of the frames before, and the number of those frames."""
 
     faces: FaceTracks
     persons: Persons
@@ -78,26 +78,25 @@ class MeasurerState(NamedTuple):
 
 
 class UpperBodyMeasurer(nn.Module):
-    """Measures head, neck and hands of everybody in a video, frame by frame.
+    """Measures head, neck and hands of all persons in a video, frame by frame.
 
-    Faces are found and followed; they give head and neck, tell what colour skin has, and where hands
-    may be.
+    Faces are detected and tracked. They give head and neck, the colours of skin, and the region of the
+    hands.
 
     Args:
-        prior: of poses; says where hands may be.
+        prior: of poses; gives the density of hands relative to the face.
         fps: frames per second.
         hands: "grid" (`HandTracker`) or "mean-shift" (`MeanShiftHandTracker`, the paper's recipe).
-        background: whether to tell the moving foreground from the background, for a camera that
-            stands still.
-        elbows: whether to measure elbows where the torso with its sleeves is widest.
+        background: whether to detect the foreground, for a static camera.
+        elbows: whether to measure elbows, where the torso with its sleeves is widest.
         face_detector: by default Haar's. max_persons: the largest faces are taken.
         head_neck: where head and neck are beside the face.
 
     Raises:
-        InputError: settings that make no sense.
+        InputError: settings out of range.
 
     Reference:
-        Burke & Lasenby, section 5. Several persons are what they leave open.
+        Burke & Lasenby, section 5. Several persons are an addition.
     """
 
     def __init__(
@@ -131,7 +130,7 @@ class UpperBodyMeasurer(nn.Module):
         self.background = BackgroundModel() if background else None
 
     def init(self) -> MeasurerState:
-        """Return the state before the first frame, and let the background model begin anew."""
+        """Return the state before the first frame, and reset the background model."""
         if self.background is not None:
             self.background.reset()
         return MeasurerState(
@@ -139,9 +138,9 @@ class UpperBodyMeasurer(nn.Module):
         )
 
     def follow_faces(self, tracks: FaceTracks, image: Image) -> FaceTracks:
-        """The faces of the next frame, in the pixels of a smaller image where the frame is large.
+        """Return the faces of the next frame, in pixels of a smaller image where the frame is large.
 
-        They depend on nothing else, so this part of `step` may be done ahead, in a thread of its own.
+        They depend on the images alone, so this part of `step` may run ahead in another thread.
         """
         import cv2
 
@@ -159,12 +158,12 @@ class UpperBodyMeasurer(nn.Module):
         tracks: FaceTracks | None = None,
         candidates: Mapping[int, Candidates] | None = None,
     ) -> tuple[MeasurerState, FrameMeasurements]:
-        """Measure the next frame.
+        """Return the next state and the measurements of the next frame.
 
         Args:
             state: from `init` or the step before. image: RGB, uint8 [H, W, 3].
-            tracks: faces of this frame by `follow_faces`, if that was done already.
-            candidates: where a pose filter believes the hands of these persons; only for "grid".
+            tracks: faces of this frame by `follow_faces`, if that has been called already.
+            candidates: hands of these persons by a pose filter; only for "grid".
 
         Raises:
             InputError: another kind of image; candidates for a tracker that takes none.
@@ -197,9 +196,9 @@ class UpperBodyMeasurer(nn.Module):
         return MeasurerState(tracks, persons, hand_state, state.frame + 1), measured
 
     def _elbows(self, image: Image, faces: Tensor, skin: SkinState) -> TorsoElbows:
-        """Return the elbows from the extent of everybody's clothes, in images in which faces have one size.
+        """Return the elbows from the clothes, in images scaled such that faces have one size.
 
-        A person's image depends on that person's face alone.
+        The scale of a person's image depends on that person's face alone.
         """
 
         def measure(scale: float, rows: Tensor) -> TorsoElbows:
@@ -223,7 +222,7 @@ class UpperBodyMeasurer(nn.Module):
         )
 
     def _used(self, tracks: FaceTracks, scale: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Faces that count, in pixels of the frame, with covariances, identities, frames unseen."""
+        """Return the faces in use, pixels of the frame, with covariances, identities, frames unseen."""
         used = self.face_tracker.usable(tracks) & (tracks.unseen <= _UNSEEN * self.fps)
         rows = torch.nonzero(used).flatten()
         if self.max_persons is not None and len(rows) > self.max_persons:
@@ -238,7 +237,7 @@ class UpperBodyMeasurer(nn.Module):
 def _expected(
     candidates: Mapping[int, Candidates], number: Int[Tensor, " N"], size: Float[Tensor, " N"]
 ) -> Candidates:
-    """Candidates of the persons of a frame, NaN without any, widened by what a hand moves in it."""
+    """Return the candidates of the persons of a frame, NaN without any, widened by a hand's motion."""
     nothing = Candidates(torch.full((2, 2), torch.nan), torch.full((2, 2, 2), torch.nan))
     found = [candidates.get(n, nothing) for n in number.tolist()]
     mean = torch.stack([each.mean.to(size) for each in found]) if found else size.new_zeros(0, 2, 2)
@@ -252,9 +251,9 @@ def _where_seen(found: HandMeasurements | TorsoElbows) -> Float[Tensor, "N 2 2"]
 
 
 def rounded_covariance(cov: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:
-    """The same uncertainty in all directions, in steps of a factor sqrt(2) of the deviation.
+    """Return isotropic covariances, their deviations rounded to powers of sqrt(2).
 
-    Filters share their gains between frames whose covariances are equal.
+    Filters share their gains between frames of equal covariances.
     """
     variance = cov.diagonal(dim1=-2, dim2=-1).mean(-1)
     std = _LEVEL ** (0.5 * variance.log() / math.log(_LEVEL)).round()
