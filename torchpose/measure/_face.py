@@ -184,7 +184,7 @@ class FaceTracker(nn.Module):
 
     Example:
         >>> import numpy as np
-        >>> from torchpose.measure import FaceTracker
+        >>> from torchpose.measure._face import FaceTracker
         >>> tracker = FaceTracker()
         >>> tracks = tracker.step(tracker.init(), np.zeros((120, 160), np.uint8))
         >>> len(tracks.mean)

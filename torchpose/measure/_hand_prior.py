@@ -39,7 +39,7 @@ class HandPrior(nn.Module):
 
     Example:
         >>> import torch, torchpose
-        >>> from torchpose.measure import HandPrior
+        >>> from torchpose.measure._hand_prior import HandPrior
         >>> prior = HandPrior.from_prior(torchpose.load_prior("kinect-upper-body"))
         >>> log_density, elbow = prior(torch.tensor([[1.5, 4.0], [-1.5, 4.0]]))
         >>> bool(log_density[0, 0] > log_density[1, 0]) and bool(elbow[0, 0, 0] > 0)

@@ -94,7 +94,8 @@ class HandTracker(nn.Module):
 
     Example:
         >>> import numpy as np, torch, torchpose
-        >>> from torchpose.measure import HandPrior, HandTracker
+        >>> from torchpose.measure import HandTracker
+        >>> from torchpose.measure._hand_prior import HandPrior
         >>> tracker = HandTracker(HandPrior.from_prior(torchpose.load_prior("kinect-upper-body")))
         >>> frame = np.full((120, 160, 3), 90, np.uint8)
         >>> face, number = torch.tensor([[80.0, 30.0, 20.0]]), torch.tensor([0])

@@ -81,8 +81,7 @@ class SkinModel(nn.Module):
 
     Example:
         >>> import torch
-        >>> from torchpose.measure import SkinModel
-        >>> from torchpose.measure._skin import rgb_to_lab
+        >>> from torchpose.measure._skin import SkinModel, rgb_to_lab
         >>> image = torch.zeros(1, 3, 60, 80)
         >>> image[:, :, 10:30, 30:50] = torch.tensor([0.8, 0.6, 0.5])[:, None, None]
         >>> model = SkinModel()
