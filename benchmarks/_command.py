@@ -5,8 +5,6 @@ import sys
 from torchpose.cli import guarded
 from torchpose.cli.protocol import Protocol, build, execute
 
-__all__ = ["PROTOCOLS", "main", "run"]
-
 PROTOCOLS = {
     "ub_people": Protocol(
         "benchmarks.ub_people", "persons whom the prior never saw (kinect_utd_mhad)", "folder"

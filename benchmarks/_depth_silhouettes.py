@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.silhouette.tables import PARTS
+from benchmarks.bodies.tracking import PARTS
 from torchpose._core.files import atomic_path, check_output_folder
 from torchpose.body import BODY_15, Body, body_joints
 from torchpose.camera import CameraRig, PinholeCamera

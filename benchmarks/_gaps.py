@@ -11,23 +11,21 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose.camera import PinholeCamera
+from benchmarks._upper_body import plain_prior
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import (
+    CAMERA,
     MEASURED,
     Estimate,
     Trials,
     add_picture,
     make_test_set,
-    plain_prior,
     track,
 )
 from torchpose.metrics import align, coverage, joint_errors_3d
 from torchpose.priors import UpperBodyPrior
 from torchpose.skeleton import LEFT_ARM, RIGHT_ARM
 from torchpose.skeleton._upper_body import OTHER_SIDE
-
-__all__ = ["add_gap_tables", "back_and_forth"]
 
 GAPS = (1.0, 2.0, 5.0)
 _START, _DURATION = 1.5, 8.0
@@ -51,7 +49,6 @@ def add_gap_tables(
     report: Report,
     out: Path,
     prior: UpperBodyPrior,
-    camera: PinholeCamera,
     poses: Sequence[Float[Tensor, "T 8 3"]],
     fps: float,
     seed: int,
@@ -65,13 +62,13 @@ def add_gap_tables(
     poses and speeds real); the gap begins after 1.5 s.
 
     Args:
-        report: to add to. out: folder of the picture. prior: of the tracker. camera: of the test.
+        report: to add to. out: folder of the picture. prior: of the tracker.
         poses: test sequences, of which `n_sequences` are used, evenly spaced. fps: frame rate.
         seed: of the noise. progress: whether to show bars. quick: only the shortest gap.
     """
     chosen = torch.linspace(0, len(poses) - 1, min(n_sequences, len(poses))).round().long().tolist()
     wanted = round(_DURATION * fps)
-    test = make_test_set([poses[i][back_and_forth(len(poses[i]), wanted)] for i in chosen], camera,
+    test = make_test_set([poses[i][back_and_forth(len(poses[i]), wanted)] for i in chosen], CAMERA,
                          fps, seed)  # fmt: skip
     table = report.table(
         "gaps",
@@ -103,13 +100,13 @@ def add_gap_tables(
     runs = _models(prior)
     bar = tqdm(total=len(runs) * (1 + 2 * len(lengths)), disable=not progress, desc="gaps")
     for name, (own, options) in runs.items():
-        whole = {frame: track(own, camera, test, frame=frame, **options)
+        whole = {frame: track(own, CAMERA, test, frame=frame, **options)
                  for frame in ("camera", "body")}  # fmt: skip
         bar.update()
         for seconds in lengths:
             parts = []
             for side in _ARMS:
-                parts.append(_one_gap(own, camera, test, whole, side, seconds, options))
+                parts.append(_one_gap(own, test, whole, side, seconds, options))
                 bar.update()
             rows = torch.stack([torch.tensor(values) for values, _, _ in parts])
             table.add(f"{name}, {seconds:g} s", rows.mean(0).tolist())
@@ -138,7 +135,6 @@ def _models(prior: UpperBodyPrior) -> dict[str, tuple[UpperBodyPrior, dict[str, 
 
 def _one_gap(
     prior: UpperBodyPrior,
-    camera: PinholeCamera,
     test: Trials,
     whole: dict[str, Estimate],
     side: str,
@@ -150,7 +146,7 @@ def _one_gap(
     last = first + round(seconds * test.fps)
     mask = torch.ones(test.keypoints.shape[:3], dtype=torch.bool)
     mask[:, first:last, MEASURED.index(f"hand_{side}")] = False
-    hidden = {frame: track(prior, camera, test, mask, frame=frame, **options) for frame in whole}
+    hidden = {frame: track(prior, CAMERA, test, mask, frame=frame, **options) for frame in whole}
     arm = list(_ARMS[side])
     other = list(_ARMS["right" if side == "left" else "left"][:3])
     estimate = hidden["camera"]

@@ -11,22 +11,14 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._upper_body import data_folder, score, trials_of
 from torchpose._core.files import atomic_path
-from torchpose.camera import PinholeCamera, ViewRange
-from torchpose.evaluation.common import (
-    MEASURED,
-    Estimate,
-    Trials,
-    centred_on_neck,
-    data_folder,
-    make_test_set,
-    score,
-    settings_hash,
-)
+from torchpose.camera import ViewRange
+from torchpose.evaluation.common import CAMERA, MEASURED, Estimate, Trials, settings_hash
 from torchpose.filters import MixtureKalmanFilter
 from torchpose.io import Recording, read_recordings
-from torchpose.learning import TRAINING_VIEWS
-from torchpose.learning._recipes import VERSION, UpperBodyRecipe
+from torchpose.learning import TRAINING_VIEWS, UpperBodyRecipe
+from torchpose.learning._recipes import VERSION
 from torchpose.priors import GaussianMixture, UpperBodyPrior
 from torchpose.priors._window import WindowLayout, WindowPrior
 from torchpose.skeleton._upper_body import ARM_JOINTS
@@ -34,7 +26,6 @@ from torchpose.upper_body import UpperBodyTracker
 from torchpose.upper_body._measurements import pixel_indices
 from torchpose.upper_body._methods import process_cov
 
-CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 FIT_PERSONS, SCORED_PERSONS = ("s1", "s2", "s4", "s5"), ("s3", "s6")
 MODES: dict[str, dict[str, Any]] = {"causal": {}, "full": {"smoothing": "full"}}
 SAMPLES = 120_000
@@ -108,8 +99,7 @@ def read_persons(data: Path, size: Size) -> Persons:
     folder = data_folder(data, "kinect_utd_mhad")
     recordings = read_recordings(_files(folder, FIT_PERSONS)[:: size.thin_fit])
     held_out = read_recordings(_files(folder, SCORED_PERSONS)[:: size.thin_scored])
-    poses = [centred_on_neck(r.upper_body().joints) for r in held_out]
-    test = make_test_set(poses, CAMERA, held_out[0].fps or 30.0)
+    test = trials_of(held_out)
     digest = settings_hash([r.joints for r in recordings + held_out])
     return Persons(recordings, test, digest)
 
@@ -291,8 +281,7 @@ def learn_noise(prior: UpperBodyPrior, recordings: list[Recording], size: Size, 
         What was gained.
     """
     step = max(1, len(recordings) // size.noise_sequences)
-    poses = [centred_on_neck(r.upper_body().joints) for r in recordings[::step]]
-    test = make_test_set(poses, CAMERA, recordings[0].fps or 30.0, seed + 1)
+    test = trials_of(recordings[::step], seed + 1)
     rows = [ARM_JOINTS.index(joint) for joint in JOINTS]
     std = prior.noise["measurement_std"]
     log_process = process_cov(prior, "left", "mkf-fixed").log().requires_grad_()

@@ -9,15 +9,13 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from torchpose.evaluation import Report
-from torchpose.evaluation.common import HANDS, Scores, Trials, add_picture
-from torchpose.evaluation.people_tables import SHORT_NAMES
-from torchpose.evaluation.report import Table
+from benchmarks._upper_body import Scores
+from torchpose.evaluation import Report, Table
+from torchpose.evaluation.common import HANDS, Trials, add_picture
+from torchpose.evaluation.person_tables import SHORT_NAMES
 from torchpose.metrics import jitter
 from torchpose.metrics._poses import share_below
 from torchpose.priors import UpperBodyPrior
-
-__all__ = ["SAMPLED", "SUMMARY", "add_findings", "add_pictures", "add_tables", "fill_summary"]
 
 SUMMARY = (
     "2D error (px)", "3D error (cm)", "jitter (m/s2)", "arm raised (cm)", "iteration (ms)",

@@ -11,36 +11,31 @@ a run that was stopped goes on.
 """
 
 import argparse
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from tqdm.auto import tqdm
 
+from benchmarks._upper_body import (
+    MADE_WITH,
+    Subject,
+    projected_training_poses,
+    score,
+    trials_of,
+)
+from benchmarks.engine import Experiment, Grid
 from benchmarks.ub_one import split_recording
 from benchmarks.ub_people import mean_pose, people
 from torchpose._core.files import check_output_folder
-from torchpose.camera import PinholeCamera
 from torchpose.evaluation import Report
-from torchpose.evaluation.common import (
-    MEASURED,
-    Estimate,
-    Trials,
-    cached_prior,
-    centred_on_neck,
-    make_test_set,
-    projected_training_poses,
-    score,
-    settings_hash,
-)
-from torchpose.evaluation.kept_runs import keep, read_kept
+from torchpose.evaluation.common import CAMERA, MEASURED, Estimate, Trials, cached_prior
 from torchpose.io import Recording
-from torchpose.learning._recipes import fit_kinect_prior
-from torchpose.priors import UpperBodyPrior
+from torchpose.learning import fit_kinect_prior
 from torchpose.upper_body import METHODS, UpperBodyTracker, method_options
 
-CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 RECIPES: dict[str, dict[str, Any]] = {
     "kinect-upper-body": {"n_components": 30},
     "kinect-upper-body-small": {"n_components": 10, "window_components": 48},
@@ -57,42 +52,47 @@ class Run(NamedTuple):
     effective_sample_size: Tensor
 
 
-def run_method(prior: UpperBodyPrior, test: Trials, method: str, arguments: Any) -> Run:
-    """Track a test set, or read what the same call gave before."""
-    facts = [method, test.keypoints, prior.left.means, *prior.noise.values(), arguments.particles]
-    path = arguments.out / f"{method}-{settings_hash(facts)}.npz"
-    found = read_kept(path, Run, Run._fields)
-    if found is None:
-        drawn = "n_particles" in method_options(method)
-        particles = {"n_particles": arguments.particles} if drawn else {}
-        tracker = UpperBodyTracker(
-            prior, CAMERA, method, fps=test.fps, neck=prior.info.neck, max_gap=None, **particles
-        )
-        generator = [torch.Generator().manual_seed(b) for b in range(len(test.lengths))]
+class Tracker(NamedTuple):
+    """A method, and the particles that it has if it draws any."""
+
+    method: str
+    particles: int
+
+
+def track(subject: Subject, tracker: Tracker, seeds: Sequence[int]) -> list[Run]:
+    """Track a test set once for every seed, each sequence with random numbers of its own."""
+    prior, test = subject
+    drawn = "n_particles" in method_options(tracker.method)
+    particles = {"n_particles": tracker.particles} if drawn else {}
+    model = UpperBodyTracker(
+        prior, CAMERA, tracker.method, fps=test.fps, neck=prior.info.neck, max_gap=None, **particles
+    )
+    n, found = len(test.lengths), []
+    for seed in seeds:
+        generator = [torch.Generator().manual_seed(seed * n + b) for b in range(n)]
         with torch.inference_mode():
-            track = tracker(
-                test.keypoints, names=MEASURED, lengths=test.lengths, generator=generator,
-                progress=arguments.progress,
-            )  # fmt: skip
-        found = Run(*(getattr(track, name) for name in Run._fields))
-        keep(path, found)
-    run: Run = found
-    return run
+            poses = model(test.keypoints, names=MEASURED, lengths=test.lengths, generator=generator)
+        found.append(Run(*(getattr(poses, name) for name in Run._fields)))
+    return found
+
+
+TRACKING = Experiment(
+    Run, track, lambda subject, tracker: [*tracker, *subject.facts()],
+    (*MADE_WITH, "benchmarks/all_trackers.py"),
+)  # fmt: skip
 
 
 def ub_people(arguments: argparse.Namespace) -> tuple[list[Recording], Trials]:
-    """Training recordings and test set: some sequences of persons never seen."""
+    """Return training recordings and test set: some sequences of persons never seen."""
     train, tested = people(arguments.data)
     tested = tested[:: arguments.every]
-    poses = [centred_on_neck(r.upper_body().joints) for r in tested]
-    return train, make_test_set(poses, CAMERA, tested[0].fps or 30.0)
+    return train, trials_of(tested)
 
 
 def ub_one(arguments: argparse.Namespace) -> tuple[list[Recording], Trials]:
-    """The first part of the authors' own recording, and frames of the rest."""
+    """Return the first part of the authors' own recording, and frames of the rest."""
     first, rest = split_recording(arguments.data)
-    pose = centred_on_neck(rest.upper_body().joints)[: arguments.frames or None]
-    return [first], make_test_set([pose], CAMERA, rest.fps or 30.0)
+    return [first], trials_of([replace(rest, joints=rest.joints[: arguments.frames or None])])
 
 
 PROTOCOLS = {"UB-people": ub_people, "UB-one": ub_one}
@@ -101,7 +101,7 @@ PROTOCOLS = {"UB-people": ub_people, "UB-one": ub_one}
 def compare(
     name: str, recordings: list[Recording], test: Trials, report: Report, arguments: Any
 ) -> None:
-    """A table for each recipe: error, coverage and sample size of every method."""
+    """Add a table for each recipe: error, coverage and sample size of every method."""
     still = mean_pose(test, *projected_training_poses(recordings, CAMERA, 20_000))
     for recipe in arguments.recipes:
         settings = RECIPES[recipe]
@@ -125,11 +125,15 @@ def compare(
              "lost frames"],
             digits=(2, 1, 0, 0, 1, 0, 0),
         )  # fmt: skip
-        bar = tqdm(METHODS, disable=not arguments.progress, desc=f"{name} {recipe}")
-        for method in bar:
-            bar.set_postfix_str(method)
-            if method != WINDOWS or prior.windows:
-                table.add(method, row(run_method(prior, test, method, arguments), test))
+        methods = [m for m in METHODS if m != WINDOWS or prior.windows]
+        grid = Grid(
+            {name: Subject(prior, test)}, {m: Tracker(m, arguments.particles) for m in methods}
+        )
+        runs = TRACKING.run(
+            {recipe: grid}, (0,), arguments.out, progress=arguments.progress, title=name
+        )
+        for (method,), own in runs.by("method").items():
+            table.add(method, row(own.runs[0], test))
         found = score(still, test)
         nothing = [None] * 5
         table.add(
@@ -140,7 +144,7 @@ def compare(
 
 
 def row(run: Run, test: Trials) -> list[float | None]:
-    """The numbers of a method."""
+    """Return the numbers of a method."""
     found = score(Estimate(*run[:3]), test)
     if found.coverage is None:
         raise RuntimeError("a track has covariances")

@@ -8,35 +8,41 @@ the true place. Errors are distances of joints.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from tqdm.auto import tqdm
 
-from benchmarks.silhouette.data import Split, take_frames
-from benchmarks.silhouette.protocol import image_size
-from benchmarks.silhouette.runs import (
+from benchmarks.bodies.clips import Split, take_frames
+from benchmarks.bodies.tracking import (
+    MADE_WITH,
     Run,
-    Runs,
+    csv_columns,
     generators_of,
-    sequence_name,
+    part_error,
+    subject_facts,
     track_view,
     view_errors,
 )
-from benchmarks.silhouette.tables import mean_of, part_errors, pooled_std, write_csv
-from benchmarks.silhouette.trackees import Conditions, Tracked, View, body_of, view_of
+from benchmarks.bodies.views import (
+    Conditions,
+    Subject,
+    Tracked,
+    body_of,
+    image_size,
+    subjects_of,
+    view_of,
+)
+from benchmarks.engine import Experiment, Grid, Results, Row, mean, pivot, spread, write_csv
 from torchpose._core.files import check_output_folder
-from torchpose.body import Body, fit_state
+from torchpose.body import fit_state
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
 from torchpose.io._mocap import MocapClip, read_mocap, select_persons
 from torchpose.priors import load_action, load_limb_conditionals, load_manifold
 from torchpose.priors._shipped import persons_of_model, refuse_seen
 from torchpose.whole_body import METHODS, BodyTracker
-
-__all__ = ["MEAN_POSE", "STILL", "run"]
 
 STILL, MEAN_POSE = "standing still", "mean pose at the true place"
 
@@ -69,6 +75,8 @@ def run(
     size: str = "160x120",
 ) -> Report:
     """Run the protocol; writes report.json, report.md and runs.csv to `out`.
+
+    Runs are kept in `out`, one file each, so that a killed run goes on where it stopped.
 
     Args:
         data: folder or file of motion capture. out: folder for the results.
@@ -107,8 +115,12 @@ def run(
         for person in chosen.values()
         for own in _by_action(person).values()
     ]
-    numbers = list(range(seed, seed + seeds))
-    runs = _run_all(tracked, models, fps, particles, numbers, progress)
+    subjects = subjects_of(tracked)
+    filters = {name: _Filter(name, models.get(name), fps, particles) for name in (*_PLAIN, *models)}
+    runs = _blind(subjects, seed) + _TRACKING.run(
+        {"": Grid(subjects, filters)}, range(seed, seed + seeds), out, progress=progress,
+        title="tracking",
+    )  # fmt: skip
     names = {"manifold": manifold, "conditionals": conditionals, "action": action}
     report = Report("Body models: persons whom they do not know", {
         "quick": quick, "seed": seed, "seeds": seeds, "persons": list(chosen),
@@ -117,8 +129,8 @@ def run(
         "frames": frames, "fps": fps, "particles": particles, "cameras used": cameras_used,
         "faults": faults, "size": size, "initial pose": "given",
     })  # fmt: skip
-    _add_errors(report, runs, tracked)
-    write_csv(out / "runs.csv", runs, fps, seed)
+    _add_errors(report, runs)
+    write_csv(out / "runs.csv", runs, csv_columns(fps))
     report.save(out)
     return report
 
@@ -189,50 +201,55 @@ def _prepare(
 # --- runs -----------------------------------------------------------------------------------------
 
 
-def _run_all(
-    tracked: Sequence[Tracked], models: Mapping[str, Any], fps: float, particles: int,
-    seeds: Sequence[int], progress: bool,
-) -> Runs:  # fmt: skip
-    methods = [*_PLAIN, *models]
-    runs: Runs = {name: {} for name in (STILL, MEAN_POSE, *methods)}
-    total = sum(len(view.clip) for t in tracked for view in t.tests) * len(methods) * len(seeds)
-    with tqdm(total=total, disable=not progress, unit="frame", desc="tracking") as bar:
-        for one in tracked:
-            for view in one.tests:
-                name = f"{sequence_name(one, view)}"
-                still, mean = _blind(one, view)
-                runs[STILL][name], runs[MEAN_POSE][name] = [still], [mean]
-                for method in methods:
-                    found = _tracked(one, view, method, models, fps, particles, seeds)
-                    runs[method][name] = found
-                    bar.update(len(seeds) * len(view.clip))
-    return runs
+class _Filter(NamedTuple):
+    """A method of `torchpose track-body`, with the model that it needs or None."""
+
+    method: str
+    model: Any
+    fps: float
+    particles: int
 
 
-def _tracked(
-    one: Tracked, view: View, method: str, models: Mapping[str, Any], fps: float, particles: int,
-    seeds: Sequence[int],
-) -> list[Run]:  # fmt: skip
-    needs = METHODS[method].needs
-    learnt = {} if needs is None else {needs: models[method]}
-    tracker = BodyTracker(view.rig, method, body=one.body, n_particles=particles, fps=fps, **learnt)
+def _track(subject: Subject[Tracked], how: _Filter, seeds: Sequence[int]) -> list[Run]:
+    view, needs = subject.view, METHODS[how.method].needs
+    learnt = {} if needs is None else {needs: how.model}
+    tracker = BodyTracker(
+        view.rig, how.method, body=subject.body, n_particles=how.particles, fps=how.fps, **learnt
+    )
     start = fit_state(tracker.body, view.clip.joints[:1]).expand(len(seeds), -1)
     return track_view(tracker.filter, tracker.body, view, start, generators_of(seeds))
 
 
-def _blind(one: Tracked, view: View) -> tuple[Run, Run]:
-    """The first pose held, and the mean pose of the person's other recordings at the true root."""
-    body = one.body
-    truth = fit_state(body, view.clip.joints)
-    still = truth[:1].expand_as(truth)
-    others = fit_state(body, torch.cat([clip.joints for clip in one.split.body]))
-    mean = body.with_relative(truth, body.relative(others).mean(0))
-    return _as_run(body, view, still), _as_run(body, view, mean)
+def _facts(subject: Subject[Tracked], how: _Filter) -> list[Any]:
+    model = [] if how.model is None else list(how.model.state_dict().values())
+    return [how.method, how.fps, how.particles, *subject_facts(subject), *model]
 
 
-def _as_run(body: Body, view: View, states: Float[Tensor, "T D"]) -> Run:
+_TRACKING = Experiment(
+    Run, _track, _facts, (*MADE_WITH, "benchmarks/body_models.py"),
+    lambda subject, how: len(subject.view.clip), "frame",
+)  # fmt: skip
+
+
+def _blind(subjects: Mapping[str, Subject[Tracked]], seed: int) -> Results:
+    """Return estimates that do not look: the first pose held, and the mean pose at the true root.
+
+    The mean is that of the person's other recordings.
+    """
+    rows = []
+    for name, subject in subjects.items():
+        body, split = subject.body, subject.person.split
+        truth = fit_state(body, subject.view.clip.joints)
+        others = fit_state(body, torch.cat([clip.joints for clip in split.body]))
+        mean_pose = body.with_relative(truth, body.relative(others).mean(0))
+        for method, states in ((STILL, truth[:1].expand_as(truth)), (MEAN_POSE, mean_pose)):
+            rows.append(Row("", name, method, seed, _as_run(subject, states)))
+    return Results(tuple(rows))
+
+
+def _as_run(subject: Subject[Tracked], states: Float[Tensor, "T D"]) -> Run:
     never = torch.zeros(len(states), dtype=torch.bool)
-    errors = view_errors(body, view, states).float()
+    errors = view_errors(subject.body, subject.view, states).float()
     zero = torch.zeros(1, dtype=torch.float64)
     return Run(errors, states.float(), torch.zeros_like(states).float(), never, never, zero)
 
@@ -240,25 +257,18 @@ def _as_run(body: Body, view: View, states: Float[Tensor, "T D"]) -> Run:
 # --- tables ---------------------------------------------------------------------------------------
 
 
-def _add_errors(report: Report, runs: Runs, tracked: Sequence[Tracked]) -> None:
-    """Mean errors of every tracker, by part of the body and by person."""
-    parts = {"whole body": "", "torso": "torso", "legs": "legs", "arms": "arms"}
-    table = report.table(
-        "errors", "Error (mm) of the joints, mean over joints, frames, sequences and runs",
-        ["whole body", "± runs", "torso", "legs", "arms"],
+def _add_errors(report: Report, runs: Results) -> None:
+    """Add mean errors of every tracker, by part of the body and by sequence."""
+    parts = {part: mean(part_error(part)) for part in ("torso", "legs", "arms")}
+    pivot(
+        report, "errors", "Error (mm) of the joints, mean over joints, frames, sequences and runs",
+        runs, ["method"], {"whole body": mean(part_error()), "± runs": spread(part_error()), **parts},
         note="± runs: standard deviation over runs, pooled over sequences.",
     )  # fmt: skip
-    for method in runs:
-        values = {name: part_errors(runs, method, part) for name, part in parts.items()}
-        whole = values["whole body"]
-        spread = float(pooled_std(whole)) if whole.shape[1] > 1 else float("nan")
-        means = [float(mean_of(errors)) for errors in values.values()]
-        table.add(method, [means[0], spread, *means[1:]])
-    by_person = report.table(
-        "sequences", "Error (mm) of the joints by sequence", list(runs),
+    pivot(
+        report, "sequences", "Error (mm) of the joints by sequence", runs, ["subject"],
+        {"{}": mean(part_error())}, columns="method",
     )  # fmt: skip
-    for i, name in enumerate(next(iter(runs.values()))):
-        by_person.add(name, [float(part_errors(runs, method)[i].mean()) for method in runs])
 
 
 if __name__ == "__main__":

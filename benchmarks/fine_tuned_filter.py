@@ -19,21 +19,13 @@ from statistics import fmean, stdev
 import torch
 from tqdm.auto import tqdm
 
-from benchmarks._levers import CAMERA
+from benchmarks._upper_body import data_folder, plain_prior, score
 from benchmarks.speed._timing import machine_line, markdown_table
 from torchpose._core.files import atomic_path, check_output_folder
-from torchpose.evaluation.common import (
-    Trials,
-    centred_on_neck,
-    data_folder,
-    make_test_set,
-    plain_prior,
-    score,
-    track,
-)
+from torchpose.evaluation.common import CAMERA, Trials, centred_on_neck, make_test_set, track
 from torchpose.io import Recording, read_recordings
+from torchpose.learning import UpperBodyRecipe
 from torchpose.learning._fine_tuning import TunableKalman, draw_sequences, parameter_groups
-from torchpose.learning._recipes import UpperBodyRecipe
 from torchpose.priors import UpperBodyPrior
 
 SPLITS = {"A": ("s3", "s6"), "B": ("s2", "s4"), "C": ("s1", "s5")}

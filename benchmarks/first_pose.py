@@ -15,10 +15,11 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks.bodies.clips import split_clips
+from benchmarks.bodies.views import Conditions
 from benchmarks.real_silhouettes import HEIGHT, four_views
-from benchmarks.silhouette.data import split_clips
+from benchmarks.silhouette.filters import prepare
 from benchmarks.silhouette.protocol import FPS, WALKERS
-from benchmarks.silhouette.trackees import Conditions, prepare
 from torchpose.body import BODY_15, Body, fit_state
 from torchpose.camera import CameraRig
 from torchpose.io._mocap import read_mocap

@@ -16,14 +16,14 @@ from pathlib import Path
 
 import torch
 
+from benchmarks._upper_body import score
 from benchmarks.ub_people import TEST_PERSONS, people, sway
 from torchpose.camera import PinholeCamera
 from torchpose.errors import OverlapError
-from torchpose.evaluation.common import Trials, centred_on_neck, make_test_set, score, track
+from torchpose.evaluation.common import CAMERA, Trials, centred_on_neck, make_test_set, track
 from torchpose.priors import UpperBodyPrior, load_prior
 
-FOCAL, CENTRE = 525.0, (319.5, 239.5)
-TRUE = PinholeCamera(FOCAL, FOCAL, *CENTRE, 640, 480)
+FOCAL, CENTRE = 525.0, (319.5, 239.5)  # of the test camera
 FACTORS = (0.7, 0.85, 1.0, 1.2, 1.4)
 TRACKERS = {
     "as it comes": {},
@@ -49,9 +49,9 @@ def main() -> None:
     _, tested = people(args.data, args.quick)
     poses = [centred_on_neck(recording.upper_body().joints) for recording in tested]
     fps = tested[0].fps or 30.0
-    still = make_test_set(poses, TRUE, fps)
+    still = make_test_set(poses, CAMERA, fps)
     paths = [sway(len(p), fps, i / len(poses)) for i, p in enumerate(poses)]
-    moving = make_test_set(poses, TRUE, fps, paths=paths)
+    moving = make_test_set(poses, CAMERA, fps, paths=paths)
     lines = [f"| {' | '.join(HEADER)} |", f"|{' --- |' * len(HEADER)}"]
     trackers = dict(list(TRACKERS.items())[: 1 if args.quick else None])
     for name, options in trackers.items():
@@ -68,7 +68,8 @@ def errors(
     prior: UpperBodyPrior, still: Trials, moving: Trials, factor: float, options: dict[str, object]
 ) -> list[str]:
     """Mean 3D error of both tests after fixed-scale Procrustes, and mean pixel error of the first."""
-    camera = PinholeCamera(factor * FOCAL, factor * FOCAL, *CENTRE, 640, 480)
+    focal = factor * FOCAL
+    camera = PinholeCamera(focal, focal, *CENTRE, 640, 480)
     first, second = (score(track(prior, camera, test, **options), test) for test in (still, moving))
     means = (100 * first.errors3d.nanmean(), 100 * second.errors3d.nanmean())
     return [f"{float(value):.2f}" for value in (*means, first.errors2d.nanmean())]

@@ -24,13 +24,12 @@ from torch import Tensor
 
 from benchmarks._humaneva_joints import SHOULDER_OFFSETS, joint_centres
 from torchpose._core.reading import read_text, reading, require_file
-from torchpose.body._skeleton import body_joints
-from torchpose.camera._pinhole import PinholeCamera
-from torchpose.camera._rig import CameraRig
+from torchpose.body import body_joints
+from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.errors import FileFormatError, InputError, MissingDependencyError
 from torchpose.io._formats.mocap_files import read_c3d_points
 from torchpose.io._mocap import MocapClip
-from torchpose.skeleton._joint_sets import SKELETONS
+from torchpose.skeleton import SKELETONS
 
 __all__ = [
     "PARTITIONS",

@@ -14,17 +14,10 @@ from typing import Any
 
 import torch
 
+from benchmarks._upper_body import plain_prior, score, trials_of
 from benchmarks.ub_people import people
-from torchpose.camera import PinholeCamera
-from torchpose.evaluation.common import (
-    Trials,
-    centred_on_neck,
-    make_test_set,
-    plain_prior,
-    score,
-    track,
-)
-from torchpose.learning._recipes import UpperBodyRecipe
+from torchpose.evaluation.common import CAMERA, Trials, track
+from torchpose.learning import UpperBodyRecipe
 from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import METHODS, PoseFilter, method_options
 
@@ -32,7 +25,6 @@ FACTORS = {
     name: method.noise.factor for name, method in METHODS.items() if isinstance(method, PoseFilter)
 }
 SEEN, TRIED = ("s1", "s2", "s3", "s4"), ("s5", "s6")
-CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 
 
 def main() -> None:
@@ -48,8 +40,7 @@ def main() -> None:
     recipe = UpperBodyRecipe(window_components=0, calibration_folds=0)
     prior = recipe.fit([r for r in train if r.person in SEEN])
     tried = [r for r in train if r.person in TRIED][:: arguments.every]
-    poses = [centred_on_neck(r.upper_body().joints) for r in tried]
-    test = make_test_set(poses, CAMERA, tried[0].fps or 30.0)
+    test = trials_of(tried)
     print(f"{len(test.lengths)} sequences, {int(test.lengths.sum())} frames")
     for method in arguments.methods:
         particles = (

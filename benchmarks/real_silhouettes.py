@@ -35,8 +35,8 @@ from benchmarks._depth_silhouettes import (
     part_means,
     seeded,
 )
-from benchmarks.silhouette.tables import PARTS
-from benchmarks.silhouette.trackees import METHODS
+from benchmarks.bodies.tracking import PARTS
+from benchmarks.silhouette.filters import METHODS
 from torchpose._core.files import atomic_path, check_output_folder
 from torchpose.body import BODY_15, Body, JointLimits, body_joints, fit_body, fit_state
 from torchpose.camera import CameraRig, load_cameras

@@ -19,16 +19,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._upper_body import data_folder
 from torchpose._core.files import check_output_folder
 from torchpose._core.reading import read_npz
 from torchpose.errors import FileFormatError
 from torchpose.evaluation import Report
-from torchpose.evaluation.common import add_picture, data_folder
+from torchpose.evaluation.common import add_picture
 from torchpose.filters import MixtureKalmanFilter
 from torchpose.priors import GaussianMixture, UpperBodyPrior
 from torchpose.priors._upper_body import released_process_cov
-
-__all__ = ["Videos", "hand_log_density", "read_videos", "released_filter", "run"]
 
 _DATA = "signer"
 _PRIOR = "released_prior_Training20_02.npz"

@@ -5,7 +5,7 @@ with 3 pixels of noise. All trackers have the paper's transition and the same R.
 print its Q; here
 
 - the mixture Kalman filters have that of the authors' released tracker
-  (`torchpose.upper_body._single_poses.default_process_cov`);
+  (`torchpose.upper_body.process_noise.default_process_cov`);
 - the mixture proposal has, as published, no burn-in and a larger Q of its own (and is shown with the
   Q of the Kalman filters as well);
 - the random walks have a burn-in and a smaller Q: the released one lets lambda move by a metre in
@@ -19,12 +19,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from benchmarks._ub_one_tables import (
     SAMPLED,
@@ -34,31 +33,24 @@ from benchmarks._ub_one_tables import (
     add_tables,
     fill_summary,
 )
-from torchpose._core.files import check_output_folder, write_npz
-from torchpose._core.reading import read_npz
-from torchpose.camera import PinholeCamera
+from benchmarks._upper_body import MADE_WITH, Subject, data_folder, plain_prior, score, trials_of
+from benchmarks.engine import Experiment, Grid, Results
+from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import (
+    CAMERA,
     Estimate,
     Recipe,
-    Scores,
     Trials,
     cached_prior,
     centred_on_neck,
-    data_folder,
-    make_test_set,
-    plain_prior,
-    score,
-    settings_hash,
     track,
 )
 from torchpose.io import Recording, read_recordings
-from torchpose.learning._recipes.upper_body import fit_kinect_prior
+from torchpose.learning import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import UpperBodyTracker
-
-__all__ = ["TRACKERS", "run", "split_recording"]
 
 _DATA = "burke_kinect"
 TRACKERS = {
@@ -95,8 +87,8 @@ def run(
 ) -> Report:
     """Run the protocol; writes report.json, report.md and pictures to `out`.
 
-    The prior and the estimates of the particle filters, which take minutes, are kept in `out` and
-    read when the same settings are run again.
+    The prior and the estimates of all trackers, which take minutes, are kept in `out` and read when
+    the same settings are run again.
 
     Args:
         data: folder burke_kinect, or the one it is in. out: folder for the results.
@@ -121,24 +113,22 @@ def run(
         tested = replace(tested, joints=tested.joints[:60])
     prior = cached_prior(out, [train], recipe, progress, **settings)
     prior.check_unseen({tested.person_id})
-    camera = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
-    pose = centred_on_neck(tested.upper_body().joints)
-    test = make_test_set([pose], camera, tested.fps or 30.0, seed)
+    test = trials_of([tested], seed)
     plain = plain_prior(prior)
-    scores: dict[str, list[Scores]] = {}
-    times: dict[str, float] = {}
-    noise: dict[str, str] = {}
-    for name, method in tqdm(TRACKERS.items(), disable=not progress, desc="trackers"):
-        factor = mixture_q if name == "PF mixture" else walk_q if "walk" in method else 1.0
-        options, noise[name] = _model(plain, method, particles, factor)
-        seeds = range(seed, seed + (n_seeds if method in SAMPLED else 1))
-        scores[name] = [
-            score(_estimate(out, plain, camera, test, method, s, options, progress), test)
-            for s in seeds
-        ]
-        times[name] = time_step(plain, camera, test, method, options)
-    scores["recipe's prior, filtered"] = [score(track(prior, camera, test), test)]
-    smooth = track(prior, camera, test, smoothing="full")
+    factors = {"PF mixture": mixture_q} | {n: walk_q for n, m in TRACKERS.items() if "walk" in m}
+    trackers = {name: _tracker(name, plain, particles, factors.get(name, 1.0)) for name in TRACKERS}
+    subjects = {"": Subject(plain, test)}
+    drawn = {name: t for name, t in trackers.items() if t.method in SAMPLED}
+    runs = Results(())
+    for some, n in ((drawn, n_seeds), ({k: t for k, t in trackers.items() if k not in drawn}, 1)):
+        runs += TRACKING.run(
+            {"": Grid(subjects, some)}, range(seed, seed + n), out, progress=progress, title="trackers"
+        )  # fmt: skip
+    scores = {name: [score(run, test) for run in runs.where(method=name).runs] for name in trackers}
+    times = {name: time_step(plain, test, t.method, t.options) for name, t in trackers.items()}
+    noise = {name: tracker.noise for name, tracker in trackers.items()}
+    scores["recipe's prior, filtered"] = [score(track(prior, CAMERA, test), test)]
+    smooth = track(prior, CAMERA, test, smoothing="full")
     scores["recipe's prior, smoothed"] = [score(smooth, test)]
     report = Report("UB-one", settings | {
         "quick": quick, "particles": particles, "seeds": n_seeds, "burn-in of the walks": BURN_IN,
@@ -146,7 +136,7 @@ def run(
         "training": f"{len(train)} frames", "test": f"{len(tested)} frames",
         "learnt transition": prior.info.transition, "threads": torch.get_num_threads(),
     })  # fmt: skip
-    raised = raised_arms(pose)
+    raised = raised_arms(centred_on_neck(tested.upper_body().joints))
     summary = report.table("summary", "", SUMMARY, digits=(1, 1, 0, 1, 2, 0, 0))
     add_tables(report, scores, times, test, raised)
     fill_summary(
@@ -204,10 +194,17 @@ def walk_process_cov(prior: UpperBodyPrior) -> Float[Tensor, " 21"]:
     return torch.cat([joints, joints.new_full((6,), 0.02)]).square() * scale
 
 
-def _model(
-    plain: UpperBodyPrior, method: str, particles: int, factor: float
-) -> tuple[dict[str, Any], str]:
-    """Options of a tracker, its process noise among them, and that noise in words."""
+class _Tracker(NamedTuple):
+    """A method with its options, the process noise among them, and that noise in words."""
+
+    method: str
+    options: dict[str, Any]
+    noise: str
+
+
+def _tracker(name: str, plain: UpperBodyPrior, particles: int, factor: float) -> _Tracker:
+    """Return a tracker of the table, with so many times the process noise that is its own."""
+    method = TRACKERS[name]
     walks = method.startswith("pf-walk")
     process_cov = walk_process_cov(plain) if walks else plain.noise["process_cov"]
     options: dict[str, Any] = {"process_cov": factor * process_cov}
@@ -218,49 +215,40 @@ def _model(
         options["burn_in"] = BURN_IN
         burn_in = f", burn-in of {BURN_IN} frames"
     share = "" if factor == 1.0 else f"{factor:g} x "
-    return options, f"{share}{'human steps' if walks else 'the released Q'}{burn_in}"
+    noise = f"{share}{'human steps' if walks else 'the released Q'}{burn_in}"
+    return _Tracker(method, options, noise)
 
 
-def _estimate(
-    out: Path,
-    prior: UpperBodyPrior,
-    camera: PinholeCamera,
-    test: Trials,
-    method: str,
-    seed: int,
-    options: dict[str, Any],
-    progress: bool,
-) -> Estimate:
-    """Track, or read what the same call gave before (only particle filters are kept)."""
-    kept = method.startswith("pf")
-    facts = [method, seed, options, test.keypoints, prior.left.means, *prior.noise.values()]
-    path = out / f"{method}-{settings_hash(facts)}.npz"
-    names = Estimate._fields
-    if kept and path.is_file():
-        arrays = read_npz(path, names)
-        return Estimate(*(torch.from_numpy(arrays[n]) for n in names))
-    generator = [torch.Generator().manual_seed(seed)]
-    found = track(prior, camera, test, method=method, generator=generator, **options)
-    if kept:
-        values = (v.numpy() for v in found if v is not None)
-        write_npz(path, dict(zip(names, values, strict=True)))
-    return found
+def _track(subject: Subject, tracker: _Tracker, seeds: Sequence[int]) -> list[Estimate]:
+    prior, test = subject
+    return [
+        track(
+            prior, CAMERA, test, method=tracker.method,
+            generator=[torch.Generator().manual_seed(seed)], **tracker.options,
+        )
+        for seed in seeds
+    ]  # fmt: skip
+
+
+def _facts(subject: Subject, tracker: _Tracker) -> list[Any]:
+    numbers = [v for v in tracker.options.values() if isinstance(v, Tensor)]
+    words = {k: v for k, v in tracker.options.items() if not isinstance(v, Tensor)}
+    return [tracker.method, words, *numbers, *subject.facts()]
+
+
+TRACKING = Experiment(Estimate, _track, _facts, (*MADE_WITH, "benchmarks/ub_one.py"))
+"""Estimates of a tracker."""
 
 
 def time_step(
-    prior: UpperBodyPrior,
-    camera: PinholeCamera,
-    test: Trials,
-    method: str,
-    options: dict[str, Any],
-    n_steps: int = 20,
+    prior: UpperBodyPrior, test: Trials, method: str, options: dict[str, Any], n_steps: int = 20
 ) -> float:
-    """Median time of one online step of one arm, in milliseconds.
+    """Return the median time of one online step of one arm, in milliseconds.
 
     Args:
-        prior, camera, test, method, options: of the tracker. n_steps: how many to time.
+        prior, test, method, options: of the tracker. n_steps: how many to time.
     """
-    tracker = UpperBodyTracker(prior, camera, method, neck=prior.info.neck, **options)
+    tracker = UpperBodyTracker(prior, CAMERA, method, neck=prior.info.neck, **options)
     model = tracker.estimator.filter("left", ("hand", "head", "neck"))
     order = [2, 0, 1]  # hand, head, neck, as the tracker's filters measure them
     z = test.keypoints[:1, :, order].flatten(2)

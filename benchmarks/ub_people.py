@@ -19,25 +19,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from benchmarks._gaps import add_gap_tables
-from torchpose._core.files import check_output_folder
-from torchpose.camera import PinholeCamera
-from torchpose.errors import InputError
-from torchpose.evaluation import Report
-from torchpose.evaluation.common import (
-    Estimate,
-    Recipe,
-    Scores,
-    Trials,
-    cached_prior,
-    centred_on_neck,
-    data_folder,
-    make_test_set,
-    plain_prior,
-    projected_training_poses,
-    score,
-    track,
-)
-from torchpose.evaluation.people_tables import (
+from benchmarks._people_tables import (
     BASELINE,
     LAGGED,
     MAIN,
@@ -51,11 +33,23 @@ from torchpose.evaluation.people_tables import (
     add_pcp_table,
     add_pictures,
 )
+from benchmarks._upper_body import Scores, data_folder, plain_prior, projected_training_poses, score
+from torchpose._core.files import check_output_folder
+from torchpose.errors import InputError
+from torchpose.evaluation import Report
+from torchpose.evaluation.common import (
+    CAMERA,
+    Estimate,
+    Recipe,
+    Trials,
+    cached_prior,
+    centred_on_neck,
+    make_test_set,
+    track,
+)
 from torchpose.io import Recording, read_recordings
-from torchpose.learning._recipes.upper_body import fit_kinect_prior
+from torchpose.learning import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
-
-__all__ = ["TEST_PERSONS", "TRAIN_PERSONS", "people", "run", "sway"]
 
 TRAIN_PERSONS = ("s1", "s2", "s3", "s4", "s5", "s6")
 TEST_PERSONS = ("s7", "s8")
@@ -102,24 +96,21 @@ def run(
     if prior is None:
         prior = cached_prior(out, train, recipe, progress, **settings)
     prior.check_unseen({r.person_id for r in tested})
-    camera = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
     poses = [centred_on_neck(r.upper_body().joints) for r in tested]
     fps = tested[0].fps or 30.0
-    still = make_test_set(poses, camera, fps, seed)
+    still = make_test_set(poses, CAMERA, fps, seed)
     paths = [sway(len(p), fps, i / len(poses)) for i, p in enumerate(poses)]
-    moving = make_test_set(poses, camera, fps, seed, paths=paths)
+    moving = make_test_set(poses, CAMERA, fps, seed, paths=paths)
     report = Report("UB-people", _settings(train, tested, still, prior, settings, quick))
     lag = 0 if quick else lag
-    projected = projected_training_poses(train, camera, 2_000 if quick else _N_PROJECTED, seed)
-    scores = _all_methods(prior, camera, still, projected, lag, progress)
-    moved = _all_methods(prior, camera, moving, projected, 0, progress, "moving: ")
+    projected = projected_training_poses(train, CAMERA, 2_000 if quick else _N_PROJECTED, seed)
+    scores = _all_methods(prior, still, projected, lag, progress)
+    moved = _all_methods(prior, moving, projected, 0, progress, "moving: ")
     add_error_tables(report, scores, moved, still, moving)
     add_pcp_table(report, scores)
     add_calibration_table(report, prior, scores)
     if n_gap_sequences:
-        add_gap_tables(
-            report, out, prior, camera, poses, fps, seed, n_gap_sequences, progress, quick
-        )
+        add_gap_tables(report, out, prior, poses, fps, seed, n_gap_sequences, progress, quick)
     add_findings(report)
     add_pictures(report, out, scores)
     report.save(out)
@@ -204,7 +195,6 @@ def _variants(prior: UpperBodyPrior, lag: int) -> dict[str, tuple[UpperBodyPrior
 
 def _all_methods(
     prior: UpperBodyPrior,
-    camera: PinholeCamera,
     test: Trials,
     projected: tuple[Tensor, Tensor],
     lag: int,
@@ -218,7 +208,7 @@ def _all_methods(
     bar = tqdm(variants.items(), disable=not progress, desc=f"{label}trackers")
     for name, (own, options) in bar:
         bar.set_postfix_str(name)
-        scores[name] = score(track(own, camera, test, progress=progress, **options), test)
+        scores[name] = score(track(own, CAMERA, test, progress=progress, **options), test)
     scores[NEIGHBOUR] = score(nearest_neighbour(test, *projected, progress=progress), test)
     scores[MEAN_POSE] = score(mean_pose(test, *projected), test)
     return scores

@@ -18,16 +18,16 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._upper_body import trials_of
 from benchmarks.ub_people import people
 from torchpose._core.files import check_output_folder
-from torchpose.camera import PinholeCamera
-from torchpose.evaluation.common import cached_prior, centred_on_neck, make_test_set, track
-from torchpose.evaluation.people_tables import SHORT_NAMES
+from torchpose.evaluation.common import CAMERA, cached_prior, track
+from torchpose.evaluation.person_tables import SHORT_NAMES
 from torchpose.io import Recording
-from torchpose.learning._recipes import fit_calibration, fit_kinect_prior
+from torchpose.learning import fit_kinect_prior
+from torchpose.learning._recipes import fit_calibration
 from torchpose.metrics import align, coverage
 
-CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 LEVELS = (0.5, 0.9)
 
 
@@ -54,8 +54,7 @@ def hold_out(
         "window_samples": 3000 if arguments.quick else arguments.window_samples,
     }
     prior = cached_prior(arguments.out, seen, fit_kinect_prior, False, **settings)
-    poses = [centred_on_neck(r.upper_body().joints) for r in own]
-    test = make_test_set(poses, CAMERA, own[0].fps or 30.0, arguments.seed)
+    test = trials_of(own, arguments.seed)
     found = track(prior, CAMERA, test)
     if found.covariance3d is None:
         raise RuntimeError("the tracker returned no covariances")

@@ -14,15 +14,14 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._upper_body import score
 from benchmarks.ub_people import people, sway
 from torchpose._core.files import check_output_folder
-from torchpose.camera import PinholeCamera
-from torchpose.evaluation.common import Trials, cached_prior, centred_on_neck, make_test_set, score
+from torchpose.evaluation.common import CAMERA, Trials, cached_prior, centred_on_neck, make_test_set
 from torchpose.evaluation.common import track as track_test
-from torchpose.learning._recipes import fit_kinect_prior
+from torchpose.learning import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
 
-CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 FITTED, TRACKED = ("s1", "s2", "s3"), ("s4", "s5", "s6")
 TRACKERS = {
     "windows, filtered": {},

@@ -28,24 +28,24 @@ import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
+from benchmarks._upper_body import score
 from benchmarks.ub_people import people, sway
-from torchpose.camera import PinholeCamera, project, sample_viewpoints
+from torchpose.camera import project, sample_viewpoints
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import (
+    CAMERA,
     MEASURED,
     Estimate,
     Trials,
     centred_on_neck,
     make_test_set,
-    score,
 )
-from torchpose.evaluation.people_tables import SHORT_NAMES
+from torchpose.evaluation.person_tables import SHORT_NAMES
 from torchpose.learning import TRAINING_VIEWS
 from torchpose.math import euler_to_matrix
 from torchpose.skeleton import UPPER_BODY
 from torchpose.skeleton._upper_body import mirror_pose
 
-CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 COLUMNS = [UPPER_BODY.index(name) for name in MEASURED]
 NOISE = 3.0
 PIXELS = 100.0  # scale of the inputs

@@ -23,12 +23,10 @@ from torchpose.evaluation.person_tables import (
     plot_pose_classes,
     pooled,
 )
-from torchpose.evaluation.persons import by_person, raised_share
+from torchpose.evaluation.persons import POSE_CLASSES, by_person, pose_classes
 from torchpose.evaluation.unseen import Job, ScoreSettings, fit_settings, run_jobs
 from torchpose.io import Recording
-from torchpose.learning._recipes.upper_body import fit_kinect_prior
-
-__all__ = ["run", "without_raised"]
+from torchpose.learning import fit_kinect_prior
 
 
 def run(
@@ -102,6 +100,12 @@ def run(
     add_picture(report, out, "uncommon-poses.png", plot_pose_classes(scored, title))
     report.save(out)
     return report
+
+
+def raised_share(recording: Recording) -> float:
+    """Return the share of the frames in which a hand is above its shoulder."""
+    classes = pose_classes(recording.upper_body().joints.double())
+    return float((classes == POSE_CLASSES.index("raised")).any(1).double().mean())
 
 
 def without_raised(

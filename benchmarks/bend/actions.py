@@ -1,6 +1,6 @@
 """Part of the protocol Bend: which action somebody performs, from recorded and from tracked joints."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -10,8 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from benchmarks.bend.data import first_bend, performances
-from benchmarks.bend.runs import BendRun, kept_tracks, variant_facts
+from benchmarks.bend.clips import first_bend, performances
 from benchmarks.bend.trackees import (
     DIMENSIONS,
     MOST_DIMENSIONS,
@@ -19,35 +18,18 @@ from benchmarks.bend.trackees import (
     Performed,
     Variant,
     fit_space,
-    make_filter,
     perform,
+    true_postures,
 )
-from benchmarks.silhouette.trackees import Conditions, Setting, view_of
-from torchpose.body import fit_state
+from benchmarks.bend.tracking import TRACKING, BendRun, Filter
+from benchmarks.bodies.views import Conditions, Subject, view_of
+from benchmarks.engine import Grid, Results, Setting, mean, pivot
+from benchmarks.engine.experiment import Measure
+from benchmarks.engine.statistics import Cell
 from torchpose.evaluation import Report
 from torchpose.io._mocap import MocapClip
 from torchpose.priors import ActionBank, ActionSpace
-from torchpose.priors._actions.postures import state_postures
 from torchpose.whole_body import constant_velocity_std
-
-__all__ = [
-    "BANK_SETTINGS",
-    "KNOWN",
-    "OTHERS",
-    "BankSetting",
-    "Recognised",
-    "TrackedAction",
-    "add_confusion",
-    "add_release",
-    "choose_bank",
-    "make_bank",
-    "make_spaces",
-    "perform_actions",
-    "postures_of",
-    "recognise_recorded",
-    "track_actions",
-    "tracked_decisions",
-]
 
 KNOWN = ("bend", "wave_right_hand", "throw", "punch")
 OTHERS = ("jumping_jacks", "clap", "sit_down")
@@ -88,18 +70,10 @@ class Recognised(NamedTuple):
     frames: float
 
 
-class TrackedAction(NamedTuple):
-    """One recording that was tracked, by tracker ("bank", "bend", "first order")."""
-
-    person: str
-    action: str
-    runs: dict[str, list[BendRun]]
-
-
 def perform_actions(
     library: Library, centres: Float[Tensor, "P 3"] | None, progress: bool
 ) -> dict[str, dict[str, Performed]]:
-    """States of everybody's single performances of every action of the bank."""
+    """Return states of everybody's single performances of every action of the bank."""
     pairs = [(a, p) for a in KNOWN if a in library for p in library[a]]
     found: dict[str, dict[str, Performed]] = {a: {} for a, _ in pairs}
     for action, person in tqdm(pairs, disable=not progress, desc="performances"):
@@ -111,7 +85,7 @@ def perform_actions(
 def make_spaces(
     trackee: BendTrackee, performed: Mapping[str, Mapping[str, Performed]]
 ) -> list[ActionSpace]:
-    """The actions of everybody else, put on the body that is tracked."""
+    """Return the actions of everybody else, put on the body that is tracked."""
     person, fps = trackee.split.person, trackee.split.test[0].fps
     return [
         fit_space(
@@ -122,7 +96,7 @@ def make_spaces(
 
 
 def make_bank(spaces: Sequence[ActionSpace], setting: BankSetting) -> ActionBank:
-    """A bank whose gates look at no more dimensions than those of a single action."""
+    """Return a bank whose gates look at no more dimensions than those of a single action."""
     cut = [s.with_dimensions(min(setting.dimensions, s.n_dimensions)) for s in spaces]
     return ActionBank(
         cut, spread=setting.spread, background=setting.background, gate_dimensions=DIMENSIONS
@@ -132,7 +106,7 @@ def make_bank(spaces: Sequence[ActionSpace], setting: BankSetting) -> ActionBank
 def postures_of(trackee: BendTrackee, library: Library) -> list[tuple[str, Tensor]]:
     """Action and postures [T, 36] of each of the person's recordings, from true joints."""
     return [
-        (action, state_postures(trackee.body, fit_state(trackee.body, clip.joints)))
+        (action, true_postures(trackee.body, clip))
         for action, persons in library.items()
         for clip in persons.get(trackee.split.person, ())
     ]
@@ -141,7 +115,7 @@ def postures_of(trackee: BendTrackee, library: Library) -> list[tuple[str, Tenso
 def recognise_recorded(
     person: str, bank: ActionBank, recordings: Sequence[tuple[str, Tensor]]
 ) -> list[Recognised]:
-    """Decisions for the recordings of `postures_of`.
+    """Return decisions for the recordings of `postures_of`.
 
     The decision is the action, or none, of the largest probability on average over the frames.
     """
@@ -164,7 +138,7 @@ def choose_bank(
     performed: Mapping[str, Mapping[str, Performed]],
     library: Library,
 ) -> tuple[BankSetting, dict[BankSetting, float]]:
-    """The settings that recognise most of other persons' frames, each kind of action alike.
+    """Return the settings that recognise most of other persons' frames, each kind of action alike.
 
     Returns:
         The settings, and the share of right frames of all that were tried.
@@ -184,7 +158,7 @@ def choose_bank(
 
 
 def _balanced(found: Sequence[Recognised]) -> float:
-    """Mean over the known actions and none of the share of right frames."""
+    """Return the mean over the known actions and none of the share of right frames."""
     groups: dict[str, list[float]] = {}
     for one in found:
         groups.setdefault(one.action if one.action in KNOWN else "none", []).append(one.frames)
@@ -197,22 +171,30 @@ def _balanced(found: Sequence[Recognised]) -> float:
 def track_actions(
     trackees: Sequence[BendTrackee], banks: Mapping[str, ActionBank],
     performed: Mapping[str, Mapping[str, Performed]], library: Library, conditions: Conditions,
-    setting: Setting, plain: Setting, folder: Path, *, particles: int, frames: int, seeds: int,
-    seed: int, progress: bool,
-) -> list[TrackedAction]:  # fmt: skip
+    setting: Setting, plain: Setting, folder: Path, *, particles: int, frames: int,
+    seeds: Sequence[int], progress: bool,
+) -> Results:  # fmt: skip
     """Track one recording of every action and person: with the bank, with the bend alone, and free.
 
     Args:
         trackees: whose bodies. banks: by person. performed: for the noise, which is that of all
             actions of the bank. library: what is tracked. conditions: of the silhouettes.
         setting: of the constrained trackers. plain: of the first-order one. folder: of kept runs.
-        particles, frames, seeds, seed, progress: as elsewhere.
+        particles: of each tracker. frames: of each recording. seeds: of the runs.
+        progress: whether to show bars.
+
+    Returns:
+        Runs by action (condition), person and tracker ("bank", "bend", "first order").
     """
-    jobs = [(t, a) for t in trackees for a in library if t.split.person in library[a]]
-    found = []
-    for trackee, action in tqdm(jobs, disable=not progress, desc="actions"):
+    methods = {
+        "bank": Filter(Variant(True, particles), setting, bank=True),
+        "bend": Filter(Variant(True, particles), setting),
+        "first order": Filter(Variant(False, particles), plain),
+    }
+    subjects: dict[str, dict[str, Subject[BendTrackee]]] = {}
+    jobs = [(a, t) for a in library for t in trackees if t.split.person in library[a]]
+    for action, trackee in tqdm(jobs, disable=not progress, desc="actions"):
         person = trackee.split.person
-        clip = first_bend(library[action][person][0], frames)
         moves = [
             states
             for persons in performed.values()
@@ -220,31 +202,13 @@ def track_actions(
             if name != person
             for states in one
         ]
-        other = seen_in(trackee, clip, conditions, constant_velocity_std(trackee.body, moves))
-        bank = banks[person]
-        runs = {}
-        for label, constrained, chosen in (
-            ("bank", True, setting), ("bend", True, setting), ("first order", False, plain)
-        ):  # fmt: skip
-            variant = Variant(constrained, particles)
-            facts = variant_facts(other, other.tests[0], variant, chosen)
-            model = bank if label == "bank" else None
-            facts += list(bank.buffers()) if label == "bank" else []
-            make = lambda v=variant, s=chosen, t=other, m=model: make_filter(v, t, s, m)  # noqa: E731
-            runs[label] = kept_tracks(make, other, 0, facts, folder, range(seed, seed + seeds))
-        found.append(TrackedAction(person, action, runs))
-    return found
-
-
-def seen_in(
-    trackee: BendTrackee, clip: MocapClip, conditions: Conditions, step_std: Tensor
-) -> BendTrackee:
-    """The same person in another clip."""
-    truth = state_postures(trackee.body, fit_state(trackee.body, clip.joints))
-    view = view_of(trackee.body, clip, conditions)
-    return replace(
-        trackee, tests=(view,), truth=(truth,), recorded_gap=(float("nan"),), step_std=step_std
-    )
+        other = replace(
+            trackee, step_std=constant_velocity_std(trackee.body, moves), bank=banks[person]
+        )
+        view = view_of(other.body, first_bend(library[action][person][0], frames), conditions)
+        subjects.setdefault(action, {})[person] = Subject(other, other.body, view)
+    grids = {action: Grid(own, methods) for action, own in subjects.items()}
+    return TRACKING.run(grids, seeds, folder, progress=progress, title="tracked actions")
 
 
 # --- tables ---------------------------------------------------------------------------------------
@@ -253,7 +217,7 @@ def seen_in(
 def add_confusion(
     report: Report, key: str, title: str, found: Sequence[Recognised], names: Sequence[str]
 ) -> None:
-    """Recordings by what they are (row) and what they were taken for (column)."""
+    """Add recordings by what they are (row) and what they were taken for (column)."""
     table = report.table(
         key, title, [*names, "right frames (%)"],
         note="Numbers of recordings; the decision is the action of the largest probability on average "
@@ -273,36 +237,36 @@ def add_confusion(
     )
 
 
-def tracked_decisions(
-    found: Sequence[TrackedAction], banks: Mapping[str, ActionBank]
-) -> list[Recognised]:
-    """Decisions of the bank's particles, mean over seeds."""
-    decisions = []
-    for one in found:
-        posterior = torch.stack([run.actions for run in one.runs["bank"]]).double().mean(0)
-        decisions.append(_decide(one.person, one.action, banks[one.person], posterior))
-    return decisions
+def tracked_decisions(runs: Results, banks: Mapping[str, ActionBank]) -> list[Recognised]:
+    """Return decisions of the bank's particles, mean over seeds."""
+    return [
+        _decide(person, action, banks[person], torch.stack([r.actions for r in own.runs]).double().mean(0))
+        for (person, action), own in runs.where(method="bank").by("subject", "condition").items()
+    ]  # fmt: skip
 
 
-def add_release(report: Report, found: Sequence[TrackedAction]) -> None:
-    """What a bank is worth: errors of the same silhouettes with the bank, the bend alone, and free."""
-    labels = list(found[0].runs)
-    table = report.table(
-        "release", "Tracked actions: mean squared error of the angles (degrees^2)",
-        [*labels, *(f"joints (mm), {label}" for label in labels), "released (%)"],
+def add_release(report: Report, runs: Results) -> None:
+    """Add what a bank is worth: errors with the bank, the bend alone, and free.
+
+    Args:
+        report: gets the table. runs: of `track_actions`.
+    """
+
+    def of(label: str, measure: Measure) -> Cell:
+        return lambda own: mean(measure)(own.where(method=label))
+
+    def known(field: str) -> Callable[[BendRun], Tensor]:
+        return lambda run: getattr(run, field).double().nanmean()
+
+    labels = runs.names("method")
+    released = mean(known("released"), 100)
+    pivot(
+        report, "release", "Tracked actions: mean squared error of the angles (degrees^2)", runs,
+        ["condition"],
+        {label: of(label, known("squared")) for label in labels}
+        | {f"joints (mm), {label}": of(label, known("errors")) for label in labels}
+        | {"released (%)": lambda own: released(own.where(method="bank"))},
         note="Bank: all actions and none of them, which releases the constraint. Bend: the action "
         "space of bending, whatever is performed. Released: frames in which none of the actions is "
         "the most probable.",
     )  # fmt: skip
-    for action in dict.fromkeys(one.action for one in found):
-        own = [one for one in found if one.action == action]
-        cells = [_over(own, label, "squared") for label in labels]
-        cells += [_over(own, label, "errors") for label in labels]
-        cells.append(100 * _over(own, labels[0], "released"))
-        table.add(action, cells)
-
-
-def _over(found: Sequence[TrackedAction], label: str, field: str) -> float:
-    """Mean of what the runs of a tracker hold under this name."""
-    values = [getattr(run, field).double().nanmean() for one in found for run in one.runs[label]]
-    return float(torch.stack(values).mean())

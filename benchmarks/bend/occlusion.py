@@ -1,6 +1,7 @@
 """Part of the protocol Bend: from the side one arm hides the other (Figure 5 of the paper)."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,24 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.bend.runs import BendRun, BendRuns, Start, run_variants
 from benchmarks.bend.trackees import BendTrackee, Variant
-from benchmarks.silhouette.runs import sequence_name
-from benchmarks.silhouette.trackees import Setting, View
+from benchmarks.bend.tracking import TRACKING, BendRun, grid_of
+from benchmarks.bodies.views import View, subjects_of
+from benchmarks.engine import Results, Setting
 from torchpose.body import BODY_15, Limbs, fit_state
 from torchpose.evaluation import Report
 from torchpose.whole_body._silhouettes.rendering import render_limbs
-
-__all__ = [
-    "HIDDEN",
-    "SIDE",
-    "HiddenArm",
-    "add_occlusion",
-    "arm_errors",
-    "displaced",
-    "hidden_arms",
-    "visible_share",
-]
 
 SIDE = 90.0
 """Where the camera stands, degrees from ahead, to the person's left: the right arm is the far one."""
@@ -53,7 +43,7 @@ class HiddenArm(NamedTuple):
 
 
 def visible_share(trackee: BendTrackee, view: View, side: str = "right") -> Float[Tensor, " T"]:
-    """Share of an arm's area in the image that no other limb covers, by the true states.
+    """Return the share of an arm's area in the image that no other limb covers, by the true states.
 
     |arm without rest| / |arm|: where it is small a silhouette says nothing about the arm.
     """
@@ -73,48 +63,53 @@ def visible_share(trackee: BendTrackee, view: View, side: str = "right") -> Floa
 
 
 def arm_errors(runs: Sequence[BendRun], side: str) -> Float[Tensor, "S T"]:
-    """Mean distance of elbow and wrist, mm, of every seed and frame."""
+    """Return the mean distance of elbow and wrist, mm, of every seed and frame."""
     return torch.stack([run.errors[:, _ARM[side]].double().mean(-1) for run in runs])
 
 
 def displaced(trackee: BendTrackee, view: View) -> Float[Tensor, " D"]:
-    """The true first pose, but with the far arm swung by a quarter of a turn, as if it was lost."""
+    """Return the true first pose, but with the far arm swung by a quarter of a turn, as if lost."""
     part = BODY_15.part("right_upper_arm")
     step = torch.zeros_like(view.initial_state)
     step[3 + 3 * part] = SWING
     return trackee.body.perturb(view.initial_state, step)
 
 
+def with_lost_arm(trackee: BendTrackee) -> BendTrackee:
+    """Return the same person, tracked from `displaced` first poses."""
+    tests = [view._replace(initial_state=displaced(trackee, view)) for view in trackee.tests]
+    return replace(trackee, tests=tuple(tests))
+
+
 def hidden_arms(
     trackees: Sequence[BendTrackee], settings: Mapping[Variant, Setting], folder: Path,
-    seeds: int, seed: int, progress: bool, start: Start | None = None,
-) -> tuple[list[HiddenArm], BendRuns]:  # fmt: skip
+    seeds: Sequence[int], progress: bool,
+) -> tuple[list[HiddenArm], Results]:  # fmt: skip
     """Track everybody from the side, and measure both arms.
 
     Args:
         trackees: seen from `SIDE`. settings: of every tracker. folder: of kept runs.
-        seeds, seed, progress: as `run_variants`. start: the first pose; the true one if None.
+        seeds: of the runs. progress: whether to show a bar.
     """
-    runs = run_variants(
-        trackees, settings, folder, seeds=seeds, seed=seed, progress=progress, title="hidden arm",
-        start=start,
-    )  # fmt: skip
+    grid = grid_of(trackees, settings)
+    runs = TRACKING.run({"": grid}, seeds, folder, progress=progress, title="hidden arm")
     found = []
-    for trackee in trackees:
-        for view in trackee.tests:
-            name = sequence_name(trackee, view)
-            far, near = (
-                {variant.label: arm_errors(runs[variant][name], side) for variant in runs}
-                for side in ("right", "left")
-            )
-            found.append(HiddenArm(name, visible_share(trackee, view), far, near))
+    for name, subject in subjects_of(trackees).items():
+        far, near = (
+            {
+                label: arm_errors(own.runs, side)
+                for (label,), own in runs.where(subject=name).by("method").items()
+            }
+            for side in ("right", "left")
+        )
+        found.append(HiddenArm(name, visible_share(subject.person, subject.view), far, near))
     return found, runs
 
 
 def add_occlusion(
     report: Report, given: Sequence[HiddenArm], lost: Sequence[HiddenArm], fps: float
 ) -> None:
-    """Errors of both arms while the far one is hidden and while it shows, and how a lost arm returns.
+    """Add errors of both arms while the far one is hidden and while it shows, and how a lost arm returns.
 
     Args:
         report: gets a table and a sentence for each tracker. given: runs from the true first pose.

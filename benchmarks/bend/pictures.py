@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from benchmarks.bend.runs import BendRuns, mean_squared
-from benchmarks.bend.tables import joint_error, root_error
-from benchmarks.silhouette.tables import pooled_std
-from benchmarks.silhouette.trackees import View
+from benchmarks.bend.report import JOINT_ERROR, root_error
+from benchmarks.bend.tracking import mean_squared
+from benchmarks.bodies.views import View
+from benchmarks.engine import Results, plot_by_condition
 from torchpose.body import BODY_15
 from torchpose.errors import DegenerateFilterWarning
 from torchpose.viz._style import (
@@ -37,59 +37,34 @@ if TYPE_CHECKING:
 else:
     Axes = Figure = Any
 
-__all__ = ["plot_hidden_arm", "plot_particles", "plot_predictions", "predictions"]
-
-LABELS = {True: "constrained", False: "first order"}
 _SEEN = (0.80, 0.84, 0.89)
 _BONES = [(i, parent) for i, parent in enumerate(BODY_15.parents) if parent >= 0]
 
 
-def plot_particles(runs: BendRuns, title: str = "Error over the number of particles") -> Figure:
-    """Figure 3 in kind: mean squared error of the angles, then root and joints, over N.
+def plot_particles(runs: Results, title: str = "Error over the number of particles") -> Figure:
+    """Draw Figure 3 in kind: mean squared error of the angles, then root and joints, over N.
 
-    Bands are one standard deviation over seeds, pooled over sequences.
+    Args:
+        runs: by number of particles, such as "1,000". title: above.
     """
-    require_matplotlib()
-    from matplotlib.lines import Line2D
-
-    styles = method_styles(list(LABELS.values()))
-    numbers = sorted({variant.particles for variant in runs})
-    panels = (
-        ("MSE of the angles (degrees²)", mean_squared),
-        ("error of the root (mm)", root_error),
-        ("error of the joints (mm)", joint_error),
+    return plot_by_condition(
+        runs,
+        {
+            "MSE of the angles (degrees²)": mean_squared,
+            "error of the root (mm)": root_error,
+            "error of the joints (mm)": JOINT_ERROR,
+        },
+        title,
+        places=[int(name.replace(",", "")) for name in runs.names("condition")],
+        axis="particles",
     )
-    figure = new_figure(11.5, 3.7, title)
-    for ax, (text, measure) in zip(figure.subplots(1, 3), panels, strict=True):
-        style_axes(ax, "particles", text)
-        for constrained, label in LABELS.items():
-            found = [
-                measure(sequences)
-                for n in numbers
-                for variant, sequences in runs.items()
-                if variant.constrained == constrained and variant.particles == n
-            ]
-            middle = torch.stack([errors.mean() for errors in found])
-            if found[0].shape[1] > 1:
-                spread = torch.stack([pooled_std(errors) for errors in found])
-                ax.fill_between(
-                    numbers, to_numpy(middle - spread), to_numpy(middle + spread),
-                    color=styles[label]["color"], alpha=0.15, linewidth=0,
-                )  # fmt: skip
-            ax.plot(numbers, to_numpy(middle), marker="o", markersize=4, **styles[label])
-        ax.set_xscale("log")
-        ax.set_xticks(numbers, [f"{n:,}" for n in numbers], rotation=45)
-        ax.minorticks_off()
-        ax.set_ylim(bottom=0)
-    add_legend(figure, [Line2D([], [], marker="o", label=n, **s) for n, s in styles.items()])
-    return figure
 
 
 @torch.no_grad()
 def predictions(
     tracker: SilhouetteParticleFilter, view: View, frame: int, count: int, seed: int = 0
 ) -> Tensor:
-    """Joints [count, 15, 3] of randomly chosen particles as predicted for a frame, before weighting.
+    """Return joints [count, 15, 3] of randomly chosen particles as predicted for a frame, before weighting.
 
     Args:
         tracker: run up to the frame. view: what it sees. frame: counted from 0. count: how many.
@@ -115,7 +90,7 @@ def plot_predictions(
     *,
     arms: bool = False,
 ) -> Figure:
-    """Figure 4 in kind: predicted postures over the silhouette, a row for each tracker.
+    """Draw Figure 4 in kind: predicted postures over the silhouette, a row for each tracker.
 
     Args:
         view: who and where. frames: one for each column.
@@ -166,7 +141,7 @@ def _background(ax: Axes, silhouette: Tensor) -> None:
 
 
 def _bones(side: str) -> list[tuple[int, int]]:
-    """The two bones of an arm."""
+    """Return the two bones of an arm."""
     names = [f"{side}_{joint}" for joint in ("shoulder", "elbow", "wrist")]
     return [(BODY_15.joint(a), BODY_15.joint(b)) for a, b in pairwise(names)]
 
@@ -190,7 +165,7 @@ def plot_hidden_arm(
     fps: float,
     title: str = "The arm that the other one hides",
 ) -> Figure:
-    """Error of the hidden arm over time, with the share of it that the silhouette shows.
+    """Draw the error of the hidden arm over time, with the share of it that the silhouette shows.
 
     Args:
         panels: for each sequence its name, the visible share [T], and by tracker the errors of the

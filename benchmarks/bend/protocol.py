@@ -16,16 +16,17 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from benchmarks.bend import actions as bend_actions
-from benchmarks.bend.data import action_clips, leave_one_out, performances
-from benchmarks.bend.occlusion import SIDE, add_occlusion, displaced, hidden_arms
-from benchmarks.bend.runs import run_variants, tune_variant
-from benchmarks.bend.tables import (
+from benchmarks.bend.clips import action_clips, leave_one_out, performances
+from benchmarks.bend.occlusion import SIDE, add_occlusion, hidden_arms, with_lost_arm
+from benchmarks.bend.report import (
+    CONSTRAINED,
+    FIRST_ORDER,
     add_dimensions,
     add_limb_shapes,
     add_particles,
     add_sequences,
     add_tuning,
-    write_csv,
+    csv_columns,
 )
 from benchmarks.bend.trackees import (
     DIMENSIONS,
@@ -40,16 +41,15 @@ from benchmarks.bend.trackees import (
     prepare,
     synchronised_space,
 )
-from benchmarks.silhouette.protocol import image_size
-from benchmarks.silhouette.runs import Tuning
-from benchmarks.silhouette.trackees import SCALES, Conditions, Setting
+from benchmarks.bend.tracking import TRACKING, Filter, grid_of, tune_variant
+from benchmarks.bodies.views import Conditions, Subject, image_size, view_of
+from benchmarks.engine import Grid, Results, Setting, Tuning, write_csv
+from benchmarks.engine.tuning import SCALES
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import add_picture
 from torchpose.io._mocap import MocapClip, read_mocap, select_persons
-
-__all__ = ["PARTS", "run"]
 
 FPS = 30.0
 PARTS = ("particles", "dimensions", "limbs", "occlusion", "actions")
@@ -74,8 +74,7 @@ class _Stage:
     centres: Float[Tensor, "P 3"]
     conditions: Conditions
     out: Path
-    seeds: int
-    seed: int
+    seeds: Sequence[int]
     at: int
     gate_dimensions: int
     numbers: list[int]
@@ -84,17 +83,27 @@ class _Stage:
     quick: bool
 
     def variant(self, constrained: bool, particles: int, limb_shape: str = "cylinders") -> Variant:
-        """A tracker whose gate, if it has one, has the dimensions that were asked for."""
+        """Return a tracker whose gate, if it has one, has the dimensions that were asked for."""
         dimensions = self.gate_dimensions if constrained else DIMENSIONS
         return Variant(constrained, particles, dimensions, limb_shape)
 
     def both(self, tunings: Mapping[str, Tuning], *numbers: int) -> dict[Variant, Setting]:
-        """Both trackers with so many particles, and what was chosen for them."""
+        """Return both trackers with so many particles, and what was chosen for them."""
         variants = [self.variant(c, n) for n in numbers for c in (True, False)]
         return {variant: tunings[variant.label].setting for variant in variants}
 
+    def grid(self, settings: Mapping[Variant, Setting]) -> Grid[Subject[BendTrackee], Filter]:
+        """Return everybody, and trackers of different labels."""
+        return grid_of(self.trackees, settings)
+
+    def run(
+        self, grids: Mapping[str, Grid[Subject[BendTrackee], Filter]], title: str = "tracking"
+    ) -> Results:
+        """Make the runs that are not kept yet, and return all."""
+        return TRACKING.run(grids, self.seeds, self.out, progress=self.progress, title=title)
+
     def settings(self, variants: Mapping[str, Variant]) -> dict[str, Tuning]:
-        """What the judges' clips choose for every tracker."""
+        """Return what the judges' clips choose for every tracker."""
         scales, values = ((1.0,), SHARPNESS[:2]) if self.quick else (SCALES, SHARPNESS)
         return {
             name: tune_variant(self.judges, variant, self.out, scales=scales, values=values)
@@ -183,7 +192,7 @@ def run(
     ]
     stage = _Stage(
         trackees[: len(testers)], trackees[len(testers) :], performed, everything, centres, conditions, out,
-        seeds, seed, at, gate_dimensions, numbers, wanted, progress, quick,
+        range(seed, seed + seeds), at, gate_dimensions, numbers, wanted, progress, quick,
     )  # fmt: skip
     tunings = stage.settings({
         "constrained": stage.variant(True, at), "first order": stage.variant(False, at)
@@ -215,13 +224,10 @@ def _particles(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> Non
     from benchmarks.bend.pictures import plot_particles, plot_predictions, predictions
     from torchpose.viz import plot_action_space
 
-    settings = stage.both(tunings, *stage.numbers)
-    runs = run_variants(
-        stage.trackees, settings, stage.out, seeds=stage.seeds, seed=stage.seed,
-        progress=stage.progress,
-    )  # fmt: skip
+    grids = {f"{n:,}": stage.grid(stage.both(tunings, n)) for n in stage.numbers}
+    runs = stage.run(grids)
     add_particles(report, runs)
-    write_csv(stage.out / "runs.csv", runs, stage.seed)
+    write_csv(stage.out / "runs.csv", runs, csv_columns(grids))
     add_picture(report, stage.out, "error-over-particles.png", plot_particles(runs))
     trackee = stage.trackees[0]
     view = trackee.tests[0]
@@ -245,13 +251,10 @@ def _particles(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> Non
 def _dimensions(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> None:
     most = min(t.space.n_dimensions for t in stage.trackees)
     wanted = list(dict.fromkeys(min(d, most) for d in stage.dimensions))
-    settings = {Variant(False, stage.at): tunings["first order"].setting}
-    settings |= {Variant(True, stage.at, d): tunings["constrained"].setting for d in wanted}
-    runs = run_variants(
-        stage.trackees, settings, stage.out, seeds=stage.seeds, seed=stage.seed,
-        progress=stage.progress, title="dimensions",
-    )  # fmt: skip
-    add_dimensions(report, runs, stage.trackees)
+    free, gated = (tunings[label].setting for label in (FIRST_ORDER, CONSTRAINED))
+    grids = {"0": stage.grid({Variant(False, stage.at): free})}
+    grids |= {str(d): stage.grid({Variant(True, stage.at, d): gated}) for d in wanted}
+    add_dimensions(report, stage.run(grids, "dimensions"), stage.trackees)
 
 
 def _limbs(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> None:
@@ -261,13 +264,11 @@ def _limbs(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> None:
         for v in (stage.variant(c, stage.at, "rectangles") for c in (True, False))
     }
     found = stage.settings(rectangles)
-    settings = stage.both(tunings, stage.at)
-    settings |= {variant: found[name].setting for name, variant in rectangles.items()}
-    runs = run_variants(
-        stage.trackees, settings, stage.out, seeds=stage.seeds, seed=stage.seed,
-        progress=stage.progress, title="limbs",
-    )  # fmt: skip
-    add_limb_shapes(report, runs)
+    grids = {
+        "cylinders": stage.grid(stage.both(tunings, stage.at)),
+        "rectangles": stage.grid({v: found[name].setting for name, v in rectangles.items()}),
+    }
+    add_limb_shapes(report, stage.run(grids, "limbs"))
     tunings |= found
 
 
@@ -276,11 +277,11 @@ def _occlusion(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> Non
     from benchmarks.bend.pictures import plot_hidden_arm, plot_predictions
 
     side = replace(stage.conditions, azimuths=(SIDE,))
-    seen = [bend_actions.seen_in(t, t.split.test[0], side, t.step_std) for t in stage.trackees]
+    seen = [replace(t, tests=(view_of(t.body, t.split.test[0], side),)) for t in stage.trackees]
     settings = stage.both(tunings, stage.at)
-    common = (seen, settings, stage.out, stage.seeds, stage.seed, stage.progress)
-    given, runs = hidden_arms(*common)
-    lost, _ = hidden_arms(*common, displaced)
+    common = (settings, stage.out, stage.seeds, stage.progress)
+    given, runs = hidden_arms(seen, *common)
+    lost, _ = hidden_arms([with_lost_arm(t) for t in seen], *common)
     add_occlusion(report, given, lost, FPS)
     panels = [(arm.name, arm.visible, _both(arm.far, arm.near)) for arm in given[:3]]
     add_picture(report, stage.out, "hidden-arm.png", plot_hidden_arm(panels, FPS))
@@ -290,10 +291,8 @@ def _occlusion(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> Non
     view = seen[0].tests[0]
     shown = [int(s * (len(view.clip) - 1)) for s in (0.1, 0.3, 0.5, 0.7, 0.9)]
     drawn = {
-        variant.label: [
-            seen[0].body.joints(sequences[given[0].name][0].mean[t].double())[None] for t in shown
-        ]
-        for variant, sequences in runs.items()
+        label: [seen[0].body.joints(own.runs[0].mean[t].double())[None] for t in shown]
+        for (label,), own in runs.where(subject=given[0].name).by("method").items()
     }
     title = "Estimates from the side: left arm blue, right arm orange"
     figure = plot_predictions(view, shown, drawn, title, arms=True)
@@ -324,8 +323,8 @@ def _actions(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> None:
     frames = 8 if stage.quick else len(stage.trackees[0].tests[0].clip)
     tracked = bend_actions.track_actions(
         stage.trackees[:_TRACKED], banks, performed, library, stage.conditions,
-        tunings["constrained"].setting, tunings["first order"].setting, stage.out,
-        particles=stage.at, frames=frames, seeds=1, seed=stage.seed, progress=stage.progress,
+        tunings[CONSTRAINED].setting, tunings[FIRST_ORDER].setting, stage.out,
+        particles=stage.at, frames=frames, seeds=stage.seeds[:1], progress=stage.progress,
     )  # fmt: skip
     decisions = bend_actions.tracked_decisions(tracked, banks)
     title = "Actions from one camera's silhouettes"

@@ -9,31 +9,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from benchmarks.silhouette.data import Split
-from benchmarks.silhouette.trackees import Conditions, Setting, Tracked, body_of, view_of
+from benchmarks.bodies.clips import Split
+from benchmarks.bodies.views import Conditions, Subject, Tracked, body_of, view_of
+from benchmarks.engine import Setting
 from torchpose.body import BODY_15, Body, centres_of, fit_body, fit_state
 from torchpose.io._mocap import MocapClip
 from torchpose.learning._action_spaces import fit_synchronised
-from torchpose.priors import ActionSpace
+from torchpose.priors import ActionBank, ActionSpace
 from torchpose.priors._actions.file import ActionInfo, Synchronised
 from torchpose.priors._actions.gate import Acceptance
 from torchpose.priors._actions.polar_limbs import LIMBS_12
 from torchpose.priors._actions.postures import posture_angles, state_postures
 from torchpose.whole_body import ConstrainedParticleFilter, constant_velocity_std
-
-__all__ = [
-    "BendTrackee",
-    "Performed",
-    "Variant",
-    "arm_centres",
-    "fit_space",
-    "known_angles",
-    "make_filter",
-    "perform",
-    "prepare",
-    "synchronised_space",
-    "true_acceptance",
-]
 
 SHARPNESS = (30.0, 1.0, 10.0, 100.0, 300.0)
 """Exponents of the intersection over union that validation chooses among, 1 as published; the first
@@ -69,7 +56,7 @@ class Variant(NamedTuple):
 
 
 Performed = tuple[Tensor, ...]
-"""States [T, D] of one person's performances of an action."""
+"""Return states [T, D] of one person's performances of an action."""
 
 
 @dataclass(frozen=True)
@@ -78,23 +65,20 @@ class BendTrackee(Tracked):
 
     Args:
         space: of the performances of everybody else, with as many dimensions as they have.
-        truth: angles of the body fitted to the recorded joints [T, 36], degrees, of every test.
-        recorded_gap: mean squared difference of these from the angles of the recorded joints,
-            degrees^2, of every test.
         known: [36], False for the angles of limbs that the recordings lack.
         own, trained: all postures [T, 36] of this person, and of one who trained.
+        bank: of several actions of the others, where there is one.
     """
 
     space: ActionSpace
-    truth: tuple[Tensor, ...]
-    recorded_gap: tuple[float, ...]
     known: Tensor
     own: Tensor
     trained: Tensor
+    bank: ActionBank | None = None
 
 
 def perform(clips: Sequence[MocapClip], centres: Float[Tensor, "P 3"] | None = None) -> Performed:
-    """States [T, D] of one person's performances, of a body with constant bone lengths.
+    """Return states [T, D] of one person's performances, of a body with constant bone lengths.
 
     Args:
         clips: of the person, one performance each. centres: of the parts; none if None.
@@ -105,7 +89,7 @@ def perform(clips: Sequence[MocapClip], centres: Float[Tensor, "P 3"] | None = N
 
 
 def arm_centres(clips: Sequence[MocapClip]) -> Float[Tensor, "P 3"]:
-    """Centres of the parts (DX 1): arms above the head are half a turn away from hanging ones, where
+    """Return centres of the parts (DX 1): arms above the head are half a turn away from hanging ones, where
     the vectors of their rotations would jump."""
     joints = torch.cat([clip.joints for clip in clips])
     body = fit_body(joints)
@@ -132,21 +116,15 @@ def prepare(
     space = fit_space(body, others, name, split.test[0].fps)
     step_std = constant_velocity_std(body, [s for one in others for s in one])
     tests = tuple(view_of(body, clip, conditions) for clip in split.test)
-    truth = tuple(state_postures(body, fit_state(body, clip.joints)) for clip in split.test)
-    known = known_angles(split.test[0])
-    gaps = [
-        (found - posture_angles(clip.joints))[:, known].square().mean()
-        for found, clip in zip(truth, split.test, strict=True)
-    ]
     own, trained = performed[split.person], others[0]
     return BendTrackee(
-        split, body, step_std, tests, (), space, truth, tuple(map(float, gaps)), known,
+        split, body, step_std, tests, (), space, known_angles(split.test[0]),
         state_postures(body, torch.cat(own)), state_postures(body, torch.cat(trained)),
     )  # fmt: skip
 
 
 def fit_space(body: Body, performed: Sequence[Performed], name: str, fps: float) -> ActionSpace:
-    """The action space of some persons' performances, put on the body that is to be tracked.
+    """Return the action space of some persons' performances, put on the body that is to be tracked.
 
     With the same rotations, where somebody's shoulders and hips are makes no difference. It has as
     many dimensions as are ever asked for.
@@ -158,22 +136,34 @@ def fit_space(body: Body, performed: Sequence[Performed], name: str, fps: float)
 def synchronised_space(
     body: Body, performed: Sequence[Performed], info: ActionInfo
 ) -> tuple[ActionSpace, Synchronised]:
-    """The same, and the performances in it before and after they are put in step."""
+    """Return the same, and the performances in it before and after they are put in step."""
     postures = [state_postures(body, states) for one in performed for states in one]
     rank = min(MOST_DIMENSIONS, int(torch.linalg.matrix_rank(torch.cat(postures), rtol=1e-4)))
     return fit_synchronised(postures, rank, name=info.name, fps=info.fps, info=info)
 
 
 def known_angles(clip: MocapClip) -> Bool[Tensor, "36"]:
-    """Angles of limbs whose joints are recorded."""
+    """Return which angles are of limbs whose joints are recorded."""
     there = dict(zip(BODY_15.names, clip.joints.isfinite().all(-1).all(0).tolist(), strict=True))
     return torch.tensor([there[limb.start] and there[limb.end] for limb in LIMBS_12 for _ in "xyz"])
+
+
+def true_postures(body: Body, clip: MocapClip) -> Float[Tensor, "T 36"]:
+    """Return the angles of a body fitted to the recorded joints, degrees."""
+    return state_postures(body, fit_state(body, clip.joints))
+
+
+def recorded_gap(subject: Subject[BendTrackee]) -> float:
+    """Return the mean squared difference of these from the angles of the recorded joints, degrees^2."""
+    clip = subject.view.clip
+    apart = true_postures(subject.body, clip) - posture_angles(clip.joints)
+    return float(apart[:, subject.person.known].square().mean())
 
 
 def make_filter(
     variant: Variant, trackee: BendTrackee, setting: Setting, action: Any = None
 ) -> ConstrainedParticleFilter:
-    """The tracker of a variant, in single precision.
+    """Return the tracker of a variant, in single precision.
 
     Args:
         variant: which. trackee: whose body and action space. setting: sharpness, and factor of the
@@ -190,7 +180,7 @@ def make_filter(
 
 
 def true_acceptance(trackee: BendTrackee, dimensions: int) -> tuple[Acceptance, Acceptance]:
-    """Share of recorded postures that pass the gates: of the person who is left out, of a trainer."""
+    """Return the share of recorded postures that pass: of the person left out, and of a trainer."""
     space = trackee.space.with_dimensions(dimensions)
     generators = [torch.Generator().manual_seed(seed) for seed in (0, 1)]
     unseen, trained = (

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from benchmarks.root_uncertainty.trackees import METHODS, Budget, Walker, make_filter, slower
-from benchmarks.silhouette.pictures import plot_silhouettes
-from benchmarks.silhouette.runs import Runs, generators_of, sequence_name
-from benchmarks.silhouette.trackees import Setting, View
+from benchmarks.bodies.pictures import plot_silhouettes
+from benchmarks.bodies.tracking import generators_of
+from benchmarks.bodies.views import View, subjects_of
+from benchmarks.engine import Results, Setting
+from benchmarks.root_uncertainty.walkers import METHODS, Budget, Walker, make_filter, slower
 from torchpose.body import Body, Limbs, fit_state
 from torchpose.camera import CameraRig
 from torchpose.evaluation import Report
@@ -42,14 +43,6 @@ if TYPE_CHECKING:
 else:
     Axes = Figure = Any
 
-__all__ = [
-    "add_pictures",
-    "plot_diffusion",
-    "plot_distributions",
-    "plot_predictions",
-    "plot_sigma_points",
-]
-
 _SEEN = (0.86, 0.89, 0.93)
 _FOLLOWED = 30  # frames after which distributions are shown
 _SHOWN = 114  # particles drawn of each method
@@ -65,11 +58,12 @@ class Sample(NamedTuple):
 
 def add_pictures(
     report: Report, walkers: Sequence[Walker], settings: Mapping[str, Setting], budget: Budget,
-    runs: Runs, out: Path,
+    runs: Results, out: Path,
 ) -> None:  # fmt: skip
     """All pictures of the first person."""
     walker = walkers[0]
-    view = walker.tests[0]
+    name, subject = next(iter(subjects_of([walker]).items()))
+    view = subject.view
     frame = min(_FOLLOWED, len(view.clip) - 1)
     state = fit_state(walker.body, view.clip.joints[frame : frame + 1])[0]
     add_picture(report, out, "predictions.png", plot_predictions(walker, state, view.rig))
@@ -84,10 +78,9 @@ def add_pictures(
         add_picture(report, out, "sigma-points.png", plot_sigma_points(root, view, frame))
     if samples:
         add_picture(report, out, "samples.png", plot_distributions(samples, view, frame))
-    name = sequence_name(walker, view)
-    shown = [(label, runs[label][name][0]) for label in samples]
+    shown = [(label, runs.where(method=label, subject=name).runs[0]) for label in samples]
     if shown:
-        figure = plot_silhouettes(walker, view, shown, 6, f"{name}: estimated poses")
+        figure = plot_silhouettes(subject, shown, 6, f"{name}: estimated poses")
         add_picture(report, out, "poses.png", figure)
 
 

@@ -13,49 +13,48 @@ from pathlib import Path
 import torch
 from tqdm.auto import tqdm
 
+from benchmarks.bodies.clips import split_clips
+from benchmarks.bodies.pictures import plot_errors_by_time
+from benchmarks.bodies.tracking import csv_columns, part_error
+from benchmarks.bodies.views import Conditions, image_size
+from benchmarks.engine import Setting, Tuning, plot_by_condition, read_settings, write_csv
 from benchmarks.root_uncertainty.pictures import add_pictures
-from benchmarks.root_uncertainty.runs import (
+from benchmarks.root_uncertainty.recovery import (
     DISPLACEMENTS,
+    RECOVERY,
     Displacement,
-    progress_bar,
-    recover_all,
-    run_condition,
+    add_recovery,
+    displaced_grids,
 )
-from benchmarks.root_uncertainty.search import tune
-from benchmarks.root_uncertainty.tables import (
+from benchmarks.root_uncertainty.report import (
     add_differences,
     add_errors,
     add_order,
     add_rates,
-    add_recovery,
-    add_setup,
+    add_sequences,
     add_speed,
     add_tuning,
 )
-from benchmarks.root_uncertainty.trackees import (
+from benchmarks.root_uncertainty.walkers import (
     FPS,
     METHODS,
     POINTS,
+    TRACKING,
     Budget,
     Walker,
+    grid_of,
     prepare,
     published,
     slower,
+    tune,
     with_cameras,
 )
-from benchmarks.silhouette.data import split_clips
-from benchmarks.silhouette.pictures import plot_errors_by_condition, plot_errors_by_time
-from benchmarks.silhouette.protocol import WALKERS, image_size
-from benchmarks.silhouette.runs import Runs, Tuning, read_settings
-from benchmarks.silhouette.tables import write_csv
-from benchmarks.silhouette.trackees import Conditions, Setting
+from benchmarks.silhouette.protocol import WALKERS
 from torchpose._core.files import check_output_folder
 from torchpose.errors import DegenerateFilterWarning, InputError
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import add_picture
 from torchpose.io._mocap import MocapClip, read_mocap
-
-__all__ = ["run"]
 
 PARTS = ("tables", "rates", "recovery", "all")
 
@@ -174,7 +173,7 @@ def run(
         for rate, found in chosen_at.items()
     }
     add_tuning(report, tunings, budget)
-    add_setup(report, walkers)
+    add_sequences(report, walkers)
     report.save(out)
     return report
 
@@ -188,22 +187,22 @@ def _fill_tables(
 ) -> None:  # fmt: skip
     """Tables 1 and 2, Figures 8 and 10, and what the distributions look like."""
     by_cameras = {n: [with_cameras(walker, n) for walker in walkers] for n in cameras_used}
-    total = len(cameras_used) * _frames(walkers) * len(settings) * len(seeds)
-    found: dict[int, Runs] = {}
-    with progress_bar(total, progress, "cameras") as bar:
-        for n, seen in by_cameras.items():
-            found[n] = run_condition(seen, settings, budget, out, seeds, bar)
-    for n, runs in found.items():
-        add_errors(report, f"{n} cameras", f"Error (mm) with {n} cameras", runs)
-        add_order(report, n, runs)
-        write_csv(out / f"runs-{n}-cameras.csv", runs, FPS, seeds[0])
-    add_differences(report, {f"{n} cameras": runs for n, runs in found.items()})
-    n, runs = next(iter(found.items()))
-    add_speed(report, runs, f"{budget.particles} likelihoods a frame in {n} cameras")
-    for n, runs in found.items():
-        figure = plot_errors_by_time(runs, FPS, f"Error over time, {n} cameras")
+    grids = {f"{n} cameras": grid_of(seen, settings, budget) for n, seen in by_cameras.items()}
+    runs = TRACKING.run(grids, seeds, out, progress=progress, title="cameras")
+    for n, key in zip(by_cameras, grids, strict=True):
+        own = runs.where(condition=key)
+        add_errors(report, key, f"Error (mm) with {key}", own)
+        add_order(report, n, own)
+        write_csv(out / f"runs-{n}-cameras.csv", own, csv_columns(FPS))
+    add_differences(report, runs)
+    first = next(iter(grids))
+    speed = f"{budget.particles} likelihoods a frame in {first}"
+    add_speed(report, runs.where(condition=first), speed)
+    for n, key in zip(by_cameras, grids, strict=True):
+        figure = plot_errors_by_time(runs.where(condition=key), FPS, f"Error over time, {key}")
         add_picture(report, out, f"error-over-time-{n}-cameras.png", figure)
-    add_pictures(report, by_cameras[cameras_used[0]], settings, budget, found[cameras_used[0]], out)
+    seen = by_cameras[cameras_used[0]]
+    add_pictures(report, seen, settings, budget, runs.where(condition=first), out)
 
 
 def _fill_rates(
@@ -212,15 +211,12 @@ def _fill_rates(
     progress: bool,
 ) -> None:  # fmt: skip
     """Figure 9, every rate with the settings that were chosen at it."""
-    total = sum(_frames(seen) * len(settings[fps]) for fps, seen in by_rate.items()) * len(seeds)
-    found: dict[float, Runs] = {}
-    with progress_bar(total, progress, "frame rates") as bar:
-        for fps, seen in by_rate.items():
-            found[fps] = run_condition(seen, settings[fps], budget, out, seeds, bar)
-            write_csv(out / f"runs-{fps:g}-fps.csv", found[fps], fps, seeds[0])
-    add_rates(report, found)
-    named = {f"{fps:g}": runs for fps, runs in found.items()}
-    figure = plot_errors_by_condition(named, "Error over frames per second")
+    grids = {f"{fps:g}": grid_of(seen, settings[fps], budget) for fps, seen in by_rate.items()}
+    runs = TRACKING.run(grids, seeds, out, progress=progress, title="frame rates")
+    for fps, key in zip(by_rate, grids, strict=True):
+        write_csv(out / f"runs-{key}-fps.csv", runs.where(condition=key), csv_columns(fps))
+    add_rates(report, runs)
+    figure = plot_by_condition(runs, {"error (mm)": part_error()}, "Error over frames per second")
     add_picture(report, out, "error-over-rates.png", figure)
 
 
@@ -229,13 +225,9 @@ def _fill_recovery(
     displacements: Sequence[Displacement], seeds: Sequence[int], times: Sequence[float],
     seconds: float, out: Path, progress: bool,
 ) -> None:  # fmt: skip
-    frames = sum(round((t + seconds) * FPS) for t in times)
-    total = frames * len(walkers) * len(settings) * len(seeds) * len(displacements)
-    with progress_bar(total, progress, "displaced") as bar:
-        found = recover_all(
-            walkers, settings, budget, out, seeds, displacements, times, seconds, bar
-        )
-    add_recovery(report, found, FPS, seconds)
+    grids = displaced_grids(walkers, settings, budget, displacements, times, seconds)
+    runs = RECOVERY.run(grids, seeds, out, progress=progress, title="displaced")
+    add_recovery(report, runs, FPS, seconds)
 
 
 def _tunings(
@@ -264,10 +256,6 @@ def _rates(part: str, steps: Mapping[float, int]) -> dict[float, int]:
     """Frame rates that a part needs, each with the n of which it takes every n-th frame."""
     whole = {FPS: 1} if part != "rates" else {}
     return whole | (dict(steps) if part in ("rates", "all") else {})
-
-
-def _frames(walkers: Sequence[Walker]) -> int:
-    return sum(len(view.clip) for walker in walkers for view in walker.tests)
 
 
 def _times(times: Sequence[float], seconds: float, walkers: Sequence[Walker]) -> tuple[float, ...]:

@@ -6,26 +6,25 @@ manifold-regularised one, with the same number of likelihoods a frame, the same 
 exponents chosen on validation clips. Errors are distances of joints (MR 31).
 """
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from tqdm.auto import tqdm
 
+from benchmarks.bodies.clips import Split, looped, split_clips
+from benchmarks.bodies.tracking import PUBLISHED_SURVIVAL
+from benchmarks.bodies.views import Conditions, Subject, image_size, subjects_of
+from benchmarks.engine import Grid, Setting, Tuning, read_settings
 from benchmarks.humaneva_files import is_humaneva
-from benchmarks.silhouette.data import Split, looped, split_clips
+from benchmarks.silhouette.filters import METHODS, TRACKING, Filter, Trackee, prepare, tune
 from benchmarks.silhouette.humaneva import HumanEvaFootage, humaneva_splits
-from benchmarks.silhouette.report import Cell, fill_one, fill_several
-from benchmarks.silhouette.runs import Tuning, read_settings, run_all, tune
-from benchmarks.silhouette.trackees import METHODS, PUBLISHED_SURVIVAL, Conditions, Setting, prepare
+from benchmarks.silhouette.report import Case, fill_one, fill_several
 from torchpose._core.files import check_output_folder
 from torchpose.camera import CameraRig
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
 from torchpose.io._mocap import MocapClip, read_mocap
-
-__all__ = ["WALKERS", "image_size", "run"]
 
 FPS = 60.0
 WALKERS = ("07", "08", "35", "39")
@@ -123,7 +122,7 @@ def run(
         splits = [_looped(split, loop) for split in splits]
         frames = max(len(clip) for split in splits for clip in split.test)
     rig = None if cameras is None else CameraRig.load(cameras)
-    cells = []
+    cases = []
     for text in size:
         conditions = Conditions(image_size(text), faults, cameras_used, rig, seed, footage=footage)
         trackees = [
@@ -135,12 +134,12 @@ def run(
                 name: tune(trackees, name, n, likelihood, out)
                 for name in tqdm(method, disable=not progress, desc="exponents")
             }
-            runs = run_all(
-                trackees, {name: tuning.setting for name, tuning in tunings.items()}, out,
-                seeds=seeds, seed=seed, n_particles=n, likelihood=likelihood, initial=initial,
-                progress=progress,
-            )  # fmt: skip
-            cells.append(Cell(n, text, trackees, tunings, runs))
+            cases.append(Case(n, text, trackees, tunings))
+    by_name = _named(cases)
+    runs = TRACKING.run(
+        {name: _grid(case, likelihood, initial) for name, case in by_name.items()},
+        range(seed, seed + seeds), out, progress=progress, title="tracking",
+    )  # fmt: skip
     report = Report("Silhouettes: three filters over body poses", {
         "quick": quick, "seed": seed, "seeds": seeds, "methods": list(method),
         "persons": list(dict.fromkeys(split.person for split in splits)),
@@ -150,12 +149,12 @@ def run(
         "cameras used": cameras_used, "faults": faults if footage is None else "real",
         "size": _one_or_all(size),
         "likelihood": likelihood, "initial pose": initial, "looped": loop,
-        "threads": torch.get_num_threads(), "settings": _chosen(cells),
+        "threads": torch.get_num_threads(), "settings": _chosen(cases),
     })  # fmt: skip
-    if len(cells) == 1:
-        fill_one(report, cells[0], out, FPS, seed)
+    if len(cases) == 1:
+        fill_one(report, cases[0], runs, out, FPS)
     else:
-        fill_several(report, cells, out, FPS, seed)
+        fill_several(report, by_name, runs, out, FPS)
     report.save(out)
     return report
 
@@ -197,19 +196,43 @@ def _given_settings(
     }
 
 
+def _named(cases: Sequence[Case]) -> dict[str, Case]:
+    """Return conditions by what they differ in."""
+    one_size = len({case.size for case in cases}) == 1
+    one_number = len({case.n_particles for case in cases}) == 1
+
+    def name(case: Case) -> str:
+        number = "" if one_number else f"{case.n_particles:,} likelihoods"
+        size = "" if one_size else case.size
+        return ", ".join(part for part in (number, size) if part)
+
+    return {name(case): case for case in cases}
+
+
+def _grid(case: Case, likelihood: str, initial: str) -> Grid[Subject[Trackee], Filter]:
+    """Return who is tracked by what under one condition."""
+    return Grid(
+        subjects_of(case.trackees),
+        {
+            name: Filter(name, tuning.setting, case.n_particles, likelihood, initial)
+            for name, tuning in case.tunings.items()
+        },
+    )
+
+
 # --- what a report says ---------------------------------------------------------------------------
 
 
-def _chosen(cells: Sequence[Cell]) -> dict[str, object]:
+def _chosen(cases: Sequence[Case]) -> dict[str, object]:
     """Settings by method; by condition and method where they differ."""
-    by_cell = {
-        f"{cell.n_particles} at {cell.size}": {
-            name: tuning.setting._asdict() for name, tuning in cell.tunings.items()
+    by_case = {
+        f"{case.n_particles} at {case.size}": {
+            name: tuning.setting._asdict() for name, tuning in case.tunings.items()
         }
-        for cell in cells
+        for case in cases
     }
-    first, *others = by_cell.values()
-    return dict(first) if all(other == first for other in others) else dict(by_cell)
+    first, *others = by_case.values()
+    return dict(first) if all(other == first for other in others) else dict(by_case)
 
 
 def _cameras(path: str | None, footage: HumanEvaFootage | None) -> str:
@@ -282,14 +305,6 @@ def _default_persons(clips: Sequence[MocapClip]) -> tuple[str, ...]:
             + ", ".join(f"{count} of {name}" for name, count in trials.items())
         )
     return enough
-
-
-def image_size(text: str) -> tuple[int, int]:
-    """(height, width) of ``160x120``."""
-    match = re.fullmatch(r"\s*(\d+)\s*[x×]\s*(\d+)\s*", text)
-    if match is None or 0 in (int(match[1]), int(match[2])):
-        raise InputError(f"--size must be width x height such as 160x120, got {text!r}")
-    return int(match[2]), int(match[1])
 
 
 def _looped(split: Split, times: int) -> Split:

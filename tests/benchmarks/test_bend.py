@@ -10,16 +10,16 @@ import torch
 from benchmarks.bend import actions as bend_actions
 from benchmarks.bend import occlusion as bend_occlusion
 from benchmarks.bend import protocol as bend
-from benchmarks.bend import runs as bend_runs
-from benchmarks.bend import tables as bend_tables
-from benchmarks.bend.data import action_clips, first_bend, leave_one_out, performances
-from benchmarks.bend.trackees import Variant, known_angles, perform, prepare
-from benchmarks.silhouette.trackees import Conditions
+from benchmarks.bend import report as bend_report
+from benchmarks.bend import tracking as bend_tracking
+from benchmarks.bend.clips import action_clips, first_bend, leave_one_out, performances
+from benchmarks.bend.trackees import known_angles, perform, prepare
+from benchmarks.bodies.views import Conditions
+from benchmarks.engine import Results, Row
 from tests.benchmarks.benders import bender, write_benders
 from torchpose.body import BODY_15
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
-from torchpose.evaluation.kept_runs import kept, read_kept
 from torchpose.io._mocap import read_mocap
 
 SMALL = {
@@ -109,49 +109,49 @@ def test_an_arm_is_hidden_from_the_side_and_seen_from_ahead(bends):
 # --- statistics -----------------------------------------------------------------------------------
 
 
-def made_up(seed, offset, n_seeds=3, n_frames=(5, 7)):
+def made_up(seed, offset, condition="", method="constrained", n_seeds=3, n_frames=(5, 7)):
     """Runs of which everything is known."""
     rng = np.random.default_rng(seed)
-    found = {}
+    rows = []
     for q, n in enumerate(n_frames):
-        runs = []
-        for _ in range(n_seeds):
+        for s in range(n_seeds):
             errors = torch.from_numpy(offset + rng.normal(0, 5, (n, 15)))
             errors[:, BODY_15.joint("head")] = torch.nan
             squared = torch.from_numpy(offset + rng.normal(0, 1, n))
             share = torch.full((n,), 0.5)
-            runs.append(bend_runs.BendRun(
+            run = bend_tracking.BendRun(
                 errors, squared, torch.zeros(n, 36), share, share / 2, torch.zeros(n, 0),
                 share * torch.nan, torch.zeros(n, dtype=torch.bool), torch.full((1,), 0.01),
-            ))  # fmt: skip
-        found[f"p{q}"] = runs
-    return found
+            )  # fmt: skip
+            rows.append(Row(condition, f"p{q}", method, s, run))
+    return Results(tuple(rows))
 
 
 def test_statistics_are_numpy_s():
     runs = made_up(0, 20.0)
-    squared = [[r.squared.numpy().mean() for r in seeds] for seeds in runs.values()]
-    np.testing.assert_allclose(bend_runs.mean_squared(runs).numpy(), squared)
-    joints = [[np.nanmean(r.errors.numpy()) for r in seeds] for seeds in runs.values()]
-    np.testing.assert_allclose(bend_tables.joint_error(runs).numpy(), joints)
-    roots = [[r.errors.numpy()[:, 0].mean() for r in seeds] for seeds in runs.values()]
-    np.testing.assert_allclose(bend_tables.root_error(runs).numpy(), roots)
-    arms = bend_occlusion.arm_errors(runs["p0"], "left").numpy()
+    cells = [own.runs for own in runs.by("subject").values()]
+    squared = [[r.squared.numpy().mean() for r in seeds] for seeds in cells]
+    np.testing.assert_allclose(runs.values(bend_tracking.mean_squared).numpy(), squared)
+    joints = [[np.nanmean(r.errors.numpy()) for r in seeds] for seeds in cells]
+    np.testing.assert_allclose(runs.values(bend_report.JOINT_ERROR).numpy(), joints)
+    roots = [[r.errors.numpy()[:, 0].mean() for r in seeds] for seeds in cells]
+    np.testing.assert_allclose(runs.values(bend_report.root_error).numpy(), roots)
+    arms = bend_occlusion.arm_errors(cells[0], "left").numpy()
     columns = [BODY_15.joint("left_elbow"), BODY_15.joint("left_wrist")]
-    np.testing.assert_allclose(arms[1], runs["p0"][1].errors.numpy()[:, columns].mean(1))
+    np.testing.assert_allclose(arms[1], cells[0][1].errors.numpy()[:, columns].mean(1))
 
 
 @pytest.mark.parametrize(("offset", "word"), [(10.0, "no worse"), (40.0, "WORSE")])
 def test_the_verdict_is_that_of_the_numbers(offset, word):
-    runs = {}
+    runs = Results(())
     for n in (500, 2000, 10000):
-        runs[Variant(True, n)] = made_up(n, offset)
-        runs[Variant(False, n)] = made_up(n + 1, 25.0)
+        runs += made_up(n, offset, f"{n:,}") + made_up(n + 1, 25.0, f"{n:,}", "first order")
     report = Report("made up")
-    bend_tables.add_particles(report, runs)
+    bend_report.add_particles(report, runs)
     assert f"2,000 particles is {word} than unconstrained with 10,000" in report.findings[0]
     assert report["particles"]["500", "accepted (%)"] == pytest.approx(50.0)
-    expected = float(bend_runs.mean_squared(runs[Variant(False, 10000)]).mean())
+    most = runs.where(condition="10,000", method="first order")
+    expected = float(most.values(bend_tracking.mean_squared).mean())
     assert report["particles"]["10,000", "MSE, first order"] == pytest.approx(expected)
 
 
@@ -168,15 +168,6 @@ def test_a_confusion_table_counts_recordings():
     assert rows["bend"][:3] == (1, 1, 0) and rows["punch"][:3] == (0, 1, 0)
     assert rows["clap (none of them)"] == (1, 0, 1, pytest.approx(30.0))
     assert "2 of 3 recordings" in report.findings[0] and "1 of 2 others" in report.findings[0]
-
-
-def test_numbers_are_kept_and_damaged_ones_made_again(tmp_path):
-    path, made = tmp_path / "error.npz", []
-    assert kept(path, lambda: made.append(1) or 3.25) == 3.25
-    assert kept(path, lambda: made.append(1) or 9.0) == 3.25 and len(made) == 1
-    path.write_bytes(path.read_bytes()[:20])
-    assert kept(path, lambda: 7.0) == 7.0
-    assert read_kept(tmp_path / "none.npz", tuple, ("a",)) is None
 
 
 # --- the whole of it ------------------------------------------------------------------------------
@@ -209,8 +200,8 @@ def test_a_killed_run_goes_on_with_the_same_numbers(done, folder, monkeypatch):
     out, report = done
     for path in sorted(out.glob("run-*.npz"))[:2]:
         path.write_bytes(path.read_bytes()[:50])
-    tracked, calls = bend_runs._tracked, []
-    monkeypatch.setattr(bend_runs, "_tracked", lambda *a: calls.append(1) or tracked(*a))
+    made, calls = bend_tracking.make_filter, []
+    monkeypatch.setattr(bend_tracking, "make_filter", lambda *a: calls.append(1) or made(*a))
     monkeypatch.setattr(bend, "PARTS", ("dimensions",))
     again = bend.run(folder, out, **SMALL)
     assert len(calls) <= 2

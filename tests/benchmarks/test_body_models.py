@@ -7,16 +7,12 @@ import pytest
 import torch
 
 from benchmarks import body_models
+from benchmarks.bodies.views import Conditions, subjects_of
 from tests.benchmarks.walkers import walker, write_walkers
 from torchpose.errors import InputError, OverlapError, PriorError
 from torchpose.io._mocap import read_mocap
-from torchpose.learning._recipes import (
-    LimbStates,
-    ManifoldFitting,
-    ManifoldPoses,
-    ManifoldRecipe,
-    fit_limbs,
-)
+from torchpose.learning import ManifoldRecipe, fit_limbs
+from torchpose.learning._recipes import LimbStates, ManifoldFitting, ManifoldPoses
 
 
 @pytest.fixture(scope="module")
@@ -88,9 +84,8 @@ def test_the_mean_pose_is_put_where_the_person_is(scene):
         np.savez(folder / f"s_{trial}.npz", joints=still, names=np.array(NAMES), fps=60.0,
                  subject="s", action="slide", axes="y-up", source="example/slides")  # fmt: skip
     clips = read_mocap(folder, 60.0)
-    conditions = body_models.Conditions((60, 80), 0.0, 1, None, 0)
-    one = body_models._prepare(clips, 1, 20, conditions)
-    stays, mean = body_models._blind(one, one.tests[0])
+    one = body_models._prepare(clips, 1, 20, Conditions((60, 80), 0.0, 1, None, 0))
+    stays, mean = body_models._blind(subjects_of([one]), 0).runs
     assert float(mean.errors.nanmean()) < 5
     expected = torch.linspace(0, 1000, 20)
     torch.testing.assert_close(stays.errors.nanmean(1), expected, atol=8.0, rtol=0)

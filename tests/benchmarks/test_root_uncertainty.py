@@ -12,31 +12,39 @@ import torch
 
 import torchpose
 from benchmarks._command import PROTOCOLS
+from benchmarks.bodies.clips import split_clips
+from benchmarks.bodies.tracking import Run, generators_of, track_view
+from benchmarks.bodies.views import Conditions, subjects_of
+from benchmarks.engine import Results, Row, Setting, Tuning
 from benchmarks.root_uncertainty import protocol as root_uncertainty
-from benchmarks.root_uncertainty import runs as root_uncertainty_runs
-from benchmarks.root_uncertainty import search as root_uncertainty_search
-from benchmarks.root_uncertainty.runs import Displacement, displaced
-from benchmarks.root_uncertainty.search import search_setting
-from benchmarks.root_uncertainty.tables import add_errors, add_order, add_rates, add_recovery
-from benchmarks.root_uncertainty.trackees import (
+from benchmarks.root_uncertainty import recovery
+from benchmarks.root_uncertainty import walkers as root_uncertainty_walkers
+from benchmarks.root_uncertainty.recovery import (
+    Displacement,
+    Recovered,
+    add_recovery,
+    displaced,
+)
+from benchmarks.root_uncertainty.report import add_errors, add_order, add_rates
+from benchmarks.root_uncertainty.walkers import (
     METHODS,
+    SOURCES,
+    TRACKING,
     Budget,
+    Filter,
     make_filter,
     prepare,
     published,
     selected_among,
     slower,
+    tune,
     with_cameras,
 )
-from benchmarks.silhouette.data import split_clips
-from benchmarks.silhouette.runs import Run, Tuning
-from benchmarks.silhouette.trackees import Conditions, Setting
 from tests.benchmarks.walkers import write_walkers
 from torchpose.cli.protocol import build
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import settings_hash
-from torchpose.evaluation.kept_runs import source_hash
 from torchpose.io._mocap import read_mocap
 from torchpose.math import quaternion_vector_to_matrix
 from torchpose.whole_body import AnnealedParticleFilter, RootUncertaintyTracker
@@ -137,52 +145,6 @@ def test_every_filter_evaluates_the_same_number_of_likelihoods(walkers):
 # --- what validation chooses ----------------------------------------------------------------------
 
 
-def bowl(value, scale):
-    """An error that is smallest at this setting, which the two may trade for each other."""
-
-    def error(setting):
-        a, b = math.log(setting.value / value), math.log(setting.scale / scale)
-        return 50 + (a + 0.5 * b) ** 2 + b**2
-
-    return error
-
-
-@pytest.mark.parametrize(
-    ("value", "scale"), [(0.17, 1.3), (0.03, 4.5), (0.3, 0.4), (0.02, 0.3), (0.36, 1.0)]
-)
-def test_what_is_chosen_lies_between_worse_settings(value, scale):
-    error = bowl(value, scale)
-    rows = METHODS["root"].values
-    found = search_setting(error, Setting(0.16, 1.4), 0.926, rows, 2 / 114)
-    assert found.error == min(found.errors) == error(found.setting)
-    values = [s.value for s in found.tried if s.scale == found.setting.scale]
-    scales = [s.scale for s in found.tried if s.value == found.setting.value]
-    assert min(values) < found.setting.value < max(values)
-    assert min(scales) < found.setting.scale < max(scales)
-    assert min(values) >= 2 / 114 and max(values) < 1
-    assert 0.926 in {s.value for s in found.tried}
-    # within a step of the truth: a ratio of at most 2.4 for the survival, 2 for the diffusion
-    assert abs(math.log(found.setting.scale / scale)) < math.log(1.5)
-    assert abs(math.log(found.setting.value / value)) < math.log(2.4)
-
-
-def test_survival_that_cannot_be_is_never_tried():
-    def falling(setting):
-        return 40 + setting.value
-
-    found = search_setting(falling, Setting(0.16, 1.4), 0.926, METHODS["sir"].values, 2 / 114)
-    assert min(s.value for s in found.tried) >= 2 / 114
-    assert found.setting.value < 2 * 2 / 114, "the least of the row that can be"
-    never = search_setting(
-        lambda s: math.nan if s.value < 0.2 else 1.0,
-        Setting(0.16, 1.4),
-        0.926,
-        (0.1, 0.16, 0.25),
-        0.02,
-    )
-    assert never.setting.value > 0.2
-
-
 def test_a_search_starts_from_what_was_chosen_at_the_rate_above(walkers, tmp_path, monkeypatch):
     asked = []
 
@@ -200,20 +162,27 @@ def test_a_search_starts_from_what_was_chosen_at_the_rate_above(walkers, tmp_pat
     assert found[15.0]["root"].setting == Setting(0.015, 1.4)
 
 
-def test_kept_errors_are_what_a_search_goes_by(walkers, tmp_path, monkeypatch):
+def test_errors_of_validation_clips_are_what_a_search_goes_by(walkers, tmp_path, monkeypatch):
+    """Runs with errors of a known landscape are put in place of those of filters."""
     errors = {0.06: 70.0, 0.1: 61.0, 0.16: 60.0, 0.25: 65.0, 0.926: 90.0}
+    tracked = []
 
-    def error(walkers, method, setting, budget, folder):
-        return errors[round(setting.value, 3)] + 10 * abs(math.log(setting.scale))
+    def track(tracker, body, view, start, generators):
+        scale = float((tracker.step_std / walkers[0].step_std)[0])
+        tracked.append(view.clip.trial)
+        error = errors[round(tracker.survival_rate, 3)] + 10 * abs(math.log(scale))
+        state, flags = torch.zeros(5, 36), torch.zeros(5, dtype=torch.bool)
+        return [Run(torch.full((5, 15), error), state, state, flags, flags, torch.ones(1))]
 
-    monkeypatch.setattr(root_uncertainty_search, "validation_error", error)
-    first = root_uncertainty_search.tune([walkers[0]], "root", Budget(), tmp_path)
+    monkeypatch.setattr(root_uncertainty_walkers, "track_view", track)
+    first = tune([walkers[0]], "root", Budget(), tmp_path)
     assert first.setting == Setting(0.16, 1.0)
     assert any(round(s.value, 3) == 0.926 for s in first.tried)
-    again = root_uncertainty_search.tune(
-        [walkers[0]], "root", Budget(), tmp_path, Setting(0.1, 1.4)
-    )
+    assert {*tracked} == {walkers[0].validation[0][1].clip.trial}
+    count = len(tracked)
+    again = tune([walkers[0]], "root", Budget(), tmp_path, Setting(0.1, 1.4))
     assert again.setting == Setting(0.16, 1.0) and all(s.value < 0.9 for s in again.tried)
+    assert len(tracked) < count + len(again.tried)  # some were kept
 
 
 def test_published_survival_is_that_of_a_second():
@@ -229,13 +198,13 @@ def test_displaced_bodies_are_moved_and_turned_about_the_pelvis(walkers):
     body, view = walkers[0].body, walkers[0].tests[0]
     state, up = view.initial_state, view.clip.up
     before = body.joints(state).numpy()
-    shift, turn = root_uncertainty_runs._steps(Displacement(0.2), up, [0, 1, 2])
+    shift, turn = recovery._steps(Displacement(0.2), up, [0, 1, 2])
     np.testing.assert_allclose(shift.norm(dim=-1).numpy(), 0.2)
     np.testing.assert_allclose((shift @ up).numpy(), 0, atol=1e-12)
     assert not bool(turn.any()) and len({tuple(s) for s in shift.tolist()}) == 3
     moved = body.joints(displaced(state.expand(3, -1), shift, turn)).numpy()
     np.testing.assert_allclose(moved - before, shift[:, None].expand(3, 15, 3).numpy(), atol=1e-9)
-    shift, turn = root_uncertainty_runs._steps(Displacement(degrees=40.0), up, [0, 1, 2, 3])
+    shift, turn = recovery._steps(Displacement(degrees=40.0), up, [0, 1, 2, 3])
     assert not bool(shift.any())
     angle = 2 * torch.asin(turn @ up).rad2deg()
     assert sorted({round(float(a), 6) for a in angle}) == [-40.0, 40.0]
@@ -248,15 +217,15 @@ def test_a_displacement_in_the_middle_moves_particles_once(walkers):
     """Errors before it do not matter, and without one they are those of an ordinary run."""
     walker, view = walkers[0], walkers[0].tests[0]
     tracker = make_filter("apf", walker, published("apf", 60.0), Budget(50))
-    after = root_uncertainty_runs._after
+    after = recovery._after
     none, there = (
         after(tracker, walker.body, view, [0, 1], Displacement(metres), 4, 6)
         for metres in (0.0, 0.3)
     )
     assert none.shape == there.shape == (2, 6)
-    generators = root_uncertainty_runs.generators_of([0, 1])
+    generators = generators_of([0, 1])
     start = view.initial_state.expand(2, -1)
-    runs = root_uncertainty_runs.track_view(tracker, walker.body, view, start, generators)
+    runs = track_view(tracker, walker.body, view, start, generators)
     plain = torch.stack([run.errors[4:10].mean(-1) for run in runs])
     torch.testing.assert_close(none.float(), plain, atol=1e-3, rtol=1e-4)
     assert bool((there[:, 0] > none[:, 0] + 100).all())
@@ -265,19 +234,18 @@ def test_a_displacement_in_the_middle_moves_particles_once(walkers):
 # --- tables ---------------------------------------------------------------------------------------
 
 
-def made_up(errors):
-    """Runs [method][sequence] with these mean errors by method, sequence and seed."""
+def made_up(errors, condition=""):
+    """Runs with these mean errors by method, sequence and seed."""
     state, flags = torch.zeros(5, 36), torch.zeros(5, dtype=torch.bool)
-    return {
-        label: {
-            f"sequence {q}": [
-                Run(torch.full((5, 15), float(e)), state, state, flags, flags, torch.ones(1))
-                for e in row
-            ]
-            for q, row in enumerate(rows)
-        }
+    return Results(tuple(
+        Row(
+            condition, f"sequence {q}", label, s,
+            Run(torch.full((5, 15), float(e)), state, state, flags, flags, torch.ones(1)),
+        )
         for label, rows in errors.items()
-    }
+        for q, row in enumerate(rows)
+        for s, e in enumerate(row)
+    ))  # fmt: skip
 
 
 def test_tables_are_numpy_s_and_findings_say_what_they_show():
@@ -286,7 +254,7 @@ def test_tables_are_numpy_s_and_findings_say_what_they_show():
         "APF": [[60.0, 70.0], [150.0, 250.0]],
         "Root uncertainty": [[80.0, 84.0], [90.0, 92.0]],
     }
-    runs, report = made_up(rows), Report("x")
+    runs, report = made_up(rows, "60"), Report("x")
     add_errors(report, "3 cameras", "title", runs)
     for label, found in rows.items():
         values = np.array(found)
@@ -304,24 +272,30 @@ def test_tables_are_numpy_s_and_findings_say_what_they_show():
     assert "better than SIR on average, as in the paper: yes; 86.5 and 110.0 mm" in said
     assert "by the worst person yes (91.0 and 200.0 mm), by the worst run yes" in said
     assert "here for sequence 0." in said
-    worse = made_up(rows | {"Root uncertainty": [[180.0, 184.0], [190.0, 292.0]]})
+    worse = made_up(rows | {"Root uncertainty": [[180.0, 184.0], [190.0, 292.0]]}, "15")
     report.findings.clear()
     add_order(report, 3, worse)
     said = "\n".join(report.findings)
     assert "ABOVE the paper's 93.7 mm" in said and "as in the paper: NO" in said
     report.findings.clear()
-    add_rates(report, {60.0: runs, 15.0: worse})
+    add_rates(report, runs + worse)
     assert report["rates"]["15", "Root uncertainty"] == pytest.approx(211.5)
     assert "ahead of SIR at 60 of 60, 15 frames per second" in report.findings[0]
 
 
 def test_recovered_are_runs_as_good_as_undisturbed_ones():
-    usual = torch.full((2, 2, 12), 50.0)
-    last = usual.clone()
-    last[..., -6:] = torch.tensor([[55.0, 79.0], [81.0, 300.0]])[..., None]
-    recovery = {"APF": {("none", 0.0): usual, ("10 cm", 0.0): last}}
+    last = [[55.0, 79.0], [81.0, 300.0]]
+    rows = [
+        Row(condition, f"p{q}", "APF", s, Recovered(torch.cat([torch.full((6,), 50.0), end])))
+        for q in range(2)
+        for s in range(2)
+        for condition, end in (
+            ("none, start", torch.full((6,), 50.0)),
+            ("10 cm, start", torch.full((6,), last[q][s])),
+        )
+    ]
     report = Report("x")
-    add_recovery(report, recovery, 60.0, 1.0)
+    add_recovery(report, Results(tuple(rows)), 60.0, 1.0)
     table = report["recovery"]
     assert table["none, start", "back, APF (%)"] == 100
     assert table["10 cm, start", "APF"] == pytest.approx((55 + 79 + 81 + 300) / 4)
@@ -373,7 +347,8 @@ def test_parts_go_on_from_what_is_kept(done, folder, tmp_path, monkeypatch):
     def never(*arguments):
         raise AssertionError("a run that is kept was made again")
 
-    monkeypatch.setattr(root_uncertainty_runs, "make_filter", never)
+    monkeypatch.setattr(root_uncertainty_walkers, "track_view", never)
+    monkeypatch.setattr(recovery, "make_filter", never)
     for part, table in (("rates", "rates"), ("recovery", "recovery")):
         again = root_uncertainty.run(folder, out, part=part, **SMALL)
         assert again[table].rows == report[table].rows and "3 cameras" not in again
@@ -383,42 +358,20 @@ def test_parts_go_on_from_what_is_kept(done, folder, tmp_path, monkeypatch):
         root_uncertainty.run(folder, out, part="rates", fps=(60.0, 20.0), **settings, **SMALL)
 
 
-def test_runs_are_made_again_once_their_source_or_options_changed(
-    done, walkers, tmp_path, monkeypatch
-):
-    walker, budget = walkers[0], Budget(50)
-    view, setting = walker.tests[0], published("root", 60.0)
+def test_runs_depend_on_their_options_and_sources(walkers, monkeypatch):
+    (subject, *_) = subjects_of(walkers).values()
+    how = Filter("root", published("root", 60.0), Budget(50))
 
-    def path_of():
-        facts = root_uncertainty_runs._facts(walker, walker.body, view, "root", setting, budget)
-        return settings_hash(facts)
+    def facts():
+        return settings_hash(TRACKING.facts(subject, how))
 
-    before = path_of()
-    assert path_of() == before
-    monkeypatch.setattr(root_uncertainty_runs, "source_hash", lambda *names: "another")
-    assert path_of() != before
-    monkeypatch.undo()
+    before = facts()
+    assert facts() == before
     other = METHODS["root"]._replace(options={"least_std": 0.05})
     monkeypatch.setitem(METHODS, "root", other)
-    assert path_of() != before
-    for name in root_uncertainty_runs._MADE_WITH:
+    assert facts() != before
+    for name in SOURCES:
         assert (Path(torchpose.__file__).parents[1] / name).exists()
-
-
-def test_the_hash_of_a_source_changes_with_a_constant(tmp_path):
-    names = ("filters", "unscented.py")
-
-    def written(root, constant):
-        (root / "filters").mkdir(parents=True)
-        (root / "filters" / "tracker.py").write_text(f"_LEAST = {constant}\n")
-        (root / "unscented.py").write_text("_D = 3\n")
-        return source_hash(*names, root=root)
-
-    one = written(tmp_path / "one", 0.02)
-    assert one == written(tmp_path / "same", 0.02) != written(tmp_path / "other", 0.03)
-    (tmp_path / "one" / "docs.py").write_text("not among them")
-    source_hash.cache_clear()
-    assert source_hash(*names, root=tmp_path / "one") == one
 
 
 @pytest.mark.parametrize(

@@ -9,23 +9,19 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.silhouette import data as silhouette_data
+from benchmarks.bodies import clips as body_clips
+from benchmarks.bodies.tracking import PARTS, Run, drift, part_error
+from benchmarks.bodies.views import Conditions
+from benchmarks.engine import Results, Row, Setting, Tuning, pooled_std, read_settings
+from benchmarks.engine.tuning import SCALES
+from benchmarks.silhouette import filters
 from benchmarks.silhouette import protocol as silhouette
-from benchmarks.silhouette import runs as silhouette_runs
-from benchmarks.silhouette import tables as silhouette_tables
-from benchmarks.silhouette.trackees import (
-    METHODS,
-    SCALES,
-    Conditions,
-    Setting,
-    make_filter,
-    prepare,
-)
+from benchmarks.silhouette.filters import METHODS, make_filter, prepare
 from tests.benchmarks.walkers import write_walkers
 from torchpose.body import BODY_15
 from torchpose.camera import save_cameras
 from torchpose.demo._rendering.clothed_body import TrueShape, true_limbs, true_silhouettes
-from torchpose.errors import FileFormatError, InputError
+from torchpose.errors import InputError
 from torchpose.io._mocap import read_mocap
 from torchpose.whole_body import AnnealedParticleFilter, SIRParticleFilter
 from torchpose.whole_body._sharpness import SharpnessFit
@@ -48,7 +44,7 @@ def clips(folder):
 
 @pytest.fixture(scope="module")
 def trackee(clips):
-    (split,) = silhouette_data.split_clips(clips, ["p1"], ["p1"], 1, 60, 60)
+    (split,) = body_clips.split_clips(clips, ["p1"], ["p1"], 1, 60, 60)
     return prepare(split, Conditions((48, 64), faults=0.0), 12, 10)
 
 
@@ -56,7 +52,7 @@ def trackee(clips):
 
 
 def test_own_trials_train_but_never_the_tracked_one(clips):
-    for split in silhouette_data.split_clips(clips, n_clips=2, manifold_frames=60):
+    for split in body_clips.split_clips(clips, n_clips=2, manifold_frames=60):
         assert split.seen and [c.trial[-1] for c in split.test] == ["0", "1"]
         for part in (split.manifold, split.validation, split.body):
             assert part and {c.person for c in part} == {split.person}
@@ -66,7 +62,7 @@ def test_own_trials_train_but_never_the_tracked_one(clips):
 
 
 def test_others_train_for_someone_unseen(clips):
-    (split,) = silhouette_data.split_clips(clips, ["p1"], ["p2"])
+    (split,) = body_clips.split_clips(clips, ["p1"], ["p2"])
     assert not split.seen and split.person == "p2"
     for part in (split.manifold, split.validation):
         assert {c.person for c in part} == {"p1"}
@@ -76,7 +72,7 @@ def test_others_train_for_someone_unseen(clips):
 
 def test_too_few_trials_are_refused(clips):
     with pytest.raises(InputError, match="person p1: expected two trials or more"):
-        silhouette_data.split_clips(clips, ["p1"], ["p1"], n_clips=3)
+        body_clips.split_clips(clips, ["p1"], ["p1"], n_clips=3)
 
 
 def renamed(clips, action):
@@ -87,7 +83,7 @@ def renamed(clips, action):
 
 
 def test_an_unseen_action_is_tracked_with_a_manifold_of_another(clips):
-    (split,) = silhouette_data.split_clips(
+    (split,) = body_clips.split_clips(
         clips, ["p1"], ["p1"], manifold_frames=60, tracked=renamed(clips, "run")
     )
     assert split.seen and [c.trial for c in split.test] == ["p1_run_0"]
@@ -95,7 +91,7 @@ def test_an_unseen_action_is_tracked_with_a_manifold_of_another(clips):
         assert {(c.person, c.action) for c in part} == {("p1", "walk")}
     assert split.body[0].action == "walk"
     assert "p1_run_0" not in {c.trial for c in split.body}
-    (split,) = silhouette_data.split_clips(
+    (split,) = body_clips.split_clips(
         [c for c in clips if c.person == "p1"], ["p1"], ["p2"], tracked=renamed(clips, "run")
     )
     assert not split.seen and {c.person for c in split.manifold} == {"p1"}
@@ -108,16 +104,16 @@ def test_an_unseen_action_is_tracked_with_a_manifold_of_another(clips):
 
 def test_cameras_stand_around_the_way_and_see_all_of_it(clips):
     clip = clips[0]
-    rig = silhouette_data.place_cameras(clip)
+    rig = body_clips.place_cameras(clip)
     assert len(rig) == 3 and rig.size == (480, 640)
-    assert silhouette_data.in_view(clip, rig).tolist() == [1.0, 1.0, 1.0]
+    assert body_clips.in_view(clip, rig).tolist() == [1.0, 1.0, 1.0]
     places = -(rig.rotation.mT @ rig.translation[..., None]).squeeze(-1)
     middle = clip.joints[:, 0, [0, 2]]
     middle = (middle.amin(0) + middle.amax(0)) / 2
     gap = places[:, [0, 2]] - middle
     np.testing.assert_allclose(gap.norm(dim=-1).numpy(), 3.8)
     bearing = torch.atan2(gap[:, 0], gap[:, 1]).rad2deg().remainder(360)  # +x is to the left of +z
-    np.testing.assert_allclose(bearing.numpy(), silhouette_data.AZIMUTHS, atol=1e-6)
+    np.testing.assert_allclose(bearing.numpy(), body_clips.AZIMUTHS, atol=1e-6)
     up = rig.rotation @ clip.up
     assert bool((up[:, 1] < -0.9).all()) and bool((up[:, 0].abs() < 1e-9).all())  # upright
     centre = rig(torch.stack([middle[0], torch.tensor(0.95 + 0.1), middle[1]])[None]).pixels
@@ -126,17 +122,17 @@ def test_cameras_stand_around_the_way_and_see_all_of_it(clips):
 
 def test_someone_who_leaves_the_image_is_counted(clips):
     clip = clips[0]
-    rig = silhouette_data.place_cameras(clip, focal=1500.0)
+    rig = body_clips.place_cameras(clip, focal=1500.0)
     view = rig(clip.joints)
     inside = (view.pixels >= -0.5).all(-1) & (view.pixels < torch.tensor([639.5, 479.5])).all(-1)
     expected = inside.double().mean((0, 2))
-    torch.testing.assert_close(silhouette_data.in_view(clip, rig), expected)
+    torch.testing.assert_close(body_clips.in_view(clip, rig), expected)
     assert bool((expected < 0.9).any())
 
 
 def test_true_silhouettes_cover_the_recorded_joints(clips):
     clip = clips[5].cut(0, 8)
-    rig = silhouette_data.place_cameras(clip)
+    rig = body_clips.place_cameras(clip)
     seen = true_silhouettes(clip, TrueShape.draw(1), rig)
     pixels = rig(clip.joints).pixels.round().long()
     t = torch.arange(8)[:, None, None]
@@ -158,7 +154,7 @@ def test_true_bodies_differ_from_each_other_and_stay_the_same():
 
 def test_faults_come_from_the_generator(clips):
     clip = clips[0].cut(0, 4)
-    rig = silhouette_data.place_cameras(clip).scaled(48, 64)
+    rig = body_clips.place_cameras(clip).scaled(48, 64)
     clean, first, second, third = (
         true_silhouettes(clip, TrueShape.draw(1), rig, faults, torch.Generator().manual_seed(seed))
         for faults, seed in ((0.0, 0), (1.0, 0), (1.0, 0), (1.0, 1))
@@ -169,7 +165,7 @@ def test_faults_come_from_the_generator(clips):
 
 def test_a_looped_walk_goes_on_without_a_jump(clips):
     clip = clips[0]
-    looped = silhouette_data.looped(clip, 3)
+    looped = body_clips.looped(clip, 3)
     assert len(looped) % 3 == 0 and "looped 3 times" in looped.trial
     length = len(looped) // 3
     assert length == pytest.approx(60, abs=2)  # the period of the first trial
@@ -179,9 +175,9 @@ def test_a_looped_walk_goes_on_without_a_jump(clips):
     pelvis = looped.joints[:, 0]
     assert float((pelvis - pelvis.mean(0)).norm(dim=-1).max()) < 0.05  # on the spot
     with pytest.raises(InputError, match="once or more"):
-        silhouette_data.looped(clip, 0)
+        body_clips.looped(clip, 0)
     with pytest.raises(InputError, match="a cycle needs"):
-        silhouette_data.looped(clip.cut(0, 30), 2)
+        body_clips.looped(clip.cut(0, 30), 2)
 
 
 # --- filters --------------------------------------------------------------------------------------
@@ -224,14 +220,14 @@ def test_validation_chooses_the_scale_first_and_then_the_exponent(trackee, tmp_p
         error = abs(math.log(scale / 1.4)) + 0.1 * abs(math.log(tracker.sharpness / 30))
         return SharpnessFit(values[0], tuple(values), (error,))
 
-    monkeypatch.setattr(silhouette_runs, "fit_sharpness", fit)
-    found = silhouette_runs.tune([trackee], "sir", 20, "bidirectional", tmp_path)
+    monkeypatch.setattr(filters, "fit_sharpness", fit)
+    found = filters.tune([trackee], "sir", 20, "bidirectional", tmp_path)
     assert found.setting == Setting(30.0, 1.4) and found.error == pytest.approx(0.0, abs=1e-6)
     assert tried[: len(SCALES)] == [(100.0, scale) for scale in SCALES]
     assert {scale for _, scale in tried[len(SCALES) :]} == {1.4}
     assert len(tried) == len(set(tried)) == len(found.tried)
     count = len(tried)
-    again = silhouette_runs.tune([trackee], "sir", 20, "bidirectional", tmp_path)
+    again = filters.tune([trackee], "sir", 20, "bidirectional", tmp_path)
     assert len(tried) == count and again == found  # kept
     budgets = {len({*SCALES}) + len(m.values) - (m.first in m.values) for m in METHODS.values()}
     assert len(budgets) == 1
@@ -240,68 +236,48 @@ def test_validation_chooses_the_scale_first_and_then_the_exponent(trackee, tmp_p
 # --- statistics -----------------------------------------------------------------------------------
 
 
-def made_up(seed, n_frames=(30, 40), n_seeds=4, offset=50.0):
+def made_up(seed, method, n_frames=(30, 40), n_seeds=4, offset=50.0):
     """Runs with errors of which everything is known."""
     rng = np.random.default_rng(seed)
-    found = {}
+    rows = []
     for q, n in enumerate(n_frames):
-        runs = []
-        for _ in range(n_seeds):
+        for s in range(n_seeds):
             errors = offset + 10 * q + rng.normal(0, 5, (n, 15)) + rng.normal(0, 3)
             errors += 0.5 * np.arange(n)[:, None]
             errors[:, BODY_15.joint("head")] = np.nan
             state = torch.zeros(n, 36)
             flags = torch.zeros(n, dtype=torch.bool)
-            runs.append(silhouette_runs.Run(
-                torch.from_numpy(errors), state, state, flags, flags, torch.ones(1)
-            ))  # fmt: skip
-        found[f"sequence {q}"] = runs
-    return found
+            run = Run(torch.from_numpy(errors), state, state, flags, flags, torch.ones(1))
+            rows.append(Row("", f"sequence {q}", method, s, run))
+    return Results(tuple(rows))
 
 
 def test_statistics_are_numpy_s():
-    runs = {"sir": made_up(0), "mrpf": made_up(1, offset=40.0)}
-    every = [[run.errors.numpy().copy() for run in seeds] for seeds in runs["sir"].values()]
-    whole = silhouette_tables.part_errors(runs, "sir")
+    runs = made_up(0, "sir") + made_up(1, "mrpf", offset=40.0)
+    sir = runs.where(method="sir")
+    every = [[r.errors.numpy().copy() for r in own.runs] for own in sir.by("subject").values()]
+    whole = sir.values(part_error())
     expected = [[np.nanmean(e) for e in seeds] for seeds in every]
     np.testing.assert_allclose(whole.numpy(), expected)
     legs = [BODY_15.joint(f"{s}_{j}") for s in ("left", "right") for j in ("knee", "ankle")]
     np.testing.assert_allclose(
-        silhouette_tables.part_errors(runs, "sir", "legs").numpy(),
+        sir.values(part_error("legs")).numpy(),
         [[e[:, legs].mean() for e in seeds] for seeds in every],
     )
-    assert bool(silhouette_tables.part_errors(runs, "sir", "head").isnan().all())
+    assert bool(sir.values(part_error("head")).isnan().all())
     slopes = [
         [np.polyfit(np.arange(len(e)) / 60, np.nanmean(e, 1), 1)[0] for e in seeds]
         for seeds in every
     ]
-    np.testing.assert_allclose(silhouette_tables.drift(runs, "sir", 60.0).numpy(), slopes)
-    runs["sir"]["sequence 0"][0].errors[5:8] = torch.nan  # the truth was lost for three frames
+    np.testing.assert_allclose(sir.values(drift(60.0)).numpy(), slopes)
+    sir.runs[0].errors[5:8] = torch.nan  # the truth was lost for three frames
     kept = np.delete(every[0][0], slice(5, 8), 0)
     slope = np.polyfit(np.delete(np.arange(30), slice(5, 8)) / 60, np.nanmean(kept, 1), 1)[0]
-    assert float(silhouette_tables.drift(runs, "sir", 60.0)[0, 0]) == pytest.approx(slope)
+    assert float(sir.values(drift(60.0))[0, 0]) == pytest.approx(slope)
     spread = math.sqrt(np.mean([np.var(row, ddof=1) for row in expected]))
-    assert float(silhouette_tables.pooled_std(whole)) == pytest.approx(spread)
-    joints = [name for names in silhouette_tables.PARTS.values() for name in names]
+    assert float(pooled_std(whole)) == pytest.approx(spread)
+    joints = [name for names in PARTS.values() for name in names]
     assert sorted(joints) == sorted(BODY_15.names)
-
-
-def test_bootstrap_intervals_hold_what_they_say():
-    """Intervals of the difference of two means cover the true one, and of spreads as well."""
-    generator = torch.Generator().manual_seed(0)
-    covered = 0
-    for trial in range(60):
-        draw = torch.randn(2, 6, 8, generator=generator, dtype=torch.float64)
-        value, low, high = silhouette_tables.bootstrap(
-            silhouette_tables.mean_of, draw[0] + 1, draw[1], seed=trial, draws=400
-        )
-        assert low <= value <= high
-        covered += low <= 1.0 <= high
-    assert covered >= 50
-    wide = 3 * torch.randn(6, 8, generator=generator, dtype=torch.float64)
-    narrow = torch.randn(6, 8, generator=generator, dtype=torch.float64)
-    _, _, high = silhouette_tables.bootstrap(silhouette_tables.pooled_std, narrow, wide)
-    assert high < 0
 
 
 # --- the whole of it ------------------------------------------------------------------------------
@@ -337,13 +313,13 @@ def test_a_killed_run_goes_on_with_the_same_numbers(done, folder, monkeypatch):
     for path in sorted(out.glob("run-*.npz"))[:2]:
         path.write_bytes(path.read_bytes()[:50])  # damaged
     kept = {p: p.stat().st_mtime_ns for p in sorted(out.glob("run-*.npz"))[2:]}
-    repaired, filtered = [], silhouette_runs._filtered
+    repaired, filtered = [], filters.track_view
 
     def watched(*arguments):
-        repaired.extend(arguments[-1])
+        repaired.extend(arguments[-1])  # a generator for each run
         return filtered(*arguments)
 
-    monkeypatch.setattr(silhouette_runs, "_filtered", watched)
+    monkeypatch.setattr(filters, "track_view", watched)
     again = silhouette.run(folder, out, **options)
     for table in ("errors", "parts", "differences"):
         assert again[table].rows == report[table].rows
@@ -353,7 +329,7 @@ def test_a_killed_run_goes_on_with_the_same_numbers(done, folder, monkeypatch):
 
 def test_other_conditions(folder, tmp_path, clips):
     """Cameras of a file, one camera, a published exponent, a looped walk, a found first pose."""
-    rig = silhouette_data.place_cameras(clips[4])  # p2's first trial
+    rig = body_clips.place_cameras(clips[4])  # p2's first trial
     from torchpose.camera import PinholeCamera
 
     save_cameras(
@@ -402,21 +378,7 @@ def test_several_conditions_with_the_settings_of_an_earlier_run(done, folder, tm
     assert settings["settings"] == {m: {"value": 100.0, "scale": 1.0} for m in ("sir", "mrpf")}
     assert settings["particles"] == [20, 40]
     with pytest.raises(InputError, match="none of apf, only of sir, mrpf"):
-        silhouette_runs.read_settings(tmp_path / "out", ["sir", "apf"])
-
-
-def test_settings_are_those_of_the_report(tmp_path):
-    path = tmp_path / "report.json"
-    with pytest.raises(InputError, match="no such file"):
-        silhouette_runs.read_settings(path, ["sir"])
-    chosen = {"sir": {"value": 30.0, "scale": 1.4}, "apf": {"value": 0.7, "scale": 2.0}}
-    path.write_text(json.dumps({"settings": {"settings": chosen}}))
-    for given in (path, tmp_path, str(tmp_path)):
-        assert silhouette_runs.read_settings(given, ["apf"]) == {"apf": Setting(0.7, 2.0)}
-    for damaged in ("no json", "[]", '{"settings": {"settings": {"500 at 160x120": {"sir": 1}}}}'):
-        path.write_text(damaged)
-        with pytest.raises(FileFormatError, match=r"expected the report\.json"):
-            silhouette_runs.read_settings(tmp_path, ["sir"])
+        read_settings(tmp_path / "out", ["sir", "apf"])
 
 
 def test_the_settings_of_each_condition_where_validation_chose_them(folder, tmp_path, monkeypatch):
@@ -424,7 +386,7 @@ def test_the_settings_of_each_condition_where_validation_chose_them(folder, tmp_
 
     def tune(trackees, method, n, likelihood, out):
         found = Setting(30.0 if n == 20 else 300.0, 1.4)
-        return silhouette_runs.Tuning(found, (found,), (50.0,))
+        return Tuning(found, (found,), (50.0,))
 
     monkeypatch.setattr(silhouette, "tune", tune)
     report = silhouette.run(
@@ -480,9 +442,9 @@ def test_refusals(folder, tmp_path, options, message):
 
 
 def test_cameras_of_another_room_are_refused(clips):
-    rig = silhouette_data.place_cameras(clips[0])
+    rig = body_clips.place_cameras(clips[0])
     rig.translation[:, 2] -= 1000.0  # behind them all
-    split = silhouette_data.split_clips(clips, ["p1"], ["p1"])[0]
+    split = body_clips.split_clips(clips, ["p1"], ["p1"])[0]
     with pytest.raises(InputError, match="no camera sees the person"):
         prepare(split, Conditions((48, 64), rig=rig), 8, 8)
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from benchmarks import humaneva_files as humaneva
-from benchmarks.silhouette import data as silhouette_data
+from benchmarks.bodies import clips as body_clips
 from benchmarks.silhouette import humaneva as silhouette_humaneva
 from benchmarks.silhouette import protocol as silhouette
 from benchmarks.silhouette.humaneva import HumanEvaFootage, humaneva_splits
@@ -116,7 +116,7 @@ def test_gaps_are_left_out(made, tmp_path, monkeypatch):
     _, (split,) = splits_of(made[0], tmp_path)
     (test,) = split.test
     assert test.trial == "Walking_1 from 5" and len(test) == 20  # frame 4 is lost
-    assert silhouette_data.whole_frames(test).tolist() == [i != 6 for i in range(20)]
+    assert body_clips.whole_frames(test).tolist() == [i != 6 for i in range(20)]
     # frames 25 to 27 are too short a piece
     assert [(c.trial, len(c)) for c in split.validation] == [("Walking_1 from 29", N - 28)]
     assert all(bool(c.joints.isfinite().all()) for c in (*split.manifold, *split.validation))

@@ -1,14 +1,16 @@
 """UB-one on a tiny recording."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from benchmarks import ub_one
+from benchmarks._upper_body import Subject, plain_prior, trials_of
+from benchmarks.engine import Grid
 from tests.data import data_dir_or_skip
 from tests.evaluation.recordings import small_recipe, write_one
-from torchpose.camera import PinholeCamera
 from torchpose.errors import InputError, OverlapError
-from torchpose.evaluation.common import centred_on_neck, make_test_set, plain_prior
 
 
 @pytest.fixture(scope="module")
@@ -33,28 +35,26 @@ def test_all_trackers(data, tmp_path):
     assert len(report.findings) >= 8
     assert all(": yes (" in line or ": no (" in line for line in report.findings)
     assert all((tmp_path / name).stat().st_size > 1000 for name in report.pictures)
-    assert len(list(tmp_path.glob("pf-*.npz"))) == 8
+    runs = len(ub_one.TRACKERS) + sum(m in ub_one.SAMPLED for m in ub_one.TRACKERS.values())
+    assert len(list(tmp_path.glob("run-*.npz"))) == runs
 
 
 @pytest.mark.filterwarnings("ignore::torchpose.errors.DegenerateFilterWarning")
-def test_estimates_of_particle_filters_are_kept(data, tmp_path, monkeypatch):
+def test_estimates_are_kept(data, tmp_path, monkeypatch):
     first, rest = ub_one.split_recording(data)
     prior = plain_prior(small_recipe([first], 2))
-    camera = PinholeCamera(525.0, 525.0, 319.5, 239.5)
-    test = make_test_set([centred_on_neck(rest.upper_body().joints[:5])], camera, 30.0)
-
-    def estimate(seed):
-        options = {"n_particles": 30}
-        return ub_one._estimate(
-            tmp_path, prior, camera, test, "pf-mixture", seed, options, progress=False
-        )
-
-    fresh = estimate(0)
+    short = replace(rest, joints=rest.joints[:5])
+    grid = Grid(
+        {"": Subject(prior, trials_of([short]))},
+        {"a": ub_one._Tracker("pf-mixture", {"n_particles": 30}, "")},
+    )
+    (fresh,) = ub_one.TRACKING.run({"": grid}, (0,), tmp_path).runs
     monkeypatch.setattr(ub_one, "track", lambda *_, **__: pytest.fail("tracked again"))
-    for ours, kept in zip(fresh, estimate(0), strict=True):
-        torch.testing.assert_close(ours, kept, rtol=0, atol=0, equal_nan=True)
+    (kept,) = ub_one.TRACKING.run({"": grid}, (0,), tmp_path).runs
+    for ours, other in zip(fresh, kept, strict=True):
+        torch.testing.assert_close(ours, other, rtol=0, atol=0, equal_nan=True)
     with pytest.raises(pytest.fail.Exception):
-        estimate(1)
+        ub_one.TRACKING.run({"": grid}, (1,), tmp_path)
 
 
 def test_the_split_keeps_frames_and_persons_apart(data):

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from benchmarks import ub_people
+from benchmarks._people_tables import BASELINE, MAIN, MEAN_POSE, SMOOTHED, UNCALIBRATED
 from tests.data import data_dir_or_skip
 from tests.evaluation.recordings import small_recipe, write_people
 from torchpose.errors import InputError, OutputError, OverlapError
-from torchpose.evaluation.people_tables import BASELINE, MAIN, MEAN_POSE, SMOOTHED, UNCALIBRATED
 from torchpose.priors import UpperBodyPrior
 
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from benchmarks._gaps import back_and_forth
+from benchmarks._upper_body import score
 from benchmarks.ub_people import mean_pose, nearest_neighbour, people, sway
 from tests.evaluation.recordings import poses, small_recipe, write_people
 from torchpose.camera import PinholeCamera
@@ -17,7 +18,6 @@ from torchpose.evaluation.common import (
     cached_prior,
     centred_on_neck,
     make_test_set,
-    score,
     track,
 )
 from torchpose.skeleton._upper_body import mirror_pose

@@ -12,8 +12,8 @@ from torchpose.camera import PinholeCamera
 from torchpose.cli import evaluate
 from torchpose.errors import InputError, OverlapError
 from torchpose.evaluation import score
-from torchpose.evaluation.common import MEASURED, make_test_set, track
-from torchpose.evaluation.unseen import CAMERA, poses_to_score
+from torchpose.evaluation.common import CAMERA, MEASURED, make_test_set, track
+from torchpose.evaluation.unseen import poses_to_score
 from torchpose.io import read_recordings
 from torchpose.metrics import align
 from torchpose.priors import load_prior

@@ -10,7 +10,7 @@ from torchpose.camera import ViewRange, sample_viewpoints
 from torchpose.errors import InputError, OverlapError, PriorError
 from torchpose.evaluation import persons as persons_module
 from torchpose.evaluation import unseen
-from torchpose.evaluation.common import centred_on_neck, make_test_set, track
+from torchpose.evaluation.common import CAMERA, centred_on_neck, make_test_set, track
 from torchpose.evaluation.completion import with_wrists
 from torchpose.evaluation.person_tables import mean_error, pooled
 from torchpose.io import read_recordings
@@ -51,8 +51,8 @@ def test_persons_are_told_apart_and_in_order(persons, tmp_path):
 def test_scores_are_those_of_tracker_and_metrics(persons, prior):
     sequences = unseen.poses_to_score(persons["s10"], prior, persons["s1"])
     found = unseen.score_person(prior, sequences, 30.0, unseen.ScoreSettings(seed=2))
-    test = make_test_set(sequences, unseen.CAMERA, 30.0, 2)
-    expected = joint_errors_3d(track(prior, unseen.CAMERA, test).joints3d, test.truth3d)
+    test = make_test_set(sequences, CAMERA, 30.0, 2)
+    expected = joint_errors_3d(track(prior, CAMERA, test).joints3d, test.truth3d)
     torch.testing.assert_close(found.filtered, expected[test.inside].float())
     assert mean_error(found) == pytest.approx(100 * float(expected.nanmean()), rel=1e-5)
     assert found.inside.shape == (30, 2, 8)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.silhouette.data import place_cameras
+from benchmarks.bodies.clips import place_cameras
 from tests.benchmarks.walkers import NAMES, walker
 from torchpose.body import body_joints
 from torchpose.demo._rendering.clothed_body import TrueShape, true_silhouettes

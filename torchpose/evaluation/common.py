@@ -1,11 +1,10 @@
-"""What the protocols share: the camera, test sequences, cached priors, tracking and scores."""
+"""What the protocols share: test sequences, tracking, and what is kept so that a killed run goes on."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,44 +15,41 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchpose._core.facade import package_version
+from torchpose._core.files import write_npz
+from torchpose._core.reading import read_npz
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import project
-from torchpose.camera._viewpoints import sample_viewpoints
 from torchpose.errors import InputError, TorchposeError
 from torchpose.evaluation.report import RESULTS, Report
 from torchpose.filters._base import Generators
 from torchpose.io._recordings import Recording
 from torchpose.io._results import replace_own
-from torchpose.learning._training import TRAINING_VIEWS, collect_poses
 from torchpose.math._rotations import euler_to_matrix
-from torchpose.metrics._calibration import Coverage, coverage, reliability
-from torchpose.metrics._poses import PCP, align, jitter, joint_errors_2d, joint_errors_3d, pcp
 from torchpose.priors._upper_body import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
-from torchpose.skeleton._upper_body import mirror_pose
-from torchpose.upper_body._single_poses import default_process_cov
 from torchpose.upper_body._tracker import UpperBodyTracker
 
 __all__ = [
+    "CAMERA",
     "HANDS",
     "MEASURED",
     "TEST_ANGLES",
     "TEST_TRANSLATION",
     "Estimate",
     "Recipe",
-    "Scores",
     "Trials",
     "add_picture",
     "cached_prior",
     "centred_on_neck",
-    "data_folder",
+    "keep",
     "make_test_set",
-    "plain_prior",
-    "projected_training_poses",
-    "score",
+    "read_kept",
     "settings_hash",
     "track",
 ]
+
+CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
+"""The camera that test sequences are seen by."""
 
 TEST_ANGLES = (0.02, -0.05, 0.03)
 """Roll, pitch and yaw of the test camera, radians, R = Rz Rx Ry (BL 3)."""
@@ -97,7 +93,7 @@ def cached_prior(
 
 
 def settings_hash(facts: Sequence[Any]) -> str:
-    """Sixteen letters that change with any of these values; tensors count with all their numbers."""
+    """Return sixteen letters that change with any of these values; tensors count with all their numbers."""
     digest = hashlib.sha256()
     for fact in facts:
         if isinstance(fact, Tensor):
@@ -107,37 +103,25 @@ def settings_hash(facts: Sequence[Any]) -> str:
     return digest.hexdigest()[:16]
 
 
-def plain_prior(prior: UpperBodyPrior) -> UpperBodyPrior:
-    """The same mixtures over poses with the paper's transition and `default_process_cov`.
-
-    Without windows, calibration or anything else that a recipe learns.
-    """
-    noise = {"process_cov": default_process_cov(prior)}
-    return UpperBodyPrior(prior.left, prior.right, replace(prior.info, transition="paper"), noise)
-
-
-def projected_training_poses(
-    recordings: Sequence[Recording], camera: PinholeCamera, n: int, seed: int = 0
-) -> tuple[Float[Tensor, "n 8 3"], Float[Tensor, "n 8 2"]]:
-    """Poses and their pixels from random training viewpoints, every second one mirrored.
+def read_kept(path: Path, kind: Callable[..., Any], fields: tuple[str, ...]) -> Any:
+    """Return a tuple of tensors that `keep` wrote, or None where there is none; damaged files are deleted.
 
     Args:
-        recordings: to draw poses from, each as often as any other. camera: whose pixels.
-        n: how many. seed: of viewpoints and order.
-
-    Returns:
-        Joints centred on the neck, metres, and pixels, without noise.
+        path: of the file. kind: what is made of the tensors. fields: their names, in its order.
     """
-    generator = torch.Generator().manual_seed(seed)
-    joints = collect_poses(recordings, centre="neck").joints
-    joints = joints[torch.isfinite(joints).flatten(1).all(1)]
-    rounds = -(-n // len(joints))
-    order = [torch.randperm(len(joints), generator=generator) for _ in range(rounds)]
-    joints = joints[torch.cat(order)[:n]]
-    joints[1::2] = mirror_pose(joints[1::2])
-    views = sample_viewpoints(n, TRAINING_VIEWS, generator)
-    rotation = euler_to_matrix(views.angles, "zxy")
-    return joints, project(joints, camera.matrix, rotation, views.translation)[..., :2]
+    if not path.is_file():
+        return None
+    try:
+        arrays = read_npz(path, fields)
+    except TorchposeError:
+        path.unlink()  # damaged: made again
+        return None
+    return kind(*(torch.from_numpy(arrays[key]) for key in fields))
+
+
+def keep(path: Path, value: Any) -> None:
+    """Write a NamedTuple of tensors, whole or not at all."""
+    write_npz(path, {key: tensor.numpy() for key, tensor in value._asdict().items()})
 
 
 class Trials(NamedTuple):
@@ -163,7 +147,7 @@ class Trials(NamedTuple):
 
 
 def centred_on_neck(joints: Float[Tensor, "T 8 3"]) -> Float[Tensor, "T 8 3"]:
-    """Every frame moved so that its own neck is the origin."""
+    """Return every frame moved so that its own neck is the origin."""
     return joints - joints[:, _NECK : _NECK + 1]
 
 
@@ -261,55 +245,6 @@ def track(
             [_padded(x, pad) for x in (poses.joints2d, poses.joints3d, poses.covariance3d)]
         )
     return Estimate(*(torch.cat(values) for values in zip(*parts, strict=True)))
-
-
-class Scores(NamedTuple):
-    """How good a method is on a test set; NaN where nothing is to be counted.
-
-    Attributes:
-        errors3d: metres after fixed-scale Procrustes [B, T, 8]. errors2d: pixels [B, T, 8].
-        limbs: curve of correct limbs in the image. jitter: m/s^2 [8], mean over frames.
-        coverage: at 50 and 90 %. reliability: at 5 to 95 %. Both None without covariances.
-    """
-
-    errors3d: Tensor
-    errors2d: Tensor
-    limbs: PCP
-    jitter: Tensor
-    coverage: Coverage | None
-    reliability: Coverage | None
-
-
-def score(estimate: Estimate, test: Trials) -> Scores:
-    """Errors, correct limbs, smoothness and calibration of estimates."""
-    inside = test.inside[..., None].expand(*test.inside.shape, 8)
-    errors3d = joint_errors_3d(estimate.joints3d, test.truth3d, inside)
-    errors2d = joint_errors_2d(estimate.joints2d, test.truth2d, inside)
-    limbs = pcp(estimate.joints2d, test.truth2d, mask=inside)
-    moved = estimate.joints3d.masked_fill(~inside[..., None], torch.nan)
-    triples = (test.lengths - 2).clamp_min(0).double()
-    per_sequence = jitter(moved, test.fps) if moved.shape[1] > 2 else torch.full((1, 8), torch.nan)
-    trembling = (per_sequence.nan_to_num() * triples[:, None]).sum(0) / triples.sum()
-    if estimate.covariance3d is None:
-        return Scores(errors3d, errors2d, limbs, trembling, None, None)
-    aligned = align(estimate.joints3d, test.truth3d, covariance=estimate.covariance3d)
-    turned: Any = aligned.covariance
-    hits = coverage(aligned.points, turned, test.truth3d, mask=inside)
-    curve = reliability(aligned.points, turned, test.truth3d, mask=inside)
-    return Scores(errors3d, errors2d, limbs, trembling, hits, curve)
-
-
-def data_folder(data: str | Path, name: str) -> Path:
-    """`data` itself, or the folder `name` in it.
-
-    Raises:
-        InputError: no such folder.
-    """
-    data = Path(data)
-    folder = data / name if (data / name).is_dir() else data
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give the one that holds {name} with --data")
-    return folder
 
 
 def add_picture(report: Report, out: Path, name: str, figure: Any) -> None:

@@ -5,8 +5,7 @@ from typing import Any
 
 import torch
 
-from torchpose.evaluation.people_tables import SHORT_NAMES
-from torchpose.evaluation.person_tables import add_pose_classes, mean_error, pooled
+from torchpose.evaluation.person_tables import SHORT_NAMES, add_pose_classes, mean_error, pooled
 from torchpose.evaluation.persons import spread
 from torchpose.evaluation.report import Report
 from torchpose.evaluation.unseen import Scored

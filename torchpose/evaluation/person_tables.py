@@ -5,12 +5,13 @@ from typing import Any, NamedTuple
 
 import torch
 
-from torchpose.evaluation.people_tables import SHORT_NAMES
 from torchpose.evaluation.persons import POSE_CLASSES, spread
 from torchpose.evaluation.report import Report, Table
 from torchpose.evaluation.unseen import Scored
+from torchpose.skeleton._joint_sets import UPPER_BODY
 
 __all__ = [
+    "SHORT_NAMES",
     "Curve",
     "add_persons",
     "add_pose_classes",
@@ -21,6 +22,9 @@ __all__ = [
     "plot_pose_classes",
     "pooled",
 ]
+
+SHORT_NAMES = tuple(name.replace("_left", " L").replace("_right", " R") for name in UPPER_BODY)
+"""Names of the joints at the heads of columns."""
 
 _HANDS, _ELBOWS = (0, 7), (1, 6)
 

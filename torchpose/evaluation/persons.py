@@ -18,7 +18,6 @@ __all__ = [
     "by_person",
     "complete_pieces",
     "pose_classes",
-    "raised_share",
     "renamed",
     "spread",
 ]
@@ -56,12 +55,6 @@ def pose_classes(poses: Float[Tensor, "N 8 3"]) -> Int[Tensor, "N 2"]:
     crossed = ((hands - middle) * across).sum(-1) < 0
     near = (hands - shoulders)[..., [0, 2]].norm(dim=-1) < _NEAR
     return torch.where(raised, 0, torch.where(crossed, 1, torch.where(near, 2, 3)))
-
-
-def raised_share(recording: Recording) -> float:
-    """Share of the frames in which a hand is above its shoulder."""
-    classes = pose_classes(recording.upper_body().joints.double())
-    return float((classes == POSE_CLASSES.index("raised")).any(1).double().mean())
 
 
 def by_person(recordings: Sequence[Recording]) -> dict[str, list[Recording]]:

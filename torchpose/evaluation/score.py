@@ -17,7 +17,7 @@ from tqdm.auto import tqdm
 
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
-from torchpose.evaluation.common import MEASURED, Trials, add_picture, make_test_set, track
+from torchpose.evaluation.common import CAMERA, MEASURED, Trials, add_picture, make_test_set, track
 from torchpose.evaluation.person_tables import (
     add_persons,
     add_pose_classes,
@@ -28,7 +28,6 @@ from torchpose.evaluation.person_tables import (
 from torchpose.evaluation.persons import by_person, pose_classes, spread
 from torchpose.evaluation.report import Report
 from torchpose.evaluation.unseen import (
-    CAMERA,
     LEVELS,
     Scored,
     compare,

@@ -17,19 +17,19 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose._core.files import write_npz
-from torchpose._core.reading import read_npz
-from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._viewpoints import ViewRange, sample_viewpoints
-from torchpose.errors import InputError, PriorError, TorchposeError
+from torchpose.errors import InputError, PriorError
 from torchpose.evaluation.common import (
+    CAMERA,
     MEASURED,
     Estimate,
     Recipe,
     Trials,
     cached_prior,
     centred_on_neck,
+    keep,
     make_test_set,
+    read_kept,
     settings_hash,
     track,
 )
@@ -44,7 +44,6 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import NeckOffset, learn_neck_offset, place_neck
 
 __all__ = [
-    "CAMERA",
     "LEVELS",
     "QUICK",
     "Job",
@@ -59,7 +58,6 @@ __all__ = [
     "training_neck",
 ]
 
-CAMERA = PinholeCamera(525.0, 525.0, 319.5, 239.5, 640, 480)
 LEVELS = (0.5, 0.9)
 """Of the ellipsoids whose coverage is counted."""
 
@@ -200,19 +198,11 @@ def _scored(prior: UpperBodyPrior, job: Job, name: str, folder: Path, progress: 
     fps = float(np.median(rates))
     facts = ["scores 1", repr(job.test), fps, *prior.state_dict().values(), *poses]
     path = folder / f"scores-{settings_hash(facts)}.npz"
-    if path.is_file():
-        try:
-            return _read(path)
-        except TorchposeError:
-            path.unlink()  # damaged: score again
-    found = score_person(prior, poses, fps, job.test, progress)
-    write_npz(path, {key: value.numpy() for key, value in found._asdict().items()})
+    found: Scored | None = read_kept(path, Scored, Scored._fields)
+    if found is None:
+        found = score_person(prior, poses, fps, job.test, progress)
+        keep(path, found)
     return found
-
-
-def _read(path: Path) -> Scored:
-    arrays = read_npz(path, Scored._fields)
-    return Scored(*(torch.from_numpy(arrays[key]) for key in Scored._fields))
 
 
 def score_person(

@@ -1,4 +1,4 @@
-"""Clips of the protocol Silhouette: who trains, who is tracked, and where the cameras stand."""
+"""Recorded clips: who trains, who is tracked, and where the cameras stand."""
 
 import math
 from collections.abc import Sequence
@@ -14,17 +14,6 @@ from torchpose.camera import CameraRig
 from torchpose.demo._rendering.walk import AZIMUTHS, cameras_around
 from torchpose.errors import InputError
 from torchpose.io._mocap import MocapClip, select_persons
-
-__all__ = [
-    "Split",
-    "in_view",
-    "looped",
-    "place_cameras",
-    "split_clips",
-    "take_frames",
-    "whole_frames",
-]
-
 
 LEAST_FRAMES = 110
 """A test trial should have as many; a shorter one is taken where there is no other."""

@@ -1,17 +1,18 @@
-"""Pictures of the protocol Silhouette: errors over time and by part, silhouettes with estimates."""
+"""Pictures of bodies that were tracked: errors over time and by part, silhouettes with estimates."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from benchmarks.silhouette.runs import Run, Runs
-from benchmarks.silhouette.tables import PARTS, part_errors, pooled_std
-from benchmarks.silhouette.trackees import Tracked, View, label_of
+from benchmarks.bodies.tracking import PARTS, Run, part_error
+from benchmarks.bodies.views import Subject
+from benchmarks.engine import Results, pooled_std
+from benchmarks.engine.pictures import draw_band
 from torchpose.viz._style import (
     INK,
     NORMAL,
@@ -29,44 +30,40 @@ if TYPE_CHECKING:
 else:
     Figure = Any
 
-__all__ = [
-    "plot_errors_by_condition",
-    "plot_errors_by_part",
-    "plot_errors_by_time",
-    "plot_silhouettes",
-]
-
 _SEEN, _BOTH, _MODEL = (0.62, 0.72, 0.83), (0.16, 0.20, 0.28), (0.90, 0.45, 0.10)
 
 
-def plot_errors_by_time(runs: Runs, fps: float, title: str = "Error over time") -> Figure:
-    """Error of every sequence over time (MR, Figure 6): mean over joints and seeds, one line a method.
+def plot_errors_by_time(
+    runs: Results,
+    fps: float,
+    title: str = "Error over time",
+    label: Callable[[str], str] = str,
+) -> Figure:
+    """Draw the error of every sequence over time (MR, Figure 6): mean over joints and seeds.
 
-    The band is one standard deviation over seeds.
+    There is one line a method. The band is one standard deviation over seeds.
+
+    Args:
+        runs: of one condition. fps: frames per second. title: above. label: what a method is called.
     """
     require_matplotlib()
     from matplotlib.lines import Line2D
 
-    labels = {method: label_of(method) for method in runs}
-    styles = method_styles(list(labels.values()))
-    names = list(next(iter(runs.values())))
+    styles = method_styles([label(method) for method in runs.names("method")])
+    names = runs.names("subject")
     columns = min(2, len(names))
     rows = math.ceil(len(names) / columns)
     figure = new_figure(5.2 * columns + 0.6, 2.5 * rows + 0.9, title)
     grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
     for ax, name in zip(grid.flat, names, strict=False):
         style_axes(ax, title=name)
-        for method, label in labels.items():
-            errors = torch.stack([r.errors.double().nanmean(1) for r in runs[method][name]])
+        for (method,), own in runs.where(subject=name).by("method").items():
+            style = styles[label(method)]
+            errors = torch.stack([run.errors.double().nanmean(1) for run in own.runs])
             time = torch.arange(errors.shape[1]).numpy() / fps
-            middle = errors.mean(0)
             if len(errors) > 1:
-                spread = errors.std(0)
-                ax.fill_between(
-                    time, to_numpy(middle - spread), to_numpy(middle + spread),
-                    color=styles[label]["color"], alpha=0.15, linewidth=0,
-                )  # fmt: skip
-            ax.plot(time, to_numpy(middle), linewidth=1.6, **styles[label])
+                draw_band(ax, time, errors.mean(0), errors.std(0), style)
+            ax.plot(time, to_numpy(errors.mean(0)), linewidth=1.6, **style)
         ax.set_ylim(bottom=0)
         ax.margins(x=0)
     for ax in list(grid.flat)[len(names) :]:
@@ -79,23 +76,28 @@ def plot_errors_by_time(runs: Runs, fps: float, title: str = "Error over time") 
     return figure
 
 
-def plot_errors_by_part(runs: Runs, title: str = "Error by part of the body") -> Figure:
-    """Mean error of the whole body and of every part, one bar a method, with the spread over seeds."""
+def plot_errors_by_part(
+    runs: Results, label: Callable[[str], str] = str, title: str = "Error by part of the body"
+) -> Figure:
+    """Draw the mean error of the whole body and of every part, one bar a method, with its spread.
+
+    Args:
+        runs: of one condition. label: what a method is called. title: above.
+    """
     require_matplotlib()
     from matplotlib.patches import Patch
 
-    labels = {method: label_of(method) for method in runs}
-    styles = method_styles(list(labels.values()))
+    styles = method_styles([label(method) for method in runs.names("method")])
     parts = ("", *PARTS)
     figure = new_figure(7.6, 3.8, title)
     ax = style_axes(figure.add_subplot(), y="error (mm)")
     ax.grid(False, axis="x")
-    width = 0.8 / len(labels)
-    for i, (method, label) in enumerate(labels.items()):
-        found = [part_errors(runs, method, part) for part in parts]
+    width = 0.8 / len(styles)
+    for i, ((method,), own) in enumerate(runs.by("method").items()):
+        found = [own.values(part_error(part)) for part in parts]
         place = [p - 0.4 + (i + 0.5) * width for p in range(len(parts))]
         means = [float(f.mean()) for f in found]
-        ax.bar(place, means, 0.9 * width, color=styles[label]["color"], alpha=0.85)
+        ax.bar(place, means, 0.9 * width, color=styles[label(method)]["color"], alpha=0.85)
         if found[0].shape[1] > 1:
             spreads = [float(pooled_std(f)) for f in found]
             ax.errorbar(place, means, spreads, fmt="none", ecolor=INK, elinewidth=1.1)
@@ -105,59 +107,24 @@ def plot_errors_by_part(runs: Runs, title: str = "Error by part of the body") ->
     return figure
 
 
-def plot_errors_by_condition(
-    conditions: Mapping[str, Runs], title: str = "Error by condition"
-) -> Figure:
-    """Mean error under each condition, in their order, one line a method, with the spread over seeds.
-
-    Args:
-        conditions: runs of the same methods by what they differ in, such as the number of particles.
-        title: above.
-    """
-    require_matplotlib()
-    from matplotlib.lines import Line2D
-
-    first = next(iter(conditions.values()))
-    labels = {method: label_of(method) for method in first}
-    styles = method_styles(list(labels.values()))
-    figure = new_figure(7.6, 3.8, title)
-    ax = style_axes(figure.add_subplot(), y="error (mm)")
-    for method, label in labels.items():
-        found = [part_errors(runs, method) for runs in conditions.values()]
-        middle = torch.stack([f.mean() for f in found])
-        place = torch.arange(len(found)).numpy()
-        if found[0].shape[1] > 1:
-            spread = torch.stack([pooled_std(f) for f in found])
-            ax.fill_between(
-                place, to_numpy(middle - spread), to_numpy(middle + spread),
-                color=styles[label]["color"], alpha=0.15, linewidth=0,
-            )  # fmt: skip
-        ax.plot(place, to_numpy(middle), linewidth=1.6, marker="o", markersize=4, **styles[label])
-    ax.set_ylim(bottom=0)
-    ax.set_xticks(range(len(conditions)), [name.replace(", ", "\n") for name in conditions])
-    ax.tick_params(axis="x", length=0, labelsize=NORMAL, labelcolor=INK)
-    add_legend(figure, [Line2D([], [], linewidth=1.8, label=n, **s) for n, s in styles.items()])
-    return figure
-
-
 def plot_silhouettes(
-    trackee: Tracked,
-    view: View,
+    subject: Subject[Any],
     runs: Sequence[tuple[str, Run]],
     n_frames: int = 4,
     title: str | None = None,
 ) -> Figure:
-    """What the cameras see, and the estimated bodies over it.
+    """Draw what the cameras see, and the estimated bodies over it.
 
     Both: dark; seen, but not in the model: blue; in the model only: orange.
 
     Args:
-        trackee, view: who and where. runs: one (label, run) for each block of rows.
+        subject: who and where. runs: one (label, run) for each block of rows.
         n_frames: from the first to the last. title: above.
     """
     require_matplotlib()
     from matplotlib.patches import Patch
 
+    view = subject.view
     frames = torch.linspace(0, len(view.clip) - 1, n_frames).round().long()
     n_cameras = view.silhouettes.shape[1]
     rows = len(runs) * n_cameras
@@ -165,7 +132,7 @@ def plot_silhouettes(
     grid = figure.subplots(rows, n_frames, squeeze=False)
     for block, (label, run) in enumerate(runs):
         height, width = view.silhouettes.shape[-2:]
-        model = render(trackee.body, run.mean[frames].double(), view.rig, height, width)
+        model = render(subject.body, run.mean[frames].double(), view.rig, height, width)
         windows = _windows(model)
         for c in range(n_cameras):
             for i, t in enumerate(frames.tolist()):
@@ -188,7 +155,7 @@ def plot_silhouettes(
 
 
 def _windows(model: Tensor, margin: float = 0.35) -> list[list[tuple[slice, slice]]]:
-    """Rows and columns about the model of every frame and camera [T, C, H, W], all of one size."""
+    """Return rows and columns about the model of every frame and camera [T, C, H, W], all of one size."""
     places = [[torch.nonzero(image) for image in frame] for frame in model]
     spans = [p.amax(0) - p.amin(0) + 1 for frame in places for p in frame if len(p)]
     full = torch.tensor(model.shape[-2:])

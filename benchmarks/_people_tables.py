@@ -4,22 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from torchpose.evaluation.common import HANDS, Scores, Trials, add_picture
-from torchpose.evaluation.report import Report
-from torchpose.metrics._poses import jitter, share_below
-from torchpose.priors._upper_body import UpperBodyPrior
-from torchpose.skeleton._joint_sets import UPPER_BODY
+from benchmarks._upper_body import Scores
+from torchpose.evaluation import Report
+from torchpose.evaluation.common import HANDS, Trials, add_picture
+from torchpose.evaluation.person_tables import SHORT_NAMES
+from torchpose.metrics import jitter
+from torchpose.metrics._poses import share_below
+from torchpose.priors import UpperBodyPrior
 
-__all__ = [
-    "SHORT_NAMES",
-    "add_calibration_table",
-    "add_error_tables",
-    "add_findings",
-    "add_pcp_table",
-    "add_pictures",
-]
-
-SHORT_NAMES = tuple(name.replace("_left", " L").replace("_right", " R") for name in UPPER_BODY)
 MAIN, LAGGED, SMOOTHED = "MKF filtered", "MKF fixed lag", "MKF smoothed"
 UNCALIBRATED = "MKF filtered, uncalibrated"
 BASELINE = "MKF paper, hand-set noise"
@@ -33,7 +25,7 @@ def add_error_tables(
     still: Trials,
     moving: Trials,
 ) -> None:
-    """3D and 2D errors, with the root at rest and moving."""
+    """Add 3D and 2D errors, with the root at rest and moving."""
     for key, title, found in (
         ("errors", "every frame centred on its neck", scores),
         ("moving_root", "moving root: a circle of 0.3 m on the floor in 4 s", moved),
@@ -69,7 +61,7 @@ def _own_jitter(test: Trials) -> float:
 
 
 def add_pcp_table(report: Report, scores: dict[str, Scores]) -> None:
-    """Share of correct upper arms and forearms at some thresholds."""
+    """Add the share of correct upper arms and forearms at some thresholds."""
     marks = (0.1, 0.2, 0.3, 0.5)
     columns = [f"{part} {m:g}" for part in ("upper arm", "forearm") for m in marks]
     table = report.table(
@@ -86,7 +78,7 @@ def add_pcp_table(report: Report, scores: dict[str, Scores]) -> None:
 
 
 def add_calibration_table(report: Report, prior: UpperBodyPrior, scores: dict[str, Scores]) -> None:
-    """Share of true joints inside the ellipsoids, before and after calibration."""
+    """Add the share of true joints inside the ellipsoids, before and after calibration."""
     table = report.table(
         "coverage",
         "True 3D joints inside the 50 % and 90 % ellipsoids (%), Procrustes rotation applied",
@@ -112,7 +104,7 @@ def add_calibration_table(report: Report, prior: UpperBodyPrior, scores: dict[st
 
 
 def add_findings(report: Report) -> None:
-    """Sentences on what smoothing, noise and transition gave, and on how calibrated it is."""
+    """Add sentences on what smoothing, noise and transition gave, and on how calibrated it is."""
     errors = report["errors_3d"]
 
     def mean(name: str) -> float:
@@ -157,7 +149,7 @@ def add_findings(report: Report) -> None:
 
 
 def add_pictures(report: Report, out: Path, scores: dict[str, Scores]) -> None:
-    """Bars of the errors, curves of correct limbs, reliability."""
+    """Add bars of the errors, curves of correct limbs, reliability."""
     from torchpose import viz
 
     shown = [n for n in (MAIN, SMOOTHED, BASELINE, NEIGHBOUR, MEAN_POSE) if n in scores]

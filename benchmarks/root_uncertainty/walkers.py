@@ -6,30 +6,42 @@ persons, none of which is tracked.
 """
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.silhouette.data import Split
-from benchmarks.silhouette.trackees import (
+from benchmarks.bodies.clips import Split
+from benchmarks.bodies.tracking import (
     LAYERS,
+    MADE_WITH,
     PUBLISHED_SURVIVAL,
-    Conditions,
     Method,
-    Setting,
+    Run,
+    generators_of,
+    part_error,
+    subject_facts,
+    track_view,
+)
+from benchmarks.bodies.views import (
+    Conditions,
+    Subject,
     Tracked,
     View,
     any_heading,
     body_of,
+    subjects_of,
+    validation_subjects,
     view_of,
 )
+from benchmarks.engine import Experiment, Grid, Setting, Tuning, search_setting
 from torchpose.body import Body, JointLimits, centres_of, fit_state
 from torchpose.errors import InputError
-from torchpose.filters._resampling import survival_rate_per_frame
+from torchpose.filters._resampling import LEAST_SURVIVORS, survival_rate_per_frame
 from torchpose.io._mocap import MocapClip
 from torchpose.learning import fit_limb_conditionals
 from torchpose.priors._limb_conditionals import LimbConditionals
@@ -41,25 +53,14 @@ from torchpose.whole_body import (
     motion_std,
 )
 
-__all__ = [
-    "FPS",
-    "METHODS",
-    "POINTS",
-    "Budget",
-    "Walker",
-    "hypotheses",
-    "make_filter",
-    "prepare",
-    "published",
-    "selected_among",
-    "slower",
-    "with_cameras",
-]
-
 FPS = 60.0
 POINTS = 7
 """Likelihoods of every limb that one hypothesis of the root costs (DX, section 5)."""
 
+SOURCES = (*MADE_WITH, "benchmarks/root_uncertainty/walkers.py")
+"""What the numbers of a run depend on beside its facts."""
+
+_FIRST_SCALE = 1.4  # with which the search for a setting starts
 _ROOM = 0.15  # beside the poses of training: 17 degrees
 _SHARES = (0.04, 0.06, 0.1, 0.16, 0.25, 0.4)
 _PER_FRAME = ("survival per frame", 0.16, _SHARES)
@@ -82,7 +83,7 @@ number as published; ``root-body`` weighs a hypothesis by the likelihood of the 
 
 
 def published(name: str, fps: float) -> Setting:
-    """Survival of a frame, or of a layer, as in section 8, and the diffusion as learnt.
+    """Return the survival of a frame, or of a layer, as in section 8, and the diffusion as learnt.
 
     Args:
         name: among `METHODS`. fps: frames per second.
@@ -104,6 +105,18 @@ class Budget(NamedTuple):
     likelihood: str = "bidirectional"
     leg_swap: float = 0.02
     limits: bool = True
+
+
+class Filter(NamedTuple):
+    """A method with all that it is run with.
+
+    Attributes:
+        name: among `METHODS`. setting: survival and scale of the diffusion. budget: that of all.
+    """
+
+    name: str
+    setting: Setting
+    budget: Budget
 
 
 @dataclass(frozen=True)
@@ -161,7 +174,7 @@ def prepare(
 
 
 def _limits(states: Float[Tensor, "N D"]) -> JointLimits:
-    """What training has, and room beside it, also where joints tell nothing: about the twist."""
+    """Return what training has, and room beside it, also where joints tell nothing: about the twist."""
     learnt = JointLimits.fit(states)
     lower, upper = (learnt.lower - _ROOM).clamp_min(-1), (learnt.upper + _ROOM).clamp_max(1)
     return JointLimits(lower, upper, learnt.softness)
@@ -178,7 +191,7 @@ def _motion(
 
 
 def slower(walker: Walker, n: int) -> Walker:
-    """Every n-th frame of the same silhouettes; motion learnt from every n-th frame of training.
+    """Take every n-th frame of the same silhouettes, with motion learnt from every n-th frame of training.
 
     A walk is smooth, so that over n frames it goes farther than a random walk of n times the variance:
     what was learnt at one rate and rescaled would be too slow.
@@ -205,7 +218,7 @@ def _slower_view(view: View, n: int, fps: float) -> View:
 
 
 def with_cameras(walker: Walker, n: int) -> Walker:
-    """The first n cameras alone, of the same silhouettes."""
+    """Take the first n cameras alone, of the same silhouettes."""
     return replace(
         walker,
         tests=tuple(_fewer_views(view, n) for view in walker.tests),
@@ -223,20 +236,25 @@ def _fewer_views(view: View, n: int) -> View:
 
 
 def make_filter(
-    name: str, walker: Walker, setting: Setting, budget: Budget | None = None
+    name: str,
+    walker: Walker,
+    setting: Setting,
+    budget: Budget | None = None,
+    body: Body | None = None,
 ) -> SilhouetteParticleFilter:
-    """A filter that evaluates as many likelihoods a frame as any other.
+    """Return a filter that evaluates as many likelihoods a frame as any other.
 
     Args:
         name: among `METHODS`. setting: survival of a frame (of a layer for APF), and factor of the
             diffusion's deviation. budget: likelihoods and options, the same for all.
+        walker: whose motion and limits. body: instead of the walker's.
 
     Raises:
         InputError: an unknown method, too few likelihoods, or a survival that leaves too few particles.
     """
     if name not in METHODS:
         raise InputError(f"method must be among {', '.join(METHODS)}, got {name!r}")
-    budget = budget or Budget()
+    budget, own = budget or Budget(), walker.body if body is None else body
     if budget.particles < POINTS:
         raise InputError(f"particles must be at least {POINTS}, got {budget.particles}")
     common: dict[str, Any] = {
@@ -247,23 +265,23 @@ def make_filter(
     }
     if name == "apf":
         return AnnealedParticleFilter(
-            walker.body, selected_among(name, budget), n_layers=LAYERS, estimate="mean",
+            own, selected_among(name, budget), n_layers=LAYERS, estimate="mean",
             survival_rate=setting.value, likelihood=budget.likelihood, **common,
         )  # fmt: skip
     if name == "sir":
         return SIRParticleFilter(
-            walker.body, budget.particles, estimate="map", likelihood=budget.likelihood,
+            own, budget.particles, estimate="map", likelihood=budget.likelihood,
             survival_rate=setting.value, **common,
         )  # fmt: skip
     return RootUncertaintyTracker(
-        walker.body, _diffusing(walker.conditionals, setting.scale),
+        own, _diffusing(walker.conditionals, setting.scale),
         hypotheses(name, budget), fps=walker.fps, survival_rate=setting.value,
         estimate="map", **METHODS[name].options, **common,
     )  # fmt: skip
 
 
 def hypotheses(name: str, budget: Budget) -> int:
-    """Root hypotheses that cost as much as the particles of the others.
+    """Return how many root hypotheses cost as much as the particles of the others.
 
     One that is weighed by the whole body costs another likelihood beside the sigma points.
     """
@@ -272,14 +290,86 @@ def hypotheses(name: str, budget: Budget) -> int:
 
 
 def selected_among(name: str, budget: Budget) -> int:
-    """Particles of which the survival keeps a share: hypotheses, or those of a layer."""
+    """Return how many particles the survival keeps a share of: hypotheses, or those of a layer."""
     if name == "apf":
         return budget.particles // LAYERS
     return budget.particles if name == "sir" else hypotheses(name, budget)
 
 
 def _diffusing(conditionals: LimbConditionals, scale: float) -> LimbConditionals:
-    """The same conditionals with another diffusion, `scale` times its standard deviation."""
+    """Return the same conditionals with another diffusion, `scale` times its standard deviation."""
     other = copy.deepcopy(conditionals)
     other.diffusion *= scale**2
     return other
+
+
+# --- runs -----------------------------------------------------------------------------------------
+
+
+def _track(subject: Subject[Walker], how: Filter, seeds: Sequence[int]) -> list[Run]:
+    tracker = make_filter(how.name, subject.person, how.setting, how.budget, subject.body)
+    start = subject.view.initial_state.expand(len(seeds), -1)
+    return track_view(tracker, subject.body, subject.view, start, generators_of(seeds))
+
+
+def filter_facts(subject: Subject[Walker], how: Filter) -> list[Any]:
+    """Return what a run depends on, beside its seed."""
+    walker = subject.person
+    facts = [*how, METHODS[how.name].options, walker.fps, *subject_facts(subject)]
+    if how.budget.limits:
+        facts += [walker.limits.lower, walker.limits.upper]
+    if how.name.startswith("root"):
+        learnt = walker.conditionals
+        facts += [learnt.mean, learnt.covariance, learnt.diffusion]
+    return facts
+
+
+TRACKING = Experiment(
+    Run, _track, filter_facts, SOURCES, lambda subject, how: len(subject.view.clip), "frame"
+)
+"""Runs of a `Filter` on a walk."""
+
+
+def grid_of(
+    walkers: Sequence[Walker], settings: Mapping[str, Setting], budget: Budget
+) -> Grid[Subject[Walker], Filter]:
+    """Return everybody, and the filters by their labels, of one condition.
+
+    Args:
+        walkers: with the cameras and the frame rate of the condition. settings: by method.
+        budget: of every filter.
+    """
+    filters = {METHODS[name].label: Filter(name, s, budget) for name, s in settings.items()}
+    return Grid(subjects_of(walkers), filters)
+
+
+def tune(
+    walkers: Sequence[Walker],
+    method: str,
+    budget: Budget,
+    folder: Path,
+    start: Setting | None = None,
+) -> Tuning:
+    """Return survival and diffusion with the smallest mean error over everybody's validation clips.
+
+    Every method has the same clips and seed to choose by.
+
+    Args:
+        walkers: at the frame rate of the choice. budget: of the filter. folder: where runs are kept.
+        start: of the search, such as what was chosen at another rate. Without one it starts from
+            `Method.first`, and the published survival is tried as well.
+    """
+    known, usual = METHODS[method], published(method, walkers[0].fps).value
+    subjects = validation_subjects(walkers)
+
+    def error(setting: Setting) -> float:
+        grid = Grid(subjects, {method: Filter(method, setting, budget)})
+        return float(TRACKING.run({"": grid}, (0,), folder).values(part_error()).mean())
+
+    return search_setting(
+        error,
+        start or Setting(known.first, _FIRST_SCALE),
+        None if start else usual,
+        known.values,
+        LEAST_SURVIVORS / selected_among(method, budget),
+    )

@@ -5,13 +5,11 @@ A recording holds several bends; a performance is one of them, from upright to u
 
 from collections.abc import Sequence
 
-from benchmarks.silhouette.data import Split
+from benchmarks.bodies.clips import Split
 from torchpose.errors import InputError
 from torchpose.io._mocap import MocapClip, select_persons
 from torchpose.learning._performances import split_repetitions
 from torchpose.priors._actions.postures import posture_angles
-
-__all__ = ["action_clips", "first_bend", "leave_one_out", "performances"]
 
 _LEAST_FRAMES = 12  # of a performance
 
