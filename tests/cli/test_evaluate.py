@@ -52,7 +52,7 @@ def test_options_reach_the_protocol(torchpose, calls, tmp_path):
     assert done.code == 0, done.err
     assert done.out == "error 5.0 cm\n"
     (call,) = calls
-    assert call["data"] == tmp_path and call["out"] == tmp_path / "out"
+    assert call["data"] == [tmp_path] and call["out"] == tmp_path / "out"
     assert (call["seed"], call["quick"], call["n_views"], call["prior"]) == (4, True, 3, None)
     assert call["methods"] == ("a",) and call["recipe"] is None
     done = torchpose("evaluate", *line, "learning-curve", "--methods", '["b", "c"]')

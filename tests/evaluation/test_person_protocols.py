@@ -164,6 +164,30 @@ def test_learning_curve(data, tmp_path):
     assert (tmp_path / "learning-curve.png").stat().st_size > 1000
 
 
+def test_learning_curve_of_any_recordings(data, tmp_path):
+    """Folders of other names, with counts that go with the persons, and persons of a third folder."""
+    one = write_people(tmp_path / "mine" / "a", ("ann", "bob"), n_frames=40)
+    two = write_people(tmp_path / "mine" / "b", ("carl",), n_frames=40)
+    report = learning_curve.run(
+        [one, two], tmp_path / "out", progress=False, n_own=0, n_subsets=1, recipes=[("r", recipe)]
+    )
+    assert list(report["curve"].rows) == ["1 person", "2 persons"]
+    assert report.settings["persons"] == ["ann", "bob", "carl"] and "own" not in report
+    report = learning_curve.run(
+        [one, two], tmp_path / "out", progress=False, n_own=0, n_subsets=1, counts=(3,),
+        more=(str(data / "burke_kinect"),), recipes=[("r", recipe)],
+    )  # fmt: skip
+    assert report.settings["further training persons"] == ["one"]
+    with pytest.raises(InputError, match="two persons or more, got carl"):
+        learning_curve.run(two, tmp_path / "out", progress=False)
+
+
+def test_counts_double_up_to_all():
+    assert [learning_curve._doubling(n) for n in (1, 2, 7, 8)] == [
+        (1,), (1, 2), (1, 2, 4, 7), (1, 2, 4, 8)
+    ]  # fmt: skip
+
+
 def test_a_point_of_the_curve():
     def scored(error):
         values = torch.full((3, 8), error / 100)
@@ -207,13 +231,57 @@ def test_across_data_sets(data, tmp_path):
         cross_dataset.run(data / "burke_kinect", tmp_path, part="cross")
 
 
-def test_no_head_of_a_tested_person_is_learnt_from(data):
-    sets = cross_dataset._wrists(data, 1, 0)
-    assert not set(sets.completion.persons) & {
-        r.person_id for g in sets.utd.tested.values() for r in g
+def test_across_any_data_sets(data, tmp_path):
+    """Three folders of other names: nothing has to be made up where all have the same joints."""
+    folders = [
+        write_people(tmp_path / name, persons, n_frames=40)
+        for name, persons in (("x", ("a", "b")), ("y", ("c", "d")), ("z", ("e", "f")))
+    ]
+    report = cross_dataset.run(
+        folders, tmp_path / "out", progress=False, recipe=recipe, tested=("c",)
+    )
+    cross = report["cross"]
+    assert {f"{a} → {b} ({p})" for a in "xyz" for b, p in zip("xyz", "bcf", strict=True)} < {
+        *cross.rows
     }
+    assert cross["x → y, all persons", "persons"] == 2 and cross["x → y (c)", "head"] > 0
+    assert "completion" not in report and len(report.findings) == 6
+    assert "wrists" not in cross.title and report.settings["part"] == "cross"
+    mocap = data / "mocap_berkeley_mhad"
+    report = cross_dataset.run([folders[0], mocap], tmp_path / "out", progress=False, recipe=recipe)
+    assert math.isnan(report["cross"]["mocap_berkeley_mhad → x (b)", "head"])
+    assert list(report["completion"].rows) == ["heads of mocap_berkeley_mhad"]
+
+
+def test_motion_capture_added_to_any_data_sets(data, tmp_path):
+    folders = [
+        write_people(tmp_path / name, persons, n_frames=60)
+        for name, persons in (("x", ("a", "b")), ("y", ("c", "d")))
+    ]
+    mocap = str(data / "mocap_berkeley_mhad")
+    report = cross_dataset.run(
+        folders, tmp_path / "out", progress=False, recipe=recipe, part="added", added=(mocap,)
+    )
+    rows = [f"{name}: {label}" for name in "xy" for label in ("alone", "with mocap_berkeley_mhad")]
+    assert list(report["added"].rows) == rows
+    frames = {row: report["added"][row, "training frames"] for row in rows}
+    assert frames["x: alone"] == 120 < frames["x: with mocap_berkeley_mhad"]
+    with pytest.raises(InputError, match="with --added, got none"):
+        cross_dataset.run(folders, tmp_path / "out", progress=False, part="added")
+    with pytest.raises(InputError, match="told apart by their folders' names"):
+        cross_dataset.run([folders[0], folders[0]], tmp_path / "out", progress=False)
+    headless = [mocap, shutil.copytree(mocap, tmp_path / "again")]
+    with pytest.raises(InputError, match="heads are missing in all data sets"):
+        cross_dataset.run(headless, tmp_path / "out", progress=False)
+
+
+def test_no_head_of_a_tested_person_is_learnt_from(data):
+    split = cross_dataset._crossed([data], (), 1)
+    sets = cross_dataset._alike(split, 0)
+    tested = {r.person_id for group in split["UTD"].tested.values() for r in group}
+    assert sets.completion.persons and not set(sets.completion.persons) & tested
     # the mean head is for tests; training recordings have residuals, and nothing else differs
-    mean, drawn = sets.mean.train["s1"][0].joints, sets.drawn.train["s1"][0].joints
+    mean, drawn = sets.mean["MHAD"].train["s1"][0].joints, sets.drawn["MHAD"]["s1"][0].joints
     assert bool((mean[:, [0, 1, 2, 5, 6, 7]] == drawn[:, [0, 1, 2, 5, 6, 7]]).all())
 
 
@@ -228,7 +296,7 @@ def test_motion_capture_is_thinned_to_a_share(data):
 def test_uncommon_poses(data, tmp_path, monkeypatch):
     monkeypatch.setattr("benchmarks.ub_people.TRAIN_PERSONS", ("s1", "s2"))
     shares = [
-        persons_module.raised_share(r)
+        uncommon_poses.raised_share(r)
         for person in ("s1", "s2")
         for r in persons_module.by_person(read_recordings(data / "kinect_utd_mhad"))[person]
     ]
@@ -252,7 +320,7 @@ def test_raised_share_counts_frames_of_either_hand(data):
     body[1, 7, 1] -= 0.8
     names = ("hand_left", "elbow_left", "shoulder_left", "head", "neck", "shoulder_right",
              "elbow_right", "hand_right")  # fmt: skip
-    assert persons_module.raised_share(replace(recording, joints=body, names=names)) == 0.5
+    assert uncommon_poses.raised_share(replace(recording, joints=body, names=names)) == 0.5
 
 
 @pytest.mark.data

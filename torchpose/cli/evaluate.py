@@ -20,13 +20,13 @@ PROTOCOLS = {
     ),
     "learning-curve": Protocol(
         "torchpose.evaluation.learning_curve",
-        "error over the number of training persons (kinect_utd_mhad and more)",
-        "folder",
+        "error over the number of training persons",
+        "recordings",
     ),
     "cross-dataset": Protocol(
         "torchpose.evaluation.cross_dataset",
         "a prior of one data set on another one's persons, and what motion capture adds",
-        "folder",
+        "recordings",
     ),
 }
 BENCHMARKS = (

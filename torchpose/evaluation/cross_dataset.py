@@ -1,18 +1,19 @@
 """Cross-dataset: priors of one data set on another one's persons, and what motion capture adds.
 
-1. UTD-MHAD (Kinect v1) and Berkeley MHAD (optical motion capture), each for training and for
-   testing. Hands are wrists on both sides. MHAD has no head, and another neck: its head is made up by
-   a conditional Gaussian learnt on UTD's training persons (`completion`), with a residual drawn for
-   each training recording, so that priors have all their dimensions; the neck is put where UTD's
-   training persons have theirs. The head is never measured, scored or aligned on. Nothing is learnt
-   from a person that is tested.
-2. Motion capture completed in the same way, with heads and hands, added to Kinect recordings: does a
-   Kinect data set that was left out get a smaller error?
+1. Every data set for training and for testing. Where one has no heads, they are made up by a
+   conditional Gaussian learnt on the training persons of those that have (`completion`), with a
+   residual drawn for each training recording, so that priors have all their dimensions, and the neck
+   is put where these have theirs; hands are wrists in all of them then, and heads are never measured,
+   scored or aligned on. Nothing is learnt from a person that is tested.
+2. Motion capture completed in the same way, with heads and hands, added to recordings of a sensor:
+   does a data set that was left out get a smaller error?
 
-Camera, noise and error are those of UB-people; covariances are not calibrated.
+Camera and noise are those of `score`; covariances are not calibrated. A folder that holds the published
+data sets by their names is run with these: UTD-MHAD (Kinect v1) and Berkeley MHAD (optical motion
+capture) in the first part, all of them in the second.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,12 +30,13 @@ from torchpose.evaluation.completion import (
     learn_completion,
     with_wrists,
 )
-from torchpose.evaluation.cross_tables import add_added, add_cross, plot_cross
+from torchpose.evaluation.cross_tables import Crossed, add_added, add_cross, plot_cross
 from torchpose.evaluation.persons import by_person
 from torchpose.evaluation.report import Report
 from torchpose.evaluation.unseen import Job, ScoreSettings, fit_settings, run_jobs
 from torchpose.io._recordings import Recording, read_recordings
 from torchpose.learning._recipes.upper_body import fit_kinect_prior
+from torchpose.skeleton._upper_body import upper_body_indices
 
 __all__ = ["run"]
 
@@ -45,33 +47,51 @@ _TESTED = {"UTD": ("s7", "s8"), "MHAD": ("s9", "s10", "s11")}
 """Persons that no prior of their own data set sees. In MHAD s4 and s12, and s10 and s11, have bodies
 of one size; the pairs stay together."""
 
-_NO_HEAD = ("head",)
+_HELD_SHARE = 4  # one of so many persons is tested, if none is named
+
+_Persons = dict[str, list[Recording]]
+"""Recordings by person."""
 
 
 class _Split(NamedTuple):
-    """Persons of a data set: to train on and to test, by name."""
+    """Persons of a data set: to train on and to test."""
 
-    train: dict[str, list[Recording]]
-    tested: dict[str, list[Recording]]
+    train: _Persons
+    tested: _Persons
 
 
-class _Wrists(NamedTuple):
-    """UTD and MHAD with wrists as hands: MHAD with drawn heads to train on, mean ones to test."""
+class _Alike(NamedTuple):
+    """Data sets with the same joints, by name.
 
+    Attributes:
+        drawn: to train on, made-up heads with residuals. mean: to test, without.
+        completion: what made heads up, where some were. how: what was done, for the tables.
+    """
+
+    drawn: dict[str, _Persons]
+    mean: dict[str, _Split]
+    completion: Completion | None
+    how: Crossed
+
+
+class _Held(NamedTuple):
+    """Persons left out, and training sets for them: alone first, then with motion capture."""
+
+    tests: _Persons
+    trains: dict[str, list[Recording]]
     completion: Completion
-    utd: _Split
-    drawn: _Split
-    mean: _Split
 
 
 def run(
-    data: str | Path,
+    data: Sequence[str | Path] | str | Path,
     out: str | Path,
     *,
     seed: int = 0,
     progress: bool = True,
     quick: bool = False,
     part: str = "both",
+    tested: tuple[str, ...] = (),
+    added: tuple[str, ...] = (),
     n_components: int | None = None,
     window_components: int | None = None,
     window_samples: int | None = None,
@@ -84,16 +104,20 @@ def run(
     """Run the protocol; writes report.json, report.md and a picture to `out`.
 
     Args:
-        data: folder with kinect_utd_mhad and mocap_berkeley_mhad; for the second part also with
-            burke_kinect, kinect_laban, mocap_cmu_walk and mocap_cmu_actions. out: folder for the
-            results.
+        data: two folders or more, each with the recordings of a data set; or one folder with
+            kinect_utd_mhad and mocap_berkeley_mhad, and for the second part also with burke_kinect,
+            kinect_laban, mocap_cmu_walk and mocap_cmu_actions. out: folder for the results.
         seed: of priors, noise and made-up joints. progress: whether to show bars.
         quick: small priors and few sequences, to see that all of it works.
         part: "cross", "added" (motion capture for training) or "both".
+        tested: persons whom no prior of their own data set sees; of a data set of which none is named
+            the last quarter.
+        added: folders of motion capture for the second part, with shoulders, elbows, wrists and hips;
+            without one there is no second part.
         n_components: Gaussians per arm over poses; this and the next two as the recipe has them if
             None.
         window_components: Gaussians per arm over windows. window_samples: training windows.
-        mocap_share: frames of motion capture that are added, at most, as a multiple of the Kinect's.
+        mocap_share: frames of motion capture that are added, at most, as a multiple of the others'.
         every: only each n-th sequence of a person is tracked. workers: processes.
         fits: folder of fitted priors, to share them with other protocols; `out` if None.
         recipe: fits the priors.
@@ -103,6 +127,11 @@ def run(
     """
     if part not in ("both", "cross", "added"):
         raise InputError(f"part must be cross, added or both, got {part!r}")
+    folders = [Path(data)] if isinstance(data, str | Path) else [Path(path) for path in data]
+    if len(folders) > 1 and not added:
+        if part == "added":
+            raise InputError("expected folders of motion capture with --added, got none")
+        part = "cross"
     out = check_output_folder(out)
     folder = check_output_folder(fits or out)
     settings = fit_settings(
@@ -116,56 +145,65 @@ def run(
     })  # fmt: skip
     thin = 8 if quick else 1
     if part != "added":
-        sets = _wrists(Path(data), thin, seed)
-        scoring_both = replace(scoring, unmeasured=_NO_HEAD, unscored=_NO_HEAD, likelihood=False)
-        held = _labelled("UTD", sets.utd.tested) | _labelled("MHAD", sets.mean.tested)
-        jobs = [
-            Job(f"trained on {name}", _all(train), held | far, test=scoring_both, **common)
-            for name, train, far in (
-                ("UTD", sets.utd.train, _labelled("MHAD", sets.mean.train)),
-                ("MHAD", sets.drawn.train, _labelled("UTD", sets.utd.train)),
-            )
-        ]
-        found = run_jobs(jobs, folder, workers, progress)
-        add_cross(report, dict(zip(("UTD", "MHAD"), found, strict=True)), _TESTED)
-        _add_completion(report, {"heads of MHAD": sets.completion})
-        add_picture(report, out, "cross-dataset.png", plot_cross(report))
+        sets = _alike(_crossed(folders, tested, thin), seed)
+        found = run_jobs(_cross_jobs(sets, scoring, common), folder, workers, progress)
+        add_cross(report, dict(zip(sets.mean, found, strict=True)), sets.how)
+        if sets.completion is not None:
+            heads = f"heads of {', '.join(sets.how.completed)}"
+            _add_completion(report, {heads: sets.completion})
+        add_picture(report, out, "cross-dataset.png", plot_cross(report, list(sets.mean)))
     if part != "cross":
-        left_out = _training_sets(Path(data), thin, seed, mocap_share)
-        keys = [(held, label) for held, (_, trains, _) in left_out.items() for label in trains]
+        left_out = _left_out(folders, added, tested, thin, seed, mocap_share)
+        keys = [(held, label) for held, one in left_out.items() for label in one.trains]
         jobs = [
-            Job(", ".join(key), left_out[key[0]][1][key[1]], left_out[key[0]][0], test=scoring,
-                **common)
+            Job(", ".join(key), left_out[key[0]].trains[key[1]], left_out[key[0]].tests,
+                test=scoring, **common)
             for key in keys
         ]  # fmt: skip
         found = run_jobs(jobs, folder, workers, progress)
         frames = [sum(map(len, job.train)) for job in jobs]
         scores = dict(zip(keys, found, strict=True))
         add_added(report, scores, dict(zip(keys, frames, strict=True)))
-        _add_completion(report, {f"without {held}": c for held, (_, _, c) in left_out.items()})
+        completions = {f"without {held}": one.completion for held, one in left_out.items()}
+        _add_completion(report, completions)
     report.save(out)
     return report
 
 
-def _labelled(name: str, persons: Mapping[str, list[Recording]]) -> dict[str, list[Recording]]:
-    return {f"{name} {person}": group for person, group in persons.items()}
+# --- data sets ------------------------------------------------------------------------------------
 
 
 def _all(persons: Mapping[str, list[Recording]]) -> list[Recording]:
     return [recording for group in persons.values() for recording in group]
 
 
-def _read(data: Path, name: str, thin: int) -> dict[str, list[Recording]]:
-    """Recordings of one data set by person; each n-th of every person."""
-    if not (data / name).is_dir():
-        raise InputError(f"{data}: expected the folder {name} in it, found none")
-    return {
-        person: group[::thin] for person, group in by_person(read_recordings(data / name)).items()
-    }
+def _read(folder: Path, thin: int) -> _Persons:
+    """Return recordings of one data set by person; each n-th of every person."""
+    return {person: group[::thin] for person, group in by_person(read_recordings(folder)).items()}
 
 
-def _split(persons: Mapping[str, list[Recording]], tested: Sequence[str], name: str) -> _Split:
-    """Persons apart into those to train on and those to test.
+def _published(home: Path, name: str, thin: int) -> _Persons:
+    """Return recordings of a data set that is known by its name."""
+    if not (home / name).is_dir():
+        raise InputError(
+            f"{home}: expected the folder {name} in it, found none; or name two folders or more, one "
+            "for each data set"
+        )
+    return _read(home / name, thin)
+
+
+def _named(folders: Sequence[str | Path], thin: int) -> dict[str, _Persons]:
+    """Return data sets by the names of their folders."""
+    names = [Path(folder).resolve().name for folder in folders]
+    if len(set(names)) < len(names):
+        raise InputError(
+            f"data sets are told apart by their folders' names, got {', '.join(names)}"
+        )
+    return {name: _read(Path(f), thin) for name, f in zip(names, folders, strict=True)}
+
+
+def _split(persons: _Persons, tested: Sequence[str], name: str) -> _Split:
+    """Put persons to train on and to test apart.
 
     Raises:
         InputError: there is nobody of either.
@@ -180,59 +218,129 @@ def _split(persons: Mapping[str, list[Recording]], tested: Sequence[str], name: 
     return _Split(train, held)
 
 
-def _wrists(data: Path, thin: int, seed: int) -> _Wrists:
-    """Both data sets with wrists as hands."""
-    kinect = _split(_read(data, _UTD, thin), _TESTED["UTD"], _UTD)
-    mocap = _split(_read(data, _MHAD, thin), _TESTED["MHAD"], _MHAD)
-    completion = learn_completion(_all(kinect.train), ("head",))
-
-    def completed(source: torch.Generator | None) -> _Split:
-        return _each(mocap, lambda recording: complete(recording, completion, source))
-
-    drawn = completed(torch.Generator().manual_seed(seed))
-    return _Wrists(completion, _each(kinect, with_wrists), drawn, completed(None))
+def _held_out(persons: _Persons, tested: Sequence[str]) -> list[str]:
+    """Return who is tested: those who are named, else the last quarter."""
+    last = list(persons)[-max(1, len(persons) // _HELD_SHARE) :]
+    return [person for person in persons if person in tested] or last
 
 
-def _each(split: _Split, convert: Callable[[Recording], Recording]) -> _Split:
-    return _Split(*({n: [convert(r) for r in g] for n, g in part.items()} for part in split))
+def _crossed(folders: Sequence[Path], tested: Sequence[str], thin: int) -> dict[str, _Split]:
+    """Return the data sets of the first part by name."""
+    if len(folders) == 1:
+        published = {"UTD": _UTD, "MHAD": _MHAD}
+        return {
+            short: _split(_published(folders[0], name, thin), _TESTED[short], name)
+            for short, name in published.items()
+        }
+    sets = _named(folders, thin)
+    return {name: _split(own, _held_out(own, tested), name) for name, own in sets.items()}
 
 
-def _training_sets(
-    data: Path, thin: int, seed: int, share: float
-) -> dict[str, tuple[dict[str, list[Recording]], dict[str, list[Recording]], Completion]]:
-    """For every data set left out: its persons, training sets by name, and the completion."""
-    kinect = {name: _read(data, name, thin if name == _UTD else 1) for name in _KINECT}
-    mocap = {
-        name: [piece for r in _all(_read(data, name, thin)) for piece in facing_pieces(r)]
-        for name in _MOCAP
+def _alike(sets: Mapping[str, _Split], seed: int) -> _Alike:
+    """Return the data sets with the same joints: heads made up, and wrists as hands, if one lacks them.
+
+    Raises:
+        InputError: heads are missing in all of them.
+    """
+
+    def kinds(name: str) -> list[Any]:
+        recordings = [r for part in sets[name] for r in _all(part)]
+        return [upper_body_indices(names) for names in {tuple(r.names) for r in recordings}]
+
+    lacking = [name for name in sets if any(kind.head is None for kind in kinds(name))]
+    donors = [name for name in sets if name not in lacking]
+    if not donors:
+        raise InputError(f"heads are missing in all data sets: {', '.join(lacking)}")
+    wrists = bool(lacking) or any(kind.hand == "wrist" for name in sets for kind in kinds(name))
+    learnt = [r for name in donors for r in _all(sets[name].train)]
+    completion = learn_completion(learnt, ("head",)) if lacking else None
+
+    def convert(name: str, persons: _Persons, source: torch.Generator | None) -> _Persons:
+        def one(recording: Recording) -> Recording:
+            if completion is not None and name in lacking:
+                return complete(recording, completion, source)
+            if wrists and recording.upper_body().hand != "wrist":
+                return with_wrists(recording)
+            return recording
+
+        return {person: [one(r) for r in group] for person, group in persons.items()}
+
+    generator = torch.Generator().manual_seed(seed)
+    drawn = {name: convert(name, split.train, generator) for name, split in sets.items()}
+    mean = {
+        name: _Split(*(convert(name, part, None) for part in split)) for name, split in sets.items()
     }
-    tested = _split(kinect[_UTD], _TESTED["UTD"], _UTD)
-    held: dict[str, tuple[dict[str, list[Recording]], dict[str, dict[str, list[Recording]]]]] = {
-        name: (kinect[name], {n: p for n, p in kinect.items() if n != name}) for name in _KINECT
+    persons = {name: [*split.tested, *split.train] for name, split in sets.items()}
+    tested = {name: list(split.tested) for name, split in sets.items()}
+    return _Alike(drawn, mean, completion, Crossed(persons, tested, wrists, lacking, donors))
+
+
+def _cross_jobs(sets: _Alike, scoring: ScoreSettings, common: dict[str, Any]) -> list[Job]:
+    """Return a fit to each data set, scored on the tested persons of all, and everybody of the others."""
+
+    def labelled(name: str, persons: _Persons) -> _Persons:
+        return {sets.how.label(name, person): group for person, group in persons.items()}
+
+    if sets.completion is not None:
+        head = ("head",)
+        scoring = replace(scoring, unmeasured=head, unscored=head, likelihood=False)
+    held = {
+        k: v for name, split in sets.mean.items() for k, v in labelled(name, split.tested).items()
     }
-    held["UTD s7, s8"] = (tested.tested, kinect | {_UTD: tested.train})
-    sets = {}
-    for name, (tests, left) in held.items():
+    jobs = []
+    for name, train in sets.drawn.items():
+        far = {
+            k: v
+            for other, split in sets.mean.items()
+            if other != name
+            for k, v in labelled(other, split.train).items()
+        }
+        jobs.append(Job(f"trained on {name}", _all(train), held | far, test=scoring, **common))
+    return jobs
+
+
+# --- motion capture added -------------------------------------------------------------------------
+
+
+def _left_out(
+    folders: Sequence[Path], added: Sequence[str], tested: Sequence[str], thin: int, seed: int,
+    share: float,
+) -> dict[str, _Held]:  # fmt: skip
+    """Return training sets with and without motion capture for every data set that is left out."""
+    held: dict[str, tuple[_Persons, dict[str, _Persons]]]
+    if len(folders) == 1:
+        sets = {n: _published(folders[0], n, thin if n == _UTD else 1) for n in _KINECT}
+        mocap = {n: _published(folders[0], n, thin) for n in _MOCAP}
+        labels = "Kinect alone", "with MHAD", "with all motion capture"
+        some = _split(sets[_UTD], _TESTED["UTD"], _UTD)
+        extra = {"UTD s7, s8": (some.tested, sets | {_UTD: some.train})}
+    else:
+        sets, mocap = _named(folders, thin), _named(added, thin)
+        labels, extra = ("alone", f"with {next(iter(mocap))}", "with all motion capture"), {}
+    held = {name: (own, {n: p for n, p in sets.items() if n != name}) for name, own in sets.items()}
+    pieces = {
+        name: [piece for r in _all(persons) for piece in facing_pieces(r)]
+        for name, persons in mocap.items()
+    }
+    found = {}
+    for name, (tests, left) in (held | extra).items():
         base = [r for persons in left.values() for r in _all(persons)]
         completion = learn_completion(base)
         generator = torch.Generator().manual_seed(seed)
-        made = {
-            other: [complete(r, completion, generator) for r in pieces]
-            for other, pieces in mocap.items()
-        }
+        made = [[complete(r, completion, generator) for r in own] for own in pieces.values()]
         bound = round(share * sum(map(len, base)))
-        whole = [r for pieces in made.values() for r in pieces]
+        first, whole = made[0], [r for own in made for r in own]
+        sources: list[list[Recording]] = [[], _at_most(first, bound), _at_most(whole, bound)]
         trains = {
-            "Kinect alone": base,
-            "with MHAD": base + _at_most(made[_MHAD], bound),
-            "with all motion capture": base + _at_most(whole, bound),
+            label: base + more
+            for label, more in zip(labels, sources[: len(made) + 1], strict=False)
         }
-        sets[name] = (tests, trains, completion)
-    return sets
+        found[name] = _Held(tests, trains, completion)
+    return found
 
 
 def _at_most(recordings: Sequence[Recording], bound: int) -> list[Recording]:
-    """Evenly spread recordings with at most about as many frames, counted at 30 per second."""
+    """Return evenly spread recordings with at most about as many frames, counted at 30 per second."""
     frames = [len(r) * 30.0 / (r.fps or 30.0) for r in recordings]
     step = max(1.0, sum(frames) / max(1, bound))
     wanted = {int(i * step) for i in range(int(len(recordings) / step))}
@@ -240,7 +348,7 @@ def _at_most(recordings: Sequence[Recording], bound: int) -> list[Recording]:
 
 
 def _add_completion(report: Report, completions: Mapping[str, Completion]) -> None:
-    """How far made-up joints are from true ones, on the recordings they were learnt on."""
+    """Add how far made-up joints are from true ones, on the recordings they were learnt on."""
     if "completion" not in report:
         report.table(
             "completion",

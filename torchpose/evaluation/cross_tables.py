@@ -1,58 +1,84 @@
 """Tables, findings and picture of the protocol across data sets."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
-from torchpose.evaluation.person_tables import SHORT_NAMES, add_pose_classes, mean_error, pooled
+from torchpose.evaluation.person_tables import (
+    SHORT_NAMES,
+    add_pose_classes,
+    mean_error,
+    pooled,
+)
 from torchpose.evaluation.persons import spread
 from torchpose.evaluation.report import Report
 from torchpose.evaluation.unseen import Scored
 
-__all__ = ["add_added", "add_cross", "plot_cross"]
-
-_SETS = ("UTD", "MHAD")
+__all__ = ["Crossed", "add_added", "add_cross", "plot_cross"]
 
 
-def add_cross(
-    report: Report,
-    found: Mapping[str, Mapping[str, Scored]],
-    tested: Mapping[str, Sequence[str]],
-) -> None:
-    """Error by training set and test set, on the same test persons, and on all unseen ones.
+class Crossed(NamedTuple):
+    """How data sets are compared.
+
+    Attributes:
+        persons: of each data set. tested: those that no prior saw.
+        wrists: whether wrists stand for hands. completed: data sets whose heads are made up.
+        donors: those that heads and necks were learnt on.
+    """
+
+    persons: Mapping[str, Sequence[str]]
+    tested: Mapping[str, Sequence[str]]
+    wrists: bool
+    completed: Sequence[str]
+    donors: Sequence[str]
+
+    def label(self, name: str, person: str) -> str:
+        """Return what a person of a data set is called."""
+        return f"{name} {person}"
+
+
+def add_cross(report: Report, found: Mapping[str, Mapping[str, Scored]], how: Crossed) -> None:
+    """Add the error by training set and test set, on the same test persons, and on all unseen ones.
 
     Args:
-        found: by training set, then by test person ("UTD s7"). tested: persons of each set that no
-            prior saw.
+        report: gets the tables. found: by training set, then by the label of a person.
+        how: the data sets were made alike.
     """
+    title, note = "3D error after Procrustes (cm)", "Joints: filtered."
+    if how.wrists:
+        title += ", wrists as hands"
+    if how.completed:
+        title += ", head neither measured nor counted"
+        note += (
+            f" Aligned on neck and shoulders. The neck of {' and '.join(how.completed)} is put where "
+            f"{' and '.join(how.donors)}'s training persons have theirs."
+        )
     table = report.table(
-        "cross",
-        "3D error after Procrustes (cm), wrists as hands, head neither measured nor counted",
-        ["persons", "frames", "filtered", "± persons", "smoothed", *SHORT_NAMES],
-        digits=(0, 0, 2, 2, 2, *[1] * 8),
-        note="Joints: filtered. Aligned on neck and shoulders. The neck of MHAD is put where UTD's "
-        "training persons have theirs.",
-    )
+        "cross", title, ["persons", "frames", "filtered", "± persons", "smoothed", *SHORT_NAMES],
+        digits=(0, 0, 2, 2, 2, *[1] * 8), note=note,
+    )  # fmt: skip
     groups = {}
     for trained, scores in found.items():
-        for target in _SETS:
-            chosen = {n: s for n, s in scores.items() if n.startswith(f"{target} ")}
-            held = {n: s for n, s in chosen.items() if n.split()[-1] in tested[target]}
+        for target in found:
+            labels = {how.label(target, person): person for person in how.persons[target]}
+            chosen = {labels[n]: s for n, s in scores.items() if n in labels}
+            held = {person: s for person, s in chosen.items() if person in how.tested[target]}
             name = f"{trained} → {target}"
             groups[name] = pooled(list(held.values()))
-            table.add(f"{name} ({', '.join(n.split()[-1] for n in held)})", _row(held))
+            table.add(f"{name} ({', '.join(held)})", _row(held))
             if len(chosen) > len(held):
                 table.add(f"{name}, all persons", _row(chosen))
     add_pose_classes(report, groups)
     error = {name: mean_error(scored) for name, scored in groups.items()}
-    for target in _SETS:
-        other = next(name for name in _SETS if name != target)
-        near, far = error[f"{target} → {target}"], error[f"{other} → {target}"]
-        report.findings.append(
-            f"On {target}, a prior of {other} has {far:.2f} cm where one of {target} itself has "
-            f"{near:.2f} cm ({far - near:+.2f})."
-        )
+    for target in found:
+        near = error[f"{target} → {target}"]
+        for other in [name for name in found if name != target]:
+            far = error[f"{other} → {target}"]
+            report.findings.append(
+                f"On {target}, a prior of {other} has {far:.2f} cm where one of {target} itself has "
+                f"{near:.2f} cm ({far - near:+.2f})."
+            )
 
 
 def _row(persons: Mapping[str, Scored]) -> list[float | int]:
@@ -68,7 +94,7 @@ def add_added(
     found: Mapping[tuple[str, str], Mapping[str, Scored]],
     frames: Mapping[tuple[str, str], int],
 ) -> None:
-    """Error on a data set that was left out, with and without motion capture in training.
+    """Add the error on a data set that was left out, with and without motion capture in training.
 
     Args:
         found: scores by person, for what was left out and what was trained on. frames: of training.
@@ -110,30 +136,38 @@ def add_added(
         )
 
 
-def plot_cross(report: Report) -> Any:
-    """Bars of the error on the test persons of each set, by training set."""
+def plot_cross(report: Report, names: Sequence[str]) -> Any:
+    """Draw bars of the error on the test persons of each data set, by training set.
+
+    Args:
+        report: with the table of `add_cross`. names: of the data sets.
+    """
     from matplotlib.patches import Patch
 
     from torchpose.viz._style import add_legend, method_styles, new_figure, style_axes
 
     table = report["cross"]
     rows = {name.split(" (")[0]: name for name in table.rows if "all persons" not in name}
-    figure = new_figure(6.4, 3.9, "Across data sets: persons that no prior saw")
+    figure = new_figure(
+        max(6.4, 2.6 * len(names)), 3.9, "Across data sets: persons that no prior saw"
+    )
     ax = style_axes(figure.add_subplot(), y="mean 3D error (cm)")
     ax.grid(False, axis="x")
-    styles = method_styles([f"trained on {name}" for name in _SETS])
+    styles = method_styles([f"trained on {name}" for name in names])
     entries: list[Any] = []
-    for i, (trained, (label, style)) in enumerate(zip(_SETS, styles.items(), strict=True)):
+    width = 0.38 / len(names)  # of a bar; there are two for each training set
+    for i, (trained, (label, style)) in enumerate(zip(names, styles.items(), strict=True)):
         for j, stage in enumerate(("filtered", "smoothed")):
-            values = [float(table[rows[f"{trained} → {target}"], stage]) for target in _SETS]
-            place = torch.arange(2).double().numpy() - 0.3 + 0.4 * i + 0.19 * j
+            values = [float(table[rows[f"{trained} → {target}"], stage]) for target in names]
+            start = (2 * i + j - len(names) + 0.5) * width * 1.05
+            place = torch.arange(len(names)).double().numpy() + start
             color, pale = style["color"], 0.85 - 0.4 * j
-            ax.bar(place, values, 0.18, color=color, alpha=pale)
+            ax.bar(place, values, 0.95 * width, color=color, alpha=pale)
             for x, value in zip(place, values, strict=True):
                 ax.annotate(f"{value:.1f}", (x, value), (0, 2), textcoords="offset points",
                             ha="center", fontsize=8.5)  # fmt: skip
             entries.append(Patch(color=color, alpha=pale, label=f"{label}, {stage}"))
-    ax.set_xticks(range(2), [f"tracked: {name}" for name in _SETS])
+    ax.set_xticks(range(len(names)), [f"tracked: {name}" for name in names])
     ax.set_ylim(bottom=0)
     add_legend(figure, entries)
     return figure

@@ -1,25 +1,25 @@
 """Learning curve: error on persons never seen over the number of training persons.
 
-For each number n, priors are fitted to cyclic runs of n persons of UTD-MHAD (s1 s2, s2 s3, ...,
-s8 s1), and each tracks all persons whom it did not see; so few fits serve many test persons, and
-every person is tracked and trained on equally often. Beyond the persons of UTD-MHAD less one, the
-authors' recording and kinect_laban join the training persons. A second part asks what a prior of
-one's own is worth: fitted to half of a person's recordings, and scored on the other half.
+For each number n, priors are fitted to cyclic runs of n persons (s1 s2, s2 s3, ..., s8 s1), and each
+tracks all persons whom it did not see; so few fits serve many test persons, and every person is
+tracked and trained on equally often. Beyond all persons less one, persons of other recordings join the
+training. A second part asks what a prior of one's own is worth: fitted to half of a person's
+recordings, and scored on the other half.
 
-Conditions are those of UB-people. Covariances are not calibrated.
+Camera and noise are those of `score`. Covariances are not calibrated.
 """
 
 import re
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
-from torchpose.evaluation.common import Recipe, add_picture, data_folder
+from torchpose.evaluation.common import Recipe, add_picture
 from torchpose.evaluation.person_tables import (
     Curve,
     add_pose_classes,
@@ -35,26 +35,21 @@ from torchpose.learning._recipes.upper_body import fit_kinect_prior
 
 __all__ = ["cyclic_subsets", "halves", "run"]
 
-_DATA = "kinect_utd_mhad"
-_MORE = ("burke_kinect", "kinect_laban")
+_PUBLISHED, _FURTHER = "kinect_utd_mhad", ("burke_kinect", "kinect_laban")
+"""Data sets that are taken from a folder that holds them, without being named."""
+_PUBLISHED_COUNTS = (1, 2, 4, 7, 9)
 STAGES = ("filtered", "smoothed")
 
 
-class _Own(NamedTuple):
-    """Whom a prior is fitted to in the second part, and where to look up its scores."""
-
-    label: str
-    job: Job
-
-
 def run(
-    data: str | Path,
+    data: Sequence[str | Path] | str | Path,
     out: str | Path,
     *,
     seed: int = 0,
     progress: bool = True,
     quick: bool = False,
-    counts: tuple[int, ...] = (1, 2, 4, 7, 9),
+    more: tuple[str, ...] = (),
+    counts: tuple[int, ...] = (),
     n_subsets: int = 8,
     n_own: int = 8,
     n_components: int | None = None,
@@ -69,11 +64,15 @@ def run(
     """Run the protocol; writes report.json, report.md and pictures to `out`.
 
     Args:
-        data: folder with kinect_utd_mhad and, for counts beyond its persons less one, burke_kinect
-            and kinect_laban. out: folder for the results.
+        data: folders or files with recordings of two persons or more. Of one folder that holds
+            kinect_utd_mhad that is taken, with burke_kinect and kinect_laban beside it as `more`.
+        out: folder for the results.
         seed: of priors and noise. progress: whether to show bars.
         quick: small priors, few subsets and a tenth of the sequences, to see that all of it works.
-        counts: numbers of training persons. n_subsets: fits for each number, at most one for each
+        more: folders or files with further training persons, for counts beyond the persons of `data`
+            less one.
+        counts: numbers of training persons; where none is given 1, 2, 4 and so on up to all, and of
+            the published data sets 1, 2, 4, 7 and 9. n_subsets: fits for each number, at most one for each
             person. n_own: persons for whom a prior of their own is fitted; 0 leaves that part out.
         n_components: Gaussians per arm over poses; this and the next two as the recipe has them if
             None.
@@ -90,11 +89,15 @@ def run(
     """
     out = check_output_folder(out)
     known = list(recipes or [("this recipe", fit_kinect_prior), *map(_imported, compare)])
-    persons = by_person(read_recordings(data_folder(data, _DATA)))
+    folders, further, usual = _sources(data, more)
+    persons = by_person(read_recordings(folders))
+    if len(persons) < 2:
+        raise InputError(f"a learning curve needs two persons or more, got {', '.join(persons)}")
+    counts = counts or usual or _doubling(len(persons) - 1)
     if quick:
         persons = {name: group[::5] for name, group in persons.items()}
         counts, n_subsets, n_own = tuple(c for c in counts if c in counts[:2]), 2, min(1, n_own)
-    others = _others(data, persons, counts)
+    others = _others(further, len(persons) - 1, max(counts))
     settings = fit_settings(
         "learning-curve", seed, quick, n_components, window_components, window_samples, 0
     )
@@ -131,7 +134,7 @@ def run(
 
 
 def cyclic_subsets(names: Sequence[str], count: int, n_subsets: int) -> list[list[str]]:
-    """Runs of `count` names, the first following the last, from starts that are evenly spread.
+    """Return runs of `count` names, the first following the last, from starts that are evenly spread.
 
     Never all of the names, so that somebody is left to score: at most all but one.
 
@@ -146,7 +149,7 @@ def cyclic_subsets(names: Sequence[str], count: int, n_subsets: int) -> list[lis
 
 
 def halves(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recording]]:
-    """A person's recordings in two halves, each with half of the trials of every action.
+    """Return a person's recordings in two halves, each with half of the trials of every action.
 
     Trials follow each other in the order of their files. Of an odd number the middle one goes to the
     half that has fewer recordings so far.
@@ -166,7 +169,7 @@ def halves(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Recor
 
 
 def _imported(text: str) -> tuple[str, Recipe]:
-    """NAME=module.function as name and function."""
+    """Return NAME=module.function as name and function."""
     match = re.fullmatch(r"(.+)=([\w.]+)\.(\w+)", text)
     try:
         if match is not None:
@@ -176,23 +179,40 @@ def _imported(text: str) -> tuple[str, Recipe]:
     raise InputError(f"--compare {text}: expected NAME=module.function")
 
 
-def _others(
-    data: str | Path, persons: Mapping[str, Any], counts: Sequence[int]
-) -> dict[str, list[Recording]]:
-    """Training persons of other data sets, as many as the largest count asks for."""
-    most = len(persons) - 1
-    if most < 1:
-        raise InputError(f"{data}: a learning curve needs two persons or more, got {len(persons)}")
-    missing = max(counts) - most
+def _sources(
+    data: Sequence[str | Path] | str | Path, more: Sequence[str]
+) -> tuple[list[Path], list[Path], tuple[int, ...]]:
+    """Return where recordings are, where those of further persons are, and the usual counts if any."""
+    given = [Path(data)] if isinstance(data, str | Path) else [Path(path) for path in data]
+    further = [Path(path) for path in more]
+    home = given[0] if len(given) == 1 else Path()
+    if home.name != _PUBLISHED and not (home / _PUBLISHED).is_dir():
+        return given, further, ()
+    beside = [home / name for name in _FURTHER if (home / name).is_dir()]
+    found = home if home.name == _PUBLISHED else home / _PUBLISHED
+    return [found], further or beside, _PUBLISHED_COUNTS
+
+
+def _doubling(most: int) -> tuple[int, ...]:
+    """Return 1, 2, 4 and so on, and the most itself.
+
+    >>> _doubling(5)
+    (1, 2, 4, 5)
+    """
+    return tuple(sorted({min(2**i, most) for i in range(most.bit_length() + 1)}))
+
+
+def _others(folders: Sequence[Path], most: int, count: int) -> dict[str, list[Recording]]:
+    """Return further training persons, as many as are missing."""
+    missing = count - most
     if missing <= 0:
         return {}
-    folders = [Path(data) / name for name in _MORE if (Path(data) / name).is_dir()]
     others = by_person(read_recordings(folders)) if folders else {}
     if missing > len(others):
         raise InputError(
-            f"{max(counts)} training persons are asked for, and there are {most} of {_DATA} beside "
-            f"the one who is tracked, and {len(others)} in {' and '.join(_MORE)}; give the folder "
-            "that holds all of these, or smaller counts"
+            f"{count} training persons are asked for, and there are {most} beside the one who is "
+            f"tracked, and {len(others)} further ones; name recordings of others with --more, or "
+            "smaller --counts"
         )
     return dict(list(others.items())[:missing])
 
@@ -221,7 +241,7 @@ def _own_jobs(
     recipe: Recipe,
     scoring: ScoreSettings,
 ) -> dict[str, Job]:
-    """Priors of a person's first half, of all others, and of both; scored on second halves."""
+    """Return fits to a person's first half, of all others, and of both; scored on second halves."""
     first, _ = halves(persons[person])
     mine = renamed(first, "first half")
     rest = [r for name, group in persons.items() if name != person for r in group]
@@ -245,7 +265,7 @@ def _add_curve(
     scores: Mapping[Any, Mapping[str, Scored]],
     n_persons: int,
 ) -> dict[str, dict[str, Curve]]:
-    """The table of the curve; and the curves by stage and recipe."""
+    """Add the table of the curve; return the curves by stage and recipe."""
     table = report.table(
         "curve",
         "3D error after Procrustes (cm) on persons never seen, by number of training persons",
@@ -281,7 +301,7 @@ def _people(count: int) -> str:
 
 
 def _point(results: Sequence[Mapping[str, Scored]], smoothed: bool) -> tuple[float, float, float]:
-    """Mean, spread over fits (root mean of the variance within a person), spread over persons."""
+    """Return mean, spread over fits (root mean of the variance within a person), spread over persons."""
     by_test: dict[str, list[float]] = {}
     for found in results:
         for name, scored in found.items():
@@ -297,7 +317,7 @@ def _add_own(
     own: Mapping[tuple[str, str, str], Job],
     scores: Mapping[Any, Mapping[str, Scored]],
 ) -> None:
-    """One person's prior against that of many, on that person and off."""
+    """Add one person's prior against that of many, on that person and off."""
     table = report.table(
         "own",
         "One person's prior against many (cm): tracked are the second halves of the recordings",
