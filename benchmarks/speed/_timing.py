@@ -74,9 +74,13 @@ class Limits(NamedTuple):
     call_us: float
 
 
-def parser(description: str, runs: int) -> argparse.ArgumentParser:
-    """A command line with the options of every benchmark."""
-    made = argparse.ArgumentParser(description=description)
+def parser(text: str | None, runs: int) -> argparse.ArgumentParser:
+    """Return a command line with the options of every benchmark.
+
+    Args:
+        text: of the script, whose first line describes it. runs: timed runs by default.
+    """
+    made = argparse.ArgumentParser(description=(text or "").partition("\n")[0])
     made.add_argument("--threads", type=int, default=2, help="cores for every library")
     made.add_argument("--runs", type=int, default=runs, help="timed runs of each method")
     made.add_argument("--quick", action="store_true", help="a tiny problem, to see that it runs")
@@ -96,6 +100,17 @@ def limit_threads(threads: int) -> None:
         from threadpoolctl import threadpool_limits
 
         threadpool_limits(threads)
+
+
+def begin(title: str, options: argparse.ArgumentParser) -> tuple[argparse.Namespace, "Report"]:
+    """Parse the command line, pin every library to its cores, and return both options and report.
+
+    Args:
+        title: of the report. options: from `parser`, perhaps with more of them.
+    """
+    args = options.parse_args()
+    limit_threads(args.threads)
+    return args, Report(title, args.out, args.threads)
 
 
 def take_turns(cases: Sequence[Case], runs: int, warm: int = 1) -> list[Timing]:
@@ -206,8 +221,8 @@ def number(value: float, digits: int = 3) -> str:
 class Report:
     """Prints as it goes, and writes the same text as Markdown at the end if asked to."""
 
-    def __init__(self, title: str, out: Path | None) -> None:
-        self.out = out
+    def __init__(self, title: str, out: Path | None, threads: int) -> None:
+        self.out, self.threads = out, threads
         self.parts: list[str] = []
         self.add(f"## {title}")
 
@@ -220,8 +235,15 @@ class Report:
         """A Markdown table."""
         self.add(markdown_table(header, rows))
 
-    def close(self) -> None:
-        """Write the file."""
+    def close(self, packages: Iterable[str] = (), limits: Limits | None = None) -> None:
+        """Say what the machine is, and write the file.
+
+        Args:
+            packages: whose versions are told. limits: of the machine, where they were measured.
+        """
+        if limits is not None:
+            self.add(limits_line(limits))
+        self.add(machine_line(self.threads, packages))
         if self.out is not None:
             self.out.parent.mkdir(parents=True, exist_ok=True)
             self.out.write_text("\n\n".join(self.parts) + "\n", encoding="utf-8")

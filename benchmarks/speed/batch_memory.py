@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from benchmarks.speed._memory import MB, forget_peak, peak_resident, resident, return_free_memory
-from benchmarks.speed._timing import Report, limit_threads, machine_line, number, parser
+from benchmarks.speed._timing import Report, limit_threads, number, parser
 
 TOLERANCE = 1e-10
 HEADER = ("case", "B", "T", "inputs MB", "outputs MB", "beyond MB", "beyond/outputs", "frames/s")
@@ -36,7 +36,7 @@ def main() -> None:
     if args.worker:
         print(json.dumps(measure(Size(*args.worker))))
         return
-    report = Report("Memory of a batch of sequences", args.out)
+    report = Report("Memory of a batch of sequences", args.out, args.threads)
     sizes = [Size(1000, 1000, False), Size(100, 1000, False), Size(100, 1000, True)]
     if args.quick:
         sizes = [Size(8, 200, True)]
@@ -51,14 +51,13 @@ def main() -> None:
         "Outputs: means, weights, evidence and covariances as returned. Beyond: the peak of resident "
         "memory while the filter works, less what was resident before and less the outputs."
     )
-    report.add(machine_line(args.threads))
     report.close()
     if not worst < TOLERANCE:
         sys.exit("a sequence comes out differently in a batch")
 
 
 def parse_args() -> argparse.Namespace:
-    made = parser(__doc__.split("\n")[0], runs=1)
+    made = parser(__doc__, runs=1)
     made.add_argument("--worker", type=int, nargs=3, help=argparse.SUPPRESS)
     return made.parse_args()
 

@@ -12,15 +12,7 @@ import math
 
 import torch
 
-from benchmarks.speed._timing import (
-    Case,
-    Report,
-    limit_threads,
-    machine_line,
-    number,
-    parser,
-    take_turns,
-)
+from benchmarks.speed._timing import Case, Report, begin, number, parser, take_turns
 from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.learning import fit_action_space
@@ -45,9 +37,7 @@ BODY = Body.of_height(BODY_15, 1.75)
 
 
 def main() -> None:
-    args = parser(__doc__.split("\n")[0], runs=5).parse_args()
-    limit_threads(args.threads)
-    report = Report("Constrained prediction", args.out)
+    args, report = begin("Constrained prediction", parser(__doc__, runs=5))
     performances = [performance(seed) for seed in range(12)]
     postures = [state_postures(BODY, states) for states in performances]
     action = fit_action_space(postures, DIMENSIONS, name="bend", fps=30.0)
@@ -55,7 +45,6 @@ def main() -> None:
     sizes = (20, 40) if args.quick else PARTICLES
     frames(action, std, sizes, args.runs, report)
     pieces(action, std, sizes[-1], args.runs, report)
-    report.add(machine_line(args.threads))
     report.close()
 
 

@@ -7,6 +7,7 @@ One float64 function computes the mean log-likelihood of every result. scikit-le
 torchgmm and pomegranate, where they can be imported, only know float32.
 """
 
+import argparse
 import logging
 import math
 import sys
@@ -23,9 +24,7 @@ from benchmarks.speed._timing import (
     Limits,
     Report,
     Timing,
-    limit_threads,
-    limits_line,
-    machine_line,
+    begin,
     measure_limits,
     number,
     parser,
@@ -59,9 +58,7 @@ class Method(NamedTuple):
 
 
 def main() -> None:
-    args = parse_args()
-    limit_threads(args.threads)
-    report = Report("Expectation-maximisation, 30 components, 21 dimensions", args.out)
+    args, report = begin("Expectation-maximisation, 30 components, 21 dimensions", options())
     points, iterations, n_components = (2000, 3, 4) if args.quick else (args.points, 20, 30)
     problem = make_problem(points, n_components, iterations)
     report.add(
@@ -75,17 +72,15 @@ def main() -> None:
     limits = measure_limits(args.quick)
     report.table(HEADER, table_rows(timings, found, iterations))
     report.add(floor_text(problem, limits))
-    report.add(limits_line(limits))
-    report.add(machine_line(args.threads, PACKAGES))
-    report.close()
+    report.close(PACKAGES, limits)
     if failed:
         sys.exit("torchpose and scikit-learn do not reach the same likelihood")
 
 
-def parse_args():  # type: ignore[no-untyped-def]
-    made = parser(__doc__.split("\n")[0], runs=3)
+def options() -> argparse.ArgumentParser:
+    made = parser(__doc__, runs=3)
     made.add_argument("--points", type=int, default=100_000)
-    return made.parse_args()
+    return made
 
 
 def make_problem(n: int, n_components: int, iterations: int) -> Problem:

@@ -29,9 +29,7 @@ from benchmarks.speed._timing import (
     Limits,
     Report,
     Timing,
-    limit_threads,
-    limits_line,
-    machine_line,
+    begin,
     measure_limits,
     number,
     parser,
@@ -67,14 +65,12 @@ class Method(NamedTuple):
 
 
 def main() -> None:
-    options = parser(__doc__.split("\n")[0], runs=9)
+    options = parser(__doc__, runs=9)
     options.add_argument(
         "--data", type=Path, help="folder of mocap_cmu_walk; none: no held-out table"
     )
     options.add_argument("--persons", nargs="+", default=["07", "08", "35", "39"], help="of it")
-    args = options.parse_args()
-    limit_threads(args.threads)
-    report = Report("A manifold: prediction and fit", args.out)
+    args, report = begin("A manifold: prediction and fit", options)
     frames, sizes = (40, (60,)) if args.quick else (FRAMES, SIZES)
     poses = walk(frames)
     manifold = fit_gplvm(poses, steps=3)
@@ -101,9 +97,7 @@ def main() -> None:
     report.table(FIT_HEADER, fit_rows(poses, manifold, args))
     if args.data is not None:
         held_out_tables(args, report)
-    report.add(limits_line(limits))
-    report.add(machine_line(args.threads, PACKAGES))
-    report.close()
+    report.close(PACKAGES, limits)
     if failed:
         sys.exit("torchpose differs from the plain computation by more than is allowed")
 

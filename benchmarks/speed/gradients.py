@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from benchmarks.speed._memory import MB, forget_peak, peak_resident, resident, return_free_memory
-from benchmarks.speed._timing import Report, limit_threads, machine_line, number, parser
+from benchmarks.speed._timing import Report, limit_threads, number, parser
 
 METHODS = ("window-mixture", "mkf-fixed")
 NAMES = ("head", "hand_left", "hand_right")
@@ -40,7 +40,7 @@ def main() -> None:
         *case, gradients = args.worker
         print(json.dumps(measure(Case(*case), bool(gradients))))
         return
-    report = Report("Gradients of poses", args.out)
+    report = Report("Gradients of poses", args.out, args.threads)
     cases = [Case(method, batch, 100) for method in (0, 1) for batch in (1, 16)]
     if args.quick:
         cases = [Case(0, 1, 6), Case(1, 1, 6)]
@@ -53,14 +53,13 @@ def main() -> None:
         f"than {moved:.1e} of max(|number|, 1), at most {TOLERANCE:g} allowed; gradients along a random "
         f"direction differ from central differences by {slope:.1e} of them, at most {SLOPE_TOLERANCE:g}."
     )
-    report.add(machine_line(args.threads))
     report.close()
     if not (moved <= TOLERANCE and slope <= SLOPE_TOLERANCE):
         sys.exit("gradients are not those of the poses")
 
 
 def parse_args() -> argparse.Namespace:
-    made = parser(__doc__.split("\n")[0], runs=1)
+    made = parser(__doc__, runs=1)
     made.add_argument("--worker", type=int, nargs=4, help=argparse.SUPPRESS)
     return made.parse_args()
 

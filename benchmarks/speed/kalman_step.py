@@ -19,9 +19,7 @@ from benchmarks.speed._timing import (
     Limits,
     Report,
     Timing,
-    limit_threads,
-    limits_line,
-    machine_line,
+    begin,
     measure_limits,
     number,
     parser,
@@ -68,9 +66,7 @@ class Method(NamedTuple):
 
 
 def main() -> None:
-    args = parser(__doc__.split("\n")[0], runs=15).parse_args()
-    limit_threads(args.threads)
-    report = Report("One Kalman step, 21 dimensions, 8 measured", args.out)
+    args, report = begin("One Kalman step, 21 dimensions, 8 measured", parser(__doc__, runs=15))
     sizes, inner = ((8,), 1) if args.quick else (SIZES, 50)
     limits, failed = measure_limits(args.quick), False
     rows: list[list[str]] = []
@@ -91,9 +87,7 @@ def main() -> None:
         rows.append(floor_row(n_filters, limits))
     report.table(HEADER, rows)
     report.add("mean, cov, log-lik.: largest |difference| / max(|truth|, 1).")
-    report.add(limits_line(limits))
-    report.add(machine_line(args.threads, PACKAGES))
-    report.close()
+    report.close(PACKAGES, limits)
     if failed:
         sys.exit("torchpose differs from the plain computation by more than is allowed")
 

@@ -11,6 +11,7 @@ The prior is that of --prior, else the authors' released one if TORCHPOSE_DATA n
 holds it (signer/released_prior_Training20_02.npz), else a synthetic one of the same scales.
 """
 
+import argparse
 import itertools
 import sys
 from collections.abc import Callable, Iterator
@@ -36,9 +37,7 @@ from benchmarks.speed._timing import (
     Limits,
     Report,
     Timing,
-    limit_threads,
-    limits_line,
-    machine_line,
+    begin,
     measure_limits,
     number,
     parser,
@@ -78,9 +77,7 @@ class Method(NamedTuple):
 
 
 def main() -> None:
-    args = parse_args()
-    limit_threads(args.threads)
-    report = Report("Mixture Kalman filter against the released algorithm", args.out)
+    args, report = begin("Mixture Kalman filter against the released algorithm", options())
     sizes = Sizes(2, 40, 10, 10, 5) if args.quick else Sizes(args.batch, 1000, 200, 40, 10)
     problem = make_problem(args.prior, args.synthetic)
     report.add(describe(problem, sizes))
@@ -98,19 +95,17 @@ def main() -> None:
     report.table(HEADER, table_rows(methods, errors, timings))
     report.add(octave)
     report.add(floor_text(problem, limits))
-    report.add(limits_line(limits))
-    report.add(machine_line(args.threads, ["numpy"]))
-    report.close()
+    report.close(["numpy"], limits)
     if failed:
         sys.exit(f"these differ from the NumPy loop by more than is allowed: {'; '.join(failed)}")
 
 
-def parse_args():  # type: ignore[no-untyped-def]
-    made = parser(__doc__.split("\n")[0], runs=7)
+def options() -> argparse.ArgumentParser:
+    made = parser(__doc__, runs=7)
     made.add_argument("--batch", type=int, default=64, help="sequences of the large batch")
     made.add_argument("--prior", type=Path, help=".npz with left_weights, left_means, ...")
     made.add_argument("--synthetic", action="store_true", help="a synthetic prior in any case")
-    return made.parse_args()
+    return made
 
 
 def describe(problem: Problem, sizes: Sizes) -> str:

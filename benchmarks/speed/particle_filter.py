@@ -9,12 +9,7 @@ where they are installed. Runs of all methods take turns, so that other work on 
 """
 
 import argparse
-import contextlib
 import math
-import os
-import platform
-import statistics
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,13 +17,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from benchmarks.speed._arm import DIM, PROCESS, released_prior
+from benchmarks.speed._timing import Case, Report, begin, number, parser, take_turns
 from torchpose.filters import BootstrapParticleFilter
 from torchpose.filters._transition import make_transition
 from torchpose.filters._walk import MixtureWalk
 from torchpose.priors import GaussianMixture
 
-DIM = 21
-PROCESS = [560, 560, 1] + [56, 56, 1] + [25, 25, 1] * 3 + [0.5] * 3 + [0.01] * 3
+PACKAGES = ("numpy", "particles", "cuthbert", "torchfilter")
 NOISE = [9.0] * 8
 MEASURED = [9, 10, 0, 1, 12, 13, 3, 4]  # u, v of head, hand, neck, elbow
 
@@ -44,30 +40,27 @@ class Problem(NamedTuple):
 
 
 def main() -> None:
-    args = parse_args()
-    limit_threads(args.threads)
-    print_machine(args.threads)
-    problem = arm_problem(args.prior, args.steps)
-    rows = arm_rows(problem, args.particles)
-    print_table(f"arm, {args.particles} particles", rows, args.runs, args.steps)
-    print_floor(problem, args.particles)
-    print_density_error(problem)
+    args, report = begin("Particle filters: one step", options())
+    n, steps = (200, 3) if args.quick else (args.particles, args.steps)
+    problem = arm_problem(args.prior, steps)
+    add_table(report, f"arm, {n} particles", arm_rows(problem, n), args.runs, steps)
+    report.add(floor_text(problem, n))
+    report.add(density_error_text(problem))
     if not args.no_peers:
-        shared = walk_problem(args.steps)
-        print(f"\nrandom walk without a prior, exact log-evidence {exact_evidence(shared):.2f}")
-        rows = walk_rows(shared, args.particles)
-        print_table(f"random walk, {args.particles} particles", rows, args.runs, args.steps)
+        shared = walk_problem(steps)
+        report.add(f"Random walk without a prior, exact log-evidence {exact_evidence(shared):.2f}.")
+        rows = walk_rows(shared, n, report)
+        add_table(report, f"random walk, {n} particles", rows, args.runs, steps)
+    report.close(PACKAGES)
 
 
-def parse_args() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--particles", type=int, default=10_000)
-    parser.add_argument("--steps", type=int, default=20, help="frames of a run")
-    parser.add_argument("--runs", type=int, default=7, help="timed runs of each method")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--prior", type=Path, help=".npz with left_weights, left_means, ...")
-    parser.add_argument("--no-peers", action="store_true", help="leave out the other libraries")
-    return parser.parse_args()
+def options() -> argparse.ArgumentParser:
+    made = parser(__doc__, runs=7)
+    made.add_argument("--particles", type=int, default=10_000)
+    made.add_argument("--steps", type=int, default=20, help="frames of a run")
+    made.add_argument("--prior", type=Path, help=".npz with left_weights, left_means, ...")
+    made.add_argument("--no-peers", action="store_true", help="leave out the other libraries")
+    return made
 
 
 # --- problems
@@ -98,16 +91,6 @@ def synthetic_prior(n_components: int = 30) -> GaussianMixture:
     means = centre + torch.randn(n_components, DIM, generator=g).double() * scale
     weights = torch.rand(n_components, generator=g).double() + 0.2
     return GaussianMixture(weights / weights.sum(), means, covs)
-
-
-def released_prior(path: Path) -> GaussianMixture:
-    with np.load(path) as file:
-        weights, means, covs = (
-            torch.tensor(file[f"left_{key}"]).double()
-            for key in ("weights", "means", "covariances")
-        )
-    weights = weights.reshape(-1)
-    return GaussianMixture(weights / weights.sum(), means, (covs + covs.mT) / 2)
 
 
 def walk_problem(n_steps: int) -> Problem:
@@ -163,7 +146,7 @@ def arm_rows(problem: Problem, n: int) -> dict[str, Callable[[], float]]:
     return rows
 
 
-def walk_rows(problem: Problem, n: int) -> dict[str, Callable[[], float]]:
+def walk_rows(problem: Problem, n: int, report: Report) -> dict[str, Callable[[], float]]:
     start = {"n_particles": n, "initial_cov": torch.eye(DIM)}
     rows = {
         "torchpose, mixture of one": ours(problem, **start),
@@ -177,7 +160,7 @@ def walk_rows(problem: Problem, n: int) -> dict[str, Callable[[], float]]:
         try:
             rows[name] = make(problem, n)
         except ImportError as error:
-            print(f"{name}: not installed ({error.name})")
+            report.add(f"{name}: not installed ({error.name}).")
     return rows
 
 
@@ -372,54 +355,29 @@ def torchfilter_walk(problem: Problem, n: int) -> Callable[[], float]:
     return run
 
 
-# --- measuring and printing
+# --- tables
 
 
-def limit_threads(threads: int) -> None:
-    """The same cores for every library."""
-    torch.set_num_threads(threads)
-    with contextlib.suppress(AttributeError, OSError):
-        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:threads])
-    with contextlib.suppress(ImportError):
-        from threadpoolctl import threadpool_limits
-
-        threadpool_limits(threads)
-
-
-def print_machine(threads: int) -> None:
-    versions = (
-        f"torch {torch.__version__}, NumPy {np.__version__}, Python {platform.python_version()}"
-    )
-    print(f"{threads} of {os.cpu_count()} cores, {platform.machine()}, {versions}")
-    print(f"load before: {os.getloadavg()[0]:.1f}")
-
-
-def timed(call: Callable[[], Any]) -> float:
-    start = time.perf_counter()
-    call()
-    return 1e3 * (time.perf_counter() - start)
-
-
-def print_table(
-    title: str, rows: dict[str, Callable[[], float]], n_runs: int, n_steps: int
+def add_table(
+    report: Report, title: str, calls: dict[str, Callable[[], float]], runs: int, steps: int
 ) -> None:
-    evidence = {name: call() for name, call in rows.items()}  # warm up
-    times: dict[str, list[float]] = {name: [] for name in rows}
-    for _ in range(n_runs):
-        for name, call in rows.items():
-            times[name].append(timed(call) / n_steps)
-    reference = statistics.median(times[next(iter(rows))])
-    print(f"\n{title:<36s} {'median ms':>10s} {'min ms':>8s} {'ratio':>7s} {'log-evidence':>13s}")
-    for name, values in times.items():
-        median = statistics.median(values)
-        print(
-            f"{name:<36s} {median:10.2f} {min(values):8.2f} {median / reference:7.2f} "
-            f"{evidence[name]:13.2f}"
+    """Milliseconds of a step of every method, and the log-evidence of its first run."""
+    evidence = {name: call() for name, call in calls.items()}  # warms up as well
+    cases = [Case(name, call, steps) for name, call in calls.items()]
+    timings = take_turns(cases, runs, warm=0)
+    header = (title, "median ms", "min ms", "CPU ms", "ratio", "log-evidence")
+    rows = [
+        (
+            t.case.name, *(number(1e3 * value) for value in (t.median, t.best, t.median_cpu)),
+            number(t.median / timings[0].median), f"{evidence[t.case.name]:.2f}",
         )
-    print(f"per step; ratio to the first row; load {os.getloadavg()[0]:.1f}")
+        for t in timings
+    ]  # fmt: skip
+    report.table(header, rows)
+    report.add("Per step; ratio to the first row.")
 
 
-def print_floor(problem: Problem, n: int) -> None:
+def floor_text(problem: Problem, n: int) -> str:
     """What no arrangement avoids: the noise, and one product of all residuals, in cache."""
     k = problem.prior.n_components
     rows, points = torch.randn(k * DIM, DIM + 1), torch.randn(DIM + 1, 512)
@@ -429,16 +387,16 @@ def print_floor(problem: Problem, n: int) -> None:
         for _ in range(math.ceil(n / 512)):
             torch.mm(rows, points, out=out)
 
-    noise = min(timed(lambda: torch.randn(n, DIM)) for _ in range(20))
-    product = min(timed(products) for _ in range(20))
+    cases = [Case("noise", lambda: torch.randn(n, DIM)), Case("products", products)]
+    noise, product = (1e3 * timing.best for timing in take_turns(cases, 20))
     flops = 2e-6 * n * k * DIM * (DIM + 1)
-    print(
-        f"floor: {noise:.2f} ms for {n * DIM:,} normal numbers, {product:.2f} ms for the residuals "
-        f"({flops:.0f} MFLOP, {flops / product:.0f} GFLOP/s)"
+    return (
+        f"Floor: {noise:.2f} ms for {n * DIM:,} normal numbers, {product:.2f} ms for the residuals "
+        f"({flops:.0f} MFLOP, {flops / product:.0f} GFLOP/s)."
     )
 
 
-def print_density_error(problem: Problem) -> None:
+def density_error_text(problem: Problem) -> str:
     """Largest error of the float32 log density against float64, on draws of the prior."""
     covariance = torch.diag(problem.process)
     walk = MixtureWalk(problem.prior.parameters_tuple(), covariance, torch.float32)
@@ -449,7 +407,7 @@ def print_density_error(problem: Problem) -> None:
         walk.log_prior_and_evidence(white), wide.log_prior_and_evidence(white.double()), strict=True
     )
     phi, evidence = (float((a - b).abs().max()) for a, b in pairs)
-    print(f"largest error of the log density in float32: prior {phi:.1e}, evidence {evidence:.1e}")
+    return f"Largest error of the log density in float32: prior {phi:.1e}, evidence {evidence:.1e}."
 
 
 if __name__ == "__main__":

@@ -18,9 +18,7 @@ from benchmarks.speed._timing import (
     Case,
     Report,
     Timing,
-    limit_threads,
-    limits_line,
-    machine_line,
+    begin,
     measure_limits,
     number,
     parser,
@@ -66,19 +64,15 @@ class Scene(NamedTuple):
 
 
 def main() -> None:
-    args = parser(__doc__.split("\n")[0], runs=9).parse_args()
-    limit_threads(args.threads)
+    args, report = begin("Root uncertainty: one frame", parser(__doc__, runs=9))
     n = 4 if args.quick else HYPOTHESES
     sizes = ((30, 40),) if args.quick else SIZES
-    report = Report("Root uncertainty: one frame", args.out)
     agree = check(make_scene(*sizes[0]), report)
     for size in sizes:
         scene = make_scene(*size)
         compare(scene, n, args.runs, report)
     where(make_scene(*sizes[0]), n, args.runs, report)
-    report.add(limits_line(measure_limits(args.quick)))
-    report.add(machine_line(args.threads))
-    report.close()
+    report.close(limits=measure_limits(args.quick))
     if not agree:
         sys.exit("counts differ from those of rendered parts")
 

@@ -20,16 +20,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from benchmarks.speed._timing import (
-    Case,
-    Report,
-    limit_threads,
-    machine_line,
-    number,
-    parser,
-    ratio,
-    take_turns,
-)
+from benchmarks.speed._timing import Case, Report, begin, number, parser, ratio, take_turns
 from torchpose.body import BODY_15, Body, Limbs
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.whole_body import count_pixels
@@ -71,12 +62,10 @@ class Problem(NamedTuple):
 
 
 def main() -> None:
-    args = parser(__doc__.split("\n")[0], runs=9).parse_args()
-    limit_threads(args.threads)
+    args, report = begin("Silhouettes: particles x cameras x limbs", parser(__doc__, runs=9))
     import cv2
 
     cv2.setNumThreads(args.threads)
-    report = Report("Silhouettes: particles x cameras x limbs", args.out)
     n = 8 if args.quick else PARTICLES
     sizes = ((30, 40), (60, 80)) if args.quick else SIZES
     wrong = [check(make_problem(3, CAMERAS, *size), report) for size in sizes]
@@ -84,8 +73,7 @@ def main() -> None:
     grow(n, sizes[0], args.runs, args.quick, report)
     chunks(n, sizes, args.runs, args.quick, report)
     sorting(n, sizes, args.runs, report)
-    report.add(machine_line(args.threads, PACKAGES))
-    report.close()
+    report.close(PACKAGES)
     if any(wrong):
         sys.exit("counts differ from those of the definition")
 

@@ -27,8 +27,6 @@ from benchmarks.speed._timing import (
     Report,
     Timing,
     limit_threads,
-    limits_line,
-    machine_line,
     measure_limits,
     number,
     parser,
@@ -131,20 +129,18 @@ def main() -> None:
         print(json.dumps(work(Job(**json.loads(args.worker)))))
         return
     limit_threads(args.threads)
-    report = Report("EM over states that are not held in memory", args.out)
+    report = Report("EM over states that are not held in memory", args.out, args.threads)
     limits = measure_limits(args.quick)
     failed = report_scaling(report, args)
     failed |= report_streamed(report, args)
     failed |= report_peers(report, args)
-    report.add(limits_line(limits))
-    report.add(machine_line(args.threads, PACKAGES))
-    report.close()
+    report.close(PACKAGES, limits)
     if failed:
         sys.exit("results that should be the same are not")
 
 
 def parse_args() -> argparse.Namespace:
-    made = parser(__doc__.split("\n")[0], runs=3)
+    made = parser(__doc__, runs=3)
     made.add_argument("--samples", type=int, default=10 * MILLION, help="of the longest fit")
     made.add_argument("--data", help="folder of recordings, such as kinect_utd_mhad")
     made.add_argument("--worker", help=argparse.SUPPRESS)

@@ -13,15 +13,7 @@ import sys
 import torch
 from torch import Tensor
 
-from benchmarks.speed._timing import (
-    Case,
-    Report,
-    limit_threads,
-    machine_line,
-    number,
-    parser,
-    take_turns,
-)
+from benchmarks.speed._timing import Case, begin, number, parser, take_turns
 from torchpose.body import BODY_15
 from torchpose.math import compose, conjugate, fit_gaussian, rotate_gaussian
 from torchpose.math._tree_messages import message_tree, propagate
@@ -34,9 +26,7 @@ CHAIN = ((0, 1), (1, 2))
 
 
 def main() -> None:
-    args = parser(__doc__.split("\n")[0], runs=30).parse_args()
-    limit_threads(args.threads)
-    report = Report("Gaussian messages over rotations", args.out)
+    args, report = begin("Gaussian messages over rotations", parser(__doc__, runs=30))
     draws, trials, sizes = (20_000, 2, (5,)) if args.quick else (1_000_000, 6, DEGREES)
     worst = linear_error()
     report.add(
@@ -55,7 +45,6 @@ def main() -> None:
         f"own error is in it; means of {trials} chains."
     )
     report.table(("one pass, 10 parts", "hypotheses", "ms", "min ms", "CPU ms"), timing_rows(args))
-    report.add(machine_line(args.threads, ()))
     report.close()
     if not worst < TOLERANCE:
         sys.exit("messages differ from the dense joint Gaussian by more than is allowed")

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from benchmarks.speed._timing import Report, limit_threads, machine_line, parser
+from benchmarks.speed._timing import Report, begin, parser
 
 FPS = 30.0
 PAGE = 4096
@@ -22,17 +22,14 @@ PAGE = 4096
 
 def main() -> None:
     """Track, and print how memory went."""
-    made = parser(__doc__.split("\n")[0], runs=1)
+    made = parser(__doc__, runs=1)
     made.add_argument("--data", type=Path, required=True, help="folder with video_asl/")
     made.add_argument("--minutes", type=float, default=60.0, help="of video")
-    args = made.parse_args()
-    limit_threads(args.threads)
+    args, report = begin("Memory over a long video", made)
     n_frames = 300 if args.quick else round(60 * FPS * args.minutes)
-    report = Report("Memory over a long video", args.out)
     with tempfile.TemporaryDirectory() as folder:
         measure(report, args, n_frames, Path(folder))
-    report.add(machine_line(args.threads, ("opencv-python-headless", "av")))
-    report.close()
+    report.close(("opencv-python-headless", "av"))
 
 
 def measure(report: Report, args: argparse.Namespace, n_frames: int, folder: Path) -> None:

@@ -19,15 +19,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from benchmarks.speed._timing import (
-    Case,
-    Report,
-    Timing,
-    limit_threads,
-    machine_line,
-    parser,
-    take_turns,
-)
+from benchmarks.speed._timing import Case, Report, Timing, begin, parser, take_turns
 
 CLIPS = ("again", "brother", "help", "bird", "milk", "book", "learn")
 FPS = 30.0
@@ -35,12 +27,11 @@ FPS = 30.0
 
 def main() -> None:
     """Print both tables."""
-    made = parser(__doc__.split("\n")[0], runs=3)
+    made = parser(__doc__, runs=3)
     made.add_argument("--data", type=Path, required=True, help="folder with video_asl/")
     made.add_argument("--mediapipe", type=Path, help="Python of an environment with mediapipe")
     made.add_argument("--repeat", type=int, default=2, help="how often the clips follow each other")
-    args = made.parse_args()
-    limit_threads(args.threads)
+    args, report = begin("Speed of the video pipeline", made)
     from torchpose.cli.common import share_cores
 
     share_cores()  # as the command does
@@ -48,12 +39,10 @@ def main() -> None:
         clip = Path(folder) / "clips.mp4"
         names = CLIPS[:1] if args.quick else CLIPS * args.repeat
         n_frames = join([args.data / "video_asl" / f"{name}.mkv" for name in names], clip)
-        report = Report("Speed of the video pipeline", args.out)
         report.add(f"{n_frames} frames of 640 x 480, H.264.")
         whole(report, clip, n_frames, args)
         stages(report, clip, n_frames)
-    report.add(machine_line(args.threads, ("opencv-python-headless", "av")))
-    report.close()
+    report.close(("opencv-python-headless", "av"))
 
 
 def join(clips: list[Path], path: Path) -> int:

@@ -234,7 +234,7 @@ def test_across_data_sets(data, tmp_path):
 def test_across_any_data_sets(data, tmp_path):
     """Three folders of other names: nothing has to be made up where all have the same joints."""
     folders = [
-        write_people(tmp_path / name, persons, n_frames=40)
+        write_people(tmp_path / name, persons, n_frames=110)
         for name, persons in (("x", ("a", "b")), ("y", ("c", "d")), ("z", ("e", "f")))
     ]
     report = cross_dataset.run(
