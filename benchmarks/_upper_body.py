@@ -1,6 +1,6 @@
 """What the upper-body benchmarks share: test sequences, poses to compare with, and scores."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,9 +9,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from benchmarks.engine import Experiment
 from torchpose.camera import PinholeCamera, project, sample_viewpoints
 from torchpose.errors import InputError
-from torchpose.evaluation.common import CAMERA, Estimate, Trials, centred_on_neck, make_test_set
+from torchpose.evaluation.common import (
+    CAMERA,
+    Estimate,
+    Trials,
+    centred_on_neck,
+    make_test_set,
+    track,
+)
 from torchpose.io import Recording
 from torchpose.learning import TRAINING_VIEWS
 from torchpose.learning._training import collect_poses
@@ -38,17 +46,37 @@ MADE_WITH = (
 """What the numbers of a tracker depend on beside its facts: files and folders of a checkout."""
 
 
-class Subject(NamedTuple):
-    """Sequences of one test set, and the prior that they are tracked with."""
+class Tracker(NamedTuple):
+    """A prior, and the options of the `UpperBodyTracker` that has it."""
 
     prior: UpperBodyPrior
-    test: Trials
+    options: Mapping[str, Any]
 
-    def facts(self) -> list[Any]:
-        """Return what a run depends on, beside the tracker and its options."""
-        prior, test = self
-        numbers = prior.state_dict().values()
-        return [prior.info.transition, *numbers, test.keypoints, test.lengths, test.fps, test.names]
+
+def tracker_facts(test: Trials, tracker: Tracker) -> list[Any]:
+    """Return what a run of a tracker on a test set depends on, beside its seed."""
+    prior, options = tracker
+    numbers = [value for value in options.values() if isinstance(value, Tensor)]
+    words = {name: v for name, v in options.items() if not isinstance(v, Tensor)}
+    facts = [words, *numbers, prior.info.transition, *prior.state_dict().values()]
+    return [*facts, test.keypoints, test.lengths, test.fps, test.names]
+
+
+def generators_of(test: Trials, seed: int) -> list[torch.Generator]:
+    """Return a stream of random numbers for each sequence."""
+    n = len(test.lengths)
+    return [torch.Generator().manual_seed(seed * n + b) for b in range(n)]
+
+
+def _track(test: Trials, tracker: Tracker, seeds: Sequence[int]) -> list[Estimate]:
+    prior, options = tracker
+    return [
+        track(prior, CAMERA, test, generator=generators_of(test, seed), **options) for seed in seeds
+    ]
+
+
+TRACKING = Experiment(Estimate, _track, tracker_facts, (*MADE_WITH, "benchmarks/_upper_body.py"))
+"""Estimates of a `Tracker` on a test set."""
 
 
 def data_folder(data: str | Path, name: str) -> Path:

@@ -21,9 +21,11 @@ from torch import Tensor
 
 from benchmarks._upper_body import (
     MADE_WITH,
-    Subject,
+    Tracker,
+    generators_of,
     projected_training_poses,
     score,
+    tracker_facts,
     trials_of,
 )
 from benchmarks.engine import Experiment, Grid
@@ -52,34 +54,35 @@ class Run(NamedTuple):
     effective_sample_size: Tensor
 
 
-class Tracker(NamedTuple):
-    """A method, and the particles that it has if it draws any."""
-
-    method: str
-    particles: int
-
-
-def track(subject: Subject, tracker: Tracker, seeds: Sequence[int]) -> list[Run]:
-    """Track a test set once for every seed, each sequence with random numbers of its own."""
-    prior, test = subject
-    drawn = "n_particles" in method_options(tracker.method)
-    particles = {"n_particles": tracker.particles} if drawn else {}
+def track(test: Trials, tracker: Tracker, seeds: Sequence[int]) -> list[Run]:
+    """Track a test set once for every seed."""
+    prior, options = tracker
     model = UpperBodyTracker(
-        prior, CAMERA, tracker.method, fps=test.fps, neck=prior.info.neck, max_gap=None, **particles
+        prior, CAMERA, fps=test.fps, neck=prior.info.neck, max_gap=None, **options
     )
-    n, found = len(test.lengths), []
+    found = []
     for seed in seeds:
-        generator = [torch.Generator().manual_seed(seed * n + b) for b in range(n)]
         with torch.inference_mode():
-            poses = model(test.keypoints, names=MEASURED, lengths=test.lengths, generator=generator)
+            poses = model(
+                test.keypoints, names=MEASURED, lengths=test.lengths,
+                generator=generators_of(test, seed),
+            )  # fmt: skip
         found.append(Run(*(getattr(poses, name) for name in Run._fields)))
     return found
 
 
 TRACKING = Experiment(
-    Run, track, lambda subject, tracker: [*tracker, *subject.facts()],
-    (*MADE_WITH, "benchmarks/all_trackers.py"),
-)  # fmt: skip
+    Run,
+    track,
+    tracker_facts,
+    (*MADE_WITH, "benchmarks/_upper_body.py", "benchmarks/all_trackers.py"),
+)
+
+
+def options_of(method: str, particles: int) -> dict[str, Any]:
+    """Return the options of a method, with the particles if it draws any."""
+    drawn = "n_particles" in method_options(method)
+    return {"method": method, "n_particles": particles} if drawn else {"method": method}
 
 
 def ub_people(arguments: argparse.Namespace) -> tuple[list[Recording], Trials]:
@@ -126,9 +129,8 @@ def compare(
             digits=(2, 1, 0, 0, 1, 0, 0),
         )  # fmt: skip
         methods = [m for m in METHODS if m != WINDOWS or prior.windows]
-        grid = Grid(
-            {name: Subject(prior, test)}, {m: Tracker(m, arguments.particles) for m in methods}
-        )
+        trackers = {m: Tracker(prior, options_of(m, arguments.particles)) for m in methods}
+        grid = Grid({name: test}, trackers)
         runs = TRACKING.run(
             {recipe: grid}, (0,), arguments.out, progress=arguments.progress, title=name
         )

@@ -19,7 +19,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -33,14 +33,13 @@ from benchmarks._ub_one_tables import (
     add_tables,
     fill_summary,
 )
-from benchmarks._upper_body import MADE_WITH, Subject, data_folder, plain_prior, score, trials_of
-from benchmarks.engine import Experiment, Grid, Results
+from benchmarks._upper_body import TRACKING, Tracker, data_folder, plain_prior, score, trials_of
+from benchmarks.engine import Grid, Results
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import (
     CAMERA,
-    Estimate,
     Recipe,
     Trials,
     cached_prior,
@@ -116,17 +115,19 @@ def run(
     test = trials_of([tested], seed)
     plain = plain_prior(prior)
     factors = {"PF mixture": mixture_q} | {n: walk_q for n, m in TRACKERS.items() if "walk" in m}
-    trackers = {name: _tracker(name, plain, particles, factors.get(name, 1.0)) for name in TRACKERS}
-    subjects = {"": Subject(plain, test)}
-    drawn = {name: t for name, t in trackers.items() if t.method in SAMPLED}
+    made = {name: _tracker(name, plain, particles, factors.get(name, 1.0)) for name in TRACKERS}
+    trackers = {name: tracker for name, (tracker, _) in made.items()}
+    noise = {name: words for name, (_, words) in made.items()}
+    drawn = {name: t for name, t in trackers.items() if TRACKERS[name] in SAMPLED}
+    others = {name: t for name, t in trackers.items() if name not in drawn}
     runs = Results(())
-    for some, n in ((drawn, n_seeds), ({k: t for k, t in trackers.items() if k not in drawn}, 1)):
+    for some, n in ((drawn, n_seeds), (others, 1)):
         runs += TRACKING.run(
-            {"": Grid(subjects, some)}, range(seed, seed + n), out, progress=progress, title="trackers"
+            {"": Grid({"": test}, some)}, range(seed, seed + n), out, progress=progress,
+            title="trackers",
         )  # fmt: skip
     scores = {name: [score(run, test) for run in runs.where(method=name).runs] for name in trackers}
-    times = {name: time_step(plain, test, t.method, t.options) for name, t in trackers.items()}
-    noise = {name: tracker.noise for name, tracker in trackers.items()}
+    times = {name: time_step(tracker, test) for name, tracker in trackers.items()}
     scores["recipe's prior, filtered"] = [score(track(prior, CAMERA, test), test)]
     smooth = track(prior, CAMERA, test, smoothing="full")
     scores["recipe's prior, smoothed"] = [score(smooth, test)]
@@ -194,20 +195,14 @@ def walk_process_cov(prior: UpperBodyPrior) -> Float[Tensor, " 21"]:
     return torch.cat([joints, joints.new_full((6,), 0.02)]).square() * scale
 
 
-class _Tracker(NamedTuple):
-    """A method with its options, the process noise among them, and that noise in words."""
-
-    method: str
-    options: dict[str, Any]
-    noise: str
-
-
-def _tracker(name: str, plain: UpperBodyPrior, particles: int, factor: float) -> _Tracker:
-    """Return a tracker of the table, with so many times the process noise that is its own."""
+def _tracker(
+    name: str, plain: UpperBodyPrior, particles: int, factor: float
+) -> tuple[Tracker, str]:
+    """Return a tracker of the table with so many times its process noise, and that noise in words."""
     method = TRACKERS[name]
     walks = method.startswith("pf-walk")
     process_cov = walk_process_cov(plain) if walks else plain.noise["process_cov"]
-    options: dict[str, Any] = {"process_cov": factor * process_cov}
+    options: dict[str, Any] = {"method": method, "process_cov": factor * process_cov}
     if method.startswith("pf"):
         options |= {"n_particles": particles, "start": "prior"}
     burn_in = ""
@@ -216,40 +211,18 @@ def _tracker(name: str, plain: UpperBodyPrior, particles: int, factor: float) ->
         burn_in = f", burn-in of {BURN_IN} frames"
     share = "" if factor == 1.0 else f"{factor:g} x "
     noise = f"{share}{'human steps' if walks else 'the released Q'}{burn_in}"
-    return _Tracker(method, options, noise)
+    return Tracker(plain, options), noise
 
 
-def _track(subject: Subject, tracker: _Tracker, seeds: Sequence[int]) -> list[Estimate]:
-    prior, test = subject
-    return [
-        track(
-            prior, CAMERA, test, method=tracker.method,
-            generator=[torch.Generator().manual_seed(seed)], **tracker.options,
-        )
-        for seed in seeds
-    ]  # fmt: skip
-
-
-def _facts(subject: Subject, tracker: _Tracker) -> list[Any]:
-    numbers = [v for v in tracker.options.values() if isinstance(v, Tensor)]
-    words = {k: v for k, v in tracker.options.items() if not isinstance(v, Tensor)}
-    return [tracker.method, words, *numbers, *subject.facts()]
-
-
-TRACKING = Experiment(Estimate, _track, _facts, (*MADE_WITH, "benchmarks/ub_one.py"))
-"""Estimates of a tracker."""
-
-
-def time_step(
-    prior: UpperBodyPrior, test: Trials, method: str, options: dict[str, Any], n_steps: int = 20
-) -> float:
+def time_step(tracker: Tracker, test: Trials, n_steps: int = 20) -> float:
     """Return the median time of one online step of one arm, in milliseconds.
 
     Args:
-        prior, test, method, options: of the tracker. n_steps: how many to time.
+        tracker, test: which tracker, and what it sees. n_steps: how many to time.
     """
-    tracker = UpperBodyTracker(prior, CAMERA, method, neck=prior.info.neck, **options)
-    model = tracker.estimator.filter("left", ("hand", "head", "neck"))
+    prior, options = tracker
+    made = UpperBodyTracker(prior, CAMERA, neck=prior.info.neck, **options)
+    model = made.estimator.filter("left", ("hand", "head", "neck"))
     order = [2, 0, 1]  # hand, head, neck, as the tracker's filters measure them
     z = test.keypoints[:1, :, order].flatten(2)
     generator = torch.Generator().manual_seed(0)

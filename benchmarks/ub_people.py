@@ -9,7 +9,7 @@ on head, neck and shoulders (BL section 6), pooled over joints and frames.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,16 @@ from benchmarks._people_tables import (
     add_pcp_table,
     add_pictures,
 )
-from benchmarks._upper_body import Scores, data_folder, plain_prior, projected_training_poses, score
+from benchmarks._upper_body import (
+    TRACKING,
+    Scores,
+    Tracker,
+    data_folder,
+    plain_prior,
+    projected_training_poses,
+    score,
+)
+from benchmarks.engine import Grid
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
@@ -45,7 +54,6 @@ from torchpose.evaluation.common import (
     cached_prior,
     centred_on_neck,
     make_test_set,
-    track,
 )
 from torchpose.io import Recording, read_recordings
 from torchpose.learning import fit_kinect_prior
@@ -72,7 +80,8 @@ def run(
 ) -> Report:
     """Run the protocol; writes report.json, report.md and pictures to `out`.
 
-    A prior that was fitted there with the same settings is read instead of fitted again.
+    A prior that was fitted there with the same settings, and estimates of the same trackers, are read
+    instead of made again.
 
     Args:
         data: folder kinect_utd_mhad, or the one it is in. out: folder for the results.
@@ -104,8 +113,10 @@ def run(
     report = Report("UB-people", _settings(train, tested, still, prior, settings, quick))
     lag = 0 if quick else lag
     projected = projected_training_poses(train, CAMERA, 2_000 if quick else _N_PROJECTED, seed)
-    scores = _all_methods(prior, still, projected, lag, progress)
-    moved = _all_methods(prior, moving, projected, 0, progress, "moving: ")
+    trackers = _variants(prior, lag)
+    scores = _all_methods(trackers, still, projected, out, progress)
+    some = {name: trackers[name] for name in (MAIN, SMOOTHED, BASELINE)}
+    moved = _all_methods(some, moving, projected, out, progress, "moving: trackers")
     add_error_tables(report, scores, moved, still, moving)
     add_pcp_table(report, scores)
     add_calibration_table(report, prior, scores)
@@ -169,46 +180,43 @@ def _settings(
     }
 
 
-def _variants(prior: UpperBodyPrior, lag: int) -> dict[str, tuple[UpperBodyPrior, dict[str, Any]]]:
-    """The trackers of the table: prior with noise, and options."""
+def _variants(prior: UpperBodyPrior, lag: int) -> dict[str, Tracker]:
+    """Return the trackers of the table: prior with noise, and options."""
     plain = plain_prior(prior)
     smooth: dict[str, Any] = {"smoothing": "full"}
-    variants: dict[str, tuple[UpperBodyPrior, dict[str, Any]]] = {
-        MAIN: (prior, {}),
-        SMOOTHED: (prior, smooth),
-    }
+    variants = {MAIN: Tracker(prior, {}), SMOOTHED: Tracker(prior, smooth)}
     if any(name.startswith("calibration") for name in prior.noise):
-        variants[UNCALIBRATED] = (prior, {"calibrated": False})
-        variants[f"{SMOOTHED}, uncalibrated"] = (prior, smooth | {"calibrated": False})
+        variants[UNCALIBRATED] = Tracker(prior, {"calibrated": False})
+        variants[f"{SMOOTHED}, uncalibrated"] = Tracker(prior, smooth | {"calibrated": False})
     poses = {"method": "mkf-fixed"}
     if prior.windows:
-        variants[f"{MAIN}, single poses"] = (prior, poses)
-        variants[f"{SMOOTHED}, single poses"] = (prior, poses | smooth)
+        variants[f"{MAIN}, single poses"] = Tracker(prior, poses)
+        variants[f"{SMOOTHED}, single poses"] = Tracker(prior, poses | smooth)
     if lag:
-        variants[f"{LAGGED} {lag}, single poses"] = (prior, poses | {"smoothing": lag})
-    variants[BASELINE] = (plain, {})
-    variants["MKF stationary, hand-set noise"] = (plain, poses | {"transition": "stationary"})
-    variants["MKF ou 0.95, hand-set noise"] = (plain, poses | {"transition": "ou", "gamma": 0.95})
-    variants[f"{BASELINE}, smoothed"] = (plain, smooth)
+        variants[f"{LAGGED} {lag}, single poses"] = Tracker(prior, poses | {"smoothing": lag})
+    variants[BASELINE] = Tracker(plain, {})
+    variants["MKF stationary, hand-set noise"] = Tracker(
+        plain, poses | {"transition": "stationary"}
+    )
+    variants["MKF ou 0.95, hand-set noise"] = Tracker(
+        plain, poses | {"transition": "ou", "gamma": 0.95}
+    )
+    variants[f"{BASELINE}, smoothed"] = Tracker(plain, smooth)
     return variants
 
 
 def _all_methods(
-    prior: UpperBodyPrior,
+    trackers: Mapping[str, Tracker],
     test: Trials,
     projected: tuple[Tensor, Tensor],
-    lag: int,
+    out: Path,
     progress: bool,
-    label: str = "",
+    title: str = "trackers",
 ) -> dict[str, Scores]:
-    variants = _variants(prior, lag)
-    if label:
-        variants = {k: variants[k] for k in (MAIN, SMOOTHED, BASELINE)}
-    scores = {}
-    bar = tqdm(variants.items(), disable=not progress, desc=f"{label}trackers")
-    for name, (own, options) in bar:
-        bar.set_postfix_str(name)
-        scores[name] = score(track(own, CAMERA, test, progress=progress, **options), test)
+    """Return the scores of the trackers, of the nearest training pose and of the mean pose."""
+    grid = Grid({"": test}, trackers)
+    runs = TRACKING.run({"": grid}, (0,), out, progress=progress, title=title)
+    scores = {row.method: score(row.run, test) for row in runs.rows}
     scores[NEIGHBOUR] = score(nearest_neighbour(test, *projected, progress=progress), test)
     scores[MEAN_POSE] = score(mean_pose(test, *projected), test)
     return scores

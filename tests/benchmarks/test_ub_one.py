@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from benchmarks import ub_one
-from benchmarks._upper_body import Subject, plain_prior, trials_of
+from benchmarks import _upper_body, ub_one
+from benchmarks._upper_body import TRACKING, Tracker, plain_prior, trials_of
 from benchmarks.engine import Grid
 from tests.data import data_dir_or_skip
 from tests.evaluation.recordings import small_recipe, write_one
@@ -44,17 +44,15 @@ def test_estimates_are_kept(data, tmp_path, monkeypatch):
     first, rest = ub_one.split_recording(data)
     prior = plain_prior(small_recipe([first], 2))
     short = replace(rest, joints=rest.joints[:5])
-    grid = Grid(
-        {"": Subject(prior, trials_of([short]))},
-        {"a": ub_one._Tracker("pf-mixture", {"n_particles": 30}, "")},
-    )
-    (fresh,) = ub_one.TRACKING.run({"": grid}, (0,), tmp_path).runs
-    monkeypatch.setattr(ub_one, "track", lambda *_, **__: pytest.fail("tracked again"))
-    (kept,) = ub_one.TRACKING.run({"": grid}, (0,), tmp_path).runs
+    tracker = Tracker(prior, {"method": "pf-mixture", "n_particles": 30})
+    grid = Grid({"": trials_of([short])}, {"a": tracker})
+    (fresh,) = TRACKING.run({"": grid}, (0,), tmp_path).runs
+    monkeypatch.setattr(_upper_body, "track", lambda *_, **__: pytest.fail("tracked again"))
+    (kept,) = TRACKING.run({"": grid}, (0,), tmp_path).runs
     for ours, other in zip(fresh, kept, strict=True):
         torch.testing.assert_close(ours, other, rtol=0, atol=0, equal_nan=True)
     with pytest.raises(pytest.fail.Exception):
-        ub_one.TRACKING.run({"": grid}, (1,), tmp_path)
+        TRACKING.run({"": grid}, (1,), tmp_path)
 
 
 def test_the_split_keeps_frames_and_persons_apart(data):

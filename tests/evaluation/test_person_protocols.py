@@ -336,7 +336,10 @@ def test_real_data_sets(tmp_path):
     assert 2 < own < far < 30
 
 
-def test_folders_on_the_command_line():
+def test_folders_on_the_command_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in "abc":
+        (tmp_path / name).mkdir()
     several = evaluate.PROTOCOLS["leave-one-person-out"]
     parser = protocol.build("evaluate leave-one-person-out", several)
     line = ["a", "b", "--out", "o", "--workers", "2"]
@@ -347,3 +350,5 @@ def test_folders_on_the_command_line():
     assert protocol.checked_data("recordings", more)[-1] == Path("c")
     with pytest.raises(InputError, match="got none"):
         protocol.checked_data("recordings", parser.parse_args(["--out", "o"]))
+    with pytest.raises(InputError, match="d: no such folder or file of recordings"):
+        protocol.checked_data("recordings", parser.parse_args(["d", "--out", "o"]))

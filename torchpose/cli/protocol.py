@@ -112,7 +112,11 @@ def checked_data(data: Data, args: Namespace) -> Any:
         given = [*(args.recordings or ()), *([args.data] if args.data else ())]
         if not given:
             raise InputError("expected folders or files of recordings, got none; see --help")
-        return [Path(path) for path in given]
+        paths = [Path(path) for path in given]
+        missing = [path for path in paths if not path.exists()]
+        if missing:
+            raise InputError(f"{missing[0]}: no such folder or file of recordings")
+        return paths
     path = Path(args.data)
     if data == "mocap" and not path.exists():
         raise InputError(f"--mocap {path}: no such folder or file of motion capture")
