@@ -22,8 +22,7 @@ from torchpose.learning._recipes import VERSION
 from torchpose.priors import GaussianMixture, UpperBodyPrior
 from torchpose.priors._window import WindowLayout, WindowPrior
 from torchpose.skeleton._upper_body import ARM_JOINTS
-from torchpose.upper_body import UpperBodyTracker
-from torchpose.upper_body._measurements import pixel_indices
+from torchpose.upper_body import UpperBodyTracker, pixel_indices
 from torchpose.upper_body._methods import process_cov
 
 FIT_PERSONS, SCORED_PERSONS = ("s1", "s2", "s4", "s5"), ("s3", "s6")

@@ -39,7 +39,8 @@ from torchpose._core.files import check_output_folder
 from torchpose.body import fit_state
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
-from torchpose.io._mocap import MocapClip, read_mocap, select_persons
+from torchpose.io import read_mocap
+from torchpose.io._mocap import MocapClip, select_persons
 from torchpose.priors import load_action, load_limb_conditionals, load_manifold
 from torchpose.priors._shipped import persons_of_model, refuse_seen
 from torchpose.whole_body import METHODS, BodyTracker

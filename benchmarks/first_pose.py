@@ -22,7 +22,7 @@ from benchmarks.silhouette.filters import prepare
 from benchmarks.silhouette.protocol import FPS, WALKERS
 from torchpose.body import BODY_15, Body, fit_state
 from torchpose.camera import CameraRig
-from torchpose.io._mocap import read_mocap
+from torchpose.io import read_mocap
 from torchpose.priors import BackConstrainedGPLVM
 from torchpose.whole_body import find_first_pose, find_pose
 

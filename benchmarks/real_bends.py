@@ -28,8 +28,7 @@ from torchpose._core.files import atomic_path, check_output_folder
 from torchpose.body import Body, centres_of, fit_body, fit_state
 from torchpose.errors import DegenerateFilterWarning
 from torchpose.evaluation import Report
-from torchpose.priors import ActionSpace
-from torchpose.priors._actions.postures import state_postures
+from torchpose.priors import ActionSpace, state_postures
 from torchpose.whole_body import ConstrainedParticleFilter, constant_velocity_std, count_pixels
 from torchpose.whole_body._silhouettes.likelihood import intersection_over_union
 from torchpose.whole_body._silhouettes.shape import fit_radii

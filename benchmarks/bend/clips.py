@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from benchmarks.bodies.clips import Split
 from torchpose.errors import InputError
 from torchpose.io._mocap import MocapClip, select_persons
-from torchpose.learning._performances import split_repetitions
-from torchpose.priors._actions.postures import posture_angles
+from torchpose.learning import split_repetitions
+from torchpose.priors import posture_angles
 
 _LEAST_FRAMES = 12  # of a performance
 

@@ -49,7 +49,8 @@ from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import add_picture
-from torchpose.io._mocap import MocapClip, read_mocap, select_persons
+from torchpose.io import read_mocap
+from torchpose.io._mocap import MocapClip, select_persons
 
 FPS = 30.0
 PARTS = ("particles", "dimensions", "limbs", "occlusion", "actions")

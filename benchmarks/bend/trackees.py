@@ -15,11 +15,10 @@ from benchmarks.engine import Setting
 from torchpose.body import BODY_15, Body, centres_of, fit_body, fit_state
 from torchpose.io._mocap import MocapClip
 from torchpose.learning._action_spaces import fit_synchronised
-from torchpose.priors import ActionBank, ActionSpace
+from torchpose.priors import ActionBank, ActionSpace, posture_angles, state_postures
 from torchpose.priors._actions.file import ActionInfo, Synchronised
 from torchpose.priors._actions.gate import Acceptance
 from torchpose.priors._actions.polar_limbs import LIMBS_12
-from torchpose.priors._actions.postures import posture_angles, state_postures
 from torchpose.whole_body import ConstrainedParticleFilter, constant_velocity_std
 
 SHARPNESS = (30.0, 1.0, 10.0, 100.0, 300.0)

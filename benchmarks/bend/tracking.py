@@ -22,7 +22,7 @@ from benchmarks.bodies.views import Subject, subjects_of
 from benchmarks.engine import Experiment, Grid, Setting, Tuning, choose_setting
 from benchmarks.engine.tuning import SCALES
 from torchpose.errors import DegenerateFilterWarning
-from torchpose.priors._actions.postures import state_postures
+from torchpose.priors import state_postures
 from torchpose.whole_body import BodyTrack
 
 _VALIDATION_SEED = 1000

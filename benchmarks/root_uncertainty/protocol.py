@@ -54,7 +54,8 @@ from torchpose._core.files import check_output_folder
 from torchpose.errors import DegenerateFilterWarning, InputError
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import add_picture
-from torchpose.io._mocap import MocapClip, read_mocap
+from torchpose.io import read_mocap
+from torchpose.io._mocap import MocapClip
 
 PARTS = ("tables", "rates", "recovery", "all")
 

@@ -24,7 +24,8 @@ from torchpose._core.files import check_output_folder
 from torchpose.camera import CameraRig
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
-from torchpose.io._mocap import MocapClip, read_mocap
+from torchpose.io import read_mocap
+from torchpose.io._mocap import MocapClip
 
 FPS = 60.0
 WALKERS = ("07", "08", "35", "39")

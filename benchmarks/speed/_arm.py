@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpose.filters import MixtureKalmanFilter
-from torchpose.filters._transition import make_transition
+from torchpose.filters import MixtureKalmanFilter, make_transition
 from torchpose.priors import GaussianMixture
 
 DIM = 21

@@ -16,9 +16,8 @@ from benchmarks.speed._timing import Case, Report, begin, number, parser, take_t
 from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.learning import fit_action_space
-from torchpose.priors import ActionSpace
+from torchpose.priors import ActionSpace, posture_angles, state_postures
 from torchpose.priors._actions.part_postures import PartPostures
-from torchpose.priors._actions.postures import posture_angles, state_postures
 from torchpose.whole_body import (
     ConstrainedParticleFilter,
     SIRParticleFilter,

@@ -19,8 +19,7 @@ import torch
 
 from benchmarks.speed._arm import DIM, PROCESS, released_prior
 from benchmarks.speed._timing import Case, Report, begin, number, parser, take_turns
-from torchpose.filters import BootstrapParticleFilter
-from torchpose.filters._transition import make_transition
+from torchpose.filters import BootstrapParticleFilter, make_transition
 from torchpose.filters._walk import MixtureWalk
 from torchpose.priors import GaussianMixture
 

@@ -31,7 +31,8 @@ from torchpose.camera import CameraRig
 from torchpose.learning import fit_limb_conditionals
 from torchpose.math._tree_messages import propagate
 from torchpose.math._unscented import sigma_points
-from torchpose.priors._limb_conditionals import LimbConditionals, in_body_frame
+from torchpose.priors import in_body_frame
+from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.whole_body import (
     AnnealedParticleFilter,
     RootUncertaintyTracker,

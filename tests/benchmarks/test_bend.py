@@ -20,7 +20,7 @@ from tests.benchmarks.benders import bender, write_benders
 from torchpose.body import BODY_15
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
-from torchpose.io._mocap import read_mocap
+from torchpose.io import read_mocap
 
 SMALL = {
     "progress": False, "quick": True, "size": "64x48", "at": 10, "frames": 5, "particles": (10,),

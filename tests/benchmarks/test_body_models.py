@@ -10,7 +10,7 @@ from benchmarks import body_models
 from benchmarks.bodies.views import Conditions, subjects_of
 from tests.benchmarks.walkers import walker, write_walkers
 from torchpose.errors import InputError, OverlapError, PriorError
-from torchpose.io._mocap import read_mocap
+from torchpose.io import read_mocap
 from torchpose.learning import ManifoldRecipe, fit_limbs
 from torchpose.learning._recipes import LimbStates, ManifoldFitting, ManifoldPoses
 

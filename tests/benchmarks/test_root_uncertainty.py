@@ -45,7 +45,7 @@ from torchpose.cli.protocol import build
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import settings_hash
-from torchpose.io._mocap import read_mocap
+from torchpose.io import read_mocap
 from torchpose.math import quaternion_vector_to_matrix
 from torchpose.whole_body import AnnealedParticleFilter, RootUncertaintyTracker
 

@@ -22,7 +22,7 @@ from torchpose.body import BODY_15
 from torchpose.camera import save_cameras
 from torchpose.demo._rendering.clothed_body import TrueShape, true_limbs, true_silhouettes
 from torchpose.errors import InputError
-from torchpose.io._mocap import read_mocap
+from torchpose.io import read_mocap
 from torchpose.whole_body import AnnealedParticleFilter, SIRParticleFilter
 from torchpose.whole_body._sharpness import SharpnessFit
 
