@@ -2,6 +2,7 @@
 
 import sys
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,20 +31,27 @@ class TrackSettings:
 
     Args:
         prior: a prior that comes with torchpose, or a .safetensors file.
-        method: window-mixture, mkf-fixed, mkf-sampled, mkf-split, pf-mixture, pf-walk or
-            pf-walk-unscaled; null is window-mixture where the prior brings windows that suit.
-        camera: a TOML file or fx,fy,cx,cy in pixels; without it K or the image size of each file.
+        method: name of the estimator; by default window-mixture if the prior brings windows that suit, else
+            mkf-fixed.
+        camera: TOML file or four numbers fx,fy,cx,cy in pixels; without it K or the image size of the
+            input.
         camera_name: which camera of a file with several.
-        measurement_std: pixels, one number or five: hand, elbow, shoulder, head, neck.
-        smoothing: later frames that an estimate may use, or "full".
-        n_particles: of the pf methods. n_tracks: of mkf-sampled and mkf-split.
-        frame: axes of the 3D poses: camera or body.
+        measurement_std: standard deviation of a keypoint in pixels: one number, or five with commas for
+            hand, elbow, shoulder, head, neck; by default what the prior learnt, else 3.
+        smoothing: use this many later frames, or all of them ("full"), for each estimate; of
+            window-mixture and mkf-fixed.
+        n_particles: particles of the pf methods (default 10000).
+        n_tracks: tracks of mkf-sampled and mkf-split.
+        frame: axes of the 3D poses: of the camera (default) or of the body.
         static_camera: let the body turn in front of a camera that stays where it is.
-        window: deprecated, see `method`. steady: take out the trembling of windows.
-        neck: kind of the keypoints' neck if their names do not tell.
+        window: deprecated: false stands for the method mkf-fixed, true for the default.
+        steady: take the trembling out of what windows give, by filters of constant velocity (default
+            true for window-mixture).
+        neck: kind of the keypoints' neck if their names do not tell: neck, low-neck, mid-shoulder.
         nose_as_head: take a nose for the head where there is none.
-        fps: frames per second, if the files do not say or err.
-        max_gap: longest stretch without any keypoint, seconds; null for no bound.
+        fps: frames per second, if the input does not say or errs; a video file is resampled to it.
+        max_gap: longest stretch without any keypoint, in seconds, null for no bound (default 5); in
+            video, somebody who is away for longer has no pose until they come back.
         seed: of the methods that draw; every recording starts from it.
     """
 
@@ -120,6 +128,7 @@ class KeypointFileTracker:
 
     Args:
         settings: how to track. device: where, such as "cpu", "cuda" or "cuda:1".
+        options: of the method, beside those of the settings.
 
     Attributes:
         settings: as given. prior: that was loaded.
@@ -128,7 +137,12 @@ class KeypointFileTracker:
         InputError, PriorError: settings that suit no recording, a device that cannot be used.
     """
 
-    def __init__(self, settings: TrackSettings, device: str = "cpu") -> None:
+    def __init__(
+        self,
+        settings: TrackSettings,
+        device: str = "cpu",
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
         self.settings = settings
         self.prior = load_prior(settings.prior)
         try:
@@ -141,6 +155,7 @@ class KeypointFileTracker:
             "measurement_std": settings.measurement_std,
             "max_gap": settings.max_gap,
             **settings.tracker_options(),
+            **(options or {}),
         }
         self._trackers: dict[_Key, UpperBodyTracker] = {}
 

@@ -65,12 +65,16 @@ class VideoTracker(nn.Module):
         prior: from `load_prior` or `fit_upper_body_prior`.
         camera: of the video.
         fps: frames per second. All frames are taken to be equally far apart.
-        hands, background, elbows, face_detector, max_persons, head_neck: see
-            `UpperBodyMeasurer`.
+        hands: how hands are found: "grid" (default) or "mean-shift", the paper's recipe.
+        background: tell what moves from what does not, for a camera that stands still.
+        elbows: measure elbows where the torso with its sleeves is widest.
         edges: correct hands that were taken for each other by the edges of the arms
             (`HandAssociation`); takes about twice the time of the poses.
-        candidates: let the hand tracker look where the last pose has the hands; frames are then
-            measured and filtered in turn, which is slower.
+        candidates: look for hands where the last pose has them as well; frames are then measured and
+            filtered in turn, which is slower.
+        face_detector: by default Haar's.
+        max_persons: follow only the N largest faces.
+        head_neck: where head and neck are beside the face.
         max_gap: seconds after which somebody who is not seen has no pose any more; None is never.
         seed: of methods that draw; every person has a generator of their own.
         options: to `UpperBodyTracker`, such as method, smoothing or frame.

@@ -65,10 +65,13 @@ class BodyTracker(nn.Module):
     Args:
         cameras: of the silhouettes, undistorted: a `CameraRig`, or what makes one.
         method: a name of `torchpose.whole_body.METHODS`; by default that of the model given, else "apf".
-        body: of the person, or a file of `BodyPoses` that has it. height: metres, of a body of average
-            proportions where `body` is not given.
-        manifold, conditionals, action: what the method has learnt: a model, the name of one that comes
-            with the package, or a file. The first pose is looked for with a manifold by every method.
+        body: the person's body, or a body.npz (`BodyPoses`) whose bone lengths and shape the person has;
+            then the height is not used.
+        height: height of the person, metres.
+        manifold: poses of an action, by a name that `torchpose info` lists, or a file; in Python also the
+            model itself. The first pose is looked for with it by every method.
+        conditionals: how limbs stand to each other and turn, by name, or a file.
+        action: postures of an action, or of several, by name, or a file.
         n_particles: likelihoods of a frame, of all layers together; a hypothesis of "root" counts seven.
         fps: frames per second; noise grows with the time between frames.
         process_cov: variances of the diffusion per frame [D], or [D, D] without entries off the diagonal,

@@ -14,6 +14,7 @@ from torchpose.body._fitting import fit_body, fit_state
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
 from torchpose.errors import InputError
+from torchpose.io._formats.axes import Axes
 from torchpose.io._recordings import Recording
 from torchpose.learning._action_spaces import Performed, fit_synchronised
 from torchpose.learning._performances import (
@@ -45,9 +46,16 @@ class ActionRecipe:
     """Settings of the fit of an action space, or of a bank.
 
     Args:
-        n_dimensions: D. n_postures: K, by default the median length. prominence: of key frames.
-        stay, spread, background, evidence_rate, gate_dimensions: of a bank, see `ActionBank`.
-        seed: of the matching that the share of accepted postures rests on.
+        n_dimensions: D, of the principal axes of the postures.
+        n_postures: K, of the mean performance; by default the median length.
+        prominence: of a key frame, share of the range of distances to the mean.
+        stay: of a bank: probability that somebody does the same thing a second later.
+        spread: of a bank: factor on the deviations, for persons it has not seen.
+        background: of a bank: factor on the deviation of everything, for none of its actions.
+        evidence_rate: of a bank: frames per second that count as independent.
+        gate_dimensions: of a bank: how many of the dimensions its gates look at, by default all; 25
+            dimensions and 13 here tell actions apart best.
+        seed: of the trial of the gate, the matching that the share of accepted postures rests on.
     """
 
     n_dimensions: int = 13
@@ -90,16 +98,17 @@ class Performances:
         held_out: Sequence[str] | None = None,
         without: Sequence[str] | None = None,
         fps: float = 30.0,
+        axes: Axes | None = None,
         repeated: bool = True,
         postures: Literal["joints", "body"] = "joints",
-        axes: str | None = None,
     ) -> Self:
         """Read, turn joints into postures, and cut recordings into performances.
 
         Args:
-            paths, actions, persons, without, axes: see `choose_recordings`.
-            held_out: persons on whom the gate is tried instead.
-            fps: frame rate that recordings are resampled to.
+            paths, persons, without, axes: see `choose_recordings`.
+            actions: names of actions, as the files give them; several give a bank.
+            held_out: persons who are not fitted to: the gate is tried on them.
+            fps: frame rate of what is fitted, best that of the videos.
             repeated: cut recordings into repetitions; false if each is a single performance.
             postures: "joints", angles between the recorded joints; "body", of a body of average
                 proportions that is turned as a body fitted to each person, so that it makes no

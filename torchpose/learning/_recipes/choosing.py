@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchpose.body._skeleton import BODY_15, body_joints
 from torchpose.errors import InputError
+from torchpose.io._formats.axes import Axes
 from torchpose.io._mocap import resample
 from torchpose.io._recordings import Recording, find_recordings, read_recordings
 from torchpose.learning._curation.splits import pick_persons, refuse_shared_recordings
@@ -42,16 +43,18 @@ def choose_recordings(
     held_out: Sequence[str] | None = None,
     actions: Sequence[str] | None = None,
     without: Sequence[str] | None = None,
-    axes: str | None = None,
+    axes: Axes | None = None,
 ) -> ChosenRecordings:
     """Read recordings and split them by person; other people in a file are on neither side.
 
     Args:
         paths: folders (with their subfolders) or files, see `expand_path`.
-        persons: whom to fit to, as `origin#person` or just the person; everybody if None.
-        held_out: persons of whom nothing is fitted, named in the same way.
-        actions: names, as the files give them; all if None.
-        without: names of files, without their suffix, that are on neither side.
+        persons: whom to fit to, as `origin#person` or just the person; by default everybody who is not
+            held out.
+        held_out: persons who are not fitted to, named in the same way: they tell how good the model is on
+            others.
+        actions: names of actions, as the files give them; by default all.
+        without: names of files, without their suffix, to leave out altogether.
         axes: of all recordings: camera, kinect, y-up, z-up; by default what each file says.
 
     Raises:

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchpose.body._fitting import fit_body, fit_state
 from torchpose.body._kinematics import Body, centres_of
 from torchpose.errors import InputError
+from torchpose.io._formats.axes import Axes
 from torchpose.io._recordings import Recording
 from torchpose.learning._limb_conditionals import fit_limb_conditionals
 from torchpose.learning._recipes.choosing import (
@@ -56,13 +57,13 @@ class LimbStates:
         actions: Sequence[str] | None = None,
         without: Sequence[str] | None = None,
         fps: float = 60.0,
-        axes: str | None = None,
+        axes: Axes | None = None,
     ) -> Self:
         """Read, fit everybody's body, and turn joints into states.
 
         Args:
             paths, persons, held_out, actions, without, axes: see `choose_recordings`.
-            fps: frame rate that recordings are resampled to, best that of the frames to be tracked.
+            fps: frame rate of what is fitted, best that of the videos.
 
         Raises:
             InputError: as `choose_recordings` and `recorded_joints`, or a rate that is not positive.
@@ -107,11 +108,12 @@ class HeldOut(NamedTuple):
 def fit_limbs(
     states: LimbStates, least_std: float = 0.01, **facts: str
 ) -> tuple[LimbConditionals, HeldOut | None]:
-    """Limb conditionals of recorded states, and how far the persons held out are from them, if any.
+    """Return limb conditionals of recorded states, and how far the persons held out are from them, if any.
 
     Args:
         states: to fit to.
-        least_std: floor of the standard deviations of q_ij, see `fit_limb_conditionals`.
+        least_std: least deviation of a limb in any direction, sine of half an angle
+            (`fit_limb_conditionals`).
         facts: name, licence, command; those that are empty are left out.
 
     Raises:

@@ -21,6 +21,7 @@ from torchpose._core.files import atomic_path
 from torchpose.body._fitting import fit_body, fit_state
 from torchpose.body._kinematics import Body
 from torchpose.errors import InputError, OutputError
+from torchpose.io._formats.axes import Axes
 from torchpose.io._recordings import Recording
 from torchpose.learning._curation.splits import refuse_shared_recordings
 from torchpose.learning._gplvm_fit import GPLVMFit, median_gamma
@@ -56,13 +57,15 @@ class ManifoldRecipe:
     """Settings of the fit of a manifold.
 
     Args:
-        latent_dim: d. gamma_x: of (MR 22); by default from the median distance of the poses.
+        latent_dim: dimensions d of the latent space.
+        gamma_x: of (MR 22); by default from the median distance of the poses.
         optimiser: "lbfgs" or "adam". learning_rate: None for the optimiser's own.
-        steps: of ten iterations, at most. patience: steps without a better held-out error after
-            which it ends.
-        start: which principal components to start from: 0 the first ones, see `principal_start`.
-        smoothness: see `GPLVMFit`. standardise: see `fit_gplvm`.
-        seed: of the frames whose distances give gamma_x, where there are very many.
+        steps: of ten iterations of the optimiser, at most.
+        patience: steps without a better error on what is held out, after which it ends.
+        start: which principal components to start from, 0 the first ones (`principal_start`).
+        smoothness: of the back constraints (`GPLVMFit`); 0 is the published form.
+        standardise: let all columns weigh the same (`fit_gplvm`).
+        seed: of the frames that tell the scale of distances, gamma_x, where there are very many.
 
     Raises:
         InputError: a setting that is not positive.
@@ -108,24 +111,25 @@ class ManifoldPoses:
         *,
         persons: Sequence[str] | None = None,
         held_out: Sequence[str] | None = None,
-        validation: int = 2,
         actions: Sequence[str] | None = None,
         without: Sequence[str] | None = None,
         fps: float = 60.0,
+        axes: Axes | None = None,
+        validation: int = 2,
         frames: int = 350,
-        axes: str | None = None,
         progress: bool = False,
     ) -> Self:
         """Read, split, and turn joints into poses of a body fitted to each person.
 
         Args:
             paths, persons, actions, without, axes: see `choose_recordings`.
-            held_out: persons whose recordings are held out, so that the standard deviations are those
-                of somebody new.
-            validation: recordings of each person that are held out instead where no persons are, the
-                last ones by name.
-            fps: frame rate of the poses. frames: that are fitted to at most, spread evenly over the
-                recordings. progress: show a bar.
+            held_out: persons who are not fitted to: they tell how good the model is on others, and give
+                the manifold its noise.
+            validation: without persons held out, recordings of each person that are, the last ones by
+                name.
+            fps: frame rate of what is fitted, best that of the videos.
+            frames: that are fitted to at most, spread over all recordings; time grows with their cube.
+            progress: show a bar.
 
         Raises:
             InputError: as `choose_recordings` and `recorded_joints`, a person with too few recordings,

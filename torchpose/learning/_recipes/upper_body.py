@@ -87,10 +87,11 @@ class UpperBodyRecipe:
             person, nothing is calibrated.
         drawn_pieces: pieces of recordings, of 60 frames at most, of each of these groups for the
             calibration of the filters that draw; 0 leaves them with that of the fixed tracks.
-        seed: of everything random.
+        seed: seed of viewpoints, start and everything else that is random.
         camera_matrix: fx, fy, cx, cy of the camera whose pixels the states are in.
         rotation_order: "zxy" (paper) or "zyx" (released priors).
-        neck: kind of neck; the highest among the recordings if None. Others are converted.
+        neck: kind of neck to convert to: neck, low-neck, mid-shoulder; by default the highest among the
+            recordings.
         mirror: fit one mixture over poses to left and mirrored right arms.
         nose_as_head: take the nose where a joint set has no head.
     """
