@@ -41,7 +41,7 @@ from benchmarks.root_uncertainty.walkers import (
     with_cameras,
 )
 from tests.benchmarks.walkers import write_walkers
-from torchpose.cli.protocol import build
+from torchpose.cli.evaluate import build
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import settings_hash

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchpose.camera import lift
-from torchpose.cli import demo_keypoints, demo_scores
+from torchpose.cli import demo_keypoints
 from torchpose.io import read_keypoints
 from torchpose.math import euler_to_matrix
 from torchpose.priors import load_prior
@@ -55,7 +55,7 @@ def test_demo_beats_the_mean_pose(torchpose, shipped, tmp_path):
 
 
 def test_failure_has_an_exit_code(torchpose, shipped, tmp_path, monkeypatch):
-    perfect = demo_scores.Scores(torch.zeros(60, 8))
+    perfect = demo_keypoints.Scores(torch.zeros(60, 8))
     monkeypatch.setattr(demo_keypoints, "score_mean_pose", lambda *_: perfect)
     options = ("--seconds", 2, "--pictures", "false", "--input", "keypoints")
     done = torchpose("demo", "--out", tmp_path / "out", *options)
@@ -82,7 +82,7 @@ def test_scores_of_the_truth_itself(files):
     performance, clip, _ = demo_keypoints.perform(2.0, seed=1)
     track = demo_keypoints.track_clip(load_prior(files / "prior.safetensors"), clip, None)
     track.joints3d = performance.joints[None]
-    scores = demo_scores.score(track, performance.joints)
+    scores = demo_keypoints.score(track, performance.joints)
     assert float(scores.errors3d.abs().max()) < 1e-9
     assert scores.inside == (1.0, 1.0)
 

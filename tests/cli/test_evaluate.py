@@ -7,7 +7,6 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from torchpose.cli import evaluate
-from torchpose.cli.protocol import build
 from torchpose.errors import OverlapError
 
 
@@ -102,7 +101,7 @@ def test_refusals(torchpose, calls, tmp_path):
 
 @pytest.mark.parametrize("name", evaluate.PROTOCOLS)
 def test_parsers_of_the_real_ones(name):
-    args = build(name, evaluate.PROTOCOLS[name]).parse_args(
+    args = evaluate.build(name, evaluate.PROTOCOLS[name]).parse_args(
         ["--data", "d", "--out", "o", "--seed", "1"]
     )
     assert (args.data, args.out, args.seed) == ("d", "o", 1)

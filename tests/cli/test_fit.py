@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchpose.cli.fit import build, recorded_command
+from torchpose.cli.fit import command
 from torchpose.io import read_recordings
 from torchpose.learning import fit_upper_body_prior
 from torchpose.learning._curation import curate
@@ -132,8 +132,8 @@ def test_what_jumps_is_left_out_and_said(torchpose, files, tmp_path):
 
 
 def test_many_paths_are_cut_short():
-    args = build().parse_args([f"r{i}.npz" for i in range(20)] + ["--out", "p.safetensors"])
-    assert recorded_command(args) == "torchpose fit r0.npz '...19 more' --out p.safetensors"
+    given = command().given([f"r{i}.npz" for i in range(20)] + ["--out", "p.safetensors"])
+    assert given.line("p.safetensors") == "torchpose fit r0.npz '...19 more' --out p.safetensors"
 
 
 def test_config_file_round_trip(torchpose, files, tmp_path):

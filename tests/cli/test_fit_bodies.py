@@ -13,7 +13,7 @@ from tests.priors.motions import motion
 from tests.priors.performances import performances
 from torchpose._core.tensor_file import format_of
 from torchpose.body import BODY_15, Body
-from torchpose.cli.fit_bodies import KINDS, build, recorded_command
+from torchpose.cli.fit_bodies import KINDS, command, recorded_command
 from torchpose.learning._gplvm_fit import GPLVMFit
 from torchpose.priors import ActionBank, ActionSpace, BackConstrainedGPLVM
 from torchpose.priors._actions.postures import posture_angles, posture_to_state
@@ -197,10 +197,8 @@ def test_a_configuration_names_the_command(torchpose, walks, tmp_path):
     assert torchpose("fit", "limbs", "--config", config).code == 0
     info = LimbConditionals.load(tmp_path / "x.safetensors").info
     assert info.command == f"torchpose fit limbs --config {config}"
-    args = build("limbs").parse_args([*(f"r{i}" for i in range(20)), "--out", "a/x.safetensors"])
-    assert (
-        recorded_command("limbs", args) == "torchpose fit limbs r0 '...19 more' --out x.safetensors"
-    )
+    given = command("limbs").given([*(f"r{i}" for i in range(20)), "--out", "a/x.safetensors"])
+    assert recorded_command(given) == "torchpose fit limbs r0 '...19 more' --out x.safetensors"
 
 
 def test_lightning_is_not_imported(walks, tmp_path):

@@ -13,7 +13,7 @@ import torch
 from benchmarks import uncommon_poses
 from tests.data import data_dir_or_skip
 from tests.evaluation.recordings import V1, poses, small_recipe, write_one, write_people
-from torchpose.cli import evaluate, protocol
+from torchpose.cli import evaluate
 from torchpose.errors import InputError, OutputError
 from torchpose.evaluation import cross_dataset, learning_curve, leave_one_person_out, unseen
 from torchpose.evaluation import persons as persons_module
@@ -341,14 +341,14 @@ def test_folders_on_the_command_line(tmp_path, monkeypatch):
     for name in "abc":
         (tmp_path / name).mkdir()
     several = evaluate.PROTOCOLS["leave-one-person-out"]
-    parser = protocol.build("evaluate leave-one-person-out", several)
+    parser = evaluate.build("evaluate leave-one-person-out", several)
     line = ["a", "b", "--out", "o", "--workers", "2"]
     args = parser.parse_args(line)
-    assert protocol.checked_data("recordings", args) == [Path("a"), Path("b")]
+    assert evaluate.checked_data("recordings", args) == [Path("a"), Path("b")]
     assert args.workers == 2
     more = parser.parse_args([*line, "--data", "c"])
-    assert protocol.checked_data("recordings", more)[-1] == Path("c")
+    assert evaluate.checked_data("recordings", more)[-1] == Path("c")
     with pytest.raises(InputError, match="got none"):
-        protocol.checked_data("recordings", parser.parse_args(["--out", "o"]))
+        evaluate.checked_data("recordings", parser.parse_args(["--out", "o"]))
     with pytest.raises(InputError, match="d: no such folder or file of recordings"):
-        protocol.checked_data("recordings", parser.parse_args(["d", "--out", "o"]))
+        evaluate.checked_data("recordings", parser.parse_args(["d", "--out", "o"]))

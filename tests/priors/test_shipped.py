@@ -10,7 +10,7 @@ import yaml
 from tests.data import data_dir_or_skip
 from torchpose import load_action, load_limb_conditionals, load_manifold
 from torchpose.body import BODY_15, Body
-from torchpose.cli.fit_bodies import build
+from torchpose.cli.fit_bodies import command
 from torchpose.errors import OverlapError, PriorError
 from torchpose.learning._model_card import body_card
 from torchpose.priors import BackConstrainedGPLVM, known_models
@@ -57,8 +57,8 @@ def test_its_configuration_makes_it_and_holds_persons_out(kind, name):
     assert settings["out"] == f"torchpose/weights/{kind}/{name}.safetensors"
     assert info.command.startswith(f"torchpose fit {FITTED_BY[kind]} --config configs/bodies/")
     config = ROOT / info.command.split("--config ")[1]
-    args = build(FITTED_BY[kind]).parse_args(["--config", str(config)])
-    assert args.fps == info.fps and args.licence == info.licence
+    args = command(FITTED_BY[kind]).given(["--config", str(config)]).values
+    assert args["fps"] == info.fps and args["licence"] == info.licence
     fitted = {person.partition("#")[2] for person in info.persons}
     assert settings["held_out"] and not fitted & set(settings["held_out"])
 

@@ -17,8 +17,8 @@ import torch
 
 from tests.priors.poses import poses, recording
 from torchpose._core.files import atomic_path
-from torchpose.cli.track import build as track_parser
-from torchpose.cli.track import run as track
+from torchpose.cli.track import command as track_command
+from torchpose.cli.track import main as track
 from torchpose.errors import InputError, OutputError, PriorError
 from torchpose.learning import fit_upper_body_prior
 from torchpose.upper_body import PoseTrack
@@ -89,7 +89,7 @@ def test_results_are_those_of_torchpose_track(data, prior_file, tmp_path) -> Non
     assert {name: o.state for name, o in outcomes.items()} == dict.fromkeys("ade", "made")
     arguments = [str(data / "a.npz"), "--out", str(tmp_path / "single"), "--prior", prior_file]
     options = ["--smoothing", "full", "--pictures", "false"]
-    assert track(track_parser().parse_args(arguments + options)) == 0
+    assert track(arguments + options) == 0
     single = PoseTrack.load(tmp_path / "single" / "poses.npz")
     batch = PoseTrack.load(tmp_path / "out" / "a.npz")
     for name in ("joints2d", "joints3d", "covariance3d", "observed", "log_evidence"):
@@ -103,7 +103,7 @@ def test_results_are_those_of_torchpose_track(data, prior_file, tmp_path) -> Non
 
 def test_settings_are_the_options_of_track() -> None:
     own = asdict(TrackSettings())
-    theirs = vars(track_parser().get_defaults())
+    theirs = vars(track_command().parser().get_defaults())
     assert {name: theirs[name] for name in own} == own
     of_video = {"hands", "background", "edges", "candidates", "elbows", "face_model", "overlay"}
     assert (

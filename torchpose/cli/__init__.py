@@ -1,8 +1,9 @@
 """The command `torchpose`: fit, track, evaluate, demo, info.
 
-Each command is a module with `build` (its parser), `run` (its work) and `main` (both). It is imported
-when it is called for, so that help comes up at once. Exit codes: 0 done; 1 done, but the result is
-not good; 2 refused (input, options, output), with one line on stderr; 130 interrupted.
+Each command is a module with `run`, a function whose parameters are the options (`Command`), and `main`,
+which reads the command line and calls it. The module is imported when the command is called for, so that
+help comes up at once. Exit codes: 0 done; 1 done, but the result is not good; 2 refused (input, options,
+output), with one line on stderr; 130 interrupted.
 """
 
 import os
@@ -71,7 +72,7 @@ def guarded(command: Callable[[list[str]], int], arguments: list[str]) -> int:
 
 
 def _is_refusal(error: Exception) -> bool:
-    """Whether it was raised on purpose, about what the user gave; anything else is a bug."""
+    """Return whether an error is about what the user gave; anything else is a bug."""
     if isinstance(error, ArgumentError):
         return True
     from torchpose.errors import TorchposeError  # here, because it imports torch

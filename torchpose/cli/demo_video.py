@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from torchpose._core.terminal import show_progress
 from torchpose.cli.common import save_pictures, share_cores
-from torchpose.cli.demo_scores import MEAN_POSE, beaten, report, score, score_mean_pose
+from torchpose.cli.demo_keypoints import MEAN_POSE, beaten, report, score, score_mean_pose
 from torchpose.cli.track_output import camera_text, track_pictures
 from torchpose.cli.track_video import write_overlay, write_people
 
@@ -28,7 +28,7 @@ _DISTANCE = 1.8  # metres: near enough for the face, far enough for raised arms
 def demo_video(
     prior: "UpperBodyPrior", results: "ResultsFolder", seconds: float, seed: int, pictures: bool
 ) -> int:
-    """Render, track, score, draw; exit code 1 if the mean pose is not beaten."""
+    """Render, track, score and draw; return exit code 1 if the mean pose is not beaten."""
     from torchpose.demo._performer import demo_camera, performer
     from torchpose.video._source import open_video
     from torchpose.video._tracker import VideoTracker
@@ -83,7 +83,7 @@ def _render(clip: Path, performance: "Performance", seed: int) -> None:
 
 
 def _smoothed(tracker: "VideoTracker", person: "TrackedPerson") -> "PoseTrack":
-    """The poses from the same measurements, all frames together."""
+    """Return the poses from the same measurements, all frames together."""
     from torchpose.upper_body._tracker import UpperBodyTracker
     from torchpose.video._recording import smoothed
 

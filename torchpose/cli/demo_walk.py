@@ -27,7 +27,7 @@ _PARTS = ("neck", "elbow", "wrist", "hip", "knee", "ankle")
 
 
 def demo_walk(folder: str, seconds: float, seed: int, pictures: bool) -> int:
-    """Render, track by `torchpose track-body`, score; exit code 1 if standing still is not beaten."""
+    """Render, track by `torchpose track-body`, score; return exit code 1 if standing still is not beaten."""
     from torchpose.cli import track_body
     from torchpose.demo._rendering.walk import walk
     from torchpose.whole_body._poses import BodyPoses
@@ -66,7 +66,7 @@ def demo_walk(folder: str, seconds: float, seed: int, pictures: bool) -> int:
 
 
 def _render(walker: "Walk", out: Path, seed: int) -> tuple[list[Path], list[Path]]:
-    """Write videos, pictures of the empty scenes, cameras and truth; returns videos and pictures."""
+    """Write videos, pictures of the empty scenes, cameras and truth; return videos and pictures."""
     from torchpose.camera._pinhole import save_cameras
     from torchpose.demo._rendering.walk import cameras_around, render_body_video, walk_clip
     from torchpose.io._results import ResultsFolder

@@ -1,30 +1,21 @@
 """`torchpose fit manifold|limbs|actions`: what the body trackers learn, from recordings of whole bodies."""
 
 import shlex
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jsonargparse import ArgumentParser, Namespace
-
 from torchpose._core.terminal import show_progress
-from torchpose.cli.common import add_seed, command_line, input_files, new_parser, pictures_possible
+from torchpose.cli.command import Command, Given
+from torchpose.cli.common import pictures_possible
+from torchpose.cli.options import Option, options_of
 from torchpose.errors import InputError
 
 if TYPE_CHECKING:
     from torchpose.io._results import ResultsFolder
 
-__all__ = ["KINDS", "build", "main"]
-
-_TEXT = {
-    "manifold": "Fit a manifold of one motion, a back-constrained GPLVM, for the manifold-regularised body "
-    "tracker (track-body --manifold). A fit that was stopped goes on when it is started again.",
-    "limbs": "Fit limb conditionals, how limbs stand to each other and how fast they turn, for the body "
-    "tracker with root hypotheses (track-body --conditionals).",
-    "actions": "Fit the postures of an action, or a bank of several actions, for the constrained body "
-    "tracker (track-body --action).",
-}
-KINDS = tuple(_TEXT)
-"""What there is to fit, beside priors of the upper body."""
+__all__ = ["KINDS", "PYTHON_ONLY", "command", "main", "recorded_command"]
 
 _EXAMPLES = {
     "manifold": "torchpose fit manifold walks/ --out walk.safetensors --persons anna ben --held-out carl\n"
@@ -34,97 +25,100 @@ _EXAMPLES = {
     "actions": "torchpose fit actions recordings/ --actions bend --out bend.safetensors --held-out carl\n"
     "torchpose fit actions recordings/ --actions bend wave clap --out bank.safetensors",
 }
-_FPS = {"manifold": 60.0, "limbs": 60.0, "actions": 30.0}
-_CHOICE = ("persons", "held_out", "actions", "axes", "fps")
+KINDS = tuple(_EXAMPLES)
+"""What there is to fit, beside priors of the upper body."""
+
+PYTHON_ONLY = frozenset({"gamma_x", "optimiser", "learning_rate"})
+"""Settings of recipes that only Python and the training loop have."""
+
+_WORDS = ("persons", "held_out", "actions", "without")
 
 
 def main(kind: str, arguments: list[str]) -> int:
     """Fit one of `KINDS` and return the exit code."""
-    return run(kind, build(kind).parse_args(arguments))
+    return command(kind).main(arguments)
 
 
-def build(kind: str) -> ArgumentParser:
-    """Parser of the command."""
-    parser = new_parser(f"fit {kind}", _TEXT[kind], _EXAMPLES[kind])
-    add = parser.add_argument
-    add("recordings", nargs="+", type=str, metavar="DIR",
-        help="folders (with their subfolders) or files of whole bodies; $NAME stands for a variable of "
-        "the environment")  # fmt: skip
-    add("--out", type=str, required=True, metavar="FILE", help="the model, NAME.safetensors")
-    add("--persons", type=str, nargs="+", metavar="PERSON",
-        help="whom to fit to (default everybody who is not held out)")  # fmt: skip
-    add("--held-out", type=str, nargs="+", metavar="PERSON",
-        help="persons who are not fitted to: they tell how good the model is on others, and a manifold's "
-        "noise")  # fmt: skip
-    add("--actions", type=str, nargs="+", metavar="ACTION", required=kind == "actions",
-        help="names of actions, as the files give them"
-        + ("; several give a bank" if kind == "actions" else " (default all)"))  # fmt: skip
-    add("--without-files", type=str, nargs="+", metavar="NAME",
-        help="names of files, without their suffix, to leave out altogether")  # fmt: skip
-    add("--fps", type=float, default=_FPS[kind], metavar="HZ",
-        help=f"frame rate of what is fitted, best that of the videos (default {_FPS[kind]:g})")  # fmt: skip
-    add("--axes", type=str, metavar="AXES",
-        help="of all recordings: camera, kinect, y-up, z-up; by default what each file says")  # fmt: skip
-    _OWN[kind](parser)
-    add("--name", type=str, default="", metavar="NAME",
-        help="name in the model's metadata (default that of the file)")  # fmt: skip
-    add("--licence", type=str, default="", metavar="TEXT", help="licence of the recordings")
-    if kind != "limbs":
-        add("--pictures", type=bool, default=True, metavar="true|false",
-            help="draw it (default true)")  # fmt: skip
-    return parser
+def command(kind: str) -> Command:
+    """Return the command that fits one of `KINDS`."""
+    run, gather, recipe = _FITS[kind]()
+    return Command(
+        f"fit {kind}",
+        run,
+        _EXAMPLES[kind],
+        {"choice": gather, "recipe": recipe},
+        spaced=("recordings",),
+        metavars={"out": "FILE", "postures": "body|joints"},
+    )
 
 
-def run(kind: str, args: Namespace) -> int:
-    """Read, fit, write and report; every check of an option comes before any work."""
-    from torchpose.io._formats.axes import AXES
+def recorded_command(given: Given) -> str:
+    """Return the command as the model's file says it."""
+    if given.values["config"]:
+        return shlex.join(
+            ["torchpose", *given.words, "--config", *map(str, given.values["config"])]
+        )
+    return given.line(Path(given.values["out"]).name)
+
+
+@contextmanager
+def _results(
+    given: Given, pictures: bool
+) -> "Iterator[tuple[ResultsFolder, Path, dict[str, str]]]":
+    """Return the folder of the model, its file, and its name, licence and command; all in use."""
     from torchpose.learning._fit_files import check_fit_file, fit_results
 
-    if args.axes is not None and args.axes not in AXES:
-        raise InputError(f"--axes must be one of {', '.join(AXES)}, got {args.axes!r}")
-    out = check_fit_file(args.out)
-    facts = {"name": args.name or out.stem, "licence": args.licence}
-    facts |= {"command": recorded_command(kind, args)}
-    with fit_results(out, input_files(args), getattr(args, "pictures", False)) as results:
-        print(_FITS[kind](args, results, out, facts))
-    return 0
+    values = given.values
+    out = check_fit_file(values["out"])
+    facts = {"name": values["name"] or out.stem, "licence": values["licence"]}
+    with fit_results(out, given.files(), pictures) as results:
+        yield results, out, facts | {"command": recorded_command(given)}
 
 
-def recorded_command(kind: str, args: Namespace) -> str:
-    """Return the command as the model's file says it."""
-    if args.config:
-        return shlex.join(["torchpose", "fit", kind, "--config", *map(str, args.config)])
-    return command_line(("fit", kind), args, build(kind).get_defaults(), Path(args.out).name)
+def _gathered(gather: Callable[..., Any], *leave_out: str) -> tuple[Option, ...]:
+    """Return the options that choose recordings, of a function that passes them to `choose_recordings`."""
+    from torchpose.learning._recipes.choosing import choose_recordings
+
+    return options_of(
+        gather, ("paths", "progress", *leave_out), {"without": "without_files"}, _WORDS,
+        refers_to=choose_recordings,
+    )  # fmt: skip
 
 
 # --- manifolds ------------------------------------------------------------------------------------
 
 
-def _manifold_options(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--validation", type=int, default=2, metavar="N",
-        help="without --held-out, recordings of each person that are held out, the last ones by name "
-        "(default 2)")  # fmt: skip
-    add("--frames", type=int, default=350, metavar="N",
-        help="that are fitted to at most, spread over all recordings (default 350); time grows with their "
-        "cube")  # fmt: skip
-    add("--latent-dim", type=int, default=2, metavar="N", help="dimensions (default 2)")
-    add("--steps", type=int, default=40, metavar="N",
-        help="of ten iterations of the optimiser, at most (default 40)")  # fmt: skip
-    add("--patience", type=int, default=3, metavar="N",
-        help="steps without a better error on what is held out, after which it ends (default 3)")  # fmt: skip
-    add("--start", type=int, default=0, metavar="N",
-        help="which principal components to start from, 0 the first ones (default 0)")  # fmt: skip
-    add("--smoothness", type=float, default=0.0, metavar="X",
-        help="of the back constraints; 0 is the published form (default 0)")  # fmt: skip
-    add("--standardise", type=bool, default=False, metavar="true|false",
-        help="let all columns weigh the same (default false)")  # fmt: skip
-    add_seed(parser, "the frames that tell the scale of distances, where there are very many")
+def _manifold() -> tuple[Callable[..., int], tuple[Option, ...], tuple[Option, ...]]:
+    from torchpose.learning._recipes.manifold import ManifoldPoses, ManifoldRecipe
+
+    return fit_manifold, _gathered(ManifoldPoses.gather), options_of(ManifoldRecipe, PYTHON_ONLY)
 
 
-def _fit_manifold(
-    args: Namespace, results: "ResultsFolder", out: Path, facts: dict[str, str]
-) -> str:
+def fit_manifold(
+    recordings: list[str],
+    *,
+    out: str,
+    choice: dict[str, Any],
+    recipe: dict[str, Any],
+    name: str = "",
+    licence: str = "",
+    pictures: bool = True,
+    given: Given,
+) -> int:
+    """Fit a manifold of one motion, a back-constrained GPLVM.
+
+    It is for the manifold-regularised body tracker (track-body --manifold). A fit that was stopped goes on
+    when it is started again.
+
+    Args:
+        recordings: folders (with their subfolders) or files of whole bodies; $NAME stands for a variable
+            of the environment.
+        out: the model, NAME.safetensors.
+        choice: arguments of `ManifoldPoses.gather`. recipe: of `ManifoldRecipe`.
+        name: name in the model's metadata (default that of the file).
+        licence: licence of the recordings.
+        pictures: draw it. given: the command.
+    """
     from torchpose.learning._fit_files import write_manifold_files
     from torchpose.learning._recipes.manifold import (
         ManifoldFitting,
@@ -134,93 +128,110 @@ def _fit_manifold(
         taken_up,
     )
 
-    names = ("latent_dim", "steps", "patience", "start", "smoothness", "standardise", "seed")
-    recipe = ManifoldRecipe(**{name: getattr(args, name) for name in names})
-    pictures = pictures_possible(args.pictures)
-    poses = ManifoldPoses.gather(
-        args.recordings, validation=args.validation, frames=args.frames, without=args.without_files,
-        progress=show_progress(), **_chosen(args),
-    )  # fmt: skip
-    fitting = ManifoldFitting(poses, recipe)
-    kept = out.with_name(f"{out.name}.partial")
-    taken = taken_up(fitting, kept)
-    if taken:
-        print(f"going on after {taken} steps, from {kept}", flush=True)
-    run_to_end(fitting, kept, show_progress())
-    return write_manifold_files(fitting, results, out.name, pictures, **facts)
+    with _results(given, pictures) as (results, file, facts):
+        settings, pictures = ManifoldRecipe(**recipe), pictures_possible(pictures)
+        poses = ManifoldPoses.gather(recordings, **choice, progress=show_progress())
+        fitting = ManifoldFitting(poses, settings)
+        kept = file.with_name(f"{file.name}.partial")
+        taken = taken_up(fitting, kept)
+        if taken:
+            print(f"going on after {taken} steps, from {kept}", flush=True)
+        run_to_end(fitting, kept, show_progress())
+        print(write_manifold_files(fitting, results, file.name, pictures, **facts))
+    return 0
 
 
 # --- limbs ----------------------------------------------------------------------------------------
 
 
-def _limb_options(parser: ArgumentParser) -> None:
-    parser.add_argument("--least-std", type=float, default=0.01, metavar="X",
-        help="least deviation of a limb in any direction, sine of half an angle (default 0.01)")  # fmt: skip
+def _limbs() -> tuple[Callable[..., int], tuple[Option, ...], tuple[Option, ...]]:
+    from torchpose.learning._recipes.limbs import LimbStates
+    from torchpose.learning._recipes.limbs import fit_limbs as recipe
+
+    return fit_limbs, _gathered(LimbStates.gather), options_of(recipe)
 
 
-def _fit_limbs(args: Namespace, results: "ResultsFolder", out: Path, facts: dict[str, str]) -> str:
+def fit_limbs(
+    recordings: list[str],
+    *,
+    out: str,
+    choice: dict[str, Any],
+    recipe: dict[str, float],
+    name: str = "",
+    licence: str = "",
+    given: Given,
+) -> int:
+    """Fit limb conditionals, how limbs stand to each other and how fast they turn.
+
+    They are for the body tracker with root hypotheses (track-body --conditionals).
+
+    Args:
+        recordings: folders (with their subfolders) or files of whole bodies; $NAME stands for a variable
+            of the environment.
+        out: the model, NAME.safetensors.
+        choice: arguments of `LimbStates.gather`. recipe: of `fit_limbs`.
+        name: name in the model's metadata (default that of the file).
+        licence: licence of the recordings.
+        given: the command.
+    """
     from torchpose.learning._fit_files import write_limb_files
     from torchpose.learning._recipes.limbs import LimbStates, check_least_std
 
-    check_least_std(args.least_std)
-    states = LimbStates.gather(args.recordings, without=args.without_files, **_chosen(args))
-    return write_limb_files(states, results, out.name, args.least_std, **facts)
+    with _results(given, False) as (results, file, facts):
+        check_least_std(recipe["least_std"])
+        states = LimbStates.gather(recordings, **choice)
+        print(write_limb_files(states, results, file.name, recipe["least_std"], **facts))
+    return 0
 
 
 # --- actions --------------------------------------------------------------------------------------
 
 
-def _action_options(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--repeated", type=bool, default=True, metavar="true|false",
-        help="cut recordings into repetitions (default true)")  # fmt: skip
-    add("--postures", type=str, default="body", metavar="body|joints",
-        help="on a body of average proportions, which is what the tracker takes (default), or between "
-        "the recorded joints")  # fmt: skip
-    add("--n-dimensions", type=int, default=13, metavar="N",
-        help="of the principal axes of the postures (default 13)")  # fmt: skip
-    add("--n-postures", type=int, metavar="N",
-        help="of the mean performance (default the median length)")  # fmt: skip
-    add("--prominence", type=float, default=0.15, metavar="X",
-        help="of a key frame, share of the range of distances to the mean (default 0.15)")  # fmt: skip
-    for name, text in (
-        ("stay", "probability that somebody does the same thing a second later (default 0.8)"),
-        ("spread", "factor on the deviations, for persons it has not seen (default 1)"),
-        ("background", "factor on the deviation of everything, for none of them (default 1)"),
-        ("evidence-rate", "frames per second that count as independent (default 1)"),
-    ):
-        default = 0.8 if name == "stay" else 1.0
-        add(f"--{name}", type=float, default=default, metavar="X", help=f"of a bank: {text}")
-    add("--gate-dimensions", type=int, metavar="N",
-        help="of a bank: how many of the dimensions its gates look at (default all); 25 dimensions and 13 "
-        "here tell actions apart best")  # fmt: skip
-    add_seed(parser, "the trial of the gate")
+def _actions() -> tuple[Callable[..., int], tuple[Option, ...], tuple[Option, ...]]:
+    from torchpose.learning._recipes.actions import ActionRecipe, Performances
+
+    return fit_actions, _gathered(Performances.gather, "postures"), options_of(ActionRecipe)
 
 
-def _fit_actions(
-    args: Namespace, results: "ResultsFolder", out: Path, facts: dict[str, str]
-) -> str:
+def fit_actions(
+    recordings: list[str],
+    *,
+    out: str,
+    choice: dict[str, Any],
+    postures: str = "body",
+    recipe: dict[str, Any],
+    name: str = "",
+    licence: str = "",
+    pictures: bool = True,
+    given: Given,
+) -> int:
+    """Fit the postures of an action, or a bank of several actions.
+
+    They are for the constrained body tracker (track-body --action).
+
+    Args:
+        recordings: folders (with their subfolders) or files of whole bodies; $NAME stands for a variable
+            of the environment.
+        out: the model, NAME.safetensors.
+        choice: arguments of `Performances.gather`.
+        postures: on a body of average proportions, which is what the tracker takes ("body", default), or
+            between the recorded joints ("joints").
+        recipe: of `ActionRecipe`.
+        name: name in the model's metadata (default that of the file).
+        licence: licence of the recordings.
+        pictures: draw it. given: the command.
+    """
     from torchpose.learning._fit_files import write_action_files
-    from torchpose.learning._recipes.actions import ActionRecipe, Performances, fit_actions
+    from torchpose.learning._recipes import actions
 
-    names = ("n_dimensions", "n_postures", "prominence", "stay", "spread", "background",
-             "evidence_rate", "gate_dimensions", "seed")  # fmt: skip
-    recipe = ActionRecipe(**{name: getattr(args, name) for name in names})
-    if args.postures not in ("body", "joints"):
-        raise InputError(f"--postures must be body or joints, got {args.postures!r}")
-    pictures = pictures_possible(args.pictures)
-    performances = Performances.gather(
-        args.recordings, without=args.without_files, repeated=args.repeated,
-        postures=args.postures, **_chosen(args),
-    )  # fmt: skip
-    fitted = fit_actions(performances, recipe)
-    return write_action_files(fitted, results, out.name, pictures, **facts)
+    with _results(given, pictures) as (results, file, facts):
+        if postures not in ("body", "joints"):
+            raise InputError(f"--postures must be body or joints, got {postures!r}")
+        settings, pictures = actions.ActionRecipe(**recipe), pictures_possible(pictures)
+        performances = actions.Performances.gather(recordings, **choice, postures=postures)  # type: ignore[arg-type]
+        fitted = actions.fit_actions(performances, settings)
+        print(write_action_files(fitted, results, file.name, pictures, **facts))
+    return 0
 
 
-def _chosen(args: Namespace) -> dict[str, Any]:
-    """What all kinds choose recordings by."""
-    return {name: getattr(args, name) for name in _CHOICE}
-
-
-_OWN = {"manifold": _manifold_options, "limbs": _limb_options, "actions": _action_options}
-_FITS = {"manifold": _fit_manifold, "limbs": _fit_limbs, "actions": _fit_actions}
+_FITS = {"manifold": _manifold, "limbs": _limbs, "actions": _actions}

@@ -4,9 +4,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jsonargparse import ArgumentParser, Namespace
-
-from torchpose.cli.common import new_parser
+from torchpose.cli.command import Command
 from torchpose.errors import InputError
 
 if TYPE_CHECKING:
@@ -29,34 +27,19 @@ _NAME = 60  # characters of what stands on the left
 
 def main(arguments: list[str]) -> int:
     """Run the command and return its exit code."""
-    parser = build()
-    args = parser.parse_args(arguments)
-    if args.what is None and args.config:  # what may be left out, and then is not read from there
-        args.what = parser.parse_path(args.config[-1]).what
-    return run(args)
+    return Command("info", run, _EXAMPLES).main(arguments)
 
 
-def build() -> ArgumentParser:
-    """Parser of the command."""
-    parser = new_parser(
-        "info",
-        "Say which version and priors are there, or what a prior, a manifold, limb conditionals, an action "
-        "space or bank, a file of poses, keypoints or recordings, or a camera file holds.",
-        _EXAMPLES,
-    )
-    parser.add_argument(
-        "what",
-        nargs="?",
-        type=str,
-        metavar="PRIOR|FILE",
-        help="name of a prior or a model of whole bodies, a file or a folder",
-    )
-    return parser
+def run(what: str | None = None) -> int:
+    """Say which version and priors are there, or what a file holds.
 
+    That is a prior, a manifold, limb conditionals, an action space or bank, a file of poses, keypoints or
+    recordings, or a camera file.
 
-def run(args: Namespace) -> int:
-    """Print facts."""
-    print(_installation() if args.what is None else _describe(args.what))
+    Args:
+        what: name of a prior or a model of whole bodies, a file or a folder.
+    """
+    print(_installation() if what is None else _describe(what))
     return 0
 
 
@@ -113,14 +96,14 @@ def _describe(what: str) -> str:
 
 
 def _models_of(name: str) -> list[Path]:
-    """Files of the models of whole bodies that come with the package under this name."""
+    """Return the files of the models of whole bodies that come with the package under this name."""
     from torchpose.priors._shipped import KINDS, find_model, known_models
 
     return [find_model(kind, name) for kind in KINDS if name in known_models(kind)]
 
 
 def _describe_npz(path: Path) -> str:
-    """Poses, recordings or keypoints, by the keys."""
+    """Return what an .npz file holds, poses, recordings or keypoints by its keys."""
     from torchpose._core.reading import npz_keys
     from torchpose.io._keypoints import read_keypoints
 
@@ -142,7 +125,7 @@ def _describe_npz(path: Path) -> str:
 
 
 def describe_prior(prior: "UpperBodyPrior") -> str:
-    """What a prior's file says about itself."""
+    """Return what a prior's file says about itself."""
     from torchpose.cli.track_output import camera_text
 
     info = prior.info
@@ -172,7 +155,7 @@ def describe_prior(prior: "UpperBodyPrior") -> str:
 
 
 def describe_poses(path: Path) -> str:
-    """Frames, shares, uncertainty and notes of a file of poses."""
+    """Return the frames, shares, uncertainty and notes of a file of poses."""
     from torchpose.upper_body._pose_track import PoseTrack
 
     track = PoseTrack.load(path)
@@ -199,7 +182,7 @@ def describe_poses(path: Path) -> str:
 
 
 def _sample_sizes(size: "Tensor") -> str:
-    """Median effective sample size of each arm; empty where a file does not say."""
+    """Return the median effective sample size of each arm; empty where a file does not say."""
     known = size[size.isfinite().all(-1)]
     if not len(known):
         return ""
@@ -208,7 +191,7 @@ def _sample_sizes(size: "Tensor") -> str:
 
 
 def describe_keypoints(keypoints: "Keypoints") -> str:
-    """Frames, joints, camera of a file of keypoints."""
+    """Return the frames, joints and camera of a file of keypoints."""
     from torchpose.camera._pinhole import PinholeCamera
     from torchpose.cli.track_output import camera_text, percent
     from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -263,7 +246,7 @@ def _describe_cameras(path: Path) -> str:
 
 
 def _starts_as_keypoints(path: Path) -> bool:
-    """Whether the first line that is no comment is a header, as keypoints have and Kinect has not."""
+    """Return whether a table begins with a header, as keypoints do and recordings of a Kinect do not."""
     from torchpose._core.reading import reading, require_file
 
     path = require_file(path)
@@ -282,7 +265,7 @@ def _length(n_frames: int, fps: float | None) -> str:
 
 
 def _table(facts: dict[str, str]) -> str:
-    """Lines of a name and a value, further lines of which are indented; empty ones are left out."""
+    """Return lines of a name and a value, whose further lines are indented; empty values are left out."""
     from torchpose.errors import printable
 
     rows = {printable(name, _NAME): value.split("\n") for name, value in facts.items() if value}

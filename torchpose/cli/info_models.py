@@ -1,4 +1,4 @@
-"""What `torchpose info` says of what the body trackers learn: manifolds, limbs, actions; and of poses."""
+"""What `torchpose info` says of models of whole bodies (manifolds, limbs, actions) and of their poses."""
 
 import math
 from collections.abc import Callable
@@ -12,7 +12,7 @@ _LISTED, _SOURCES = 12, 3  # persons or actions that are named, and sources
 
 
 def describe_manifold(path: Path) -> Facts:
-    """A manifold of poses."""
+    """Return what a manifold of poses is."""
     from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 
     manifold = BackConstrainedGPLVM.load(path)
@@ -33,7 +33,7 @@ def describe_manifold(path: Path) -> Facts:
 
 
 def describe_limbs(path: Path) -> Facts:
-    """Limb conditionals: how far each limb turns against the one above it, and how fast."""
+    """Return what limb conditionals are: how far each limb turns against the one above it, and how fast."""
     from torchpose.priors._limb_conditionals import LimbConditionals
 
     limbs = LimbConditionals.load(path)
@@ -60,7 +60,7 @@ def describe_limbs(path: Path) -> Facts:
 
 
 def describe_action(path: Path) -> Facts:
-    """The postures of one action."""
+    """Return what the postures of one action are."""
     from torchpose.priors._actions.space import ActionSpace
 
     space = ActionSpace.load(path)
@@ -84,7 +84,7 @@ def describe_action(path: Path) -> Facts:
 
 
 def describe_bank(path: Path) -> Facts:
-    """The postures of several actions."""
+    """Return what the postures of several actions are."""
     from torchpose.priors._actions.bank import ActionBank
 
     bank = ActionBank.load(path)
@@ -120,7 +120,7 @@ DESCRIBED: dict[str, Callable[[Path], Facts]] = {
 
 
 def describe_body_poses(path: Path) -> Facts:
-    """Poses of a whole body, from `torchpose track-body`."""
+    """Return what poses of a whole body are, from `torchpose track-body`."""
     from torchpose.cli.track_body_output import action_text
     from torchpose.whole_body._poses import BodyPoses
 
@@ -145,7 +145,7 @@ def describe_body_poses(path: Path) -> Facts:
 
 
 def _degrees(covariance: Any) -> list[float]:
-    """Deviation of a rotation's angle; vectors are sines of half angles."""
+    """Return the standard deviation of each rotation's angle in degrees, from sines of half angles."""
     trace = covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
     return [math.degrees(2 * math.asin(min(1.0, math.sqrt(value)))) for value in trace.tolist()]
 

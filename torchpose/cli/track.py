@@ -4,9 +4,21 @@ from argparse import ArgumentError
 from pathlib import Path
 from typing import Any
 
-from jsonargparse import ArgumentParser, Namespace
-
-from torchpose.cli.common import add_seed, new_parser
+from torchpose._core.terminal import check_positive, show_progress
+from torchpose.cli.command import Command, Given
+from torchpose.cli.common import pictures_possible
+from torchpose.cli.options import Option, options_of, options_of_methods
+from torchpose.cli.track_output import (
+    Job,
+    camera_text,
+    report_failure,
+    smoothing_text,
+    summary,
+    track_results,
+    write_pictures,
+    write_track,
+)
+from torchpose.errors import InputError
 
 _EXAMPLES = """
 torchpose track clip.mp4 --out result
@@ -20,197 +32,130 @@ torchpose track keypoints.npz --out result --print_config > track.yaml
 torchpose track --config track.yaml"""
 _JOINT_STDS = 5
 _KEYPOINT_FILES = (".npz", ".csv")
+PYTHON_ONLY = frozenset({
+    "likelihood_power", "uniform_weight", "transition", "gamma", "subspace", "burn_in",
+    "burn_in_scale", "weighting", "reset_below", "resample_threshold", "resampling", "start",
+})  # fmt: skip
+"""Options of the shipped methods that only Python has: what the papers' experiments vary."""
 
 
 def main(arguments: list[str]) -> int:
     """Run the command and return its exit code."""
-    return run(build().parse_args(arguments))
+    return command().main(arguments)
 
 
-def build() -> ArgumentParser:
-    """Parser of the command."""
+def command() -> Command:
+    """Return the command, with the methods that are registered now."""
+    from torchpose.upper_body._keypoint_files import TrackSettings
     from torchpose.upper_body._methods import METHODS
+    from torchpose.video._tracker import VideoTracker
 
-    parser = new_parser(
+    settings = [
+        option._replace(text=f"{option.text}. There are {', '.join(METHODS)}")
+        if option.name == "method"
+        else option
+        for option in options_of(TrackSettings)
+    ]
+    names = {option.name for option in settings}
+    video = options_of(VideoTracker, leave_out=names)
+    return Command(
         "track",
-        "Track everybody in a video, a folder of images or the picture of a camera; or a person from "
-        "2D keypoints of head, neck and hands, or any others of the upper body, gaps and all. Writes "
-        "poses.npz, poses.csv, poses.bvh and pictures into a folder, of video also overlay.mp4 and "
-        "report.html.",
+        run,
         _EXAMPLES,
+        {
+            "settings": settings,
+            "video": [option._replace(text=f"video: {option.text}") for option in video],
+            "method_options": _method_options(names),
+        },
+        parse={"measurement_std": parse_stds, "smoothing": parse_smoothing},
+        metavars={"frame": "camera|body", "hands": "grid|mean-shift"},
     )
-    add = parser.add_argument
-    add(
-        "input",
-        type=str,
-        metavar="INPUT",
-        help="a video file, a folder of images, or the number of a camera; or keypoints: .npz, .csv or "
-        "a folder of OpenPose JSON files. Digits are a camera only if no such path exists",
-    )
-    add("--out", type=str, required=True, metavar="DIR", help="folder of the results")
-    add(
-        "--prior",
-        type=str,
-        default="kinect-upper-body",
-        metavar="NAME|FILE",
-        help="a prior that comes with torchpose, or a .safetensors file (default kinect-upper-body)",
-    )
-    add(
-        "--method",
-        type=str,
-        metavar="METHOD",
-        help=f"one of {', '.join(METHODS)}; by default window-mixture if the prior brings windows that "
-        "suit, else mkf-fixed",
-    )
-    add(
-        "--camera",
-        type=str,
-        metavar="FILE|fx,fy,cx,cy",
-        help="TOML file or four numbers in pixels; without it K or the image size of the input",
-    )
-    add("--camera-name", type=str, metavar="NAME", help="which camera of a file with several")
-    add(
-        "--measurement-std",
-        type=parse_stds,
-        metavar="PX",
-        help="standard deviation of a keypoint in pixels: one number, or five with commas for hand, "
-        "elbow, shoulder, head, neck; by default what the prior learnt, else 3",
-    )
-    add(
-        "--smoothing",
-        type=parse_smoothing,
-        metavar="N|full",
-        help="use N later frames, or all of them, for each estimate (window-mixture and mkf-fixed)",
-    )
-    add("--n-particles", type=int, metavar="N", help="particles of the pf methods (default 10000)")
-    add("--n-tracks", type=int, metavar="N", help="tracks of mkf-sampled and mkf-split")
-    add(
-        "--frame",
-        type=str,
-        default="camera",
-        metavar="camera|body",
-        help="axes of the 3D poses: of the camera (default) or of the body",
-    )
-    add(
-        "--static-camera",
-        type=bool,
-        default=False,
-        metavar="true|false",
-        help="let the body turn in front of a camera that stays where it is (default false)",
-    )
-    add(
-        "--window",
-        type=bool | None,
-        default=None,
-        metavar="true|false",
-        help="deprecated: false stands for --method mkf-fixed, true for the default",
-    )
-    add(
-        "--steady",
-        type=bool | None,
-        default=None,
-        metavar="true|false",
-        help="take the trembling out of what windows give, by filters of constant velocity (default "
-        "true for window-mixture)",
-    )
-    add(
-        "--neck",
-        type=str,
-        metavar="KIND",
-        help="kind of the keypoints' neck if their names do not tell: neck, low-neck, mid-shoulder",
-    )
-    add(
-        "--nose-as-head",
-        type=bool,
-        default=False,
-        metavar="true|false",
-        help="take a nose for the head where there is none (default false)",
-    )
-    add(
-        "--fps",
-        type=float,
-        metavar="HZ",
-        help="frames per second, if the input does not say or errs; a video file is resampled to it",
-    )
-    add(
-        "--max-gap",
-        type=float | None,
-        default=5.0,
-        metavar="S",
-        help="longest stretch without any keypoint, in seconds, null for no bound (default 5); in "
-        "video, somebody who is away for longer has no pose until they come back",
-    )
-    add_seed(parser, "the methods that draw")
-    add(
-        "--hands",
-        type=str,
-        default="grid",
-        metavar="grid|mean-shift",
-        help="video: how hands are found (default grid; mean-shift is the paper's recipe)",
-    )
-    add(
-        "--background",
-        type=bool,
-        default=False,
-        metavar="true|false",
-        help="video: tell what moves from what does not, for a camera that stands still (default "
-        "false)",
-    )
-    add(
-        "--edges",
-        type=bool,
-        default=False,
-        metavar="true|false",
-        help="video: correct hands that were taken for each other by the edges of the arms (default "
-        "false)",
-    )
-    add(
-        "--candidates",
-        type=bool,
-        default=False,
-        metavar="true|false",
-        help="video: look for hands where the last pose has them as well; slower (default false)",
-    )
-    add(
-        "--elbows",
-        type=bool,
-        default=False,
-        metavar="true|false",
-        help="video: measure elbows where the torso with its sleeves is widest (default false)",
-    )
-    add(
-        "--face-model",
-        type=str,
-        metavar="FILE",
-        help="video: a face detector of MediaPipe (.tflite) in place of OpenCV's cascade; needs "
-        "mediapipe",
-    )
-    add("--max-persons", type=int, metavar="N", help="video: follow only the N largest faces")
-    add(
-        "--overlay",
-        type=bool,
-        default=True,
-        metavar="true|false",
-        help="video: write overlay.mp4 and report.html (default true)",
-    )
-    add("--pictures", type=bool, default=True, metavar="true|false",
-        help="draw pose_strip.png and joint_curves.png (default true)")  # fmt: skip
-    return parser
 
 
-def run(args: Namespace) -> int:
-    """Track, write and report; every check comes before any work."""
-    if is_video(args.input):
+def _method_options(leave_out: set[str]) -> tuple[Option, ...]:
+    """Return the options of single methods that are no settings of all."""
+    from torchpose.upper_body._methods import METHODS, method_options
+    from torchpose.upper_body._single_poses import PoseFilter
+
+    having = {}
+    for name, method in METHODS.items():
+        options = options_of(method.filter if isinstance(method, PoseFilter) else method)
+        having[name] = [option for option in options if option.name in method_options(name)]
+    return options_of_methods(having, leave_out | PYTHON_ONLY)
+
+
+def run(
+    input: str,
+    *,
+    out: str,
+    settings: dict[str, Any],
+    video: dict[str, Any],
+    face_model: str | None = None,
+    method_options: dict[str, Any],
+    overlay: bool = True,
+    pictures: bool = True,
+    given: Given,
+) -> int:
+    """Track everybody in a video, or a person from 2D keypoints; write poses and what shows them.
+
+    A video may be a folder of images or the picture of a camera; keypoints are those of head, neck and
+    hands, or any others of the upper body, gaps and all. Writes poses.npz, poses.csv, poses.bvh and
+    pictures into a folder, of video also overlay.mp4 and report.html.
+
+    Args:
+        input: a video file, a folder of images, or the number of a camera; or keypoints: .npz, .csv or a
+            folder of OpenPose JSON files. Digits are a camera only if no such path exists.
+        out: folder of the results.
+        settings: of `TrackSettings`. video: options of `VideoTracker`. method_options: of the method.
+        face_model: video: a face detector of MediaPipe (.tflite) in place of OpenCV's cascade; needs
+            mediapipe.
+        overlay: video: write overlay.mp4 and report.html.
+        pictures: draw pose_strip.png and joint_curves.png.
+        given: the command.
+
+    Returns:
+        The exit code: 1 if the filter degenerated, or if there is nobody in the video.
+    """
+    from torchpose.upper_body._keypoint_files import TrackSettings
+
+    if settings["prior"] is None:  # as a configuration may say it
+        raise InputError("--prior must be a name or a file, got null")
+    for option in ("fps", "max_gap"):
+        check_positive(f"--{option.replace('_', '-')}", settings[option])
+    options = {name: value for name, value in method_options.items() if value is not None}
+    job = Job(input, out, given.files(), TrackSettings(**settings), options, pictures)
+    if is_video(input):
         from torchpose.cli.track_video import track_video
 
-        return track_video(args)
-    from torchpose.cli.track_keypoints import track_keypoints
+        return track_video(job, video, face_model, overlay)
+    return track_keypoints(job)
 
-    return track_keypoints(args)
+
+def track_keypoints(job: Job) -> int:
+    """Track keypoints, write and report, and return the exit code; every check comes before any work."""
+    from torchpose.io._keypoints import read_keypoints
+    from torchpose.upper_body._keypoint_files import KeypointFileTracker
+
+    keypoints = read_keypoints(job.input)
+    tracker = KeypointFileTracker(job.settings, options=job.options)
+    prepared = tracker.prepare(keypoints)
+    pictures = pictures_possible(job.pictures)
+    with track_results(job.out, job.files, pictures, video=False) as results:
+        track = tracker.track(keypoints, prepared, show_progress())
+        written = results.commit(write_track(track, results.stage))
+        if pictures:
+            written += results.commit(write_pictures(track, results.stage))
+    facts = {
+        "prior": tracker.prior.info.name or job.settings.prior,
+        "camera": camera_text(prepared.camera),
+        "method": track.method + smoothing_text(job.settings.smoothing),
+    }
+    print(summary(track, written, facts, results.notes))
+    return report_failure(track)
 
 
 def is_video(where: str) -> bool:
-    """Whether it is a video, a folder of images or a camera, and not keypoints."""
+    """Return whether it is a video, a folder of images or a camera, and not keypoints."""
     path = Path(where)
     if path.is_dir():
         return not any(path.glob("*.json"))
@@ -218,7 +163,11 @@ def is_video(where: str) -> bool:
 
 
 def parse_stds(value: Any) -> float | list[float] | None:
-    """One number or five, from text with commas, a number or a list."""
+    """Return one number or five, from text with commas, a number or a list.
+
+    Raises:
+        ArgumentError: anything else.
+    """
     parts = value.split(",") if isinstance(value, str) else value
     try:
         numbers = [float(p) for p in (parts if isinstance(parts, list) else [parts])]
@@ -235,7 +184,11 @@ def parse_stds(value: Any) -> float | list[float] | None:
 
 
 def parse_smoothing(value: Any) -> int | str:
-    """A number of frames or "full"."""
+    """Return a number of frames or "full".
+
+    Raises:
+        ArgumentError: anything else.
+    """
     if value == "full":
         return "full"
     try:

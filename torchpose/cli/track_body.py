@@ -7,11 +7,12 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from jsonargparse import ArgumentParser, Namespace
-
 from torchpose._core.terminal import check_positive, show_progress
-from torchpose.cli.common import add_seed, new_parser, pictures_possible, share_cores
+from torchpose.cli.command import Command, Given
+from torchpose.cli.common import pictures_possible, share_cores
+from torchpose.cli.options import Option, options_of, options_of_methods
 from torchpose.cli.track_body_output import (
+    Recordings,
     body_results,
     draw,
     facts_of,
@@ -19,7 +20,6 @@ from torchpose.cli.track_body_output import (
     write_page,
     write_poses,
 )
-from torchpose.cli.track_body_videos import Recordings
 from torchpose.errors import CameraError, DegenerateFilterWarning, InputError, NobodySeenError
 
 if TYPE_CHECKING:
@@ -34,90 +34,125 @@ torchpose track-body cameras.toml cam*.mp4 --manifold walk --out result
 torchpose track-body cameras.toml cam*.mp4 --method root --conditionals walk --out result
 torchpose track-body cameras.toml cam1.mp4 --method constrained --action bend.safetensors --out result
 torchpose track-body cameras.toml cam*.mp4 --body result/body.npz --facing [1,0,0] --out again"""
-_LEARNT = ("manifold", "conditionals", "action")
+PYTHON_ONLY = frozenset({
+    "weights", "proposal", "step_std", "likelihood", "limit_mode", "resampling",
+    "resample_threshold", "estimate", "leg_swap", "limb_shape", "respread_scale", "n_layers",
+    "survival_rate", "schedule", "noise_decay", "survival_per_second", "normalisation",
+    "camera_rule", "observation_sharpness", "least_std", "first_std", "weighting",
+    "velocity_rate", "max_redraws", "gate_width",
+})  # fmt: skip
+"""Options of the shipped filters that only Python has: what the papers' experiments vary."""
 
 
 def main(arguments: list[str]) -> int:
     """Run the command and return its exit code."""
-    return run(build().parse_args(arguments))
+    return command().main(arguments)
 
 
-def build() -> ArgumentParser:
-    """Return the parser of the command."""
+def command() -> Command:
+    """Return the command, with the filters that are registered now."""
     from torchpose.whole_body._methods import METHODS
+    from torchpose.whole_body._tracker import BodyTracker
 
-    parser = new_parser(
+    return Command(
         "track-body",
-        "Track one person's whole body through the videos of calibrated cameras that stand still, by "
-        "silhouettes and a particle filter. Writes body.npz, joints.csv, an overlay of every camera, "
-        "report.html and a picture into a folder.",
+        run,
         _EXAMPLES,
+        {
+            "tracker": options_of(BodyTracker, ("cameras", "method", "fps")),
+            "method_options": _method_options(),
+        },
+        spaced=("videos", "background"),
+        metavars={"cameras": "CAMERAS", "method": "|".join(METHODS), "background": "FILE"},
     )
-    add = parser.add_argument
-    add("cameras", type=str, metavar="CAMERAS",
-        help="TOML file with a table per camera: size, matrix, distortions, and its pose")  # fmt: skip
-    add("videos", type=str, nargs="+", metavar="VIDEO",
-        help="a video or a folder of images per camera, in the order of the file, in step")  # fmt: skip
-    add("--out", type=str, required=True, metavar="DIR", help="folder of the results")
-    add("--camera-names", type=list[str] | None, default=None, metavar="NAMES",
-        help="which cameras of the file the videos are of, if not all in order")  # fmt: skip
-    add("--background", type=str, nargs="+", metavar="FILE",
-        help="picture, folder of pictures or video of the empty scene per camera; without, what stays "
-        "in a video is its background, so the person has to move about")  # fmt: skip
-    add("--ignore-still", type=bool, default=False, metavar="true|false",
-        help="with --background: what always looks the same in a video was moved since the scene was "
-        "empty, and is no person; not for somebody who stands still (default false)")  # fmt: skip
-    add("--method", type=str, metavar="|".join(METHODS),
-        help="manifold-regularised (needs --manifold), annealed, plain, root hypotheses with Gaussian "
-        "limbs (needs --conditionals), or constrained to an action (needs --action) particle filter "
-        "(default what the file given is for, else apf)")  # fmt: skip
-    add("--manifold", type=str, metavar="NAME|FILE",
-        help="poses of an action, by a name that `torchpose info` lists, or a file")  # fmt: skip
-    add("--conditionals", type=str, metavar="NAME|FILE",
-        help="how limbs stand to each other and turn, by name, or a file")  # fmt: skip
-    add("--action", type=str, metavar="NAME|FILE",
-        help="postures of an action, or of several, by name, or a file")  # fmt: skip
-    add("--height", type=float, default=1.75, metavar="M",
-        help="height of the person, metres (default 1.75)")  # fmt: skip
-    add("--body", type=str, metavar="FILE",
-        help="a body.npz whose bone lengths and shape the person has; then --height is not used")  # fmt: skip
-    add("--initial-pose", type=str, metavar="FILE",
-        help="a body.npz whose first pose the person begins with; without, it is found")  # fmt: skip
-    add("--facing", type=list[float] | None, default=None, metavar="[x,y,z]",
-        help="where the person looks at first, in world axes; without, the first steps and the bend of "
-        "the knees tell, which one who walks backwards or stands straight gets wrong")  # fmt: skip
-    add(
-        "--rows", type=int, default=160, metavar="N", help="height of the silhouettes (default 160)"
-    )
-    add("--n-particles", type=int, default=1000, metavar="N",
-        help="particles, of all layers together; a root hypothesis counts seven (default 1000)")  # fmt: skip
-    add("--sharpness", type=float, metavar="X",
-        help="exponent of the likelihood; not for root (default 100, of the overlap that constrained "
-        "goes by 30; the papers have 1)")  # fmt: skip
-    add("--fps", type=float, metavar="HZ", help="rate at which all videos are read")
-    add("--delays", type=list[int] | None, default=None, metavar="[n,n,...]",
-        help="frames by which each video began too early (default none)")  # fmt: skip
-    add_seed(parser, "the filter")
-    add("--overlay", type=bool, default=True, metavar="true|false",
-        help="write a video per camera with the body drawn into it (default true)")  # fmt: skip
-    add("--pictures", type=bool, default=True, metavar="true|false",
-        help="write overlay.png (default true)")  # fmt: skip
-    return parser
 
 
-def run(args: Namespace) -> int:
-    """Track, write and report; exit code 1 if nobody was seen or the filter lost the person."""
-    _check(args)
+def _method_options() -> tuple[Option, ...]:
+    """Return the options of single filters; the sharpness is the command's own, with its usual values."""
+    from torchpose.whole_body._methods import METHODS, method_options
+
+    having = {
+        name: [one for one in options_of(method.filter) if one.name in method_options(name)]
+        for name, method in METHODS.items()
+    }
+    return options_of_methods(having, PYTHON_ONLY | {"sharpness"})
+
+
+def run(
+    cameras: str,
+    videos: list[str],
+    *,
+    out: str,
+    camera_names: list[str] | None = None,
+    background: list[str] | None = None,
+    ignore_still: bool = False,
+    method: str | None = None,
+    tracker: dict[str, Any],
+    initial_pose: str | None = None,
+    facing: list[float] | None = None,
+    rows: int = 160,
+    sharpness: float | None = None,
+    method_options: dict[str, Any],
+    fps: float | None = None,
+    delays: list[int] | None = None,
+    seed: int = 0,
+    overlay: bool = True,
+    pictures: bool = True,
+    given: Given,
+) -> int:
+    """Track one person's whole body through videos of calibrated cameras, by silhouettes.
+
+    The cameras stand still. Writes body.npz, joints.csv, an overlay of every camera, report.html and a
+    picture into a folder.
+
+    Args:
+        cameras: TOML file with a table per camera: size, matrix, distortions, and its pose.
+        videos: a video or a folder of images per camera, in the order of the file, in step.
+        out: folder of the results.
+        camera_names: which cameras of the file the videos are of, if not all in order.
+        background: picture, folder of pictures or video of the empty scene per camera; without, what
+            stays in a video is its background, so the person has to move about.
+        ignore_still: with --background: what always looks the same in a video was moved since the scene
+            was empty, and is no person; not for somebody who stands still.
+        method: manifold-regularised (needs --manifold), annealed, plain, root hypotheses with Gaussian
+            limbs (needs --conditionals), or constrained to an action (needs --action) particle filter
+            (default what the file given is for, else apf).
+        tracker: arguments of `BodyTracker`.
+        initial_pose: a body.npz whose first pose the person begins with; without, it is found.
+        facing: where the person looks at first, in world axes; without, the first steps and the bend of
+            the knees tell, which one who walks backwards or stands straight gets wrong.
+        rows: height of the silhouettes.
+        sharpness: exponent of the likelihood; not for root (default 100, of the overlap that constrained
+            goes by 30; the papers have 1).
+        method_options: of the filter.
+        fps: rate at which all videos are read.
+        delays: frames by which each video began too early (default none).
+        seed: seed of the filter.
+        overlay: write a video per camera with the body drawn into it.
+        pictures: write overlay.png.
+        given: the command.
+
+    Returns:
+        The exit code: 1 if nobody was seen or the filter lost the person.
+    """
+    _check(given.values)
     share_cores()
-    cameras = _cameras(args)
-    learnt = _learnt(args)
-    pictures = pictures_possible(args.pictures)
+    found = _cameras(cameras, camera_names, len(videos))
+    options = {"sharpness": sharpness, **method_options}
+    options = {name: value for name, value in options.items() if value is not None}
+    tracker |= _models(method, tracker, options, initial_pose)
+    pictures = pictures_possible(pictures)
     with ExitStack() as stack:
-        results = stack.enter_context(body_results(args, cameras, pictures))
-        with Recordings(args, cameras) as recordings:
+        files = given.files()
+        results = stack.enter_context(body_results(out, files, found, overlay, pictures))
+        recordings = Recordings(
+            videos, found, rows, fps=fps, delays=delays, background=background,
+            ignore_still=ignore_still,
+        )  # fmt: skip
+        with recordings:
             start = time.perf_counter()
-            tracker = _tracker(args, recordings, learnt)
-            poses = _track(args, recordings, tracker)
+            body_tracker = _tracker(recordings, method, tracker, options)
+            poses = _track(recordings, body_tracker, initial_pose, facing, seed)
             seconds = time.perf_counter() - start
             if poses is None:
                 print(
@@ -127,91 +162,98 @@ def run(args: Namespace) -> int:
                 return 1
             written = results.commit(write_poses(results.stage, poses))
             shown = []
-            if args.overlay or pictures:
-                shown = draw(recordings, poses, results.stage, args.overlay, pictures)
-        facts = facts_of(args, tracker, recordings, poses, seconds)
+            if overlay or pictures:
+                shown = draw(recordings, poses, results.stage, overlay, pictures)
+        facts = facts_of(given, body_tracker, recordings, poses, seconds)
         shown += write_page(recordings, poses, facts, results.stage)
         written += results.commit(shown)
     return summary(poses, facts, written, results.notes)
 
 
-def _check(args: Namespace) -> None:
-    for option, value in (("--height", args.height), ("--sharpness", args.sharpness),
-                          ("--rows", args.rows), ("--n-particles", args.n_particles),
-                          ("--fps", args.fps)):  # fmt: skip
-        check_positive(option, value)
-    if args.facing is not None and len(args.facing) != 3:
-        raise InputError(f"--facing must be three numbers, got {args.facing}")
-    if args.ignore_still and not args.background:
+def _check(values: dict[str, Any]) -> None:
+    """Raise `InputError` for values out of range, and for lists that do not go with the videos."""
+    for key in ("height", "sharpness", "rows", "n_particles", "fps"):
+        check_positive(f"--{key.replace('_', '-')}", values[key])
+    facing, n_videos = values["facing"], len(values["videos"])
+    if facing is not None and len(facing) != 3:
+        raise InputError(f"--facing must be three numbers, got {facing}")
+    if values["ignore_still"] and not values["background"]:
         raise InputError("--ignore-still true needs --background")
-    for option, given in (("--background", args.background), ("--delays", args.delays)):
-        if given and len(given) != len(args.videos):
+    for key in ("background", "delays"):
+        given = values[key]
+        if given and len(given) != n_videos:
             raise InputError(
-                f"{option} needs one entry for each of the {len(args.videos)} videos, "
-                f"got {len(given)}"
+                f"--{key} needs one entry for each of the {n_videos} videos, got {len(given)}"
             )
 
 
-def _cameras(args: Namespace) -> "list[PinholeCamera]":
+def _cameras(file: str, names: list[str] | None, n_videos: int) -> "list[PinholeCamera]":
     from torchpose.camera._pinhole import load_cameras
 
-    found = load_cameras(args.cameras)
-    names = list(found) if args.camera_names is None else args.camera_names
+    found = load_cameras(file)
+    names = list(found) if names is None else names
     missing = [name for name in names if name not in found]
-    if missing or len(names) != len(args.videos):
+    if missing or len(names) != n_videos:
         raise CameraError(
-            f"{args.cameras}: expected a camera for each of the {len(args.videos)} videos, got "
+            f"{file}: expected a camera for each of the {n_videos} videos, got "
             f"{', '.join(names)}; it holds {', '.join(found)} (choose by --camera-names)"
         )
     return [found[name] for name in names]
 
 
-def _learnt(args: Namespace) -> dict[str, Any]:
+def _models(
+    method: str | None,
+    tracker: dict[str, Any],
+    options: dict[str, Any],
+    initial_pose: str | None,
+) -> dict[str, Any]:
     """Return the models that the options name; refuse options that do not go together."""
     from torchpose.whole_body._methods import LEARNT, METHODS, check_options, choose_method
 
-    given = {kind: getattr(args, kind) for kind in _LEARNT if getattr(args, kind)}
-    method = choose_method(args.method, given)
-    if args.sharpness is not None:
-        check_options(method, ["sharpness"])
-    if args.initial_pose and "manifold" in given and METHODS[method].needs != "manifold":
-        raise InputError(f"--manifold does nothing for --method {method} with an initial pose")
+    given = {kind: tracker[kind] for kind in LEARNT if tracker[kind]}
+    chosen = choose_method(method, given)
+    check_options(chosen, options)
+    if initial_pose and "manifold" in given and METHODS[chosen].needs != "manifold":
+        raise InputError(f"--manifold does nothing for --method {chosen} with an initial pose")
     return {kind: LEARNT[kind].load(name) for kind, name in given.items()}
 
 
-def _tracker(args: Namespace, recordings: "Recordings", learnt: dict[str, Any]) -> "BodyTracker":
+def _tracker(
+    recordings: Recordings, method: str | None, arguments: dict[str, Any], options: dict[str, Any]
+) -> "BodyTracker":
     from torchpose.whole_body._tracker import BodyTracker
 
-    options = {} if args.sharpness is None else {"sharpness": args.sharpness}
-    return BodyTracker(
-        recordings.rig, args.method, body=args.body, height=args.height, **learnt,
-        n_particles=args.n_particles, fps=recordings.fps, **options,
-    )  # fmt: skip
+    return BodyTracker(recordings.rig, method, fps=recordings.fps, **arguments, **options)
 
 
-def _track(args: Namespace, recordings: "Recordings", tracker: "BodyTracker") -> "BodyPoses | None":
-    """Find the person, then track; None if there is nobody."""
+def _track(
+    recordings: Recordings,
+    tracker: "BodyTracker",
+    initial_pose: str | None,
+    facing: list[float] | None,
+    seed: int,
+) -> "BodyPoses | None":
+    """Find the person, then track; return None if there is nobody."""
     import torch
 
     from torchpose.body._fitting import fit_state
     from torchpose.whole_body._poses import BodyPoses
 
-    start, facing = None, None
+    start = None
     frames = recordings.silhouettes()
-    if args.initial_pose:
-        recorded = BodyPoses.load(args.initial_pose)
+    if initial_pose:
+        recorded = BodyPoses.load(initial_pose)
         start = fit_state(tracker.body, recorded.joints3d[:1])[0]
     else:
         print("finding the pose of the first frame ...", flush=True)
-    if args.facing is not None:
-        facing = torch.tensor(args.facing, dtype=torch.float64)
-    generator = torch.Generator().manual_seed(args.seed)
+    direction = None if facing is None else torch.tensor(facing, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(seed)
     with warnings.catch_warnings():
         # said in a note, with the numbers of the frames
         warnings.filterwarnings("ignore", "the gate rejected", DegenerateFilterWarning)
         try:
             poses = tracker(
-                frames, start, generator, show_progress(), facing=facing,
+                frames, start, generator, show_progress(), facing=direction,
                 n_frames=recordings.n_frames,
             )  # fmt: skip
         except NobodySeenError:

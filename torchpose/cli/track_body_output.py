@@ -1,25 +1,25 @@
-"""What `torchpose track-body` writes and prints."""
+"""What `torchpose track-body` reads, writes and prints: videos as silhouettes, poses, pictures, words."""
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from jsonargparse import Namespace
-
-from torchpose.cli.common import input_files
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from torchpose.camera._pinhole import PinholeCamera
-    from torchpose.cli.track_body_videos import Recordings
+    from torchpose.camera._rig import CameraRig
+    from torchpose.cli.command import Given
     from torchpose.io._results import ResultsFolder
-    from torchpose.video._silhouettes import SilhouetteView
+    from torchpose.video._base import VideoSource
+    from torchpose.video._silhouettes import SilhouetteMeasurer, SilhouetteView
     from torchpose.whole_body._poses import BodyPoses
     from torchpose.whole_body._tracker import BodyTracker
 
 __all__ = [
+    "Recordings",
     "action_text",
     "body_results",
     "draw",
@@ -35,20 +35,154 @@ _OWN = r"body\.npz|joints\.csv|overlay(_.+\.mp4|\.png)|report\.html"
 _MOST_RUNS = 8  # of actions that are listed by their frames
 
 
+class Recordings:
+    """The videos, how each becomes silhouettes, and the silhouettes that were seen so far.
+
+    A context manager, which closes the videos.
+
+    Args:
+        videos: a file or a folder of images for each camera. cameras: in the same order.
+        rows: height of the silhouettes. fps: rate at which all are read, by default their own.
+        delays: frames by which each began too early. background: of the empty scene for each camera.
+        ignore_still: whether what always looks the same in a video is no person.
+    """
+
+    def __init__(
+        self,
+        videos: Sequence[str],
+        cameras: "Sequence[PinholeCamera]",
+        rows: int,
+        *,
+        fps: float | None = None,
+        delays: Sequence[int] | None = None,
+        background: Sequence[str] | None = None,
+        ignore_still: bool = False,
+    ) -> None:
+        from torchpose.video._silhouettes import fit_views
+
+        self.videos, self._fps, self.background = videos, fps, background or ()
+        self._delays, self._ignore_still = delays, ignore_still
+        self.sources = self._open()
+        self.views = fit_views(cameras, [s.size for s in self.sources], rows)
+        self.packed: list[Any] = []
+        self.notes: list[str] = []
+
+    def __enter__(self) -> "Recordings":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for source in self.sources:
+            source.close()
+
+    @cached_property
+    def rig(self) -> "CameraRig":
+        """Return the cameras of the silhouettes."""
+        from torchpose.camera._rig import CameraRig
+
+        return CameraRig([view.camera for view in self.views])
+
+    @property
+    def fps(self) -> float:
+        """Return the frames per second."""
+        return float(self.sources[0].fps)
+
+    @property
+    def n_frames(self) -> int | None:
+        """Return how many frames to expect, None if unknown."""
+        counts = [s.n_frames for s in self.sources if s.n_frames is not None]
+        return min(counts, default=None)
+
+    def silhouettes(self) -> "Iterator[Tensor]":
+        """Learn the background; return silhouettes [C, H, W] of one frame after the other.
+
+        They are kept, a bit per pixel.
+        """
+        return self._read(self._measurers())
+
+    def _read(self, measurers: "list[SilhouetteMeasurer]") -> "Iterator[Tensor]":
+        import numpy as np
+
+        from torchpose.video._silhouettes import read_silhouettes
+
+        for masks in read_silhouettes(self.sources, measurers, self._delays):
+            self.packed.append(np.packbits(masks.numpy(), axis=-1))
+            yield masks
+
+    def kept(self, frame: int) -> "Tensor":
+        """Return the silhouettes of a frame that was read."""
+        import numpy as np
+        import torch
+
+        width = self.rig.sizes[0][1]  # type: ignore[index]  # views have sizes
+        bits = np.unpackbits(self.packed[frame], axis=-1)[..., :width]
+        return torch.from_numpy(bits.astype(bool))
+
+    def images(self) -> Iterator[tuple[Any, ...]]:
+        """Read the frames of all cameras once more."""
+        from torchpose.video._silhouettes import frames_in_step
+
+        sources = self._open()
+        try:
+            for frames in frames_in_step(sources, self._delays or [0] * len(sources)):
+                yield tuple(frame.image for frame in frames)
+        finally:
+            for source in sources:
+                source.close()
+
+    def _open(self) -> "list[VideoSource]":
+        from torchpose.video._source import open_video
+
+        return [open_video(path, fps=self._fps) for path in self.videos]
+
+    def _measurers(self) -> "list[SilhouetteMeasurer]":
+        from torchpose.video._silhouettes import (
+            SilhouetteMeasurer,
+            learning_frames,
+            read_empty_scene,
+        )
+        from torchpose.video._source import open_video
+
+        print("learning the background ...", flush=True)
+        empty = [read_empty_scene(path) for path in self.background]
+        if not empty:
+            self.notes.append(
+                "without --background what stays in the videos is taken for their background; a part "
+                "of the person that never moves is taken for it, too"
+            )
+        measurers = []
+        for i, (view, path) in enumerate(zip(self.views, self.videos, strict=True)):
+            if empty and not self._ignore_still:
+                measurers.append(SilhouetteMeasurer(view, empty[i]))
+                continue
+            with open_video(path, fps=self._fps) as source:
+                frames = learning_frames(source)
+                measurers.append(SilhouetteMeasurer(view, empty[i] if empty else None, frames))
+        return measurers
+
+
 def body_results(
-    args: Namespace, cameras: "Sequence[PinholeCamera]", pictures: bool
+    out: str,
+    files: Sequence[Path],
+    cameras: "Sequence[PinholeCamera]",
+    overlay: bool,
+    pictures: bool,
 ) -> "ResultsFolder":
-    """Return the folder of `--out`, for poses of a body and what shows them."""
+    """Return the folder of `--out`, for poses of a body and what shows them.
+
+    Args:
+        out: folder of the results. files: that the command reads. cameras: of the videos.
+        overlay, pictures: whether a video per camera, and a picture, are going to be written.
+    """
     from torchpose.io._results import ResultsFolder, holds_arrays
 
-    videos = [_overlay_name(camera.name) for camera in cameras] if args.overlay else []
+    videos = [_overlay_name(camera.name) for camera in cameras] if overlay else []
     return ResultsFolder(
-        args.out,
+        out,
         "track",
         _OWN,
         [*_POSES, *videos, *(["overlay.png"] if pictures else []), "report.html"],
-        input_files(args),
-        lambda out: holds_arrays(out / _POSES[0], ("state", "joints3d", "body_skeleton")),
+        files,
+        lambda folder: holds_arrays(folder / _POSES[0], ("state", "joints3d", "body_skeleton")),
     )
 
 
@@ -177,7 +311,7 @@ def _write_strip(path: Path, strip: list[list[Any]]) -> Path:
 
 
 def facts_of(
-    args: Namespace,
+    given: "Given",
     tracker: "BodyTracker",
     recordings: "Recordings",
     poses: "BodyPoses",
@@ -185,15 +319,16 @@ def facts_of(
 ) -> dict[str, str]:
     """Return what was tracked, and how, by the name of each fact."""
     height, width = recordings.rig.sizes[0]  # type: ignore[misc]  # views have sizes
+    values = given.values
     matters = "sharpness" not in tracker.filter.unused
     sharpness = f", sharpness {tracker.filter.sharpness:g}" if matters else ""
     facts = {
-        "videos": f"{len(args.videos)} cameras, {recordings.fps:g} fps",
+        "videos": f"{len(recordings.videos)} cameras, {recordings.fps:g} fps",
         "silhouettes": f"{width} x {height} pixels, "
-        + ("against the empty scene" if args.background else "against what stays"),
-        "method": f"{tracker.method}, {args.n_particles} particles{sharpness}",
-        "learnt": ", ".join(filter(None, (args.manifold, args.conditionals, args.action))),
-        "body": args.body or f"average proportions, {args.height:g} m",
+        + ("against the empty scene" if recordings.background else "against what stays"),
+        "method": f"{tracker.method}, {tracker.n_particles} particles{sharpness}",
+        "learnt": ", ".join(filter(None, map(values.get, ("manifold", "conditionals", "action")))),
+        "body": values["body"] or f"average proportions, {values['height']:g} m",
         "actions": action_text(poses),
         "speed": f"{len(poses) / max(seconds, 1e-9):.1f} frames a second, without drawing",
     }
@@ -240,7 +375,7 @@ def write_page(
 def summary(
     poses: "BodyPoses", facts: dict[str, str], written: Sequence[Path], notes: Sequence[str] = ()
 ) -> int:
-    """Say what was found; returns 1 if the filter lost the person in more than half of the frames."""
+    """Print what was found; return 1 if the person was lost in more than half of the frames, else 0."""
     for name, fact in facts.items():
         print(f"{name:<12} {fact}")
     print(f"{'frames':<12} {len(poses)} from frame {poses.first_frame}")

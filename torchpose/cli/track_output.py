@@ -1,15 +1,11 @@
-"""What `torchpose track` does alike with keypoints and video: its settings, its files, what it prints."""
+"""What `torchpose track` has for keypoints and for video: the job, the files, what is printed."""
 
 import sys
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jsonargparse import Namespace
-
-from torchpose.cli.common import input_files, save_pictures
-from torchpose.errors import InputError
+from torchpose.cli.common import save_pictures
 
 if TYPE_CHECKING:
     from torchpose.io._results import ResultsFolder
@@ -22,6 +18,7 @@ _VIDEO = ("overlay.mp4", "report.html")
 _OWN = r"poses(_p\d\d+)?\.(npz|csv|bvh)|overlay\.mp4|report\.html|(pose_strip|joint_curves)\.png"
 
 __all__ = [
+    "Job",
     "camera_text",
     "percent",
     "report_failure",
@@ -29,46 +26,59 @@ __all__ = [
     "summary",
     "track_pictures",
     "track_results",
-    "track_settings",
     "write_pictures",
     "write_track",
 ]
 
 
-def track_settings(args: Namespace) -> "TrackSettings":
-    """Return the settings of a tracker that are among the options of the command."""
-    from torchpose.upper_body._keypoint_files import TrackSettings
+class Job(NamedTuple):
+    """What is to be tracked, how, and where the results go.
 
-    if args.prior is None:  # as a configuration may say it
-        raise InputError("--prior must be a name or a file, got null")
-    return TrackSettings(**{f.name: getattr(args, f.name) for f in fields(TrackSettings)})
+    Attributes:
+        input: as it was given. out: folder of the results. files: that the command reads.
+        settings: of the tracker. options: of its method. pictures: whether they are wanted.
+    """
+
+    input: str
+    out: str
+    files: list[Path]
+    settings: "TrackSettings"
+    options: dict[str, Any]
+    pictures: bool
 
 
 def track_results(
-    args: Namespace, pictures: bool, video: bool, more: Sequence[str] = (), own: str = ""
+    out: str,
+    files: Sequence[Path],
+    pictures: bool,
+    video: bool,
+    more: Sequence[str] = (),
+    own: str = "",
 ) -> "ResultsFolder":
-    """The folder of `--out`, for poses of persons and what shows them.
+    """Return the folder of `--out`, for poses of persons and what shows them.
 
     Args:
-        args: of the command. pictures, video: whether they are going to be written.
+        out: folder of the results. files: that the command reads.
+        pictures, video: whether they are going to be written.
         more: further names that are. own: pattern of further names that a run may write.
     """
     from torchpose.io._results import ResultsFolder, holds_arrays
 
     return ResultsFolder(
-        args.out,
+        out,
         "track",
         f"{_OWN}|{own}" if own else _OWN,
         [*_POSES, *(_PICTURES if pictures else ()), *(_VIDEO if video else ()), *more],
-        input_files(args),
-        lambda out: holds_arrays(out / _POSES[0], ("joints3d", "covariance3d", "observed")),
+        files,
+        lambda folder: holds_arrays(folder / _POSES[0], ("joints3d", "covariance3d", "observed")),
     )
 
 
 def write_track(track: "PoseTrack", out: Path, suffix: str = "") -> list[Path]:
-    """Write poses.npz, .csv and, if there is a pose in them, .bvh of one sequence.
+    """Write poses.npz, .csv and, if there is a pose in them, .bvh of one sequence; return their paths.
 
     Args:
+        track: of the sequence. out: folder.
         suffix: of the names, such as "_p02".
     """
     from torchpose.upper_body._pose_files import write_bvh, write_pose_csv
@@ -83,7 +93,7 @@ def write_track(track: "PoseTrack", out: Path, suffix: str = "") -> list[Path]:
 
 
 def write_pictures(track: "PoseTrack", out: Path) -> list[Path]:
-    """Draw one sequence, if there is a pose in it."""
+    """Draw one sequence if there is a pose in it, and return the paths of the pictures."""
     return save_pictures(out, track_pictures(track)) if _has_poses(track) else []
 
 
@@ -92,7 +102,7 @@ def _has_poses(track: "PoseTrack") -> bool:
 
 
 def track_pictures(track: "PoseTrack", truth: Any = None, labels: Any = None) -> dict[str, Any]:
-    """Pictures of one sequence by file name, each as a function that draws it."""
+    """Return the pictures of one sequence by file name, each as a function that draws it."""
     from torchpose import viz
 
     joints, observed, fps = track.joints3d[0], track.observed[0], track.fps or 30.0
@@ -110,7 +120,7 @@ def track_pictures(track: "PoseTrack", truth: Any = None, labels: Any = None) ->
 def summary(
     track: "PoseTrack", written: list[Path], settings: dict[str, str], notes: Sequence[str] = ()
 ) -> str:
-    """A few lines for people: frames, what was measured, what was assumed, which files."""
+    """Return some lines on frames, what was measured, what was assumed, and the files."""
     n, fps = track.joints3d.shape[1], track.fps
     length = f" ({n / fps:.1f} s at {fps:g} fps)" if fps else ""
     shares = track.observed[0].double().mean(0).tolist()
@@ -131,7 +141,7 @@ def summary(
 
 
 def _sample_size(track: "PoseTrack") -> list[str]:
-    """A line on how many particles or tracks carry the weight, where it is known."""
+    """Return a line on the effective number of particles or tracks, where it is known."""
     size = track.effective_sample_size[0]
     size = size[size.isfinite().all(-1)]
     if not len(size):
@@ -143,7 +153,7 @@ def _sample_size(track: "PoseTrack") -> list[str]:
 
 
 def report_failure(track: "PoseTrack") -> int:
-    """Exit code: 1 and a line on stderr if the filter degenerated, else 0."""
+    """Return the exit code: 1, with a line on stderr, if the filter degenerated, else 0."""
     at = int(track.failed_at[0])
     if at < 0:
         return 0
@@ -157,18 +167,18 @@ def report_failure(track: "PoseTrack") -> int:
 
 
 def camera_text(camera: Any) -> str:
-    """Focal lengths and centre of a camera in a few words."""
+    """Return the focal lengths and the centre of a camera in words."""
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
     return f"f = ({fx:g}, {fy:g}), centre ({cx:g}, {cy:g}) pixels"
 
 
 def smoothing_text(smoothing: int | str | None) -> str:
-    """How later frames were used, to follow the name of a method."""
+    """Return how later frames were used, to follow the name of a method."""
     if smoothing is None:
         return ", filtered"
     return ", smoothed" if smoothing == "full" else f", smoothed with {smoothing} later frames"
 
 
 def percent(share: float) -> str:
-    """Rounded, but 100 % only for all."""
+    """Return a share as a rounded percentage, which is 100 % only of all."""
     return f"{min(100 * share, 99.9 if share < 1 else 100.0):.3g} %"

@@ -8,17 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jsonargparse import Namespace
-
-from torchpose._core.terminal import check_positive, show_progress
+from torchpose._core.terminal import show_progress
 from torchpose.cli.common import UntilInterrupted, pictures_possible, share_cores
 from torchpose.cli.track_output import (
+    Job,
     camera_text,
     report_failure,
     smoothing_text,
     summary,
     track_results,
-    track_settings,
     write_pictures,
     write_track,
 )
@@ -36,39 +34,43 @@ _KEYPOINTS = "keypoints are expected as .npz, .csv or a folder of OpenPose JSON 
 __all__ = ["track_video", "write_overlay", "write_people"]
 
 
-def track_video(args: Namespace) -> int:
-    """Track everybody, write and report; exit code 1 if there is nobody."""
+def track_video(job: Job, options: dict[str, Any], face_model: str | None, overlay: bool) -> int:
+    """Track everybody, write and report, and return the exit code: 1 if there is nobody.
+
+    Args:
+        job: of the command. options: of `VideoTracker`. face_model: file of a face detector, or None.
+        overlay: whether the video and the page that show the poses are written.
+    """
     from torchpose.camera._choice import resolve_camera
     from torchpose.priors._upper_body import load_prior
 
-    for option, value in (("--fps", args.fps), ("--max-gap", args.max_gap)):
-        check_positive(option, value)
-    _refuse_keypoint_options(args)
+    settings = job.settings
+    _refuse_keypoint_options(job)
     share_cores()
-    prior = load_prior(args.prior)
-    pictures = pictures_possible(args.pictures)
+    prior = load_prior(settings.prior)
+    pictures = pictures_possible(job.pictures)
     with contextlib.ExitStack() as stack:
-        with _open(args.input, args.fps) as source:
+        with _open(job.input, settings.fps) as source:
             camera, notes = resolve_camera(
-                args.camera, args.camera_name, source.size, None, args.input
+                settings.camera, settings.camera_name, source.size, None, job.input
             )
-            tracker = _tracker(args, prior, camera, source.fps)
-            results = stack.enter_context(track_results(args, pictures, args.overlay))
+            tracker = _tracker(job, options, face_model, prior, camera, source.fps)
+            results = stack.enter_context(track_results(job.out, job.files, pictures, overlay))
             start = time.perf_counter()
             if source.reopenable:
                 people, n_frames = _track_recording(tracker, source, results.stage)
             else:
-                people, n_frames = _track_camera(tracker, source, results.stage, args.overlay)
+                people, n_frames = _track_camera(tracker, source, results.stage, overlay)
             seconds = time.perf_counter() - start
             notes += tuple(source.notes)
         if not people:
-            return _nobody(args, n_frames, notes, results.folder)
+            return _nobody(job.input, n_frames, notes, results.folder)
         facts = {
-            "video": f"{args.input}, {source.size[0]} x {source.size[1]}, {source.fps:g} fps",
-            "prior": prior.info.name or args.prior,
+            "video": f"{job.input}, {source.size[0]} x {source.size[1]}, {source.fps:g} fps",
+            "prior": prior.info.name or settings.prior,
             "camera": camera_text(camera),
             "method": people[0].track.method
-            + f"{smoothing_text(args.smoothing)}, hands by {args.hands}",
+            + f"{smoothing_text(settings.smoothing)}, hands by {options['hands']}",
             "speed": f"{n_frames / max(seconds, 1e-9):.0f} frames a second, without drawing",
         }
         people = [replace(p, track=replace(p.track, notes=notes + p.track.notes)) for p in people]
@@ -76,11 +78,11 @@ def track_video(args: Namespace) -> int:
         written = results.commit(write_people(people, results.stage))
         if pictures:
             written += results.commit(write_pictures(people[0].track, results.stage))
-        if args.overlay:
-            overlay = results.stage / _OVERLAY
+        if overlay:
+            drawn = results.stage / _OVERLAY
             if source.reopenable:
-                write_overlay(overlay, source.reopen(), people, n_frames)
-            title = Path(args.input).name
+                write_overlay(drawn, source.reopen(), people, n_frames)
+            title = Path(job.input).name
             shown = _write_report(results.stage, people, n_frames, facts, notes, title)
             written += results.commit(shown)
     print(_summary(people, written, facts, results.notes))
@@ -88,7 +90,7 @@ def track_video(args: Namespace) -> int:
 
 
 def _open(where: str, fps: float | None) -> "VideoSource":
-    from torchpose.video._source import open_video
+    from torchpose.video import open_video
 
     try:
         return open_video(where, fps=fps)
@@ -96,44 +98,40 @@ def _open(where: str, fps: float | None) -> "VideoSource":
         raise FileFormatError(f"{error}; {_KEYPOINTS}") from error
 
 
-def _refuse_keypoint_options(args: Namespace) -> None:
-    """Options that only mean something for keypoints."""
+def _refuse_keypoint_options(job: Job) -> None:
+    """Raise `InputError` for options that only mean something for keypoints."""
     given = {
-        "--nose-as-head": args.nose_as_head,
-        "--neck": args.neck is not None,
-        "--measurement-std": args.measurement_std is not None,
+        "--nose-as-head": job.settings.nose_as_head,
+        "--neck": job.settings.neck is not None,
+        "--measurement-std": job.settings.measurement_std is not None,
     }
     for option, used in given.items():
         if used:
-            raise InputError(f"{option} is for keypoints; {args.input} is taken for a video")
+            raise InputError(f"{option} is for keypoints; {job.input} is taken for a video")
 
 
-def _tracker(args: Namespace, prior: Any, camera: "PinholeCamera", fps: float) -> "VideoTracker":
+def _tracker(
+    job: Job,
+    options: dict[str, Any],
+    face_model: str | None,
+    prior: Any,
+    camera: "PinholeCamera",
+    fps: float,
+) -> "VideoTracker":
     from torchpose.measure._mediapipe import MediaPipeFaceDetector
     from torchpose.video._tracker import VideoTracker
 
-    detector = None if args.face_model is None else MediaPipeFaceDetector(args.face_model)
+    detector = None if face_model is None else MediaPipeFaceDetector(face_model)
     return VideoTracker(
-        prior,
-        camera,
-        fps=fps,
-        hands=args.hands,
-        background=args.background,
-        edges=args.edges,
-        candidates=args.candidates,
-        elbows=args.elbows,
-        face_detector=detector,
-        max_persons=args.max_persons,
-        max_gap=args.max_gap,
-        seed=args.seed,
-        **track_settings(args).tracker_options(),
-    )
+        prior, camera, fps=fps, face_detector=detector, max_gap=job.settings.max_gap,
+        seed=job.settings.seed, **options, **job.settings.tracker_options(), **job.options,
+    )  # fmt: skip
 
 
 def _track_recording(
     tracker: "VideoTracker", source: "VideoSource", out: Path
 ) -> tuple[list["TrackedPerson"], int]:
-    """Everybody in a file or folder, and how many frames it had. Ctrl-C ends the recording there."""
+    """Return everybody in a file or folder and how many frames it had; Ctrl-C ends the recording."""
     with UntilInterrupted(source) as frames:
         people = tracker(frames, progress=show_progress(), n_frames=source.n_frames, folder=out)
     return people, frames.count
@@ -142,7 +140,7 @@ def _track_recording(
 def _track_camera(
     tracker: "VideoTracker", source: "VideoSource", out: Path, overlay: bool
 ) -> tuple[list["TrackedPerson"], int]:
-    """Everybody before a camera, shown on a page while it runs, until q, stop or Ctrl-C."""
+    """Return everybody before a camera, shown on a page while it runs, until q, stop or Ctrl-C."""
     from torchpose.video._live import LiveView
     from torchpose.video._writer import VideoWriter
 
@@ -166,7 +164,7 @@ def _track_camera(
 
 
 def _record(writers: list[Any], image: Any) -> None:
-    """Write a frame; when that is no longer possible, say so and go on without."""
+    """Write a frame; where that is not possible any more, say so and stop writing."""
     try:
         writers[0].write(image)
     except OutputError as error:
@@ -184,7 +182,7 @@ def write_overlay(
     """
     from tqdm.auto import tqdm
 
-    from torchpose.video._prefetch import prefetch
+    from torchpose.video import prefetch
     from torchpose.video._writer import VideoWriter
 
     with source, VideoWriter(path, source.fps, source.size) as writer:
@@ -207,7 +205,7 @@ def _first(source: "VideoSource", n_frames: int) -> Iterator[Any]:
 def _drawn(
     image: Any, tracks: dict[int, Any], frame: int | dict[int, int], faces: Any = None
 ) -> Any:
-    """A frame with the poses of everybody there, by place, of a frame of their tracks."""
+    """Return a frame with poses drawn into it, by number of the person, from a frame of their tracks."""
     import torch
 
     from torchpose.video._overlay import draw_overlay
@@ -228,7 +226,7 @@ def _drawn(
 
 
 def write_people(people: list["TrackedPerson"], out: Path) -> list[Path]:
-    """Poses of everybody: the one seen longest without a number, others as poses_p02 and so on."""
+    """Write the poses of everybody and return the paths: poses, and poses_p02 and so on of the others."""
     written = []
     for place, person in enumerate(people, 1):
         written += write_track(person.track, out, "" if place == 1 else f"_p{place:02d}")
@@ -260,14 +258,14 @@ def _write_report(
     return [*written, out / "report.html"]
 
 
-def _nobody(args: Namespace, n_frames: int, notes: tuple[str, ...], out: Path) -> int:
-    """Say that there is no pose, and why."""
+def _nobody(where: str, n_frames: int, notes: tuple[str, ...], out: Path) -> int:
+    """Say that there is no pose, and why; return the exit code."""
     if (out / "poses.npz").exists():
         notes += (f"{out / 'poses.npz'} is of an earlier run",)
     for note in notes:
         print(f"note     {note}")
     print(
-        f"torchpose: no face was seen for long enough in the {n_frames} frames of {args.input}, so "
+        f"torchpose: no face was seen for long enough in the {n_frames} frames of {where}, so "
         "there are no poses. The detector wants faces from the front, upright and at least 40 "
         "pixels high; keypoints of another detector can be tracked instead",
         file=sys.stderr,
@@ -278,7 +276,7 @@ def _nobody(args: Namespace, n_frames: int, notes: tuple[str, ...], out: Path) -
 def _summary(
     people: list["TrackedPerson"], written: list[Path], facts: dict[str, str], notes: Sequence[str]
 ) -> str:
-    """What was found, for people."""
+    """Return in words what was found."""
     first = summary(people[0].track, written, facts, notes)
     if len(people) == 1:
         return first
