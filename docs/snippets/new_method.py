@@ -23,7 +23,13 @@ class Alone(NamedTuple):
 
 
 class FrameByFrame(Estimator):
-    def __init__(self, model, *, widening: float = 1.0):  # an option of the method
+    """Estimates every frame by itself.
+
+    Args:
+        widening: factor on the covariances of the prior.
+    """
+
+    def __init__(self, model, *, widening: float = 1.0):  # an option, here and of the command
         self.prior, self.widening = model.prior, widening
 
     def init(self, batch_size, joints, generators):
@@ -50,8 +56,9 @@ class FrameByFrame(Estimator):
 
 register_method("frame-by-frame", FrameByFrame)
 
-# torchpose track keypoints.npz --method frame-by-frame --out result
-main(["track", "keypoints.npz", "--method", "frame-by-frame", "--out", "result"])
+# torchpose track keypoints.npz --method frame-by-frame --widening 2 --out result
+line = ["track", "keypoints.npz", "--method", "frame-by-frame", "--widening", "2"]
+main([*line, "--out", "result"])
 track = PoseTrack.load("result/poses.npz")
 if track.method != "frame-by-frame" or not track.joints3d.isfinite().all():
     raise SystemExit(f"unexpected poses of {track.method}")

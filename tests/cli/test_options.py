@@ -16,14 +16,11 @@ from torchpose.cli import COMMANDS, demo, fit, fit_bodies, info, track, track_bo
 from torchpose.cli.command import Command
 from torchpose.cli.options import REQUIRED, documented, options_of, options_of_methods
 from torchpose.io import write_keypoints
-from torchpose.learning._recipes import UpperBodyRecipe
-from torchpose.learning._recipes.actions import ActionRecipe
-from torchpose.learning._recipes.manifold import ManifoldRecipe
-from torchpose.upper_body import METHODS, register_method
+from torchpose.learning import ActionRecipe, ManifoldRecipe, UpperBodyRecipe
+from torchpose.upper_body import METHODS, method_options, register_method
 from torchpose.upper_body._keypoint_files import TrackSettings
-from torchpose.upper_body._methods import method_options
 from torchpose.upper_body._windows import WindowMixture
-from torchpose.whole_body import methods as body_methods
+from torchpose.whole_body import _methods as body_methods
 
 COMMAND_OF = {
     "track": track.command,

@@ -182,7 +182,7 @@ def write_overlay(
     """
     from tqdm.auto import tqdm
 
-    from torchpose.video import prefetch
+    from torchpose.video._prefetch import prefetch
     from torchpose.video._writer import VideoWriter
 
     with source, VideoWriter(path, source.fps, source.size) as writer:
