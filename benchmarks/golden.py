@@ -942,7 +942,7 @@ def run_body(out, name, model, start, silhouettes, cameras, body=None):
 
 def body_options():
     step = tp.motion_std(walker(), strides(60, seed=3), floor=1e-3)
-    return {"step_std": step, "sharpness": 60.0}
+    return {"process_cov": step.square(), "sharpness": 60.0}
 
 
 @capability("body/sir")
@@ -1061,8 +1061,9 @@ def body_root(folder):
         }.items():
             if kind == "exercises" and name != "plain":
                 continue
+            noise = torch.full((body.dim,), 0.01).square()
             model = tp.RootUncertaintyTracker(
-                body, conditionals, 21, fps=60.0, step_std=0.01, **more
+                body, conditionals, 21, fps=60.0, process_cov=noise, **more
             )
             run_body(out, f"{kind}.{name}", model, begin, silhouettes, rig())
     conditionals.save(folder / "c.safetensors")
@@ -1103,7 +1104,7 @@ def body_constrained(folder):
                     body,
                     action,
                     60,
-                    step_std=step,
+                    process_cov=step.square(),
                     fps=60.0,
                     weights=weights,
                     likelihood="overlap",

@@ -85,7 +85,7 @@ def track(person: Person, dimensions: int | None, setting: Setting, n: int, seed
     """Estimates from the true first pose."""
     action = None if dimensions is None else person.space.with_dimensions(dimensions)
     tracker = ConstrainedParticleFilter(
-        person.body, action, n, step_std=setting.scale * person.step_std, likelihood="overlap",
+        person.body, action, n, process_cov=(setting.scale * person.step_std).square(), likelihood="overlap",
         sharpness=setting.value, max_redraws=REDRAWS,
     )  # fmt: skip
     with warnings.catch_warnings():  # frames in which all were clamped are counted

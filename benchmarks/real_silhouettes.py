@@ -129,15 +129,15 @@ def report_four(report: Report, folder: Path, seeds: int, out: Path) -> None:
 
 
 def plain_filters(
-    body: Body, step_std: Tensor | None, limits: JointLimits | None = None
+    body: Body, process_cov: Tensor | None, limits: JointLimits | None = None
 ) -> dict[str, Make]:
     """SIR and the annealed filter of as many likelihoods a frame."""
     return {
         "SIR": lambda s: SIRParticleFilter(
-            body, N_PARTICLES, step_std=step_std, sharpness=s, limits=limits
+            body, N_PARTICLES, process_cov=process_cov, sharpness=s, limits=limits
         ),
         "APF": lambda s: AnnealedParticleFilter(
-            body, N_PARTICLES // LAYERS, n_layers=LAYERS, step_std=step_std, limits=limits
+            body, N_PARTICLES // LAYERS, n_layers=LAYERS, process_cov=process_cov, limits=limits
         ),
     }
 
@@ -180,14 +180,14 @@ def prepare(folder: Path, person: str, action: str) -> Person:
 
 def filters_of(person: Person) -> dict[str, Make]:
     """The filters, the manifold's in its exact and its published form, with the same noise and limits."""
-    common = {"step_std": person.step_std, "limits": person.limits}
+    common = {"process_cov": person.step_std.square(), "limits": person.limits}
 
     def with_manifold(options: dict[str, str]) -> Make:
         return lambda s: ManifoldParticleFilter(
             person.body, person.manifold, N_PARTICLES, sharpness=s, **common, **options
         )
 
-    return plain_filters(person.body, person.step_std, person.limits) | {
+    return plain_filters(person.body, person.step_std.square(), person.limits) | {
         METHODS[name].label: with_manifold(METHODS[name].options)
         for name in ("mrpf", "mrpf-published")
     }

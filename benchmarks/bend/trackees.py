@@ -172,7 +172,7 @@ def make_filter(
         action = trackee.space.with_dimensions(min(variant.dimensions, trackee.space.n_dimensions))
     tracker = ConstrainedParticleFilter(
         trackee.body, action if variant.constrained else None, variant.particles,
-        step_std=setting.scale * trackee.step_std, likelihood="overlap",
+        process_cov=(setting.scale * trackee.step_std).square(), likelihood="overlap",
         sharpness=setting.value, limb_shape=variant.limb_shape, max_redraws=REDRAWS,
     )  # fmt: skip
     return copy.deepcopy(tracker).float()

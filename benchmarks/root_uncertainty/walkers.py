@@ -258,7 +258,7 @@ def make_filter(
     if budget.particles < POINTS:
         raise InputError(f"particles must be at least {POINTS}, got {budget.particles}")
     common: dict[str, Any] = {
-        "step_std": setting.scale * walker.step_std,
+        "process_cov": (setting.scale * walker.step_std).square(),
         "limits": walker.limits if budget.limits else None,
         "limit_mode": "discard",
         "leg_swap": budget.leg_swap,

@@ -173,7 +173,7 @@ def make_filter(
         raise InputError(f"method must be among {', '.join(METHODS)}, got {name!r}")
     method, own = METHODS[name], trackee.body if body is None else body
     common: dict[str, Any] = {
-        "step_std": setting.scale * trackee.step_std,
+        "process_cov": (setting.scale * trackee.step_std).square(),
         "likelihood": likelihood,
     }
     if name == "apf":

@@ -85,7 +85,7 @@ def frames(
     states = performance(99)[SKIPPED : SKIPPED + FRAMES + 1]
     camera = rig()
     silhouettes = render(BODY, states[1:], camera, HEIGHT, WIDTH)
-    options = {"step_std": std, "likelihood": "overlap", "sharpness": 30.0}
+    options = {"process_cov": std.square(), "likelihood": "overlap", "sharpness": 30.0}
     rows = []
     for n in sizes:
         trackers = {

@@ -31,7 +31,7 @@ silhouettes = render(body, states[1:], camera, 120, 160)  # bool [T, 1, H, W]
 
 tracker = ConstrainedParticleFilter(
     body, action, 200, likelihood="overlap", sharpness=30.0,
-    step_std=constant_velocity_std(body, recorded, floor=0.005),
+    process_cov=constant_velocity_std(body, recorded, floor=0.005).square(),
 )  # fmt: skip
 track = tracker(silhouettes, camera, states[0], torch.Generator().manual_seed(0))
 print(track.mean.shape, track.details["acceptance"])  # [T, D], share of first draws accepted

@@ -114,7 +114,7 @@ def body_filter(kind, model=None, person=walker):
     def make(seed):
         learnt = () if model is None else (model(seed),)
         own = person().altered(radii=person().radii * (1 + 0.1 * seed))
-        return kind(own, *learnt, 20, step_std=0.01 * seed, likelihood=low_states)
+        return kind(own, *learnt, 20, process_cov=(0.01 * seed) ** 2, likelihood=low_states)
 
     return make
 
@@ -128,7 +128,9 @@ def root_tracker(seed):
     own, _ = walks(1)
     own = own.altered(radii=own.radii * (1 + 0.1 * seed))
     learnt = fit_limb_conditionals(own, [0.9 * seed * s for s in walks(1)[1]], 60.0)
-    return whole_body.RootUncertaintyTracker(own, learnt, 10, fps=60.0, step_std=0.01 * seed)
+    return whole_body.RootUncertaintyTracker(
+        own, learnt, 10, fps=60.0, process_cov=(0.01 * seed) ** 2
+    )
 
 
 def follow_root(tracker):

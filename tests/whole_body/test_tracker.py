@@ -64,7 +64,7 @@ def test_it_does_what_the_stages_do_by_hand(scene):
     g = seeded()
     start = find_first_pose(walker(), silhouettes[:6], rig(), None, g, fps=12.0).state
     step = default_step_std(walker()) * math.sqrt(60 / 12)
-    model = AnnealedParticleFilter(walker(), 20, step_std=step, sharpness=100.0)
+    model = AnnealedParticleFilter(walker(), 20, process_cov=step.square(), sharpness=100.0)
     by_hand = track_body(model, silhouettes, rig(), start, g, initial_std=2 * step)
     assert_same(poses, by_hand)
     assert (poses.first_frame, poses.method, poses.fps) == (2, "apf", 12.0)
@@ -100,7 +100,8 @@ def test_covariances_are_those_of_the_filter(scene):
     )  # fmt: skip
     torch.testing.assert_close(by_cov.process_cov, variances)
     torch.testing.assert_close(by_cov.initial_std, 2 * variances.sqrt())
-    by_std = BodyTracker(rig(), "sir", body=walker(), n_particles=60, step_std=variances.sqrt())
+    with pytest.warns(DeprecationWarning, match="square as process_cov"):
+        by_std = BodyTracker(rig(), "sir", body=walker(), n_particles=60, step_std=variances.sqrt())
     a, b = (t(silhouettes, states[0], seeded()) for t in (by_cov, by_std))
     torch.testing.assert_close(a.state, b.state)
     full = torch.diag(variances) + 1e-6
@@ -109,6 +110,10 @@ def test_covariances_are_those_of_the_filter(scene):
             BodyTracker(rig(), "sir", process_cov=bad)
     with pytest.raises(InputError, match="leave one of them out"):
         BodyTracker(rig(), "sir", process_cov=variances, step_std=0.1)
+    with pytest.raises(InputError, match="must be diagonal"):
+        SIRParticleFilter(walker(), process_cov=full)
+    one = SIRParticleFilter(walker(), process_cov=4e-4)
+    torch.testing.assert_close(one.step_std, torch.full((36,), 0.02, dtype=torch.float64))
 
 
 def test_models_put_the_body_into_their_frame(scene):
@@ -211,7 +216,7 @@ def test_every_filter_has_the_options_of_the_base():
     shared = set(BodyFilterOptions.__annotations__)
     assert shared == set(method_options_of(SilhouetteParticleFilter))
     for name, (filter_class, _) in METHODS.items():
-        assert shared - filter_class.unused <= set(method_options(name))
+        assert shared - filter_class.unused - {"step_std"} <= set(method_options(name))
 
 
 def method_options_of(filter_class):

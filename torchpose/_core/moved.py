@@ -60,7 +60,7 @@ MODULES = {
     "filters.gamma": "filters._transition",
     "filters.geometric_median": "math._geometric_median",
     "filters.joint_spread": "whole_body._filters.body_particles",
-    "filters.leg_swap": "whole_body._filters.motion",
+    "filters.leg_swap": "whole_body._filters.legs",
     "filters.limb_observations": "whole_body._filters.limb_observations",
     "filters.manifold": "whole_body._filters.manifold",
     "filters.mending": "filters._outputs",

@@ -105,7 +105,7 @@ def find_first_pose(
         states = torch.cat([states, turned_round(body, states)])
     model = AnnealedParticleFilter(
         body, n_tracking // _LAYERS, n_layers=_LAYERS, likelihood=likelihood, limits=limits,
-        step_std=default_step_std(body) * math.sqrt(stride * _RATE / fps),
+        process_cov=(default_step_std(body) * math.sqrt(stride * _RATE / fps)).square(),
     )  # fmt: skip
     many = frames.expand(len(states), *frames.shape)
     track = model(many, rig, states, generator, initial_std=2 * model.step_std).mean

@@ -38,6 +38,7 @@ __all__ = [
 ]
 
 _DEFAULT = "apf"  # needs nothing
+_DEPRECATED = {"step_std"}  # options that still work and are not listed
 
 
 class BodyMethod(NamedTuple):
@@ -234,7 +235,8 @@ def method_options(method: str) -> tuple[str, ...]:
     names = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY and p.name != "fps"]
     if any(p.kind is p.VAR_KEYWORD for p in parameters):
         names += [name for name in BodyFilterOptions.__annotations__ if name not in names]
-    return tuple(name for name in names if name not in filter_class.unused)
+    unlisted = filter_class.unused | _DEPRECATED
+    return tuple(name for name in names if name not in unlisted)
 
 
 def check_options(method: str, options: Iterable[str]) -> None:
@@ -244,6 +246,7 @@ def check_options(method: str, options: Iterable[str]) -> None:
         InputError: such an option.
     """
     said = f"does nothing for method {method}"
+    options = (name for name in options if name not in _DEPRECATED)
     refuse_unused(options, said, method, METHODS, method_options)
 
 
@@ -274,7 +277,11 @@ def make_filter(
             f"n_particles must be at least {least} for method {method}, so that several survive a "
             f"frame, got {n_particles}"
         )
-    settings = {**filter_class.tracking_options(body, fps, learnt), **options}
+    settings = filter_class.tracking_options(body, fps, learnt)
+    if options.keys() & {"process_cov", "step_std"}:  # one replaces the other
+        settings.pop("process_cov", None)
+        settings.pop("step_std", None)
+    settings.update(options)
     if needs is not None:
         settings[needs] = learnt
     if "fps" in inspect.signature(filter_class).parameters:

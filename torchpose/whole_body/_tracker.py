@@ -74,9 +74,9 @@ class BodyTracker(nn.Module):
         action: postures of an action, or of several, by name, or a file.
         n_particles: likelihoods of a frame, of all layers together; a hypothesis of "root" counts seven.
         fps: frames per second; noise grows with the time between frames.
-        process_cov: variances of the diffusion per frame [D], or [D, D] without entries off the diagonal,
-            in squares of metres for the root and of sines of half angles for rotations; by default what
-            suits the method.
+        process_cov: variances of the diffusion per frame [D], [D, D] without entries off the diagonal, or
+            one number, in squares of metres for the root and of sines of half angles for rotations; by
+            default that of the method.
         initial_cov: the same of the particles about the first pose; by default four times `process_cov`.
         options: of the method's filter (`torchpose.whole_body._methods.method_options`), such as sharpness,
             limits, leg_swap or n_layers.
@@ -118,8 +118,8 @@ class BodyTracker(nn.Module):
         action: ActionSpace | ActionBank | str | Path | None = None,
         n_particles: int = 1000,
         fps: float = 60.0,
-        process_cov: Tensor | None = None,
-        initial_cov: Tensor | None = None,
+        process_cov: Tensor | float | None = None,
+        initial_cov: Tensor | float | None = None,
         **options: Any,
     ) -> None:
         super().__init__()
@@ -137,9 +137,7 @@ class BodyTracker(nn.Module):
             learnt = models[needs][0]
             tracked = upright if needs == "manifold" else LEARNT[needs].body(person, learnt)
         if process_cov is not None:
-            if "step_std" in options:
-                raise InputError("process_cov and step_std say the same; leave one of them out")
-            options["step_std"] = std_of_covariance("process_cov", process_cov, tracked.dim)
+            options["process_cov"] = process_cov
         self.filter = make_filter(self.method, tracked, learnt, fps, n_particles, options)
         self.cameras, self.fps, self.n_particles = as_rig(cameras), float(fps), n_particles
         self.notes = tuple(filter(None, (note for _, note in models.values())))
@@ -170,7 +168,7 @@ class BodyTracker(nn.Module):
     @property
     def process_cov(self) -> Float[Tensor, " D"]:
         """Variances of the diffusion per frame."""
-        return self.filter.step_std.square()
+        return self.filter.process_cov
 
     @property
     def initial_std(self) -> Float[Tensor, " D"]:

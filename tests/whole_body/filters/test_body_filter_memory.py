@@ -14,7 +14,7 @@ from torchpose.whole_body import (
     SIRParticleFilter,
     reweight,
 )
-from torchpose.whole_body._filters.motion import exchange_legs
+from torchpose.whole_body._filters.legs import exchange_legs
 
 WIDE = torch.float64
 
@@ -44,7 +44,7 @@ def near(states, frame):
 
 
 def tracker(n=30, **options):
-    options = {"step_std": 0.25, "likelihood": near, **options}
+    options = {"process_cov": 0.25**2, "likelihood": near, **options}
     return Genealogist(LinearBody(2), n, **options)
 
 
@@ -127,7 +127,7 @@ def test_every_filter_finds_legs_that_had_been_taken_for_each_other(kind):
     start, frames = exchange_legs(body, true)[0], torch.zeros(4, 1, dtype=WIDE)
     error = []
     for rate in (0.0, 0.5):
-        model = kind(body, 100, step_std=0.005, likelihood=likelihood, leg_swap=rate)
+        model = kind(body, 100, process_cov=0.005**2, likelihood=likelihood, leg_swap=rate)
         out = model(frames, None, start, torch.Generator().manual_seed(0))
         error.append(float((body.joints(out.mean[-1]) - joints).norm(dim=-1).mean()))
     assert error[0] > 0.05, "without a swap the legs stay where they were"
@@ -135,7 +135,10 @@ def test_every_filter_finds_legs_that_had_been_taken_for_each_other(kind):
 
 
 def test_memory_hears_of_swapped_legs():
-    options = {"step_std": 0.0, "likelihood": lambda states, frame: 200 * states[..., 0].double()}
+    options = {
+        "process_cov": 0.0,
+        "likelihood": lambda states, frame: 200 * states[..., 0].double(),
+    }
     model = Genealogist(walker(), 200, leg_swap=1.0, **options)
     start = strides(model.body)
     spread = torch.zeros(model.body.dim, dtype=WIDE)
@@ -172,7 +175,7 @@ def test_limits_that_discard_hold_for_the_estimate_of_the_largest_weight():
         model = SIRParticleFilter(
             body,
             200,
-            step_std=0.05,
+            process_cov=0.05**2,
             likelihood=drawn_outside,
             limits=limits,
             limit_mode=mode,

@@ -106,7 +106,7 @@ def test_one_frame_is_the_model_sampled_by_brute_force(brute_force, weights):
     expected = weight.flatten() @ drawn[:, 6:]
 
     tracker = ConstrainedParticleFilter(
-        BODY, BEND, 16 * 80, step_std=STD, likelihood=near(target), max_redraws=200,
+        BODY, BEND, 16 * 80, process_cov=STD**2, likelihood=near(target), max_redraws=200,
         weights=weights, resample_threshold=0.0, velocity_rate=None,
     )  # fmt: skip
     copies = ancestors.repeat_interleave(80, 0)
@@ -127,7 +127,7 @@ def test_one_frame_is_the_model_sampled_by_brute_force(brute_force, weights):
 def test_the_weights_differ_between_the_two_forms():
     """The same draws, so that only Z is between them."""
     start, ahead = performance("bend", 3)[12], performance("bend", 3)[14]
-    options = {"step_std": STD, "likelihood": near(ahead), "initial_std": STD}
+    options = {"process_cov": STD**2, "likelihood": near(ahead), "initial_std": STD}
     spread = options.pop("initial_std")
     means = []
     for weights in ("published", "normalised"):
@@ -141,7 +141,7 @@ def test_the_weights_differ_between_the_two_forms():
 def test_every_particle_belongs_to_the_action():
     start = performance("bend", 3)[10]
     tracker = ConstrainedParticleFilter(
-        BODY, BEND, 200, step_std=2 * STD, likelihood=flat, max_redraws=100
+        BODY, BEND, 200, process_cov=(2 * STD) ** 2, likelihood=flat, max_redraws=100
     )
     state, out = tracker.step(tracker.init(start), FRAME, None, generator())
     assert out.details["clamped"] < 0.02 and 0 < out.details["acceptance"] < 0.7
@@ -158,7 +158,7 @@ def test_every_particle_belongs_to_the_action():
 def test_without_an_action_and_velocity_it_is_sir():
     states = performance("bend", 3)
     silhouettes = render(BODY, states[1:6], RIG, HEIGHT, WIDTH)
-    options = {"step_std": STD, "sharpness": 30.0, "likelihood": "overlap"}
+    options = {"process_cov": STD**2, "sharpness": 30.0, "likelihood": "overlap"}
     ours = ConstrainedParticleFilter(BODY, None, 50, velocity_rate=None, **options)
     out = ours(silhouettes, RIG, states[0], generator())
     expected = SIRParticleFilter(BODY, 50, **options)(silhouettes, RIG, states[0], generator())
@@ -169,7 +169,7 @@ def test_without_an_action_and_velocity_it_is_sir():
 def test_the_velocity_is_that_of_the_estimates():
     """Without noise every particle moves by V, which the drawn estimates alone decide."""
     body, start = LinearBody(3), torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    tracker = ConstrainedParticleFilter(body, None, 2, step_std=0.0, likelihood=flat)
+    tracker = ConstrainedParticleFilter(body, None, 2, process_cov=0.0, likelihood=flat)
     state = tracker.init(start)
     velocity, before = torch.tensor([0.4, 0.0, -0.2]).double(), start - 1.0
     state = state._replace(trend=torch.stack([velocity, before])[None])
@@ -197,7 +197,7 @@ def error(body, mean, states):
 
 def test_a_bend_is_tracked_better_than_without_the_action(sequence):
     states, silhouettes = sequence
-    options = {"step_std": 2 * motion_noise(), "likelihood": "overlap", "sharpness": 40.0}
+    options = {"process_cov": (2 * motion_noise()) ** 2, "likelihood": "overlap", "sharpness": 40.0}
     errors = []
     for action in (BEND, None):
         tracker = ConstrainedParticleFilter(BODY, action, 150, max_redraws=20, **options)
@@ -212,7 +212,13 @@ def test_frame_by_frame_and_alone_it_is_the_same(sequence):
     bank = ActionBank([BEND, WAVE])
     for action in (BEND, bank):
         tracker = ConstrainedParticleFilter(
-            BODY, action, 20, step_std=STD, likelihood="overlap", sharpness=30.0, max_redraws=10
+            BODY,
+            action,
+            20,
+            process_cov=STD**2,
+            likelihood="overlap",
+            sharpness=30.0,
+            max_redraws=10,
         )
         both = torch.stack([silhouettes[:3], silhouettes[4:7]])
         start = torch.stack([states[0], states[4]])
@@ -232,7 +238,7 @@ def test_coasting_stays_in_the_action(sequence):
     states, silhouettes = sequence
     gone = silhouettes[:8].clone()
     gone[2:] = False
-    tracker = ConstrainedParticleFilter(BODY, BEND, 100, step_std=STD, likelihood="overlap")
+    tracker = ConstrainedParticleFilter(BODY, BEND, 100, process_cov=STD**2, likelihood="overlap")
     out = tracker(gone, RIG, states[0], generator())
     assert out.coasting.tolist() == [False] * 2 + [True] * 6
     z = BEND.project(state_postures(BODY, out.mean))
@@ -244,7 +250,13 @@ def test_joint_limits_hold_too(sequence):
     limits = JointLimits.fit(torch.cat(performances("bend")), margin=1.0)
     for mode in ("clamp", "discard"):
         tracker = ConstrainedParticleFilter(
-            BODY, BEND, 60, step_std=motion_noise(), limits=limits, limit_mode=mode, max_redraws=10
+            BODY,
+            BEND,
+            60,
+            process_cov=motion_noise() ** 2,
+            limits=limits,
+            limit_mode=mode,
+            max_redraws=10,
         )
         state = tracker.init(states[0])
         state, _ = tracker.step(state, silhouettes[:1], RIG, generator())
@@ -263,7 +275,7 @@ def follow(action, states, n_particles, n_seeds):
         return near(seen[-1])(particles, frame)
 
     tracker = ConstrainedParticleFilter(
-        BODY, action, n_particles, step_std=motion_noise(), likelihood=log_likelihood,
+        BODY, action, n_particles, process_cov=motion_noise() ** 2, likelihood=log_likelihood,
         max_redraws=10,
     )  # fmt: skip
     generators = [generator(seed) for seed in range(n_seeds)]
@@ -321,7 +333,7 @@ def test_a_gate_that_rejects_everything_is_reported():
     for part in ("left_thigh", "right_upper_arm"):  # sitting, an arm up
         start[3 + 3 * BODY.skeleton.part(part)] = -0.7
     tracker = ConstrainedParticleFilter(
-        BODY, BEND, 30, step_std=0.1 * STD, likelihood=flat, max_redraws=3
+        BODY, BEND, 30, process_cov=(0.1 * STD) ** 2, likelihood=flat, max_redraws=3
     )
     with pytest.warns(DegenerateFilterWarning, match="all particles 1 times .element 0 at frame 0"):
         state, out = tracker.step(tracker.init(start), FRAME, None, generator())
@@ -331,7 +343,13 @@ def test_a_gate_that_rejects_everything_is_reported():
     off = ((z[:, None] - BEND.performance).abs() - 2 * BEND.std).amax(-1).amin(-1)
     assert off.max() < 12  # degrees: shoulders are fixed in the torso, so not quite at the border
     normalised = ConstrainedParticleFilter(
-        BODY, BEND, 30, step_std=0.1 * STD, likelihood=flat, max_redraws=3, weights="normalised"
+        BODY,
+        BEND,
+        30,
+        process_cov=(0.1 * STD) ** 2,
+        likelihood=flat,
+        max_redraws=3,
+        weights="normalised",
     )
     with pytest.warns(DegenerateFilterWarning):
         _, out = normalised.step(normalised.init(start), FRAME, None, generator())

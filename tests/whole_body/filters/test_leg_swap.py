@@ -11,7 +11,7 @@ from torchpose.body._kinematics import FRAMES
 from torchpose.errors import InputError, SkeletonError
 from torchpose.filters._resampling import RESAMPLING
 from torchpose.whole_body import SilhouetteParticleFilter, reweight
-from torchpose.whole_body._filters.motion import (
+from torchpose.whole_body._filters.legs import (
     exchange_legs,
     extra_copies,
     leg_angle,
@@ -117,7 +117,7 @@ def resampled(resampling="systematic", threshold=1.0):
         return frame[:, :1] * states[..., 0].double()
 
     model = Labelled(
-        body, 200, step_std=0.0, likelihood=weigh, leg_swap=1.0, resampling=resampling,
+        body, 200, process_cov=0.0, likelihood=weigh, leg_swap=1.0, resampling=resampling,
         resample_threshold=threshold,
     )  # fmt: skip
     state = model.init(walk(body, 40)[20:22])

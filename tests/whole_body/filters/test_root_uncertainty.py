@@ -13,8 +13,8 @@ from torchpose.learning import fit_limb_conditionals
 from torchpose.math._unscented import sigma_points
 from torchpose.priors._limb_conditionals import in_body_frame
 from torchpose.whole_body import RootUncertaintyTracker, render
+from torchpose.whole_body._filters.legs import exchange_legs
 from torchpose.whole_body._filters.limb_observations import count_positions, part_log_likelihood
-from torchpose.whole_body._filters.motion import exchange_legs
 from torchpose.whole_body._filters.root_uncertainty import PUBLISHED
 from torchpose.whole_body._silhouettes.rendering import prepare_silhouettes
 
@@ -34,7 +34,7 @@ def scene():
 
 def tracker(n=25, **options):
     body, conditionals, _, _ = scene()
-    options = {"fps": 60.0, "step_std": 0.01, "survival_rate": 0.46, **options}
+    options = {"fps": 60.0, "process_cov": 0.01**2, "survival_rate": 0.46, **options}
     return RootUncertaintyTracker(body, conditionals, n, **options)
 
 
@@ -228,7 +228,7 @@ def test_the_published_form_is_there_by_name():
 def test_single_precision_tracks_as_well():
     body, conditionals, truth, silhouettes = scene()
     single = RootUncertaintyTracker(
-        body.altered().float(), conditionals, 10, fps=60.0, step_std=0.01
+        body.altered().float(), conditionals, 10, fps=60.0, process_cov=0.01**2
     )
     track = single(silhouettes[:3], rig(), truth[0].float(), generator=seeded(0)[0])
     assert track.mean.dtype == torch.float32 and bool(track.mean.isfinite().all())

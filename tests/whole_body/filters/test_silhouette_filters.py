@@ -74,7 +74,7 @@ def run(tracker, z, runs=RUNS, seed=0, initial_std=START_STD):
 
 
 def sir(n=3000, **options):
-    options = {"step_std": STEP, "likelihood": gaussian_likelihood(H, R), **options}
+    options = {"process_cov": STEP**2, "likelihood": gaussian_likelihood(H, R), **options}
     return SIRParticleFilter(LinearBody(3), n, **options)
 
 
@@ -126,7 +126,7 @@ def test_sir_with_a_survival_rate_keeps_that_share():
 
 def filters():
     manifold = linear_manifold()
-    options = {"step_std": STEP, "likelihood": gaussian_likelihood(H, R)}
+    options = {"process_cov": STEP**2, "likelihood": gaussian_likelihood(H, R)}
     body = LinearBody(3, n_root=1)
     return {
         "sir": SIRParticleFilter(body, 40, **options),
@@ -196,7 +196,7 @@ def killing(frames, value=-math.inf):
 @pytest.mark.parametrize("kind", ["sir", "annealed", "manifold"])
 def test_particles_that_all_die_are_spread_about_the_last_mean(kind, value):
     likelihood, z = killing([2, 3], value)
-    options = {"step_std": STEP, "likelihood": likelihood, "respread_scale": 4.0}
+    options = {"process_cov": STEP**2, "likelihood": likelihood, "respread_scale": 4.0}
     body = LinearBody(3, n_root=1)
     tracker = {
         "sir": lambda: SIRParticleFilter(body, 4000, **options),
@@ -282,7 +282,7 @@ def test_every_layer_has_its_survival_rate():
 def test_the_noise_of_a_layer_shrinks_with_the_survival_rate():
     flat = lambda states, frame: torch.zeros(states.shape[:2], dtype=WIDE)  # noqa: E731
     tracker = AnnealedParticleFilter(
-        LinearBody(3), 20_000, n_layers=4, survival_rate=0.5, step_std=STEP, likelihood=flat
+        LinearBody(3), 20_000, n_layers=4, survival_rate=0.5, process_cov=STEP**2, likelihood=flat
     )
     z = observations(2, missing=(1,))
     out = tracker(z, None, START, generator())
@@ -297,7 +297,7 @@ def test_the_noise_of_a_layer_shrinks_with_the_survival_rate():
 def test_the_estimate_is_that_of_the_last_layer():
     z = observations(1, missing=())
     tracker = AnnealedParticleFilter(
-        LinearBody(3), 200, step_std=STEP, likelihood=gaussian_likelihood(H, R)
+        LinearBody(3), 200, process_cov=STEP**2, likelihood=gaussian_likelihood(H, R)
     )
     state, out = tracker.step(tracker.init(START[None]), z, None, generator(4))
     expected = torch.einsum("bn,bnd->bd", state.log_weights.exp(), state.particles)
@@ -307,7 +307,7 @@ def test_the_estimate_is_that_of_the_last_layer():
 
 def test_one_layer_of_exponent_one_is_sir():
     z = observations()
-    options = {"step_std": STEP, "likelihood": gaussian_likelihood(H, R)}
+    options = {"process_cov": STEP**2, "likelihood": gaussian_likelihood(H, R)}
     one = AnnealedParticleFilter(LinearBody(3), 300, n_layers=1, schedule=[1.0], **options)
     expected = run(sir(300), z, runs=2)
     found = run(one, z, runs=2)
@@ -320,7 +320,7 @@ def test_annealing_finds_a_narrow_peak_that_sir_misses():
     peak = tensor([0.9, -0.8, 1.1, 0.7])
     likelihood = lambda x, frame: -0.5 * ((x - peak) / 0.02).square().sum(-1)  # noqa: E731
     frames, start = torch.ones(12, 1, 1, dtype=WIDE), torch.zeros(12, 4, dtype=WIDE)
-    options = {"step_std": 1.0, "likelihood": likelihood}
+    options = {"process_cov": 1.0, "likelihood": likelihood}
     annealed = AnnealedParticleFilter(LinearBody(4), 100, n_layers=10, **options)
     plain = SIRParticleFilter(LinearBody(4), 1000, **options)
     near = (annealed(frames, None, start, generator()).mean - peak).norm(dim=-1)
@@ -375,7 +375,7 @@ def test_the_manifold_filter_agrees_with_the_exact_posterior(weights, proposal):
     mean, std, evidence = manifold_filter(z, manifold, weights)
     tracker = ManifoldParticleFilter(
         LinearBody(3, n_root=1), manifold, 6000, weights=weights, proposal=proposal,
-        step_std=STEP, likelihood=gaussian_likelihood(H, R),
+        process_cov=STEP**2, likelihood=gaussian_likelihood(H, R),
     )  # fmt: skip
     out = run(tracker, z)
     assert_within_error(out.mean, mean, slack=1e-3)
@@ -392,7 +392,7 @@ def test_the_two_weights_differ_and_the_product_wastes_fewer_particles():
     for proposal in MANIFOLD_PROPOSALS:
         tracker = ManifoldParticleFilter(
             LinearBody(3, n_root=1), manifold, 500, weights="normalised", proposal=proposal,
-            step_std=STEP, likelihood=gaussian_likelihood(H, R),
+            process_cov=STEP**2, likelihood=gaussian_likelihood(H, R),
         )  # fmt: skip
         sizes[proposal] = float(run(tracker, z, runs=8).effective_sample_size.mean())
     assert sizes["product"] > 1.3 * sizes["diffusion"]
@@ -408,7 +408,7 @@ def test_how_far_particles_stray_without_evidence(weights):
     )  # fmt: skip
     flat = lambda states, frame: torch.zeros(states.shape[:2], dtype=WIDE)  # noqa: E731
     tracker = ManifoldParticleFilter(
-        LinearBody(1), point, 4000, weights=weights, step_std=0.1, likelihood=flat
+        LinearBody(1), point, 4000, weights=weights, process_cov=0.1**2, likelihood=flat
     )
     out = tracker(torch.ones(150, 1), None, tensor([0.0]), generator())
     if weights == "published":  # P = (1 / (P + q) + 1 / s)^-1
@@ -550,9 +550,9 @@ def test_motion_std_is_the_change_from_frame_to_frame():
         ({"resample_threshold": 1.5}, "resample_threshold"),
         ({"estimate": "mode"}, "estimate must be one of"),
         ({"limit_mode": "reflect"}, "limit_mode must be one of"),
-        ({"step_std": tensor([1.0, -1.0, 1.0])}, "must not be negative"),
-        ({"step_std": tensor([1.0, 1.0])}, "step_std must have shape"),
-        ({"step_std": math.nan}, "finite"),
+        ({"process_cov": tensor([1.0, -1.0, 1.0])}, "must not be negative"),
+        ({"process_cov": tensor([1.0, 1.0])}, "process_cov must have shape"),
+        ({"process_cov": math.nan}, "finite"),
         ({"respread_scale": -1.0}, "respread_scale"),
         ({"survival_rate": 1.0}, "survival_rate"),
     ],

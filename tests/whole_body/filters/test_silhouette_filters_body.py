@@ -34,8 +34,8 @@ def sequence():
 
 
 @pytest.fixture(scope="module")
-def step_std():
-    return motion_std(BODY, walk(BODY, 120, seed=3), floor=1e-3)
+def process_cov():
+    return motion_std(BODY, walk(BODY, 120, seed=3), floor=1e-3).square()
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +45,8 @@ def manifold():
     return fit_gplvm_noise(found, BODY.relative(validation), fps=60.0)
 
 
-def make(kind, step_std, manifold, **options):
-    options = {"step_std": step_std, "sharpness": 60.0, **options}
+def make(kind, process_cov, manifold, **options):
+    options = {"process_cov": process_cov, "sharpness": 60.0, **options}
     if kind == "sir":
         return SIRParticleFilter(BODY, 300, **options)
     if kind == "annealed":
@@ -55,9 +55,9 @@ def make(kind, step_std, manifold, **options):
 
 
 @pytest.mark.parametrize("kind", ["sir", "annealed", "manifold"])
-def test_a_walk_is_tracked(kind, sequence, step_std, manifold):
+def test_a_walk_is_tracked(kind, sequence, process_cov, manifold):
     start, states, silhouettes = sequence
-    tracker = make(kind, step_std, manifold)
+    tracker = make(kind, process_cov, manifold)
     out = tracker(silhouettes, RIG, start, generator())
     error = mean_joint_error(BODY, out.mean, BODY.joints(states))
     still = mean_joint_error(BODY, start.expand_as(states), BODY.joints(states))
@@ -69,14 +69,14 @@ def test_a_walk_is_tracked(kind, sequence, step_std, manifold):
 
 
 @pytest.mark.parametrize("kind", ["sir", "annealed", "manifold"])
-def test_empty_silhouettes_let_the_filter_coast(kind, sequence, step_std, manifold):
+def test_empty_silhouettes_let_the_filter_coast(kind, sequence, process_cov, manifold):
     start, _, silhouettes = sequence
     gone = silhouettes[:12].clone()
     gone[4:10] = False
     one_blind = silhouettes[:12].clone()
     one_blind[:, 0] = False
     both = torch.stack([gone, one_blind])
-    out = make(kind, step_std, manifold)(both, RIG, start, generator())
+    out = make(kind, process_cov, manifold)(both, RIG, start, generator())
     expected = torch.zeros(2, 12, dtype=torch.bool)
     expected[0, 4:10] = True
     assert (out.coasting == expected).all()
@@ -86,11 +86,11 @@ def test_empty_silhouettes_let_the_filter_coast(kind, sequence, step_std, manifo
     assert out.mean.isfinite().all()
 
 
-def test_overlap_limits_and_single_precision(sequence, step_std):
+def test_overlap_limits_and_single_precision(sequence, process_cov):
     start, states, silhouettes = sequence
     limits = JointLimits.fit(walk(BODY, 120, seed=5))
     tracker = SIRParticleFilter(
-        walker().float(), 100, step_std=step_std, likelihood="overlap", sharpness=30.0,
+        walker().float(), 100, process_cov=process_cov, likelihood="overlap", sharpness=30.0,
         limits=limits.float(),
     )  # fmt: skip
     out = tracker(silhouettes[:6], RIG, start, generator())
@@ -102,19 +102,21 @@ def test_overlap_limits_and_single_precision(sequence, step_std):
     assert float(error) < 0.1
 
 
-def test_a_body_that_no_camera_has_in_view_is_no_error(sequence, step_std):
+def test_a_body_that_no_camera_has_in_view_is_no_error(sequence, process_cov):
     start, _, silhouettes = sequence
     behind = start.clone()
     behind[0] += 50.0
-    out = SIRParticleFilter(BODY, 20, step_std=step_std)(silhouettes[:2], RIG, behind, generator())
+    out = SIRParticleFilter(BODY, 20, process_cov=process_cov)(
+        silhouettes[:2], RIG, behind, generator()
+    )
     # model and silhouette share nothing: both terms are 1 in every camera (MR 12)
     assert out.log_evidence.tolist() == pytest.approx([-2.0, -2.0])
     assert not out.coasting.any()
 
 
-def test_cameras_that_do_not_match(sequence, step_std):
+def test_cameras_that_do_not_match(sequence, process_cov):
     start, _, silhouettes = sequence
-    tracker = SIRParticleFilter(BODY, 5, step_std=step_std)
+    tracker = SIRParticleFilter(BODY, 5, process_cov=process_cov)
     with pytest.raises(CameraError, match="2 cameras"):
         tracker(silhouettes, RIG.select([0, 1]), start)
     with pytest.raises(CameraError, match="60 x 80"):
@@ -136,11 +138,11 @@ def test_a_manifold_of_another_body_is_refused(manifold):
 
 
 @pytest.mark.parametrize("weights", ["published", "normalised"])
-def test_the_manifold_keeps_what_no_camera_shows_near_it(weights, sequence, step_std, manifold):
+def test_the_manifold_keeps_what_no_camera_shows_near_it(weights, sequence, process_cov, manifold):
     """Without evidence particles wander off, but for the manifold."""
     start, frames = sequence[0], torch.ones(50, 1)
     options = {
-        "step_std": step_std.clamp_min(0.012),
+        "process_cov": process_cov.clamp_min(0.012**2),
         "likelihood": lambda states, frame: torch.zeros(states.shape[:2]),
     }
     distance = {}
@@ -159,11 +161,11 @@ def test_the_manifold_keeps_what_no_camera_shows_near_it(weights, sequence, step
     assert distance["held"] < 0.6 * distance["free"]
 
 
-def test_sharpness_is_fitted_on_silhouettes(sequence, step_std):
+def test_sharpness_is_fitted_on_silhouettes(sequence, process_cov):
     start, states, silhouettes = sequence
     one = ValidationSequence(silhouettes[:8], RIG, states[:8], start)
     found = fit_sharpness(
-        lambda s: SIRParticleFilter(BODY, 80, step_std=step_std, sharpness=s),
+        lambda s: SIRParticleFilter(BODY, 80, process_cov=process_cov, sharpness=s),
         [one], values=[1.0, 60.0], seeds=3,
     )  # fmt: skip
     assert found.sharpness == 60.0

@@ -94,7 +94,7 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
     """Annealed particle filter: in every frame, layers from a broad to a peaked likelihood.
 
     Each frame starts from the particles of the last, resampled. Layer m = 0, ..., M - 1:
-        x ~ N(x, alpha^m diag(step_std^2)),   w_n = p(I_t | x_n)^beta_m / sum_j p(I_t | x_j)^beta_m
+        x ~ N(x, alpha^m diag(process_cov)),   w_n = p(I_t | x_n)^beta_m / sum_j p(I_t | x_j)^beta_m
     and resampling between layers. beta_m is solved so that the share alpha of the particles survives,
     alpha = (sum w^beta)^2 / (N sum w^(2 beta)), and the covariance of the noise shrinks at the same
     rate. The estimate is that of the last layer, weighted.
@@ -103,7 +103,7 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
     does not. The weights are those of no posterior, so the log-evidence is NaN (0 while coasting); the
     spread of the particles is that about one mode.
 
-    An element that nobody sees is diffused once, with `step_std`, and not annealed.
+    An element that nobody sees is diffused once, with `process_cov`, and not annealed.
 
     Args:
         body: as `SilhouetteParticleFilter`. n_particles: N of each layer.

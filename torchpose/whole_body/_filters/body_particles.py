@@ -59,6 +59,7 @@ class PoseSpace(Protocol):
 class BodyFilterOptions(TypedDict, total=False):
     """The options of `SilhouetteParticleFilter`, which every filter over body poses has."""
 
+    process_cov: Tensor | float | None
     step_std: Tensor | float | None
     likelihood: str | Likelihood
     sharpness: float

@@ -47,7 +47,7 @@ _TRACKING_SHARPNESS = 30.0  # of the overlap
 _REJECTED = (
     "the gate rejected every draw of all particles {times} times ({frames}), and they were moved to its "
     "border; start in a posture of the action, use fewer dimensions, a wider gate, more redraws or a "
-    "larger step_std, or a bank in which no action is possible too"
+    "larger process_cov, or a bank in which no action is possible too"
 )
 
 
@@ -91,7 +91,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         posture_body: see `PostureGate`.
         fps: of the frames to be tracked, to which a bank's transitions are rescaled (`repr` says from
             which); that of its performances if None. One action is the same at any frame rate.
-        options: as `SilhouetteParticleFilter`; `step_std` is sigma_phi (see `constant_velocity_std`), and
+        options: as `SilhouetteParticleFilter`; `process_cov` is sigma_phi^2 (`constant_velocity_std`), and
             ``likelihood="overlap"`` the published one.
 
     Raises:
@@ -217,7 +217,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         step = torch.empty(body.dim, dtype=torch.float64)
         step[:3], step[3:6], step[6:] = _TRACKING_STD
         return {
-            "step_std": rescale_std(step, 1 / _TRACKING_RATE, 1 / fps),
+            "process_cov": rescale_std(step, 1 / _TRACKING_RATE, 1 / fps).square(),
             "sharpness": _TRACKING_SHARPNESS,
             "likelihood": "overlap",
             "posture_body": None if learnt is None else _posture_body(learnt),

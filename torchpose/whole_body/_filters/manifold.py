@@ -84,8 +84,8 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
             form holds poses so close to the manifold that they fall behind.
         fps: of the frames to be tracked; the manifold must have its noise for that rate. None if it
             does not matter.
-        options: as `SilhouetteParticleFilter`. `step_std` [D] is the root's and sigma x->x; the
-            manifold's own `std_step` (and `default_step_std` for the root) if None.
+        options: as `SilhouetteParticleFilter`. `process_cov` [D] is the root's and sigma x->x^2; that of
+            the manifold's own `std_step` (and `default_step_std` for the root) if None.
 
     Raises:
         PriorError: a manifold of another skeleton or frame rate, or without its noise.
@@ -111,8 +111,8 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
         manifold.check_for(body, fps)
         columns = torch.as_tensor(body.relative_columns, dtype=torch.long)  # type: ignore[attr-defined]
         _check_noise(manifold, len(columns))
-        if options.get("step_std") is None:
-            options["step_std"] = _step_std(body, manifold)
+        if options.get("process_cov") is None and options.get("step_std") is None:
+            options["process_cov"] = _process_cov(body, manifold)
         super().__init__(body, n_particles, **options)
         self.manifold, self.weights, self.proposal = manifold, weights, proposal
         self.register_buffer("columns", columns.to(self.step_std.device), persistent=False)
@@ -125,7 +125,7 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
         """Return the usual options, with twice the noise of the manifold."""
         options = super().tracking_options(body, fps)
         if learnt is not None:
-            options["step_std"] = _step_std(body, learnt, fps, _TRACKING_STEP)
+            options["process_cov"] = _process_cov(body, learnt, fps, _TRACKING_STEP)
         return options
 
     def move(
@@ -187,14 +187,14 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
         return self.step_std[self.columns].square(), pose.square()
 
 
-def _step_std(
+def _process_cov(
     body: PoseSpace, manifold: PoseManifold, fps: float = 60.0, scale: float = 1.0
 ) -> Float[Tensor, " D"]:
-    """Return the diffusion of the root by default, and so many times sigma x->x of the parts."""
+    """Return the variances [D] of the root by default, and of the parts by so many times sigma x->x."""
     std = default_step_std(body, fps)
     columns = torch.as_tensor(body.relative_columns, dtype=torch.long)  # type: ignore[attr-defined]
     std[columns.to(std.device)] = scale * manifold.std_step.detach().to(std)
-    return std
+    return std.square()
 
 
 def _check_noise(manifold: PoseManifold, n_columns: int) -> None:

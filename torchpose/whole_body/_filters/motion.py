@@ -1,36 +1,27 @@
-"""Move bodies from frame to frame: noise of the motion, learnt or by default, and exchanged legs.
+"""Compute the noise of the motion from frame to frame, learnt or by default, and velocities.
 
 A random walk has the noise of `default_step_std` or `motion_std`; first-order motion goes on with the
-velocity of the estimate, and has that of `constant_velocity_std`."""
+velocity of the estimate, and has that of `constant_velocity_std`.
+"""
 
+import warnings
 from collections.abc import Sequence
-from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose.body._kinematics import Body
-from torchpose.body._skeleton import BodySkeleton
-from torchpose.errors import InputError, SkeletonError, check_finite, check_shape
-from torchpose.filters._base import Generators, uniform
-from torchpose.math._rotations import compose, conjugate
+from torchpose.errors import InputError, check_finite, check_shape
 from torchpose.whole_body._filters.body_particles import PoseSpace
 
 __all__ = [
-    "as_step_std",
-    "check_leg_swap",
     "constant_velocity_std",
     "default_step_std",
-    "exchange_legs",
-    "extra_copies",
-    "leg_angle",
-    "leg_permutation",
+    "diffusion_std",
     "motion_std",
     "next_velocity",
     "rescale_std",
     "std_of_covariance",
-    "swap_legs",
 ]
 
 # Per frame at 60 Hz, about twice the motion of a walk: metres, then sines of half angles.
@@ -60,7 +51,9 @@ def default_step_std(body: PoseSpace, fps: float = _RATE) -> Float[Tensor, " D"]
 def motion_std(
     body: PoseSpace, states: Float[Tensor, "T D"] | Sequence[Tensor], floor: float = 0.0
 ) -> Float[Tensor, " D"]:
-    """Return the root mean square change of recorded states from frame to frame, for `step_std`.
+    """Return the root mean square change of recorded states from frame to frame.
+
+    Its square is a `process_cov` of the filters.
 
     Args:
         states: one sequence [T, D], or several. Frames with NaN are passed over.
@@ -78,20 +71,21 @@ def motion_std(
     return steps.square().mean(0).sqrt().clamp_min(floor)
 
 
-def std_of_covariance(name: str, cov: Tensor, dim: int) -> Float[Tensor, " D"]:
+def std_of_covariance(name: str, cov: Tensor | float, dim: int) -> Float[Tensor, " D"]:
     """Return the standard deviations of a diagonal covariance.
 
     Args:
-        name: of the argument. cov: variances [D], or the diagonal matrix [D, D], in squares of the units
-            of a step. dim: D.
+        name: of the argument. cov: variances [D], the diagonal matrix [D, D], or one variance for all
+            columns, in squares of the units of a step. dim: D.
 
     Raises:
-        ShapeError: another size. InputError: negative or infinite variances, or entries off the diagonal:
-        the filters let every column of a state diffuse by itself.
+        ShapeError: another size. InputError: negative or infinite variances, or entries off the diagonal,
+        which the filters do not support.
 
     >>> std_of_covariance("process_cov", torch.tensor([4.0, 9.0]), 2)
     tensor([2., 3.])
     """
+    cov = _floating(cov)
     if cov.ndim == 2:
         check_shape(name, cov, [dim, dim])
         if bool((cov - torch.diag(cov.diagonal())).any()):
@@ -99,30 +93,53 @@ def std_of_covariance(name: str, cov: Tensor, dim: int) -> Float[Tensor, " D"]:
                 f"{name} must be diagonal, [{dim}] or [{dim}, {dim}], got other entries"
             )
         cov = cov.diagonal()
-    check_shape(name, cov, [dim])
-    check_finite(name, cov)
-    if bool((cov < 0).any()):
-        raise InputError(f"{name} must not be negative, got {float(cov.min()):g}")
-    return cov.sqrt()
+    return _not_negative(name, cov, dim).sqrt()
 
 
-def as_step_std(body: PoseSpace, value: Tensor | float | None) -> Float[Tensor, " D"]:
-    """Return the `step_std` of a filter, checked, in the dtype and on the device of the body.
+def diffusion_std(
+    body: PoseSpace, process_cov: Tensor | float | None, step_std: Tensor | float | None = None
+) -> Float[Tensor, " D"]:
+    """Return the standard deviations of a filter's diffusion, in the dtype and on the device of the body.
+
+    Args:
+        body: of D columns. process_cov: as `std_of_covariance` takes it; the square of
+            `default_step_std` if None. step_std: deprecated, the deviations [D] or one number, instead.
 
     Raises:
-        ShapeError: not [D]. InputError: not finite, or negative.
+        ShapeError, InputError: as `std_of_covariance`, or both arguments are given.
     """
-    std = default_step_std(body) if value is None else torch.as_tensor(value).detach()
-    std = std if std.is_floating_point() else std.double()
-    if std.ndim == 0:
-        std = std.double().expand(body.dim)
-    check_shape("step_std", std, [body.dim])
-    check_finite("step_std", std)
-    if bool((std < 0).any()):
-        raise InputError(f"step_std must not be negative, got {float(std.min()):g}")
+    if process_cov is not None and step_std is not None:
+        raise InputError("process_cov and step_std say the same; leave one of them out")
+    if step_std is not None:
+        warnings.warn(
+            "step_std is deprecated and goes with version 0.3.0; give its square as process_cov",
+            DeprecationWarning,
+            stacklevel=4,
+        )
+        std = _not_negative("step_std", _floating(step_std), body.dim)
+    elif process_cov is not None:
+        std = std_of_covariance("process_cov", process_cov, body.dim)
+    else:
+        std = default_step_std(body)
     if isinstance(body, nn.Module):
         std = std.to(next((b for b in body.buffers() if b.is_floating_point()), std))
     return std.clone()
+
+
+def _floating(value: Tensor | float) -> Tensor:
+    """Return a tensor as it is if it holds floating-point numbers, anything else in double precision."""
+    value = torch.as_tensor(value, dtype=None if isinstance(value, Tensor) else torch.float64)
+    return value.detach() if value.is_floating_point() else value.double()
+
+
+def _not_negative(name: str, value: Tensor, dim: int) -> Float[Tensor, " D"]:
+    """Return values [D], one repeated for every column, or raise unless all are finite and not negative."""
+    value = value.double().expand(dim) if value.ndim == 0 else value
+    check_shape(name, value, [dim])
+    check_finite(name, value)
+    if bool((value < 0).any()):
+        raise InputError(f"{name} must not be negative, got {float(value.min()):g}")
+    return value
 
 
 # --- first-order motion ---------------------------------------------------------------------------
@@ -239,136 +256,3 @@ def _positive(name: str, value: float) -> float:
     if not 0 < value < float("inf"):
         raise InputError(f"{name} must be positive and finite, got {value}")
     return value
-
-
-_LEG_PARTS = ("thigh", "shank")
-_ROOT_COLUMNS = 3  # the position; the vectors of all parts follow
-
-
-def leg_permutation(skeleton: BodySkeleton) -> Int[Tensor, " P"]:
-    """Return the indices of the parts with those of the left and the right leg exchanged.
-
-    Args:
-        skeleton: with the parts left_thigh, left_shank, right_thigh and right_shank.
-
-    Raises:
-        SkeletonError: it lacks one of them.
-
-    >>> from torchpose.body._skeleton import BODY_15
-    >>> leg_permutation(BODY_15).tolist()
-    [0, 1, 2, 3, 4, 9, 10, 7, 8, 5, 6]
-    """
-    order = torch.arange(len(skeleton.parts))
-    for part in _LEG_PARTS:
-        left, right = skeleton.part(f"left_{part}"), skeleton.part(f"right_{part}")
-        order[left], order[right] = right, left
-    return order
-
-
-def leg_angle(body: Body, states: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch"]:
-    """Return the angle between the upper legs, theta_legs, radians from 0 to pi.
-
-    Args:
-        states: of `body`, [..., D].
-    """
-    thighs = [body.skeleton.part(f"{side}_thigh") for side in ("left", "right")]
-    bones = [_bone(body, thigh) for thigh in thighs]
-    rotations = body.part_rotations(states)[..., thighs, :, :]
-    left, right = (rotations @ torch.stack(bones).unsqueeze(-1)).squeeze(-1).unbind(-2)
-    across = torch.linalg.cross(left, right).norm(dim=-1)
-    return torch.atan2(across, (left * right).sum(-1))  # an arccos would be NaN beyond 1
-
-
-def exchange_legs(body: Body, states: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D"]:
-    """Return states whose left leg is turned as the right one was, and the other way round.
-
-    C_l R(q_l') = C_r R(q_r),   C_r R(q_r') = C_l R(q_l)
-
-    Doing so twice changes nothing.
-    """
-    order = leg_permutation(body.skeleton).to(states.device)
-    centres = body.centres.to(states)
-    vectors = states[..., _ROOT_COLUMNS:].unflatten(-1, (-1, 3))
-    moved = order != torch.arange(len(order), device=order.device)
-    shift = compose(conjugate(centres[moved]), centres[order[moved]])
-    exchanged = vectors.clone()
-    exchanged[..., moved, :] = compose(shift, vectors[..., order[moved], :])
-    return torch.cat([states[..., :_ROOT_COLUMNS], exchanged.flatten(-2)], -1)
-
-
-def extra_copies(ancestors: Int[Tensor, "B N"]) -> Bool[Tensor, "B N"]:
-    """Tell which particles are copies beside the first one of the same ancestor.
-
-    Args:
-        ancestors: of the resampled particles, in any order.
-
-    >>> extra_copies(torch.tensor([[2, 0, 2, 2, 3]])).tolist()
-    [[False, False, True, True, False]]
-    """
-    ordered, place = ancestors.sort(dim=-1, stable=True)
-    again = torch.zeros_like(ordered, dtype=torch.bool)
-    again[..., 1:] = ordered[..., 1:] == ordered[..., :-1]
-    return torch.zeros_like(again).scatter(-1, place, again)
-
-
-def swap_legs(
-    body: Any,
-    particles: Float[Tensor, "B N D"],
-    copies: Bool[Tensor, "B N"],
-    rate: float,
-    generator: Generators = None,
-) -> tuple[Float[Tensor, "B N D"], Bool[Tensor, "B N"]]:
-    """Exchange the legs of some extra copies of particles, the more often the wider they are apart.
-
-    p(swap) = rate theta_legs / pi,   theta_legs the angle between the upper legs
-
-    The first copy of every particle keeps its legs, and so does everything that was not resampled.
-
-    Args:
-        particles: [B, N, D], resampled. copies: those that may be swapped, see `extra_copies`.
-        rate: probability for legs in opposite directions, 0 to 1.
-        generator: as for `standard_normal`; nothing is drawn at a rate of 0.
-
-    Returns:
-        The particles, and which of them were swapped.
-
-    Raises:
-        InputError, SkeletonError: as `check_leg_swap`.
-
-    Reference: Daubney & Xie, section 8: an extra copy of a particle is occasionally kept with the
-    legs swapped, and the number of particles stays the same.
-    """
-    check_leg_swap(body, rate)
-    if rate == 0:
-        return particles, torch.zeros_like(copies)
-    batch, n = particles.shape[:2]
-    drawn = uniform(batch, (n,), generator, particles)
-    swapped = copies & (drawn < rate * leg_angle(body, particles) / torch.pi)
-    return torch.where(swapped[..., None], exchange_legs(body, particles), particles), swapped
-
-
-def check_leg_swap(body: Any, rate: float) -> None:
-    """Raise unless the legs of a body can be swapped at this rate.
-
-    Raises:
-        InputError: a rate that is not from 0 to 1. SkeletonError: a body without upper and lower legs.
-    """
-    if not 0 <= rate <= 1:
-        raise InputError(f"leg_swap must be a probability, from 0 to 1, got {rate}")
-    if rate == 0:
-        return
-    if not isinstance(body, Body):
-        raise SkeletonError(
-            f"leg_swap needs a torchpose.body.Body with two legs, got {type(body).__name__}; set "
-            "leg_swap=0"
-        )
-    leg_permutation(body.skeleton)
-
-
-def _bone(body: Body, part: int) -> Float[Tensor, "3"]:
-    """Return the offset of the first joint that a part carries."""
-    carried = [j for j, p in enumerate(body.skeleton.part_of) if p == part]
-    if not carried:
-        name = body.skeleton.parts[part]
-        raise SkeletonError(f"part {name!r} carries no joint, so that it has no direction")
-    return body.offsets[carried[0]]

@@ -42,6 +42,7 @@ from torchpose.whole_body._filters.body_particles import (
     check_choice,
     reweight,
 )
+from torchpose.whole_body._filters.legs import leg_permutation
 from torchpose.whole_body._filters.limb_observations import (
     check_rules,
     count_positions,
@@ -49,7 +50,7 @@ from torchpose.whole_body._filters.limb_observations import (
     part_groups,
     part_log_likelihood,
 )
-from torchpose.whole_body._filters.motion import default_step_std, leg_permutation
+from torchpose.whole_body._filters.motion import default_step_std
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
 
 __all__ = ["PUBLISHED", "WEIGHTINGS", "RootUncertaintyTracker", "joint_covariance_with_parts"]
@@ -72,7 +73,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
     """Root hypotheses by sampling, and for each of them a Gaussian over every part's rotation.
 
     X_n = {x_r, mu_1, Sigma_1, ..., mu_{P-1}, Sigma_{P-1}, w}. In every frame the root diffuses,
-    x_r <- x_r + N(0, step_std^2), and the parts' covariances grow (DX 13-14). Seven sigma points of
+    x_r <- x_r + N(0, process_cov), and the parts' covariances grow (DX 13-14). Seven sigma points of
     every part, the others at their means, are weighed by the silhouette pixels under them (DX 4) and
     make p(x_i | O_i) = N(mu_i^obs, Sigma_i^obs); messages along the tree of parts (DX 5-11) give the
     posterior of each part. A hypothesis weighs
@@ -107,7 +108,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
             means, one more evaluation for each hypothesis.
         options: as `SilhouetteParticleFilter`, but `estimate` is "map" by default, the means of the
             hypothesis of the largest weight, and `limit_mode` "discard"; only the root's part of
-            `step_std` counts, `likelihood` only with ``weighting="body"``, and `sharpness` cancels.
+            `process_cov` counts, `likelihood` only with ``weighting="body"``, and `sharpness` cancels.
 
     Attributes:
         conditionals: at `fps`. survival_rate: alpha, per frame.
@@ -166,7 +167,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
     @classmethod
     def tracking_options(cls, body: Any, fps: float, learnt: Any = None) -> dict[str, Any]:
         """Return the default diffusion of the root, and legs that are exchanged now and then."""
-        return {"step_std": default_step_std(body, fps), "leg_swap": _TRACKING_SWAP}
+        return {"process_cov": default_step_std(body, fps).square(), "leg_swap": _TRACKING_SWAP}
 
     def start_std(self) -> Float[Tensor, " D"]:
         """Return the spread of the root alone: parts have Gaussians of their own."""

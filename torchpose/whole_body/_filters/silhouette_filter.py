@@ -40,13 +40,8 @@ from torchpose.whole_body._filters.body_particles import (
     stack_tracks,
     warn_of_frames,
 )
-from torchpose.whole_body._filters.motion import (
-    as_step_std,
-    check_leg_swap,
-    default_step_std,
-    extra_copies,
-    swap_legs,
-)
+from torchpose.whole_body._filters.legs import check_leg_swap, extra_copies, swap_legs
+from torchpose.whole_body._filters.motion import default_step_std, diffusion_std
 from torchpose.whole_body._silhouettes.likelihood import LIKELIHOODS
 from torchpose.whole_body._silhouettes.outlines import check_limb_shape
 
@@ -56,7 +51,7 @@ _MOST_SPREAD = 10  # frames over which the noise of a filter that stays lost kee
 _SHARPNESS = 100.0  # exponent of a likelihood in [-2, 0] that tells poses apart
 _DIED = (
     "all particles died {times} times ({frames}) and were spread about the last mean; use more "
-    "particles, a larger step_std, a smaller sharpness or wider joint limits"
+    "particles, a larger process_cov, a smaller sharpness or wider joint limits"
 )
 
 
@@ -69,8 +64,9 @@ class SilhouetteParticleFilter(nn.Module, ABC):
     Args:
         body: whose poses are tracked; anything with the methods of `PoseSpace`.
         n_particles: N.
-        step_std: standard deviation of the diffusion per frame, [D] or one number (metres for the
-            root, sines of half angles for rotations); `default_step_std` if None. (MR 29)
+        process_cov: variances of the diffusion per frame, [D], [D, D] without entries off the diagonal, or
+            one number (squares of metres for the root, of sines of half angles for rotations); the
+            square of `default_step_std` if None (MR 29). step_std: its square root; deprecated.
         likelihood: "bidirectional" (MR 12), "overlap" (log of AS 7), or a callable
             (states [B, N, D], frame [B, ...]) -> log-likelihood [B, N] for observations of another
             kind.
@@ -86,7 +82,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
             the angle between its upper legs over pi (Daubney & Xie, section 8); 0 for never.
         limb_shape: of the body in silhouettes, "cylinders" or "rectangles" (AS, section 3.2).
         respread_scale: particles that all died are drawn about the last mean with this many times
-            `step_std`, twice that in the second such frame, and so on.
+            the noise of a step, twice that in the second such frame, and so on.
 
     Raises:
         InputError, ShapeError: an argument is not as described.
@@ -101,6 +97,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         body: PoseSpace,
         n_particles: int = 500,
         *,
+        process_cov: Tensor | float | None = None,
         step_std: Tensor | float | None = None,
         likelihood: str | Likelihood = "bidirectional",
         sharpness: float = 1.0,
@@ -133,7 +130,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         self.likelihood, self.limb_shape, self.estimate = likelihood, limb_shape, estimate
         self.resampling, self.resample_threshold = resampling, resample_threshold
         self.leg_swap, self.respread_scale = leg_swap, respread_scale
-        self.register_buffer("step_std", as_step_std(body, step_std))
+        self.register_buffer("step_std", diffusion_std(body, process_cov, step_std))
 
     # --- what a subclass adds
 
@@ -194,7 +191,12 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         Args:
             body: that is tracked. fps: frames per second. learnt: what the filter needs, if anything.
         """
-        return {"step_std": default_step_std(body, fps), "sharpness": _SHARPNESS}
+        return {"process_cov": default_step_std(body, fps).square(), "sharpness": _SHARPNESS}
+
+    @property
+    def process_cov(self) -> Float[Tensor, " D"]:
+        """Variances of the diffusion per frame."""
+        return self.step_std.square()
 
     def start_std(self) -> Float[Tensor, " D"]:
         """Return the spread of particles about a first pose that was found in images."""
@@ -267,10 +269,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         generator: Generators = None,
         initial_std: Tensor | None = None,
     ) -> BodyFilterState:
-        """Return N copies of the initial state, spread if `initial_std` [D] is given.
-
-        Reference: MR, Algorithm 1, step 1.
-        """
+        """Return N copies of the initial state, spread if `initial_std` [D] is given (step 1, MR)."""
         start = initial_state.to(self.step_std).reshape(-1, initial_state.shape[-1])
         check_shape("initial_state", start, ["B", self.body.dim])
         check_finite("initial_state", start)
@@ -324,14 +323,10 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         mean = torch.where(dead[:, None], state.mean, mean)
         evidence = torch.where(frame.seen, moved.log_evidence, 0.0)  # exactly: without rounding
         out = BodyTrack(
-            mean,
-            torch.where(dead & ~evidence.isnan(), -torch.inf, evidence),
+            mean, torch.where(dead & ~evidence.isnan(), -torch.inf, evidence),
             self.spread(particles, log_weights, mean, moved.memory),
-            effective_sample_size(log_weights),
-            ~frame.seen,
-            dead,
-            moved.details or {},
-        )
+            effective_sample_size(log_weights), ~frame.seen, dead, moved.details or {},
+        )  # fmt: skip
         after = BodyFilterState(particles, log_weights, mean, lost, moved.memory, moved.trend)
         return after, out
 

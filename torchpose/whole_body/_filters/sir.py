@@ -22,7 +22,7 @@ __all__ = ["SIRParticleFilter"]
 class SIRParticleFilter(SilhouetteParticleFilter):
     """The Condensation algorithm: diffuse, weigh by the image, resample.
 
-    x_t ~ N(x_{t-1}, diag(step_std^2)) (MR 29),   w_n = p(I_t | x_t^(n))^s / sum_j p(I_t | x_t^(j))^s
+    x_t ~ N(x_{t-1}, diag(process_cov)) (MR 29),   w_n = p(I_t | x_t^(n))^s / sum_j p(I_t | x_t^(j))^s
 
     with the sharpness s. With a survival rate the exponent is instead solved in every frame, so that
     this share of the particles survives (Daubney & Xie); then `sharpness` cancels and the log-evidence
