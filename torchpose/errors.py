@@ -1,4 +1,4 @@
-"""Typed errors, which are public, and the checks of arguments that raise them, which are not.
+"""Define the typed errors, and the private checks of arguments that raise them.
 
 Every message says what was expected, what came, and what to do about it. Messages are one line of
 printable characters, whatever the file or the name that they quote.

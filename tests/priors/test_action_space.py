@@ -8,7 +8,7 @@ import torch
 
 from tests.data import data_dir_or_skip
 from tests.priors.performances import performances
-from torchpose.body import BODY_15, Body
+from torchpose.body import BODY_15, Body, body_joints
 from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError, SkeletonError
 from torchpose.learning import fit_action_space
 from torchpose.learning._action_spaces import fit_synchronised
@@ -17,7 +17,7 @@ from torchpose.priors import ActionSpace
 from torchpose.priors._actions.file import ActionInfo
 from torchpose.priors._actions.gate import match_postures
 from torchpose.priors._actions.polar_limbs import LIMBS_12
-from torchpose.priors._actions.postures import normalise_postures, recorded_postures, state_postures
+from torchpose.priors._actions.postures import normalise_postures, posture_angles, state_postures
 
 
 @pytest.fixture(scope="module")
@@ -237,7 +237,7 @@ def test_bends_of_an_unseen_person_pass_the_gate_about_as_often_as_they_should()
     persons = ("s02", "s03", "s05", "s06", "s09", "s11")
     files = [f for p in persons for f in sorted(folder.glob(f"{p}_a03_bend_r[123].npz"))]
     recordings = read_recordings(files)
-    postures = [recorded_postures(r.joints, r.names) for r in recordings]
+    postures = [posture_angles(body_joints(r.joints, r.names)) for r in recordings]
     axis = repetition_axis(postures)
     cut = [[p[s] for s in split_repetitions(p, 30.0, axis)] for p in postures]
     assert [len(parts) for parts in cut] == [5] * len(files)  # each was asked for five

@@ -15,10 +15,8 @@ from torchpose.priors._actions.postures import (
     posture_directions,
     posture_root,
     posture_to_state,
-    recorded_postures,
     state_postures,
 )
-from torchpose.skeleton import SKELETONS
 
 
 def angle(postures, limb):
@@ -171,14 +169,6 @@ def test_a_joint_that_the_set_lacks_is_at_rest():
         angle(found, "left_upper_arm")[0], torch.tensor([0.0, -90, 0]).double()
     )
     assert torch.isfinite(found).all()
-
-
-def test_of_any_joint_set():
-    names = SKELETONS["mhad-16"].joints
-    joints = torch.randn(4, len(names), 3, dtype=torch.float64)
-    assert recorded_postures(joints, names).shape == (4, 36)
-    with pytest.raises(SkeletonError, match="no_such"):
-        recorded_postures(joints, ("no_such", *names[1:]))
 
 
 def test_bad_input():

@@ -1,1 +1,1 @@
-"""Foundations that every other package stands on: checks, registered state, safe files."""
+"""Provide what every room stands on: checks, registered state, safe files."""

@@ -1,4 +1,4 @@
-"""What metrics take: estimates and truth of one shape and precision, masks that are masks."""
+"""Check arguments of metrics: estimates and truth of one shape and precision, boolean masks."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Checks of estimates that were read from a file: numbers that agree, covariances that are some."""
+"""Check estimates that were read from a file: numbers that agree, valid covariances."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,7 +24,7 @@ def to_tensor(array: np.ndarray) -> Tensor:
 
 
 def frame_facts(path: str | Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """What results of all kinds say beside their frames: `fps`, `notes` and `first_frame`.
+    """Return what results of all kinds say beside their frames: `fps`, `notes` and `first_frame`.
 
     Raises:
         FileFormatError: of another type, a rate that no camera has, or a negative frame.

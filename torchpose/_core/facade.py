@@ -1,4 +1,4 @@
-"""What a room shows: public names and subpackages, and for one release the names that have left it."""
+"""Show the public names and subpackages of a room, and for one release the names that have left it."""
 
 import sys
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""State of modules: what is registered, what is derived from it, and in which precision it is kept."""
+"""Manage the state of modules: registered tensors, what is derived from them, and their precision."""
 
 import threading
 from collections.abc import Callable, Hashable, Iterator, Sequence
@@ -55,7 +55,7 @@ def wide_or_parameter(value: Tensor | float | Sequence[float] | None) -> Tensor 
 
 
 class _Mark(NamedTuple):
-    """How a tensor looked when something was derived from it; any change of values changes it."""
+    """Identity and version of a tensor when something was derived from it; any change of values shows."""
 
     tensor: Tensor
     version: int
@@ -75,6 +75,8 @@ class _Mark(NamedTuple):
 
 
 class _Entry(NamedTuple):
+    """Value that was derived, with the marks of the tensors that it came from."""
+
     marks: tuple[_Mark, ...]
     value: Any
 
@@ -84,7 +86,7 @@ _KEPT: "WeakKeyDictionary[nn.Module, dict[Hashable, _Entry]]" = WeakKeyDictionar
 
 
 class _Graphs(threading.local):
-    """What was derived with a graph while a run goes on in this thread."""
+    """Values derived with a graph while a run goes on in this thread."""
 
     def __init__(self) -> None:
         self.depth = 0
@@ -145,7 +147,7 @@ def derived(
 
 
 def _without_graph(make: Callable[[], T]) -> T:
-    """`make()` for use anywhere."""
+    """Return `make()` for use anywhere."""
     with torch.inference_mode(False), torch.no_grad():
         return make()
 
@@ -175,7 +177,7 @@ def _kept_in(
 
 
 def _kept_in_this_run(key: Hashable, given: tuple[Tensor, ...], make: Callable[[], T]) -> T:
-    """`make()`, or what it returned before in this run for the very same tensors."""
+    """Return `make()`, or what it returned before in this run for the very same tensors."""
     found = _GRAPHS.traced.get(key)
     if found is None or [*map(id, found[0])] != [*map(id, given)]:
         found = _GRAPHS.traced[key] = (given, make())

@@ -1,4 +1,4 @@
-"""Old import paths, which work for one release with a `DeprecationWarning`.
+"""Import modules by their old paths, for one release, with a `DeprecationWarning`.
 
 `MODULES` and `NAMES` are the whole table. Both are to go in version 0.3.0.
 """
@@ -429,7 +429,7 @@ def _warn(old: str, new: str) -> None:
 
 
 class _OldNames:
-    """Finds a module by its old name, and gives the present one in its place.
+    """Finder of modules by their old names, which loads the present ones.
 
     A finder as `sys.meta_path` has them. The base classes of `importlib.abc` are not needed for that, and
     take as long to import as half of torchpose.
@@ -453,7 +453,7 @@ class _OldNames:
 
 
 class _Alias:
-    """Loads the present module, and leaves it as it was."""
+    """Loader that returns the present module unchanged."""
 
     def __init__(self, present: str) -> None:
         self.present = present

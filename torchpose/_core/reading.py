@@ -1,4 +1,4 @@
-"""The boundary that foreign files come in through: what is wrong with one is one typed error.
+"""Read foreign files, and raise one typed error for anything wrong with one.
 
 The directory of the archive and the header of each array come first: their shapes, types and sizes are
 checked against one another and against the size of the file before anything is allocated, and only what is

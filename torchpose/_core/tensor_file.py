@@ -1,4 +1,4 @@
-"""Files of what was fitted: tensors as safetensors, what they were fitted on as JSON in the header.
+"""Read and write fitted models: tensors as safetensors, what they were fitted on as JSON in the header.
 
 Every kind of file is a `FileKind`: its name and version, a dataclass of facts, and the tensors that
 belong in it. `write_tensors` and `read_tensors` do the rest.
@@ -73,7 +73,7 @@ class FileKind(Generic[Info]):
 
     @property
     def words(self) -> str:
-        """What it is in words: "an action space"."""
+        """Return the kind in words: "an action space"."""
         name = self.format.removeprefix("torchpose-").replace("-", " ")
         return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
 
@@ -114,7 +114,7 @@ def write_tensors(
 
 
 def read_tensors(path: str | Path, kind: FileKind[Info]) -> tuple[Info, dict[str, Tensor]]:
-    """What the tensors of a file were fitted on, and the tensors by name, on the CPU.
+    """Return what the tensors of a file were fitted on, and the tensors by name, on the CPU.
 
     Raises:
         InputError: no such file. FileFormatError: truncated, of another kind or version, or facts or
@@ -153,7 +153,7 @@ def format_of(path: str | Path) -> str | None:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """A file of safetensors; what its library raises becomes a `ValueError`."""
+    """Return a file of safetensors; what its library raises becomes a `ValueError`."""
     try:
         with safe_open(path, framework="pt") as file:
             yield file

@@ -1,4 +1,4 @@
-"""What programs say at a terminal: errors on one line, bars where somebody looks at them."""
+"""Print errors on one line, and progress bars only to a terminal."""
 
 import re
 import sys

@@ -1,4 +1,4 @@
-"""Whether values may be looked at: the switch for what cannot be exported, compiled or vectorised.
+"""Decide whether values may be looked at: not while a function is exported, compiled or vectorised.
 
 Checks of values raise errors that name the element at fault, and some computations are left out where
 values show that they would change nothing. Both need the numbers, which there are none of while a

@@ -1,4 +1,4 @@
-"""The articulated body: skeleton, kinematics, fits to recorded joints, limits, silhouettes."""
+"""Model the articulated body: skeleton, kinematics, fits to recorded joints, limits."""
 
 from torchpose._core.facade import set_up_facade
 from torchpose.body._fitting import fit_body, fit_state

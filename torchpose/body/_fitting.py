@@ -1,4 +1,4 @@
-"""Bodies and states from recorded joint positions, batched over frames.
+"""Fit bodies and states to recorded joint positions, batched over frames.
 
 What joints cannot tell, and what is taken instead:
 
@@ -157,7 +157,7 @@ class _Fit(NamedTuple):
 
 
 class _Tilt(NamedTuple):
-    """What tells the tilt of the root part about the line of the hips.
+    """Evidence of the tilt of the root part about the line of the hips.
 
     axis, spine: [3], the line and the rest direction of the spine across it, in the part's axes.
     seen: [T, 3], the recorded direction of the spine across the line of the hips, world axes.
@@ -305,7 +305,7 @@ def _linearise(body: Body, fit: _Fit, joints: Tensor, known: Tensor) -> tuple[Te
 
 
 def _where(condition: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """Choose by frame, as `torch.where`."""
+    """Return `new` or `old` by frame, as `torch.where`."""
     return torch.where(condition.view(-1, *[1] * (new.ndim - 1)), new, old)
 
 
@@ -323,7 +323,7 @@ def _tilt_residual(fit: _Fit, tilt: _Tilt) -> tuple[Tensor, Tensor]:
 
 
 class _Roles(NamedTuple):
-    """What the fit does with the joints of a skeleton and its parts.
+    """Roles of a skeleton's joints and parts in the fit.
 
     rigid_parts: those that carry several joints, the root part and the torso. rigid: [J], joints
     carried by them. learnt: [J], joints whose offset is learnt: those, and of the parts with one

@@ -1,4 +1,4 @@
-"""Forward kinematics of the articulated body: states to rotations, joints and limbs.
+"""Compute the forward kinematics of the articulated body: states to rotations, joints and limbs.
 
 A state x [..., D] is the root's position (metres, in any right-handed world axes), the root part's
 orientation, then the rotation of every other part in the order of the skeleton's parts, each as a
@@ -45,7 +45,7 @@ _RELATIVE = slice(6, None)
 
 
 class _Geometry(NamedTuple):
-    """What follows from a body's measures; see `Body`. `centred`: whether a part has a centre."""
+    """Tensors that follow from a body's measures; see `Body`. `centred`: whether a part has a centre."""
 
     offsets: Tensor
     centre_rotations: Tensor
@@ -147,17 +147,17 @@ class Body(nn.Module):
 
     @property
     def centre_rotations(self) -> Float[Tensor, "P 3 3"]:
-        """Rotation of every part's centre."""
+        """Return the rotation of every part's centre."""
         return self._geometry().centre_rotations
 
     @property
     def joint_weights(self) -> Float[Tensor, "P3 J"]:
-        """How the joints depend on the columns of the parts' rotations, [3 P, J]."""
+        """Return how the joints depend on the columns of the parts' rotations, [3 P, J]."""
         return self._geometry().joint_weights
 
     @property
     def limb_weights(self) -> Float[Tensor, "P3 L2"]:
-        """How the ends of the limbs depend on them, [3 P, 2 L]."""
+        """Return how the ends of the limbs depend on them, [3 P, 2 L]."""
         return self._geometry().limb_weights
 
     def _geometry(self) -> "_Geometry":
@@ -215,12 +215,12 @@ class Body(nn.Module):
 
     @property
     def height(self) -> float:
-        """Body height by the bone lengths, metres."""
+        """Return the body height by the bone lengths, metres."""
         return self.skeleton.height(self.bone_lengths)
 
     @property
     def relative_columns(self) -> tuple[int, ...]:
-        """Columns of a state without the root's position and orientation, Q = D - 6 of them."""
+        """Return the columns of a state without the root's position and orientation, Q = D - 6 of them."""
         return tuple(range(6, self.dim))
 
     # --- states to points ---------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Limbs of a body, and the checks of the parameters that a body is built from."""
+"""Describe the limbs of a body, and check the parameters that a body is built from."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Limits of the joints, learnt from recorded states: a box per part with soft edges."""
+"""Limit joints as recorded states do: a box per part with soft edges."""
 
 import math
 
@@ -16,7 +16,7 @@ _LEAST_MARGIN = 0.03  # sine of half the angle: about 3.5 degrees
 
 
 class JointLimits(nn.Module):
-    """How far every entry of the parts' quaternion vectors may go, l <= q <= u.
+    """Limits of every entry of the parts' quaternion vectors, l <= q <= u.
 
     As a density, an entry is uniform within its limits and falls off as a Gaussian of deviation s
     beyond them:

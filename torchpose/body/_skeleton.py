@@ -1,4 +1,4 @@
-"""The articulated body: joints, rigid parts, tips and limbs, and the map of joint sets to it.
+"""Describe the articulated body: joints, rigid parts, tips and limbs, and the map of joint sets to it.
 
 Axes of a part: x to the person's left, y towards the part's parent end (up, in the rest pose:
 standing, arms hanging), z forward; x cross y = z. Left and right are the person's own. Lengths in a
@@ -119,27 +119,27 @@ class BodySkeleton:
 
     @property
     def dim(self) -> int:
-        """Numbers in a state: root position, and three for the orientation of every part."""
+        """Return how many numbers a state has: root position, and three for the orientation of every part."""
         return 3 + 3 * len(self.parts)
 
     @cached_property
     def joint_levels(self) -> tuple[tuple[int, ...], ...]:
-        """Joints by their depth in the tree, the root first."""
+        """Return the joints by their depth in the tree, the root first."""
         return tree_levels(self.parents, self.names)
 
     @cached_property
     def part_levels(self) -> tuple[tuple[int, ...], ...]:
-        """Parts by their depth in the tree, the root first."""
+        """Return the parts by their depth in the tree, the root first."""
         return tree_levels(self.part_parents, self.parts)
 
     @cached_property
     def points(self) -> tuple[str, ...]:
-        """Names of all points: the joints, then the tips."""
+        """Return the names of all points: the joints, then the tips."""
         return self.names + tuple(tip.name for tip in self.tips)
 
     @cached_property
     def mirrored_limbs(self) -> tuple[int, ...]:
-        """Index of each limb's counterpart on the other side; its own in the middle."""
+        """Return the index of each limb's counterpart on the other side; its own in the middle."""
         where = {limb.name: i for i, limb in enumerate(self.limbs)}
         return tuple(where.get(other_side(limb.name), i) for i, limb in enumerate(self.limbs))
 

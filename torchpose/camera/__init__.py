@@ -1,4 +1,4 @@
-"""Cameras: pinhole models, rigs, projection and lifting, viewpoints."""
+"""Model cameras: pinhole cameras and rigs, projection and lifting, viewpoints."""
 
 from torchpose._core.facade import set_up_facade
 from torchpose.camera._pinhole import PinholeCamera, load_cameras, save_cameras

@@ -1,4 +1,4 @@
-"""Which camera the input is of: --camera, what the input says, or a guess that is said."""
+"""Choose the camera of an input: the one given, the one that the input names, or a reported guess."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ def resolve_camera(
     matrix: Tensor | None,
     source: object,
 ) -> tuple[PinholeCamera, tuple[str, ...]]:
-    """The camera of keypoints or of a video, and notes on what was assumed.
+    """Return the camera of keypoints or of a video, and notes on what was assumed.
 
     In this order: what was given; K that came with the input; its image size with f = 525/640 of the
     longer side.

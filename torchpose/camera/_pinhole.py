@@ -1,4 +1,4 @@
-"""Pinhole camera as a module, and its TOML file.
+"""Define the pinhole camera as a module, and read and write its TOML file.
 
 Camera axes: x right, y down, z forward. Metres, pixels, radians. The functions on tensors are in
 `torchpose.camera._projection` and `torchpose.math._rotations`, random viewpoints in
@@ -177,16 +177,16 @@ class PinholeCamera(nn.Module):
 
     @property
     def image_size(self) -> tuple[int, int] | None:
-        """(width, height) in pixels, or None."""
+        """Return (width, height) in pixels, or None."""
         return None if self.width is None or self.height is None else (self.width, self.height)
 
     @property
     def rotation_matrix(self) -> Tensor:
-        """R [3, 3] of the Rodrigues vector `rotation`, world axes to camera axes."""
+        """Return R [3, 3] of the Rodrigues vector `rotation`, world axes to camera axes."""
         return rotvec_to_matrix(self.rotation)
 
     def forward(self, points: Float[Tensor, "... J 3"]) -> Float[Tensor, "... J 3"]:
-        """(u, v, lambda) of world points [..., J, 3] by K, rotation and translation (BL 3)."""
+        """Return (u, v, lambda) of world points [..., J, 3] by K, rotation and translation (BL 3)."""
         check_floating("points", points)
         K, R, t = (m.to(points) for m in (self.matrix, self.rotation_matrix, self.translation))
         return project(points, K, R, t)

@@ -1,4 +1,4 @@
-"""From points to pixels and back, and from the state of an arm to joints in metres (BL 5).
+"""Project points to pixels and lift them back, and turn the state of an arm into joints in metres (BL 5).
 
 Camera axes: x right, y down, z forward. Metres and pixels. (BL n) is an equation of Burke &
 Lasenby, "Single camera pose estimation using Bayesian filtering and Kinect motion priors". Every
@@ -177,7 +177,7 @@ def check_intrinsics(name: str, K: Tensor) -> None:
 
 
 def intrinsics(K: Float[Tensor, "... 3 3"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """fx, fy, skew, cx, cy of a camera matrix (BL 4), each [...], pixels."""
+    """Return fx, fy, skew, cx, cy of a camera matrix (BL 4), each [...], pixels."""
     return K[..., 0, 0], K[..., 1, 1], K[..., 0, 1], K[..., 0, 2], K[..., 1, 2]
 
 

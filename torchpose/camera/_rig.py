@@ -1,4 +1,4 @@
-"""Several calibrated cameras at once: projection of points into all of them, sizes, undistortion."""
+"""Project points into several calibrated cameras at once, and undistort their images."""
 
 import copy
 from collections.abc import Iterable, Mapping, Sequence
@@ -81,7 +81,7 @@ class CameraRig(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path) -> "CameraRig":
-        """All cameras of a TOML file, in its order.
+        """Read all cameras of a TOML file, in its order.
 
         Raises:
             InputError: no such file. FileFormatError: not such a file. CameraError: bad values.
@@ -93,7 +93,7 @@ class CameraRig(nn.Module):
 
     @property
     def size(self) -> tuple[int, int] | None:
-        """(height, width) in pixels if all cameras have the same, else None."""
+        """Return (height, width) in pixels if all cameras have the same, else None."""
         return self.sizes[0] if len(set(self.sizes)) == 1 else None
 
     def forward(self, points: Float[Tensor, "*batch N 3"]) -> RigView:
@@ -130,7 +130,7 @@ class CameraRig(nn.Module):
         return rig
 
     def scaled(self, height: int, width: int) -> "CameraRig":
-        """The same cameras with images of another size.
+        """Return the same cameras with images of another size.
 
         Pixel centres are at whole numbers, so u' + 1/2 = (u + 1/2) width / old width, and the same
         for v. Distortions do not depend on the size.
@@ -225,7 +225,7 @@ class CameraRig(nn.Module):
 def scale_matrix(
     matrix: Float[Tensor, "*batch 3 3"], sx: Tensor | float, sy: Tensor | float
 ) -> Float[Tensor, "*batch 3 3"]:
-    """K of images that are scaled by sx and sy, pixel centres at whole numbers.
+    """Return K of images that are scaled by sx and sy, pixel centres at whole numbers.
 
     Args:
         matrix: K. sx, sy: new by old width and height, numbers or of the batch's shape.

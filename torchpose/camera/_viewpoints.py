@@ -1,4 +1,4 @@
-"""Random viewpoints: camera poses that training poses are seen from."""
+"""Draw random viewpoints: the camera poses that training poses are seen from."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Where the body is in the image, and a virtual camera that sees it where the prior expects it.
+"""Find the body in the image, and place a virtual camera that sees it where the prior expects it.
 
 A prior over windows has bodies in one place, between the distances of its training views. Head and
 neck of the last second tell where a body is and how large it is seen, so that hands of other frames
@@ -258,7 +258,7 @@ def view_body(
 
 
 def _excess(value: Tensor, low: float, high: float) -> Tensor:
-    """Nothing below `low`, the value itself above `high`, and a line between."""
+    """Return zero below `low`, the value itself above `high`, and a line between."""
     line = (value - low).clamp_min(0.0) * (high / (high - low))
     return torch.minimum(line, value.clamp_min(0.0))
 

@@ -1,4 +1,4 @@
-"""Recursive Bayesian filters over learned motion priors."""
+"""Filter recursively over learnt motion priors: Kalman filters of mixtures, particle filters."""
 
 from torchpose._core.facade import set_up_facade
 from torchpose.filters._base import RecursiveFilter, standard_normal, uniform

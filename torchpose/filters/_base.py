@@ -1,4 +1,4 @@
-"""Interface of the recursive filters: checks of what is measured, and the one loop over time.
+"""Define the interface of the recursive filters: checks of measurements, and the one loop over time.
 
 A filter is a fixed model (buffers) and pure steps over a state, which is a NamedTuple. A new filter
 implements `init` and `filter_frame`; shapes, masks, lengths and failures are handled here.

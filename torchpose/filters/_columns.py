@@ -1,4 +1,4 @@
-"""Fixed tracks over many sequences that share one history of masks, sequences innermost.
+"""Run fixed tracks over many sequences that share one history of masks, sequences innermost.
 
 A step of all tracks is one product of the gains with the measurements and one with the states, both
 over columns that are sequences; a few frames at a time stay in the cache until their weights are in.

@@ -1,4 +1,4 @@
-"""A Kalman filter and smoother for numbers that move at nearly constant velocity."""
+"""Filter and smooth numbers that move at nearly constant velocity, by a Kalman filter."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""The mixture Kalman filter with fixed tracks: one Kalman filter for each component (BL 49)."""
+"""Run the mixture Kalman filter with fixed tracks: one Kalman filter for each component (BL 49)."""
 
 import math
 from collections.abc import Sequence
@@ -101,7 +101,7 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
 
     @property
     def weight_rule(self) -> WeightRule:
-        """How the tracks are weighted."""
+        """Return how the tracks are weighted."""
         log_prior, by_frame = self.log_prior.to(self.dtype), self.weighting == "frame"
         return WeightRule(
             log_prior, self.uniform_weight, self.likelihood_power, self.reset_below, by_frame
@@ -109,13 +109,13 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
 
     @property
     def is_memoryless(self) -> bool:
-        """Whether frames do not depend on each other: neither the weights nor the states do."""
+        """Return whether frames do not depend on each other: neither weights nor states do."""
         still = self.gamma is not None and bool((self.gamma == 0).all())
         return self._weighs_frames_alone and still
 
     @property
     def _weighs_frames_alone(self) -> bool:
-        """Whether neither weights nor, at a rate of 0, states depend on the frames before."""
+        """Return whether neither weights nor, at a rate of 0, states depend on earlier frames."""
         return self.weighting == "frame" and self.transition_kind == "ou"
 
     def filter_frame(
@@ -140,7 +140,7 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
     def _filter_unseen(
         self, rule: WeightRule, state: MKFState, frame: Measurements, return_cov: bool
     ) -> tuple[MKFState, StepOutput]:
-        """One step while nobody may look whether the rate is 0; it matters to medians alone."""
+        """Take one step while the rate may not be looked at; it matters to medians alone."""
         new_state, out = self._filter_tracks(rule, state, frame, return_cov)
         if not self._may_have_medians:
             return new_state, out
@@ -149,7 +149,7 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
 
     @property
     def _may_have_medians(self) -> bool:
-        """Whether there are medians to estimate if the rate is 0, which nobody may look at."""
+        """Return whether there are medians to estimate if the rate, which may not be looked at, is 0."""
         return self.gamma is not None and len(self.medians) > 0 and self._weighs_frames_alone
 
     def _choose_unseen(

@@ -1,4 +1,4 @@
-"""Kalman gains of fixed tracks, computed once per history of masks and shared by all sequences.
+"""Compute Kalman gains of fixed tracks once per history of masks, shared by all sequences.
 
 With fixed tracks the covariances depend on which joints were measured, never on where they were. The
 histories form a graph: a node is the covariances of all tracks, an edge is one time step under one
@@ -183,7 +183,7 @@ def _block_model(
 
 
 class History(NamedTuple):
-    """Steps through the gain graph for H distinct histories of masks.
+    """Walk through the gain graph for H distinct histories of masks.
 
     Attributes:
         graph: the graph. edges: per frame, one edge for each history, or a single one for all.

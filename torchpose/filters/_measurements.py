@@ -1,4 +1,4 @@
-"""What filters are given, checked: measurements with masks, noise and lengths, and covariances."""
+"""Check what filters are given: measurements with masks, noise and lengths, and covariances."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Frames by themselves: the mixture conditioned on each, whatever was measured before it.
+"""Condition the mixture on each frame alone, for models in which frames are independent.
 
 Weights by frame draw the indicator of every frame from pi anew, as for sampled tracks (BL 47), while
 each component's track goes on as if it had been right all along: weights without memory, states with. If
@@ -142,7 +142,7 @@ class _Group(NamedTuple):
 
     @property
     def shares_gain(self) -> bool:
-        """Whether all frames have one gain."""
+        """Return whether all frames have one gain."""
         return self.mask.ndim == 1
 
 

@@ -1,4 +1,4 @@
-"""The mixture Kalman filter: its model, its state, and the choice of tracks (paper section 3.4).
+"""Define the mixture Kalman filter: its model, its state, and the choice of tracks (paper section 3.4).
 
 `FixedTrackFilter`, `SampledTrackFilter` and `SplitTrackFilter` are the three kinds of it.
 """
@@ -209,13 +209,13 @@ class MixtureKalmanFilter(RecursiveFilter):
 
     @property
     def sources(self) -> tuple[Tensor, ...]:
-        """The tensors that every gain depends on, beside R."""
+        """Return the tensors that every gain depends on, beside R."""
         tensors = (self.log_prior, self.means, self.covariances, self.process_cov)
         return (*tensors, *(t for t in (self.gamma, self.initial_cov) if t is not None))
 
     @property
     def start_cov(self) -> Float[Tensor, "K D D"]:
-        """Covariance of every component's track before the first prediction."""
+        """Return the covariance of every component's track before the first prediction."""
         if self.initial_cov is None:
             return self.covariances.to(torch.float64)
         cov = as_covariance("initial_cov", self.initial_cov, self.dim, self.initial_cov.ndim)
@@ -223,7 +223,7 @@ class MixtureKalmanFilter(RecursiveFilter):
 
     @property
     def is_memoryless(self) -> bool:
-        """Whether frames do not depend on each other: neither the weights nor the states do."""
+        """Return whether frames do not depend on each other: neither weights nor states do."""
         return False
 
     def transition(self, time: int) -> Transition:

@@ -1,4 +1,4 @@
-"""Results of filters: estimates, failures, mended covariances, and how steps become a run."""
+"""Assemble results of filters: estimates, failures, mended covariances, and runs of steps."""
 
 import warnings
 from collections.abc import Sequence
@@ -77,7 +77,7 @@ def effective_sample_size(log_weights: Float[Tensor, "*batch M"]) -> Float[Tenso
 
 
 class Mending(NamedTuple):
-    """What `mended_cholesky` had to do.
+    """Repairs that `mended_cholesky` had to make.
 
     Attributes:
         mended: number of covariances that got a jitter, [B] or [B, T].

@@ -1,4 +1,4 @@
-"""Bootstrap particle filters with the three proposals of Burke & Lasenby, section 3.3."""
+"""Run bootstrap particle filters with the three proposals of Burke & Lasenby, section 3.3."""
 
 import math
 from collections.abc import Sequence
@@ -62,7 +62,7 @@ class ParticleState(NamedTuple):
 
 
 class _Constants(NamedTuple):
-    """What the model determines before any measurement.
+    """Tensors that the model determines before any measurement.
 
     Attributes:
         walk: prior density and evidence in whitened coordinates. initial: maps noise to the first
@@ -186,7 +186,7 @@ class BootstrapParticleFilter(RecursiveFilter):
 
     @property
     def walk(self) -> MixtureWalk:
-        """The random walk under the prior, in whitened coordinates."""
+        """Return the random walk under the prior, in whitened coordinates."""
         return self._constants().walk
 
     @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Functions that are called again for their gradients, so that little is kept for these."""
+"""Call functions again for their gradients, so that little is kept for these."""
 
 import threading
 import weakref

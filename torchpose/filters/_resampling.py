@@ -1,4 +1,4 @@
-"""Resampling of weighted particles on log-weights, and the survival rate that sharpens their weights.
+"""Resample particles by their log-weights, and sharpen weights to a survival rate.
 
 Every method returns ancestor indices. Each batch element draws the same number of random numbers
 whatever its weights are, so that its result does not depend on its neighbours."""

@@ -1,4 +1,4 @@
-"""The mixture Kalman filter with sampled tracks, whose indicators are drawn (BL 43-48)."""
+"""Run the mixture Kalman filter with sampled tracks, whose indicators are drawn (BL 43-48)."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Fixed tracks whose gains are shared by all sequences of one history of masks.
+"""Run fixed tracks whose gains are shared by all sequences of one history of masks.
 
 Gains come from the graph of mask histories. Where the measurements want gradients, frames are stepped
 through; else constant stretches are solved in blocks and in place. Under constant gains the means are a
@@ -119,7 +119,7 @@ def run_for_gradients(
 
 
 class _Carry(NamedTuple):
-    """What a frame leaves to the next: deviations of tracks [M, B, D] and log-weights [B, M]."""
+    """State handed from frame to frame: deviations of tracks [M, B, D] and log-weights [B, M]."""
 
     deviation: Tensor
     log_weights: Tensor
@@ -159,7 +159,7 @@ def _marginal(model: MixtureKalmanFilter, rule: WeightRule, frames: Measurements
 
 
 class _Workspace:
-    """Memory that all stretches of a run share: fresh pages cost more than the products in them."""
+    """Memory shared by all stretches of a run: fresh pages cost more than the products in them."""
 
     def __init__(self) -> None:
         self._held: dict[str, Tensor] = {}

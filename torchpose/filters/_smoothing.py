@@ -1,4 +1,4 @@
-"""Smoothing of fixed tracks: over the whole sequence, or with a fixed lag.
+"""Smooth fixed tracks: over the whole sequence, or with a fixed lag.
 
 Inside a track, Rauch-Tung-Striebel; over the tracks, forward-backward on the indicator, with the chain
 whose forward pass is the filter itself. The states of different tracks are not mixed, so this is an

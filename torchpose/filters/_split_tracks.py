@@ -1,4 +1,4 @@
-"""The mixture Kalman filter with split tracks (Smith & Winter, as cited in paper section 3.4)."""
+"""Run the mixture Kalman filter with split tracks (Smith & Winter, as cited in paper section 3.4)."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""Steps of fixed tracks: the Kalman filter of every track, the weights, and the plain loop over them.
+"""Step fixed tracks: the Kalman filter of every track, the weights, and the plain loop over them.
 
 A track never changes its component, so its covariances depend only on which joints were measured:
 elements whose histories of masks and noise are the same share them, and their gains.

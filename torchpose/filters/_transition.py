@@ -1,4 +1,4 @@
-"""Transition models, a discrete Ornstein-Uhlenbeck process per prior component, and the fit of their rate."""
+"""Make transition models, a discrete Ornstein-Uhlenbeck process per component, and fit their rate."""
 
 import math
 from collections.abc import Sequence
@@ -163,7 +163,7 @@ _LEAST_SHARE = 1.0  # pairs of frames that a component needs for a gamma of its 
 
 
 class _Pairs(NamedTuple):
-    """Of N pairs of consecutive frames, what the likelihood of gamma depends on, [N, K].
+    """Statistics of N pairs of consecutive frames that the likelihood of gamma depends on, [N, K].
 
     Attributes:
         later, both, earlier: y_t^T y_t, y_t^T y_{t-1} and y_{t-1}^T y_{t-1} of the whitened states, in

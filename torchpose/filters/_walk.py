@@ -1,4 +1,4 @@
-"""The random walk of a state under a mixture prior: densities and moves of many particles at once.
+"""Move many particles at once by a random walk under a mixture prior, and weigh them.
 
 All of it is computed in coordinates whitened by the mean and covariance of the whole prior. There the
 particles are of order one, so that float32 is enough for a prior whose scales span 1e-6 to 1e4.

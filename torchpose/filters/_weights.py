@@ -1,4 +1,4 @@
-"""Weights of tracks, the estimate that weighted tracks make together, and the evidence.
+"""Weigh tracks, and compute their joint estimate and the evidence.
 
 Fixed tracks are weighted by the sequence (BL 49), one step at a time or all of it at once, or by every
 frame alone.
@@ -28,7 +28,7 @@ __all__ = [
 
 
 class WeightRule(NamedTuple):
-    """What the weights of fixed tracks depend on, beside the measurements.
+    """Settings of the weights of fixed tracks.
 
     Attributes:
         log_prior: log pi [M], in the dtype of the weights.

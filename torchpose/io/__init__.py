@@ -1,4 +1,4 @@
-"""Files in and out: recordings of 3D joints, 2D keypoints, and safe writing."""
+"""Read and write files: recordings of 3D joints, 2D keypoints, results."""
 
 from torchpose._core.facade import set_up_facade
 from torchpose.io._keypoints import Keypoints, read_keypoints, write_keypoints

@@ -1,4 +1,4 @@
-"""2D keypoints of one person: .npz, .csv, and folders of OpenPose JSON.
+"""Read and write 2D keypoints of one person: .npz, .csv, and folders of OpenPose JSON.
 
 Pixels, u to the right and v down. A keypoint that was not measured is NaN; a confidence of 0 or NaN
 says so too.
@@ -15,28 +15,21 @@ import torch
 from torch import Tensor
 
 from torchpose._core.files import atomic_path, write_npz
-from torchpose._core.reading import (
-    check_span,
-    npz_keys,
-    one_number,
-    one_text,
-    read_npz,
-    read_text,
-    reading,
-    require_file,
-    texts,
-)
+from torchpose._core.reading import reading, require_file
 from torchpose.camera._projection import check_intrinsics
 from torchpose.errors import CameraError, FileFormatError, InputError, SkeletonError, check_rate
+from torchpose.io._formats.keypoint_files import (
+    RawKeypoints,
+    read_csv_keypoints,
+    read_npz_keypoints,
+)
 from torchpose.io._formats.openpose import read_openpose
-from torchpose.io._formats.raw_recording import numbers
 from torchpose.skeleton._joint_sets import canonical_names, identify_skeleton
 from torchpose.skeleton._mediapipe_landmarks import derive_joints, lacks_joints
 from torchpose.skeleton._upper_body import NECK_KINDS
 
 __all__ = ["Keypoints", "read_keypoints", "write_keypoints"]
 
-_MAX_GAP = 100_000  # frames; a larger jump of the frame number is taken for a damaged file
 _LARGEST_IMAGE = 100_000  # pixels of a side
 _FAR = 1e9  # pixels; no keypoint is there
 
@@ -72,21 +65,8 @@ class Keypoints:
 
     @property
     def measured(self) -> Tensor:
-        """[T, J] bool, True where there is a measurement."""
+        """Return [T, J] bool, True where there is a measurement."""
         return torch.isfinite(self.keypoints).all(-1)
-
-
-@dataclass
-class _Raw:
-    """What a file holds, before the checks."""
-
-    keypoints: np.ndarray
-    names: tuple[str, ...]
-    confidence: np.ndarray | None = None
-    fps: float | None = None
-    K: np.ndarray | None = None
-    image_size: np.ndarray | Sequence[float] | None = None
-    neck: str | None = None
 
 
 def read_keypoints(path: str | Path) -> Keypoints:
@@ -118,12 +98,12 @@ def read_keypoints(path: str | Path) -> Keypoints:
         return _finish(path, _read(path))
 
 
-def _read(path: Path) -> _Raw:
+def _read(path: Path) -> RawKeypoints:
     if os.path.isdir(path):
         points, confidence, names = read_openpose(path)
-        return _Raw(points, names, confidence)
+        return RawKeypoints(points, names, confidence)
     path = require_file(path)
-    readers = {".npz": _read_npz, ".csv": _read_csv}
+    readers = {".npz": read_npz_keypoints, ".csv": read_csv_keypoints}
     if path.suffix.lower() not in readers:
         raise FileFormatError(
             f"{path}: expected keypoints as .npz, .csv or a folder of OpenPose JSON files, got "
@@ -151,24 +131,6 @@ def write_keypoints(path: str | Path, keypoints: Keypoints) -> None:
         raise InputError(f"{path}: expected a name that ends in .npz or .csv")
 
 
-# --- npz ------------------------------------------------------------------------------------------
-
-
-def _read_npz(path: Path) -> _Raw:
-    there = npz_keys(path)
-    landmarks = "keypoints" not in there and "joints2d" in there
-    points, seen = ("joints2d", "visibility") if landmarks else ("keypoints", "confidence")
-    arrays = read_npz(path, (points, "names"), (seen, "fps", "K", "image_size", "neck"))
-    given = {key: numbers(f"{path}: {key}", arrays[key])
-             for key in (points, seen, "K", "image_size") if key in arrays}  # fmt: skip
-    neck = one_text(path, "neck", arrays["neck"]) if "neck" in arrays else ""
-    return _Raw(
-        given[points], texts(path, "names", arrays["names"]), given.get(seen),
-        one_number(path, "fps", arrays["fps"]) if "fps" in arrays else None,
-        given.get("K"), given.get("image_size"), neck or None,
-    )  # fmt: skip
-
-
 def _write_npz(path: Path, data: Keypoints) -> None:
     arrays = {"keypoints": data.keypoints.cpu().numpy(), "names": np.array(data.names)}
     for key, value in (("confidence", data.confidence), ("K", data.K)):
@@ -178,127 +140,6 @@ def _write_npz(path: Path, data: Keypoints) -> None:
         if getattr(data, key) is not None:
             arrays[key] = np.asarray(getattr(data, key))
     write_npz(path, arrays)
-
-
-# --- csv ------------------------------------------------------------------------------------------
-
-
-def _read_csv(path: Path) -> _Raw:
-    lines = read_text(path, "comma-separated text").splitlines()
-    notes = [line for line in lines if line.startswith("#")]
-    rows = [(number, [cell.strip() for cell in line.split(",")])
-            for number, line in enumerate(lines, start=1)
-            if line.strip() and not line.startswith("#")]  # fmt: skip
-    if not rows:
-        raise FileFormatError(f"{path}: expected a header frame,NAME_x,NAME_y,...; it is empty")
-    header = rows[0][1]
-    if header[0].lower() != "frame":
-        raise FileFormatError(
-            f"{path}, line {rows[0][0]}: expected a header frame,NAME_x,NAME_y[,NAME_confidence],... "
-            f"or frame,name,x,y[,confidence], got {','.join(header)[:60]!r}"
-        )
-    for number, cells in rows:
-        if len(cells) != len(header):
-            raise FileFormatError(
-                f"{path}, line {number}: expected {len(header)} cells as in the header, "
-                f"got {len(cells)}"
-            )
-    long = [cell.lower() for cell in header[1:4]] == ["name", "x", "y"]
-    raw = _long_rows(path, header, rows[1:]) if long else _wide_rows(path, header, rows[1:])
-    raw.fps, raw.image_size = _csv_notes(path, notes)
-    return raw
-
-
-def _wide_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]]) -> _Raw:
-    column = {name: i for i, name in enumerate(header)}
-    names = [h[:-2] for h in header[1:] if h.endswith("_x")]
-    wanted = {"frame"} | {f"{n}_{axis}" for n in names for axis in ("x", "y", "confidence")}
-    strange = [h for h in header if h not in wanted]
-    absent = [f"{n}_y" for n in names if f"{n}_y" not in column]
-    if not names or strange or absent or len(column) != len(header):
-        raise FileFormatError(
-            f"{path}: expected columns frame,NAME_x,NAME_y[,NAME_confidence],... each once, got "
-            f"{', '.join(strange + absent) or ','.join(header)}"
-            + (" (absent)" if absent and not strange else "")
-        )
-    table = np.array([[_cell(path, number, c) for c in cells] for number, cells in rows])
-    table = table.reshape(-1, len(header))
-    index, count = _frames(path, table[:, 0], rows, repeated=False)
-    joints = np.stack([table[:, [column[f"{n}_{a}"] for n in names]] for a in "xy"], -1)
-    points = np.full((count, len(names), 2), np.nan)
-    points[index] = joints
-    confidence = None
-    if any(f"{n}_confidence" in column for n in names):
-        confidence = np.zeros((count, len(names)))
-        for j, name in enumerate(names):
-            given = column.get(f"{name}_confidence")
-            confidence[index, j] = 1.0 if given is None else table[:, given]
-    return _Raw(points, tuple(names), confidence)
-
-
-def _long_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]]) -> _Raw:
-    scored = [h.lower() for h in header[4:]] == ["confidence"]
-    if len(header) != 4 + scored:
-        raise FileFormatError(f"{path}: expected columns frame,name,x,y[,confidence]")
-    names = list(dict.fromkeys(cells[1] for _, cells in rows))
-    table = np.array([[_cell(path, number, c) for c in (cells[0], *cells[2:])]
-                      for number, cells in rows]).reshape(-1, 3 + scored)  # fmt: skip
-    index, count = _frames(path, table[:, 0], rows, repeated=True)
-    joint = np.array([names.index(cells[1]) for _, cells in rows], dtype=int)
-    if len(set(zip(index.tolist(), joint.tolist(), strict=True))) < len(rows):
-        raise FileFormatError(
-            f"{path}: a keypoint is given twice in one frame; expected one person"
-        )
-    points = np.full((count, len(names), 2), np.nan)
-    points[index, joint] = table[:, 1:3]
-    confidence = None
-    if scored:
-        confidence = np.zeros((count, len(names)))
-        confidence[index, joint] = table[:, 3]
-    return _Raw(points, tuple(names), confidence)
-
-
-def _cell(path: Path, number: int, cell: str) -> float:
-    if not cell:
-        return math.nan
-    try:
-        return float(cell)
-    except ValueError as error:
-        raise FileFormatError(f"{path}, line {number}: expected a number, got {cell!r}") from error
-
-
-def _frames(
-    path: Path, frames: np.ndarray, rows: list[tuple[int, list[str]]], repeated: bool
-) -> tuple[np.ndarray, int]:
-    """Return the row -> index of its frame, counted from the first one, and the number of frames."""
-    with np.errstate(invalid="ignore"):  # of infinite ones
-        whole = np.isfinite(frames) & (frames % 1 == 0)
-        steps = np.diff(frames, prepend=frames[:1] - (not repeated))
-    bad = ~whole | (steps < (not repeated)) | (steps > _MAX_GAP)
-    if bad.any():
-        at = int(np.flatnonzero(bad)[0])
-        raise FileFormatError(
-            f"{path}, line {rows[at][0]}: frame numbers must be whole and increase, "
-            f"got {rows[at][1][0] or 'none'}"
-        )
-    index = (frames - frames[:1]).astype(int)
-    count = int(index[-1]) + 1 if len(index) else 0
-    check_span(path, count, len(np.unique(index)))
-    return index, count
-
-
-def _csv_notes(path: Path, notes: list[str]) -> tuple[float | None, list[float] | None]:
-    fps, size = None, None
-    for note in notes:
-        key, _, value = note.lstrip("# ").partition("=")
-        try:
-            if key.strip() == "fps":
-                fps = float(value)
-            elif key.strip() == "image_size":
-                size = [float(v) for v in value.split(",")]
-        except ValueError as error:
-            raise FileFormatError(f"{path}: cannot read {note!r}") from error
-    return fps, size
 
 
 def _to_csv(data: Keypoints) -> str:
@@ -320,7 +161,7 @@ def _to_csv(data: Keypoints) -> str:
 # --- checks ---------------------------------------------------------------------------------------
 
 
-def _finish(path: Path, raw: _Raw) -> Keypoints:
+def _finish(path: Path, raw: RawKeypoints) -> Keypoints:
     points, names = raw.keypoints, raw.names
     if points.ndim != 3 or points.shape[1:] != (len(names), 2):
         raise FileFormatError(
@@ -365,7 +206,7 @@ def _finish(path: Path, raw: _Raw) -> Keypoints:
 
 
 def _with_joints(data: Keypoints) -> Keypoints:
-    """MediaPipe's landmarks with head, neck and hands appended."""
+    """Return MediaPipe's landmarks with head, neck and hands appended."""
     points, confidence, names = derive_joints(data.keypoints, data.confidence, data.names)
     if confidence is not None:
         confidence = torch.where(torch.isfinite(points).all(-1), confidence, 0.0)

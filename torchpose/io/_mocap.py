@@ -1,4 +1,4 @@
-"""Motion capture as clips of whole bodies: fifteen joints at one rate, in the axes of the file.
+"""Read motion capture as clips of whole bodies: fifteen joints at one rate, in the axes of the file.
 
 `torchpose.io._recordings` turns everybody towards the camera; a room with several calibrated cameras
 has axes of its own, so here they are those of the file, in metres.

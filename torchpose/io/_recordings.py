@@ -1,4 +1,4 @@
-"""Recordings of 3D joints, whatever sensor or software wrote them.
+"""Read recordings of 3D joints of any supported sensor or software.
 
 Joints come back in camera axes and metres; see `torchpose.io._formats.axes` and
 `torchpose.io._formats.axes` for how. One file per format reads what a file holds; here it is
@@ -87,7 +87,7 @@ class Recording:
 
     @property
     def person_id(self) -> str:
-        """The person, told apart from persons of the same name in other data sets.
+        """Return the person, told apart from persons of the same name in other data sets.
 
         ``origin#person``: the origin is the repository that `source` names, else the folder. Files
         that were made from one repository share it, whatever folder they are in. Where a file names

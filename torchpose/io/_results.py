@@ -1,4 +1,4 @@
-"""A folder in which the results of a run appear together, and no file of the user's is lost."""
+"""Write the results of a run to a folder all at once, and keep files that the user put there."""
 
 import contextlib
 import hashlib
@@ -22,7 +22,7 @@ _LISTED = 5
 
 
 class ResultsFolder:
-    """Stages the files of a run in a private folder, and puts them in their places together.
+    """Folder that stages the files of a run and puts them in their places together.
 
     A list in the folder, `.torchpose-KIND.json`, says which files a run has put there, by name, size
     and SHA-256. Only these, as long as nobody has changed them, are replaced or deleted by the next
@@ -124,7 +124,7 @@ class ResultsFolder:
             _refuse_stranger(self.folder / name, listed)
 
     def _present(self) -> list[Path]:
-        """What is in the folder under a name that a run of this kind may write."""
+        """Return what is in the folder under a name that a run of this kind may write."""
         return [path for path in self.folder.iterdir() if self._own.fullmatch(path.name)]
 
     def _take_stage(self) -> Path:
@@ -185,7 +185,7 @@ class ResultsFolder:
 
 @contextlib.contextmanager
 def replace_own(path: str | Path, kind: str) -> Iterator[Path]:
-    """A temporary file that becomes `path` when the block succeeds, as `atomic_path` does.
+    """Yield a temporary file that becomes `path` when the block succeeds, as `atomic_path` does.
 
     What stands at `path` and was not written in this way before, with the same `kind`, or was changed
     since, is moved to a folder `earlier-1` (or 2, ...) beside it.
@@ -234,7 +234,7 @@ def holds_arrays(path: str | Path, names: Iterable[str]) -> bool:
 
 
 def _read_list(folder: Path, kind: str) -> dict[str, Any] | None:
-    """Size and digest of the files that runs of a kind have put in a folder, None without a list."""
+    """Return size and digest of the files that runs of a kind have put in a folder, None without a list."""
     try:
         found = json.loads(_list_path(folder, kind).read_text(encoding="utf-8"))["files"]
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Batched Gaussian algebra, shared by every prior and filter.
+"""Compute with batches of Gaussians: densities, conditionals, Kalman prediction and update.
 
 Pure functions on tensors. Covariances are never inverted: everything goes through Cholesky factors,
 and what comes back is symmetric by construction.
@@ -126,7 +126,7 @@ def log_prob(
     mean: Float[Tensor, "... D"],
     cholesky: Float[Tensor, "... D D"],
 ) -> Float[Tensor, "..."]:
-    """Log density of N(mean, L L^T).
+    """Return the log density of N(mean, L L^T).
 
     log N(x) = -1/2 ||L^-1 (x - mu)||^2 - sum log diag L - D/2 log 2 pi   (BL 52)
 
@@ -280,7 +280,7 @@ def kalman_gain(
 def _innovation(
     cov: Tensor, measurement_cov: Tensor, observed: Tensor, mask: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor | int, Tensor | None]:
-    """H P, the factor of H P H^T + R, the number of measured dimensions, and the factor's jitter."""
+    """Return H P, the factor of H P H^T + R, the number of measured dimensions, and the factor's jitter."""
     cross = cov.index_select(-2, observed)
     innovation = cross.index_select(-1, observed) + measurement_cov
     if mask is None:
@@ -298,19 +298,19 @@ def _log_norm(factor: Tensor, count: Tensor | int) -> Tensor:
 
 
 def _spare(columns: int) -> int:
-    """How many columns, at least one, make a matrix of so many a multiple of `_LANES` wide."""
+    """Return how many columns, at least one, make a matrix of so many a multiple of `_LANES` wide."""
     return _LANES - columns % _LANES
 
 
 def _multiply(a: Tensor, b: Tensor) -> Tensor:
-    """A @ B; matmul itself takes 2 us longer to see that neither has to be broadcast."""
+    """Return A @ B; matmul itself takes 2 us longer to see that neither has to be broadcast."""
     if a.ndim == b.ndim == 3 and a.shape[0] == b.shape[0]:
         return torch.bmm(a, b)
     return a @ b
 
 
 def _beside(cross: Tensor, residual: Tensor) -> Tensor:
-    """[H P, z - H x, 0 ...]."""
+    """Return [H P, z - H x, 0 ...]."""
     dim = cross.shape[-1]
     if cross.shape[:-2] != residual.shape[:-1]:
         # not torch.broadcast_shapes, whose first call imports a computer algebra system
@@ -373,7 +373,7 @@ def mended_update(
     Float[Tensor, "..."],
     Float[Tensor, "..."] | None,
 ]:
-    """`kalman_update`, with the jitter of the innovation covariances (`mended_cholesky`) beside it."""
+    """Return what `kalman_update` does, and the jitter of the innovation covariances (`mended_cholesky`)."""
     cross, factor, count, jitter = _innovation(cov, measurement_cov, observed, mask)
     residual = z - mean.index_select(-1, observed)
     if mask is not None:

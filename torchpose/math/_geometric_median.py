@@ -1,4 +1,4 @@
-"""Points that a mixture estimates with the least expected distance, instead of squared distance."""
+"""Estimate points of a mixture by the least expected distance, instead of squared distance."""
 
 import torch
 from jaxtyping import Float, Int

@@ -163,7 +163,7 @@ class MixtureFit(nn.Module):
 
     @torch.no_grad()
     def maximise(self, statistics: SufficientStatistics, tol: float = 0.0) -> float:
-        """`record`, and the maximisation step unless the fit has converged.
+        """Run `record`, and the maximisation step unless the fit has converged.
 
         Returns:
             Mean log-likelihood, in units of the states, of the mixture before the step.
@@ -178,7 +178,7 @@ class MixtureFit(nn.Module):
         return value
 
     def mean_log_likelihood(self, statistics: SufficientStatistics) -> float:
-        """Mean log-likelihood, in units of the states, from statistics that `expect` made."""
+        """Return the mean log-likelihood, in units of the states, from statistics that `expect` made."""
         if float(statistics.weight) == 0:
             raise InputError("EM needs samples of positive weight, got none; look at the weights")
         offset = float(self.factor.diagonal().log().sum())

@@ -1,4 +1,4 @@
-"""Where a mixture fit starts from: k-means++ centres, moved by a few steps of Lloyd's algorithm."""
+"""Choose the start of a mixture fit: k-means++ centres, moved by a few steps of Lloyd's algorithm."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def k_means(
     shares: Float[Tensor, " N"],
     steps: int = 10,
 ) -> tuple[Float[Tensor, "K D"], Int[Tensor, " N"]]:
-    """k-means++ centres after some steps of Lloyd's algorithm, and the nearest one of every point.
+    """Return k-means++ centres after some steps of Lloyd's algorithm, and the nearest one of every point.
 
     Args:
         x: points.
@@ -147,7 +147,7 @@ def _nearest(x: Tensor, centres: Tensor) -> Int[Tensor, " N"]:
 
 
 def _draw(mass: Tensor, n: int, generator: torch.Generator) -> Int[Tensor, " n"]:
-    """Indices drawn in proportion to `mass` (torch.multinomial stops at 2^24 entries)."""
+    """Draw indices in proportion to `mass` (torch.multinomial stops at 2^24 entries)."""
     edges = mass.cumsum(0)
     uniform = torch.rand(n, generator=generator, dtype=mass.dtype, device=mass.device)
     return torch.searchsorted(edges, uniform * edges[-1], right=True).clamp_max(len(mass) - 1)

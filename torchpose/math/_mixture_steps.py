@@ -91,7 +91,7 @@ class MixtureParameters(NamedTuple):
 
 
 class SufficientStatistics(NamedTuple):
-    """What an expectation step hands to the maximisation step.
+    """Sums over points that an expectation step hands to the maximisation step.
 
     Attributes:
         table: sum_n w_n r_nk phi(x_n); the first column is the number of points per component.
@@ -119,18 +119,18 @@ class SufficientStatistics(NamedTuple):
         return cls(table, table.new_zeros(()), table.new_zeros(()))
 
     def pack(self) -> Float[Tensor, " P"]:
-        """Everything in one vector, which processes can sum up in a single exchange."""
+        """Return everything in one vector, which processes can sum up in a single exchange."""
         return torch.cat([self.table.flatten(), self.log_likelihood[None], self.weight[None]])
 
     @classmethod
     def unpack(cls, packed: Float[Tensor, " P"], n_components: int) -> SufficientStatistics:
-        """What `pack` was given."""
+        """Return the statistics that `pack` was given."""
         return cls(packed[:-2].reshape(n_components, -1), packed[-2], packed[-1])
 
 
 @dataclass(frozen=True)
 class FitReport:
-    """How a fit went.
+    """Report of a fit: iterations, log-likelihoods, convergence.
 
     Attributes:
         iterations: maximisation steps taken.
@@ -148,7 +148,7 @@ class FitReport:
 
 
 def natural_parameters(parameters: MixtureParameters) -> Float[Tensor, "K F"]:
-    """theta with theta_k . phi(x) = log pi_k + log N(x; mu_k, Sigma_k).
+    """Return theta with theta_k . phi(x) = log pi_k + log N(x; mu_k, Sigma_k).
 
     With P_k = Sigma_k^-1,
     theta_k = [log pi_k - log|2 pi Sigma_k|/2 - mu_k' P_k mu_k/2, P_k mu_k, -P_k/2].
@@ -222,7 +222,7 @@ def _chunk_size(device: torch.device) -> int:
 
 
 def _pad_components(theta: Tensor) -> Tensor:
-    """Terms that vanish, up to a multiple of four: products are 10 % faster than with 30."""
+    """Add terms that vanish, up to a multiple of four: products are 10 % faster than with 30."""
     extra = theta.new_zeros(-len(theta) % 4, theta.shape[1])
     extra[:, 0] = torch.finfo(theta.dtype).min
     return torch.cat([theta, extra])

@@ -1,4 +1,4 @@
-"""Gaussians over rotations, in a space where a rotation is a vector of three numbers.
+"""Compute with Gaussians over rotations, in a space where a rotation is a vector of three numbers.
 
 A vector x in the unit ball stands for the rotation C R(x): R(x) turns by x as a quaternion vector
 (`torchpose.math._rotations`: axis times the sine of half the angle), and the centre C is a
@@ -211,7 +211,7 @@ def sigma_quaternions(
 def quaternion_moments(
     quaternions: Float[Tensor, "*batch 7 4"],
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3 3"]]:
-    """Mean and covariance of the vectors of six sigma points, from quaternions as they were turned.
+    """Return mean and covariance of the vectors of six sigma points, from their turned quaternions.
 
     Args:
         quaternions: [..., 7, 4], the image of the mean first, for its hemisphere alone.
@@ -232,7 +232,7 @@ def right_matrix(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch
 
 
 def _sign(values: Tensor) -> Tensor:
-    """-1 below zero and 1 elsewhere."""
+    """Return -1 below zero and 1 elsewhere."""
     return torch.where(values < 0, -1.0, 1.0).to(values.dtype)
 
 

@@ -161,7 +161,7 @@ def vector_to_quaternion(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*b
 
 
 def _squared_length(vector: Tensor) -> Tensor:
-    """|v|^2 [..., 1]; a sum over a dimension of three takes five times as long."""
+    """Return |v|^2 [..., 1]; a sum over a dimension of three takes five times as long."""
     x, y, z = vector.split(1, -1)
     return x * x + y * y + z * z
 

@@ -1,4 +1,4 @@
-"""Belief propagation over a tree of Gaussians: every node's posterior from all observations.
+"""Propagate beliefs over a tree of Gaussians: every node's posterior from all observations.
 
 Messages go from the leaves to the top and back. Nodes of one depth are taken at once, for all
 elements of a batch; products of Gaussians are sums in information form (DX 7), P = Sigma^-1 and
@@ -164,7 +164,7 @@ def _moments(information: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _solved(factor: Tensor, vector: Tensor) -> Tensor:
-    """[A^-1 | A^-1 b], symmetric on the left: W^T [W | W b] with W = L^-1, A = L L^T."""
+    """Return [A^-1 | A^-1 b], symmetric on the left: W^T [W | W b] with W = L^-1, A = L L^T."""
     eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
     sides = torch.cat([eye.expand_as(factor), vector[..., None]], -1)
     white = torch.linalg.solve_triangular(factor, sides, upper=False)

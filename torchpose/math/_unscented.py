@@ -1,4 +1,4 @@
-"""The unscented transform: a Gaussian through a nonlinear function, by a few points of equal weight.
+"""Transform Gaussians through nonlinear functions, by a few points of equal weight.
 
 All 2 D points, or 2 D + 1 with the mean, weigh the same: they have the Gaussian's own mean and
 covariance, and weights of any other kind (a likelihood at each point) turn them into a measured
@@ -193,7 +193,7 @@ def floor_eigenvalues(
 
 
 def _eigh(covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """Eigenvalues and eigenvectors; NaN for a matrix that is not finite, which eigh would refuse."""
+    """Return eigenvalues and eigenvectors; NaN for a matrix that is not finite, which eigh would refuse."""
     finite = torch.isfinite(covariance).all(-1, keepdim=True).all(-2, keepdim=True)
     if bool(finite.all()):
         values, vectors = torch.linalg.eigh(covariance)

@@ -1,4 +1,4 @@
-"""How good is a pose: Procrustes, joint errors, PCP, calibration of covariances, jitter."""
+"""Measure poses: Procrustes and joint errors, PCP, jitter, calibration of covariances."""
 
 from torchpose._core.facade import set_up_facade
 from torchpose.metrics._calibration import (

@@ -1,4 +1,4 @@
-"""Are the covariances right: coverage, reliability curve, predictive log-likelihood.
+"""Measure the calibration of covariances: coverage, reliability curve, predictive log-likelihood.
 
 Pure functions on tensors; chi-square needs no scipy. What is missing (NaN or masked) is left out of
 every share, and the counts say how much was not. Also importable from `torchpose.metrics`.
@@ -145,7 +145,7 @@ def reliability(
     levels: Sequence[float] = RELIABILITY_LEVELS,
     mask: Bool[Tensor, "*batch J"] | None = None,
 ) -> Coverage:
-    """`coverage` over a grid of levels, 5 to 95 %: the curve of a reliability diagram."""
+    """Return `coverage` over a grid of levels, 5 to 95 %: the curve of a reliability diagram."""
     return coverage(estimate, covariance, truth, levels, mask)
 
 
@@ -160,7 +160,7 @@ def predictive_log_likelihood(
     covariance: Float[Tensor, "*batch M D D"],
     value: Float[Tensor, "*batch D"],
 ) -> Float[Tensor, "*batch"]:
-    """Log density of what came next under a mixture that predicted it.
+    """Return the log density of what came next under a mixture that predicted it.
 
     log sum_m w_m N(value; mean_m, C_m), the weights normalised here.
 

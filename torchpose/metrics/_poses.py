@@ -1,4 +1,4 @@
-"""How good is a pose: Procrustes, joint errors, PCP, calibration of covariances, jitter.
+"""Measure the errors of poses: Procrustes, joint errors, PCP, jitter.
 
 Pure functions on tensors, on any device; those on covariances are in `torchpose.metrics._calibration` and
 can be imported from here as well. Missing values are NaN or masked, and every function says

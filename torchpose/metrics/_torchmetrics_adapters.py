@@ -1,4 +1,4 @@
-"""The metrics of `torchpose.metrics` as `torchmetrics.Metric`, which add up over batches and ranks.
+"""Wrap the metrics as `torchmetrics.Metric`, which add up over batches and ranks.
 
 Needs torchmetrics; nothing else in torchpose imports this module. Every state is a sum, so that
 processes reduce it by adding.

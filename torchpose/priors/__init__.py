@@ -1,4 +1,4 @@
-"""Learned priors over body states: mixtures of both arms, manifolds, postures of actions."""
+"""Hold learnt priors over body states: mixtures of both arms, manifolds, postures of actions."""
 
 from torchpose._core.facade import set_up_facade
 from torchpose.priors._actions.bank import ActionBank

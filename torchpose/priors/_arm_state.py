@@ -1,4 +1,4 @@
-"""State of one arm (D = 21): five projected joints, then the camera they were seen from.
+"""Make and mirror states of one arm (D = 21): five projected joints, then their camera.
 
 0:15 are (u, v, lambda) of hand, elbow, shoulder, head and neck, 15:18 roll, pitch and yaw, 18:21
 tx, ty and tz: pixels, pixels, metres, radians, metres.
@@ -20,7 +20,6 @@ from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM
 __all__ = [
     "ANGLES",
     "STATE_DIM",
-    "TRANSLATION",
     "arm_state",
     "arm_states",
     "check_rotation_order",
@@ -31,7 +30,6 @@ __all__ = [
 
 STATE_DIM = 21
 ANGLES = slice(15, 18)
-TRANSLATION = slice(18, 21)
 _PIXELS_U = (0, 3, 6, 9, 12)
 _NEGATED = (*_PIXELS_U, 15, 17, 18)  # u, roll, yaw, tx
 
@@ -42,7 +40,7 @@ def arm_state(
     matrix: Float[Tensor, "3 3"],
     order: str = "zxy",
 ) -> Float[Tensor, "N 21"]:
-    """States of one arm seen from random viewpoints (BL 3).
+    """Return states of one arm seen from random viewpoints (BL 3).
 
     Args:
         points: hand, elbow, shoulder, head, neck in body axes, metres.
@@ -78,7 +76,7 @@ def arm_states(
     matrix: Float[Tensor, "3 3"],
     order: str = "zxy",
 ) -> tuple[Float[Tensor, "N 21"], Float[Tensor, "N 21"]]:
-    """States of the left and the right arm of poses, both arms from the same viewpoints (BL 3).
+    """Return states of the left and the right arm of poses, both seen from the same viewpoints (BL 3).
 
     Args:
         joints: poses in the order of `UPPER_BODY`, body axes, metres.
@@ -100,7 +98,7 @@ def arm_states(
 
 
 def mirror_arm_state(state: Float[Tensor, "*batch 21"], cx: float) -> Float[Tensor, "*batch 21"]:
-    """State of the other arm in the mirror image: u -> 2 cx - u, roll, yaw and tx change sign.
+    """Return the other arm's state in the mirror image: u -> 2 cx - u, roll, yaw and tx change sign.
 
     With M = diag(-1, 1, 1) a mirrored body M X is seen by the rotation M R M, which has the
     opposite roll and yaw in either rotation order. The map is its own inverse.
@@ -118,7 +116,7 @@ def mirror_arm_state(state: Float[Tensor, "*batch 21"], cx: float) -> Float[Tens
 
 
 def mirror_mixture(mixture: GaussianMixture, cx: float) -> GaussianMixture:
-    """Mixture over the states of the other arm; gradients flow through it.
+    """Return the mixture over the states of the other arm; gradients flow through it.
 
     Args:
         mixture: over states of one arm.

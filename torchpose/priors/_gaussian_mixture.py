@@ -1,4 +1,4 @@
-"""Gaussian mixture with full covariances, the prior over the state of an arm (BL 7)."""
+"""Define the Gaussian mixture with full covariances, the prior over the state of an arm (BL 7)."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def component_log_density(
     means: Float[Tensor, "K D"],
     cholesky: Float[Tensor, "K D D"],
 ) -> Float[Tensor, "*batch K"]:
-    """Log density of every point under every Gaussian, log N(x; mu_k, L_k L_k^T).
+    """Return the log density of every point under every Gaussian, log N(x; mu_k, L_k L_k^T).
 
     The residuals L_k^-1 (x - mu_k) of all components are one matrix product with the rows of all
     L_k^-1, taken chunk by chunk and in float64, since states mix units whose variances span ten
@@ -125,19 +125,19 @@ class GaussianMixture(nn.Module):
 
     @property
     def n_components(self) -> int:
-        """Number of Gaussians K."""
+        """Return the number of Gaussians K."""
         return int(self.means.shape[0])
 
     @property
     def dim(self) -> int:
-        """Number of dimensions D."""
+        """Return the number of dimensions D."""
         return int(self.means.shape[1])
 
     def extra_repr(self) -> str:
         return f"n_components={self.n_components}, dim={self.dim}, dtype={self.means.dtype}"
 
     def rounded(self) -> GaussianMixture:
-        """The mixture in numbers that single precision holds, its covariances still positive definite.
+        """Return the mixture in single-precision numbers, its covariances still positive definite.
 
         Rounding may push the least eigenvalue of a covariance below zero. There, a share of each
         variance is added before: the least of 0, 1e-6, ... 1e-3 with which a tenth of a millionth
@@ -155,12 +155,12 @@ class GaussianMixture(nn.Module):
         return GaussianMixture(weights, means, best)
 
     def parameters_tuple(self) -> MixtureParameters:
-        """Weights, means and covariances as one value."""
+        """Return weights, means and covariances as one value."""
         return MixtureParameters(self.weights, self.means, self.covariances)
 
     @classmethod
     def from_parameters(cls, parameters: MixtureParameters) -> GaussianMixture:
-        """Mixture of the given weights, means and covariances."""
+        """Return the mixture of the given weights, means and covariances."""
         return cls(*parameters)
 
     @classmethod
@@ -205,14 +205,11 @@ class GaussianMixture(nn.Module):
         if sample_weight is not None:
             sample_weight = sample_weight.detach().double()
         floor = floor_variances(x, covariance_floor, sample_weight)
+        settings = (sample_weight, max_iter, tol, floor, dtype, progress)
         runs = []
         for _ in range(n_init):
             start = start_mixture(x, n_components, generator, floor, sample_weight, init)
-            runs.append(
-                expectation_maximisation(
-                    x, start, sample_weight, max_iter, tol, floor, dtype, progress
-                )
-            )
+            runs.append(expectation_maximisation(x, start, *settings))
         scores = tuple(report.log_likelihood[-1] for _, report in runs)
         best, report = runs[scores.index(max(scores))]
         mixture = cls.from_parameters(best)
@@ -220,12 +217,12 @@ class GaussianMixture(nn.Module):
         return mixture
 
     def cholesky(self) -> Float[Tensor, "K D D"]:
-        """Lower factors L_k of the covariances, Sigma_k = L_k L_k^T (factorised in float64)."""
+        """Return lower factors L_k of the covariances, Sigma_k = L_k L_k^T (factorised in float64)."""
         factor = torch.linalg.cholesky(symmetrise(self.covariances.double()))
         return factor.to(self.covariances.dtype)
 
     def component_log_prob(self, x: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch K"]:
-        """Log of each term of the mixture, log pi_k + log N(x; mu_k, Sigma_k).
+        """Return the log of each term of the mixture, log pi_k + log N(x; mu_k, Sigma_k).
 
         Args:
             x: points, any leading dimensions.
@@ -238,7 +235,7 @@ class GaussianMixture(nn.Module):
         return self.weights.log() + component_log_density(x, self.means, self.cholesky())
 
     def log_prob(self, x: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch"]:
-        """Log density of the mixture, log sum_k pi_k N(x; mu_k, Sigma_k).
+        """Return the log density of the mixture, log sum_k pi_k N(x; mu_k, Sigma_k).
 
         Args:
             x: points, any leading dimensions.
@@ -249,17 +246,17 @@ class GaussianMixture(nn.Module):
         return self.component_log_prob(x).logsumexp(-1)
 
     def forward(self, x: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch"]:
-        """`log_prob`."""
+        """Return `log_prob`."""
         return self.log_prob(x)
 
     def moments(self) -> tuple[Float[Tensor, " D"], Float[Tensor, "D D"]]:
-        """Mean and covariance of the whole mixture."""
+        """Return the mean and covariance of the whole mixture."""
         return mixture_moments(self.weights.log(), self.means, self.covariances)
 
     def sample(
         self, shape: Sequence[int] = (), generator: torch.Generator | None = None
     ) -> Float[Tensor, "*shape D"]:
-        """Independent draws.
+        """Return independent draws.
 
         Args:
             shape: leading dimensions of the result.
@@ -271,7 +268,8 @@ class GaussianMixture(nn.Module):
         n = math.prod(shape)
         weights = self.weights
         factor, rows = self.cholesky(), []
-        for count in _chunk_sizes(n):
+        for start in range(0, n, SAMPLE_CHUNK):
+            count = min(SAMPLE_CHUNK, n - start)
             uniform = torch.rand(
                 count, generator=generator, dtype=torch.float64, device=weights.device
             )
@@ -284,7 +282,7 @@ class GaussianMixture(nn.Module):
         return draws.reshape(*shape, self.dim)
 
     def marginal(self, indices: Sequence[int] | Int[Tensor, " S"]) -> GaussianMixture:
-        """Mixture over a subset of the dimensions, in the order of `indices`.
+        """Return the mixture over a subset of the dimensions, in the order of `indices`.
 
         Raises:
             InputError: an index is out of range or given twice.
@@ -299,7 +297,7 @@ class GaussianMixture(nn.Module):
         indices: Sequence[int] | Int[Tensor, " S"],
         values: Float[Tensor, "*batch S"],
     ) -> ConditionedMixture:
-        """Mixture over the other dimensions, given x[indices] = values.
+        """Return the mixture over the other dimensions, given x[indices] = values.
 
         With the factor of the covariance in the order (observed, hidden),
         L = [[L_o, 0], [L_ho, L_h]], each component has the mean
@@ -327,8 +325,7 @@ class GaussianMixture(nn.Module):
         covariance = self.covariances.double()[:, order][:, :, order]
         factor = torch.linalg.cholesky(symmetrise(covariance)).to(self.means.dtype)
         n = len(seen)
-        seen_factor, cross = factor[:, :n, :n], factor[:, n:, :n]
-        hidden_factor = factor[:, n:, n:]
+        seen_factor, cross, hidden_factor = factor[:, :n, :n], factor[:, n:, :n], factor[:, n:, n:]
         mean = self.means[:, order]
         gain = torch.linalg.solve_triangular(seen_factor, cross, upper=False, left=False)
         residual = values.unsqueeze(-2) - mean[:, :n]
@@ -349,13 +346,9 @@ class GaussianMixture(nn.Module):
 
 
 def _components(weights: Tensor, uniform: Tensor) -> Tensor:
-    """Component of each uniform number, by inversion of the cumulative weights."""
+    """Return the component of each uniform number, by inversion of the cumulative weights."""
     edges = weights.detach().double().cumsum(0)
     return torch.searchsorted(edges, uniform * edges[-1], right=True).clamp_max(len(weights) - 1)
-
-
-def _chunk_sizes(n: int) -> list[int]:
-    return [min(SAMPLE_CHUNK, n - start) for start in range(0, n, SAMPLE_CHUNK)]
 
 
 def _check_fit(

@@ -1,4 +1,4 @@
-"""How limbs stand to each other and how fast they turn, learnt from recorded bodies.
+"""Model how limbs stand to each other and how fast they turn, learnt from recorded bodies.
 
 A limb conditional is a Gaussian over the rotation q_ij = q_i^-1 q_j from a part i to the part j that
 hangs on it; temporal diffusion is one over the rotation of a part from one frame to the next. Both
@@ -48,7 +48,7 @@ _SAME_CENTRE = 1e-6  # of a quaternion vector
 
 @dataclass(frozen=True)
 class LimbInfo:
-    """What limb conditionals were fitted on; fields that are not known are empty.
+    """Facts about the fit of limb conditionals; fields that are not known are empty.
 
     Attributes:
         name: of the conditionals.
@@ -87,7 +87,7 @@ _KIND = FileKind(
 
 
 class _Products(NamedTuple):
-    """Of quaternions, for messages along every edge; see `LimbConditionals._make_products`."""
+    """Products of quaternions, for messages along every edge; see `LimbConditionals._make_products`."""
 
     predict: Tensor
     carry: Tensor
@@ -192,7 +192,7 @@ class LimbConditionals(nn.Module):
         edges: Int[Tensor, " El"],
         upward: bool,
     ) -> tuple[Float[Tensor, "*batch El 3"], Float[Tensor, "*batch El 3 3"]]:
-        """Messages along edges: what the part at one end says about the part at the other.
+        """Return messages along edges: what the part at one end says about the part at the other.
 
         N(mu_j, Sigma_j) = F(mu_i, N(mu_ij, Sigma_ij))   (DX 9)
         N(., Sigma_j^err) = F(N(mu_i, Sigma_i), mu_ij)   (DX 10)
@@ -220,7 +220,7 @@ class LimbConditionals(nn.Module):
         mean: Float[Tensor, "*batch V 3"],
         covariance: Float[Tensor, "*batch V 3 3"],
     ) -> tuple[Float[Tensor, "*batch V 3"], Float[Tensor, "*batch V 3 3"]]:
-        """The parts one frame later: the same mean, and a covariance inflated by the diffusion.
+        """Return the parts one frame later: the same mean, and a covariance inflated by the diffusion.
 
         N(x^{t+1}; mu^t, Sigma^t + Sigma^diff),   N(., Sigma^diff) = F(mu^t, N(0, Sigma'))   (DX 13-14)
 
@@ -238,7 +238,7 @@ class LimbConditionals(nn.Module):
     # --- rates, bodies and files --------------------------------------------------------------
 
     def at_rate(self, fps: float, growth: float | None = None) -> "LimbConditionals":
-        """The same at another frame rate: the diffusion per frame is rescaled, `info.fps` says so.
+        """Return the same with the diffusion per frame of another frame rate, `info.fps`.
 
         Sigma'_j(fps) = Sigma'_j (fps_0 / fps)^{g_j}
 
@@ -309,7 +309,7 @@ class LimbConditionals(nn.Module):
         return derived(self, "products", sources, self._make_products)
 
     def _make_products(self) -> "_Products":
-        """What every message along an edge has in common, down and up: products of quaternions.
+        """Return products of quaternions that all messages along an edge share, down and up.
 
         Down, C_j R(x_j) = C_i R(x_i) C_ij R(x_ij) is linear in the quaternion of x_i for each sigma
         point of x_ij (`_predict`), and in that of every sigma point of x_i for the mean of x_ij
@@ -329,7 +329,7 @@ class LimbConditionals(nn.Module):
 def in_body_frame(
     persons: Sequence[tuple[Body, Sequence[Tensor]]],
 ) -> tuple[Body, list[Tensor]]:
-    """Recorded states of several persons as states of one body with safe centres (DX 1).
+    """Return recorded states of several persons as states of one body with safe centres (DX 1).
 
     Args:
         persons: every one's body, of any frame and centres, and their sequences of states [T, D].
@@ -351,7 +351,7 @@ def in_body_frame(
 
 
 def _tree(edges: Tensor, n_parts: int) -> Any:
-    """The message tree over the parts that are not the root."""
+    """Return the message tree over the parts that are not the root."""
     return message_tree(edges.long() - 1, n_parts - 1)
 
 

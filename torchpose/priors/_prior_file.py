@@ -30,7 +30,7 @@ CENTRES = ("neck", "head", "sequence")
 
 @dataclass(frozen=True)
 class PriorInfo:
-    """What a prior was fitted on, and in which conventions its states are.
+    """Facts about the fit of a prior, and the conventions of its states.
 
     Attributes:
         name: of the prior.
@@ -91,17 +91,17 @@ class PriorInfo:
 
     @property
     def camera(self) -> PinholeCamera:
-        """The camera whose pixels the states are in."""
+        """Return the camera whose pixels the states are in."""
         return PinholeCamera(self.fx, self.fy, self.cx, self.cy, name=self.name)
 
     @property
     def matrix(self) -> Tensor:
-        """Camera matrix K [3, 3], pixels."""
+        """Return the camera matrix K [3, 3], pixels."""
         rows = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
         return torch.tensor(rows, dtype=torch.float64)
 
     def to_json(self) -> str:
-        """Text that `from_json` reads back."""
+        """Return text that `from_json` reads back."""
         return info_to_json(self)
 
     @classmethod
@@ -129,7 +129,7 @@ def write_prior(path: str | Path, info: PriorInfo, tensors: Mapping[str, Tensor]
 
 
 def _pack(key: str, tensor: Tensor) -> Tensor:
-    """Covariances [K, D, D] as their lower triangles [K, D (D + 1) / 2], row by row."""
+    """Return covariances [K, D, D] as their lower triangles [K, D (D + 1) / 2], row by row."""
     if not key.endswith(".covariances") or not torch.equal(tensor, tensor.mT):
         return tensor
     rows, columns = torch.tril_indices(*tensor.shape[-2:])
@@ -150,14 +150,14 @@ def _unpack(key: str, tensor: Tensor) -> Tensor:
 
 
 def _compact(tensor: Tensor) -> Tensor:
-    """The same numbers in single precision, if all of them fit into it."""
+    """Return the same numbers in single precision, if all of them fit into it."""
     single = tensor.float()
     lossless = tensor.is_floating_point() and torch.equal(single.to(tensor.dtype), tensor)
     return single if lossless else tensor
 
 
 def read_prior(path: str | Path) -> tuple[PriorInfo, dict[str, Tensor]]:
-    """Metadata and tensors of a prior file.
+    """Return metadata and tensors of a prior file.
 
     Raises:
         InputError: no such file. FileFormatError: truncated, foreign, or of a newer version.

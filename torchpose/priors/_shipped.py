@@ -1,4 +1,4 @@
-"""Models that come with the package, by their names: manifolds, limb conditionals, actions."""
+"""Load models that come with the package, by their names: manifolds, limb conditionals, actions."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ KINDS = {
 
 
 def known_models(kind: str) -> list[str]:
-    """Names of the models of a kind, among `KINDS`, that come with the package."""
+    """Return the names of the models of a kind, among `KINDS`, that come with the package."""
     return sorted(path.stem for path in (WEIGHTS / kind).glob("*.safetensors"))
 
 
 def find_model(kind: str, name_or_path: str | Path) -> Path:
-    """File of a model that comes with the package, by its name, or the file of this path.
+    """Return the file of a model that comes with the package, by its name, or the file of this path.
 
     Args:
         kind: among `KINDS`. name_or_path: a name (`known_models`), or a file.
@@ -108,7 +108,7 @@ def load_action(name_or_path: str | Path) -> ActionSpace | ActionBank:
 
 
 def persons_of_model(model: Any) -> set[str]:
-    """Ids of all persons that a model has anything of: fitted to, or held out for a manifold's noise."""
+    """Return ids of all persons that a model was fitted to, or held out for a manifold's noise."""
     return {*model.info.persons, *model.info.extra.get("held_out_persons", ())}
 
 

@@ -1,4 +1,4 @@
-"""Prior over the upper body: one Gaussian mixture per arm, and what it was fitted on."""
+"""Define the prior over the upper body: one Gaussian mixture per arm, and what it was fitted on."""
 
 from __future__ import annotations
 
@@ -97,12 +97,12 @@ class UpperBodyPrior(nn.Module):
 
     @property
     def windows(self) -> dict[str, WindowPrior]:
-        """Mixtures over short windows of motion, by name."""
+        """Return mixtures over short windows of motion, by name."""
         return {name: cast(WindowPrior, window) for name, window in self._windows.items()}
 
     @property
     def noise(self) -> dict[str, Tensor]:
-        """Learnt noise by name."""
+        """Return learnt noise by name."""
         return {name: getattr(self, f"noise_{name}") for name in self._noise_names}
 
     def set_noise(self, name: str, value: Tensor) -> None:
@@ -124,12 +124,12 @@ class UpperBodyPrior(nn.Module):
 
     @property
     def camera(self) -> PinholeCamera:
-        """The camera whose pixels the states are in."""
+        """Return the camera whose pixels the states are in."""
         return self.info.camera
 
     @property
     def n_components(self) -> int:
-        """Number of Gaussians of the left arm."""
+        """Return the number of Gaussians of the left arm."""
         return self.left.n_components
 
     def mean_pose(self) -> Float[Tensor, "8 3"]:
@@ -142,7 +142,7 @@ class UpperBodyPrior(nn.Module):
         return join_arms(*arms)[0, 0]
 
     def mirrored(self) -> UpperBodyPrior:
-        """Prior of the mirrored person: each arm is the mirror image of the other one.
+        """Return the prior of the mirrored person: each arm is the mirror image of the other one.
 
         Noise by side changes sides; `info` and the rest stay.
         """
@@ -166,7 +166,7 @@ class UpperBodyPrior(nn.Module):
             )
 
     def get_extra_state(self) -> Tensor:
-        """What is no tensor: `info` and the settings of the windows, as bytes of JSON [N], uint8."""
+        """Return `info` and the settings of the windows, as bytes of JSON [N], uint8."""
         return torch.tensor(list(self._full_info().to_json().encode()), dtype=torch.uint8)
 
     def set_extra_state(self, state: Tensor) -> None:
@@ -279,7 +279,7 @@ class UpperBodyPrior(nn.Module):
 
 
 def released_process_cov() -> Tensor:
-    """Diagonal [21] of Q in the authors' released sign-language tracker, pixels and metres."""
+    """Return the diagonal [21] of Q in the authors' released sign-language tracker, pixels and metres."""
     return torch.tensor(
         [560, 560, 1, 56, 56, 1, *[25, 25, 1] * 3, 0.5, 0.5, 0.5, 0.01, 0.01, 0.01],
         dtype=torch.float64,
@@ -287,7 +287,7 @@ def released_process_cov() -> Tensor:
 
 
 def known_priors() -> list[str]:
-    """Names of the priors that come with the package."""
+    """Return the names of the priors that come with the package."""
     return sorted(p.stem for p in WEIGHTS.glob("*.safetensors"))
 
 
@@ -325,7 +325,7 @@ def _mixture(path: str | Path, side: str, tensors: Mapping[str, Tensor]) -> Gaus
 
 
 def _mirrored_noise(value: Tensor) -> Tensor:
-    """The noise of the mirror image: a covariance of states changes signs, variances do not."""
+    """Return the noise of the mirror image: a covariance of states changes signs, variances do not."""
     return mirror_covariance(value) if value.shape == (STATE_DIM, STATE_DIM) else value
 
 

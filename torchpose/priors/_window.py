@@ -1,4 +1,4 @@
-"""Priors over short windows: an arm's state together with where hands were seen around it.
+"""Model short windows of motion: an arm's state together with where hands were seen around it.
 
 A window state is the 21 numbers of the arm followed by pixels (u, v) of hands: of the arm's own hand
 some frames earlier (or later), and of the other hand. A mixture over windows carries motion and the
@@ -41,7 +41,7 @@ _SAME_BONE = (0, 1, 2, 3, 1, 2, 3)  # left and right limbs are of one length
 
 @dataclass(frozen=True)
 class WindowLayout:
-    """Which hands a window holds.
+    """Lags of the hands that a window holds.
 
     Attributes:
         own: lags of the arm's own hand, frames; positive is the past. other: lags of the other hand.
@@ -56,22 +56,22 @@ class WindowLayout:
 
     @property
     def dim(self) -> int:
-        """Number of dimensions of a window state."""
+        """Return the number of dimensions of a window state."""
         return STATE_DIM + 2 * self.n_hands + (_TORSO_DIM if self.torso else 0)
 
     @property
     def n_hands(self) -> int:
-        """Number of hands of other frames and of the other arm."""
+        """Return the number of hands of other frames and of the other arm."""
         return len(self.own) + len(self.other)
 
     @property
     def hands(self) -> range:
-        """Dimensions of a window state that are pixels of hands."""
+        """Return the dimensions of a window state that are pixels of hands."""
         return range(STATE_DIM, STATE_DIM + 2 * self.n_hands)
 
     @property
     def deciding(self) -> list[int]:
-        """Dimensions that decide which component a window belongs to (`torchpose.learning._streamed_em`).
+        """Return the dimensions that decide a window's component (`torchpose.learning._streamed_em`).
 
         What is measured, and with `torso` what is wanted of it; without, all of them.
         """
@@ -81,21 +81,21 @@ class WindowLayout:
 
     @property
     def in_torso(self) -> range:
-        """Dimensions of a window state that are joints in the axes of the torso."""
+        """Return the dimensions of a window state that are joints in the axes of the torso."""
         return range(self.hands.stop, self.dim)
 
     @property
     def lags(self) -> tuple[int, ...]:
-        """All lags, with 0, in order."""
+        """Return all lags, with 0, in order."""
         return tuple(sorted({0, *self.own, *self.other}))
 
     @property
     def ahead(self) -> int:
-        """Number of later frames that a window needs."""
+        """Return the number of later frames that a window needs."""
         return max(0, -min((*self.own, *self.other), default=0))
 
     def at_rate(self, fps: float) -> "WindowLayout":
-        """The lags in frames at another frame rate."""
+        """Return the lags in frames at another frame rate."""
         ratio = fps / self.fps
         own = tuple(round(lag * ratio) for lag in self.own)
         other = tuple(round(lag * ratio) for lag in self.other)
@@ -134,7 +134,7 @@ class WindowPrior(nn.Module):
         self.settings = dict(settings)
 
     def facts(self) -> dict[str, Any]:
-        """What a prior file says about it, as JSON can hold it."""
+        """Return what a prior file says about it, as JSON can hold it."""
         layout: dict[str, Any] = {"own": list(self.layout.own), "other": list(self.layout.other)}
         layout |= {"fps": self.layout.fps, "torso": self.layout.torso}
         return layout | {"settings": self.settings}
@@ -143,13 +143,13 @@ class WindowPrior(nn.Module):
     def from_facts(
         cls, left: GaussianMixture, right: GaussianMixture, facts: Mapping[str, Any]
     ) -> "WindowPrior":
-        """From mixtures and `facts`."""
+        """Return the windows of mixtures and `facts`."""
         own, other = tuple(facts["own"]), tuple(facts["other"])
         layout = WindowLayout(own, other, facts["fps"], bool(facts.get("torso", False)))
         return cls(left, right, layout, facts["settings"])
 
     def mirrored(self, cx: float) -> "WindowPrior":
-        """Windows of the mirrored person: each arm is the mirror image of the other one."""
+        """Return windows of the mirrored person: each arm is the mirror image of the other one."""
         left, right = (_mirror(mixture, cx, self.layout) for mixture in (self.right, self.left))
         return WindowPrior(left, right, self.layout, self.settings)
 
@@ -172,7 +172,7 @@ def augment_bodies(
     size: float,
     bones: float,
 ) -> Float[Tensor, "N W 8 3"]:
-    """Windows of bodies of other sizes: all bones times one factor, and each by one of its own.
+    """Return windows of other body sizes: all bones times one factor, and each by one of its own.
 
     Args:
         joints: centred on the neck. size, bones: largest relative change, uniform; left and right
@@ -190,7 +190,7 @@ def augment_bodies(
 def mirror_bodies(
     joints: Float[Tensor, "N W 8 3"], generator: torch.Generator, share: float
 ) -> Float[Tensor, "N W 8 3"]:
-    """Windows of which a share, drawn at random, is mirrored: left and right change places."""
+    """Return windows of which a random share is mirrored: left and right change places."""
     mirrored = torch.rand(len(joints), generator=generator) < share
     return torch.where(mirrored[:, None, None, None], mirror_pose(joints), joints)
 
@@ -203,7 +203,7 @@ def window_state(
     matrix: Float[Tensor, "3 3"],
     rotation_order: str,
 ) -> Float[Tensor, "N D"]:
-    """Window states of one arm: the arm now, the camera, hands at their lags, the arm on its torso.
+    """Return window states of one arm: the arm, the camera, hands at their lags, the arm on its torso.
 
     Args:
         joints: poses at `layout.lags`, centred on the neck, metres. views: a camera pose for each
@@ -233,7 +233,7 @@ def window_measurements(
     path: BodyPath,
     start: int = 0,
 ) -> tuple[Float[Tensor, "B S H 2"], Bool[Tensor, "B S H"]]:
-    """Where the hands of each frame's window were measured, relative to where the body is now.
+    """Return where the hands of each frame's window were measured, relative to the body's place now.
 
     Poses of the prior are centred on the neck and seen from one place, so a hand of another frame is
     carried along with the body (`BodyPath.carried`). A hand that was not measured, or that lies
@@ -264,7 +264,7 @@ def window_measurements(
 def _shifted(
     uv: Float[Tensor, "B T 2"], mask: Bool[Tensor, "B T"], lag: int
 ) -> tuple[Tensor, Tensor]:
-    """Values `lag` frames ago, missing where that is outside the sequence."""
+    """Return values `lag` frames ago, missing where that is outside the sequence."""
     n_frames = uv.shape[1]
     source = torch.arange(n_frames, device=uv.device) - lag
     inside = (source >= 0) & (source < n_frames)

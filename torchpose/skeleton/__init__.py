@@ -1,4 +1,4 @@
-"""Joint sets, their names and trees, and the eight joints of the upper body."""
+"""Name joint sets and their trees, and find the eight joints of the upper body in them."""
 
 from torchpose._core.facade import set_up_facade
 from torchpose.skeleton._joint_sets import SKELETONS, UPPER_BODY, Skeleton, canonical_name

@@ -1,4 +1,4 @@
-"""Names of joints in every spelling, and the joint sets that are known, with their trees.
+"""Define the known joint sets with their trees, and resolve the spellings of joint names.
 
 Left and right are the person's own.
 """
@@ -176,7 +176,7 @@ class Skeleton:
     turned: bool = False
 
     def reordered(self, joints: Sequence[str]) -> "Skeleton":
-        """The same set with its joints in another order (and spelling)."""
+        """Return the same set with its joints in another order (and spelling)."""
         own, other = canonical_names(self.joints), canonical_names(joints)
         parent = {c: (own[p] if p >= 0 else None) for c, p in zip(own, self.parents, strict=True)}
         parents = tuple(-1 if parent[c] is None else other.index(str(parent[c])) for c in other)

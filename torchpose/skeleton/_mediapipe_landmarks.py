@@ -1,4 +1,4 @@
-"""MediaPipe's landmarks as the joints that priors know: head, neck and hands.
+"""Derive head, neck and hands, as priors have them, from MediaPipe's landmarks.
 
 MediaPipe marks nose, eyes and ears but no head, shoulders but no neck, and wrists and fingers but no
 hand; and its shoulders lie higher than Kinect's. A tracker takes place and scale of the body from head

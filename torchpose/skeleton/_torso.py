@@ -1,4 +1,4 @@
-"""Poses in the axes of their torso, and where the neck is, on which joint sets disagree by up to 12 cm.
+"""Align poses with the torso, and place necks, on which joint sets disagree by up to 12 cm.
 
 It is what the 3D error compares (BL section 6), and what a person does apart from how they stand
 towards the camera, so that estimates from different views and postures may be averaged in it."""

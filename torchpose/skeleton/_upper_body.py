@@ -1,4 +1,4 @@
-"""The eight upper-body joints, and the map of any joint set to them.
+"""Map joint sets to the eight joints of the upper body.
 
 Left and right are the person's own. Three things differ between joint sets under one name, and are
 told apart here:
@@ -79,7 +79,7 @@ _NECKS = (("neck", None), ("upper_neck", "neck"), ("shoulder_center", "neck"),
 
 
 class UpperBodyMap(NamedTuple):
-    """Where the eight joints of `UPPER_BODY` are in a joint set.
+    """Places of the eight joints of `UPPER_BODY` in a joint set.
 
     indices: eight indices into the set, -1 where it has no such joint. missing: names of those.
     neck: kind of neck, None if the names do not tell (or there is none). hand: ``"hand"``,

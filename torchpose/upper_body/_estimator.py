@@ -1,4 +1,4 @@
-"""The interface of the estimators: measured joints in, the states of both arms out."""
+"""Define the interface of the estimators: measured joints in, the states of both arms out."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ ArmJoints = dict[str, tuple[str, ...]]
 
 
 class TrackerModel(NamedTuple):
-    """What an estimator is made from, beside its own options.
+    """Prior, noise and settings that an estimator is made from, beside its own options.
 
     Attributes:
         owner: the module with which filters are kept between calls.
@@ -56,7 +56,7 @@ class TrackerModel(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Frames per second, 30 where nobody says."""
+        """Return the frames per second, 30 where none is given."""
         return self.fps or 30.0
 
 
@@ -106,7 +106,7 @@ class MotionRatios(NamedTuple):
 
 
 class Estimator(ABC):
-    """Estimates the states of both arms from the measured joints; each entry of `METHODS` makes one.
+    """Estimator of the states of both arms from the measured joints; `METHODS` has one per method.
 
     The constructor takes a `TrackerModel` and, by name, the options of the method. An estimator holds
     no state: what changes from frame to frame is the value that `init` makes and `advance` returns.

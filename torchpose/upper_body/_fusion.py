@@ -1,4 +1,4 @@
-"""From the estimates of both arms to poses, and their motion made steady.
+"""Read poses off the estimates of both arms, and steady their motion.
 
 A filter over windows estimates every frame for itself, so that the noise of keypoints and the change
 from one component to the next show as trembling. `MotionStage` filters (or smooths) what is read out.

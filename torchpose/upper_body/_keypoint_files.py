@@ -27,7 +27,7 @@ _KEPT_TRACKERS = 8
 
 @dataclass(frozen=True)
 class TrackSettings:
-    """How recordings are tracked; every setting is the option of `torchpose track` of that name.
+    """Settings of tracking; every one is the option of `torchpose track` of that name.
 
     Args:
         prior: a prior that comes with torchpose, or a .safetensors file.
@@ -99,7 +99,7 @@ class TrackSettings:
 
 
 class Prepared(NamedTuple):
-    """What a file of keypoints is tracked with.
+    """Tracker, camera and joint names of a file, and what was assumed.
 
     Attributes:
         tracker: for its camera, frame rate and neck. camera: of the tracker.
@@ -113,7 +113,7 @@ class Prepared(NamedTuple):
 
 
 class _Key(NamedTuple):
-    """What a tracker depends on beside the settings."""
+    """Facts about a file that its tracker depends on, beside the settings."""
 
     matrix: tuple[float, ...]
     size: tuple[int, int] | None
@@ -122,7 +122,7 @@ class _Key(NamedTuple):
 
 
 class KeypointFileTracker:
-    """Tracks one file of keypoints after the other with one prior.
+    """Tracker of one file of keypoints after the other with one prior.
 
     Trackers are kept by camera, frame rate and kind of neck, the last eight of them.
 
@@ -225,7 +225,7 @@ class KeypointFileTracker:
 
     @property
     def camera_file(self) -> Path | None:
-        """The file of the camera that was given, if it is a file."""
+        """Return the file of the camera that was given, if it is a file."""
         given = self.settings.camera
         return Path(given) if given and Path(given).is_file() else None
 

@@ -1,4 +1,4 @@
-"""Live streams: what is known between two frames, and the poses of one frame."""
+"""Hold the state of live streams between two frames, and the poses of one frame."""
 
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ __all__ = ["LivePose", "StreamState", "live_pose", "unseen_frames"]
 
 
 class StreamState(NamedTuple):
-    """What `UpperBodyTracker.step` needs to know of the frames before.
+    """State of `UpperBodyTracker.step` between two frames.
 
     Attributes:
         estimator: state of the method's estimator.

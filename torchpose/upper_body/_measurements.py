@@ -1,4 +1,4 @@
-"""From the keypoints that a caller has to the measured joints that estimators take."""
+"""Turn the keypoints of a caller into the measured joints that estimators take."""
 
 import math
 from collections.abc import Sequence
@@ -53,7 +53,7 @@ class MeasuredJoints(NamedTuple):
 
 
 class Picked(NamedTuple):
-    """Where the eight joints are among the keypoints.
+    """Places of the eight joints among the keypoints.
 
     Attributes:
         indices: of each, -1 if absent; with `middle`, that of the neck is the keypoint that lies in

@@ -1,4 +1,4 @@
-"""The methods of the upper-body tracker: one table of estimators by name, and which of them runs."""
+"""List the methods of the upper-body tracker by name, and choose the one that runs."""
 
 import inspect
 import warnings

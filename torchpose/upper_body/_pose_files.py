@@ -57,7 +57,7 @@ _CHAINS = (
 
 
 class BvhMotion(NamedTuple):
-    """What a BVH file says of T frames.
+    """Skeleton and motion of T frames for a BVH file.
 
     Attributes:
         lengths: of the bones that end in `ends` [7], centimetres.
@@ -107,7 +107,7 @@ def write_bvh(track: PoseTrack, path: str | Path) -> None:
 
 
 def joints_to_bvh(joints: Float[Tensor, "T 8 3"]) -> BvhMotion:
-    """Positions of joints as bone lengths and rotations.
+    """Return positions of joints as bone lengths and rotations.
 
     The root's axes are x along the shoulders, z = x × up, y = z × x. A bone of direction u is turned
     by the shortest arc from its direction at rest d to R^T u, R the rotation of its parent.
@@ -148,7 +148,7 @@ def joints_to_bvh(joints: Float[Tensor, "T 8 3"]) -> BvhMotion:
 
 
 def _fill(joints: Tensor) -> Tensor:
-    """Each frame with a joint that is not finite becomes the last good one, or the first at all."""
+    """Replace frames with a joint that is not finite by the last good one, or the first at all."""
     good = torch.isfinite(joints).all(-1).all(-1)
     if not bool(good.any()):
         raise InputError(
@@ -160,7 +160,7 @@ def _fill(joints: Tensor) -> Tensor:
 
 
 def _shoulder_axes(line: Tensor) -> Tensor:
-    """Rotations [T, 3, 3] with x along the line [T, 3] and y as upright as that allows."""
+    """Return rotations [T, 3, 3] with x along the line [T, 3] and y as upright as that allows."""
     x = torch.nn.functional.normalize(line, dim=-1)
     up = torch.tensor([0.0, 1.0, 0.0], dtype=x.dtype).expand_as(x)
     z = torch.linalg.cross(x, up)
@@ -175,7 +175,7 @@ def _shoulder_axes(line: Tensor) -> Tensor:
 def _shortest_arc(
     start: Float[Tensor, "*#batch 3"], goal: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3 3"]:
-    """The smallest rotation that takes one direction into another.
+    """Return the smallest rotation that takes one direction into another.
 
     R = I + [v]x + [v]x^2 / (1 + c),   v = a × b, c = a . b; half a turn about z where b = -a.
 
@@ -197,7 +197,7 @@ def _shortest_arc(
 
 
 def _hierarchy(motion: BvhMotion) -> list[str]:
-    """Lines of the nodes with their offsets at rest."""
+    """Return lines of the nodes with their offsets at rest."""
     lengths = dict(zip(motion.ends, motion.lengths.tolist(), strict=True))
     offsets = {
         bone.end: [lengths[bone.end] * part for part in bone.rest] for bone in _BONES
@@ -248,7 +248,7 @@ def write_pose_csv(track: PoseTrack, path: str | Path) -> None:
 
 
 def _rows(track: PoseTrack, frames: slice) -> Iterator[str]:
-    """Lines of some frames."""
+    """Return lines of some frames."""
     fps = track.fps or 30.0
     std = track.covariance3d[0, frames].diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
     observed = track.observed[0, frames, :, None].to(std)

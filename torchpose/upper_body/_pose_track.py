@@ -1,4 +1,4 @@
-"""The result of tracking: poses with covariances, and their file."""
+"""Hold the result of tracking, poses with covariances, and read and write its file."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -96,7 +96,7 @@ class PoseTrack:
 
     @property
     def failed(self) -> Tensor:
-        """Whether the filter degenerated, [B], as `LivePose.failed`."""
+        """Return whether the filter degenerated, [B], as `LivePose.failed`."""
         return self.failed_at >= 0
 
     def sequence(self, index: int) -> "PoseTrack":

@@ -30,7 +30,7 @@ __all__ = ["PoseReader", "check_frame", "note_collapse"]
 
 
 class PoseReader(NamedTuple):
-    """Reads the poses out of the estimates of both arms.
+    """Reader of poses out of the estimates of both arms.
 
     Attributes:
         prior, camera: whose pixels the estimates and the results are in.
@@ -53,7 +53,7 @@ class PoseReader(NamedTuple):
 
     @property
     def order(self) -> RotationOrder:
-        """Order of roll, pitch and yaw in the prior."""
+        """Return the order of roll, pitch and yaw in the prior."""
         order: RotationOrder = self.prior.info.rotation_order  # type: ignore[assignment]
         return order
 

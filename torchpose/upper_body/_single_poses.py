@@ -151,7 +151,7 @@ class PoseFilter:
 
     @property
     def options(self) -> tuple[str, ...]:
-        """Names of the method's options, by the signature of its filter."""
+        """Return the names of the method's options, by the signature of its filter."""
         names = [*inspect.signature(self.filter).parameters][1:]  # without the mixture
         taken = {*_GIVEN, *self.settings}
         return tuple(name for name in names if name not in taken)
@@ -224,7 +224,7 @@ class PoseState(NamedTuple):
 
 
 class SinglePoses(Estimator):
-    """Follows single poses from frame to frame with a recursive filter of each arm.
+    """Estimator that follows single poses with a recursive filter of each arm.
 
     Args:
         model: of the tracker. method: which filter, and what it takes from the prior.

@@ -1,4 +1,4 @@
-"""The main job: 2D keypoints of head, neck and hands to 2D and 3D poses of eight joints."""
+"""Track upper bodies: from 2D keypoints of head, neck and hands to 2D and 3D poses of eight joints."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -52,7 +52,7 @@ __all__ = ["METHODS", "PoseTrack", "UpperBodyTracker"]
 
 
 class UpperBodyTracker(WideModule):
-    """Tracks eight joints in 2D and 3D from the keypoints of any of them, typically head and hands.
+    """Tracker of eight joints in 2D and 3D from any of them, typically head and hands.
 
     Each arm, with head and neck, is estimated from the same measurements (BL section 3.1); head, neck
     and camera of the two are averaged and their covariances bounded, never fused as if they were
@@ -171,7 +171,7 @@ class UpperBodyTracker(WideModule):
 
     @property
     def measurement_cov(self) -> Float[Tensor, "8 2 2"]:
-        """R of each of the eight joints, the prior's pixels."""
+        """Return R of each of the eight joints, the prior's pixels."""
         info, learnt = self.prior.info, getattr(self.prior, "noise_measurement_std", None)
         sources = (self.measurement_std, learnt, self.camera.matrix)
         return derived(
@@ -183,13 +183,13 @@ class UpperBodyTracker(WideModule):
 
     @property
     def given_options(self) -> dict[str, Any]:
-        """The options of the method, with tensors as they are registered."""
+        """Return the options of the method, with tensors as they are registered."""
         return {name: getattr(self, name, value) if isinstance(value, Tensor) else value
                 for name, value in self.options.items()}  # fmt: skip
 
     @property
     def estimator(self) -> Estimator:
-        """The estimator of the method, on prior, noise and options as they are now."""
+        """Return the estimator of the method, on prior, noise and options as they are now."""
         make: Callable[..., Estimator] = METHODS[self.method]
         model = TrackerModel(self, self.prior, self.measurement_cov, self.fps, self.smoothing)
         return make(model, **self.given_options)

@@ -1,4 +1,4 @@
-"""The estimator over windows of motion: each frame by itself, with the hands shortly round it.
+"""Estimate poses from windows of motion: each frame with the hands shortly before and after it.
 
 Mixtures over windows see the body through a virtual camera that follows it
 (`torchpose.camera._virtual_camera`).
@@ -146,7 +146,7 @@ def _of_anchors(cov: Float[Tensor, "*batch 8 2 2"]) -> Float[Tensor, "*batch 2"]
 
 
 class WindowState(NamedTuple):
-    """What the next frame needs to know of the frames before.
+    """State of `WindowMixture` between two frames.
 
     Attributes:
         recent: the eight joints of the last N frames in the prior's pixels, the latest last, with R of
@@ -158,7 +158,7 @@ class WindowState(NamedTuple):
 
 
 class WindowMixture(Estimator):
-    """Conditions the prior's mixture over windows on each frame by itself and the hands round it.
+    """Estimator that conditions the prior's mixture over windows on each frame and the hands near it.
 
     The motion stage follows, since the noise of keypoints and the change from one component to the
     next show as trembling.

@@ -1,4 +1,4 @@
-"""A first pose from the silhouettes of the first frames, which tell front from back."""
+"""Find a first pose in the silhouettes of the first frames, which tell front from back."""
 
 import math
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""The filters over whole bodies by name: which one tracks, what it has to have learnt, which options it has.
+"""List the filters over whole bodies by name, with the models and options that each takes.
 
 `METHODS` is the table of all of them. A filter of your own is a subclass of `SilhouetteParticleFilter`
 and one call of `register_body_filter`.

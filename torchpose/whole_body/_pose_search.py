@@ -1,4 +1,4 @@
-"""A first pose from the silhouettes of one frame, without a pose to start from."""
+"""Find a first pose in the silhouettes of one frame, without a pose to start from."""
 
 import math
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ _ONE_MODE = math.sin(math.pi / 8)  # particles turned by less than 45 degrees fr
 
 
 class SilhouettePlace(NamedTuple):
-    """Where the silhouettes put the middle of the body.
+    """Middle of the body by the silhouettes.
 
     Attributes:
         position: [..., 3], metres, world axes. cov: [..., 3, 3].

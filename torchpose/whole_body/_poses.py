@@ -1,4 +1,4 @@
-"""The poses of a tracked whole body, with their uncertainty, and their file."""
+"""Hold the poses of a tracked whole body with their uncertainty, and read and write their file."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -83,12 +83,12 @@ class BodyPoses:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the joints."""
+        """Return the names of the joints."""
         return self.body.skeleton.names
 
     @property
     def failed_at(self) -> int:
-        """First frame in which all particles had died, -1 if there is none; tracking went on from it."""
+        """Return the first frame in which all particles had died, -1 if there is none."""
         return int(first_true(self.respread))
 
     def save(self, path: str | Path) -> None:

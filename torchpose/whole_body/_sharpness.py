@@ -1,4 +1,4 @@
-"""The sharpness exponent of a likelihood, chosen on validation sequences."""
+"""Choose the sharpness exponent of a likelihood on validation sequences."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence

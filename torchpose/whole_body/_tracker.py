@@ -1,4 +1,4 @@
-"""The main job for whole bodies: silhouettes of calibrated cameras to the poses of one person."""
+"""Track whole bodies: from the silhouettes of calibrated cameras to the poses of one person."""
 
 from collections.abc import Iterable
 from itertools import chain, islice
@@ -34,7 +34,7 @@ _SEEN = 0.002  # of the image: fewer pixels are nobody
 
 
 class BodyStream(NamedTuple):
-    """What `BodyTracker.step` needs to know of the frames before.
+    """State of `BodyTracker.step` between two frames.
 
     Attributes:
         filter: state of the filter. frame: number of the next frame. generator: for what is drawn.
@@ -46,7 +46,7 @@ class BodyStream(NamedTuple):
 
 
 class BodyTracker(nn.Module):
-    """Tracks one person's whole body through the silhouettes of calibrated cameras, in 3D.
+    """Tracker of one person's whole body through the silhouettes of calibrated cameras, in 3D.
 
     `forward` tracks a whole sequence and finds the first pose by itself; `init` and `step` track live,
     `advance` some frames at a time, with the same numbers.
@@ -157,22 +157,22 @@ class BodyTracker(nn.Module):
 
     @property
     def body(self) -> Body:
-        """The body that is tracked, in the frame and about the centres that the method needs."""
+        """Return the body that is tracked, in the frame and about the centres that the method needs."""
         return self.filter.body  # type: ignore[return-value]
 
     @property
     def upright(self) -> Body:
-        """The same person, on whom the first pose is looked for."""
+        """Return the same person, on whom the first pose is looked for."""
         return self.body if self._upright is None else self._upright
 
     @property
     def process_cov(self) -> Float[Tensor, " D"]:
-        """Variances of the diffusion per frame."""
+        """Return the variances of the diffusion per frame."""
         return self.filter.process_cov
 
     @property
     def initial_std(self) -> Float[Tensor, " D"]:
-        """Standard deviation of the particles about the first pose."""
+        """Return the standard deviation of the particles about the first pose."""
         return self.filter.start_std() if self._initial_std is None else self._initial_std
 
     @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Weights of single limbs against images of them."""
+"""Weights of parts of the body against images of them."""
 
 import pytest
 import torch
@@ -6,41 +6,8 @@ import torch
 from tests.whole_body.silhouettes.test_rendering import HEIGHT, WIDTH, make_rig, random_limbs
 from torchpose.body import Limbs
 from torchpose.errors import ShapeError
-from torchpose.whole_body._silhouettes.limb_counts import PartCounts, count_limbs, count_parts
+from torchpose.whole_body._silhouettes.limb_counts import PartCounts, count_parts
 from torchpose.whole_body._silhouettes.rendering import render_limbs
-
-
-def weight_by_pixels(limbs, opposing, rig, silhouettes):
-    """(DX 4): a copy of the silhouette that is 1/2 under the opposing limb, summed under each limb."""
-    image = silhouettes.double().expand(*limbs.start.shape[:-2], -1, -1, -1)
-    if opposing is not None:
-        union = render_limbs(opposing, rig, HEIGHT, WIDTH)
-        image = image * torch.where(union, 0.5, 1.0)
-    single = Limbs(*(x.unsqueeze(-2) for x in limbs))
-    covered = render_limbs(single, rig, HEIGHT, WIDTH)
-    return (covered * image.unsqueeze(-4)).sum((-2, -1))
-
-
-@pytest.mark.parametrize("own_radii", [False, True])
-@pytest.mark.parametrize("chunk", [None, 2])
-def test_weights_are_sums_over_the_halved_silhouette(own_radii, chunk):
-    rig = make_rig(2)
-    limbs = random_limbs(3, 2, n_limbs=7, seed=1, spread=0.3, own_radii=own_radii)
-    opposing = random_limbs(3, 2, n_limbs=5, seed=2, spread=0.3)
-    silhouettes = torch.rand(2, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0)) < 0.6
-    result = count_limbs(limbs, opposing, rig, silhouettes, chunk=chunk)
-    expected = weight_by_pixels(limbs, opposing, rig, silhouettes)
-    assert result.shape == (3, 2, 7, 2)
-    assert torch.equal(result, expected)
-    assert bool((result < count_limbs(limbs, None, rig, silhouettes)).any())
-
-
-def test_without_an_opposing_limb_and_with_a_silhouette_for_each():
-    rig = make_rig(2)
-    limbs = random_limbs(3, n_limbs=4, seed=3)
-    silhouettes = torch.rand(3, 2, HEIGHT, WIDTH) < 0.5
-    result = count_limbs(limbs, None, rig, silhouettes)
-    assert torch.equal(result, weight_by_pixels(limbs, None, rig, silhouettes))
 
 
 def parts_of(*shape, seed, own_radii=True):
@@ -70,9 +37,11 @@ def counts_by_pixels(parts, opposing, rig, silhouettes):
 
 @pytest.mark.parametrize("chunk", [None, 1])
 @pytest.mark.parametrize("batch_of_silhouettes", [False, True])
-def test_parts_of_several_limbs_weigh_as_their_union(chunk, batch_of_silhouettes):
+@pytest.mark.parametrize(("n_limbs", "own_radii"), [(2, True), (1, False)])
+def test_parts_weigh_as_the_union_of_their_limbs(chunk, batch_of_silhouettes, n_limbs, own_radii):
     rig, generator = make_rig(2), torch.Generator().manual_seed(4)
-    parts, opposing = parts_of(2, 3, 7, 2, seed=5), parts_of(2, 3, 4, 3, seed=6)
+    parts = parts_of(2, 3, 7, n_limbs, seed=5, own_radii=own_radii)
+    opposing = parts_of(2, 3, 4, 3, seed=6)
     shape = (2, 2, HEIGHT, WIDTH) if batch_of_silhouettes else (2, HEIGHT, WIDTH)
     silhouettes = torch.rand(shape, generator=generator) < 0.6
     result = count_parts(parts, opposing, rig, silhouettes, chunk=chunk)
@@ -103,6 +72,4 @@ def test_shapes_must_fit():
     with pytest.raises(ShapeError, match="or the first of them"):
         count_parts(parts_of(2, 7, 1, seed=1), None, rig, silhouettes.expand(3, 1, -1, -1))
     with pytest.raises(ShapeError, match="leading dimensions"):
-        count_limbs(
-            random_limbs(3), random_limbs(2), make_rig(1), torch.ones(1, HEIGHT, WIDTH).bool()
-        )
+        count_parts(parts_of(3, 4, 1, seed=1), parts_of(2, 4, 1, seed=2), rig, silhouettes)

@@ -1,1 +1,1 @@
-"""Readers of one file format each, which `torchpose.io` chooses from."""
+"""Read one file format per module, which `torchpose.io` chooses from."""

@@ -1,4 +1,4 @@
-"""From the axes and units of files to metres in camera axes; the one place where both are converted.
+"""Convert the axes and units of files to metres in camera axes; nothing else converts them.
 
 Camera axes: x right, y down, z forward (away from the camera). Every conversion is a rotation."""
 

@@ -1,4 +1,4 @@
-"""Tables of 3D joints: Kinect v1 and v2 rows without a header, and any joint set with one."""
+"""Read tables of 3D joints: Kinect v1 and v2 rows without a header, and any joint set with one."""
 
 import math
 import re
@@ -42,7 +42,7 @@ _PERSONS = ("person", "subject")
 
 
 class _Layout(NamedTuple):
-    """What a row without a header holds."""
+    """Layout of a row without a header."""
 
     skeleton: str
     numbers: int  # of each joint: x, y, z, and a state with four

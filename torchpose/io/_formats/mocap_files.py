@@ -1,4 +1,4 @@
-"""Motion capture as recordings of joints: BVH files by the library bvhio, C3D files by the library c3d."""
+"""Read motion capture as recordings of joints: BVH files by bvhio, C3D files by c3d."""
 
 import re
 import warnings
@@ -148,7 +148,7 @@ def _head_end(head: Any, posed: Any) -> tuple[Any, str]:
 
 
 def _check(path: Path) -> None:
-    """Whether the file is whole; bvhio would read on for ever at the end of a truncated one."""
+    """Raise unless the file is whole; bvhio would read on for ever at the end of a truncated one."""
     text = read_text(path, "a BVH file", "utf-8")
     hierarchy, mark, motion = text.partition("MOTION")
     if not hierarchy.lstrip().startswith("HIERARCHY") or not mark:

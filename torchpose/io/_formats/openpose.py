@@ -1,4 +1,4 @@
-"""OpenPose output: a folder with one `*_keypoints.json` per frame.
+"""Read OpenPose output: a folder with one `*_keypoints.json` per frame.
 
 Of several people one is followed: in the first frame with people the one of largest mean confidence,
 afterwards the one nearest to the last frame in which that person was seen (mean pixel distance over

@@ -1,4 +1,4 @@
-"""What a file of 3D joints holds before conversion; the package's own .npz and the authors' .yaml files."""
+"""Hold the 3D joints of a file before conversion, and read the package's .npz and the authors' .yaml."""
 
 import re
 from collections.abc import Iterable
@@ -112,7 +112,7 @@ def join_bodies(
     fps: float | None,
     **facts: Any,
 ) -> list[RawRecording]:
-    """One recording for each person in a file of several bodies that come and go.
+    """Return one recording for each person in a file of several bodies that come and go.
 
     A sensor gives a body that it lost and found a new number. So bodies that are never there at once
     are taken for one person: first those of the body tracked longest, whose file it is, then those
@@ -158,7 +158,7 @@ def join_bodies(
 
 
 def _tracked(frames: Iterable[BodyFrame]) -> float:
-    """In how many frames a body is there, those of inferred joints counting less."""
+    """Return in how many frames a body is there, those of inferred joints counting less."""
     return sum(1.0 if one.weights is None else float(one.weights.mean()) for one in frames)
 
 

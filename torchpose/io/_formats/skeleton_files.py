@@ -1,4 +1,4 @@
-"""Skeletons as sensors' software writes them: Kinect v1 text, NTU RGB+D, Azure Kinect JSON."""
+"""Read skeletons of sensors' software: Kinect v1 text, NTU RGB+D, Azure Kinect JSON."""
 
 import re
 from pathlib import Path

@@ -1,1 +1,1 @@
-"""Action spaces: the postures of one action, and banks of several."""
+"""Hold action spaces, the postures of one action, and banks of several."""

@@ -1,4 +1,4 @@
-"""Several actions at once, and none of them: gates, likelihoods of postures, and who does what when."""
+"""Recognise which of several actions, or none, is performed: gates, likelihoods, transitions."""
 
 import math
 from collections.abc import Sequence
@@ -110,18 +110,18 @@ class ActionBank(nn.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the states: the actions, then "none"."""
+        """Return the names of the states: the actions, then "none"."""
         return (*self.info.names, NONE)
 
     @property
     def none(self) -> int:
-        """Index A of the state "none"."""
+        """Return the index A of the state "none"."""
         return len(self.info.names)
 
     # --- gates ------------------------------------------------------------------------------------
 
     def project(self, postures: Float[Tensor, "*batch 36"]) -> Float[Tensor, "*batch A D"]:
-        """Projections on the subspace of every action, degrees."""
+        """Return projections on the subspace of every action, degrees."""
         check_shape("postures", postures, ["...", POSTURE_DIM])
         flat = self.basis.transpose(0, 1).flatten(1)  # [36, A D]
         offset = (self.mean[:, None] @ self.basis).flatten()
@@ -135,7 +135,7 @@ class ActionBank(nn.Module):
         *,
         uniform: Float[Tensor, "*batch"] | None = None,
     ) -> Int[Tensor, "*batch"]:
-        """The posture of its own action that each is matched with, see `ActionSpace.match`.
+        """Return the posture of its own action that each is matched with, see `ActionSpace.match`.
 
         Args:
             postures: [..., 36]. actions: [...], A for none, for which the index means nothing.
@@ -159,7 +159,7 @@ class ActionBank(nn.Module):
         j: Int[Tensor, "*batch"],
         width: float = GATE_WIDTH,
     ) -> Bool[Tensor, "*batch"]:
-        """Whether postures lie in the gates of their own actions (AS 6); always for none."""
+        """Return whether postures lie in the gates of their own actions (AS 6); always for none."""
         check_gate_width(width)
         z, own = self._own(postures, actions)
         within = (z - self.performance[own, j]).abs() < width * self.std[own, j]
@@ -173,7 +173,7 @@ class ActionBank(nn.Module):
         width: float = GATE_WIDTH,
         rounds: int = CLAMP_ROUNDS,
     ) -> Float[Tensor, "*batch 36"]:
-        """Postures moved into the gates of their own actions, see `ActionSpace.clamp_postures`.
+        """Move postures into the gates of their own actions, see `ActionSpace.clamp_postures`.
 
         They stay as they are for none.
         """
@@ -192,7 +192,7 @@ class ActionBank(nn.Module):
     # --- which action -----------------------------------------------------------------------------
 
     def log_likelihood(self, postures: Float[Tensor, "*batch 36"]) -> Float[Tensor, "*batch S"]:
-        """log p(phi | a) of every state, [..., A + 1], the last one none, of a single posture."""
+        """Return log p(phi | a) of a posture for every state, [..., A + 1], the last one none."""
         z = self.project(postures)
         std = self.info.spread * self.std
         used = torch.arange(std.shape[-1], device=z.device) < self.n_dimensions[:, None]  # [A, D]
@@ -207,7 +207,7 @@ class ActionBank(nn.Module):
         return both - 0.5 * POSTURE_DIM * math.log(2 * math.pi)
 
     def transition(self, fps: float | None = None) -> Float[Tensor, "S S"]:
-        """Probabilities [A + 1, A + 1] of going from each state to each in one frame.
+        """Return the probabilities [A + 1, A + 1] of going from each state to each in one frame.
 
         Args:
             fps: frames per second; by default that of the performances.
@@ -215,7 +215,7 @@ class ActionBank(nn.Module):
         return chain_transition(len(self.names), self.info.stay, self.frame_rate(fps), self.mean)
 
     def evidence_share(self, fps: float | None = None) -> float:
-        """min(1, evidence_rate / fps), the power to which the likelihood of a frame counts.
+        """Return min(1, evidence_rate / fps), the power to which the likelihood of a frame counts.
 
         Args:
             fps: frames per second; by default that of the performances.
@@ -223,7 +223,7 @@ class ActionBank(nn.Module):
         return evidence_share(self.info.evidence_rate, self.frame_rate(fps))
 
     def frame_rate(self, fps: float | None = None) -> float:
-        """The given frame rate, or that of the performances.
+        """Return the given frame rate, or that of the performances.
 
         Raises:
             InputError: not positive, or there is none.
@@ -236,7 +236,7 @@ class ActionBank(nn.Module):
         return rate
 
     def start(self) -> Float[Tensor, " S"]:
-        """Log-probabilities [A + 1] of the states before the first frame: all alike."""
+        """Return the log-probabilities [A + 1] of the states before the first frame: all alike."""
         return self.mean.new_full((len(self.names),), -math.log(len(self.names)))
 
     def update(
@@ -245,7 +245,7 @@ class ActionBank(nn.Module):
         postures: Float[Tensor, "*batch 36"],
         fps: float | None = None,
     ) -> Float[Tensor, "*batch S"]:
-        """One frame of the recursion over actions, see `chain_step`.
+        """Take one frame of the recursion over actions, see `chain_step`.
 
         Args:
             log_posterior: [..., A + 1], of the frame before. postures: [..., 36], of this frame.
@@ -258,7 +258,7 @@ class ActionBank(nn.Module):
     def recognise(
         self, postures: Float[Tensor, "*batch T 36"], fps: float | None = None
     ) -> Float[Tensor, "*batch T S"]:
-        """Posterior over the actions and none in every frame, given the frames up to it.
+        """Return the posterior over the actions and none in every frame, given the frames up to it.
 
         Args:
             postures: [..., T, 36], degrees, of one sequence or a batch of them.
@@ -318,14 +318,14 @@ class ActionBank(nn.Module):
     # --- pieces -----------------------------------------------------------------------------------
 
     def _own(self, postures: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Projection [..., D] of each on its own action, and that action (none: the last one)."""
+        """Return the projection [..., D] of each on its own action, and that action (none: the last one)."""
         own = actions.clamp_max(self.none - 1)
         z = self.project(postures)
         index = own[..., None, None].expand(*own.shape, 1, z.shape[-1])
         return z.gather(-2, index).squeeze(-2), own
 
     def _squared(self, z: Tensor, std: Tensor) -> Tensor:
-        """sum_d (z_d - g_{k,d})^2 / std_{k,d}^2 of every action and posture, [..., A, K].
+        """Return sum_d (z_d - g_{k,d})^2 / std_{k,d}^2 of every action and posture, [..., A, K].
 
         By products of matrices: the table of differences, [..., A, K, D], would not fit the cache.
         """
@@ -339,11 +339,11 @@ class ActionBank(nn.Module):
 
     @property
     def _gated(self) -> int:
-        """Dimensions that the gates look at."""
+        """Return the dimensions that the gates look at."""
         return min(self.info.gate_dimensions or self.basis.shape[-1], self.basis.shape[-1])
 
     def _there(self) -> Tensor:
-        """[A, K], postures that are not padding."""
+        """Return [A, K], True for postures that are not padding."""
         k = torch.arange(self.performance.shape[1], device=self.performance.device)
         return k < self.n_postures[:, None]
 

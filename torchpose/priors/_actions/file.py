@@ -1,4 +1,4 @@
-"""What action spaces and banks were fitted on: performances in step, facts, and the files."""
+"""Record what action spaces and banks were fitted on, and name the kinds of their files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _LIMBS = tuple(limb.name for limb in LIMBS_12)
 
 @dataclass(frozen=True)
 class ActionInfo:
-    """What an action space was fitted on; fields that are not known are empty.
+    """Facts about the fit of an action space; fields that are not known are empty.
 
     Attributes:
         name: of the action. fps: of the performances. limbs: that the postures are of.
@@ -42,7 +42,7 @@ class ActionInfo:
 
 @dataclass(frozen=True)
 class BankInfo:
-    """What a bank holds, and how sure it is.
+    """Facts about the actions of a bank, and the settings of its recognition.
 
     Attributes:
         names: of the A actions. fps: of their performances. limbs: that the postures are of.

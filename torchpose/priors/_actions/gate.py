@@ -1,4 +1,4 @@
-"""The gate around a performance (AS 6): matching, deciding, moving in; for one action or a bank."""
+"""Match postures with a performance and gate them (AS 6), for one action or a bank."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -47,7 +47,7 @@ class Acceptance(NamedTuple):
 def match_postures(
     log_weights: Float[Tensor, "*batch K"], uniform: Float[Tensor, "*batch"]
 ) -> Int[Tensor, "*batch"]:
-    """An index for every row, drawn by the inverse of its distribution function.
+    """Draw an index for every row, by the inverse of its distribution function.
 
     Args:
         log_weights: [..., K], of any common factor. uniform: [...], in [0, 1).
@@ -63,7 +63,7 @@ def match_postures(
 def clamp_offset(
     offset: Float[Tensor, "*batch D"], std: Float[Tensor, "*batch D"], width: float
 ) -> Float[Tensor, "*batch D"]:
-    """Offset z - g from a matched posture, moved to just within the gate.
+    """Return the offset z - g from a matched posture, moved to just within the gate.
 
     Args:
         offset: [..., D]. std: sigma of the posture, [..., D]. width: of the gate, in sigma.
@@ -99,7 +99,7 @@ def passes_any_gate(
     std: Float[Tensor, "K D"],
     width: float,
 ) -> Bool[Tensor, " N"]:
-    """Whether there is any posture of the performance in whose gate z lies."""
+    """Return whether there is any posture of the performance in whose gate z lies."""
     parts = z.split(max(1, _CHUNK // performance.numel()))
     reach = width * std
     near = [((part[:, None] - performance).abs() < reach).all(-1).any(-1) for part in parts]

@@ -1,4 +1,4 @@
-"""Limbs whose relative angles make a posture, and these angles straight from rotations of parts.
+"""Compute relative angles of limbs straight from rotations of parts.
 
 The same numbers as `posture_angles` of the joints, at a tenth of the cost: only the directions of the
 twelve bones are turned, components first (x, y and z apart, states last), and no matrix is formed."""
@@ -74,12 +74,12 @@ class PartPostures(nn.Module):
         self._carries = _carries()
 
     def forward(self, states: Float[Tensor, "N D"]) -> Float[Tensor, "N 36"]:
-        """Relative angles, degrees, as `torchpose.priors._actions.postures.state_postures`."""
+        """Return relative angles, degrees, as `torchpose.priors._actions.postures.state_postures`."""
         check_shape("states", states, ["N", self._dim])
         return self.of_relative(states[:, 6:])
 
     def of_relative(self, relative: Float[Tensor, "N Q"]) -> Float[Tensor, "N 36"]:
-        """The same from the columns without the root, which make no difference."""
+        """Return the same from the columns without the root, which make no difference."""
         check_shape("relative", relative, ["N", self._dim - 6])
         relative = relative.to(self.bones)
         if len(relative) <= _CHUNK:
@@ -108,14 +108,14 @@ class PartPostures(nn.Module):
         return torch.rad2deg(sines.clamp(-1, 1).asin())
 
     def _in_root_axes(self, x: Tensor, y: Tensor, z: Tensor) -> Vectors:
-        """From axes with x along the hips to those with y along the spine, at right angles to x."""
+        """Turn axes with x along the hips to those with y along the spine, at right angles to x."""
         scale = torch.rsqrt(y[:1] * y[:1] + z[:1] * z[:1])
         up, ahead = y[:1] * scale, z[:1] * scale
         return x, y * up + z * ahead, z * up - y * ahead
 
 
 def _turns(parts: list[int], above: tuple[int, ...]) -> list[_Turn]:
-    """From the outermost parts inwards: which bones each level of parts turns."""
+    """Return which bones each level of parts turns, from the outermost parts inwards."""
     chains = []
     for first in parts:
         chain, part = [], first
@@ -132,7 +132,7 @@ def _turns(parts: list[int], above: tuple[int, ...]) -> list[_Turn]:
 
 
 def _carries() -> list[_Turn]:
-    """From the root outwards: which limbs each level of limbs carries."""
+    """Return which limbs each level of limbs carries, from the root outwards."""
     carries = []
     for level in tree_levels(LIMB_PARENTS, [limb.name for limb in LIMBS_12]):
         pairs = [(i, a) for i in range(len(LIMBS_12)) for a in _ancestors(i) if a in level]
@@ -150,7 +150,7 @@ def _ancestors(limb: int) -> list[int]:
 
 
 def _axes_along(direction: Tensor) -> Tensor:
-    """A rotation [3, 3] that turns a direction to the x axis."""
+    """Return a rotation [3, 3] that turns a direction to the x axis."""
     x = normalize(direction, dim=-1)
     y = normalize(torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0]).to(x), x), dim=-1)
     return torch.stack([x, y, torch.linalg.cross(x, y)])
@@ -166,7 +166,7 @@ def _cross(a: list[Tensor] | Vectors, b: list[Tensor] | Vectors) -> Vectors:
 
 
 def _rotated(u: list[Tensor], w: Tensor, x: list[Tensor]) -> Vectors:
-    """x + 2 w (u x x) + 2 u x (u x x)."""
+    """Return x + 2 w (u x x) + 2 u x (u x x)."""
     once = _cross(u, x)
     twice = _cross(u, once)
     a, b, c = (
@@ -176,7 +176,7 @@ def _rotated(u: list[Tensor], w: Tensor, x: list[Tensor]) -> Vectors:
 
 
 def _carried_back(seen: list[Tensor], straight: tuple[Tensor, ...], x: list[Tensor]) -> Vectors:
-    """x turned by the smallest rotation from `seen` [k, n] to `straight` [k]."""
+    """Return x turned by the smallest rotation from `seen` [k, n] to `straight` [k]."""
     s = [c[:, None] for c in straight]
     axis = _cross(seen, s)
     cosine = seen[0] * s[0] + seen[1] * s[1] + seen[2] * s[2]
@@ -188,7 +188,7 @@ def _carried_back(seen: list[Tensor], straight: tuple[Tensor, ...], x: list[Tens
 
 
 def _times(matrix: Tensor, x: list[Tensor] | Vectors) -> Vectors:
-    """Matrices [k or 1, 3, 3] times vectors."""
+    """Return matrices [k or 1, 3, 3] times vectors."""
     a, b, c = (
         sum(matrix[:, row, column, None] * x[column] for column in range(3)) for row in range(3)
     )

@@ -1,4 +1,4 @@
-"""The twelve limbs whose relative angles make a posture, and the order of the 36 angles."""
+"""List the twelve limbs whose relative angles make a posture, and order the 36 angles."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

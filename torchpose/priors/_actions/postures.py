@@ -1,4 +1,4 @@
-"""Postures as relative angles of twelve limbs: 36 numbers that leave out where the body stands.
+"""Convert states to and from postures: relative angles of twelve limbs, 36 numbers without the root.
 
 A limb's posture is the direction u of its bone in the axes of the limb that it hangs on, told by the
 angles between the bone and the three planes of those axes (x left, y up, z forward),
@@ -23,32 +23,23 @@ from torch import Tensor
 
 from torchpose.body._fitting import swing_parts
 from torchpose.body._kinematics import Body
-from torchpose.body._skeleton import BODY_15, body_joints
+from torchpose.body._skeleton import BODY_15
 from torchpose.errors import InputError, ShapeError, SkeletonError, check_finite, check_shape
 from torchpose.math._rotations import minimal_rotation, quaternion_vector_to_matrix
 from torchpose.math._tree_messages import tree_levels
 from torchpose.priors._actions.polar_limbs import (
-    ANGLE_NAMES,
     LIMB_PARENTS,
     LIMBS_12,
     POSTURE_DIM,
-    PolarLimb,
-    check_limbs,
 )
 
 __all__ = [
-    "ANGLE_NAMES",
-    "LIMBS_12",
-    "POSTURE_DIM",
-    "PolarLimb",
     "check_body",
-    "check_limbs",
     "normalise_postures",
     "posture_angles",
     "posture_directions",
     "posture_root",
     "posture_to_state",
-    "recorded_postures",
     "state_postures",
 ]
 
@@ -59,7 +50,7 @@ _TINY = 1e-6  # metres or sines: nothing shorter has a direction
 
 
 def posture_angles(joints: Float[Tensor, "*batch 15 3"]) -> Float[Tensor, "*batch 36"]:
-    """Relative angles of the twelve limbs, degrees.
+    """Return the relative angles of the twelve limbs, degrees.
 
     Args:
         joints: [..., 15, 3], metres, in the order of `BODY_15` (`body_joints`), any right-handed
@@ -100,7 +91,7 @@ def posture_angles(joints: Float[Tensor, "*batch 15 3"]) -> Float[Tensor, "*batc
 
 
 def posture_root(joints: Float[Tensor, "*batch 15 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation from the root's axes to the world's: x along the hips, y up the spine, z forward.
+    """Return the rotation from the root's axes to the world's: x along the hips, y up the spine, z forward.
 
     Args:
         joints: [..., 15, 3], metres, in the order of `BODY_15`.
@@ -123,22 +114,8 @@ def posture_root(joints: Float[Tensor, "*batch 15 3"]) -> Float[Tensor, "*batch 
     return torch.stack([x, torch.linalg.cross(z, x), z], -1)
 
 
-def recorded_postures(
-    joints: Float[Tensor, "*batch K 3"], names: Sequence[str]
-) -> Float[Tensor, "*batch 36"]:
-    """Relative angles, degrees, from the joints of any joint set that `body_joints` knows.
-
-    Args:
-        joints: [..., K, 3], metres. names: the K names.
-
-    Raises:
-        SkeletonError: an unknown name, or no shoulders or hips. InputError: see `posture_angles`.
-    """
-    return posture_angles(body_joints(joints, names))
-
-
 def state_postures(body: Body, state: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch 36"]:
-    """Relative angles, degrees, of the states of a body.
+    """Return the relative angles, degrees, of the states of a body.
 
     Raises:
         SkeletonError: a body of other joints than those of `BODY_15`.
@@ -151,7 +128,7 @@ def state_postures(body: Body, state: Float[Tensor, "*batch D"]) -> Float[Tensor
 
 
 def normalise_postures(postures: Float[Tensor, "*batch 36"]) -> Float[Tensor, "*batch 36"]:
-    """Angles of the directions nearest in sines: a = arcsin(u), u = sin a / |sin a|.
+    """Return the angles of the directions nearest in sines: a = arcsin(u), u = sin a / |sin a|.
 
     Three angles of a limb belong to a direction only if their squared sines sum to 1, which
     interpolated or projected ones do not.
@@ -165,7 +142,7 @@ def normalise_postures(postures: Float[Tensor, "*batch 36"]) -> Float[Tensor, "*
 def posture_directions(
     postures: Float[Tensor, "*batch 36"], root: Float[Tensor, "*batch 3 3"]
 ) -> Float[Tensor, "*batch 12 3"]:
-    """World directions of the twelve limbs, u = sin a / |sin a|, carried on from the root.
+    """Return world directions of the twelve limbs, u = sin a / |sin a|, carried on from the root.
 
     Args:
         postures: [..., 36], degrees. root: [..., 3, 3], of `posture_root`.
@@ -190,7 +167,7 @@ def posture_directions(
 def posture_to_state(
     body: Body, postures: Float[Tensor, "*batch 36"], root_state: Float[Tensor, "*#batch D"]
 ) -> Float[Tensor, "*batch D"]:
-    """States of given postures, in closed form, with the root of other states.
+    """Return the states of given postures, in closed form, with the root of other states.
 
     Kept of `root_state` are the root's position, the pelvis and the plane in which the torso leans
     forward: all that `posture_root` is made of. The torso points where the posture says and turns
@@ -236,7 +213,7 @@ def check_body(body: Body) -> None:
 
 
 def _local_directions(postures: Tensor) -> Tensor:
-    """u [..., 12, 3], unit directions in the parents' axes; at rest where all angles are zero."""
+    """Return unit directions u [..., 12, 3] in the parents' axes; at rest where all angles are zero."""
     check_shape("postures", postures, ["...", POSTURE_DIM])
     sines = torch.deg2rad(postures.clamp(-90, 90)).sin().unflatten(-1, (-1, 3))
     none = sines.norm(dim=-1, keepdim=True) < _TINY
@@ -244,7 +221,7 @@ def _local_directions(postures: Tensor) -> Tensor:
 
 
 def _torso_rotation(body: Body, rest: Tensor, bones: Tensor) -> Tensor:
-    """World rotation [N, 3, 3] that points the neck's offset along its bone and then turns about it.
+    """Return rotations [N, 3, 3] that point the neck's offset along its bone and then turn about it.
 
     The turn brings the shoulders nearest to their bones: tan of it = sum t . (a x s) / sum a . s
     over both, a the shoulder's offset and s its bone, both across t.
@@ -262,14 +239,14 @@ def _torso_rotation(body: Body, rest: Tensor, bones: Tensor) -> Tensor:
 
 
 def _joint_bones(body: Body, directions: Tensor) -> Tensor:
-    """Vectors [N, J, 3] from each joint's parent to it; hips and root are left zero."""
+    """Return vectors [N, J, 3] from each joint's parent to it; hips and root are left zero."""
     bones = directions.new_zeros(len(directions), len(body.skeleton.names), 3)
     bones[:, _ENDS] = directions * body.bone_lengths[_ENDS, None]
     return bones
 
 
 def _carry(axes: Tensor, local: Tensor, level: "_Level") -> Tensor:
-    """Axes of those limbs of a level that others hang on, turned from straight to where they point.
+    """Return the axes of a level's limbs that carry others, turned from straight to where they point.
 
     The smallest rotation from a to b is I - (a + b)(a + b)^T / (1 + a . b) + 2 b a^T.
     """
@@ -302,7 +279,7 @@ class _Level(NamedTuple):
 
 
 def _level(limbs: Sequence[int], carriers: Sequence[int]) -> _Level:
-    """A level, by the carriers of the level before (-1: the root)."""
+    """Return a level, by the carriers of the level before (-1: the root)."""
     above = [carriers.index(LIMB_PARENTS[limb]) for limb in limbs]
     return _Level(list(limbs), above, [i for i, limb in enumerate(limbs) if limb in LIMB_PARENTS])
 
@@ -327,12 +304,12 @@ _ENDS = _joints(*(limb.end for limb in LIMBS_12))
 
 
 def _axes(kind: str, like: Tensor) -> Tensor:
-    """Directions [12, 3], straight or at rest, on a tensor's device."""
+    """Return directions [12, 3], straight or at rest, on a tensor's device."""
     return like.new_tensor([getattr(limb, kind) for limb in LIMBS_12])
 
 
 def _known(joints: Tensor) -> Tensor:
-    """[12], limbs both of whose joints are known."""
+    """Return [12], True for limbs both of whose joints are known."""
     if joints.ndim < 2 or joints.shape[-2:] != (len(BODY_15.names), 3):
         raise ShapeError(
             f"joints must have shape [..., 15, 3] in the order of BODY_15, got "

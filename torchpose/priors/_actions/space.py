@@ -1,4 +1,4 @@
-"""The postures of one action: a principal subspace, a mean performance in it and a tube around it."""
+"""Model the postures of one action: a principal subspace, a mean performance and gates around it."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -144,16 +144,16 @@ class ActionSpace(nn.Module):
 
     @property
     def n_dimensions(self) -> int:
-        """D."""
+        """Return D."""
         return self.basis.shape[1]
 
     @property
     def n_postures(self) -> int:
-        """K."""
+        """Return K."""
         return len(self.performance)
 
     def with_dimensions(self, n_dimensions: int) -> "ActionSpace":
-        """The same action in its first dimensions only.
+        """Return the same action in its first dimensions only.
 
         Raises:
             InputError: more than there are, or none.
@@ -175,19 +175,19 @@ class ActionSpace(nn.Module):
     # --- postures and the subspace ----------------------------------------------------------------
 
     def project(self, postures: Float[Tensor, "*batch 36"]) -> Float[Tensor, "*batch D"]:
-        """z = (phi - m) U, degrees."""
+        """Return z = (phi - m) U, degrees."""
         check_shape("postures", postures, ["...", POSTURE_DIM])
         return (postures - self.mean) @ self.basis
 
     def reconstruct(self, z: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch 36"]:
-        """The posture m + U z, degrees."""
+        """Return the posture m + U z, degrees."""
         check_shape("z", z, ["...", self.n_dimensions])
         return self.mean + z @ self.basis.mT
 
     # --- the gate ---------------------------------------------------------------------------------
 
     def log_match(self, z: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch K"]:
-        """log N(z; g_k, Delta) of every k, up to what they have in common."""
+        """Return log N(z; g_k, Delta) of every k, up to a constant that all share."""
         check_shape("z", z, ["...", self.n_dimensions])
         a, b = z / self.match_std, self.performance / self.match_std
         return a @ b.mT - 0.5 * b.square().sum(-1) - 0.5 * a.square().sum(-1, keepdim=True)
@@ -195,7 +195,7 @@ class ActionSpace(nn.Module):
     def match(
         self, z: Float[Tensor, "*batch D"], generator: torch.Generator | None = None
     ) -> Int[Tensor, "*batch"]:
-        """The matched posture j of every z, drawn with probability proportional to N(z; g_j, Delta).
+        """Draw the matched posture j of every z with probability proportional to N(z; g_j, Delta).
 
         Args:
             z: [..., D]. generator: of the random numbers.
@@ -204,13 +204,13 @@ class ActionSpace(nn.Module):
         return match_postures(self.log_match(z), uniform)
 
     def best_match(self, z: Float[Tensor, "*batch D"]) -> Int[Tensor, "*batch"]:
-        """The most likely posture of every z."""
+        """Return the most likely posture of every z."""
         return self.log_match(z).argmax(-1)
 
     def inside(
         self, z: Float[Tensor, "*batch D"], j: Int[Tensor, "*batch"], width: float = GATE_WIDTH
     ) -> Bool[Tensor, "*batch"]:
-        """Whether z lies in the gate of posture j in all dimensions (AS 6).
+        """Return whether z lies in the gate of posture j in all dimensions (AS 6).
 
         Args:
             z: [..., D]. j: [...]. width: of the gate, in sigma to either side; 2 as published.
@@ -221,7 +221,7 @@ class ActionSpace(nn.Module):
     def clamp(
         self, z: Float[Tensor, "*batch D"], j: Int[Tensor, "*batch"], width: float = GATE_WIDTH
     ) -> Float[Tensor, "*batch D"]:
-        """The nearest point of the gate of posture j; z itself where it is inside."""
+        """Return the nearest point of the gate of posture j; z itself where it is inside."""
         check_gate_width(width)
         centre = self.performance[j]
         return centre + clamp_offset(z - centre, self.std[j], width)
@@ -233,7 +233,7 @@ class ActionSpace(nn.Module):
         width: float = GATE_WIDTH,
         rounds: int = CLAMP_ROUNDS,
     ) -> Float[Tensor, "*batch 36"]:
-        """Postures moved into the gate of posture j; those inside stay as they are.
+        """Move postures into the gate of posture j; those inside stay as they are.
 
         A projection is clamped and what lies outside of the D dimensions stays. That leaves angles
         of no direction, and those of the directions nearest to them are outside again: so both are
@@ -258,7 +258,7 @@ class ActionSpace(nn.Module):
         width: float = GATE_WIDTH,
         generator: torch.Generator | None = None,
     ) -> Acceptance:
-        """Share of true postures that the gate lets through.
+        """Return the share of true postures that the gate lets through.
 
         One that deviates as the training postures do, independently in D dimensions and matched
         without error, passes with probability erf(width / sqrt 2)^D: 0.55 for 2 sigma and D = 13.

@@ -1,4 +1,4 @@
-"""Tensors of a bank of actions, and the Markov chain over who does which of them when."""
+"""Stack the tensors of several actions into a bank, and step the Markov chain over its states."""
 
 import math
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ _LEAST_RESIDUAL = 2.0  # degrees, of every direction outside of an action's subs
 
 
 def stack_spaces(spaces: Sequence[ActionSpace], background: float) -> dict[str, Tensor]:
-    """The tensors of a bank by the names of its buffers, see `ActionBank`.
+    """Return the tensors of a bank by the names of its buffers, see `ActionBank`.
 
     Args:
         spaces: of different D and K, which are padded to the largest ones.
@@ -39,7 +39,7 @@ def stack_spaces(spaces: Sequence[ActionSpace], background: float) -> dict[str, 
 
 
 def names_of(spaces: Sequence[ActionSpace]) -> tuple[str, ...]:
-    """Names of the actions, or `InputError` unless each has one of its own."""
+    """Return the names of the actions, or raise `InputError` unless each has one of its own."""
     names = tuple(space.info.name for space in spaces)
     if not names:
         raise InputError("a bank needs at least one action space, got none")
@@ -52,7 +52,7 @@ def names_of(spaces: Sequence[ActionSpace]) -> tuple[str, ...]:
 
 
 def common_frame_rate(spaces: Sequence[ActionSpace]) -> float | None:
-    """Frame rate of the performances, None if no space knows it, `InputError` if they differ."""
+    """Return the performances' frame rate, None if unknown; raise `InputError` if they differ."""
     rates = {space.info.fps for space in spaces if space.info.fps is not None}
     if len(rates) > 1:
         raise InputError(
@@ -63,7 +63,7 @@ def common_frame_rate(spaces: Sequence[ActionSpace]) -> float | None:
 
 
 def _padded(spaces: Sequence[ActionSpace]) -> dict[str, Tensor]:
-    """The tensors of all actions, padded to the same D and K."""
+    """Return the tensors of all actions, padded to the same D and K."""
     dims = torch.tensor([s.n_dimensions for s in spaces])
     counts = torch.tensor([s.n_postures for s in spaces])
     d, k = int(dims.max()), int(counts.max())
@@ -88,7 +88,7 @@ def _padded(spaces: Sequence[ActionSpace]) -> dict[str, Tensor]:
 
 
 def _densities(spaces: Sequence[ActionSpace], background: float) -> dict[str, Tensor]:
-    """Deviation outside of the subspaces, and the Gaussian of none of the actions."""
+    """Return the deviation outside of the subspaces, and the Gaussian of none of the actions."""
     left = [s.lost_variance / max(POSTURE_DIM - s.n_dimensions, 1) for s in spaces]
     residual = torch.stack(left).mean().sqrt().clamp_min(_LEAST_RESIDUAL)
     means = torch.stack([s.mean for s in spaces])
@@ -104,7 +104,7 @@ def _densities(spaces: Sequence[ActionSpace], background: float) -> dict[str, Te
 
 
 def chain_transition(n_states: int, stay: float, fps: float, like: Tensor) -> Float[Tensor, "S S"]:
-    """Probabilities of going from each state to each in one frame of 1 / fps seconds.
+    """Return probabilities of going from each state to each in one frame of 1 / fps seconds.
 
         p(A_t = A_{t-1}) = 1/n + (1 - 1/n) e^(-r / fps),   all other states alike
 
@@ -128,7 +128,7 @@ def chain_step(
     log_transition: Float[Tensor, "S S"],
     share: float,
 ) -> Float[Tensor, "*batch S"]:
-    """One frame of the posterior over states.
+    """Take one frame of the posterior over states.
 
         log p(A_t | phi_1:t) = e log p(phi_t | A_t) + log sum p(A_t | A_{t-1}) p(A_{t-1} | ...) + const
 
@@ -141,7 +141,7 @@ def chain_step(
 
 
 def evidence_share(evidence_rate: float, fps: float) -> float:
-    """e = min(1, evidence_rate / fps), the power to which the likelihood of a frame counts.
+    """Return e = min(1, evidence_rate / fps), the power to which the likelihood of a frame counts.
 
     Args:
         evidence_rate: frames per second that count as independent of each other.

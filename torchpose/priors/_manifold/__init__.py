@@ -1,1 +1,1 @@
-"""Back-constrained Gaussian process latent variable models of poses."""
+"""Model poses by back-constrained Gaussian process latent variable models."""

@@ -1,4 +1,4 @@
-"""What a manifold was fitted on, whose body its columns are of, and the file that it is kept in."""
+"""Record what a manifold was fitted on and whose body its columns are of; read and write its file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SAME_CENTRE = 1e-6  # of a quaternion vector
 
 @dataclass(frozen=True)
 class ManifoldInfo:
-    """What a manifold was fitted on; fields that are not known are empty.
+    """Facts about the fit of a manifold; fields that are not known are empty.
 
     Attributes:
         name: of the manifold.
@@ -59,7 +59,7 @@ class ManifoldInfo:
 
     @classmethod
     def of_body(cls, body: Any, **facts: Any) -> ManifoldInfo:
-        """Info with the skeleton, columns, frame and centres of a body, and other facts as given."""
+        """Return info with the skeleton, columns, frame and centres of a body, and other facts as given."""
         return cls(
             skeleton=tuple(body.skeleton.names),
             columns=tuple(f"{part} {axis}" for part in body.skeleton.parts[1:] for axis in "xyz"),
@@ -104,7 +104,7 @@ class ManifoldInfo:
         return replace(self, fps=float(fps), extra={**self.extra, _GROWTH: dict(growth)})
 
     def noise_factors(self, fps: float, known: bool) -> tuple[float, float]:
-        """Factors of sigma x->z and sigma x->x for another frame rate.
+        """Return factors of sigma x->z and sigma x->x for another frame rate.
 
         Raises:
             PriorError: as `check_rate`, if nothing says how they grow.
@@ -117,7 +117,7 @@ class ManifoldInfo:
         return float(ratio ** growth["latent"]), float(ratio ** growth["step"])
 
     def to_json(self) -> str:
-        """Text that `from_json` reads back."""
+        """Return text that `from_json` reads back."""
         return info_to_json(self)
 
     @classmethod
@@ -155,7 +155,7 @@ def write_manifold(path: str | Path, info: ManifoldInfo, tensors: Mapping[str, T
 
 
 def read_manifold(path: str | Path) -> tuple[ManifoldInfo, dict[str, Tensor]]:
-    """Info and tensors of a manifold's file.
+    """Return info and tensors of a manifold's file.
 
     Raises:
         InputError: no such file. FileFormatError: truncated, of another kind or version, or tensors
@@ -170,7 +170,7 @@ def _centres(body: Any) -> tuple[tuple[float, ...], ...]:
 
 
 def _same_centres(mine: Sequence[Sequence[float]], theirs: Sequence[Sequence[float]]) -> bool:
-    """Alike up to rounding; none at all are zeros."""
+    """Return whether centres are alike up to rounding; none at all are zeros."""
     a, b = ([v for row in rows for v in row] for rows in (mine, theirs))
     size = max(len(a), len(b))
     a, b = a or [0.0] * size, b or [0.0] * size

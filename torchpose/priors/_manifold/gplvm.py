@@ -1,4 +1,4 @@
-"""Back-constrained Gaussian process latent variable model of poses (MR 13, 14, 21-26).
+"""Define the back-constrained Gaussian process latent variable model of poses (MR 13, 14, 21-26).
 
 A pose x is f(z) + noise, every column of f a Gaussian process over a latent space of few dimensions,
 and z = g(x) is a smooth function of the pose, so that poses that are alike are neighbours. Fitted to
@@ -212,7 +212,7 @@ class BackConstrainedGPLVM(nn.Module):
     # --- both ways
 
     def to_latent(self, x: Float[Tensor, "*batch Q"]) -> Float[Tensor, "*batch d"]:
-        """Latent points of poses, z = g(x)   (MR 21).
+        """Return latent points of poses, z = g(x)   (MR 21).
 
         Raises:
             ShapeError: another number of columns.
@@ -223,7 +223,7 @@ class BackConstrainedGPLVM(nn.Module):
         return found.reshape(*x.shape[:-1], self.latent_dim)
 
     def pose_mean(self, z: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch Q"]:
-        """Mean pose of latent points, f(z) = X^T K^-1 k   (MR 25).
+        """Return the mean pose of latent points, f(z) = X^T K^-1 k   (MR 25).
 
         Raises:
             ShapeError: another number of latent dimensions.
@@ -235,7 +235,7 @@ class BackConstrainedGPLVM(nn.Module):
     def to_pose(
         self, z: Float[Tensor, "*batch d"]
     ) -> tuple[Float[Tensor, "*batch Q"], Float[Tensor, "*batch"]]:
-        """Mean and variance of the poses of latent points   (MR 24-26).
+        """Return mean and variance of the poses of latent points   (MR 24-26).
 
         mu = X^T K^-1 k,   sigma^2 = k(z, z) - k^T K^-1 k + sigma_z^2
 
@@ -254,38 +254,38 @@ class BackConstrainedGPLVM(nn.Module):
         return mean.reshape(*z.shape[:-1], self.dim), variance.reshape(z.shape[:-1])
 
     def reconstruct(self, x: Float[Tensor, "*batch Q"]) -> Float[Tensor, "*batch Q"]:
-        """The pose on the manifold that a pose leads to, f(g(x))."""
+        """Return the pose on the manifold that a pose leads to, f(g(x))."""
         return self.pose_mean(self.to_latent(x))
 
     def reconstruction_error(self, x: Float[Tensor, "*batch Q"]) -> float:
-        """Root mean square of x - f(g(x)) over all columns."""
+        """Return the root mean square of x - f(g(x)) over all columns."""
         return float((x - self.reconstruct(x)).square().mean().sqrt())
 
     def forward(
         self, x: Float[Tensor, "*batch Q"]
     ) -> tuple[Float[Tensor, "*batch Q"], Float[Tensor, "*batch"]]:
-        """Mean and variance of f(g(x))."""
+        """Return mean and variance of f(g(x))."""
         return self.to_pose(self.to_latent(x))
 
     # --- what it is
 
     @property
     def latent_dim(self) -> int:
-        """Number of latent dimensions d."""
+        """Return the number of latent dimensions d."""
         return int(self.weights.shape[1])
 
     @property
     def dim(self) -> int:
-        """Number of columns Q of a pose."""
+        """Return the number of columns Q of a pose."""
         return int(self.poses.shape[1])
 
     @property
     def kernel(self) -> KernelParameters:
-        """beta, beta_0, gamma_z and sigma_z."""
+        """Return beta, beta_0, gamma_z and sigma_z."""
         return KernelParameters(*self.log_kernel.unbind())
 
     def trajectories(self) -> tuple[Tensor, ...]:
-        """Latent points of each sequence that it was fitted to, [T_s, d]."""
+        """Return latent points of each sequence that it was fitted to, [T_s, d]."""
         return self.latents.split(self.lengths.tolist())
 
     def check_for(self, body: Any, fps: float | None = None) -> None:
@@ -351,7 +351,7 @@ class BackConstrainedGPLVM(nn.Module):
         return Prepared(self.latents, *(getattr(self, f"_{name}") for name in Prepared._fields[1:]))
 
     def _prepare(self) -> None:
-        """What prediction needs and follows from the rest."""
+        """Return what prediction needs and follows from the rest."""
         for name, value in gplvm_prediction.prepare(self.poses, self._fitted)._asdict().items():
             own = name if name == "latents" else f"_{name}"
             self.register_buffer(own, value.to(self.poses.dtype), persistent=False)

@@ -1,4 +1,4 @@
-"""Kernels of a back-constrained GPLVM (MR 14, 22), and both ways through one that was fitted (MR 21-26)."""
+"""Compute the kernels of a back-constrained GPLVM (MR 14, 22), and map poses both ways (MR 21-26)."""
 
 from typing import NamedTuple
 
@@ -42,19 +42,19 @@ class KernelParameters(NamedTuple):
 
     @property
     def variance(self) -> Float[Tensor, ""]:
-        """k(z, z) = beta + beta_0."""
+        """Return k(z, z) = beta + beta_0."""
         return self.log_beta.exp() + self.log_beta0.exp()
 
     @property
     def noise(self) -> Float[Tensor, ""]:
-        """sigma_z^2, and what keeps the kernel matrix regular."""
+        """Return sigma_z^2, and the jitter that keeps the kernel matrix regular."""
         return (2 * self.log_sigma).exp() + _JITTER * self.variance
 
 
 def rbf_rows(
     centres: Float[Tensor, "T D"], gamma: Float[Tensor, ""], log_scale: Float[Tensor, ""]
 ) -> Float[Tensor, "D+2 T"]:
-    """What `rbf_with_rows` needs of the centres, computed once.
+    """Return what `rbf_with_rows` needs of the centres, computed once.
 
     The exponent log s - gamma / 2 ||x - c||^2 is the product of [gamma x, -gamma / 2 ||x||^2, 1]
     with a column [c, 1, log s - gamma / 2 ||c||^2].
@@ -69,7 +69,7 @@ def rbf_rows(
 def rbf_with_rows(
     x: Float[Tensor, "N D"], rows: Float[Tensor, "D+2 T"], gamma: Float[Tensor, ""]
 ) -> Float[Tensor, "N T"]:
-    """s exp(-gamma / 2 ||x - c||^2) for all pairs, as one product.
+    """Return s exp(-gamma / 2 ||x - c||^2) for all pairs, as one product.
 
     Args:
         x: points. rows: of the centres, see `rbf_rows`. gamma: the same as there.
@@ -85,20 +85,20 @@ def rbf(
     gamma: Float[Tensor, ""],
     log_scale: Float[Tensor, ""] | None = None,
 ) -> Float[Tensor, "N T"]:
-    """k(x, c) = s exp(-gamma / 2 ||x - c||^2)   (MR 22, with s = 1)."""
+    """Return k(x, c) = s exp(-gamma / 2 ||x - c||^2)   (MR 22, with s = 1)."""
     log_scale = torch.zeros_like(gamma) if log_scale is None else log_scale
     return rbf_with_rows(x, rbf_rows(centres, gamma, log_scale), gamma)
 
 
 def covariance(latents: Float[Tensor, "T d"], kernel: KernelParameters) -> Float[Tensor, "T T"]:
-    """Covariance of a column of noisy poses at latent points, K + sigma_z^2 I   (MR 14, 15)."""
+    """Return the covariance of a column of noisy poses at latent points, K + sigma_z^2 I   (MR 14, 15)."""
     smooth = rbf(latents, latents, kernel.log_gamma.exp(), kernel.log_beta)
     eye = torch.eye(len(latents), dtype=latents.dtype, device=latents.device)
     return smooth + kernel.log_beta0.exp() + kernel.noise * eye
 
 
 class Prepared(NamedTuple):
-    """What follows from a fit and stays the same for every pose.
+    """Tensors that follow from a fit and stay the same for every pose.
 
     Attributes:
         latents: z of the training poses [T, d]. mean: of these poses [Q].
@@ -117,7 +117,7 @@ class Prepared(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """What a fit has found.
+    """Parameters and points that a fit has found.
 
     Attributes:
         scale: of columns [Q]. weights: a [T, d]. bias: b [d]. gamma_x: of (MR 22).
@@ -132,7 +132,7 @@ class Fitted(NamedTuple):
 
 
 def prepare(poses: Float[Tensor, "T Q"], fitted: Fitted) -> Prepared:
-    """The factor of the kernel matrix and alpha = K^-1 X, in double precision.
+    """Return the factor of the kernel matrix and alpha = K^-1 X, in double precision.
 
     Args:
         poses: training poses X. fitted: to them.
@@ -151,7 +151,7 @@ def prepare(poses: Float[Tensor, "T Q"], fitted: Fitted) -> Prepared:
 
 
 def to_latent(x: Float[Tensor, "N Q"], fitted: Fitted, prepared: Prepared) -> Float[Tensor, "N d"]:
-    """g(x)   (MR 21)."""
+    """Return g(x)   (MR 21)."""
     target = (x - prepared.mean) / fitted.scale
     chunks = [
         rbf_with_rows(part, prepared.pose_rows, fitted.gamma_x) @ fitted.weights + fitted.bias
@@ -163,7 +163,7 @@ def to_latent(x: Float[Tensor, "N Q"], fitted: Fitted, prepared: Prepared) -> Fl
 def to_pose_mean(
     z: Float[Tensor, "N d"], fitted: Fitted, prepared: Prepared
 ) -> Float[Tensor, "N Q"]:
-    """f(z) = X^T K^-1 k   (MR 25)."""
+    """Return f(z) = X^T K^-1 k   (MR 25)."""
     chunks = [
         _varying(part, fitted, prepared) @ prepared.alpha + prepared.offset
         for part in z.split(_CHUNK)
@@ -174,7 +174,7 @@ def to_pose_mean(
 def to_pose(
     z: Float[Tensor, "N d"], fitted: Fitted, prepared: Prepared
 ) -> tuple[Float[Tensor, "N Q"], Float[Tensor, " N"]]:
-    """Mean X^T K^-1 k and variance k(z, z) - k^T K^-1 k + sigma_z^2   (MR 24-26)."""
+    """Return mean X^T K^-1 k and variance k(z, z) - k^T K^-1 k + sigma_z^2   (MR 24-26)."""
     kernel = fitted.kernel
     means, variances = [], []
     for part in z.split(_CHUNK):
@@ -187,5 +187,5 @@ def to_pose(
 
 
 def _varying(z: Tensor, fitted: Fitted, prepared: Prepared) -> Float[Tensor, "N T"]:
-    """beta exp(...) of points and the training poses'; beta_0 is in the offset."""
+    """Return beta exp(...) of points and the training poses'; beta_0 is in the offset."""
     return rbf_with_rows(z, prepared.latent_rows, fitted.kernel.log_gamma.exp())

@@ -1,1 +1,1 @@
-"""Particle filters over body poses."""
+"""Filter body poses by particles, from silhouettes."""

@@ -1,4 +1,4 @@
-"""The annealed particle filter of Deutscher and Reid."""
+"""Run the annealed particle filter of Deutscher and Reid."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""What a filter over body poses sees: frames of silhouettes, checked, and how well states explain them."""
+"""Check frames of silhouettes, and score how well states explain them."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -34,7 +34,7 @@ Likelihood = Callable[[Tensor, Tensor], Tensor]
 
 
 class Frame(NamedTuple):
-    """What is seen in one frame, and how well states explain it.
+    """Observation of one frame, and the score of states under it.
 
     Attributes:
         score: states [B, N, D] -> sharpened log-likelihood [B, N], float64; 0 in elements that nobody

@@ -1,4 +1,4 @@
-"""Particles over body poses: what a body has to offer, weights, states, and tracks of estimates."""
+"""Define particles over body poses: their weights, states and tracks, and the body they need."""
 
 import math
 import warnings
@@ -39,7 +39,7 @@ _LISTED = 8  # frames that a warning names
 
 @runtime_checkable
 class PoseSpace(Protocol):
-    """What a filter asks of a body; `torchpose.body.Body` has it.
+    """Protocol of the bodies that filters track; `torchpose.body.Body` has it.
 
     Attributes:
         dim: D. perturb(state, step): the state moved by a step, both [..., D].
@@ -100,7 +100,7 @@ class BodyTrack(NamedTuple):
 
     @property
     def failed_at(self) -> Int[Tensor, "*batch"]:
-        """First frame in which all particles died, -1 where there is none; tracking went on from it."""
+        """Return the first frame in which all particles died, -1 where there is none."""
         return first_true(self.respread)
 
     def element(self, index: int) -> "BodyTrack":

@@ -1,4 +1,4 @@
-"""The particle filter with action-specific posture constraints (aSpace)."""
+"""Run the particle filter with action-specific posture constraints (aSpace)."""
 
 from typing import Any, Unpack
 
@@ -184,7 +184,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
 
     @property
     def action_names(self) -> tuple[str, ...]:
-        """Names of the bank's actions, none last; empty without a bank."""
+        """Return the names of the bank's actions, none last; empty without a bank."""
         return () if self.gate is None or not self.gate.several else tuple(self.gate.action.names)
 
     def notes(self, track: BodyTrack, first_frame: int = 0) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Likelihoods of single parts of the body, and the Gaussians that seven places of each make of them.
+"""Compute likelihoods of single parts of the body, and Gaussians from seven places of each.
 
 Every part is tried at the sigma points of its prediction while the others stay at their means; the
 silhouette pixels under it are the likelihood of each point, and the weighted points make a Gaussian.

@@ -1,4 +1,4 @@
-"""The manifold-regularised particle filter."""
+"""Run the manifold-regularised particle filter."""
 
 from typing import Any, Protocol, Unpack, runtime_checkable
 
@@ -30,7 +30,7 @@ _LEAST_STD = 1e-3  # of sigma z->x: the twist of a limb, which no joint shows, d
 
 @runtime_checkable
 class PoseManifold(Protocol):
-    """What the filter asks of a manifold; `torchpose.priors.BackConstrainedGPLVM` has it.
+    """Protocol of the manifolds that the filter takes, as `torchpose.priors.BackConstrainedGPLVM`.
 
     Attributes:
         to_latent(x): g(x), [..., Q] -> [..., d] (MR 21). pose_mean(z): f(z), [..., d] -> [..., Q]

@@ -1,4 +1,4 @@
-"""The gate of an action, or of several, and drawing again what it does not let through (AS 6).
+"""Gate postures by an action, or by several, and draw again those that are rejected (AS 6).
 
 Many particles are drawn again at once, a bounded number of times.
 """
@@ -177,7 +177,7 @@ def _place(total: Tensor, wanted: int) -> Tensor:
 
 
 class PostureGate(nn.Module):
-    """Tells whether states belong to an action, and finds the nearest ones that do.
+    """Gate that accepts states of an action, and finds the nearest ones that it accepts.
 
     The relative angles of a state are projected, a posture j of the mean performance is drawn for them
     (its match), and they are let through if they lie within two deviations of it in all dimensions

@@ -1,4 +1,4 @@
-"""What the particle filters over body poses share: likelihood, limits, coasting, failure, estimates.
+"""Provide what the particle filters over body poses share: likelihood, limits, coasting, estimates.
 
 A filter is its `move`: how the particles of one frame become weighted particles of the next. Batches,
 empty silhouettes, dead particles and the loop over time are handled here.
@@ -195,7 +195,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
 
     @property
     def process_cov(self) -> Float[Tensor, " D"]:
-        """Variances of the diffusion per frame."""
+        """Return the variances of the diffusion per frame."""
         return self.step_std.square()
 
     def start_std(self) -> Float[Tensor, " D"]:
@@ -204,7 +204,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
 
     @property
     def action_names(self) -> tuple[str, ...]:
-        """Names of the columns of ``details["actions"]``, of a filter that tells actions apart."""
+        """Return the names of the columns of ``details["actions"]``; empty by default."""
         return ()
 
     def notes(self, track: BodyTrack, first_frame: int = 0) -> tuple[str, ...]:

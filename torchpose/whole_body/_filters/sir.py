@@ -1,4 +1,4 @@
-"""Sampling importance resampling over body poses, from silhouettes."""
+"""Run sampling importance resampling over body poses, from silhouettes."""
 
 from typing import Unpack
 

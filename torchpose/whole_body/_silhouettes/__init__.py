@@ -1,1 +1,1 @@
-"""Silhouettes of articulated bodies: rendered, counted against observed ones, weighed."""
+"""Render silhouettes of articulated bodies, count them against observed ones, and weigh them."""

@@ -1,4 +1,4 @@
-"""Faults of background subtraction, put into clean silhouettes.
+"""Put faults of background subtraction into clean silhouettes.
 
 What a person in front of a real camera suffers: holes where clothes have the background's colour,
 which stay as long as the person does; a region that is lost for a while; a shadow on the ground;
@@ -33,7 +33,7 @@ _MOST = 0.6  # largest share of anything, however severe
 
 
 class _Scene(NamedTuple):
-    """What belongs to the recording as a whole.
+    """Tensors that belong to the recording as a whole.
 
     Attributes:
         background, clothes: smooth fields [C, H, W] of unit variance; the first stays in place, the

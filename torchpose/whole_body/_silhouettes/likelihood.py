@@ -1,4 +1,4 @@
-"""Likelihoods of silhouettes from numbers of pixels; the caller multiplies by a sharpness exponent.
+"""Compute likelihoods of silhouettes from numbers of pixels, without the sharpness exponent.
 
 As printed both are nearly flat: -log p lies in [0, 2] for the bidirectional one, so weights of
 particles differ by at most e^2. A sharpness of 1 is the published form.

@@ -1,4 +1,4 @@
-"""Limbs of many bodies in many cameras, chunk by chunk: the work that rendering and counting share."""
+"""Project limbs of many bodies into many cameras, chunk by chunk, for rendering and counting."""
 
 import math
 from collections.abc import Callable

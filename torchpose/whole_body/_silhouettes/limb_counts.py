@@ -1,4 +1,4 @@
-"""Silhouette pixels under single limbs, those that the opposing limb may explain counted half."""
+"""Count silhouette pixels under parts of the body, those that the opposing part may explain by half."""
 
 import math
 from typing import NamedTuple
@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchpose.body._limbs import Limbs, check_limbs
+from torchpose.body._limbs import Limbs
 from torchpose.camera._rig import Cameras, as_rig
 from torchpose.errors import ShapeError
 from torchpose.whole_body._silhouettes.limb_batches import (
@@ -22,11 +22,11 @@ from torchpose.whole_body._silhouettes.limb_batches import (
 from torchpose.whole_body._silhouettes.outlines import NEAR, RowIntervals, Strip
 from torchpose.whole_body._silhouettes.rendering import PreparedSilhouettes, prepare_silhouettes
 
-__all__ = ["PartCounts", "count_limbs", "count_parts"]
+__all__ = ["PartCounts", "count_parts"]
 
 
 class PartCounts(NamedTuple):
-    """What each position of a part weighs in each camera.
+    """Weighted pixels of each position of a part in each camera.
 
     Attributes:
         weight: [..., S, C], float64, silhouette pixels under the part, 1/2 where the opposing part may
@@ -37,7 +37,7 @@ class PartCounts(NamedTuple):
     area: Int[Tensor, "*batch S C"]
 
     def share(self) -> Float[Tensor, "*batch S C"]:
-        """The weight as a share of the part's own pixels, which no scale of the image changes.
+        """Return the weight as a share of the part's own pixels, which no scale of the image changes.
 
         0 where the part is out of sight.
         """
@@ -114,46 +114,11 @@ def count_parts(
     return PartCounts(inside.double() - shared.double() / 2, area)
 
 
-def count_limbs(
-    limbs: Limbs,
-    opposing: Limbs | None,
-    cameras: Cameras,
-    silhouettes: Tensor | PreparedSilhouettes,
-    *,
-    chunk: int | None = None,
-    near: float = NEAR,
-) -> Float[Tensor, "*batch S C"]:
-    """Weight of each position of a single limb: `count_parts` with parts of one limb.
-
-    Args:
-        limbs: S positions of a limb, each counted apart: [*batch, S, 3], radii [S, 2] or
-            [*batch, S, 2].
-        opposing: O positions of the opposing limb, [*batch, O, 3]; None if there is none.
-        cameras, silhouettes, chunk, near: as `count_parts`.
-
-    Returns:
-        [*batch, S, C], float64, pixels.
-
-    Raises:
-        ShapeError: the leading dimensions differ; others as `count_pixels`.
-
-    Reference: Daubney & Xie, section 5 and equation (4).
-    """
-    check_limbs(limbs)
-    radii = limbs.radii.expand(*limbs.start.shape[:-1], 2).unsqueeze(-2)
-    alone = Limbs(limbs.start.unsqueeze(-2), limbs.end.unsqueeze(-2), radii)
-    if opposing is not None:
-        check_limbs(opposing)
-        radii = opposing.radii.expand(*opposing.start.shape[:-1], 2).unsqueeze(-2)
-        opposing = Limbs(opposing.start.unsqueeze(-2), opposing.end.unsqueeze(-2), radii)
-    return count_parts(alone, opposing, cameras, silhouettes, chunk=chunk, near=near).weight
-
-
 # --- helpers --------------------------------------------------------------------------------------
 
 
 class _Union(NamedTuple):
-    """Where the opposing parts may be: disjoint intervals in rising order, the first one empty.
+    """Pixels that the opposing parts may cover: disjoint intervals in rising order, the first one empty.
 
     Attributes:
         start, stop: [R], packed item and place. before: [R], silhouette pixels of the union before

@@ -1,4 +1,4 @@
-"""Limbs as cameras see them, hulls of two discs or rectangles, and the intervals of rows that they cover.
+"""Outline limbs in images, hulls of two discs or rectangles, and list the intervals of rows in them.
 
 Each end of a limb projects to a disc: the centre by the camera matrix, the radius f r / z with f the
 geometric mean of both focal lengths. (A ball off the optical axis is really a slightly elongated
@@ -69,7 +69,7 @@ class ProjectedLimbs(NamedTuple):
 
 
 class Outlines(NamedTuple):
-    """What a row needs of each limb, M = C N L limbs in this order.
+    """Row-wise description of each limb's outline, M = C N L limbs in this order.
 
     Attributes:
         discs: [2, 3, M]: x, y and squared radius of both discs; [0, 3, M] for limbs without round ends.
@@ -183,17 +183,17 @@ class Strip(NamedTuple):
 
     @property
     def pixels(self) -> int:
-        """Pixels of an item."""
+        """Return the number of pixels of an item."""
         return self.cameras * self.height * self.width
 
     @property
     def bits(self) -> int:
-        """Bits of a place; its end may be one past the last pixel."""
+        """Return the bits of a place; its end may be one past the last pixel."""
         return self.pixels.bit_length()
 
     @property
     def length_bits(self) -> int:
-        """Bits of an interval's length."""
+        """Return the bits of an interval's length."""
         return self.width.bit_length()
 
 

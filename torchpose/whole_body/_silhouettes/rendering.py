@@ -1,4 +1,4 @@
-"""Silhouettes of many bodies in many cameras: rendered, or only counted against observed ones.
+"""Render silhouettes of many bodies in many cameras, or only count them against observed ones.
 
 Both rest on intervals of rows (`torchpose.whole_body._silhouettes.outlines`): exact, and without a
 loop over particles, cameras or limbs. Counting never forms an image.
@@ -40,7 +40,7 @@ _PIXELS = 2**22  # rendered in one chunk
 
 @runtime_checkable
 class HasLimbs(Protocol):
-    """Anything that knows where its limbs are, such as `Body`."""
+    """Protocol of what has limbs, such as `Body`."""
 
     def limbs(self, state: Tensor) -> Limbs:
         """Return limbs [..., L] of states [..., D]."""

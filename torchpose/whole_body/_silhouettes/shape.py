@@ -1,4 +1,4 @@
-"""A person's shape from silhouettes: radii of the limbs by the cross-entropy method."""
+"""Fit the radii of a person's limbs to silhouettes by the cross-entropy method."""
 
 import torch
 from jaxtyping import Bool, Float

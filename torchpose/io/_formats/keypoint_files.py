@@ -1,0 +1,172 @@
+"""Read 2D keypoints from .npz and .csv files as they are there, before any check of their values."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from torchpose._core.reading import (
+    check_span,
+    npz_keys,
+    one_number,
+    one_text,
+    read_npz,
+    read_text,
+    texts,
+)
+from torchpose.errors import FileFormatError
+from torchpose.io._formats.raw_recording import numbers
+
+__all__ = ["RawKeypoints", "read_csv_keypoints", "read_npz_keypoints"]
+
+_MAX_GAP = 100_000  # frames; a larger jump of the frame number is taken for a damaged file
+
+
+@dataclass
+class RawKeypoints:
+    """Contents of a file, before the checks."""
+
+    keypoints: np.ndarray
+    names: tuple[str, ...]
+    confidence: np.ndarray | None = None
+    fps: float | None = None
+    K: np.ndarray | None = None
+    image_size: np.ndarray | Sequence[float] | None = None
+    neck: str | None = None
+
+
+def read_npz_keypoints(path: Path) -> RawKeypoints:
+    """Read `keypoints` [T, J, 2] and `names` [J], or MediaPipe's, and the other keys of `read_keypoints`."""
+    there = npz_keys(path)
+    landmarks = "keypoints" not in there and "joints2d" in there
+    points, seen = ("joints2d", "visibility") if landmarks else ("keypoints", "confidence")
+    arrays = read_npz(path, (points, "names"), (seen, "fps", "K", "image_size", "neck"))
+    given = {key: numbers(f"{path}: {key}", arrays[key])
+             for key in (points, seen, "K", "image_size") if key in arrays}  # fmt: skip
+    neck = one_text(path, "neck", arrays["neck"]) if "neck" in arrays else ""
+    return RawKeypoints(
+        given[points], texts(path, "names", arrays["names"]), given.get(seen),
+        one_number(path, "fps", arrays["fps"]) if "fps" in arrays else None,
+        given.get("K"), given.get("image_size"), neck or None,
+    )  # fmt: skip
+
+
+def read_csv_keypoints(path: Path) -> RawKeypoints:
+    """Read a table with a row per frame or per keypoint; `read_keypoints` describes both."""
+    lines = read_text(path, "comma-separated text").splitlines()
+    notes = [line for line in lines if line.startswith("#")]
+    rows = [(number, [cell.strip() for cell in line.split(",")])
+            for number, line in enumerate(lines, start=1)
+            if line.strip() and not line.startswith("#")]  # fmt: skip
+    if not rows:
+        raise FileFormatError(f"{path}: expected a header frame,NAME_x,NAME_y,...; it is empty")
+    header = rows[0][1]
+    if header[0].lower() != "frame":
+        raise FileFormatError(
+            f"{path}, line {rows[0][0]}: expected a header frame,NAME_x,NAME_y[,NAME_confidence],... "
+            f"or frame,name,x,y[,confidence], got {','.join(header)[:60]!r}"
+        )
+    for number, cells in rows:
+        if len(cells) != len(header):
+            raise FileFormatError(
+                f"{path}, line {number}: expected {len(header)} cells as in the header, "
+                f"got {len(cells)}"
+            )
+    long = [cell.lower() for cell in header[1:4]] == ["name", "x", "y"]
+    raw = _long_rows(path, header, rows[1:]) if long else _wide_rows(path, header, rows[1:])
+    raw.fps, raw.image_size = _csv_notes(path, notes)
+    return raw
+
+
+def _wide_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]]) -> RawKeypoints:
+    column = {name: i for i, name in enumerate(header)}
+    names = [h[:-2] for h in header[1:] if h.endswith("_x")]
+    wanted = {"frame"} | {f"{n}_{axis}" for n in names for axis in ("x", "y", "confidence")}
+    strange = [h for h in header if h not in wanted]
+    absent = [f"{n}_y" for n in names if f"{n}_y" not in column]
+    if not names or strange or absent or len(column) != len(header):
+        raise FileFormatError(
+            f"{path}: expected columns frame,NAME_x,NAME_y[,NAME_confidence],... each once, got "
+            f"{', '.join(strange + absent) or ','.join(header)}"
+            + (" (absent)" if absent and not strange else "")
+        )
+    table = np.array([[_cell(path, number, c) for c in cells] for number, cells in rows])
+    table = table.reshape(-1, len(header))
+    index, count = _frames(path, table[:, 0], rows, repeated=False)
+    joints = np.stack([table[:, [column[f"{n}_{a}"] for n in names]] for a in "xy"], -1)
+    points = np.full((count, len(names), 2), np.nan)
+    points[index] = joints
+    confidence = None
+    if any(f"{n}_confidence" in column for n in names):
+        confidence = np.zeros((count, len(names)))
+        for j, name in enumerate(names):
+            given = column.get(f"{name}_confidence")
+            confidence[index, j] = 1.0 if given is None else table[:, given]
+    return RawKeypoints(points, tuple(names), confidence)
+
+
+def _long_rows(path: Path, header: list[str], rows: list[tuple[int, list[str]]]) -> RawKeypoints:
+    scored = [h.lower() for h in header[4:]] == ["confidence"]
+    if len(header) != 4 + scored:
+        raise FileFormatError(f"{path}: expected columns frame,name,x,y[,confidence]")
+    names = list(dict.fromkeys(cells[1] for _, cells in rows))
+    table = np.array([[_cell(path, number, c) for c in (cells[0], *cells[2:])]
+                      for number, cells in rows]).reshape(-1, 3 + scored)  # fmt: skip
+    index, count = _frames(path, table[:, 0], rows, repeated=True)
+    joint = np.array([names.index(cells[1]) for _, cells in rows], dtype=int)
+    if len(set(zip(index.tolist(), joint.tolist(), strict=True))) < len(rows):
+        raise FileFormatError(
+            f"{path}: a keypoint is given twice in one frame; expected one person"
+        )
+    points = np.full((count, len(names), 2), np.nan)
+    points[index, joint] = table[:, 1:3]
+    confidence = None
+    if scored:
+        confidence = np.zeros((count, len(names)))
+        confidence[index, joint] = table[:, 3]
+    return RawKeypoints(points, tuple(names), confidence)
+
+
+def _cell(path: Path, number: int, cell: str) -> float:
+    if not cell:
+        return math.nan
+    try:
+        return float(cell)
+    except ValueError as error:
+        raise FileFormatError(f"{path}, line {number}: expected a number, got {cell!r}") from error
+
+
+def _frames(
+    path: Path, frames: np.ndarray, rows: list[tuple[int, list[str]]], repeated: bool
+) -> tuple[np.ndarray, int]:
+    """Return the row -> index of its frame, counted from the first one, and the number of frames."""
+    with np.errstate(invalid="ignore"):  # of infinite ones
+        whole = np.isfinite(frames) & (frames % 1 == 0)
+        steps = np.diff(frames, prepend=frames[:1] - (not repeated))
+    bad = ~whole | (steps < (not repeated)) | (steps > _MAX_GAP)
+    if bad.any():
+        at = int(np.flatnonzero(bad)[0])
+        raise FileFormatError(
+            f"{path}, line {rows[at][0]}: frame numbers must be whole and increase, "
+            f"got {rows[at][1][0] or 'none'}"
+        )
+    index = (frames - frames[:1]).astype(int)
+    count = int(index[-1]) + 1 if len(index) else 0
+    check_span(path, count, len(np.unique(index)))
+    return index, count
+
+
+def _csv_notes(path: Path, notes: list[str]) -> tuple[float | None, list[float] | None]:
+    fps, size = None, None
+    for note in notes:
+        key, _, value = note.lstrip("# ").partition("=")
+        try:
+            if key.strip() == "fps":
+                fps = float(value)
+            elif key.strip() == "image_size":
+                size = [float(v) for v in value.split(",")]
+        except ValueError as error:
+            raise FileFormatError(f"{path}: cannot read {note!r}") from error
+    return fps, size
