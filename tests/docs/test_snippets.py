@@ -50,11 +50,13 @@ def folder(tmp_path, monkeypatch):
 def methods():
     """Take back what a snippet registers."""
     from torchpose.upper_body import METHODS
+    from torchpose.whole_body._methods import METHODS as BODY_METHODS
 
-    before = dict(METHODS)
+    before = [(table, dict(table)) for table in (METHODS, BODY_METHODS)]
     yield
-    METHODS.clear()
-    METHODS.update(before)
+    for table, entries in before:
+        table.clear()
+        table.update(entries)
 
 
 @pytest.mark.parametrize("path", SNIPPETS, ids=lambda p: p.stem)
