@@ -35,7 +35,7 @@ torchpose track-body cameras.toml cam*.mp4 --method root --conditionals walk --o
 torchpose track-body cameras.toml cam1.mp4 --method constrained --action bend.safetensors --out result
 torchpose track-body cameras.toml cam*.mp4 --body result/body.npz --facing [1,0,0] --out again"""
 PYTHON_ONLY = frozenset({
-    "weights", "proposal", "step_std", "likelihood", "limit_mode", "resampling",
+    "weights", "proposal", "process_cov", "likelihood", "limit_mode", "resampling",
     "resample_threshold", "estimate", "leg_swap", "limb_shape", "respread_scale", "n_layers",
     "survival_rate", "schedule", "noise_decay", "survival_per_second", "normalisation",
     "camera_rule", "observation_sharpness", "least_std", "first_std", "weighting",

@@ -74,9 +74,9 @@ class BodyTracker(nn.Module):
         action: postures of an action, or of several, by name, or a file.
         n_particles: likelihoods of a frame, of all layers together; a hypothesis of "root" counts seven.
         fps: frames per second; noise grows with the time between frames.
-        process_cov: variances of the diffusion per frame [D], [D, D] without entries off the diagonal, or
-            one number, in squares of metres for the root and of sines of half angles for rotations; by
-            default that of the method.
+        process_cov: variances of the diffusion per frame [D], or [D, D] without entries off the diagonal,
+            in squares of metres for the root and of sines of half angles for rotations; by default what
+            suits the method.
         initial_cov: the same of the particles about the first pose; by default four times `process_cov`.
         options: of the method's filter (`torchpose.whole_body._methods.method_options`), such as sharpness,
             limits, leg_swap or n_layers.
@@ -118,8 +118,8 @@ class BodyTracker(nn.Module):
         action: ActionSpace | ActionBank | str | Path | None = None,
         n_particles: int = 1000,
         fps: float = 60.0,
-        process_cov: Tensor | float | None = None,
-        initial_cov: Tensor | float | None = None,
+        process_cov: Tensor | None = None,
+        initial_cov: Tensor | None = None,
         **options: Any,
     ) -> None:
         super().__init__()
