@@ -37,7 +37,7 @@ def add_tables(
     test: Trials,
     raised: Bool[Tensor, "T 2"],
 ) -> None:
-    """Errors, correct limbs, spikes and smoothness, time."""
+    """Add errors, correct limbs, spikes and smoothness, time."""
     for key, title, field, scale in (
         ("errors_2d", "2D error (pixels; mean over seeds, and its spread)", "errors2d", 1.0),
         ("errors_3d", "3D error after Procrustes (cm; mean over seeds, and its spread)",
@@ -128,7 +128,7 @@ def _behaviour(scores: Scores, raised: Bool[Tensor, "T 2"]) -> list[float]:
 def add_findings(
     report: Report, scores: Runs, times: Mapping[str, float], raised: Bool[Tensor, "T 2"]
 ) -> None:
-    """Which findings of the paper's section 4 appear in these numbers, and which do not."""
+    """Say which findings of the paper's section 4 appear in these numbers, and which do not."""
     pixels, behaviour = report["errors_2d"], report["behaviour"]
 
     def px(name: str) -> float:
@@ -210,7 +210,7 @@ def add_pictures(
     fps: float,
     prior: UpperBodyPrior,
 ) -> None:
-    """Error per joint, correct limbs, errors over time, the prior's mean poses."""
+    """Add the error per joint, correct limbs, errors over time, the prior's mean poses."""
     from torchpose import viz
 
     bars = viz.plot_error_bars(

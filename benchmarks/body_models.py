@@ -140,7 +140,7 @@ def run(
 
 
 def _load(manifold: str | None, conditionals: str | None, action: str | None) -> dict[str, Any]:
-    """Models by the method that tracks with them."""
+    """Return models by the method that tracks with them."""
     found: dict[str, Any] = {}
     if manifold is not None:
         found["mrpf"] = load_manifold(manifold)
@@ -156,7 +156,7 @@ def _load(manifold: str | None, conditionals: str | None, action: str | None) ->
 def _unseen(
     clips: Sequence[MocapClip], models: Mapping[str, Any], persons: Sequence[str]
 ) -> dict[str, list[MocapClip]]:
-    """Clips of who is tracked, by person; whoever is named must be unknown to all models."""
+    """Return clips of who is tracked, by person; whoever is named must be unknown to all models."""
     everybody = select_persons(clips, persons)
     if persons:
         for model in models.values():
@@ -186,7 +186,7 @@ def _by_action(clips: Sequence[MocapClip]) -> dict[str, list[MocapClip]]:
 def _prepare(
     own: Sequence[MocapClip], n_clips: int, n_frames: int, conditions: Conditions
 ) -> Tracked:
-    """Body of a person's other recordings, and what cameras see of those that are tracked."""
+    """Return the body of a person's other recordings, and what cameras see of those that are tracked."""
     if len(own) <= n_clips:
         raise InputError(
             f"person {own[0].person}: expected more than {n_clips} recordings of {own[0].action}, of which "

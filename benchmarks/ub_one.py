@@ -152,7 +152,7 @@ def run(
 
 
 def split_recording(data: str | Path, share: float = 0.6) -> tuple[Recording, Recording]:
-    """The first frames and the rest, as recordings of two 'persons' so that none is scored twice.
+    """Return the first frames and the rest, as recordings of two 'persons', so that none is scored twice.
 
     Args:
         data: folder burke_kinect, or the one it is in. share: of the first part.
@@ -176,13 +176,13 @@ def split_recording(data: str | Path, share: float = 0.6) -> tuple[Recording, Re
 
 
 def raised_arms(pose: Float[Tensor, "T 8 3"]) -> Bool[Tensor, "T 2"]:
-    """Frames in which the left or the right hand is above its shoulder (y points down)."""
+    """Return frames in which the left or the right hand is above its shoulder (y points down)."""
     hands, shoulders = pose[:, [0, 7], 1], pose[:, [2, 5], 1]
     return hands < shoulders
 
 
 def walk_process_cov(prior: UpperBodyPrior) -> Float[Tensor, " 21"]:
-    """Diagonal of Q for a filter that proposes from the random walk itself: human steps.
+    """Return the diagonal of Q for a filter that proposes from the random walk itself: human steps.
 
     In 1/30 s a hand moves 5 cm, an elbow 2.5 cm, the rest of the body 1 cm, and the camera 2 cm and 0.02
     rad (standard deviations), seen at the prior's mean distance.

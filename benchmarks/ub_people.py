@@ -129,7 +129,7 @@ def run(
 
 
 def people(data: str | Path, quick: bool = False) -> tuple[list[Recording], list[Recording]]:
-    """Recordings of the training and of the test persons (a few of them if `quick`).
+    """Return recordings of the training and of the test persons (a few of them if `quick`).
 
     Raises:
         InputError: recordings of either are missing.
@@ -149,7 +149,7 @@ def people(data: str | Path, quick: bool = False) -> tuple[list[Recording], list
 
 
 def sway(n_frames: int, fps: float, phase: float = 0.0) -> Float[Tensor, "T 3"]:
-    """Path of a body that moves 0.3 m to either side and 0.3 m in depth once in 4 s.
+    """Return the path of a body that moves 0.3 m to either side and 0.3 m in depth once in 4 s.
 
     x = 0.3 sin(a), z = 0.3 cos(a), a = 2 pi (t / 4 s + phase): a circle on the floor, 0.47 m/s.
 
@@ -223,7 +223,7 @@ def _all_methods(
 
 
 def mean_pose(test: Trials, joints: Float[Tensor, "N 8 3"], uv: Float[Tensor, "N 8 2"]) -> Estimate:
-    """The mean of the training poses for every frame; in the image, about the measured neck."""
+    """Return the mean of the training poses for every frame; in the image, about the measured neck."""
     shape = test.truth3d.shape[:2]
     offsets = (uv - uv[:, 4:5]).mean(0)
     return Estimate(
@@ -238,7 +238,7 @@ def nearest_neighbour(
     chunk: int = 256,
     progress: bool = False,
 ) -> Estimate:
-    """For each frame alone the training pose whose head, neck and hands look most alike.
+    """Return for each frame alone the training pose whose head, neck and hands look most alike.
 
     Args:
         test: sequences. joints, uv: training poses and their pixels.

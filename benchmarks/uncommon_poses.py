@@ -111,7 +111,7 @@ def raised_share(recording: Recording) -> float:
 def without_raised(
     recordings: Sequence[Recording], share: float = 0.1, seed: int = 0
 ) -> dict[str, list[Recording]]:
-    """Recordings without those of raised arms, and without as many frames drawn at random.
+    """Return recordings without those of raised arms, and without as many frames drawn at random.
 
     Args:
         recordings: to train on. share: of frames with a hand above its shoulder, above which a

@@ -104,7 +104,7 @@ def make_bank(spaces: Sequence[ActionSpace], setting: BankSetting) -> ActionBank
 
 
 def postures_of(trackee: BendTrackee, library: Library) -> list[tuple[str, Tensor]]:
-    """Action and postures [T, 36] of each of the person's recordings, from true joints."""
+    """Return action and postures [T, 36] of each of the person's recordings, from true joints."""
     return [
         (action, true_postures(trackee.body, clip))
         for action, persons in library.items()

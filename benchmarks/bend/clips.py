@@ -21,7 +21,7 @@ def leave_one_out(
     n_clips: int = 1,
     n_frames: int = 86,
 ) -> list[Split]:
-    """One person left out after the other: tracked in their first recordings; the others train.
+    """Leave one person out after the other: tracked in their first recordings; the others train.
 
     The other recordings of the person tell bone lengths and radii.
 
@@ -59,7 +59,7 @@ def leave_one_out(
 def action_clips(
     clips: Sequence[MocapClip], actions: Sequence[str]
 ) -> dict[str, dict[str, list[MocapClip]]]:
-    """Recordings by action and person, in the order asked for.
+    """Return recordings by action and person, in the order asked for.
 
     Raises:
         InputError: an action that nobody performed.
@@ -77,13 +77,13 @@ def action_clips(
 
 
 def performances(clip: MocapClip) -> list[MocapClip]:
-    """The single repetitions of a recording; the whole of it where nothing is repeated."""
+    """Return the single repetitions of a recording; the whole of it where nothing is repeated."""
     parts = [clip.cut(p.start, p.stop) for p in _repetitions(clip)]
     return [part for part in parts if len(part) >= _LEAST_FRAMES] or [clip]
 
 
 def first_bend(clip: MocapClip, n_frames: int) -> MocapClip:
-    """So many frames from the start of the first repetition, or the last ones of the recording."""
+    """Return so many frames from the start of the first repetition, or the last ones of the recording."""
     start = min(_repetitions(clip)[0].start, max(len(clip) - n_frames, 0))
     return clip.cut(start, start + n_frames)
 

@@ -221,7 +221,7 @@ def run(
 
 
 def _particles(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> None:
-    """Figures 1, 3 and 4."""
+    """Add Figures 1, 3 and 4."""
     from benchmarks.bend.pictures import plot_particles, plot_predictions, predictions
     from torchpose.viz import plot_action_space
 
@@ -259,7 +259,7 @@ def _dimensions(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> No
 
 
 def _limbs(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> None:
-    """Each kind of limbs with settings of its own, chosen as those of the others were."""
+    """Compare kinds of limbs, each with settings of its own, chosen as those of the others were."""
     rectangles = {
         f"{v.label}, rectangles": v
         for v in (stage.variant(c, stage.at, "rectangles") for c in (True, False))
@@ -274,7 +274,7 @@ def _limbs(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> None:
 
 
 def _occlusion(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> None:
-    """Figure 5: the same persons from the side."""
+    """Add Figure 5: the same persons from the side."""
     from benchmarks.bend.pictures import plot_hidden_arm, plot_predictions
 
     side = replace(stage.conditions, azimuths=(SIDE,))
@@ -301,7 +301,7 @@ def _occlusion(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> Non
 
 
 def _actions(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> None:
-    """Which action it is, from recorded joints and from silhouettes."""
+    """Add which action it is, from recorded joints and from silhouettes."""
     there = {clip.action for clip in stage.clips}
     names = [n for n in (*bend_actions.KNOWN, *bend_actions.OTHERS) if n in there]
     library = action_clips(stage.clips, names)
@@ -369,7 +369,7 @@ def _numbers(name: str, given: Sequence[int]) -> list[int]:
 def _persons(
     clips: Sequence[MocapClip], testers: Sequence[str], judges: Sequence[str], quick: bool
 ) -> tuple[list[str], list[str]]:
-    """Who is tracked, and whose clips choose the settings."""
+    """Return who is tracked, and whose clips choose the settings."""
     everybody = list(select_persons(clips, ()))
     if len(everybody) < 3:
         raise InputError(

@@ -48,7 +48,7 @@ def split_clips(
     validation_frames: int = 300,
     tracked: Sequence[MocapClip] = (),
 ) -> list[Split]:
-    """Who is tracked with what.
+    """Return who is tracked with what.
 
     A person who trains as well is tracked in the first trials, and the manifold and the validation
     have the following ones. Somebody else is tracked with a manifold of the others; bone lengths and
@@ -89,7 +89,7 @@ def split_clips(
 
 
 def take_frames(clips: Sequence[MocapClip], n_frames: int) -> tuple[MocapClip, ...]:
-    """Clips from the first on until there are so many frames; the last one is cut."""
+    """Return clips from the first on until there are so many frames; the last one is cut."""
     taken: list[MocapClip] = []
     left = n_frames
     for clip in clips:
@@ -101,7 +101,7 @@ def take_frames(clips: Sequence[MocapClip], n_frames: int) -> tuple[MocapClip, .
 
 
 def whole_frames(clip: MocapClip) -> Bool[Tensor, " T"]:
-    """Frames in which no joint was lost; one that the joint set lacks altogether does not count."""
+    """Return frames in which no joint was lost; one that the set lacks altogether does not count."""
     missing = clip.joints.isnan().any(-1)
     return ~(missing & ~missing.all(0)).any(-1) & ~missing.all(-1)
 
@@ -114,7 +114,7 @@ def _test_trials(group: Sequence[MocapClip], n_clips: int) -> tuple[MocapClip, .
 def _share(
     pool: Sequence[MocapClip], n_frames: int, seen: bool
 ) -> tuple[tuple[MocapClip, ...], list[MocapClip]]:
-    """Clips for the manifold, and what is left for the validation: at least one.
+    """Return clips for the manifold, and what is left for the validation: at least one.
 
     Of several persons everybody gives the same number of frames.
     """
@@ -139,12 +139,12 @@ def _share(
 def place_cameras(
     clip: MocapClip, azimuths: Sequence[float] = AZIMUTHS, **options: float
 ) -> CameraRig:
-    """The rig of `cameras_around` a clip, which takes the options."""
+    """Return the rig of `cameras_around` a clip, which takes the options."""
     return CameraRig(cameras_around(clip, azimuths, **options))
 
 
 def in_view(clip: MocapClip, cameras: CameraRig) -> Float[Tensor, " C"]:
-    """Share of the joints that lie in each camera's image."""
+    """Return the share of the joints that lie in each camera's image."""
     known = clip.joints.isfinite().all(-1)
     view = cameras(clip.joints.nan_to_num().double())
     height, width = cameras.size or (480, 640)
@@ -158,7 +158,7 @@ def in_view(clip: MocapClip, cameras: CameraRig) -> Float[Tensor, " C"]:
 
 
 def looped(clip: MocapClip, times: int, blend: int = 8) -> MocapClip:
-    """One cycle of a walk, on the spot, so many times, its end blended into its start.
+    """Return one cycle of a walk, on the spot, so many times, its end blended into its start.
 
     The mean velocity is taken out of the clip; the cycle is that whose last pose is nearest to its
     first, in places and steps.
@@ -198,7 +198,7 @@ def _on_the_spot(clip: MocapClip) -> tuple[Tensor, Tensor]:
 
 
 def _cycle(clip: MocapClip, blend: int, shortest: int = 40, longest: int = 110) -> tuple[int, int]:
-    """First frame and length of the cycle whose ends are nearest to each other."""
+    """Return the first frame and length of the cycle whose ends are nearest to each other."""
     joints, _ = _on_the_spot(clip)
     points = joints.nan_to_num().flatten(1)
     step = 5 * (points[1:] - points[:-1])

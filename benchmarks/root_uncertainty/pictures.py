@@ -60,7 +60,7 @@ def add_pictures(
     report: Report, walkers: Sequence[Walker], settings: Mapping[str, Setting], budget: Budget,
     runs: Results, out: Path,
 ) -> None:  # fmt: skip
-    """All pictures of the first person."""
+    """Add all pictures of the first person."""
     walker = walkers[0]
     name, subject = next(iter(subjects_of([walker]).items()))
     view = subject.view
@@ -85,7 +85,7 @@ def add_pictures(
 
 
 def follow(tracker: SilhouetteParticleFilter, view: View, n_frames: int) -> Sample:
-    """A filter after the first frames of a clip, and one more."""
+    """Return a filter after the first frames of a clip, and one more."""
     generators = generators_of([0])
     state = tracker.init(view.initial_state[None], generators)
     for t in range(n_frames + 1):
@@ -97,7 +97,7 @@ def follow(tracker: SilhouetteParticleFilter, view: View, n_frames: int) -> Samp
 
 
 def plot_predictions(walker: Walker, state: Tensor, rig: CameraRig) -> Figure:
-    """Lower legs that the limb conditionals predict from the upper ones (DX, Figure 3)."""
+    """Draw lower legs that the limb conditionals predict from the upper ones (DX, Figure 3)."""
     body, learnt = walker.body, walker.conditionals
     shanks = [body.skeleton.part(f"{side}_shank") for side in ("left", "right")]
     edges = torch.nonzero(torch.isin(learnt.edges[:, 1], torch.tensor(shanks))).flatten()
@@ -111,7 +111,7 @@ def plot_predictions(walker: Walker, state: Tensor, rig: CameraRig) -> Figure:
 
 
 def plot_diffusion(walker: Walker, state: Tensor, rig: CameraRig) -> Figure:
-    """Limbs one, two and three frames later, if nothing is seen (DX, Figure 5)."""
+    """Draw limbs one, two and three frames later, if nothing is seen (DX, Figure 5)."""
     body, learnt = walker.body, walker.conditionals
     parts = torch.arange(1, len(body.skeleton.parts))
     mean = state[6:].unflatten(0, (-1, 3))
@@ -127,7 +127,7 @@ def plot_diffusion(walker: Walker, state: Tensor, rig: CameraRig) -> Figure:
 
 
 def _with_parts(state: Tensor, parts: Tensor, vectors: Tensor) -> Tensor:
-    """A state with other vectors [K, 3] of some parts."""
+    """Return a state with other vectors [K, 3] of some parts."""
     turned = state[3:].unflatten(0, (-1, 3)).clone()
     turned[parts] = vectors
     return torch.cat([state[:3], turned.flatten()])
@@ -137,7 +137,7 @@ def _plot_positions(
     body: Body, state: Tensor, groups: Mapping[str, Tensor], rig: CameraRig, parts: Sequence[int],
     title: str,
 ) -> Figure:  # fmt: skip
-    """A body, and in every panel the limbs of some parts in several states [S, D]."""
+    """Draw a body, and in every panel the limbs of some parts in several states [S, D]."""
     require_matplotlib()
     panels = [(name, c) for name in groups for c in range(len(rig))]
     figure = new_figure(3.0 * len(panels) + 0.4, 4.6, title)
@@ -158,7 +158,7 @@ def _plot_positions(
 
 
 def plot_sigma_points(sample: Sample, view: View, frame: int, cameras: int = 2) -> Figure:
-    """Seven places of every limb of the best hypothesis, in two views (DX, Figure 4)."""
+    """Draw seven places of every limb of the best hypothesis, in two views (DX, Figure 4)."""
     require_matplotlib()
     body, rig = sample.body, view.rig
     best = int(sample.state.log_weights[0].argmax())
@@ -178,7 +178,7 @@ def plot_sigma_points(sample: Sample, view: View, frame: int, cameras: int = 2) 
 
 
 def plot_distributions(samples: Mapping[str, Sample], view: View, frame: int) -> Figure:
-    """Particles of SIR, and hypotheses of the root tracker with their limbs (DX, Figure 6)."""
+    """Draw particles of SIR, and hypotheses of the root tracker with their limbs (DX, Figure 6)."""
     require_matplotlib()
     from matplotlib.lines import Line2D
 
@@ -202,7 +202,7 @@ def plot_distributions(samples: Mapping[str, Sample], view: View, frame: int) ->
 
 
 def _sigma_states(sample: Sample, index: int) -> Tensor:
-    """States [7, D] with every part at its s-th sigma point."""
+    """Return states [7, D] with every part at its s-th sigma point."""
     state = sample.state.particles[0, index]
     memory = sample.state.memory
     if memory is None:
@@ -216,7 +216,7 @@ def _sigma_states(sample: Sample, index: int) -> Tensor:
 
 
 def _part_of(body: Body, limb: int) -> int:
-    """The part that a limb's far end moves with."""
+    """Return the part that a limb's far end moves with."""
     skeleton = body.skeleton
     carrier = {name: skeleton.part_of[i] for i, name in enumerate(skeleton.names)}
     carrier |= {tip.name: skeleton.part(tip.part) for tip in skeleton.tips}
@@ -232,7 +232,7 @@ def _draw_limbs(
     ax: Axes, limbs: Limbs, rig: CameraRig, camera: int, colours: Sequence[str],
     width: float = 0.8, fill: bool = False,
 ) -> None:  # fmt: skip
-    """Outlines of limbs in one camera: hulls of two discs."""
+    """Draw outlines of limbs in one camera: hulls of two discs."""
     import cv2
     import numpy as np
     from matplotlib.collections import PolyCollection
@@ -257,7 +257,7 @@ def _draw_bones(
     ax: Axes, body: Body, states: Tensor, rig: CameraRig, camera: int, alpha: float,
     width: float = 0.8,
 ) -> None:  # fmt: skip
-    """Bones of several states [N, D] as lines, by side."""
+    """Draw bones of several states [N, D] as lines, by side."""
     from matplotlib.collections import LineCollection
 
     pixels = to_numpy(rig(body.joints(states)).pixels[:, camera])
@@ -281,7 +281,7 @@ def _show(ax: Axes, silhouette: Tensor) -> None:
 
 
 def _frame(ax: Axes, points: Tensor, title: str, margin: float = 0.15) -> None:
-    """Limits around points [N, 2], one scale, no ticks, v downwards."""
+    """Set limits around points [N, 2], with one scale and no ticks, v downwards."""
     low, high = points.amin(0), points.amax(0)
     room = margin * float((high - low).max())
     ax.set_xlim(float(low[0]) - room, float(high[0]) + room)

@@ -186,7 +186,7 @@ def _fill_tables(
     report: Report, walkers: Sequence[Walker], settings: Mapping[str, Setting], budget: Budget,
     cameras_used: Sequence[int], seeds: Sequence[int], out: Path, progress: bool,
 ) -> None:  # fmt: skip
-    """Tables 1 and 2, Figures 8 and 10, and what the distributions look like."""
+    """Add Tables 1 and 2, Figures 8 and 10, and what the distributions look like."""
     by_cameras = {n: [with_cameras(walker, n) for walker in walkers] for n in cameras_used}
     grids = {f"{n} cameras": grid_of(seen, settings, budget) for n, seen in by_cameras.items()}
     runs = TRACKING.run(grids, seeds, out, progress=progress, title="cameras")
@@ -211,7 +211,7 @@ def _fill_rates(
     settings: Mapping[float, Mapping[str, Setting]], budget: Budget, seeds: Sequence[int], out: Path,
     progress: bool,
 ) -> None:  # fmt: skip
-    """Figure 9, every rate with the settings that were chosen at it."""
+    """Add Figure 9, every rate with the settings that were chosen at it."""
     grids = {f"{fps:g}": grid_of(seen, settings[fps], budget) for fps, seen in by_rate.items()}
     runs = TRACKING.run(grids, seeds, out, progress=progress, title="frame rates")
     for fps, key in zip(by_rate, grids, strict=True):
@@ -235,7 +235,7 @@ def _tunings(
     by_rate: Mapping[float, Sequence[Walker]], methods: Sequence[str], budget: Budget, out: Path,
     settings: str, quick: bool, progress: bool,
 ) -> dict[float, dict[str, Tuning]]:  # fmt: skip
-    """Of every frame rate, from the highest on; the search at one starts from the choice at the last."""
+    """Choose settings at every frame rate, from the highest on, each search starting from the last choice."""
     found: dict[float, dict[str, Tuning]] = {}
     started: dict[str, Setting] = {}
     for fps in sorted(by_rate, reverse=True):
@@ -254,13 +254,13 @@ def _tunings(
 
 
 def _rates(part: str, steps: Mapping[float, int]) -> dict[float, int]:
-    """Frame rates that a part needs, each with the n of which it takes every n-th frame."""
+    """Return frame rates that a part needs, each with the n of which it takes every n-th frame."""
     whole = {FPS: 1} if part != "rates" else {}
     return whole | (dict(steps) if part in ("rates", "all") else {})
 
 
 def _times(times: Sequence[float], seconds: float, walkers: Sequence[Walker]) -> tuple[float, ...]:
-    """Checked to leave `seconds` of everybody's clip."""
+    """Return times, checked to leave `seconds` of everybody's clip."""
     shortest = min(len(walker.tests[0].clip) for walker in walkers) / FPS
     if not times or min(times) < 0 or max(times) + seconds > shortest + 1e-9:
         given = " ".join(f"{t:g}" for t in times) or "none"
@@ -278,7 +278,7 @@ def _check(
     part: str, methods: Sequence[str], seeds: int, recovery_seeds: int, cameras: Sequence[int],
     rates: Sequence[float],
 ) -> dict[float, int]:  # fmt: skip
-    """Rates, each with the n of which it takes every n-th frame."""
+    """Check the options; return rates, each with the n of which it takes every n-th frame."""
     if part not in PARTS:
         raise InputError(f"--part must be one of {', '.join(PARTS)}, got {part!r}")
     unknown = [name for name in methods if name not in METHODS]
@@ -301,7 +301,7 @@ def _check(
 
 
 def _most_frames(clips: Sequence[MocapClip]) -> tuple[str, ...]:
-    """CMU's first three walkers where they are, else those with most frames in three trials or more."""
+    """Return CMU's first three walkers where they are, else those with most frames in three trials."""
     frames: dict[str, list[int]] = {}
     for clip in clips:
         frames.setdefault(clip.person, []).append(len(clip))

@@ -62,7 +62,7 @@ def humaneva_splits(
     train_persons: Sequence[str] = (),
     test_persons: Sequence[str] = (),
 ) -> list[Split]:
-    """Who is tracked with what: one split for every action and person.
+    """Return who is tracked with what: one split for every action and person.
 
     Args:
         root: the data set. footage: is told where the frames of each clip are.
@@ -120,7 +120,7 @@ def _chosen(materials: Mapping[str, _Material], persons: Sequence[str]) -> list[
 
 
 def _materials(root: str | Path, action: str, footage: "HumanEvaFootage") -> dict[str, _Material]:
-    """Everybody whose filmed trial of an action has its videos."""
+    """Return everybody whose filmed trial of an action has its videos."""
     trials = find_humaneva(root)
     numbers: dict[str, list[str]] = {}
     for person, name, number in trials:
@@ -151,7 +151,7 @@ def _materials(root: str | Path, action: str, footage: "HumanEvaFootage") -> dic
 def _material(
     trial: HumanEvaTrial, others: Sequence[HumanEvaTrial], footage: "HumanEvaFootage"
 ) -> _Material:
-    """The parts of the filmed trial, and the others as a whole."""
+    """Return the parts of the filmed trial, and the others as a whole."""
     end = min(len(trial), footage.frames_of(trial))
     halves = (1, end // 2, end)
     first, middle, last = PARTITIONS.get((trial.person, trial.action), halves)
@@ -177,7 +177,7 @@ def _material(
 
 
 def _pieces(trial: HumanEvaTrial, start: int, stop: int) -> list[tuple[int, MocapClip]]:
-    """Pieces between gaps of the frames `start` to `stop`, each with its first frame's number."""
+    """Return pieces between gaps of the frames `start` to `stop`, each with its first frame's number."""
     clip = trial.clip(start, stop)
     known = whole_frames(clip).int()
     edges = torch.diff(known, prepend=known.new_zeros(1), append=known.new_zeros(1))
@@ -229,7 +229,7 @@ class HumanEvaFootage:
         self._places[clip.person, clip.trial] = _Place(trial, start)
 
     def frames_of(self, trial: HumanEvaTrial) -> int:
-        """How many frames all videos of a trial have, from the trial's first frame on."""
+        """Return how many frames all videos of a trial have, from the trial's first frame on."""
         counts = []
         for camera, path in trial.videos.items():
             with _open(path) as source:
@@ -238,13 +238,13 @@ class HumanEvaFootage:
         return max(min(counts, default=len(trial)), 0)
 
     def sees(self, clip: MocapClip) -> bool:
-        """Whether a clip is a part of a filmed trial."""
+        """Return whether a clip is a part of a filmed trial."""
         return (clip.person, clip.trial) in self._places
 
     def __call__(
         self, clip: MocapClip, size: tuple[int, int], n_cameras: int
     ) -> tuple[CameraRig, Bool[Tensor, "T C H W"]]:
-        """The first cameras, scaled to (height, width), and what they see of a clip.
+        """Return the first cameras, scaled to (height, width), and what they see of a clip.
 
         Raises:
             InputError: more cameras than there are, a clip of no filmed trial, videos that end early.
@@ -297,7 +297,7 @@ class HumanEvaFootage:
 
 
 def _open(path: Path) -> VideoSource:
-    """A video with its own frames, or a folder of them."""
+    """Open a video with its own frames, or a folder of them."""
     return open_video(path, fps=FPS if path.is_dir() else None)
 
 
@@ -310,7 +310,7 @@ def _views(trial: HumanEvaTrial, size: tuple[int, int]) -> list[SilhouetteView]:
 
 
 def _measure_of(view: SilhouetteView, backgrounds: Sequence[Path], video: Path) -> Measure:
-    """What differs from all backgrounds, or from what stays in the video."""
+    """Return a measurer of what differs from all backgrounds, or from what stays in the video."""
     if not backgrounds:
         with _open(video) as source:
             return SilhouetteMeasurer(view, None, learning_frames(source))
@@ -326,7 +326,7 @@ def _measure_of(view: SilhouetteView, backgrounds: Sequence[Path], video: Path) 
 
 
 def _facts(trial: HumanEvaTrial, views: Sequence[SilhouetteView]) -> list[object]:
-    """What silhouettes depend on."""
+    """Return what silhouettes depend on."""
     files = [*trial.videos.values(), *(p for paths in trial.backgrounds.values() for p in paths)]
     facts: list[object] = [_VERSION, trial.person, trial.action, sorted(trial.first_frames.items())]
     facts += [[path.name, path.stat().st_size, path.stat().st_mtime_ns] for path in files]

@@ -164,7 +164,7 @@ def _splits(
     data: str | Path, actions: tuple[str, ...], test_actions: tuple[str, ...],
     train_persons: tuple[str, ...], test_persons: tuple[str, ...], clips: int,
 ) -> list[Split]:  # fmt: skip
-    """Who is tracked with what, everybody and every action by the names that were given."""
+    """Return who is tracked with what, everybody and every action by the names that were given."""
     recorded = read_mocap(data, FPS, actions)
     _one_action(recorded)
     if not test_actions:
@@ -184,7 +184,7 @@ def _splits(
 def _given_settings(
     methods: Sequence[str], sharpness: float | None, settings: str | None
 ) -> dict[str, Tuning]:
-    """What stands instead of a validation; nothing if that shall choose."""
+    """Return what stands instead of a validation; nothing if that shall choose."""
     if settings is not None:
         if sharpness is not None:
             raise InputError("--settings holds a sharpness already: leave --sharpness out")
@@ -225,7 +225,7 @@ def _grid(case: Case, likelihood: str, initial: str) -> Grid[Subject[Trackee], F
 
 
 def _chosen(cases: Sequence[Case]) -> dict[str, object]:
-    """Settings by method; by condition and method where they differ."""
+    """Return settings by method; by condition and method where they differ."""
     by_case = {
         f"{case.n_particles} at {case.size}": {
             name: tuning.setting._asdict() for name, tuning in case.tunings.items()
@@ -273,7 +273,7 @@ def _check(
 
 
 def _check_footage(cameras: str | None, loop: int, clips: int) -> None:
-    """What cannot be had from videos that are there."""
+    """Refuse what cannot be had from videos that are there."""
     if cameras is not None:
         raise InputError("--cameras: HumanEva has its own calibration; leave the option out")
     if loop or clips != 1:
@@ -293,7 +293,7 @@ def _one_action(clips: Sequence[MocapClip]) -> None:
 
 
 def _default_persons(clips: Sequence[MocapClip]) -> tuple[str, ...]:
-    """CMU's four walkers where all of them are, else everybody with four trials or more."""
+    """Return CMU's four walkers where all of them are, else everybody with four trials or more."""
     trials: dict[str, int] = {}
     for clip in clips:
         trials[clip.person] = trials.get(clip.person, 0) + 1

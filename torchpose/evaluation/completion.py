@@ -54,7 +54,7 @@ class Completion(NamedTuple):
 def learn_completion(
     recordings: Sequence[Recording], targets: Sequence[str] = ("head", "hand_left", "hand_right")
 ) -> Completion:
-    """Least squares on recordings that have the targets, wrists and hips.
+    """Fit a linear map by least squares on recordings that have the targets, wrists and hips.
 
     Args:
         recordings: those without wrists, hips or one of the targets are passed over.
@@ -94,7 +94,7 @@ def learn_completion(
 def complete(
     recording: Recording, completion: Completion, generator: torch.Generator | None = None
 ) -> Recording:
-    """The eight joints of a recording, its head, hands (if among the targets) and neck made up.
+    """Return the eight joints of a recording, its head, hands (if among the targets) and neck made up.
 
     Hands that are no target stay wrists. The neck is put where the completion's recordings have it,
     from the shoulders and the head.
@@ -135,7 +135,7 @@ def complete(
 
 
 def with_wrists(recording: Recording) -> Recording:
-    """The eight joints of a Kinect recording, with wrists in place of hands."""
+    """Return the eight joints of a Kinect recording, with wrists in place of hands."""
     names = ("head", "elbow_left", "elbow_right", "shoulder_left", "shoulder_right")
     body = recording.upper_body()
     wrists = _joints(recording, ("wrist_left", "wrist_right"))
@@ -149,7 +149,7 @@ def with_wrists(recording: Recording) -> Recording:
 
 
 def facing_pieces(recording: Recording, least: float = 0.6, frames: int = 30) -> list[Recording]:
-    """The parts of a recording in which the person faces the camera, as recordings of their own.
+    """Return the parts of a recording in which the person faces the camera, as recordings of their own.
 
     Args:
         least: cosine of the largest angle between the shoulders' line and the image.
@@ -190,7 +190,7 @@ def _joints(recording: Recording, wanted: Sequence[str]) -> Float[Tensor, "T J 3
 def _trunk(
     known: Float[Tensor, "N 7 3"],
 ) -> tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3"]]:
-    """Axes of the trunk as columns (to the person's left, up, forward), and the shoulders' middle."""
+    """Return axes of the trunk as columns (to the person's left, up, forward), and the shoulders' middle."""
     middle = (known[:, _LEFT] + known[:, _RIGHT]) / 2
     across = torch.nn.functional.normalize(known[:, _LEFT] - known[:, _RIGHT], dim=-1)
     up = middle - known[:, _HIP]

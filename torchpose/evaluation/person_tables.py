@@ -30,18 +30,18 @@ _HANDS, _ELBOWS = (0, 7), (1, 6)
 
 
 def pooled(parts: Sequence[Scored]) -> Scored:
-    """All frames of several persons as one."""
+    """Return all frames of several persons as one."""
     return Scored(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 def mean_error(scored: Scored, smoothed: bool = False) -> float:
-    """Mean over all joints and frames, centimetres."""
+    """Return the mean over all joints and frames, centimetres."""
     errors = scored.smoothed if smoothed else scored.filtered
     return 100 * float(errors.double().nanmean())
 
 
 def add_persons(report: Report, persons: Mapping[str, Scored]) -> Table:
-    """One row for each person, then mean and spread over persons, and all frames pooled."""
+    """Add one row for each person, then mean and spread over persons, and all frames pooled."""
     table = report.table(
         "persons",
         "3D error after Procrustes (cm), true joints inside the ellipsoids (%), log-likelihood of "
@@ -73,7 +73,7 @@ def _row(scored: Scored) -> list[float | int]:
 def add_pose_classes(
     report: Report, groups: Mapping[str, Scored], key: str = "pose_classes"
 ) -> Table:
-    """Error of hand and elbow by what the arm does, for each group of scored frames."""
+    """Add the error of hand and elbow by what the arm does, for each group of scored frames."""
     table = report.table(
         key,
         "What uncommon poses cost: error of the arm (cm) by what it does",
@@ -94,7 +94,7 @@ def add_pose_classes(
 
 
 def class_error(scored: Scored, name: str, smoothed: bool = False) -> float:
-    """Mean error of hands and elbows (cm) of arms that do this."""
+    """Return the mean error of hands and elbows (cm) of arms that do this."""
     errors = scored.smoothed if smoothed else scored.filtered
     chosen = scored.classes == POSE_CLASSES.index(name)
     arm = (errors[:, list(_HANDS)] + errors[:, list(_ELBOWS)]) / 2
@@ -105,7 +105,7 @@ def class_error(scored: Scored, name: str, smoothed: bool = False) -> float:
 
 
 def plot_persons(persons: Mapping[str, Scored], title: str) -> Any:
-    """Error of each person, filtered and smoothed, then the mean and its spread over persons."""
+    """Draw the error of each person, filtered and smoothed, then the mean and its spread over persons."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -144,7 +144,7 @@ class Curve(NamedTuple):
 
 
 def plot_curves(curves: Mapping[str, Mapping[str, Curve]], title: str) -> Any:
-    """Learning curves: a panel for each stage (filtered, smoothed), a line for each recipe.
+    """Draw learning curves: a panel for each stage (filtered, smoothed), a line for each recipe.
 
     The band is one standard deviation over the persons that were tracked. A whisker is one over
     which persons were drawn to train on; there is none where each person is tracked by one fit only.
@@ -190,7 +190,7 @@ def plot_curves(curves: Mapping[str, Mapping[str, Curve]], title: str) -> Any:
 
 
 def plot_pose_classes(groups: Mapping[str, Scored], title: str) -> Any:
-    """Error of hands and elbows by what the arm does, a bar for each group."""
+    """Draw the error of hands and elbows by what the arm does, a bar for each group."""
     from matplotlib.patches import Patch
 
     from torchpose.viz._style import add_legend, method_styles, new_figure, style_axes

@@ -33,12 +33,12 @@ _NEAR = 0.2  # metres
 
 
 def complete_pieces(joints: Float[Tensor, "T 8 3"]) -> list[Float[Tensor, "S 8 3"]]:
-    """Runs of at least ten frames in which no joint is missing."""
+    """Return runs of at least ten frames in which no joint is missing."""
     return [joints[frames] for frames in runs(measured(joints).all(1), LEAST_FRAMES)]
 
 
 def pose_classes(poses: Float[Tensor, "N 8 3"]) -> Int[Tensor, "N 2"]:
-    """What the left and the right arm do: index into `POSE_CLASSES`, the first that applies.
+    """Return what the left and the right arm do: index into `POSE_CLASSES`, the first that applies.
 
     Raised: the hand is above its shoulder. Crossed: it is on the other side of the middle of the
     shoulders, along their line. Near the body: within 20 cm of its shoulder, horizontally. Else it
@@ -58,7 +58,7 @@ def pose_classes(poses: Float[Tensor, "N 8 3"]) -> Int[Tensor, "N 2"]:
 
 
 def by_person(recordings: Sequence[Recording]) -> dict[str, list[Recording]]:
-    """Recordings of each person, under a name that no other one has, in order."""
+    """Return recordings of each person, under a name that no other one has, in order."""
     groups: dict[str, list[Recording]] = {}
     for recording in recordings:
         groups.setdefault(recording.person_id, []).append(recording)
@@ -80,18 +80,18 @@ def _folder(recording: Recording) -> str:
 
 
 def _natural(name: str) -> tuple[Any, ...]:
-    """s2 before s10."""
+    """Return a key by which s2 comes before s10."""
     digits = "".join(c if c.isdigit() else " " for c in name).split()
     return ("".join(c for c in name if not c.isdigit()), *map(int, digits))
 
 
 def renamed(recordings: Sequence[Recording], suffix: str) -> list[Recording]:
-    """The recordings as those of another person, where a test on the same person is the point."""
+    """Return the recordings as those of another person, where a test on the same person is the point."""
     return [replace(r, person=f"{r.person}, {suffix}") for r in recordings]
 
 
 def spread(values: Sequence[float] | Tensor) -> tuple[float, float]:
-    """Mean and standard deviation, NaN left out; NaN for the latter of fewer than two."""
+    """Return the mean and standard deviation, NaN left out; NaN for the latter of fewer than two."""
     known = torch.as_tensor(values, dtype=torch.float64)
     known = known[torch.isfinite(known)]
     if not len(known):

@@ -53,12 +53,12 @@ class Table:
         self.rows[name] = tuple(cells)
 
     def __getitem__(self, key: tuple[str, str]) -> Any:
-        """The cell of (row, column)."""
+        """Return the cell of (row, column)."""
         row, column = key
         return self.rows[row][self.columns.index(column)]
 
     def cells(self) -> list[list[str]]:
-        """All cells as text, the header first."""
+        """Return all cells as text, the header first."""
         digits = self.digits
         if isinstance(digits, int):
             digits = (digits,) * len(self.columns)
@@ -69,7 +69,7 @@ class Table:
         return [["", *self.columns], *body]
 
     def to_text(self) -> str:
-        """Columns aligned with blanks."""
+        """Return columns aligned with blanks."""
         cells = self.cells()
         widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
         lines = []
@@ -81,7 +81,7 @@ class Table:
         return "\n".join([self.title, *lines, *([self.note] if self.note else [])])
 
     def to_markdown(self) -> str:
-        """A Markdown table under its title."""
+        """Return a Markdown table under its title."""
         header, *body = [[c.replace("|", "/") for c in row] for row in self.cells()]
         rule = ["---", *["---:"] * len(self.columns)]
         lines = [f"| {' | '.join(row)} |" for row in (header, rule, *body)]
@@ -114,19 +114,19 @@ class Report(Mapping[str, Table]):
         return len(self.tables)
 
     def table(self, key: str, title: str, columns: Sequence[str], **options: Any) -> Table:
-        """A new table, part of the report from now on."""
+        """Add a new table, and return it."""
         self.tables[key] = Table(title, tuple(columns), **options)
         return self.tables[key]
 
     def summary(self) -> str:
-        """All tables and findings as plain text."""
+        """Return all tables and findings as plain text."""
         parts = [self.name, *(t.to_text() for t in self.tables.values())]
         if self.findings:
             parts.append("\n".join(f"- {line}" for line in self.findings))
         return "\n\n".join(parts)
 
     def to_markdown(self) -> str:
-        """All tables, findings, pictures and settings as Markdown."""
+        """Return all tables, findings, pictures and settings as Markdown."""
         parts = [f"# {self.name}", *(t.to_markdown() for t in self.tables.values())]
         if self.findings:
             parts.append("## Findings\n\n" + "\n".join(f"- {line}" for line in self.findings))
@@ -136,7 +136,7 @@ class Report(Mapping[str, Table]):
         return "\n\n".join(parts) + "\n"
 
     def to_json(self) -> str:
-        """All of it as JSON; what is not finite is null."""
+        """Return all of it as JSON; what is not finite is null."""
         tables = {
             key: {
                 "title": t.title,
@@ -178,7 +178,7 @@ def _text(value: Cell, digits: int) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """What JSON can hold."""
+    """Return what JSON can hold."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, Tensor):

@@ -131,7 +131,7 @@ def fit_settings(
     window_samples: int | None,
     calibration_folds: int,
 ) -> dict[str, Any]:
-    """Settings of a recipe: what was asked for, small sizes for a quick run, else its own."""
+    """Return the settings of a recipe: what was asked for, small sizes for a quick run, else its own."""
     settings: dict[str, Any] = {"name": name, "seed": seed}
     settings |= QUICK if quick else {}
     sizes = {
@@ -189,7 +189,7 @@ def _run(job: Job, folder: Path, progress: bool) -> dict[str, Scored]:
 
 
 def _scored(prior: UpperBodyPrior, job: Job, name: str, folder: Path, progress: bool) -> Scored:
-    """Scores of one person, read from the folder if they are there."""
+    """Return the scores of one person, read from the folder if they are there."""
     recordings = job.tests[name]
     prior.check_unseen({r.person_id for r in recordings})
     chosen = recordings[:: job.test.every]
@@ -261,7 +261,7 @@ def compare(found: Estimate, test: Trials, scored: Bool[Tensor, " 8"]) -> tuple[
 def log_likelihood(
     prior: UpperBodyPrior, poses: Float[Tensor, "N 8 3"], seed: int = 0
 ) -> Float[Tensor, " N"]:
-    """Log density of poses under the mixtures over poses, mean of both arms, nats.
+    """Return the log density of poses under the mixtures over poses, mean of both arms, nats.
 
     Every pose is seen from a random viewpoint of the prior's own, as its training poses were.
 
@@ -283,7 +283,7 @@ def poses_to_score(
     train: Sequence[Recording] | None,
     name: str = "",
 ) -> list[Float[Tensor, "T 8 3"]]:
-    """Complete sequences with the prior's neck, centred on it.
+    """Return complete sequences with the prior's neck, centred on it.
 
     Frames with a missing joint cut a recording in two, and pieces below ten frames are left out. A
     neck of another kind is put where the training recordings have theirs (`learn_neck_offset`).
@@ -320,7 +320,7 @@ def poses_to_score(
 
 
 def training_neck(train: Sequence[Recording], kind: str) -> NeckOffset:
-    """Where training recordings whose neck is of this kind have it.
+    """Return where training recordings whose neck is of this kind have it.
 
     Raises:
         PriorError: there are fewer than ten such frames.
