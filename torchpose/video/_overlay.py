@@ -20,12 +20,19 @@ from torchpose.errors import InputError, check_rgb, check_shape
 from torchpose.metrics._calibration import chi2_quantile
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import LIMBS
-from torchpose.viz._style import LEFT, RIGHT
+from torchpose.viz._style import LEFT, RIGHT, side_of
 
 __all__ = ["PERSON_TINTS", "Color", "Pen", "draw_body", "draw_overlay", "rgb"]
 
 Color = tuple[int, int, int]
 
+PERSON_TINTS = ("#F2F2F2", "#009E73", "#CC79A7", "#F0E442", "#56B4E9")
+"""Colours of the persons in turn, from the palette of Okabe & Ito."""
+
+_HAND_SIDES = (LEFT, RIGHT)
+_HEAD = UPPER_BODY.index("head")
+_MIDDLE, _MEASURED, _MODEL = (242, 242, 242), (240, 228, 66), (0, 158, 115)
+_TINT = 0.35  # opacity of the model's silhouette
 _LIGHT, _DARK = (255, 255, 255), (20, 20, 20)
 _SHIFT = 3  # cv2 takes coordinates in eighths of a pixel
 _REACH = 8  # what lies further out than so many image sizes is nonsense, and is left out
@@ -137,13 +144,6 @@ def _outline(color: Color) -> Color:
     return _DARK if 0.3 * color[0] + 0.59 * color[1] + 0.11 * color[2] > 140 else _LIGHT
 
 
-PERSON_TINTS = ("#F2F2F2", "#009E73", "#CC79A7", "#F0E442", "#56B4E9")
-"""Of one person after the other, from the colours of Okabe & Ito; they come round again."""
-
-_HAND_SIDES = (LEFT, RIGHT)
-_HEAD = UPPER_BODY.index("head")
-
-
 def draw_overlay(
     image: Image,
     poses2d: Float[Tensor, "P 8 2"],
@@ -200,9 +200,9 @@ def draw_overlay(
     if hands is not None:
         _draw_hands(pen, hands, hand_covariance, level)
     points = poses2d.tolist()
-    ellipses = None if covariance2d is None else _ellipses(covariance2d, level, 2)
+    ellipses = None if covariance2d is None else _ellipses(covariance2d, level)
     for person, seen in enumerate(observed.tolist()):
-        colors = _joint_colors(own[person])
+        colors = _joint_colors(UPPER_BODY, own[person])
         for joint in range(len(UPPER_BODY)):
             if ellipses is not None and not seen[joint]:
                 pen.ellipse(points[person][joint], ellipses[person][joint], colors[joint])
@@ -222,7 +222,7 @@ def _draw_hands(pen: Pen, hands: Tensor, covariance: Tensor | None, level: float
     ellipses = None
     if covariance is not None:
         check_shape("hand_covariance", covariance, [len(points), 2, 2, 2])
-        ellipses = _ellipses(covariance, level, 2)
+        ellipses = _ellipses(covariance, level)
     for person, pair in enumerate(points):
         for side, point in enumerate(pair):
             color = rgb(_HAND_SIDES[side])
@@ -231,7 +231,7 @@ def _draw_hands(pen: Pen, hands: Tensor, covariance: Tensor | None, level: float
             pen.cross(point, color)
 
 
-def _ellipses(covariance: Tensor, level: float, dof: int) -> list:
+def _ellipses(covariance: Tensor, level: float) -> list:
     """Half axes in pixels and angle in degrees of ellipses [..., 2, 2]; NaN where undefined.
 
     Half axes: sqrt(l chi2) of the eigenvalues l = (a + c)/2 +- sqrt(((a - c)/2)^2 + b^2) of
@@ -241,20 +241,20 @@ def _ellipses(covariance: Tensor, level: float, dof: int) -> list:
     a, b, c = C[..., 0, 0], (C[..., 0, 1] + C[..., 1, 0]) / 2, C[..., 1, 1]
     middle, radius = (a + c) / 2, torch.hypot((a - c) / 2, b)
     squared = torch.stack([middle + radius, middle - radius], -1).clamp_min(0)
-    half = (squared * _chi2(level, dof)).sqrt()
+    half = (squared * _chi2(level)).sqrt()
     angle = torch.rad2deg(torch.atan2(2 * b, a - c)) / 2
     return torch.cat([half, angle[..., None]], -1).tolist()
 
 
 @lru_cache(maxsize=8)
-def _chi2(level: float, dof: int) -> float:
-    return float(chi2_quantile(torch.tensor(level, dtype=torch.float64), dof))
+def _chi2(level: float) -> float:
+    return float(chi2_quantile(torch.tensor(level, dtype=torch.float64), 2))
 
 
 @lru_cache(maxsize=32)
-def _joint_colors(own: Color) -> list[Color]:
-    sides = {"left": rgb(LEFT), "right": rgb(RIGHT)}
-    return [sides.get(name.rsplit("_", 1)[-1], own) for name in UPPER_BODY]
+def _joint_colors(names: tuple[str, ...], own: Color) -> list[Color]:
+    sides = {"left": rgb(LEFT), "right": rgb(RIGHT), "middle": own}
+    return [sides[side_of(name)] for name in names]
 
 
 def _check(
@@ -277,12 +277,6 @@ def _check(
             raise InputError(f"expected {name} for {n} persons, got {len(given)}")
     if not 0 < level < 1:
         raise InputError(f"level must be a probability inside (0, 1), got {level}")
-
-
-_MIDDLE = rgb("#F2F2F2")
-_MEASURED = rgb("#F0E442")
-_MODEL = rgb("#009E73")
-_TINT = 0.35  # of the model's silhouette over the picture
 
 
 def draw_body(
@@ -319,7 +313,7 @@ def draw_body(
         _tint(canvas, model, _MODEL)
     if silhouette is not None:
         _contour(canvas, silhouette, _MEASURED, pen.edge + 1)
-    points, colors = joints2d.tolist(), [_color(name) for name in skeleton.names]
+    points, colors = joints2d.tolist(), _joint_colors(tuple(skeleton.names), _MIDDLE)
     for joint, parent in enumerate(skeleton.parents):
         if parent >= 0:
             pen.bone(points[parent], points[joint], colors[joint])
@@ -328,11 +322,6 @@ def draw_body(
     pen.label(label, points, skeleton.names.index("head") if "head" in skeleton.names else 0,
               _MIDDLE)  # fmt: skip
     return canvas
-
-
-def _color(name: str) -> Color:
-    side = name.split("_")[0]
-    return {"left": rgb(LEFT), "right": rgb(RIGHT)}.get(side, _MIDDLE)
 
 
 def _enlarged(canvas: Image, mask: Tensor) -> NDArray[np.uint8]:

@@ -30,6 +30,8 @@ from torchpose.video._person_stream import (
 
 __all__ = ["PoseSpool", "TrackedPerson", "TrackedRecording", "smoothed"]
 
+_LEAST_SECONDS = 0.5  # for which a person has to be seen to be reported
+
 
 class PoseSpool:
     """Appends blocks of poses of one sequence to files, and reads them as one `PoseTrack`.
@@ -104,11 +106,6 @@ class PoseSpool:
 
 def _array(values: Tensor) -> np.ndarray:
     return values[0].detach().cpu().contiguous().numpy()
-
-
-set_up_facade(__name__)
-
-_LEAST_SECONDS = 0.5  # for which somebody has to be seen to be reported
 
 
 @dataclass
@@ -304,3 +301,6 @@ def _nobody(n_frames: int, tracker: UpperBodyTracker) -> PoseTrack:
         notes=tracker.notes,
         method=tracker.method,
     )
+
+
+set_up_facade(__name__)

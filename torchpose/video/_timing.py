@@ -48,14 +48,13 @@ class Tally:
     """What had to be done to reach a constant rate, in frames.
 
     Attributes:
-        repeated, dropped: frames shown again, frames left out. untimed: frames without a time.
+        repeated, dropped: frames shown again, frames left out.
         late: frames not after the one before. restarts: times at which the clock jumped back, or
         forward by more than ten seconds (two intervals of slower videos); the jump was taken out.
     """
 
     repeated: int = 0
     dropped: int = 0
-    untimed: int = 0
     late: int = 0
     restarts: int = 0
 
@@ -142,7 +141,6 @@ def _turns(
     origin, last, step = 0.0, 0.0, 1 / fps
     for count, (time, frame) in enumerate(timed):
         if time is None:
-            tally.untimed += 1
             now = last + step if count else 0.0
         elif count == 0:
             origin, now = time, 0.0

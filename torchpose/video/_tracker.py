@@ -233,21 +233,21 @@ class VideoTracker(nn.Module):
         `last` holds the poses of the frame before, for candidates.
         """
         state = self.measurer.init()
-
-        def with_faces() -> Iterator[tuple[Image, FaceTracks]]:
-            tracks = state.faces
-            for frame in frames:
-                image = as_image(getattr(frame, "image", frame))
-                with torch.no_grad():
-                    tracks = self.measurer.follow_faces(tracks, image)
-                yield image, tracks
-
-        current = state
-        for image, tracks in prefetch(with_faces()):
+        for image, tracks in prefetch(self._follow_faces(frames, state.faces)):
             with torch.no_grad():
                 candidates = _candidates(last) if self.candidates else None
-                current, measured = self.measurer.step(current, image, tracks, candidates)
+                state, measured = self.measurer.step(state, image, tracks, candidates)
             yield image, measured
+
+    def _follow_faces(
+        self, frames: Iterable[Any] | Tensor, tracks: FaceTracks
+    ) -> Iterator[tuple[Image, FaceTracks]]:
+        """Yield frames and the faces in them."""
+        for frame in frames:
+            image = as_image(getattr(frame, "image", frame))
+            with torch.no_grad():
+                tracks = self.measurer.follow_faces(tracks, image)
+            yield image, tracks
 
 
 def as_image(image: Any) -> Image:

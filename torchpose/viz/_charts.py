@@ -22,6 +22,7 @@ from torchpose.viz._style import (
     add_legend,
     join_unit,
     joint_colors,
+    legend_line,
     method_styles,
     new_figure,
     readable,
@@ -46,7 +47,8 @@ __all__ = [
 CURVE_JOINTS = ("hand_left", "elbow_left", "hand_right", "elbow_right")
 ERROR_JOINTS = ("hand_left", "hand_right", "elbow_left", "elbow_right", "shoulder_left",
                 "shoulder_right")  # fmt: skip
-_GAP = "#F1E9D2"
+_GAP, _BAND = "#F1E9D2", "#EDEDED"
+_DASHED = (0, (3, 1.5))
 
 
 def plot_joint_curves(
@@ -72,7 +74,6 @@ def plot_joint_curves(
     """
     check_shape("joints", joints, [None, 8, None])
     require_matplotlib()
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     rows, dims = _indices(show), joints.shape[-1]
@@ -102,7 +103,7 @@ def plot_joint_curves(
                 )  # fmt: skip
             if truth is not None:
                 ax.plot(time, to_numpy(truth[:, joint, d]), color=INK, linewidth=1.1,
-                        linestyle=(0, (3, 1.5)))  # fmt: skip
+                        linestyle=_DASHED)  # fmt: skip
             ax.plot(time, middle, color=colors[joint], linewidth=1.5)
             ax.margins(x=0)
             if dims == 2 and d == 1:
@@ -110,13 +111,11 @@ def plot_joint_curves(
         note = "\n(inferred throughout)" if never else ""
         label = readable(UPPER_BODY[joint]) + note
         grid[row, 0].set_ylabel(label, fontsize=NORMAL, color=INK)
-    entries: list[Any] = [Line2D([], [], color=MUTED, linewidth=1.5, label="estimate")]
+    entries = [legend_line("estimate", MUTED, linewidth=1.5)]
     if covariance is not None:
         entries.append(Patch(color=PALE, label=f"{100 * level:.0f} % band"))
     if truth is not None:
-        entries.append(
-            Line2D([], [], color=INK, linewidth=1.1, linestyle=(0, (3, 1.5)), label="truth")
-        )
+        entries.append(legend_line("truth", linewidth=1.1, linestyle=_DASHED))
     if observed is not None:
         entries.append(Patch(color=_GAP, label="not measured here: inferred"))
     figure.align_ylabels(grid[:, 0])
@@ -187,11 +186,9 @@ def plot_errors_over_time(
 
 
 def _line_entries(styles: Mapping[str, Mapping[str, Any]], bound: str | None = None) -> list[Any]:
-    from matplotlib.lines import Line2D
-
-    entries = [Line2D([], [], linewidth=1.8, label=name, **s) for name, s in styles.items()]
+    entries = [legend_line(name, linewidth=1.8, **style) for name, style in styles.items()]
     if bound is not None:
-        entries.append(Line2D([], [], color=MUTED, linewidth=0.9, label=bound))
+        entries.append(legend_line(bound, MUTED, linewidth=0.9))
     return entries
 
 
@@ -211,7 +208,6 @@ def plot_error_bars(
         title: above the picture.
     """
     require_matplotlib()
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     styles = method_styles(list(errors))
@@ -232,7 +228,7 @@ def plot_error_bars(
         average = float(flat.nanmean())
         label = f"{name} (mean {average:.1f} {unit})"
         entries.append(Patch(color=styles[name]["color"], alpha=0.85, label=label))
-    entries.append(Line2D([], [], color=INK, linewidth=1.1, label="middle half of the errors"))
+    entries.append(legend_line("middle half of the errors", linewidth=1.1))
     ax.set_xticks(range(8), [readable(n).replace(" ", "\n") for n in UPPER_BODY])
     ax.tick_params(axis="x", length=0, labelsize=NORMAL, labelcolor=INK)
     ax.set_ylim(bottom=0)
@@ -305,7 +301,7 @@ def plot_reliability(
         ax = style_axes(grid.flat[place], title=readable(joint))
         ax.fill_between(
             [0, 100], [-100 * tolerance, 100 - 100 * tolerance],
-            [100 * tolerance, 100 + 100 * tolerance], color="#EDEDED", linewidth=0, zorder=0,
+            [100 * tolerance, 100 + 100 * tolerance], color=_BAND, linewidth=0, zorder=0,
         )  # fmt: skip
         ax.plot([0, 100], [0, 100], color=MUTED, linewidth=0.9, zorder=1)
         for name, curve in by_name.items():
@@ -322,6 +318,6 @@ def plot_reliability(
             ax.set_xlabel("nominal (%)", fontsize=NORMAL, color=INK)
     for ax in grid.flat[len(names) :]:
         ax.set_visible(False)
-    band = Patch(color="#EDEDED", label=f"within {100 * tolerance:g} points")
+    band = Patch(color=_BAND, label=f"within {100 * tolerance:g} points")
     add_legend(figure, [*_line_entries(styles), band])
     return figure

@@ -12,14 +12,16 @@ from torchpose.errors import InputError, ShapeError
 from torchpose.viz._style import (
     INK,
     LEFT,
-    MIDDLE,
     MUTED,
     PALE,
     RIGHT,
+    SIDE_COLORS,
     SMALL,
     add_legend,
+    legend_line,
     method_styles,
     new_figure,
+    side_of,
     style_axes,
     to_numpy,
 )
@@ -190,13 +192,11 @@ def _draw_figure(ax: Axes, body: Body, pose: Tensor, shift: float) -> None:
     for joint, parent in enumerate(body.skeleton.parents):
         if parent < 0:
             continue
-        name = body.skeleton.names[joint]
-        left, right = name.startswith("left_"), name.startswith("right_")
-        color = LEFT if left else RIGHT if right else MIDDLE
+        side = side_of(body.skeleton.names[joint])
         ends = to_numpy(pose[[parent, joint]])
         ax.plot(
-            ends[:, _SIDE] + shift, ends[:, _UP], color=color, linewidth=2.4,
-            solid_capstyle="round", zorder=1 if left else 3 if right else 2,
+            ends[:, _SIDE] + shift, ends[:, _UP], color=SIDE_COLORS[side], linewidth=2.4,
+            solid_capstyle="round", zorder=("left", "middle", "right").index(side) + 1,
         )  # fmt: skip
 
 
@@ -222,13 +222,11 @@ def _number(ax: Axes, places: Tensor) -> None:
 def _legend(
     fitted: Mapping[str, Any], watched: Mapping[str, Any], styles: Mapping[str, dict[str, Any]]
 ) -> list[Any]:
-    from matplotlib.lines import Line2D
-
     def entry(name: str, dashes: Any, face: str | None) -> Any:
         color = styles[name]["color"]
-        return Line2D(
-            [], [], color=color, linestyle=dashes, linewidth=1.3, marker="o", markersize=6,
-            markerfacecolor=face or color, label=name,
+        return legend_line(
+            name, color, linestyle=dashes, linewidth=1.3, marker="o", markersize=6,
+            markerfacecolor=face or color,
         )  # fmt: skip
 
     entries = [entry(name, "-", None) for name in fitted]
@@ -302,15 +300,13 @@ def _draw(ax: Axes, lines: Tensor, mean: Tensor, reach: Tensor) -> None:
 
 
 def _action_legend(deviations: float) -> list[Any]:
-    from matplotlib.lines import Line2D
-
+    spread = f"{deviations:g} standard deviations"
     return [
-        Line2D([], [], color=LEFT, linewidth=0.8, alpha=0.7, label="performances"),
-        Line2D([], [], color=RIGHT, linewidth=2.4, label="mean performance"),
-        Line2D([], [], color=INK, linewidth=1.1, linestyle=(0, (4, 2)),
-               label=f"{deviations:g} standard deviations"),
-        Line2D([], [], color=MUTED, linewidth=0.8, linestyle=":", label="key frames"),
-    ]  # fmt: skip
+        legend_line("performances", LEFT, linewidth=0.8, alpha=0.7),
+        legend_line("mean performance", RIGHT, linewidth=2.4),
+        legend_line(spread, linewidth=1.1, linestyle=(0, (4, 2))),
+        legend_line("key frames", MUTED, linewidth=0.8, linestyle=":"),
+    ]
 
 
 def _action_title(space: ActionSpace) -> str:

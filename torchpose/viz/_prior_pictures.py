@@ -15,17 +15,22 @@ from torchpose.errors import InputError
 from torchpose.math._rotations import RotationOrder, euler_to_matrix
 from torchpose.viz._skeletons import ARM_LIMBS, _limits, _set_view, draw_skeleton
 from torchpose.viz._style import (
+    GRID,
     INK,
     LEFT,
     MIDDLE,
     MUTED,
     NORMAL,
     RIGHT,
+    SIDE_COLORS,
     SMALL,
     add_legend,
+    label_row,
+    legend_line,
     new_figure,
     style_axes,
     to_numpy,
+    weight_bar,
 )
 
 if TYPE_CHECKING:
@@ -40,11 +45,9 @@ __all__ = ["plot_log_likelihood", "plot_prior_components", "plot_prior_samples"]
 
 _FRONT, _SIDE = (0, 1), (2, 1)
 _VIEWS = {"front": _FRONT, "side": _SIDE}
-_COLORS = {"left": LEFT, "right": RIGHT}
 _PER_ROW, _PANEL = 6, 1.9  # panels and their width in inches
 _DRAWS_OF_A_COMPONENT = 25
-_TRACK = "#E4E4E4"
-_SEEN, _UNSEEN = "#0072B2", "#D55E00"
+_SEEN, _UNSEEN = LEFT, RIGHT  # the same two colours
 
 
 class _Component(NamedTuple):
@@ -122,7 +125,7 @@ def _components(
     if name == "pose":
         arms = {"left": prior.left, "right": prior.right}
     elif name in prior.windows:
-        arms = {side: getattr(prior.windows[name], side) for side in _COLORS}
+        arms = {side: getattr(prior.windows[name], side) for side in ("left", "right")}
     else:
         known = ", ".join(["pose", *prior.windows])
         raise InputError(f"mixture must be one of {known}, got {name!r}")
@@ -193,7 +196,7 @@ def _draw_components(
                 if pick == _SIDE and side == "right" and len(component.means) > 1:
                     continue  # seen from the side the mirror image is the same
                 _draw_arms(ax, component.draws[side][..., pick] + offset, side)
-                colors = [_COLORS[side]] * 3 + [MIDDLE] * 2
+                colors = [SIDE_COLORS[side]] * 3 + [MIDDLE] * 2
                 draw_skeleton(
                     ax, mean[:, pick] + offset, colors=colors, limbs=ARM_LIMBS,
                     linewidth=1.0 + 1.4 * share, alpha=0.35 + 0.65 * share,
@@ -203,8 +206,8 @@ def _draw_components(
             xlim=(float(low[0]), float(high[0]) + size[2]),
             ylim=(float(high[1]), float(low[1])),
         )
-        ax.plot(2 * [float(high[0])], [float(low[1]), float(high[1])], color=_TRACK, linewidth=0.8)
-        _weight_bar(ax, component.weight, share)
+        ax.plot(2 * [float(high[0])], [float(low[1]), float(high[1])], color=GRID, linewidth=0.8)
+        weight_bar(ax, component.weight, share)
 
 
 def _draw_arms(
@@ -212,36 +215,17 @@ def _draw_arms(
 ) -> None:
     """Thin lines from shoulder to hand."""
     flat = to_numpy(arms[:, :3])
-    ax.plot(
-        flat[..., 0].T,
-        flat[..., 1].T,
-        color=_COLORS[side],
-        linewidth=linewidth,
-        alpha=alpha,
-        zorder=1,
-    )
-
-
-def _weight_bar(ax: Axes, weight: float, share: float) -> None:
-    percent = 100 * weight
-    text = f"{percent:.1f} %" if percent >= 0.05 else "< 0.1 %"
-    ax.set_title(text, fontsize=SMALL, color=INK, pad=7)
-    for length, color in ((1.0, _TRACK), (share, INK)):
-        ax.plot(
-            [0, length], [1.03, 1.03], transform=ax.transAxes, color=color, linewidth=3,
-            clip_on=False, solid_capstyle="butt",
-        )  # fmt: skip
+    style = {"linewidth": linewidth, "alpha": alpha, "zorder": 1}
+    ax.plot(flat[..., 0].T, flat[..., 1].T, color=SIDE_COLORS[side], **style)
 
 
 def _component_legend(on_one_body: bool) -> list[Any]:
-    from matplotlib.lines import Line2D
-
     right = "right arm, the mirror image" if on_one_body else "person's right arm"
     return [
-        Line2D([], [], color=LEFT, linewidth=3, label="person's left arm"),
-        Line2D([], [], color=RIGHT, linewidth=3, label=right),
-        Line2D([], [], color=MUTED, linewidth=2.4, marker="o", label="mean"),
-        Line2D([], [], color=MUTED, linewidth=0.6, alpha=0.6, label="draws from the component"),
+        legend_line("person's left arm", LEFT, linewidth=3),
+        legend_line(right, RIGHT, linewidth=3),
+        legend_line("mean", MUTED, linewidth=2.4, marker="o"),
+        legend_line("draws from the component", MUTED, linewidth=0.6, alpha=0.6),
     ]
 
 
@@ -296,8 +280,7 @@ def plot_prior_samples(
             draw_skeleton(ax, body[:, pick], linewidth=2.2)
             _set_view(ax, *limits, pick)
             if column == 0:
-                ax.text(0.0, 0.5, name, transform=ax.transAxes, rotation=90, va="center",
-                        ha="right", fontsize=SMALL, color=MUTED)  # fmt: skip
+                label_row(ax, name)
     _draw_cloud(cloud, bodies[:n_cloud])
     add_legend(figure, _sample_legend())
     return figure
@@ -317,20 +300,19 @@ def _draw_cloud(part: SubFigure, bodies: Float[Tensor, "N 8 3"]) -> None:
             trunk = to_numpy(arms[:, 2:])
             ax.plot(trunk[..., 0].T, trunk[..., 1].T, color=MIDDLE, linewidth=0.6, alpha=0.06)
             hands = to_numpy(arms[:, 0])
-            ax.scatter(hands[:, 0], hands[:, 1], s=7, color=_COLORS[side], linewidths=0, alpha=0.6)
+            ax.scatter(
+                hands[:, 0], hands[:, 1], s=7, color=SIDE_COLORS[side], linewidths=0, alpha=0.6
+            )
         ax.set_aspect("equal")
         ax.set_xlim(float(low[pick[0]]), float(high[pick[0]]))
     panels[0].set_ylim(float(high[1]), float(low[1]))
 
 
 def _sample_legend() -> list[Any]:
-    from matplotlib.lines import Line2D
-
-    dot: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 4}
     return [
-        Line2D([], [], color=LEFT, linewidth=3, label="person's left arm"),
-        Line2D([], [], color=RIGHT, linewidth=3, label="person's right arm"),
-        Line2D([], [], color=MUTED, label="hands of all draws", **dot),
+        legend_line("person's left arm", LEFT, linewidth=3),
+        legend_line("person's right arm", RIGHT, linewidth=3),
+        legend_line("hands of all draws", MUTED, marker="o", linestyle="", markersize=4),
     ]
 
 
@@ -382,14 +364,12 @@ def plot_log_likelihood(
 
 
 def _likelihood_legend(held_out: bool) -> list[Any]:
-    from matplotlib.lines import Line2D
-
-    dots: dict[str, Any] = {"marker": "o", "markersize": 4, "linewidth": 1.8}
-    entries = [Line2D([], [], color=_SEEN, linewidth=1.8, label="training persons")]
+    entries = [legend_line("training persons", _SEEN, linewidth=1.8)]
     if held_out:
-        entries.append(Line2D([], [], color=_UNSEEN, label="held-out persons", **dots))
-    best = Line2D([], [], color=INK, marker="D", markersize=5, linestyle="", label="best step")
-    return [*entries, best]
+        entries.append(
+            legend_line("held-out persons", _UNSEEN, marker="o", markersize=4, linewidth=1.8)
+        )
+    return [*entries, legend_line("best step", marker="D", markersize=5, linestyle="")]
 
 
 def _draw_likelihood(

@@ -19,6 +19,7 @@ from torchpose.viz._style import (
     PALE,
     RIGHT,
     add_legend,
+    legend_line,
     new_figure,
     to_numpy,
 )
@@ -143,10 +144,8 @@ def _cloud(
 
 
 def _legend() -> list[Any]:
-    from matplotlib.lines import Line2D
-
     kinds = (("draws", LEFT, 3), ("sigma points", RIGHT, 6), ("mean", INK, 7))
     return [
-        Line2D([], [], color=color, marker="o", markersize=size, linestyle="", label=label)
+        legend_line(label, color, marker="o", markersize=size, linestyle="")
         for label, color, size in kinds
     ]

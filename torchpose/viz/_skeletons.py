@@ -25,9 +25,12 @@ from torchpose.viz._style import (
     SMALL,
     add_legend,
     joint_colors,
+    label_row,
+    legend_line,
     new_figure,
     style_axes,
     to_numpy,
+    weight_bar,
 )
 
 if TYPE_CHECKING:
@@ -120,22 +123,22 @@ def _draw_ellipse(
 def _legend_entries(
     observed: Tensor | None, covariance: Tensor | None, truth: Tensor | None, level: float
 ) -> list[Any]:
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    entries: list[Any] = [
-        Line2D([], [], color=LEFT, linewidth=3, label="person's left arm"),
-        Line2D([], [], color=RIGHT, linewidth=3, label="person's right arm"),
+    entries = [
+        legend_line("person's left arm", LEFT, linewidth=3),
+        legend_line("person's right arm", RIGHT, linewidth=3),
     ]
     if observed is not None:
-        dot: dict[str, Any] = {"marker": "o", "linestyle": "", "markeredgecolor": MIDDLE}
-        entries.append(Line2D([], [], markerfacecolor=MIDDLE, label="measured", **dot))
-        entries.append(Line2D([], [], markerfacecolor="white", label="inferred", **dot))
+        for name, face in (("measured", MIDDLE), ("inferred", "white")):
+            entries.append(
+                legend_line(name, MIDDLE, marker="o", linestyle="", markerfacecolor=face)
+            )
     if covariance is not None:
         label = f"{100 * level:.0f} % ellipse"
         entries.append(Patch(facecolor="#DDDDDD", edgecolor=MUTED, label=label))
     if truth is not None:
-        entries.append(Line2D([], [], color=PALE, linewidth=2.5, label="truth"))
+        entries.append(legend_line("truth", PALE, linewidth=2.5))
     return entries
 
 
@@ -281,8 +284,7 @@ def plot_pose_strip(
             draw_skeleton(ax, joints[frame][:, pick], observed=seen, linewidth=2.2)
             _set_view(ax, low, high, pick)
             if len(views) == 2 and column == 0:
-                ax.text(0.0, 0.5, ("front", "side")[row], transform=ax.transAxes, rotation=90,
-                        va="center", ha="right", fontsize=SMALL, color=MUTED)  # fmt: skip
+                label_row(ax, ("front", "side")[row])
         word = f"\n{labels[frame]}" if labels is not None else ""
         top = grid[line * len(views), column]
         top.set_title(f"{frame / fps:.1f} s{word}", fontsize=SMALL, color=INK)
@@ -346,11 +348,5 @@ def plot_prior_means(
             draw_skeleton(ax, poses[k], colors=colors, limbs=ARM_LIMBS, linewidth=2.0)
             ax.set_aspect("equal")
             ax.set(xlim=(float(low[0]), float(high[0])), ylim=(float(high[1]), float(low[1])))
-            percent = 100 * float(weights[k])
-            text = f"{percent:.1f} %" if percent >= 0.05 else "< 0.1 %"
-            ax.set_title(text, fontsize=SMALL, color=INK, pad=7)
-            ax.plot([0, 1], [1.03, 1.03], transform=ax.transAxes, color="#E4E4E4", linewidth=3,
-                    clip_on=False, solid_capstyle="butt")  # fmt: skip
-            ax.plot([0, share], [1.03, 1.03], transform=ax.transAxes, color=INK, linewidth=3,
-                    clip_on=False, solid_capstyle="butt")  # fmt: skip
+            weight_bar(ax, float(weights[k]), share)
     return figure

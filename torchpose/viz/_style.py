@@ -26,21 +26,27 @@ __all__ = [
     "NORMAL",
     "PALE",
     "RIGHT",
+    "SIDE_COLORS",
     "SMALL",
     "add_legend",
     "join_unit",
     "joint_colors",
+    "label_row",
+    "legend_line",
     "method_styles",
     "new_figure",
     "readable",
     "require_matplotlib",
     "save_figure",
+    "side_of",
     "style_axes",
     "to_numpy",
+    "weight_bar",
 ]
 
 INK, MUTED, PALE, GRID = "#222222", "#666666", "#B8B8B8", "#E4E4E4"
 LEFT, RIGHT, MIDDLE = "#0072B2", "#D55E00", "#555555"
+SIDE_COLORS = {"left": LEFT, "right": RIGHT, "middle": MIDDLE}
 _METHODS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (5, 1, 1, 1)), (0, (8, 2)),
                             (0, (3, 1, 1, 1, 1, 1)), "-")  # fmt: skip
@@ -112,6 +118,28 @@ def add_legend(figure: Figure, handles: Iterable[Any]) -> None:
     )
 
 
+def legend_line(label: str, color: str = INK, **style: Any) -> Any:
+    """Return the entry of a legend for a line or marker, with matplotlib's options of a `Line2D`."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], color=color, label=label, **style)
+
+
+def weight_bar(ax: Axes, weight: float, share: float) -> None:
+    """Draw a weight as the title of a panel, and its share of the largest one as a bar below."""
+    ax.set_title(f"{100 * weight:.1f} %" if weight >= 5e-4 else "< 0.1 %",
+                 fontsize=SMALL, color=INK, pad=7)  # fmt: skip
+    for length, color in ((1.0, GRID), (share, INK)):
+        ax.plot([0, length], [1.03, 1.03], transform=ax.transAxes, color=color, linewidth=3,
+                clip_on=False, solid_capstyle="butt")  # fmt: skip
+
+
+def label_row(ax: Axes, text: str) -> None:
+    """Draw an upright label to the left of a panel without axes."""
+    ax.text(0.0, 0.5, text, transform=ax.transAxes, rotation=90, va="center", ha="right",
+            fontsize=SMALL, color=MUTED)  # fmt: skip
+
+
 def method_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Colour and dashes of each method, in the order given."""
     if not names:
@@ -124,8 +152,16 @@ def method_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 def joint_colors(names: Sequence[str]) -> list[str]:
     """Blue for the person's left, orange for the right, grey for the rest."""
-    sides = {"left": LEFT, "right": RIGHT}
-    return [sides.get(name.rsplit("_", 1)[-1], MIDDLE) for name in names]
+    return [SIDE_COLORS[side_of(name)] for name in names]
+
+
+def side_of(name: str) -> str:
+    """Return "left", "right" or "middle", the side of a joint by its name.
+
+    >>> side_of("hand_left"), side_of("right_knee"), side_of("neck")
+    ('left', 'right', 'middle')
+    """
+    return next((side for side in ("left", "right") if side in name.split("_")), "middle")
 
 
 def readable(name: str) -> str:

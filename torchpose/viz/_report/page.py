@@ -26,7 +26,7 @@ from torchpose.viz._report.packing import (
     Thinned,
     pack_person,
 )
-from torchpose.viz._style import readable
+from torchpose.viz._style import readable, side_of
 
 __all__ = ["MAX_EMBEDDED", "write_report"]
 
@@ -101,7 +101,7 @@ def write_report(
         "fps": fps,
         "frames": n_frames,
         "names": [readable(name) for name in joints],
-        "sides": [_side(name) for name in joints],
+        "sides": [side_of(name) for name in joints],
         "limbs": [list(pair) for pair in limbs],
         "frame": people[0].frame if people else "camera",
         "video": None if video is None else video.source,
@@ -253,10 +253,6 @@ def _facts(facts: dict[str, str]) -> str:
 def _list(notes: Sequence[str]) -> str:
     items = "".join(f"<li>{html.escape(str(note))}</li>\n" for note in notes)
     return f"<ul>\n{items}</ul>" if items else "<p>None.</p>"
-
-
-def _side(name: str) -> str:
-    return next((side for side in ("left", "right") if side in name.split("_")), "middle")
 
 
 def _check(
