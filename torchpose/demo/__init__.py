@@ -1,4 +1,4 @@
-"""An animated performer with known joints: what the demo, the examples and the tests track."""
+"""Animate a performer with known joints, for the demo, the examples and the tests."""
 
 from torchpose._core.facade import set_up_facade
 from torchpose.demo._performer import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer

@@ -1,4 +1,4 @@
-"""A jointed upper body: joint angles in, joints out, bones of fixed length.
+"""Compute the joints of an upper body from joint angles, with bones of fixed length.
 
 Axes of the body at rest are those of a camera that the person faces: x towards the person's own
 left, y down, z away from the camera (to the person's back). An arm has four angles:
@@ -37,7 +37,7 @@ _ELBOW_SIDE = (0.40, 0.80, 0.35)  # where the elbow goes, seen from the line to 
 
 @dataclass(frozen=True)
 class BodySize:
-    """Bone lengths in metres; the defaults are those of Kinect v1 recordings of adults.
+    """Holds bone lengths in metres; the defaults are those of Kinect v1 recordings of adults.
 
     Args:
         upper_arm, forearm: shoulder to elbow, elbow to wrist.
@@ -64,7 +64,7 @@ class BodySize:
 
 
 class BodyAngles(NamedTuple):
-    """A movement as joint angles, radians.
+    """Holds a movement as joint angles, radians.
 
     Attributes:
         position: of the hips relative to their place at rest [T, 3], metres.
@@ -102,7 +102,7 @@ def angles_to_joints(
     up = like.new_tensor([0.0, -size.torso, 0.0])
     neck = angles.position - up + torso @ up
     head = neck + _turn(torso @ euler_to_matrix(angles.head), [0.0, -size.head, -0.03])
-    # One arm is worked out for both sides, as a left arm; the right one is its mirror image.
+    # Both arms are computed as left arms; the right one is then mirrored.
     abduction, flexion, twist, elbow = angles.arms.unbind(-1)
     zero = torch.zeros_like(abduction)
     raised = torch.hypot(abduction, flexion)
@@ -144,7 +144,7 @@ def hands_to_arms(
         size: bone lengths.
 
     Returns:
-        Abduction, flexion, twist, elbow, radians; only the elbow is within `ANGLE_LIMITS` for sure.
+        Abduction, flexion, twist, elbow, radians; only the elbow is certain to be within `ANGLE_LIMITS`.
 
     Example:
         >>> hands = torch.tensor([[[0.1, 0.2, -0.3], [-0.1, 0.2, -0.3]]])
@@ -185,7 +185,7 @@ def hands_to_arms(
 
 
 def _shoulder(raised: Tensor, size: BodySize) -> Tensor:
-    """Place of the left shoulder from the neck [..., 3] for an arm that is raised so far, radians."""
+    """Return the left shoulder relative to the neck [..., 3] for an arm raised by an angle, radians."""
     shrug = 0.24 * torch.nn.functional.softplus(raised - math.radians(30), beta=6.0)
     zero = torch.zeros_like(shrug)
     collar = rotvec_to_matrix(torch.stack([zero, zero, -shrug], -1))

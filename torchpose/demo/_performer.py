@@ -1,8 +1,8 @@
-"""A procedurally animated performer: joint angles between key frames, bones of fixed length.
+"""Animate a performer: joint angles between key frames, bones of fixed length.
 
-The movement (wave, reach, cross the arms, a hand at the face, rest) is written down here as joint
-angles. It is not drawn from any prior, so tracking it is a fair smoke test. The body, and what its
-angles mean, is `torchpose.demo._mannequin`.
+The movement (wave, reach, cross the arms, a hand at the face, rest) is given as joint angles. It is not
+sampled from any prior, so that tracking it is a fair test. The body and its angles are defined in
+`torchpose.demo._mannequin`.
 """
 
 import math
@@ -37,19 +37,19 @@ __all__ = [
 ]
 
 KEYPOINT_NAMES = ("head", "neck", "hand_left", "hand_right")
-"""What `noisy_keypoints` gives, in its order."""
+"""Names of the keypoints of `noisy_keypoints`, in its order."""
 
 
 class Performance(NamedTuple):
-    """The animated performer.
+    """Holds the joints of an animated performer.
 
     Attributes:
         joints: [T, 8, 3], camera axes, metres, in the order of `torchpose.skeleton.UPPER_BODY`.
         body: the same in the body frame [T, 8, 3]: origin at the neck of the body at rest.
         wrists: left and right wrist [T, 2, 3], camera axes.
-        angles: what the joints were made from.
+        angles: of the joints.
         rotation, translation: [3, 3], [3]: joints = rotation body + translation.
-        labels: what the performer does, one word for each frame.
+        labels: the action, one word for each frame.
         fps: frames per second. names: of the joints.
     """
 
@@ -70,7 +70,7 @@ class Performance(NamedTuple):
 def minimum_jerk(
     times: Float[Tensor, " T"], keys: Float[Tensor, " N"], values: Float[Tensor, "N *shape"]
 ) -> Float[Tensor, "T *shape"]:
-    """Interpolate key frames the way hands move: at rest in every key, smooth in between.
+    """Return key frames interpolated with minimum jerk: at rest in every key, smooth in between.
 
     x(s) = a + (b - a) (10 s^3 - 15 s^4 + 6 s^5), s from 0 to 1 between two keys.
 
@@ -152,15 +152,15 @@ def performer_angles(
     seed: int = 0,
     dtype: torch.dtype = torch.float64,
 ) -> tuple[BodyAngles, tuple[str, ...]]:
-    """Return the joint angles of the performance, and what the performer does in each frame.
+    """Return the joint angles of the performance, and the action in each frame.
 
-    Key frames with minimum-jerk movements between them; the torso starts a little before the arms;
-    slow sway, breathing and tremor on top, because nobody stands still. After 20 s it starts over.
+    Movements between key frames have minimum jerk, and the torso starts a little before the arms. Slow
+    sway, breathing and tremor are added. The performance repeats after 20 s.
 
     Args:
         n_frames: T.
         fps: frames per second.
-        seed: of the sway, and of how far each movement goes (some 3 %).
+        seed: of the sway, and of the amplitude of each movement (about 3 %).
         dtype: of the result.
     """
     if n_frames < 1 or not fps > 0:
@@ -194,7 +194,7 @@ def performer_angles(
 
 
 def hip_sway(clock: Tensor, generator: torch.Generator) -> Float[Tensor, "T 3"]:
-    """Return how the hips move while one stands and breathes, metres."""
+    """Return the motion of the hips while standing and breathing, metres."""
     position = sway(clock, (3,), 0.008, (0.08, 0.3), generator)
     breathing = 0.003 * torch.sin(2 * math.pi * 0.25 * clock)
     position[:, 1] = 0.3 * position[:, 1] + breathing
@@ -208,7 +208,7 @@ def sway(
     band: tuple[float, float],
     generator: torch.Generator,
 ) -> Tensor:
-    """Return a slow sway, since nobody stands still: four sinusoids of random phase and frequency.
+    """Return a slow sway: the sum of four sinusoids of random phase and frequency.
 
     Args:
         clock: seconds [T]. shape: of what sways. amplitude: about its root mean square.
@@ -238,15 +238,15 @@ def performer(
     """Return the animated performer in front of `demo_camera`.
 
     Args:
-        n_frames: T; the performance takes 20 s and then starts over.
+        n_frames: T; the performance repeats after 20 s.
         fps: frames per second.
-        seed: of the natural variation.
+        seed: of the variation.
         size: bone lengths.
         distance: of the neck from the camera, metres.
         dtype: of the result.
 
     Returns:
-        `Performance`.
+        The performance in camera axes.
 
     >>> performer(n_frames=2).joints.shape
     torch.Size([2, 8, 3])
@@ -309,7 +309,7 @@ def noisy_keypoints(
     gap: tuple[str, float, float] | None = ("hand_right", 2.6, 1.0),
     fps: float = 30.0,
 ) -> Float[Tensor, "T 4 2"]:
-    """Return what a detector of head, neck and hands would give: pixels with noise and a gap.
+    """Return simulated detections of head, neck and hands: pixels with noise and a gap.
 
     Args:
         joints: [T, 8, 3], camera axes, metres.

@@ -1,4 +1,4 @@
-"""Video in and out: files, folders of images and cameras; H.264 files that a browser plays."""
+"""Read video from files, folders of images and cameras; write H.264 files that a browser plays."""
 
 from torchpose._core.facade import set_up_facade
 from torchpose.video._base import VideoFrame, VideoSource

@@ -1,4 +1,4 @@
-"""What every source of frames has in common: files, folders of images, cameras."""
+"""Define the interface of video sources: files, folders of images, cameras."""
 
 import abc
 from collections.abc import Iterator
@@ -12,10 +12,10 @@ __all__ = ["Image", "VideoFrame", "VideoSource"]
 
 
 class VideoFrame(NamedTuple):
-    """One frame of a video.
+    """Holds one frame of a video.
 
     Attributes:
-        image: RGB, uint8, [H, W, 3], C-contiguous; its receiver may draw on it.
+        image: RGB, uint8, [H, W, 3], C-contiguous; the receiver may draw on it.
         time: seconds since the first frame. Files and folders: index / fps, exactly. Cameras: clock.
         index: 0, 1, 2, ...
     """
@@ -26,16 +26,16 @@ class VideoFrame(NamedTuple):
 
 
 class VideoSource(abc.ABC):
-    """Frames of one size at a constant rate, read once from front to back.
+    """Yields frames of one size at a constant rate, once, from the first to the last.
 
-    A source is an iterator over `VideoFrame` and a context manager. What was noticed about the input
-    (a rotated or truncated file, frames that were repeated) stands in `notes`, in plain words; some of
-    it is known only after the last frame.
+    A source is an iterator over `VideoFrame` and a context manager. Findings about the input (a rotated
+    or truncated file, repeated frames) are sentences in `notes`; some are known only after the last
+    frame.
 
     Attributes:
-        name: what the user gave. fps: frames per second. size: (width, height) of every frame, pixels.
-        n_frames: how many frames to expect, an estimate; None if it cannot be told (a camera).
-        notes: what was noticed so far. reopenable: whether `reopen` works.
+        name: as given by the user. fps: frames per second. size: (width, height) of every frame, pixels.
+        n_frames: estimated number of frames; None if unknown (a camera).
+        notes: findings so far. reopenable: whether `reopen` works.
     """
 
     reopenable = False
@@ -51,14 +51,14 @@ class VideoSource(abc.ABC):
 
     @abc.abstractmethod
     def _read(self) -> Iterator[VideoFrame]:
-        """The frames, as a generator that is started once."""
+        """Return a generator over the frames, which is started once."""
 
     @abc.abstractmethod
     def _release(self) -> None:
-        """Give back what the source holds open."""
+        """Release the resources of the source."""
 
     def reopen(self) -> "VideoSource":
-        """A new source that starts at the first frame of the same input.
+        """Return a new source that starts at the first frame of the same input.
 
         Raises:
             InputError: a camera, which cannot be read twice.
@@ -68,7 +68,7 @@ class VideoSource(abc.ABC):
         )
 
     def close(self) -> None:
-        """Give back what is held open; may be called any number of times. `notes` stay."""
+        """Release the resources; may be called repeatedly. `notes` remain."""
         if not self._closed:
             self._closed = True
             self._frames = None

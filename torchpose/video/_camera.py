@@ -1,4 +1,4 @@
-"""Cameras, read by OpenCV."""
+"""Read cameras by OpenCV."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -9,14 +9,14 @@ from torchpose.video._base import VideoFrame, VideoSource
 
 __all__ = ["CameraSource", "Capture"]
 
-_WARM_UP = 10  # frames that are read and left out: exposure settles, and the rate can be measured
-_PATIENCE = 5  # reads without a frame, one after another, before a camera counts as gone
+_WARM_UP = 10  # frames that are discarded: exposure settles, and the rate is measured
+_PATIENCE = 5  # reads without a frame, one after another, before a camera counts as unplugged
 _PAUSE = 0.02  # seconds between them
 
 
 @runtime_checkable
 class Capture(Protocol):
-    """The part of `cv2.VideoCapture` that is used."""
+    """Declares the part of `cv2.VideoCapture` that is used."""
 
     def isOpened(self) -> bool: ...
 
@@ -30,14 +30,14 @@ class Capture(Protocol):
 
 
 class CameraSource(VideoSource):
-    """Frames of a camera, until it is closed or unplugged.
+    """Yields frames of a camera until it is closed or unplugged.
 
-    The rate is measured while the first frames, left out, let the exposure settle. Frames pass as they
-    come; their times are those of the clock.
+    The rate is measured over the first frames, which are discarded while the exposure settles. The times
+    of the frames are those of the clock.
 
     Args:
         index: number of the camera, from 0. fps: the rate to ask the camera for.
-        capture: makes the reader from the index; `cv2.VideoCapture` by default.
+        capture: returns the reader of an index; `cv2.VideoCapture` by default.
 
     Raises:
         InputError: no such camera, one that gives no frames, or a rate that is not positive.
@@ -69,7 +69,7 @@ class CameraSource(VideoSource):
                 f"camera {index} cannot be opened: there is none, another program uses it, or "
                 "reading it is not permitted; cameras are numbered from 0"
             )
-        self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # late frames are worth little
+        self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # no queue of old frames
         if fps is not None:
             self._capture.set(cv2.CAP_PROP_FPS, fps)
         reported = float(self._capture.get(cv2.CAP_PROP_FPS))
@@ -80,7 +80,7 @@ class CameraSource(VideoSource):
                 raise InputError(f"camera {index} opens but gives no frames; is it in use?")
             moments.append(time.monotonic())
             self.size = (image.shape[1], image.shape[0])
-        span = moments[-1] - moments[2]  # the first frames take their time
+        span = moments[-1] - moments[2]  # the first frames are late
         measured = (len(moments) - 3) / span if span > 0 else 0.0
         self.fps = reported if 1 <= reported <= 1000 else fps or 30.0
         if 1 <= measured <= 1000 and abs(measured / self.fps - 1) > 0.2:
@@ -125,7 +125,7 @@ def _open(index: int) -> Capture:
     import cv2
 
     level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the typed error says it
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the typed error reports it
     try:
         return cv2.VideoCapture(index)
     finally:

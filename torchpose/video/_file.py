@@ -1,4 +1,4 @@
-"""Video files, decoded by FFmpeg's libraries (PyAV): upright RGB frames at a constant rate."""
+"""Decode video files by FFmpeg's libraries (PyAV) to upright RGB frames at a constant rate."""
 
 import itertools
 import math
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["FileSource"]
 
 _FALLBACK_FPS = 30.0
-_FASTEST = 1000.0  # frames per second; times that say more are no times
+_FASTEST = 1000.0  # frames per second; higher rates are no valid times
 _MOST_HELD = 64  # frames in a decoder's pipeline that fail one after another
 _LATE_SOUND = 1.0  # seconds by which sound may outlast the picture
 _UNKNOWN_MATRIX = 2  # as numbered by H.273
@@ -38,13 +38,13 @@ _HDR = {16: "PQ", 18: "HLG"}
 
 
 class FileSource(VideoSource):
-    """Frames of a video file.
+    """Yields the frames of a video file.
 
     Times come from the file's own time stamps. Where frames come at a variable rate, or another rate
-    is asked for, the frame nearest to each k / fps is taken; lost frames are filled by repeating.
+    is asked for, the frame nearest to each k / fps is taken; lost frames are replaced by repeated ones.
     Rotation and mirroring of phone videos are undone, colours converted by the file's own matrix and
     range (10-bit and grey to 8-bit RGB). Frames that cannot be decoded are left out and counted in
-    `notes`, and a truncated file ends where it ends.
+    `notes`. A truncated file ends at its last frame.
 
     Args:
         path: the file. fps: the rate wanted; None is the file's own.
@@ -73,7 +73,7 @@ class FileSource(VideoSource):
             raise
 
     def reopen(self) -> "FileSource":
-        """A new source that starts at the first frame of the same file."""
+        """Return a new source that starts at the first frame of the same file."""
         return FileSource(self.path, self._wanted)
 
     def _release(self) -> None:
@@ -130,7 +130,7 @@ class FileSource(VideoSource):
             self.n_frames = self._stream.frames
 
     def _describe(self, frame: "av.VideoFrame", odd_turn: bool) -> None:
-        """Notes on what the first frame is like."""
+        """Add notes on the first frame."""
         swapped, flip_x, flip_y = self._turn
         if swapped or flip_x or flip_y:
             width, height = self.size
@@ -154,7 +154,7 @@ class FileSource(VideoSource):
             self.notes.append(f"the file's clock starts at {start:.2f} s; times count from there")
 
     def _declared_end(self, scan: Scan) -> None:
-        """A note if the file says that it is longer than it is."""
+        """Add a note if the file declares more frames than it holds."""
         if not scan.complete:
             return
         duration = self._duration() if scan.rate else 0.0
@@ -171,7 +171,7 @@ class FileSource(VideoSource):
         )
 
     def _duration(self) -> float:
-        """Seconds that the file says it lasts, 0 if it does not."""
+        """Return the declared duration, seconds; 0 if unknown."""
         return (self._container.duration or 0) / 1e6
 
     def _scan(self) -> Scan:
@@ -180,9 +180,9 @@ class FileSource(VideoSource):
             return scan_packets(container, stream)
 
     def _packets(self) -> Iterator["av.Packet"]:
-        """Packets of the video, without the broken one at the end of a truncated file.
+        """Yield packets of the video, without the broken one at the end of a truncated file.
 
-        A decoder that runs in several threads loses sound frames over it.
+        A decoder with several threads would lose intact frames because of it.
         """
         from av.error import FFmpegError
 
@@ -205,7 +205,7 @@ class FileSource(VideoSource):
             held = packet
 
     def _decode(self) -> Iterator["av.VideoFrame"]:
-        """Frames as they are stored, those left out that cannot be decoded."""
+        """Yield frames as they are stored, without those that cannot be decoded."""
         from av.error import EOFError as AvEOFError
         from av.error import FFmpegError
 
@@ -232,7 +232,7 @@ class FileSource(VideoSource):
             yield self._time(frame), frame
 
     def _time(self, frame: "av.VideoFrame") -> float | None:
-        """Seconds on the file's clock; `frame.time` has none for the last frames of a decoder."""
+        """Return seconds on the file's clock, None if unknown; the last frames have no `frame.time`."""
         if frame.pts is None or self._timeless:
             return None
         return float(frame.pts * (self._stream.time_base or 0))
@@ -273,7 +273,7 @@ class FileSource(VideoSource):
         return _upright(image, self._turn)
 
     def _tell(self) -> None:
-        """Notes on what was found while reading."""
+        """Add notes on what was found while reading."""
         tally, count = self._tally, _plural
         missing = self._kept - self._count
         if missing > 0:
@@ -311,7 +311,7 @@ def _why_no_frame(path: Path, scan: Scan) -> str:
 
 
 def _orientation(frame: "av.VideoFrame") -> tuple[tuple[bool, bool, bool], bool]:
-    """(transpose, then mirror x, then mirror y) that turn a frame upright; whether it is skewed.
+    """Return (transpose, then mirror x, then mirror y) to turn a frame upright; whether it is skewed.
 
     The matrix of the file maps (x, y) to (a x + c y, b x + d y); a, b, c, d are in 16.16 fixed point.
     """

@@ -1,4 +1,4 @@
-"""A folder of images as a video."""
+"""Read a folder of images as a video."""
 
 import re
 import struct
@@ -19,7 +19,7 @@ _DEFAULT_FPS = 30.0
 
 
 def natural_key(name: str) -> list[str | int]:
-    """Key that sorts names as people do: by the values of the numbers in them.
+    """Return a key that sorts names in natural order: by the values of the numbers in them.
 
     >>> sorted(["f10.png", "f9.png", "F1.png"], key=natural_key)
     ['F1.png', 'f9.png', 'f10.png']
@@ -29,7 +29,7 @@ def natural_key(name: str) -> list[str | int]:
 
 
 def find_images(folder: str | Path) -> list[Path]:
-    """Images directly in a folder (png, jpg, bmp, tif, webp), in natural order of their names.
+    """Return images directly in a folder (png, jpg, bmp, tif, webp), in natural order of their names.
 
     Raises:
         InputError: no such folder, or no images in it.
@@ -51,11 +51,11 @@ def find_images(folder: str | Path) -> list[Path]:
 
 
 class FolderSource(VideoSource):
-    """Images of a folder, in natural order of their names, at a constant rate.
+    """Yields the images of a folder, in natural order of their names, at a constant rate.
 
     Grey and 16-bit images become 8-bit RGB (of 16 bits the upper 8), transparency is ignored, and
-    the orientation that a camera wrote into a JPEG is undone. An image that cannot be read is a missing
-    frame: the one before is shown again, and `notes` says so.
+    the orientation that a camera wrote into a JPEG is undone. An image that cannot be read is
+    replaced by the one before, which is noted.
 
     Args:
         folder: the folder. fps: frames per second; 30 without it, which is noted.
@@ -85,7 +85,7 @@ class FolderSource(VideoSource):
         self._check_headers()
 
     def reopen(self) -> "FolderSource":
-        """A new source that starts at the first image of the same folder."""
+        """Return a new source that starts at the first image of the same folder."""
         return FolderSource(self.folder, self._wanted)
 
     def _release(self) -> None:
@@ -110,11 +110,11 @@ class FolderSource(VideoSource):
             )
 
     def _check_headers(self) -> None:
-        """Find an image of another size now rather than after an hour, where headers are simple."""
+        """Raise now if an image has another size, as far as its header can be read."""
         first = _stored_size(self._paths[0])
         for path in self._paths:
             if first is not None and _stored_size(path) not in (None, first):
-                image = _read_image(path)  # the orientation may still make them equal
+                image = _read_image(path)  # the orientation may make the sizes equal
                 if not isinstance(image, str):
                     self._check_size(path, image)
 
@@ -147,7 +147,7 @@ class FolderSource(VideoSource):
 
 
 def _read_image(path: Path) -> Image | str:
-    """The image, RGB, or in a few words why it cannot be read."""
+    """Return the image, RGB, or the reason why it cannot be read."""
     import cv2
 
     try:
@@ -169,14 +169,14 @@ def _read_image(path: Path) -> Image | str:
 
 
 def _is_cut(data: bytes) -> bool:
-    """Whether the end of a JPEG or PNG is missing, which decoders fill with grey."""
+    """Return whether the end of a JPEG or PNG is missing, which decoders fill with grey."""
     if data.startswith(b"\xff\xd8"):
         return data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
     return data.startswith(b"\x89PNG") and b"IEND" not in data[-64:]
 
 
 def _stored_size(path: Path) -> tuple[int, int] | None:
-    """Width and height in the header of a PNG, BMP or JPEG; None if they are not found at once."""
+    """Return width and height in the header of a PNG, BMP or JPEG; None if not found."""
     try:
         with path.open("rb") as stream:
             head = stream.read(32)

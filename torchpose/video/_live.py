@@ -1,4 +1,4 @@
-"""A live view in the browser: pictures over HTTP to this machine alone, with a button that stops."""
+"""Show a live view in the browser: pictures over HTTP on this machine, with a stop button."""
 
 import contextlib
 import functools
@@ -16,7 +16,7 @@ from torchpose.errors import InputError, OutputError, check_rgb
 
 __all__ = ["LiveView"]
 
-_HOST = "127.0.0.1"  # this machine only; nobody else sees the camera
+_HOST = "127.0.0.1"  # this machine only, since it shows a camera
 _BOUNDARY = "torchpose-frame"
 _PATIENCE = 1.0  # seconds after which a waiting browser gets the last picture again
 
@@ -52,12 +52,12 @@ document.addEventListener("keydown", (event) => { if (event.key === "q") stop();
 
 
 class LiveView:
-    """Shows pictures in a browser while they are made, and notices when the user wants to stop.
+    """Shows pictures in a browser as they are made, and reports a request to stop.
 
-    A small server listens on 127.0.0.1 for as long as the block lasts, in threads of its own: a page
-    at `url` with the stream (MJPEG) and a stop button. Only the newest picture is kept, so a slow
-    browser delays nothing, and a picture is compressed only while somebody looks. If the program
-    runs in a terminal, the key q stops it as well (not under Windows).
+    A server on 127.0.0.1 runs in threads of its own until the end of the block: a page at `url` with the
+    stream (MJPEG) and a stop button. Only the newest picture is kept, so that a slow browser delays
+    nothing. Pictures are compressed only while a browser is connected. In a terminal the key q requests
+    a stop as well (not under Windows).
 
     Args:
         port: to listen on; 0 takes any that is free.
@@ -129,13 +129,13 @@ class LiveView:
 
     @property
     def stop_requested(self) -> bool:
-        """Whether somebody pressed the button, or typed q."""
+        """Return whether the button or the key q was pressed."""
         if not self._stop.is_set() and self._keys.pressed_q():
             self._stop.set()
         return self._stop.is_set()
 
     def show(self, image: Image) -> None:
-        """Make an RGB picture [H, W, 3], uint8, the newest one; does not wait for anybody.
+        """Make an RGB picture [H, W, 3], uint8, the newest one, without waiting.
 
         Raises:
             InputError: another kind of picture.
@@ -147,7 +147,7 @@ class LiveView:
             self._news.notify_all()
 
     def _pictures(self) -> Iterator[bytes]:
-        """JPEG files, each new one once, the same again if nothing is new for a while."""
+        """Yield JPEG files: each new picture once, the last one again after a while without a new one."""
         last = 0
         while True:
             with self._news:
@@ -163,7 +163,7 @@ class LiveView:
         return self._closed or self._number > last
 
     def _compress(self, image: Image, number: int) -> bytes:
-        """JPEG of a picture, made once for all browsers that look, and not while `show` waits."""
+        """Return a picture as JPEG, compressed once for all browsers, and outside of the lock of `show`."""
         with self._compressing:
             if self._compressed != number:
                 self._jpeg, self._compressed = _to_jpeg(image, self.quality), number
@@ -172,14 +172,14 @@ class LiveView:
 
 class _Server(http.server.ThreadingHTTPServer):
     daemon_threads = True
-    block_on_close = False  # a browser that hangs must not keep the results from being written
+    block_on_close = False  # a browser that hangs must not delay the results
 
     def __init__(self, address: tuple[str, int], view: LiveView) -> None:
         self.view = view
         super().__init__(address, _Handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that goes away is no news."""
+        """Ignore browsers that disconnect."""
 
 
 class _Handler(http.server.BaseHTTPRequestHandler):
@@ -207,7 +207,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._answer(404, b"not found\n")
 
     def _is_local(self) -> bool:
-        """Whether the request is meant for this server: no other site's page may read or stop it."""
+        """Return whether a page of this server made the request; answer others with an error."""
         own = f"{_HOST}:{self.server.server_port}"
         named = f"localhost:{self.server.server_port}"
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
@@ -242,7 +242,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Requests are not worth a line in the terminal."""
+        """Print nothing for a request."""
 
 
 def _to_jpeg(image: Image, quality: int) -> bytes:
@@ -255,9 +255,9 @@ def _to_jpeg(image: Image, quality: int) -> bytes:
 
 
 class _Keys:
-    """Single keys of the terminal, without waiting for them; nothing where there is no terminal.
+    """Reads single keys of the terminal without waiting; none where there is no terminal.
 
-    Ctrl-C keeps its meaning, and the terminal gets its old settings back.
+    Ctrl-C keeps its meaning, and the settings of the terminal are restored.
     """
 
     def __init__(self) -> None:
@@ -270,7 +270,7 @@ class _Keys:
             import tty
 
             descriptor = sys.stdin.fileno()
-            # a job in the background would be halted if it touched the terminal
+            # a background job is halted when it changes the terminal
             if not os.isatty(descriptor) or os.tcgetpgrp(descriptor) != os.getpgrp():
                 return
             with contextlib.suppress(termios.error):

@@ -1,8 +1,9 @@
-"""Draw tracked persons over their video frame.
+"""Draw tracked persons on their video frame.
 
-The look is that of `torchpose.viz`: the person's left arm is blue, the right one orange; a filled
-joint was measured, a ring was inferred and comes with the ellipse that holds it. What belongs to
-neither arm (head, neck, collar bones, face box, label) has the tint of the person."""
+The colours are those of `torchpose.viz`: the person's left arm is blue, the right one orange. A filled
+joint was measured; a ring was inferred and has an ellipse of its covariance. Head, neck, collar bones,
+bounding box of the face and label have the tint of the person.
+"""
 
 import math
 from collections.abc import Sequence
@@ -35,11 +36,11 @@ _MIDDLE, _MEASURED, _MODEL = (242, 242, 242), (240, 228, 66), (0, 158, 115)
 _TINT = 0.35  # opacity of the model's silhouette
 _LIGHT, _DARK = (255, 255, 255), (20, 20, 20)
 _SHIFT = 3  # cv2 takes coordinates in eighths of a pixel
-_REACH = 8  # what lies further out than so many image sizes is nonsense, and is left out
+_REACH = 8  # image sizes; points further out are not drawn
 
 
 class Pen:
-    """cv2 with outlines, in widths that fit the image; skips what cannot be drawn."""
+    """Draws outlined shapes by OpenCV, in widths that fit the image; skips what cannot be drawn."""
 
     def __init__(self, canvas: Image) -> None:
         height, width = canvas.shape[:2]
@@ -107,13 +108,13 @@ class Pen:
                     self.line(*ends, paint, width)
 
     def label(self, text: str, joints: list[list[float]], head: int, color: Color) -> None:
-        """Over the head, else over the highest joint that is there, and inside the image."""
+        """Draw a label over the head, else over the highest known joint, inside the image."""
         import cv2
 
         there = [joint for joint in joints if self.drawable(*joint)]
         if not text or not there:
             return
-        text = text.encode("ascii", "replace").decode()  # all that cv2's letters have
+        text = text.encode("ascii", "replace").decode()  # cv2 has no other letters
         size = max(0.35, 0.5 * self.scale)
         (width, height), base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, self.edge)
         over = joints[head]
@@ -140,7 +141,7 @@ def rgb(text: str) -> Color:
 
 @lru_cache(maxsize=32)
 def _outline(color: Color) -> Color:
-    """Black around light colours, white around dark ones, so that both show on any picture."""
+    """Return black for light colours and white for dark ones, for contrast on any picture."""
     return _DARK if 0.3 * color[0] + 0.59 * color[1] + 0.11 * color[2] > 140 else _LIGHT
 
 
@@ -157,11 +158,11 @@ def draw_overlay(
     tints: Sequence[int] | None = None,
     level: float = 0.9,
 ) -> Image:
-    """Draw P persons, and what was measured of them, on a copy of a frame.
+    """Return a copy of a frame with P persons and their measurements drawn on it.
 
     Bones join the joints; a joint that was measured is a disc, one that was inferred a ring with the
-    ellipse of probability `level`. Joints that are NaN, or absurdly far outside, are left out with
-    their bones. Widths grow with the image.
+    ellipse of probability `level`. Joints that are NaN or far outside of the image are left out with
+    their bones. Widths scale with the image.
 
     Args:
         image: [H, W, 3], RGB, uint8; not changed.
@@ -172,7 +173,7 @@ def draw_overlay(
         hands: measured hands, left and right [N, 2, 2], pixels, drawn as crosses below the joints.
         hand_covariance: theirs [N, 2, 2, 2], drawn as ellipses of probability `level`.
         labels: a word or two for each person, over the head; ASCII.
-        tints: which of `PERSON_TINTS` each person has, such as its number; by default in order.
+        tints: index into `PERSON_TINTS` of each person, such as its number; by default in order.
         level: probability of the ellipses.
 
     Returns:
@@ -232,7 +233,7 @@ def _draw_hands(pen: Pen, hands: Tensor, covariance: Tensor | None, level: float
 
 
 def _ellipses(covariance: Tensor, level: float) -> list:
-    """Half axes in pixels and angle in degrees of ellipses [..., 2, 2]; NaN where undefined.
+    """Return half axes in pixels and angle in degrees of ellipses [..., 2, 2]; NaN where undefined.
 
     Half axes: sqrt(l chi2) of the eigenvalues l = (a + c)/2 +- sqrt(((a - c)/2)^2 + b^2) of
     [[a, b], [b, c]]; the angle of the longer one is atan2(2 b, a - c) / 2.
@@ -288,7 +289,7 @@ def draw_body(
     silhouette: Bool[Tensor, "h w"] | None = None,
     label: str = "",
 ) -> Image:
-    """Draw a body, its silhouette, and the measured silhouette's outline on a copy of a frame.
+    """Return a copy of a frame with a body, its silhouette and the measured outline drawn on it.
 
     The person's left is blue, the right orange. The body's silhouette is a green tint, the outline
     of what was measured yellow. Joints that are NaN or far outside are left out with their bones.

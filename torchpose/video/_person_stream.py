@@ -1,4 +1,4 @@
-"""The poses of one person of a video, and whether their hands have been taken for each other."""
+"""Track the poses of one person of a video, and decide whether left and right hand are swapped."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,7 +20,7 @@ __all__ = ["Measured", "PersonStream", "PersonStreamState", "measured_of", "unme
 
 
 class Measured(NamedTuple):
-    """What was measured of one person in T frames.
+    """Holds the measurements of one person in T frames.
 
     Attributes:
         keypoints: pixels, NaN where missing [T, J, 2]. covariance: [T, J, 2, 2].
@@ -37,7 +37,7 @@ class Measured(NamedTuple):
 
 
 def measured_of(block: Sequence[FrameMeasurements], number: int, n_joints: int) -> Measured:
-    """Return what was measured of one person in each frame of a block."""
+    """Return the measurements of one person in each frame of a block."""
     keypoints, cov, size = found = unmeasured(len(block), n_joints)
     for t, frame in enumerate(block):
         row = torch.nonzero(frame.person == number).flatten()
@@ -48,7 +48,7 @@ def measured_of(block: Sequence[FrameMeasurements], number: int, n_joints: int) 
 
 
 def unmeasured(n_frames: int, n_joints: int) -> Measured:
-    """Return frames in which nothing is measured."""
+    """Return frames without measurements."""
     return Measured(
         torch.full((n_frames, n_joints, 2), torch.nan, dtype=torch.float64),
         torch.eye(2, dtype=torch.float64).repeat(n_frames, n_joints, 1, 1),
@@ -57,26 +57,26 @@ def unmeasured(n_frames: int, n_joints: int) -> Measured:
 
 
 class PersonStreamState(NamedTuple):
-    """Of the tracker (with `association`, of hands as given and of hands swapped), and of the votes."""
+    """Holds the states of the tracker (with `association`, of both hypotheses) and of the votes."""
 
     stream: StreamState
     votes: AssociationState | None
 
     @property
     def unseen(self) -> int:
-        """Frames since anything was measured."""
+        """Return the number of frames since the last measurement."""
         return int(self.stream.unseen[0])
 
 
 class PersonStream(nn.Module):
-    """Tracks one person; with `association`, both as measured and with the hands swapped.
+    """Tracks one person; with `association`, under two hypotheses: hands as measured and swapped.
 
-    Which of the two the edges of the arms support is asked in every frame (BL 50), and the poses,
-    and the hands that were measured, are those of the better hypothesis.
+    The edges of the arms select a hypothesis in every frame (BL 50). The poses and the measured hands are
+    those of the selected one.
 
     Args:
         tracker: of poses. names: of the measured joints. seed: of methods that draw.
-        association: of the hands; None trusts what is measured.
+        association: of the hands; None takes the hands as measured.
 
     Reference:
         Burke & Lasenby, section 5.3.
@@ -107,15 +107,15 @@ class PersonStream(nn.Module):
     def advance(
         self, state: PersonStreamState, measured: Measured, images: Sequence[Image] = ()
     ) -> tuple[PersonStreamState, PoseTrack, Measured]:
-        """Track some more frames.
+        """Return the poses of the next frames.
 
         Args:
             state: from `init` or the call before. measured: in these frames.
-            images: the frames, RGB; only looked at with `association`.
+            images: the frames, RGB; used with `association` only.
 
         Returns:
-            The next state, the poses, and what was measured, with hands exchanged where they had
-            been taken for each other.
+            The next state, the poses, and the measurements, in which hands are exchanged where they
+            were swapped.
         """
         if self.association is None or state.votes is None:
             stream, poses = self.tracker.advance(
@@ -143,7 +143,7 @@ def _vote(
     images: Sequence[Image],
     hands: list[int],
 ) -> tuple[AssociationState, Tensor]:
-    """Return which hypothesis holds in each frame, 0 or 1 [T]."""
+    """Return the next votes, and the selected hypothesis of each frame, 0 or 1 [T]."""
     import cv2
 
     number = torch.zeros(1, dtype=torch.long)
@@ -159,7 +159,7 @@ def _vote(
 
 
 def _choose(poses: PoseTrack, which: Tensor) -> PoseTrack:
-    """Return one sequence of two, chosen frame by frame."""
+    """Return one sequence, selected from two frame by frame."""
     frames = torch.arange(len(which))
     fields = {name: getattr(poses, name)[which, frames][None] for name in FRAME_FIELDS}
     failed = poses.failed_at[which]

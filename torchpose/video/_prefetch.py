@@ -1,4 +1,4 @@
-"""Work ahead of the consumer in a thread: decoding while filters run."""
+"""Run an iterable ahead of its consumer in a thread, to decode while filters run."""
 
 import threading
 from collections import deque
@@ -21,8 +21,8 @@ def prefetch(iterable: Iterable[T], size: int = 4) -> Generator[T, None, None]:
     making and nothing more is read. The iterable is closed at the end in all of these cases, in the
     thread that ran it, if it has a `close`. The thread starts with the first item that is asked for.
 
-    An exception keeps the frames of its functions alive, this generator in them; where that matters,
-    `with contextlib.closing(prefetch(...))` ends the thread on leaving the block.
+    An exception keeps this generator alive through its traceback; to end the thread at the end of a
+    block all the same, use `with contextlib.closing(prefetch(...))`.
 
     Args:
         iterable: what to run; nothing else may use it meanwhile.
@@ -47,7 +47,7 @@ def _consume(iterable: Iterable[T], size: int) -> Generator[T, None, None]:
     thread = threading.Thread(
         target=_produce, args=(iterable, shelf), name="torchpose-prefetch", daemon=True
     )
-    del iterable  # the thread's alone, so that it can let go of it
+    del iterable  # only the thread refers to it, so that it can be freed there
     try:
         thread.start()
         while shelf.wait():
@@ -62,7 +62,7 @@ def _consume(iterable: Iterable[T], size: int) -> Generator[T, None, None]:
 
 
 class _Shelf(Generic[T]):
-    """Items on their way from one thread to another."""
+    """Passes items from one thread to another."""
 
     def __init__(self, size: int) -> None:
         self.size = size
@@ -72,7 +72,7 @@ class _Shelf(Generic[T]):
         self.error: BaseException | None = None
 
     def wait_for_room(self) -> bool:
-        """Wait until an item may be made; False if none is wanted any more."""
+        """Wait until an item may be made; return False if the consumer has stopped."""
         with self.changed:
             self.changed.wait_for(lambda: self.stopped or len(self.items) < self.size)
             return not self.stopped
@@ -89,9 +89,9 @@ class _Shelf(Generic[T]):
             self.changed.notify_all()
 
     def wait(self) -> bool:
-        """Wait for an item; False if there will be none."""
+        """Wait for an item; return False if there are no more."""
         with self.changed:
-            # with a limit, because Ctrl-C does not interrupt a wait without one on Windows
+            # on Windows Ctrl-C does not interrupt a wait without a limit
             while not self.changed.wait_for(lambda: bool(self.items) or self.finished, 0.5):
                 pass
             return bool(self.items)
@@ -118,7 +118,7 @@ def _produce(iterable: Iterable[Any], shelf: _Shelf[Any]) -> None:
             close = getattr(iterable, "close", None)
             if close is not None:
                 close()
-    except BaseException as caught:  # whatever it is belongs to the consumer
+    except BaseException as caught:  # raised again in the consumer
         error = caught
     del iterable
     shelf.finish(error)

@@ -1,4 +1,4 @@
-"""Put the poses of everybody in a recording together block by block, kept on disk meanwhile."""
+"""Track the persons of a recording block by block, and keep their poses in files meanwhile."""
 
 import shutil
 import tempfile
@@ -36,7 +36,7 @@ _LEAST_SECONDS = 0.5  # for which a person has to be seen to be reported
 class PoseSpool:
     """Appends blocks of poses of one sequence to files, and reads them as one `PoseTrack`.
 
-    The files go with the spool; poses that were read from it stay readable as long as they are held.
+    The files are deleted with the spool; poses that were read from it remain readable.
 
     Args:
         folder: where the files are; None is the system's folder for temporary files.
@@ -110,13 +110,13 @@ def _array(values: Tensor) -> np.ndarray:
 
 @dataclass
 class TrackedPerson:
-    """Poses of one person of a video.
+    """Holds the poses of one person of a video.
 
     Attributes:
-        number: in the order of coming. first_frame: of the video, that of the first pose.
-        track: poses as a batch of one; NaN where the person was away for longer than `max_gap`.
-        keypoints: what was measured [T, J, 2], pixels, NaN where missing, in the order of the
-            measurer's `names`. covariance: of that [T, J, 2, 2].
+        number: in the order of appearance. first_frame: of the video, that of the first pose.
+        track: poses as a batch of one; NaN where the person was absent for longer than `max_gap`.
+        keypoints: measured [T, J, 2], pixels, NaN where missing, in the order of the
+            measurer's `names`. covariance: of these [T, J, 2, 2].
     """
 
     number: int
@@ -131,10 +131,10 @@ class TrackedPerson:
 
 @dataclass
 class _Person:
-    """One person while a recording is read.
+    """Holds one person while a recording is tracked.
 
-    `state` is None while nobody is there; the frames of that time are counted in `absent`, and
-    written only if the person returns.
+    `state` is None while the person is absent. Frames of an absence are counted in `absent`, and written
+    only if the person returns.
     """
 
     number: int
@@ -149,12 +149,12 @@ class _Person:
 
 
 class TrackedRecording:
-    """Tracks everybody whose measurements are appended, each with a stream of its own.
+    """Tracks all persons whose measurements are appended, each with a stream of its own.
 
     Args:
         stream: of every person.
-        gap: frames after which somebody who is not seen has no pose any more, and is tracked anew
-            when they come back.
+        gap: frames without measurements after which a person has no pose; the tracker is
+            reinitialised when the person returns.
         folder: for temporary files.
     """
 
@@ -166,11 +166,10 @@ class TrackedRecording:
     def append(
         self, block: Sequence[FrameMeasurements], images: Sequence[Image] = ()
     ) -> dict[int, PoseTrack]:
-        """Track the next frames, with their images if the stream looks at them.
+        """Track the next frames, with their images if the stream uses them.
 
         Returns:
-            The poses of everybody who was there before the block or is in it, by number: those of
-            the last frames of the block.
+            The poses in the last frames of the block, by number, of all persons so far.
 
         Raises:
             OutputError: the disk is full.
@@ -190,7 +189,7 @@ class TrackedRecording:
         return poses
 
     def _extend(self, person: _Person, measured: Measured, images: Sequence[Image]) -> PoseTrack:
-        """Track some frames; where nobody is there yet, or any more, poses are NaN."""
+        """Track some frames; poses are NaN while the person is absent."""
         seen = _seen(measured)
         frames, count = torch.nonzero(seen).flatten(), len(seen)
         if len(frames):
@@ -217,10 +216,10 @@ class TrackedRecording:
         return poses
 
     def finish(self, smoother: UpperBodyTracker | None = None) -> list[TrackedPerson]:
-        """Return everybody who was seen for half a second, the one seen longest first.
+        """Return the persons who were seen for half a second or longer, the longest seen first.
 
         Args:
-            smoother: gives the poses anew, from all frames.
+            smoother: of the whole recording; None keeps the filtered poses.
         """
         least = _LEAST_SECONDS * (self.stream.tracker.fps or 30.0)
         lasting = [person for person in self._people.values() if person.n_seen >= least]
@@ -243,7 +242,7 @@ class TrackedRecording:
 def smoothed(
     person: TrackedPerson, smoother: UpperBodyTracker, names: Sequence[str], gap: int
 ) -> PoseTrack:
-    """Return the poses of a person anew, from all measurements together.
+    """Return the smoothed poses of a person, from all measurements.
 
     Args:
         names: of the measured joints. gap: frames after which there is no pose.
@@ -281,7 +280,7 @@ def _without_long_gaps(
 
 
 def _nobody(n_frames: int, tracker: UpperBodyTracker) -> PoseTrack:
-    """Return frames in which somebody has no pose."""
+    """Return frames without poses."""
 
     def nothing(*shape: int) -> Tensor:
         return torch.full((1, n_frames, *shape), torch.nan, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""One person's silhouettes in the synchronised videos of calibrated cameras."""
+"""Measure silhouettes of one person in the synchronised videos of calibrated cameras."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
@@ -30,20 +30,20 @@ __all__ = [
 ]
 
 _BLOCK = 16  # pixels: codecs store multiples of it, and some calibrations are of what is stored
-_PART = 0.03  # of the largest piece: a smaller one is not a part of the person that was cut off
-_HOLE = 0.02  # of the silhouette: a larger hole is what one sees between arm and body
-_STILL, _SAME = 0.9, 18  # share of the frames, and grey levels, for what always looks the same
-_LEARNING_FRAMES = 120  # of a video without an empty scene, spread over all of it
+_PART = 0.03  # of the largest piece: smaller ones are no part of the person
+_HOLE = 0.02  # of the silhouette: larger holes are real, such as between arm and body
+_STILL, _SAME = 0.9, 18  # share of the frames, and grey levels, of a static pixel
+_LEARNING_FRAMES = 120  # spread over the video
 
 
 class SilhouetteView(NamedTuple):
-    """How a camera's images become silhouettes of a common size.
+    """Holds the mapping of a camera's images to silhouettes of a common size.
 
     Attributes:
         camera: of the silhouettes, without distortion. size: (width, height) of a frame of the video.
-        padding: columns and rows that calibration has to the right and below, and the video has not.
-        inner: (width, height) of the image in the silhouette, the rest being empty.
-        source: the camera as it was calibrated.
+        padding: columns at the right and rows below that the calibrated image has and the video lacks.
+        inner: (width, height) of the image in the silhouette; the rest is empty.
+        source: the camera as calibrated.
     """
 
     camera: PinholeCamera
@@ -56,7 +56,7 @@ class SilhouetteView(NamedTuple):
 def fit_view(
     camera: PinholeCamera, size: tuple[int, int], height: int, width: int
 ) -> SilhouetteView:
-    """Scale a camera so that its image fits into height x width; pixel centres are integers.
+    """Return a camera scaled so that its image fits into height x width; pixel centres are integers.
 
     Args:
         camera: calibrated for `size`, or for that with up to 15 columns and rows more at the right
@@ -92,7 +92,7 @@ def fit_view(
 def fit_views(
     cameras: Sequence[PinholeCamera], sizes: Sequence[tuple[int, int]], rows: int
 ) -> list[SilhouetteView]:
-    """`fit_view` of each camera, in images of so many rows that are wide enough for all of them."""
+    """Return `fit_view` of each camera, in images of `rows` rows that are wide enough for all."""
     shapes = [camera.image_size or size for camera, size in zip(cameras, sizes, strict=True)]
     width = max(round(w * rows / h) for w, h in shapes)
     return [
@@ -101,14 +101,14 @@ def fit_views(
 
 
 def clean_silhouette(mask: NDArray[np.bool_], largest_hole: float = _HOLE) -> NDArray[np.bool_]:
-    """Without specks and small holes: what a background model leaves of one person.
+    """Return a foreground mask of one person without specks and small holes.
 
-    A median filter takes single pixels, a closing joins what is a pixel apart; of the pieces those
-    stay that have 3 % of the largest one's pixels, and holes are filled that have less than
-    `largest_hole` of the silhouette's.
+    A median filter removes single pixels, and a closing joins pieces that are a pixel apart. Pieces of
+    less than 3 % of the largest one are removed. Holes of less than `largest_hole` of the silhouette are
+    filled.
 
     Args:
-        mask: True where there is something [H, W]. largest_hole: share of the silhouette.
+        mask: True on the foreground [H, W]. largest_hole: share of the silhouette.
     """
     import cv2
 
@@ -127,7 +127,7 @@ class _Areas(NamedTuple):
 
 
 def _areas(mask: NDArray[np.uint8]) -> _Areas:
-    """Connected pieces by number, 0 being none, and how many pixels each has."""
+    """Return the connected pieces by number, 0 outside of them, and their pixel counts."""
     import cv2
 
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
@@ -144,15 +144,16 @@ def _pieces(mask: NDArray[np.uint8], share: float) -> NDArray[np.uint8]:
 
 
 class SilhouetteMeasurer:
-    """Silhouettes of one camera: undistorted, scaled, told from the background, cleaned.
+    """Measures silhouettes of one camera: undistorts, scales, subtracts the background, cleans.
 
     Args:
         view: from `fit_view`.
         empty: RGB frames of the empty scene [N, H, W, 3], uint8, with or without the padding; then
-            the background is a `BrightnessBackground`, which knows shadows. None takes `frames`.
-        frames: RGB frames spread over the video itself. With `empty`, what looks the same in nine of
-            ten of them is something that was moved since the scene was empty, and no person; without
-            `empty`, OpenCV's MOG2 learns what stays, and whoever does not move becomes background.
+            the background is a `BrightnessBackground`, which detects shadows. None takes `frames`.
+        frames: RGB frames spread over the video itself. With `empty`, pixels that are static in nine
+            of ten of them show an object that was moved since the scene was empty, and count as
+            background. Without `empty`, OpenCV's MOG2 learns the background from them, and a person
+            who does not move becomes background.
 
     Raises:
         InputError: neither. ShapeError, InputError: frames of another size or kind.
@@ -166,7 +167,7 @@ class SilhouetteMeasurer:
     ) -> None:
         self.view = view
         self._maps = _undistortion(view)
-        # large frames pass one by one, what is kept of them is small
+        # one by one, since frames are large and only scaled ones are kept
         without = [self._prepare(frame) for frame in (() if empty is None else empty)]
         shown = [self._prepare(frame) for frame in (() if frames is None else frames)]
         if not without and not shown:
@@ -181,7 +182,7 @@ class SilhouetteMeasurer:
             self._mixture = _learn(shown)
 
     def __call__(self, frame: Image) -> NDArray[np.bool_]:
-        """The silhouette in a frame: bool, of the size of the view's camera [height, width].
+        """Return the silhouette in a frame: bool, of the size of the view's camera [height, width].
 
         Args:
             frame: RGB, of the size of the video.
@@ -202,7 +203,7 @@ class SilhouetteMeasurer:
         return np.asarray(self._mixture.apply(small, None, 0.0) == 255)
 
     def _prepare(self, frame: Image) -> Image:
-        """Padded, undistorted and scaled in one go."""
+        """Return a frame padded, undistorted and scaled."""
         import cv2
 
         check_rgb("frame", frame, empty=False)
@@ -229,7 +230,7 @@ def _stack(images: Sequence[Image]) -> UInt8[Tensor, "N 3 H W"]:
 
 
 def _learn(images: Sequence[Image]) -> Any:
-    """OpenCV's MOG2 of what stays in all of the images."""
+    """Return OpenCV's MOG2 with the background of all the images."""
     import cv2
 
     mixture = cv2.createBackgroundSubtractorMOG2(len(images), 16.0, True)
@@ -239,7 +240,7 @@ def _learn(images: Sequence[Image]) -> Any:
 
 
 class _Moved(NamedTuple):
-    """What a video shows nearly all the time: its colour [3, H, W], and where [H, W]."""
+    """Holds the median colours of a video [3, H, W], and where it is static [H, W]."""
 
     colour: Tensor
     still: Tensor
@@ -255,14 +256,14 @@ def _alike(images: Tensor, colour: Tensor) -> Tensor:
 
 
 def _undistortion(view: SilhouetteView) -> tuple[np.ndarray, np.ndarray] | None:
-    """`undistortion_maps` of the image with its padding."""
+    """Return `undistortion_maps` of the image with its padding."""
     camera = view.source
     size = (view.size[0] + view.padding[0], view.size[1] + view.padding[1])
     return undistortion_maps(camera.matrix, camera.distortions, camera.fisheye, size)
 
 
 def learning_frames(source: VideoSource) -> Iterator[Image]:
-    """Some frames spread over a video, for what it shows all the time."""
+    """Return some frames spread over a video, to learn its background."""
     count = source.n_frames or _LEARNING_FRAMES
     stride = max(1, count // _LEARNING_FRAMES)
     spread = (frame.image for frame in source if frame.index % stride == 0)
@@ -270,7 +271,7 @@ def learning_frames(source: VideoSource) -> Iterator[Image]:
 
 
 def read_empty_scene(path: str | Path) -> list[Image]:
-    """Frames of the empty scene: of a picture, a folder of pictures or a video.
+    """Return frames of the empty scene, from a picture, a folder of pictures or a video.
 
     Raises:
         InputError: no such file. FileFormatError: neither a picture nor a video.
@@ -290,10 +291,10 @@ def read_empty_scene(path: str | Path) -> list[Image]:
 def frames_in_step(
     sources: Sequence[VideoSource], delays: Sequence[int]
 ) -> Iterator[tuple[VideoFrame, ...]]:
-    """The frames of all videos side by side, until the first one ends.
+    """Yield the frames of all videos together, until the first video ends.
 
     Args:
-        delays: frames by which each video began too early, which are passed over.
+        delays: frames to skip at the beginning of each video.
     """
     for source, delay in zip(sources, delays, strict=True):
         for _ in range(delay):
@@ -306,12 +307,12 @@ def read_silhouettes(
     measurers: Sequence[Callable[[Image], NDArray[np.bool_]]],
     delays: Sequence[int] | None = None,
 ) -> Iterator[Bool[Tensor, "C H W"]]:
-    """The silhouettes of all cameras, frame by frame, until the first video ends.
+    """Yield the silhouettes of all cameras, frame by frame, until the first video ends.
 
     Args:
         sources: one video per camera, of one frame rate.
         measurers: one per camera, such as a `SilhouetteMeasurer`.
-        delays: frames by which each video began too early, which are passed over.
+        delays: frames to skip at the beginning of each video.
 
     Raises:
         InputError: numbers that do not match, or videos of different frame rates.

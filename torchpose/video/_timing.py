@@ -1,7 +1,8 @@
-"""Find out what a video file is without decoding it, and bring its frames to a constant rate.
+"""Scan a video file without decoding it, and resample its frames to a constant rate.
 
-Filters step at a fixed rate, and files do not always: phones and screen recorders write frames when
-they have one, webcams lose some, clocks restart. A constant-rate file passes through untouched."""
+Filters step at a fixed rate. Phones and screen recorders write frames at a variable rate, webcams lose
+frames, and clocks restart. A file of constant rate is not changed.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -30,14 +31,14 @@ __all__ = [
 T = TypeVar("T")
 _JITTER = 0.2  # of the usual interval: what a constant rate may deviate by
 _REGULAR = 0.9  # of all intervals have to be that regular
-_LONGEST_GAP = 10.0  # seconds; more is a cut or a fault of the clock, not a still picture
+_LONGEST_GAP = 10.0  # seconds; a longer gap is a cut or a fault of the clock
 _LAST = 0.5 - 1e-6  # intervals for which the last frame is shown after its time
-_LATE = 0.5  # seconds; a clock that goes back further has been restarted
+_LATE = 0.5  # seconds; a clock that goes back by more has been restarted
 
 
 @dataclass(frozen=True)
 class Rate:
-    """Frames per second, and whether the frames come at a constant rate."""
+    """Holds the frames per second, and whether the rate is constant."""
 
     fps: float
     constant: bool
@@ -45,7 +46,7 @@ class Rate:
 
 @dataclass
 class Tally:
-    """What had to be done to reach a constant rate, in frames.
+    """Counts the changes made to reach a constant rate, in frames.
 
     Attributes:
         repeated, dropped: frames shown again, frames left out.
@@ -60,7 +61,7 @@ class Tally:
 
 
 def frame_rate(times: Sequence[float], declared: float | None = None) -> Rate | None:
-    """The rate of frames that are shown at these times.
+    """Return the rate of frames at these times.
 
     If nine in ten intervals are within a fifth of the median, the rate is constant (jitter, lost
     frames) and is one over the mean of those intervals; otherwise it is the average over all.
@@ -93,28 +94,28 @@ def frame_rate(times: Sequence[float], declared: float | None = None) -> Rate | 
 
 
 def shown_for(times: Sequence[float]) -> float:
-    """Seconds from the first to the last frame, cuts (more than ten seconds) taken out."""
+    """Return seconds from the first to the last frame, without gaps of more than ten seconds."""
     intervals = np.diff(np.unique(np.asarray(times, dtype=np.float64)))
     usual = float(np.median(intervals)) if len(intervals) else 0.0
     return float(intervals[intervals <= _longest(usual)].sum())
 
 
 def _longest(interval: float) -> float:
-    """Seconds between two frames that are no cut yet."""
+    """Return the longest gap between two frames that counts, seconds."""
     return max(_LONGEST_GAP, 2 * interval)
 
 
 def to_constant_rate(
     timed: Iterable[tuple[float | None, T]], fps: float, tally: Tally, snap: bool = True
 ) -> Iterator[T]:
-    """For each time k / fps after the first frame, the frame that is nearest to it.
+    """Yield for each time k / fps after the first frame the frame that is nearest to it.
 
     Args:
         timed: time in seconds (None: unknown) and frame, in order of display.
         fps: the constant rate.
         tally: counts what was done; complete after the last frame.
-        snap: the frames come at that rate already, up to jitter: each is shown once as long as it is
-            within one interval of its turn.
+        snap: the frames have that rate already, up to jitter: each is shown once if it is within one
+            interval of its turn.
 
     Yields:
         Frames; a repeated one is the same object again.
@@ -137,7 +138,7 @@ def to_constant_rate(
 def _turns(
     timed: Iterable[tuple[float | None, T]], fps: float, tally: Tally
 ) -> Iterator[tuple[float, T]]:
-    """Times in intervals since the first frame, never going back."""
+    """Yield the times in intervals since the first frame, in ascending order."""
     origin, last, step = 0.0, 0.0, 1 / fps
     for count, (time, frame) in enumerate(timed):
         if time is None:
@@ -157,7 +158,7 @@ def _turns(
 
 
 def _snapped(turns: Iterable[tuple[float, T]]) -> Iterator[tuple[float, T]]:
-    """Whole numbers: the next one, unless the frame is a whole interval away from it."""
+    """Yield whole turns: the next one, unless the frame is an interval or more away from it."""
     place = -1
     for turn, frame in turns:
         place = place + 1 if abs(turn - place - 1) < 1 else round(turn)
@@ -196,11 +197,11 @@ _NO_VIDEO = {"tty", "image2", "hls", "concat", "dash", "sdp", "rtsp", "lavfi"}
 
 
 class Scan(NamedTuple):
-    """What reading the packets, without decoding them, tells.
+    """Holds the result of reading the packets without decoding them.
 
     Attributes:
-        frames: packets of video. rate: by their times, None without. declared: rate that the file
-        says, None if it makes no sense. span: seconds from first to last frame. last: end of the last
+        frames: packets of video. rate: by their times, None without. declared: rate by the file,
+        None if it is not plausible. span: seconds from first to last frame. last: end of the last
         packet of any stream, seconds on the file's clock. complete: whether the end was reached.
         fault: the error that ended the file early, or nothing.
     """
@@ -215,18 +216,18 @@ class Scan(NamedTuple):
 
 
 def is_cover(stream: "av.VideoStream") -> bool:
-    """Whether the stream is the picture of a piece of music."""
+    """Return whether the stream is the cover picture of a sound file."""
     from av.stream import Disposition
 
     return bool(stream.disposition & Disposition.attached_pic)
 
 
 def open_container(path: Path) -> tuple["av.container.InputContainer", "av.VideoStream"]:
-    """The container and its first video stream, or a typed error that says what the file is."""
+    """Return the container and its first video stream; raise a typed error for another kind of file."""
     import av
 
     try:
-        # titles are in any encoding, and nobody needs them here
+        # titles may have any encoding, and are not used
         container = av.open(str(path.absolute()), metadata_errors="replace")
     except av.FFmpegError as error:
         raise FileFormatError(f"{path}: {_why_not(path, error)}") from error
@@ -253,7 +254,7 @@ def open_container(path: Path) -> tuple["av.container.InputContainer", "av.Video
 
 
 def _why_not(path: Path, error: Exception) -> str:
-    """Why a file cannot be opened."""
+    """Return the reason why a file cannot be opened."""
     if isinstance(error, PermissionError):
         return "cannot be read (permission denied)"
     if path.stat().st_size == 0:
@@ -271,7 +272,7 @@ def _why_not(path: Path, error: Exception) -> str:
 
 
 def _mp4_boxes(path: Path) -> list[str]:
-    """Names of the outermost boxes of an MP4 file; empty for other files."""
+    """Return the names of the outermost boxes of an MP4 file; empty for other files."""
     names: list[str] = []
     with path.open("rb") as stream:
         end, start = path.stat().st_size, 0

@@ -1,4 +1,4 @@
-"""The whole way from video to poses of everybody in it."""
+"""Track the poses of all persons in a video."""
 
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -34,14 +34,14 @@ from torchpose.video._recording import TrackedPerson, TrackedRecording
 __all__ = ["LivePerson", "TrackedPerson", "VideoState", "VideoTracker", "Watcher"]
 
 Watcher = Callable[[Image, FrameMeasurements, dict[int, PoseTrack]], None]
-"""Is shown a frame, what was measured in it, and the poses of everybody there by number."""
+"""Is called with a frame, its measurements, and the poses of the persons in it by number."""
 
 _HANDS = [UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")]
 _BLOCK = 32  # frames of a recording that are filtered together
 
 
 class VideoState(NamedTuple):
-    """What `VideoTracker.step` knows of the frames before: of measuring, streams, the last poses."""
+    """Holds the state of `VideoTracker.step`: of the measurer, of all streams, and the last poses."""
 
     measurer: MeasurerState
     streams: dict[int, PersonStreamState]
@@ -49,7 +49,7 @@ class VideoState(NamedTuple):
 
 
 class LivePerson(NamedTuple):
-    """The pose of somebody in one frame: number, pose (a track of one frame), and what was measured."""
+    """Holds a person in one frame: number, pose (a track of one frame), and measurements."""
 
     number: int
     pose: PoseTrack
@@ -57,7 +57,7 @@ class LivePerson(NamedTuple):
 
 
 class VideoTracker(nn.Module):
-    """Tracks everybody in a video: `UpperBodyMeasurer`, then an `UpperBodyTracker` for each person.
+    """Tracks all persons in a video: `UpperBodyMeasurer`, then an `UpperBodyTracker` for each person.
 
     `forward` tracks a recording, `init` and `step` a camera.
 
@@ -65,18 +65,18 @@ class VideoTracker(nn.Module):
         prior: from `load_prior` or `fit_upper_body_prior`.
         camera: of the video.
         fps: frames per second. All frames are taken to be equally far apart.
-        hands: how hands are found: "grid" (default) or "mean-shift", the paper's recipe.
-        background: tell what moves from what does not, for a camera that stands still.
-        elbows: measure elbows where the torso with its sleeves is widest.
-        edges: correct hands that were taken for each other by the edges of the arms
-            (`HandAssociation`); takes about twice the time of the poses.
-        candidates: look for hands where the last pose has them as well; frames are then measured and
-            filtered in turn, which is slower.
+        hands: the hand tracker: "grid" (default) or "mean-shift", the paper's method.
+        background: detect the foreground, for a static camera.
+        elbows: measure elbows, where the torso with its sleeves is widest.
+        edges: correct swapped hands by the edges of the arms (`HandAssociation`); takes about twice
+            the time of the poses.
+        candidates: also reinitialise the hand tracker at the hands of the last pose; frames are then
+            measured and filtered in turn, which is slower.
         face_detector: by default Haar's.
-        max_persons: follow only the N largest faces.
-        head_neck: where head and neck are beside the face.
-        max_gap: seconds after which somebody who is not seen has no pose any more; None is never.
-        seed: of methods that draw; every person has a generator of their own.
+        max_persons: track only the N largest faces.
+        head_neck: offsets of head and neck from the face.
+        max_gap: seconds without measurements after which a person has no pose; None is never.
+        seed: of methods that draw; every person has a generator.
         options: to `UpperBodyTracker`, such as method, smoothing or frame.
 
     Raises:
@@ -124,18 +124,18 @@ class VideoTracker(nn.Module):
         self.stream = PersonStream(tracker, self.measurer.names, seed, association)
         self.smoothing = smoothing
         self._options = {"fps": fps, "max_gap": None, **options}
-        _ = self.smoother  # raises what does not fit before any work
+        _ = self.smoother  # raises errors of the options before any work
         self.fps = float(fps)
         self.gap = sys.maxsize if max_gap is None else round(max_gap * fps)
 
     @property
     def tracker(self) -> UpperBodyTracker:
-        """The tracker of every person's poses."""
+        """Return the tracker of the poses of all persons."""
         return self.stream.tracker
 
     @property
     def smoother(self) -> UpperBodyTracker | None:
-        """The tracker of whole recordings, on the same prior and camera; None without smoothing."""
+        """Return the smoother of recordings, with the same prior and camera; None without smoothing."""
         if self.smoothing is None:
             return None
         own = self.tracker
@@ -147,18 +147,18 @@ class VideoTracker(nn.Module):
         )
 
     def init(self) -> VideoState:
-        """Return the state before the first frame, when nobody was seen yet."""
+        """Return the state before the first frame."""
         return VideoState(self.measurer.init(), {}, {})
 
     def step(self, state: VideoState, image: Image | Tensor) -> tuple[VideoState, list[LivePerson]]:
-        """Track one more frame of a camera.
+        """Return the next state and the persons in one more frame of a camera.
 
         Args:
             state: from `init` or the step before. image: RGB, uint8, an array [H, W, 3] or a tensor
                 [3, H, W].
 
         Returns:
-            The next state, and everybody who is there or was until `max_gap` ago.
+            The next state, and the persons seen within the last `max_gap`.
 
         Raises:
             InputError: another kind of image, or a tracker that smooths.
@@ -187,7 +187,7 @@ class VideoTracker(nn.Module):
         folder: str | Path | None = None,
         watch: Watcher | None = None,
     ) -> list[TrackedPerson]:
-        """Track a recording, however long: memory does not grow with it.
+        """Return the poses of all persons in a recording, in memory independent of its length.
 
         Args:
             frames: RGB, uint8, arrays [H, W, 3], or what has such an `image` (a `VideoSource`); or a
@@ -197,7 +197,7 @@ class VideoTracker(nn.Module):
             watch: is called for every frame; frames are then filtered one by one, which is slower.
 
         Returns:
-            Everybody who was seen for half a second, the one seen longest first.
+            The persons who were seen for half a second or longer, the longest seen first.
 
         Raises:
             InputError: another kind of image. OutputError: the disk is full.

@@ -1,4 +1,4 @@
-"""H.264 files that a browser plays, written whole or not at all."""
+"""Write H.264 files that a browser plays, whole or not at all."""
 
 import contextlib
 from fractions import Fraction
@@ -35,9 +35,9 @@ class VideoWriter:
 
     The file is written under a temporary name in the same folder and appears with `close()`. Leaving
     the `with` block by an exception removes it; leaving by KeyboardInterrupt (Ctrl-C) keeps what was
-    written so far, as a valid file, and the interrupt goes on. Without a single frame no file appears.
-    H.264 wants even sizes: an odd width or height is padded by repeating the last column or row,
-    which `notes` says.
+    written so far, as a valid file, and the interrupt goes on. Without frames no file appears.
+    H.264 has even sizes: an odd width or height is padded by repeating the last column or row, which is
+    noted.
 
     Args:
         path: where the file is to appear, ending in .mp4; its folder must exist.
@@ -129,7 +129,7 @@ class VideoWriter:
         self._stream, self._reformatter = stream, VideoReformatter()
 
     def write(self, image: Image) -> None:
-        """Add a frame.
+        """Write a frame.
 
         Args:
             image: RGB, uint8, [H, W, 3] of the size given.
@@ -179,7 +179,7 @@ class VideoWriter:
             self._container.mux(self._waiting.pop(0))
 
     def close(self) -> None:
-        """Finish the file, which appears now; may be called any number of times.
+        """Finish the file, which appears now; may be called repeatedly.
 
         Raises:
             OutputError: the disk is full, or writing fails for another reason; nothing is left there.
@@ -204,7 +204,7 @@ class VideoWriter:
         container, self._container = self._container, None
         self._waiting.clear()
         if container is not None:
-            with contextlib.suppress(Exception):  # its last words fail where the others did
+            with contextlib.suppress(Exception):  # the cause is reported already
                 container.close()
         self._file.__exit__(_Discarded, _Discarded(), None)
 
@@ -229,7 +229,7 @@ class _Discarded(Exception):  # noqa: N818
 
 @contextlib.contextmanager
 def _as_output_error(path: Path) -> Any:
-    """Turn errors of FFmpeg and of the disk into typed ones."""
+    """Convert errors of FFmpeg and of the disk to typed ones."""
     import av
 
     try:
@@ -244,7 +244,7 @@ def _as_output_error(path: Path) -> Any:
 
 
 def _encoder() -> str:
-    """The H.264 encoder of the installed PyAV."""
+    """Return the name of the H.264 encoder of the installed PyAV."""
     import av
 
     for name in _ENCODERS:

@@ -1,9 +1,9 @@
-"""Pictures of poses and of how good they are, each a matplotlib `Figure`.
+"""Draw poses, priors and errors, each picture a matplotlib `Figure`.
 
-matplotlib is imported when a picture is made, and only its object interface is used: no pyplot, no
-global settings. One look throughout: the person's left is blue, the right is orange, the middle is
-grey; a filled joint was measured, a hollow one was inferred. The colours are those of Okabe & Ito,
-which colour-blind readers can tell apart; lines differ in their dashes as well.
+matplotlib is imported when a picture is made. Only its object interface is used: no pyplot, no global
+settings. In all pictures the person's left is blue, the right is orange and the middle is grey. A filled
+joint was measured, a hollow one was inferred. The colours are the palette of Okabe & Ito, which
+colour-blind readers can distinguish; lines differ in their dashes as well.
 """
 
 from torchpose._core.facade import set_up_facade

@@ -1,4 +1,4 @@
-"""Curves and bars: joints and errors over time, PCP, calibration, error per joint."""
+"""Plot joints and errors over time, errors per joint, PCP and calibration."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ def plot_joint_curves(
     level: float = 0.9,
     title: str | None = None,
 ) -> Figure:
-    """Coordinates of some joints over time, with bands, and the gaps in which one was inferred.
+    """Return coordinates of some joints over time, with bands, and with gaps of the measurements.
 
     Args:
         joints: [T, 8, 3], camera axes, metres, or [T, 8, 2], pixels.
         covariance: [T, 8, D, D]; the band holds each coordinate with probability `level`.
-        observed: [T, 8], True = measured. Gaps of a joint that is measured at times are shaded;
-            one that never is says so beside its name.
+        observed: [T, 8], True = measured. Gaps of a joint that is measured in some frames are
+            shaded; a joint without measurements is labelled as inferred.
         truth: [T, 8, D], drawn in dark grey.
         fps: frames per second. show: names of the joints, one row each.
         level: probability of the bands. title: above the picture.
@@ -131,7 +131,7 @@ def _indices(names: Sequence[str]) -> list[int]:
 
 
 def _spans(flag: Tensor) -> list[tuple[float, float]]:
-    """Stretches of True as (start, stop) in frames, half a frame wider on each side."""
+    """Return runs of True as (start, stop) in frames, half a frame wider on each side."""
     padded = torch.nn.functional.pad(flag.detach().cpu().int(), (1, 1))
     edges = torch.nonzero(padded.diff()).flatten().tolist()
     return [(a - 0.5, b - 0.5) for a, b in zip(edges[::2], edges[1::2], strict=True)]
@@ -173,7 +173,7 @@ def plot_errors_over_time(
         ax.set_ylim(bottom=0)
     if bound is not None:
         for ax in grid.flat[: len(rows)]:
-            ax.set_ylim(0, ax.get_ylim()[1])  # so that the line does not widen the scale
+            ax.set_ylim(0, ax.get_ylim()[1])  # the line does not widen the scale
             ax.axhline(bound, color=MUTED, linewidth=0.9, zorder=1)
     for ax in grid[-1]:
         ax.set_xlabel("time (s)", fontsize=NORMAL, color=INK)
@@ -278,9 +278,9 @@ def plot_reliability(
     tolerance: float = 0.05,
     title: str | None = None,
 ) -> Figure:
-    """Reliability diagram of each joint: share inside the ellipsoid over its nominal probability.
+    """Return the reliability diagram of each joint: share inside the ellipsoid over its probability.
 
-    On the diagonal a covariance is right; below it is too small (overconfident), above too large.
+    A covariance is calibrated on the diagonal, too small (overconfident) below it, too large above it.
 
     Args:
         curves: from `torchpose.metrics.reliability`, one or several by name.

@@ -1,4 +1,4 @@
-"""Draw what body models have learnt: the latent space of a manifold, the space of an action."""
+"""Draw the latent space of a manifold, and the space of an action."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ def plot_manifold(
 ) -> Figure:
     """Return the first two latent dimensions, the trajectories in them, and the predictive deviation.
 
-    White is where the manifold is as sure of a pose as it gets, dark where it falls back on the mean
-    pose. A line is a sequence, with arrows in the direction of time and a dot where it starts;
-    sequences of one name share a colour. With a body, poses along the first sequence stand below,
-    seen from the side, walking to the right; their numbers are in the latent space as well.
+    The predictive deviation is least where the picture is white; where it is dark the manifold predicts
+    the mean pose. A line is a sequence, with arrows in the direction of time and a dot at its start.
+    Sequences of one name share a colour. With a body, poses along the first sequence are drawn below,
+    seen from the side and facing right; their numbers are in the latent space as well.
 
     Args:
         manifold: of two latent dimensions or more; the others are held at zero.
@@ -112,7 +112,7 @@ def _title(manifold: BackConstrainedGPLVM) -> str:
 
 
 def _by_name(manifold: BackConstrainedGPLVM) -> dict[str, list[Tensor]]:
-    """Latent points of the sequences that were fitted to."""
+    """Return the latent points of the training sequences by name."""
     names, paths = manifold.info.sequences, manifold.trajectories()
     if len(names) != len(paths):
         names = tuple(f"sequence {i + 1}" for i in range(len(paths)))
@@ -168,7 +168,7 @@ def _draw_path(ax: Axes, path: Tensor, color: str, dashes: Any, hollow: bool = F
 
 
 def _draw_poses(part: Any, manifold: BackConstrainedGPLVM, body: Body, n_poses: int) -> Tensor:
-    """Return the poses along the first sequence, beside each other; returns their latent points."""
+    """Draw poses along the first sequence, beside each other; return their latent points."""
     path = manifold.trajectories()[0]
     cycle = path[: _cycle(path)]
     at = torch.linspace(0, len(cycle) - 1, n_poses + 1)[:-1].round().long()

@@ -1,4 +1,4 @@
-"""What a prior has learnt: its components as bodies, draws from it, its likelihood over EM."""
+"""Draw the components of a prior, samples from it, and its likelihood over EM."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _SEEN, _UNSEEN = LEFT, RIGHT  # the same two colours
 
 
 class _Component(NamedTuple):
-    """One Gaussian as arms in body axes: by side, the mean [5, 3] and draws [N, 5, 3]."""
+    """Holds one Gaussian as arms in body axes: by side, the mean [5, 3] and draws [N, 5, 3]."""
 
     weight: float
     means: dict[str, Tensor]
@@ -67,11 +67,10 @@ def plot_prior_components(
 ) -> Figure:
     """Return the components of a prior as bodies from the front and the side, heaviest first.
 
-    A strong line is a component's mean, turned and moved back from its camera's view to the body
-    (BL 5); the thin ones are draws from that component, so that its spread is seen too. The heavier a
-    component, the stronger its line; the number is its weight, the bar its weight relative to the
-    heaviest one. Where the right arm is the mirror image of the left one both are drawn on one body,
-    else each arm has a block of its own.
+    A strong line is a component's mean, transformed from its camera's view to the body (BL 5). Thin
+    lines are draws from the component, which show its spread. The line is stronger for a larger weight.
+    The number is the weight, the bar the weight relative to the largest. Where the right arm is the
+    mirror image of the left one, both are drawn on one body; otherwise each arm has a block of its own.
 
     Args:
         prior: whose components are drawn.
@@ -121,7 +120,7 @@ def _components_title(
 def _components(
     prior: UpperBodyPrior, name: str, n_shown: int, seed: int
 ) -> dict[str, list[_Component]]:
-    """Blocks of components, heaviest first: one of both arms, or one for each arm."""
+    """Return blocks of components, heaviest first: one of both arms, or one for each arm."""
     if name == "pose":
         arms = {"left": prior.left, "right": prior.right}
     elif name in prior.windows:
@@ -180,7 +179,7 @@ def _draw_components(
     low: Tensor,
     high: Tensor,
 ) -> None:
-    """A panel for each component: the front view beside the side view."""
+    """Draw a panel for each component: the front view beside the side view."""
     size = (high - low).tolist()
     middle = float((low + high)[2]) / 2
     aside = float(high[0]) - middle + size[2] / 2  # where the side view has its z = 0
@@ -194,7 +193,7 @@ def _draw_components(
             offset = torch.tensor([shift, 0.0], dtype=torch.float64)
             for side, mean in component.means.items():
                 if pick == _SIDE and side == "right" and len(component.means) > 1:
-                    continue  # seen from the side the mirror image is the same
+                    continue  # the mirror image looks the same from the side
                 _draw_arms(ax, component.draws[side][..., pick] + offset, side)
                 colors = [SIDE_COLORS[side]] * 3 + [MIDDLE] * 2
                 draw_skeleton(
@@ -213,7 +212,7 @@ def _draw_components(
 def _draw_arms(
     ax: Axes, arms: Float[Tensor, "N 5 2"], side: str, linewidth: float = 0.6, alpha: float = 0.22
 ) -> None:
-    """Thin lines from shoulder to hand."""
+    """Draw thin lines from shoulder to hand."""
     flat = to_numpy(arms[:, :3])
     style = {"linewidth": linewidth, "alpha": alpha, "zorder": 1}
     ax.plot(flat[..., 0].T, flat[..., 1].T, color=SIDE_COLORS[side], **style)
@@ -236,10 +235,10 @@ def plot_prior_samples(
     n_cloud: int = 300,
     title: str | None = None,
 ) -> Figure:
-    """Draws from a prior as bodies from the front and the side, one by one and all on top.
+    """Return samples of a prior as bodies from the front and the side, one by one and superimposed.
 
-    The arms are drawn independently, as the prior has them, each from a camera of its own, and put
-    on one neck; arms that could not be one person's show how far that independence is from the truth.
+    The arms are sampled independently, as in the prior, each with a camera of its own, and joined at the
+    neck. Pairs of arms that no person could have show the error of that independence.
 
     Args:
         prior: to draw from.
@@ -287,7 +286,7 @@ def plot_prior_samples(
 
 
 def _draw_cloud(part: SubFigure, bodies: Float[Tensor, "N 8 3"]) -> None:
-    """Every draw on top of the others, the hands as dots."""
+    """Draw all samples superimposed, the hands as dots."""
     levels = torch.tensor([0.005, 0.995], dtype=torch.float64)
     low, high = _limits(torch.quantile(bodies.flatten(0, 1), levels, dim=0), margin=0.08)
     panels = part.subplots(2, 1, sharey=True)
@@ -375,7 +374,7 @@ def _likelihood_legend(held_out: bool) -> list[Any]:
 def _draw_likelihood(
     ax: Axes, name: str, values: Sequence[float] | Tensor, unseen: bool = False
 ) -> tuple[float, float]:
-    """One curve; returns the lowest and highest value that the scale is to show."""
+    """Draw one curve; return the lowest and highest value for the scale."""
     y = torch.as_tensor(values, dtype=torch.float64).detach().cpu().flatten()
     steps = torch.arange(1, len(y) + 1)
     finite = torch.isfinite(y)

@@ -1,4 +1,4 @@
-"""Uncertain rotations on a sphere: where a direction goes that they turn."""
+"""Draw uncertain rotations on a sphere, as the directions to which they turn one direction."""
 
 from __future__ import annotations
 
@@ -45,15 +45,15 @@ def plot_rotations(
     generator: torch.Generator | None = None,
     title: str | None = None,
 ) -> Figure:
-    """Return Gaussians over rotations as clouds of the direction that they turn, with their sigma points.
+    """Return Gaussians over rotations as clouds of a rotated direction, with their sigma points.
 
-    Each panel is a unit sphere; pale points are draws, arcs lead from the mean to the six sigma
-    points (DX 2). What lies behind the sphere is fainter.
+    Each panel is a unit sphere. Pale points are draws; arcs lead from the mean to the six sigma points
+    (DX 2). Points on the far side are fainter.
 
     Args:
         gaussians: by name, mean [3], covariance [3, 3] and centre [3] (or None) of each.
-        direction: that is turned, [3]; by default that of a hanging limb in its part's axes.
-        view: degrees, from where it is looked at: to the person's left of the front, and from above.
+        direction: that is rotated, [3]; by default that of a hanging limb in its part's axes.
+        view: of the virtual camera, degrees: from the front to the person's left, and upwards.
         draws: points of each cloud. generator: of the draws. title: above the panels.
 
     Raises:
@@ -90,7 +90,7 @@ def _camera(across: float, above: float) -> Tensor:
 
 
 def _sphere(ax: Axes, camera: Tensor) -> None:
-    """Outline, meridians and circles of latitude every 30 degrees, the front half of them."""
+    """Draw the outline, and the near half of meridians and circles of latitude every 30 degrees."""
     turn = torch.linspace(0, 2 * torch.pi, 181, dtype=torch.float64)
     zero = torch.zeros_like(turn)
     ax.plot(turn.cos().numpy(), turn.sin().numpy(), color=PALE, linewidth=1.2)
@@ -123,7 +123,7 @@ def _cloud(
     check_shape("covariance", covariance, [3, 3])
 
     def seen(x: Tensor) -> Any:
-        """Right, up and towards the viewer of the turned direction, [3, ...]."""
+        """Return the rotated direction: right, up and towards the viewer, [3, ...]."""
         turned = quaternion_vector_to_matrix(compose(centre, x)) @ direction
         return to_numpy((turned @ camera.mT).movedim(-1, 0))
 

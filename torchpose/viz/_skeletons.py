@@ -1,4 +1,4 @@
-"""Poses as pictures: in the image, from three sides, as a strip of frames; the prior's means."""
+"""Draw poses in the image, from three sides and as a strip of frames; draw a prior's means."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ ARM_LIMBS = ((0, 1), (1, 2), (2, 4), (4, 3))
 
 
 class Mixture(Protocol):
-    """Anything with weights [K] and means [K, D], such as `torchpose.priors.GaussianMixture`."""
+    """Declares weights [K] and means [K, D], as of `torchpose.priors.GaussianMixture`."""
 
     weights: Tensor
     means: Tensor
@@ -63,10 +63,10 @@ def draw_skeleton(
     linewidth: float = 3.0,
     alpha: float = 1.0,
 ) -> None:
-    """Draw a skeleton on axes that the caller owns.
+    """Draw a skeleton on the given axes.
 
     Args:
-        ax: matplotlib axes; its scale is left alone.
+        ax: matplotlib axes; its scale is not changed.
         joints: [J, 2]; NaN joints and their limbs are left out.
         covariance: [J, 2, 2], drawn as the ellipse of probability `level`.
         observed: [J], True = measured (filled marker), False = inferred (hollow).
@@ -156,7 +156,7 @@ def plot_pose(
     level: float = 0.9,
     title: str | None = None,
 ) -> Figure:
-    """One pose in the image, with the ellipses of its covariances.
+    """Return one pose in the image, with the ellipses of its covariances.
 
     Args:
         joints: [8, 2], pixels. covariance: [8, 2, 2], squared pixels.
@@ -192,7 +192,7 @@ def plot_pose_3d(
     level: float = 0.9,
     title: str | None = None,
 ) -> Figure:
-    """One pose from the front, the side and above, all at one scale.
+    """Return one pose from the front, the side and above, at one scale.
 
     Args:
         joints: [8, 3], camera axes, metres. covariance: [8, 3, 3], m^2; each view shows the
@@ -231,7 +231,7 @@ def plot_pose_3d(
 
 
 def _limits(points: Tensor, margin: float) -> tuple[Tensor, Tensor]:
-    """Lowest and highest finite coordinate of [..., D] with a margin, relative to the larger."""
+    """Return lowest and highest finite coordinates of [..., D] with a margin, relative to the range."""
     flat = points.detach().cpu().double().reshape(-1, points.shape[-1])
     flat = flat[torch.isfinite(flat).all(-1)]
     if flat.shape[0] == 0:
@@ -301,7 +301,7 @@ def _choose_frames(frames: Sequence[int] | None, n_frames: int, total: int) -> l
 
 
 def _set_view(ax: Axes, low: Tensor, high: Tensor, pick: tuple[int, int]) -> None:
-    """The same scale in every panel: as wide as the front view, centred on this view's range."""
+    """Set the scale of a panel: as wide as the front view, centred on this view's range."""
     half, middle = float((high - low)[0]) / 2, float((low + high)[pick[0]]) / 2
     ax.set_aspect("equal")
     ax.set(xlim=(middle - half, middle + half), ylim=(float(high[pick[1]]), float(low[pick[1]])))

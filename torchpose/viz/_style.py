@@ -1,4 +1,4 @@
-"""The look that all pictures share: colours, figures without global state, legends, saving."""
+"""Define the style of all pictures: colours, figures without global state, legends, saving."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def new_figure(width: float, height: float, title: str | None = None) -> Figure:
 
 
 def style_axes(ax: Axes, x: str = "", y: str = "", title: str = "", grid: bool = True) -> Axes:
-    """Light grid, no box, labels of one size, ticks at round numbers."""
+    """Return axes with a light grid, no box, labels of one size, and ticks at round numbers."""
     from matplotlib.ticker import MaxNLocator
 
     for axis in (ax.xaxis, ax.yaxis):
@@ -100,7 +100,7 @@ def style_axes(ax: Axes, x: str = "", y: str = "", title: str = "", grid: bool =
 
 
 def add_legend(figure: Figure, handles: Iterable[Any]) -> None:
-    """A legend below the panels, outside of the data, in as many columns as fit the width."""
+    """Add a legend below the panels, in as many columns as fit the width."""
     entries = list(handles)
     if not entries:
         return
@@ -141,7 +141,7 @@ def label_row(ax: Axes, text: str) -> None:
 
 
 def method_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Colour and dashes of each method, in the order given."""
+    """Return colour and dashes of each method, in the order given."""
     if not names:
         raise InputError("expected at least one named curve, got none")
     return {
@@ -151,7 +151,7 @@ def method_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def joint_colors(names: Sequence[str]) -> list[str]:
-    """Blue for the person's left, orange for the right, grey for the rest."""
+    """Return the colour of each joint: blue for the left, orange for the right, grey for the middle."""
     return [SIDE_COLORS[side_of(name)] for name in names]
 
 
@@ -165,7 +165,7 @@ def side_of(name: str) -> str:
 
 
 def readable(name: str) -> str:
-    """``hand_left`` as ``left hand``.
+    """Return a joint's name in words, ``hand_left`` as ``left hand``.
 
     >>> readable("hand_left")
     'left hand'
@@ -175,7 +175,7 @@ def readable(name: str) -> str:
 
 
 def join_unit(label: str, unit: str) -> str:
-    """``error (cm)``."""
+    """Return a label with its unit, such as ``error (cm)``."""
     return f"{label} ({unit})" if unit else label
 
 

@@ -1,4 +1,4 @@
-"""Rendered performers: video with known truth, for the demo, the benchmarks and the tests."""
+"""Render performers: video with ground truth, for the demo, the benchmarks and the tests."""
 
 from torchpose._core.facade import set_up_facade
 from torchpose.demo._rendering.look import LOOKS, Look

@@ -1,9 +1,9 @@
-"""The silhouettes that trackers see: recorded joints, clothed in another body than the tracker's.
+"""Render silhouettes of recorded joints with another body than the tracker's.
 
-A tracker's body has constant bone lengths and one tapered cylinder or two for each part. Here the
-joints are those that were recorded, with everything the joint set has (spine, hands, toes), the torso
-is a bundle of cylinders in other places, hands, feet and head are of other lengths, and every limb is
-thicker or thinner by a factor of its own. So a tracker never meets its own model.
+A tracker's body has constant bone lengths and one or two tapered cylinders for each part. Here the
+joints are the recorded ones, with all of the joint set (spine, hands, toes). The torso is a bundle of
+cylinders in other places, hands, feet and head have other lengths, and the radius of every limb has a
+factor of its own. So the images differ from a tracker's model.
 """
 
 from collections.abc import Mapping
@@ -53,11 +53,11 @@ _LIMBS_OF_MIDDLE = (
 
 @dataclass(frozen=True)
 class TrueShape:
-    """How one person's outline differs from the average one.
+    """Holds the differences of one person's outline from the average one.
 
     Args:
         radii: factor of each kind of limb, the same on both sides. lengths: factor of hands, feet
-            and head. depth: factor of how far belly and breast stand out.
+            and head. depth: factor of the depth of belly and breast.
     """
 
     radii: Mapping[str, float]
@@ -87,7 +87,7 @@ def true_silhouettes(
     faults: float = 0.0,
     generator: torch.Generator | None = None,
 ) -> Bool[Tensor, "T C H W"]:
-    """Return the silhouettes of a clip as background subtraction would give them.
+    """Return the silhouettes of a clip, with the faults of background subtraction.
 
     Args:
         clip: recorded joints. shape: of the person. cameras: with their image sizes.
@@ -130,7 +130,7 @@ def limb_kinds() -> list[str]:
 
 
 def _points(clip: MocapClip, shape: TrueShape) -> tuple[dict[str, Tensor], float]:
-    """Named points [T, 3] of the outline, and the person's size relative to the tables'."""
+    """Return named points [T, 3] of the outline, and the person's size relative to the tables'."""
     joints = dict(zip(BODY_15.names, clip.joints.unbind(1), strict=True))
     extra = dict(zip(canonical_names(clip.names), clip.recorded.unbind(1), strict=True))
     scale = _size(joints) / _LEG
@@ -166,7 +166,7 @@ def _trunk(
     scale: float,
     shape: TrueShape,
 ) -> dict[str, Tensor]:
-    """Bundles beside and before the spine, which is bent where the joint set knows how."""
+    """Return points of the trunk about the spine, which is bent if the joint set has its joints."""
     pelvis, neck = joints["pelvis"], joints["neck"]
     waist = extra.get("lower_back", pelvis + 0.25 * (neck - pelvis))
     chest = extra.get("thorax", extra.get("upper_back", pelvis + 0.72 * (neck - pelvis)))
@@ -226,7 +226,7 @@ def _leg(
     scale: float,
     shape: TrueShape,
 ) -> dict[str, Tensor]:
-    """The foot points where the recorded one does, else ahead at a right angle to the shank."""
+    """Return points of a leg; without a recorded foot it is at a right angle to the shank."""
     knee, ankle = joints[f"{side}_knee"], joints[f"{side}_ankle"]
     shank = normalize(knee - ankle, dim=-1)
     toe = next((extra[k] for k in (f"foot_{side}", f"toe_{side}", f"big_toe_{side}") if k in extra),

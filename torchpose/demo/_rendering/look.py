@@ -1,4 +1,4 @@
-"""How the performer looks: clothes, complexion, and the textures of torso, neck and hands."""
+"""Define the appearance of the performer: clothes, skin, textures of torso, neck and hands."""
 
 from functools import lru_cache
 from typing import Literal, NamedTuple
@@ -21,7 +21,7 @@ _HAND_ORIGIN = (106.0, 66.0)
 
 
 class Look(NamedTuple):
-    """What the performer wears.
+    """Holds the clothes of a performer.
 
     Attributes:
         clothes, trousers: colours, red, green, blue, 0 to 255.
@@ -41,14 +41,14 @@ LOOKS = {
     "short sleeves": Look((96.0, 104.0, 108.0), (50.0, 54.0, 56.0), "short"),
     "skin-coloured jumper": Look((196.0, 128.0, 92.0), (62.0, 70.0, 92.0)),
 }
-"""Looks by name: what makes hands easy to find by colour, harder, and hardest."""
+"""Looks by name, in ascending difficulty of finding hands by colour."""
 
 
 class Wardrobe(NamedTuple):
-    """Everything that is worn and shown.
+    """Holds the colours and textures of a look.
 
     Attributes:
-        look: what was asked for. portrait: head, neck, skin. skin: colour of bare arms [3].
+        look: as given. portrait: head, neck, skin. skin: colour of bare arms [3].
         torso: texture of the clothes, see `TORSO_TEXTURE`. neck: texture of the neck.
         hand: sprite of an open hand: x along the fingers, y to the thumb, about the hand joint.
     """

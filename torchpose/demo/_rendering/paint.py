@@ -1,4 +1,4 @@
-"""Brushes: shaded limbs, filled outlines and sprites, painted on a float image with soft edges."""
+"""Paint shaded limbs, filled outlines and sprites on a float image, with soft edges."""
 
 import math
 from typing import NamedTuple
@@ -25,7 +25,7 @@ _AMBIENT, _DIFFUSE, _ROOT = 0.52, 0.56, 0.90
 
 
 class Box(NamedTuple):
-    """Part of an image, pixels; right and bottom are outside."""
+    """Holds a part of an image, pixels; right and bottom are outside."""
 
     left: int
     top: int
@@ -44,16 +44,16 @@ class Box(NamedTuple):
 
     @property
     def empty(self) -> bool:
-        """True if there is nothing in it."""
+        """Return whether the box has no pixels."""
         return self.right <= self.left or self.bottom <= self.top
 
     def of(self, image: NDArray) -> NDArray:
-        """That part of the image, a view."""
+        """Return that part of the image, as a view."""
         return image[self.top : self.bottom, self.left : self.right]
 
 
 class Capsule(NamedTuple):
-    """A tapered limb in the image: two round ends (x, y), radii, pixels.
+    """Holds a tapered limb in the image: two round ends (x, y), radii, pixels.
 
     With `bulge` the second end is cut off, that many radii beyond the point.
     """
@@ -104,12 +104,12 @@ def paint_capsule(
     folds: float = 0.0,
     root: float = 0.0,
 ) -> None:
-    """A limb lit as a round thing.
+    """Paint a limb, shaded as a cylinder.
 
     Args:
         canvas: [H, W, 3] float32, painted on. limb: where. colour: [3].
         folds: strength of the creases of a sleeve. root: share of the length over which the limb
-            grows out of what it hangs on, without an edge of its own.
+            fades in from the part that it is joined to.
     """
     box = limb.box(canvas.shape)
     if box.empty:
@@ -144,7 +144,7 @@ def polygon_box(points: NDArray, shape: tuple[int, ...]) -> Box:
 
 
 def paint_polygon(canvas: Array, points: NDArray, texture: Array, to_image: NDArray) -> None:
-    """An outline filled with a texture.
+    """Paint an outline filled with a texture.
 
     Args:
         canvas: [H, W, 3] float32, painted on. points: outline [N, 2], pixels.
@@ -176,7 +176,7 @@ def polygon_alpha(points: NDArray, box: Box) -> Array:
 
 
 def paint_sprite(canvas: Array, sprite: Sprite, place: NDArray, axes: NDArray) -> None:
-    """A sprite, turned and foreshortened.
+    """Paint a sprite, rotated and foreshortened.
 
     Args:
         canvas: [H, W, 3] float32, painted on. place: of its origin in the image [2], pixels.

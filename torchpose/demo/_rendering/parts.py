@@ -1,6 +1,6 @@
-"""The performer's parts in space and in the image, each with its depth, so that near ones hide far ones.
+"""Place the performer's parts in space and in the image, with their depths for occlusion.
 
-Numbers of this file are metres of an adult. The torso's own axes are those of the body at rest
+Numbers in this file are metres of an adult. The torso's own axes are those of the body at rest
 (`torchpose.demo._mannequin`): x to the person's left, y down, z to the back, from the neck."""
 
 from typing import NamedTuple, Protocol
@@ -34,7 +34,7 @@ FACE_FROM_HEAD = (0.0, 0.025, -0.04)
 
 
 class Pose(NamedTuple):
-    """One person at one time, camera axes, metres.
+    """Holds one person at one time, camera axes, metres.
 
     Attributes:
         joints: [8, 3] in the order of `UPPER_BODY`. wrists: left and right [2, 3].
@@ -50,7 +50,7 @@ class Pose(NamedTuple):
 
     @property
     def neck(self) -> Points:
-        """The neck joint [3]."""
+        """Return the neck joint [3]."""
         return self.joints[4]
 
     def on_torso(self, points: Points) -> Points:
@@ -66,7 +66,7 @@ class Pose(NamedTuple):
 
 
 class Bodies(NamedTuple):
-    """One person over time: the fields of `Pose`, with frames as leading dimension."""
+    """Holds one person over time: the fields of `Pose`, with frames as leading dimension."""
 
     joints: Points
     wrists: Points
@@ -82,12 +82,12 @@ class Bodies(NamedTuple):
         after, share = min(before + 1, last), time - before
         if share == 0:
             return Pose(*(x[before] for x in self))
-        # Between two frames axes turn so little that their mean is as good as a rotation.
+        # Axes rotate so little between two frames that their mean is nearly a rotation.
         return Pose(*((1 - share) * x[before] + share * x[after] for x in self))
 
 
 def bodies(performance: Performance) -> Bodies:
-    """Return everything that the drawing needs of a performance."""
+    """Return the bodies of a performance."""
     upright = performance.rotation.double()
     torso = upright @ euler_to_matrix(performance.angles.torso.double())
     head = torso @ euler_to_matrix(performance.angles.head.double())
@@ -96,10 +96,10 @@ def bodies(performance: Performance) -> Bodies:
 
 
 class Brush(Protocol):
-    """Something that can be painted."""
+    """Declares what can be painted on an image."""
 
     def paint(self, canvas: Array) -> None:
-        """Paint it on [H, W, 3]."""
+        """Paint on a canvas [H, W, 3]."""
         ...
 
     def box(self, shape: tuple[int, ...]) -> Box:
@@ -107,17 +107,17 @@ class Brush(Protocol):
         ...
 
     def alpha(self, box: Box) -> Array:
-        """Its opacity in a box."""
+        """Return the opacity in a box."""
         ...
 
     @property
     def anchors(self) -> Points:
-        """Points that move with it [N, 2], pixels."""
+        """Return points that move with the part [N, 2], pixels."""
         ...
 
 
 class Limb(NamedTuple):
-    """A shaded limb."""
+    """Paints a shaded limb."""
 
     capsule: Capsule
     colour: NDArray
@@ -139,7 +139,7 @@ class Limb(NamedTuple):
 
 
 class Outline(NamedTuple):
-    """A filled outline."""
+    """Paints a filled outline."""
 
     points: Points
     texture: Array
@@ -160,7 +160,7 @@ class Outline(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """A sprite."""
+    """Paints a sprite."""
 
     sprite: Sprite
     place: NDArray
@@ -183,11 +183,11 @@ class Picture(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A part of a person.
+    """Holds a part of a person.
 
     Attributes:
         name: "head", "neck", "torso", "legs", or "upper_arm", "forearm", "hand" with _left, _right.
-        depth: it is painted before everything nearer, metres. brush: what to paint.
+        depth: parts are painted in descending order of it, metres. brush: what to paint.
     """
 
     name: str
@@ -196,7 +196,7 @@ class Part(NamedTuple):
 
 
 class View:
-    """Points of camera axes in the image.
+    """Projects points of camera axes into the image.
 
     Args:
         K: [3, 3].
@@ -360,7 +360,7 @@ def _hand(pose: Pose, side: int, worn: Wardrobe, view: View) -> Picture:
     thumb = thumb / max(float(np.linalg.norm(thumb)), 1e-6)
     place, axes = view.plane(hand, np.stack([fingers, thumb], 1))
     scale = view.scale(hand)
-    # A hand is no sheet of paper: seen from the edge or the finger tips it keeps its thickness.
+    # Seen from the edge or the finger tips a hand still has a thickness.
     along = axes[:, 0]
     length = max(float(np.linalg.norm(along)), 1e-6)
     across = np.array([-along[1], along[0]]) / length

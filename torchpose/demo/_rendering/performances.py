@@ -1,7 +1,7 @@
-"""Movements for rendered benchmarks: signing, clapping, merging hands, two people who cross.
+"""Generate movements for rendered benchmarks: signing, clapping, merging hands, crossing persons.
 
-Key frames are places of the hands, in metres on the torso; the arms follow by inverse kinematics.
-Every movement is drawn at random from its kind, so another seed is another sequence.
+Key frames are places of the hands in the torso's axes, metres; the arms follow by inverse kinematics.
+Movements are random, so that every seed gives another sequence.
 """
 
 import math
@@ -27,7 +27,7 @@ _LABEL_REST = "rest"
 
 
 class _Keys(NamedTuple):
-    """Key frames: seconds, words, places of the left and the right hand."""
+    """Holds key frames: seconds, words, places of the left and the right hand."""
 
     times: list[float]
     labels: list[str]
@@ -35,11 +35,11 @@ class _Keys(NamedTuple):
 
     @classmethod
     def begin(cls) -> "_Keys":
-        """Hands hanging down."""
+        """Return the first key frame, with hands hanging down."""
         return cls([0.0], [_LABEL_REST], [(_REST, _mirror(_REST))])
 
     def go(self, label: str, left: Place, right: Place, seconds: float) -> None:
-        """Add a key after some time, more if the way is too long for it."""
+        """Add a key after some time, which is extended if the path is too long."""
         before = self.hands[-1]
         way = max(math.dist(a, b) for a, b in zip(before, (left, right), strict=True))
         # The quickest moment of a minimum-jerk movement is 1.875 times its mean speed.
@@ -157,7 +157,7 @@ def _animate(
 
 
 def _clap(keys: _Keys, rng: np.random.Generator) -> None:
-    """A burst of claps somewhere before the body; sometimes a rest."""
+    """Add a series of claps in front of the body, sometimes with a rest."""
     x, y, z = rng.uniform(-0.06, 0.06), rng.uniform(0.08, 0.34), rng.uniform(-0.38, -0.28)
     half, period = rng.uniform(0.08, 0.17), rng.uniform(0.42, 0.62)
     tilt = rng.uniform(-0.02, 0.02)
@@ -174,7 +174,7 @@ def _clap(keys: _Keys, rng: np.random.Generator) -> None:
 
 
 def _merge(keys: _Keys, rng: np.random.Generator) -> None:
-    """Hands that meet and part, swap sides, and swap heights, one in front of the other."""
+    """Add hands that meet and part, swap sides, and swap heights, with occlusion."""
     for kind in rng.permutation(["meet", "swap", "stack"]):
         y, z = rng.uniform(0.14, 0.32), rng.uniform(-0.34, -0.28)
         wide, pace = rng.uniform(0.15, 0.24), rng.uniform(0.4, 0.8)
@@ -209,7 +209,7 @@ _IN_SPACE = ((0.14, 0.10, -0.34), (0.22, 0.18, -0.30), (0.10, 0.24, -0.36), (0.2
 
 
 def _sign(keys: _Keys, rng: np.random.Generator) -> None:
-    """Something like a sign: a hand or both go somewhere and make a stroke or two there."""
+    """Add a movement like a sign: one hand or both go to a place and make strokes there."""
     dominant = rng.random() < 0.7  # the right hand leads more often
     where = (_AT_FACE, _AT_CHEST, _IN_SPACE)[rng.choice(3, p=[0.3, 0.3, 0.4])]
     jitter = rng.uniform(-0.02, 0.02, 3)

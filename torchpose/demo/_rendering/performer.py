@@ -1,4 +1,4 @@
-"""Frames of rendered performers, videos of them, and the truth about them."""
+"""Render frames and videos of performers, with ground truth."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -39,11 +39,10 @@ def render_performance(
     scene: Scene | None = None,
     look: str | Look | Sequence[str | Look] = "dark sleeves",
 ) -> Iterator[Image]:
-    """Render frames of one or more animated performers.
+    """Yield rendered frames of one or more animated performers.
 
-    The head is cut out of the portrait that matplotlib ships and moves rigidly with the pose; the
-    rest is painted. What is nearer hides what is farther. Motion blur is the mean of several
-    pictures over the time for which the shutter is open.
+    The head is a portrait from matplotlib that moves rigidly with the pose; the other parts are painted.
+    Nearer parts occlude farther ones. Motion blur is the mean of several pictures over the exposure.
 
     Args:
         performance: one, or several of the same length, in the axes of the camera.
@@ -110,10 +109,10 @@ def _paint(
     order: NDArray,
     still: NDArray,
 ) -> Box:
-    """Paint the parts in their order; returns the part of the canvas that was painted over.
+    """Paint the parts in their order, and return the part of the canvas that was painted.
 
-    What stands still and is hidden by nothing that moves is painted once; from there on everything
-    is painted at every time, and the mean is taken.
+    Static parts behind all moving ones are painted once. The others are painted at every time of the
+    exposure, and the mean is taken.
     """
     count = 0
     while count < len(order) and (still[order[count]] or not blurred):
@@ -144,7 +143,7 @@ def _union(boxes: list[Box]) -> Box:
 
 
 def _movement(a: Part, b: Part) -> float:
-    """Pixels."""
+    """Return the largest movement of a part, pixels."""
     return float(np.abs(a.brush.anchors - b.brush.anchors).max())
 
 
@@ -200,11 +199,11 @@ def choose_looks(look: str | Look | Sequence[str | Look], n: int) -> list[Look]:
 
 
 class Truth(NamedTuple):
-    """Where the joints of one performer are.
+    """Holds the ground truth of one performer.
 
     Attributes:
         joints3d: camera axes, metres, in the order of `UPPER_BODY`. joints2d: pixels.
-        occluded: something nearer hides the joint, or it lies outside the image.
+        occluded: whether the joint is occluded or outside of the image.
     """
 
     joints3d: Float[Tensor, "T 8 3"]
@@ -217,9 +216,9 @@ def performance_truth(
     camera: PinholeCamera,
     look: str | Look | Sequence[str | Look] = "dark sleeves",
 ) -> tuple[Truth, ...]:
-    """Return the truth about what `render_performance` shows of the same arguments, one for each performer.
+    """Return the ground truth of each performer in `render_performance` of the same arguments.
 
-    A joint is occluded when the nearest part that is painted over its pixel is not its own: its limb,
+    A joint is occluded when the nearest part at its pixel is not its own. Its own parts are its limbs,
     for a shoulder the torso too, for the neck torso, neck and head.
 
     Raises:
@@ -255,7 +254,7 @@ _OWN = tuple(_own_parts(joint) for joint in UPPER_BODY)
 
 
 def _hidden(parts: list[Part], pixels: NDArray, size: tuple[int, int]) -> NDArray:
-    """Return which joints of N persons are hidden [N, 8]; the parts come person by person."""
+    """Return which joints of N persons are occluded [N, 8]; the parts are in order of the persons."""
     each = len(parts) // len(pixels)
     shape = (size[1], size[0])
     boxes = [part.brush.box(shape) for part in parts]
@@ -288,7 +287,7 @@ def render_video(
     look: str | Look | Sequence[str | Look] = "dark sleeves",
     truth: str | Path | None = None,
 ) -> tuple[Truth, ...]:
-    """Render to an H.264 file, with the truth beside it.
+    """Write a rendered H.264 video and its ground truth, which is returned.
 
     Args:
         path: of the video, ending in .mp4; its folder must exist.
@@ -299,7 +298,7 @@ def render_video(
             image_size. Further performers go to truth_p02.npz and so on.
 
     Returns:
-        `Truth` of each performer.
+        The ground truth of each performer.
 
     Raises:
         See `render_performance` and `torchpose.video.VideoWriter`.

@@ -1,7 +1,7 @@
-"""Head, neck and skin of the rendered performer, cut out of the portrait that matplotlib ships.
+"""Cut head, neck and skin of the performer out of a portrait that comes with matplotlib.
 
-The portrait (`grace_hopper.jpg`, in the public domain) is read from matplotlib, where it lies, and
-never copied. A sprite is a small picture with opacity, in metres about an origin of its own.
+The portrait (`grace_hopper.jpg`, in the public domain) is read from matplotlib and not copied. A sprite
+is a small picture with opacity, in metres about an origin of its own.
 """
 
 from functools import lru_cache
@@ -19,7 +19,7 @@ __all__ = ["FACE_BOX", "Portrait", "Sprite", "load_portrait"]
 Array = NDArray[np.float32]
 
 FACE_BOX = 0.165
-"""Side of the box that the Haar cascade finds about an adult's face, metres."""
+"""Side of the Haar cascade's bounding box of an adult's face, metres."""
 
 # Pixels of the portrait: the middle of its Haar box, a side, the outline of the head with hat and
 # hair, and rectangles (left, top, right, bottom) of nothing but skin. The box on the portrait itself
@@ -40,7 +40,7 @@ _CHEEKS = ((196, 232, 216, 262), (318, 236, 338, 266))
 
 
 class Sprite(NamedTuple):
-    """A picture with opacity, also at half, a quarter, ... of its size.
+    """Holds a picture with opacity, also at half, a quarter, ... of its size.
 
     Attributes:
         levels: [h, w, 4] float32 each: red, green, blue times opacity (0 to 255), opacity (0 to 1).
@@ -68,10 +68,10 @@ class Sprite(NamedTuple):
 
 
 class Portrait(NamedTuple):
-    """What the performer is made of.
+    """Holds the parts of the portrait.
 
     Attributes:
-        head: sprite about the middle of the face; FACE_BOX says how large it is.
+        head: sprite about the middle of the face, scaled to FACE_BOX.
         neck: skin of the neck [h, w, 3]. cheek: smooth skin [h, w, 3].
         skin: median colour of the cheeks [3]. All 0 to 255, red, green, blue, float32.
     """
@@ -84,11 +84,11 @@ class Portrait(NamedTuple):
 
 @lru_cache(maxsize=8)
 def load_portrait(mirrored: bool = False, tone: tuple[float, float, float] = (1, 1, 1)) -> Portrait:
-    """Return the portrait, cut up.
+    """Return the parts of the portrait.
 
     Args:
-        mirrored: left and right exchanged, so that two performers are not one and the same.
-        tone: factors on red, green and blue, for another complexion.
+        mirrored: whether left and right are exchanged, so that performers differ.
+        tone: factors of red, green and blue, for another complexion.
 
     Raises:
         MissingDependencyError: matplotlib is not installed. InputError: one without the portrait.
@@ -140,7 +140,7 @@ def _cut(picture: Array, box: tuple[int, int, int, int]) -> Array:
 
 
 def _smooth(outline: NDArray) -> NDArray:
-    """Corners cut twice (Chaikin), in sixteenths of a pixel."""
+    """Return an outline with corners cut twice (Chaikin), in sixteenths of a pixel."""
     for _ in range(2):
         following = np.roll(outline, -1, 0)
         pair = np.stack([0.75 * outline + 0.25 * following, 0.25 * outline + 0.75 * following], 1)

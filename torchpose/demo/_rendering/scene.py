@@ -1,4 +1,4 @@
-"""The room behind the performer, and what the camera adds: noise, flicker, an open shutter."""
+"""Render the room behind the performer, and the noise and flicker of the camera."""
 
 import math
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ __all__ = ["Scene", "Sensor", "room"]
 
 @dataclass(frozen=True)
 class Scene:
-    """What is rendered besides the performers.
+    """Holds the settings of room and camera.
 
     Args:
-        clutter: furniture behind them, a picture of the colour of skin among it; else a bare wall.
+        clutter: furniture behind the performers, some of the colour of skin; else a bare wall.
         noise: standard deviation of the sensor's noise at middle grey, of 255; it grows with the
-            square root of the brightness, as photons do.
+            square root of the brightness (shot noise).
         exposure: part of a frame's time for which the shutter is open (motion blur), 0 to 1.
         flicker: standard deviation of the slow change of the illumination, as a share.
 
@@ -67,7 +67,7 @@ def room(width: int, height: int, scene: Scene, seed: int = 0) -> Array:
 
 
 def _furnish(picture: Image, rng: np.random.Generator) -> None:
-    """Blue board, window, shelf with books, monitor with a skin-coloured picture, chair, skirting."""
+    """Draw a board, a shelf with books, a monitor with a skin-coloured picture, a chair, skirting."""
     import cv2
 
     height, width = picture.shape[:2]
@@ -118,7 +118,7 @@ def _furnish(picture: Image, rng: np.random.Generator) -> None:
 
 
 class Sensor:
-    """Noise and flicker, the same in every run with one seed.
+    """Adds noise and flicker, the same in every run with one seed.
 
     Args:
         width, height: pixels. scene: how much of them. seed: of the noise. fps: for the flicker.
@@ -127,8 +127,8 @@ class Sensor:
     def __init__(self, width: int, height: int, scene: Scene, seed: int, fps: float) -> None:
         self._rng = np.random.default_rng([seed, 2])
         self._size, self._scene = (width, height), scene
-        # Drawing a picture of normal numbers takes longer than all the rest; so one larger picture
-        # is drawn, and every frame has its own part of it, mirrored at random.
+        # Sampling a picture of normal numbers takes longer than all the rest. So one larger picture
+        # is sampled, and every frame has another part of it, mirrored at random.
         extra = self._extra = 96 if scene.noise else 0
         if scene.noise:
             bank = self._rng.standard_normal((height + extra, width + extra, 3), dtype=np.float32)

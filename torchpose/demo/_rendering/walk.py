@@ -1,10 +1,9 @@
-"""A walk animated by hand from joint angles of textbooks, and its videos in calibrated cameras.
+"""Animate a walk from joint angles of textbooks, and render it in calibrated cameras.
 
-It is neither recorded nor drawn from a learnt model, so that a tracker with a manifold of recorded walks
-meets somebody whom the manifold does not know.
-
-The body is painted as the protocols' outlines are: other limbs, other radii and a trunk of other pieces
-than the body that a tracker moves."""
+The walk is neither recorded nor sampled from a learnt model, so that it is held out from every manifold of
+recorded walks. The body is that of `clothed_body`: its limbs, radii and trunk differ from those of a
+tracker's body.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -57,10 +56,10 @@ _SOFT = 0.008  # metres, over which the weight goes from foot to foot
 
 
 class Walk(NamedTuple):
-    """Somebody who walks.
+    """Holds the states and joints of a walking person.
 
     Attributes:
-        body: who. states: [T, 36] of the body. joints: [T, 15, 3], metres, y up, the floor at 0.
+        body: of the person. states: [T, 36] of the body. joints: [T, 15, 3], metres, y up, the floor at 0.
         fps: frames per second.
     """
 
@@ -88,13 +87,13 @@ def walk(
     cadence: float = 0.92,
     stray: float = 25.0,
 ) -> Walk:
-    """A walk past the origin along z, in a bend.
+    """Return a walk past the origin along z, in a bend.
 
     Args:
         seconds, fps: how long, and frames per second.
         height: metres; of it, the legs have more and trunk and arms less than average.
         seed: of small differences from step to step. cadence: gait cycles (two steps) per second.
-        stray: degrees by which the way bends from its start to its end.
+        stray: degrees by which the path bends from its start to its end.
 
     Raises:
         InputError: values that are not positive.
@@ -127,7 +126,7 @@ def walk(
 
 
 def _walker(height: float) -> Body:
-    """Somebody of other proportions than the average."""
+    """Return a body of other proportions than the average."""
     lengths = BODY_15.standard_lengths(height)
     factors = {
         "knee": 1.04,
@@ -173,7 +172,7 @@ def _about_two_axes(heading: Tensor, tilt: Tensor) -> Float[Tensor, "T 3"]:
 
 
 def _on_the_floor(body: Body, states: Tensor, heading: Tensor, fps: float) -> Walk:
-    """Put the foot that carries on the floor, and go on as fast as it is left behind."""
+    """Return the walk with its supporting foot fixed on the floor."""
     ankles = body.joints(states)[:, [BODY_15.joint(f"{s}_ankle") for s in ("left", "right")]]
     share = torch.softmax(-ankles[..., 1] / _SOFT, -1)  # of the weight on either foot
     states = states.clone()
@@ -188,7 +187,7 @@ def _on_the_floor(body: Body, states: Tensor, heading: Tensor, fps: float) -> Wa
 
 
 def _smooth(values: Float[Tensor, " T"], width: int) -> Float[Tensor, " T"]:
-    """Moving average over an odd number of frames; the ends are repeated."""
+    """Return the moving average over an odd number of frames; the ends are repeated."""
     reach = min(width, len(values)) // 2
     padded = torch.cat([values[:1].expand(reach), values, values[-1:].expand(reach)])
     return padded.unfold(0, 2 * reach + 1, 1).mean(-1)
@@ -236,7 +235,7 @@ def walk_clip(walk: Walk) -> MocapClip:
 
 
 def empty_scene(camera: PinholeCamera, seed: int = 0) -> Array:
-    """Return the room without anybody [H, W, 3], 0 to 255: a wall, a floor, a skirting board, plaster.
+    """Return the empty room [H, W, 3], 0 to 255: a wall, a floor, a skirting board, plaster.
 
     Args:
         camera: level, with the size of its image. seed: of the plaster and the light.
@@ -267,7 +266,7 @@ def render_body_video(
     """Write a video for each camera, NAME.mp4, and a picture of its empty scene, NAME-empty.png.
 
     Args:
-        folder: that exists. walk: who walks. cameras: with names and sizes, y up.
+        folder: must exist. walk: of the person. cameras: with names and sizes, y up.
         seed: of the shape of the body, the rooms and the sensors' noise.
 
     Returns:
@@ -337,13 +336,13 @@ def cameras_around(
     height: float = 1.5,
     focal: float = 450.0,
 ) -> list[PinholeCamera]:
-    """Return the cameras of 640 x 480 pixels around the middle of the way, which they look at.
+    """Return cameras of 640 x 480 pixels around the middle of the path, which they look at.
 
-    They stand at `azimuths` from the direction of the walk, none of them in its line, so that the
-    person stays in view for four metres of it.
+    They stand at `azimuths` from the direction of the walk, none of them in its line. So the person
+    is in view over four metres of the path.
 
     Args:
-        clip: whose way it is. azimuths: degrees, one camera each. distance: from the middle, metres.
+        clip: of the walk. azimuths: degrees, one camera each. distance: from the middle, metres.
         height: above the lowest joint, metres. focal: length, pixels.
     """
     up = clip.up.double()
@@ -364,7 +363,7 @@ def cameras_around(
 
 
 def _way(clip: MocapClip) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Return the horizontal direction of the walk, or of the chest where nobody walks, and its left."""
+    """Return the horizontal direction of the walk, or of the chest without a walk, and its left."""
     up = clip.up.double()
     pelvis = clip.joints[:, _PELVIS].double()
     way = pelvis[-1] - pelvis[0]

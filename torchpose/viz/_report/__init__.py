@@ -1,4 +1,4 @@
-"""The report of a tracked video: one self-contained HTML page that needs no network."""
+"""Write the report of a tracked video: one self-contained HTML page that needs no network."""
 
 from torchpose._core.facade import set_up_facade
 from torchpose.viz._report.page import write_report

@@ -1,4 +1,4 @@
-"""Numbers of a track as they lie in the page: base64 of little-endian arrays, thinned if long."""
+"""Pack the numbers of a track for the page: base64 of little-endian arrays, thinned if long."""
 
 import base64
 import math
@@ -25,7 +25,7 @@ _TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # what a symmetric
 
 @runtime_checkable
 class ReportedTrack(Protocol):
-    """What the page needs of one person: a `PoseTrack`, or a body with other joints.
+    """Declares the attributes of one person that the page needs, as of a `PoseTrack`.
 
     Attributes:
         joints3d: [1, T, J, 3], metres, in `frame`. covariance3d: [1, T, J, 3, 3].
@@ -46,7 +46,7 @@ class ReportedTrack(Protocol):
 
 
 class Thinned(NamedTuple):
-    """How much of a track is in the page: every `stride`-th pose, curves in steps of `bucket`."""
+    """Holds the thinning of a track: every `stride`-th pose, curves in steps of `bucket`."""
 
     stride: int
     bucket: int
@@ -70,12 +70,12 @@ def pack_person(
     truth: Float[Tensor, "T J 3"] | None = None,
     max_poses: int = MAX_POSES,
 ) -> tuple[dict[str, Any], Thinned]:
-    """Everything that the page holds of one person.
+    """Return the data of one person in the page.
 
-    Poses and covariances are those of every stride-th frame, so that at most `max_poses` remain;
-    the page interpolates between them. What was measured is kept for every frame. Where there are
-    more frames than `CURVE_POINTS`, curves become the smallest and the largest value (and the widest
-    band) in each of `CURVE_POINTS` / 2 buckets of equal length, so no peak is lost.
+    Poses and covariances are those of every stride-th frame, so that at most `max_poses` remain. The
+    page interpolates between them. `observed` is kept for every frame. With more frames than
+    `CURVE_POINTS`, curves become the smallest and the largest value, and the widest band, in each of
+    `CURVE_POINTS` / 2 buckets of equal length. So no peak is lost.
 
     Args:
         track: one sequence of T frames. label: its name in the page.
@@ -84,7 +84,7 @@ def pack_person(
         max_poses: see above.
 
     Returns:
-        What JSON takes, and what was thinned.
+        A dictionary for JSON, and the thinning.
     """
     joints, covariance = _array(track.joints3d[0]), _array(track.covariance3d[0])
     n = len(joints)
@@ -124,7 +124,7 @@ def _shares(observed: np.ndarray, there: np.ndarray) -> list[float]:
 
 
 def _curves(joints: np.ndarray, covariance: np.ndarray, bucket: int) -> np.ndarray:
-    """Lowest and highest value, lower and upper end of the band, for each bucket [4, J, 3, N]."""
+    """Return lowest and highest value, lower and upper end of the band, by bucket [4, J, 3, N]."""
     quantile = chi2_quantile(torch.tensor(_LEVEL, dtype=torch.float64), 1)
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore"):  # NaN stays NaN, whatever its sign bit
@@ -133,7 +133,7 @@ def _curves(joints: np.ndarray, covariance: np.ndarray, bucket: int) -> np.ndarr
     ends = [
         reduce.reduceat(values, starts, axis=0)
         for reduce, values in (
-            (np.fmin, joints),  # these pass over NaN unless there is nothing else
+            (np.fmin, joints),  # these ignore NaN unless all are NaN
             (np.fmax, joints),
             (np.fmin, joints - half),
             (np.fmax, joints + half),

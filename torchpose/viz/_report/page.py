@@ -1,4 +1,4 @@
-"""`report.html`: overlay, skeleton, curves, and what was measured, in one file without a network."""
+"""Write `report.html`: overlay, skeleton, curves and measured joints in one file."""
 
 import base64
 import html
@@ -31,7 +31,7 @@ from torchpose.viz._style import readable, side_of
 __all__ = ["MAX_EMBEDDED", "write_report"]
 
 MAX_EMBEDDED = 64 * 2**20
-"""Bytes of an overlay that is still put into the page; a larger one is linked."""
+"""Largest overlay that is embedded in the page, bytes; a larger one is linked."""
 
 _SCRIPTS = ("numbers.js", "skeleton.js", "plots.js", "player.js")
 _FPS = 30.0
@@ -52,21 +52,20 @@ def write_report(
     truth: Tensor | None = None,
     limbs: Sequence[tuple[int, int]] = LIMBS,
 ) -> Path:
-    """Write what was tracked as one HTML page that any browser shows, without a network.
+    """Write tracked poses as one HTML page that any browser shows, without a network.
 
-    It holds the overlay video, the 3D skeleton that can be turned while it plays, the curves of each
-    joint with 90 % bands, and for each joint and frame whether it was measured or inferred. Numbers
-    lie in it as base64 of 32-bit floats. Long tracks are thinned as `torchpose.viz._report.packing` says,
-    and the page says so.
+    The page holds the overlay video, a 3D skeleton that can be rotated while it plays, the curves of each
+    joint with 90 % bands, and for each joint and frame whether it was measured or inferred. Numbers are
+    base64 of 32-bit floats. Long tracks are thinned, which the page states.
 
     Args:
         path: the page; it appears whole or not at all.
         people: one `PoseTrack` of one sequence for each person, or the like with other joints; an
-            empty list gives a page that says that nobody was tracked. NaN poses are drawn as nothing.
-        overlay: video for the page, H.264; up to 64 MB it is put into the page, a larger one is
-            linked. Without it the page plays the skeleton alone.
+            empty list gives a page without persons. NaN poses are not drawn.
+        overlay: video for the page, H.264; up to 64 MB it is embedded, a larger one is linked.
+            Without it the page plays the skeleton alone.
         title: of the page. facts: rows of a table, such as video, camera, method.
-        notes: what was assumed or went wrong, one sentence each.
+        notes: assumptions and failures, one sentence each.
         first_frames: frame of the video with which each track begins; by default 0.
         n_frames: frames of the video; by default up to the end of the last track.
         labels: name of each person; by default "person 1" and so on.
@@ -126,7 +125,7 @@ def write_report(
 
 
 class _Overlay:
-    """The video of the page: embedded if it is small enough, else linked."""
+    """Embeds the video of the page if it is small enough, else links it."""
 
     def __init__(self, file: Path, page: Path) -> None:
         self.file = file
@@ -150,7 +149,7 @@ class _Overlay:
 
 
 def _fill(stream: TextIO, template: str, parts: dict[str, str], video: _Overlay | None) -> None:
-    """Write the template; what is put in is never searched for placeholders itself."""
+    """Write the template with its parts, in which no placeholders are searched for."""
     for i, piece in enumerate(re.split(r"\{\{(\w+)\}\}", template)):
         if i % 2 == 0:
             stream.write(piece)
