@@ -47,7 +47,7 @@ def test_lost_frames_are_filled_from_both_sides():
 def test_missing_times_follow_on():
     shown, tally = resample([None] * 7, 25.0, snap=True)
     assert shown == list(range(7))
-    assert tally == Tally(untimed=7)
+    assert tally == Tally()
 
 
 def test_a_time_that_does_not_advance_is_late_and_dropped():

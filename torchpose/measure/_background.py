@@ -20,7 +20,7 @@ _LARGEST = (320, 240)  # width and height at which the model works
 _TOP, _WIDEST = (1.0, -1.2), (2.8, 2.0)  # and so wide from there to the bottom of the image
 _BODY = (1.4, 1.2)  # the same for head and torso alone
 _ANOTHER, _SAME = 30, 16  # grey levels between what is something else, and within what is at rest
-_UNKNOWN = (255, 0, 255)  # stands for what nobody has seen yet
+_UNKNOWN = (255, 0, 255)  # colour for unknown background
 
 
 def person_region(

@@ -68,7 +68,7 @@ def frame_rate(times: Sequence[float], declared: float | None = None) -> Rate | 
 
     Args:
         times: of the frames, seconds, in any order.
-        declared: what the file says; taken if within half a percent of what was found.
+        declared: rate by the file, taken if within half a percent of the one found.
 
     Returns:
         The rate, None for fewer than two different times.

@@ -87,7 +87,7 @@ class VideoTracker(nn.Module):
         >>> prior = torchpose.load_prior("kinect-upper-body")
         >>> camera = torchpose.PinholeCamera.from_image_size(160, 120)
         >>> tracker = torchpose.VideoTracker(prior, camera)
-        >>> tracker(np.zeros((5, 120, 160, 3), np.uint8))  # nobody there
+        >>> tracker(np.zeros((5, 120, 160, 3), np.uint8))  # no persons
         []
     """
 

@@ -18,7 +18,7 @@ from torchpose.errors import InputError
 __all__ = ["PERFORMANCES", "crossing", "performance"]
 
 PERFORMANCES = ("performer", "signing", "clapping", "merging hands")
-"""Names that `performance` knows."""
+"""Names that `performance` takes."""
 
 Place = tuple[float, float, float]
 _FASTEST = 3.2  # metres per second at the middle of a movement
@@ -74,7 +74,7 @@ def performance(
         distance: of the neck from the camera, metres. size: bone lengths.
 
     Raises:
-        InputError: an unknown name, or lengths that make no sense.
+        InputError: an unknown name, or lengths out of range.
 
     Reference:
         Burke & Lasenby, figure 8: hands that merge, and clapping, are what trackers fail at.
