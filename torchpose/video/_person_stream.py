@@ -1,12 +1,12 @@
 """Track the poses of one person of a video, and decide whether left and right hand are swapped."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose._core.images import Image
@@ -16,7 +16,15 @@ from torchpose.upper_body._live import StreamState
 from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
 from torchpose.upper_body._tracker import UpperBodyTracker
 
-__all__ = ["Measured", "PersonStream", "PersonStreamState", "measured_of", "unmeasured"]
+__all__ = [
+    "Measured",
+    "PersonStream",
+    "PersonStreamState",
+    "TrackedBlock",
+    "measured_of",
+    "unmeasured",
+    "without_long_gaps",
+]
 
 
 class Measured(NamedTuple):
@@ -30,6 +38,11 @@ class Measured(NamedTuple):
     keypoints: Float[Tensor, "T J 2"]
     covariance: Float[Tensor, "T J 2 2"]
     size: Float[Tensor, " T"]
+
+    @property
+    def seen(self) -> Bool[Tensor, " T"]:
+        """Return in which frames anything was measured."""
+        return self.keypoints.isfinite().flatten(1).any(1)
 
     def frames(self, rows: slice) -> "Measured":
         """Return some of the frames."""
@@ -66,6 +79,19 @@ class PersonStreamState(NamedTuple):
     def unseen(self) -> int:
         """Return the number of frames since the last measurement."""
         return int(self.stream.unseen[0])
+
+
+class TrackedBlock(NamedTuple):
+    """Holds the poses of one person in a block of frames.
+
+    Attributes:
+        start: first frame of the block in which the person is tracked.
+        poses: from that frame on, NaN after a long gap. measured: in these frames.
+    """
+
+    start: int
+    poses: PoseTrack
+    measured: Measured
 
 
 class PersonStream(nn.Module):
@@ -134,6 +160,36 @@ class PersonStream(nn.Module):
         chosen = Measured(keypoints, cov, measured.size)
         return PersonStreamState(stream, votes), _choose(poses, which), chosen
 
+    def advance_all(
+        self,
+        states: Mapping[int, PersonStreamState],
+        block: Sequence[FrameMeasurements],
+        images: Sequence[Image],
+        gap: int,
+    ) -> tuple[dict[int, PersonStreamState], dict[int, TrackedBlock]]:
+        """Return the next states and the poses of all persons in a block of frames, by number.
+
+        Args:
+            states: of the persons before the block. block: measurements of each frame.
+            images: the frames, RGB; used with `association` only.
+            gap: frames without measurements after which a person has neither pose nor state.
+        """
+        present = {number for frame in block for number in frame.person.tolist()}
+        following, tracked = {}, {}
+        for number in sorted(states.keys() | present):
+            measured, start = measured_of(block, number, len(self.names)), 0
+            state = states.get(number)
+            if state is None:
+                state, start = self.init(number), int(measured.seen.long().argmax())
+            rows, unseen = slice(start, None), state.unseen
+            measured = measured.frames(rows)
+            state, poses, chosen = self.advance(state, measured, images[rows])
+            poses = without_long_gaps(poses, measured.seen, unseen, gap)
+            tracked[number] = TrackedBlock(start, poses, chosen)
+            if state.unseen <= gap:
+                following[number] = state
+        return following, tracked
+
 
 def _vote(
     association: HandAssociation,
@@ -168,6 +224,27 @@ def _choose(poses: PoseTrack, which: Tensor) -> PoseTrack:
     return replace(
         poses, **fields, lengths=poses.lengths[:1], failed_at=poses.failed_at.new_tensor([first])
     )
+
+
+def without_long_gaps(
+    poses: PoseTrack, seen: Bool[Tensor, " T"], unseen: int, gap: int
+) -> PoseTrack:
+    """Return the poses, NaN where nothing was seen for more than `gap` frames.
+
+    Args:
+        unseen: number of frames without measurements before these.
+    """
+    frames = torch.arange(len(seen))
+    last = torch.where(seen, frames, torch.full_like(frames, -1 - unseen)).cummax(0).values
+    away = frames - last > gap
+    if not bool(away.any()):
+        return poses
+    changed = {}
+    for name in ("joints2d", "joints3d", "covariance2d", "covariance3d"):
+        value = getattr(poses, name).clone()
+        value[:, away] = torch.nan
+        changed[name] = value
+    return replace(poses, **changed)
 
 
 def _other_side(name: str) -> str:

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool
 from torch import Tensor
 
 from torchpose._core.facade import set_up_facade
@@ -24,8 +23,9 @@ from torchpose.video._person_stream import (
     Measured,
     PersonStream,
     PersonStreamState,
-    measured_of,
+    TrackedBlock,
     unmeasured,
+    without_long_gaps,
 )
 
 __all__ = ["PoseSpool", "TrackedPerson", "TrackedRecording", "smoothed"]
@@ -131,19 +131,12 @@ class TrackedPerson:
 
 @dataclass
 class _Person:
-    """Holds one person while a recording is tracked.
-
-    `state` is None while the person is absent. Frames of an absence are counted in `absent`, and written
-    only if the person returns.
-    """
+    """Holds one person while a recording is tracked; `last_seen` counts from `first_frame`."""
 
     number: int
     first_frame: int
     poses: PoseSpool
-    state: PersonStreamState | None = None
     measured: list[Measured] = field(default_factory=list)
-    n_frames: int = 0
-    absent: int = 0
     last_seen: int = 0
     n_seen: int = 0
 
@@ -162,6 +155,7 @@ class TrackedRecording:
         self.stream, self.gap, self.folder = stream, gap, folder
         self.n_frames = 0
         self._people: dict[int, _Person] = {}
+        self._streams: dict[int, PersonStreamState] = {}
 
     def append(
         self, block: Sequence[FrameMeasurements], images: Sequence[Image] = ()
@@ -169,51 +163,34 @@ class TrackedRecording:
         """Track the next frames, with their images if the stream uses them.
 
         Returns:
-            The poses in the last frames of the block, by number, of all persons so far.
+            The poses in the last frames of the block, by number, of all persons present.
 
         Raises:
             OutputError: the disk is full.
         """
-        newcomers = {number for measured in block for number in measured.person.tolist()}
-        poses = {}
-        for number in sorted(self._people.keys() | newcomers):  # each with a state of its own
-            measured, first = measured_of(block, number, len(self.stream.names)), 0
-            if number not in self._people:
-                first = int(_seen(measured).long().argmax())
-                self._people[number] = _Person(
-                    number, self.n_frames + first, PoseSpool(self.folder)
-                )
-            rows = slice(first, None)
-            poses[number] = self._extend(self._people[number], measured.frames(rows), images[rows])
+        self._streams, tracked = self.stream.advance_all(self._streams, block, images, self.gap)
+        for number, part in tracked.items():
+            self._keep(number, part)
         self.n_frames += len(block)
-        return poses
+        return {number: part.poses for number, part in tracked.items()}
 
-    def _extend(self, person: _Person, measured: Measured, images: Sequence[Image]) -> PoseTrack:
-        """Track some frames; poses are NaN while the person is absent."""
-        seen = _seen(measured)
-        frames, count = torch.nonzero(seen).flatten(), len(seen)
-        if len(frames):
-            person.last_seen = person.n_frames + int(frames[-1])
-            person.n_seen += len(frames)
-        person.n_frames += count
-        start = 0
-        if person.state is None:
-            start = int(frames[0]) if len(frames) else count
-        person.absent += start
-        if start == count:
-            return _nobody(count, self.stream.tracker)
-        if person.absent:
-            person.measured.append(unmeasured(person.absent, len(self.stream.names)))
-            person.poses.append(_nobody(person.absent, self.stream.tracker))
-            person.absent = 0
-        state = person.state or self.stream.init(person.number)
-        unseen, rows = state.unseen, slice(start, None)
-        state, poses, chosen = self.stream.advance(state, measured.frames(rows), images[rows])
-        poses = _without_long_gaps(poses, seen[rows], unseen, self.gap)
-        person.poses.append(poses)
-        person.measured.append(chosen)
-        person.state = None if state.unseen > self.gap else state
-        return poses
+    def _keep(self, number: int, part: TrackedBlock) -> None:
+        """Append a person's part of a block, after NaN for the frames of an absence."""
+        frame = self.n_frames + part.start
+        if number not in self._people:
+            self._people[number] = _Person(number, frame, PoseSpool(self.folder))
+        person = self._people[number]
+        place = frame - person.first_frame
+        absent = place - len(person.poses)
+        if absent:
+            person.measured.append(unmeasured(absent, len(self.stream.names)))
+            person.poses.append(_nobody(absent, self.stream.tracker))
+        person.measured.append(part.measured)
+        person.poses.append(part.poses)
+        seen = torch.nonzero(part.measured.seen).flatten()
+        if len(seen):
+            person.last_seen = place + int(seen[-1])
+            person.n_seen += len(seen)
 
     def finish(self, smoother: UpperBodyTracker | None = None) -> list[TrackedPerson]:
         """Return the persons who were seen for half a second or longer, the longest seen first.
@@ -250,33 +227,8 @@ def smoothed(
     with torch.no_grad():
         track = smoother(person.keypoints[None], names=names, covariance=person.covariance[None])
     seen = person.keypoints.isfinite().flatten(1).any(1)
-    track = _without_long_gaps(track, seen, 0, gap)
+    track = without_long_gaps(track, seen, 0, gap)
     return replace(track, first_frame=person.first_frame)
-
-
-def _seen(measured: Measured) -> Bool[Tensor, " T"]:
-    return measured.keypoints.isfinite().flatten(1).any(1)
-
-
-def _without_long_gaps(
-    poses: PoseTrack, seen: Bool[Tensor, " T"], unseen: int, gap: int
-) -> PoseTrack:
-    """Return the poses, NaN where nothing was seen for more than `gap` frames.
-
-    Args:
-        unseen: number of frames without measurements before these.
-    """
-    frames = torch.arange(len(seen))
-    last = torch.where(seen, frames, torch.full_like(frames, -1 - unseen)).cummax(0).values
-    away = frames - last > gap
-    if not bool(away.any()):
-        return poses
-    changed = {}
-    for name in ("joints2d", "joints3d", "covariance2d", "covariance3d"):
-        value = getattr(poses, name).clone()
-        value[:, away] = torch.nan
-        changed[name] = value
-    return replace(poses, **changed)
 
 
 def _nobody(n_frames: int, tracker: UpperBodyTracker) -> PoseTrack:

@@ -27,7 +27,7 @@ from torchpose.priors._upper_body import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._tracker import UpperBodyTracker
-from torchpose.video._person_stream import Measured, PersonStream, PersonStreamState, measured_of
+from torchpose.video._person_stream import Measured, PersonStream, PersonStreamState
 from torchpose.video._prefetch import prefetch
 from torchpose.video._recording import TrackedPerson, TrackedRecording
 
@@ -168,15 +168,8 @@ class VideoTracker(nn.Module):
         image = as_image(image)
         candidates = _candidates(state.poses) if self.candidates else None
         measurer, measured = self.measurer.step(state.measurer, image, None, candidates)
-        streams, people = {}, []
-        there = set(measured.person.tolist())
-        for number in sorted(state.streams.keys() | there):  # each with a state of its own
-            stream = state.streams.get(number) or self.stream.init(number)
-            own = measured_of([measured], number, len(self.stream.names))
-            stream, pose, chosen = self.stream.advance(stream, own, [image])
-            if stream.unseen <= self.gap:
-                streams[number] = stream
-                people.append(LivePerson(number, pose, chosen))
+        streams, tracked = self.stream.advance_all(state.streams, [measured], [image], self.gap)
+        people = [LivePerson(n, tracked[n].poses, tracked[n].measured) for n in streams]
         return VideoState(measurer, streams, {p.number: p.pose for p in people}), people
 
     def forward(
