@@ -69,6 +69,7 @@ class LiveView:
     Raises:
         InputError: a port or quality that is out of range. OutputError: the port is taken.
 
+    >>> import numpy as np
     >>> with LiveView() as view:
     ...     view.show(np.zeros((48, 64, 3), dtype=np.uint8))
     ...     view.stop_requested
