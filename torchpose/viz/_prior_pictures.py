@@ -214,8 +214,8 @@ def _draw_arms(
 ) -> None:
     """Draw thin lines from shoulder to hand."""
     flat = to_numpy(arms[:, :3])
-    style = {"linewidth": linewidth, "alpha": alpha, "zorder": 1}
-    ax.plot(flat[..., 0].T, flat[..., 1].T, color=SIDE_COLORS[side], **style)
+    ax.plot(flat[..., 0].T, flat[..., 1].T, color=SIDE_COLORS[side], linewidth=linewidth,
+            alpha=alpha, zorder=1)  # fmt: skip
 
 
 def _component_legend(on_one_body: bool) -> list[Any]:
