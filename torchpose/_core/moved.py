@@ -159,6 +159,7 @@ MODULES = {
     "recipes": "learning._recipes",
     "recording": "video._recording",
     "rendering": "demo._rendering",
+    "rendering.portrait": "demo._rendering.look",
     "report": "viz._report",
     "rotation_gaussians": "math._rotation_gaussians",
     "rotations": "math._rotations",

@@ -20,8 +20,8 @@ from torchpose.demo._rendering import (
     performance_truth,
     render_performance,
 )
+from torchpose.demo._rendering.look import FACE_BOX, load_portrait
 from torchpose.demo._rendering.parts import FACE_FROM_HEAD
-from torchpose.demo._rendering.portrait import FACE_BOX, load_portrait
 from torchpose.errors import CameraError, InputError, MissingDependencyError
 from torchpose.measure import HaarFaceDetector
 from torchpose.skeleton import UPPER_BODY

@@ -6,17 +6,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpose.demo._rendering.portrait import Array, Sprite
-
 __all__ = [
     "LIGHT",
+    "Array",
     "Box",
     "Capsule",
+    "Sprite",
     "paint_capsule",
     "paint_polygon",
     "paint_sprite",
     "polygon_box",
 ]
+
+Array = NDArray[np.float32]
 
 LIGHT = (-0.38, -0.52, 0.765)
 """Direction to the lamp: x right, y down in the image, z towards the camera."""
@@ -173,6 +175,34 @@ def polygon_alpha(points: NDArray, box: Box) -> Array:
     fixed = np.round(16 * (points - (box.left, box.top))).astype(np.int32)
     cv2.fillPoly(mask, [fixed], 255, cv2.LINE_AA, 4)
     return mask.astype(np.float32) / np.float32(255)
+
+
+class Sprite(NamedTuple):
+    """Holds a picture with opacity, also at half, a quarter, ... of its size.
+
+    Attributes:
+        levels: [h, w, 4] float32 each: red, green, blue times opacity (0 to 255), opacity (0 to 1).
+        origin: its place in the first level, pixels. scale: metres per pixel of the first level.
+    """
+
+    levels: tuple[Array, ...]
+    origin: tuple[float, float]
+    scale: float
+
+    @classmethod
+    def of(
+        cls, rgb: NDArray, alpha: NDArray, origin: tuple[float, float], scale: float
+    ) -> "Sprite":
+        """Return the sprite of a picture [h, w, 3], 0 to 255, and its opacity [h, w], 0 to 1."""
+        import cv2
+
+        alpha = np.asarray(alpha, np.float32)[..., None]
+        level = np.concatenate([np.asarray(rgb, np.float32) * alpha, alpha], -1)
+        levels = [level]
+        while min(level.shape[:2]) >= 24:
+            level = cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            levels.append(level)
+        return cls(tuple(levels), origin, scale)
 
 
 def paint_sprite(canvas: Array, sprite: Sprite, place: NDArray, axes: NDArray) -> None:

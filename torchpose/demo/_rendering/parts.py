@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from torchpose.demo._performer import Performance
 from torchpose.demo._rendering.look import TORSO_TEXTURE, Wardrobe
 from torchpose.demo._rendering.paint import (
+    Array,
     Box,
     Capsule,
+    Sprite,
     paint_capsule,
     paint_polygon,
     paint_sprite,
@@ -22,7 +24,6 @@ from torchpose.demo._rendering.paint import (
     polygon_box,
     warp_sprite,
 )
-from torchpose.demo._rendering.portrait import Array, Sprite
 from torchpose.math._rotations import euler_to_matrix
 
 __all__ = ["FACE_FROM_HEAD", "Bodies", "Part", "Pose", "bodies", "body_parts"]

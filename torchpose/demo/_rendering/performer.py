@@ -17,9 +17,8 @@ from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import project
 from torchpose.demo._performer import Performance
 from torchpose.demo._rendering.look import LOOKS, Look, Wardrobe, wardrobe
-from torchpose.demo._rendering.paint import Box
+from torchpose.demo._rendering.paint import Array, Box
 from torchpose.demo._rendering.parts import Bodies, Part, bodies, body_parts
-from torchpose.demo._rendering.portrait import Array
 from torchpose.demo._rendering.scene import Scene, Sensor, room
 from torchpose.errors import CameraError, InputError
 from torchpose.skeleton._joint_sets import UPPER_BODY

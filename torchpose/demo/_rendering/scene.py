@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from torchpose._core.images import Image
 from torchpose.demo._rendering.look import smooth_noise
-from torchpose.demo._rendering.portrait import Array
+from torchpose.demo._rendering.paint import Array
 from torchpose.errors import InputError
 
 __all__ = ["Scene", "Sensor", "room"]

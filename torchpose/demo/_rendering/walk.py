@@ -24,8 +24,7 @@ from torchpose.body._skeleton import BODY_15
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.demo._rendering.clothed_body import TrueShape, limb_kinds, true_limbs
 from torchpose.demo._rendering.look import smooth_noise
-from torchpose.demo._rendering.paint import Capsule, paint_capsule
-from torchpose.demo._rendering.portrait import Array
+from torchpose.demo._rendering.paint import Array, Capsule, paint_capsule
 from torchpose.errors import InputError
 from torchpose.io._mocap import MocapClip
 
