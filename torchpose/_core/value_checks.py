@@ -1,8 +1,7 @@
 """Decide whether values may be looked at: not while a function is exported, compiled or vectorised.
 
-Checks of values raise errors that name the element at fault, and some computations are left out where
-values show that they would change nothing. Both need the numbers, which there are none of while a
-function is traced.
+Value checks raise errors that name the faulty element. Some computations are skipped where the values
+show that they would change nothing. Both read numbers, which do not exist while a function is traced.
 """
 
 from collections.abc import Iterator

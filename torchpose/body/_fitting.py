@@ -1,12 +1,12 @@
 """Fit bodies and states to recorded joint positions, batched over frames.
 
-What joints cannot tell, and what is taken instead:
+Joint positions leave some quantities undetermined. The fit takes for:
 
 - the twist of a part about its only bone (head, arms, legs): none; the part swings from its centre
   to the bone's direction by the smallest angle;
 - the tilt of the pelvis about the line of the hips: the torso's, where the pelvis joint lies within
   4 cm of that line (pose2sim: 0, Berkeley MHAD: 2 cm, whose own tilt is off by up to 100 degrees).
-  Where it lies farther away (CMU: 10 cm), the hips tell the tilt;
+  Where it lies farther away (CMU: 10 cm), the hips determine the tilt;
 - a joint that the set lacks: its part stays at rest.
 """
 

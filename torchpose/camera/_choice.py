@@ -28,7 +28,7 @@ def resolve_camera(
         source: the input, for messages.
 
     Raises:
-        CameraError: no camera can be told, four numbers are not what was given, or its image size is
+        CameraError: no camera is known, four numbers are not what was given, or its image size is
             not that of the input. InputError, FileFormatError: the file.
     """
     if given:

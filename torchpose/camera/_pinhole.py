@@ -1,8 +1,7 @@
 """Define the pinhole camera as a module, and read and write its TOML file.
 
 Camera axes: x right, y down, z forward. Metres, pixels, radians. The functions on tensors are in
-`torchpose.camera._projection` and `torchpose.math._rotations`, random viewpoints in
-`torchpose.camera._viewpoints`; they can be imported from here as well.
+`torchpose.camera._projection` and `torchpose.math._rotations`.
 """
 
 import re
@@ -17,44 +16,16 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from torchpose.camera._projection import (
-    backproject,
     check_intrinsics,
     intrinsics,
-    lift,
-    map_pixel_covariance,
-    map_pixels,
     project,
 )
-from torchpose.camera._viewpoints import PAPER_VIEWS, Viewpoints, ViewRange, sample_viewpoints
 from torchpose.errors import CameraError, FileFormatError, InputError, check_floating, check_real
 from torchpose.math._rotations import (
-    ROTATION_ORDERS,
-    RotationOrder,
-    euler_to_matrix,
-    matrix_to_euler,
     rotvec_to_matrix,
 )
 
-__all__ = [
-    "PAPER_VIEWS",
-    "ROTATION_ORDERS",
-    "PinholeCamera",
-    "RotationOrder",
-    "ViewRange",
-    "Viewpoints",
-    "backproject",
-    "check_intrinsics",
-    "euler_to_matrix",
-    "lift",
-    "load_cameras",
-    "map_pixel_covariance",
-    "map_pixels",
-    "matrix_to_euler",
-    "project",
-    "rotvec_to_matrix",
-    "sample_viewpoints",
-    "save_cameras",
-]
+__all__ = ["PinholeCamera", "load_cameras", "save_cameras"]
 
 _FARTHEST = 1e9  # pixels or metres: no number of a camera is larger
 _LARGEST_TURN = 100.0  # radians; a few full turns mean the same as none

@@ -1,9 +1,9 @@
 """Find the body in the image, and place a virtual camera that sees it where the prior expects it.
 
-A prior over windows has bodies in one place, between the distances of its training views. Head and
-neck of the last second tell where a body is and how large it is seen, so that hands of other frames
-can be moved along with it, and so that the camera can be turned, and zoomed where it is much nearer
-or farther, until body and prior agree.
+A prior over windows has bodies in one place, between the distances of its training views. The
+position and scale of a body follow from head and neck in the last second. Hands of other frames are
+moved along with the body. The camera is turned, and zoomed where the body is much nearer or farther,
+until body and prior agree.
 """
 
 import math

@@ -29,7 +29,7 @@ _UNIFORM_WEIGHT = 1e-3
 
 
 class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
-    """Mixture Kalman filter with one track for each component, which it keeps for ever (BL 49).
+    """Mixture Kalman filter with one track for each component, which it always keeps (BL 49).
 
     Each track j is a Kalman filter; with a_j prop. to pi_j w_{t-1,j}, its weight and the evidence are
         w_j prop. to a_j N_j^power,  log p(z_t | z_1:t-1) = logsumexp_j(log a_j + log N_j),

@@ -1,9 +1,9 @@
 """Condition the mixture on each frame alone, for models in which frames are independent.
 
-Weights by frame draw the indicator of every frame from pi anew, as for sampled tracks (BL 47), while
-each component's track goes on as if it had been right all along: weights without memory, states with. If
-the states have none either (transition "ou" with gamma = 0), frames do not depend on each other at
-all: `run_memoryless` conditions the mixture on all of them at once.
+With weights by frame, the indicator of every frame is drawn from pi independently, as for sampled
+tracks (BL 47); the track of each component still carries its state from frame to frame. Where the
+states carry nothing over either (transition "ou" with gamma = 0), frames are independent, and
+`run_memoryless` conditions the mixture on all of them at once.
 """
 
 from collections.abc import Iterator

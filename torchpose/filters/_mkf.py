@@ -64,7 +64,7 @@ class MixtureKalmanFilter(RecursiveFilter):
     There are three kinds of tracks, each a class of its own with its own options. A call of this class
     makes a filter of the kind that `tracks` names:
 
-    - "fixed", `FixedTrackFilter`: track j keeps indicator j for ever (BL 49).
+    - "fixed", `FixedTrackFilter`: track j always keeps indicator j (BL 49).
     - "sampled", `SampledTrackFilter`: indicators are drawn from pi (BL 47), and tracks are resampled.
     - "split", `SplitTrackFilter`: every track is continued by every component, and the M likeliest are
       kept (Smith & Winter).

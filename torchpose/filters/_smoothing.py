@@ -1,8 +1,8 @@
 """Smooth fixed tracks: over the whole sequence, or with a fixed lag.
 
-Inside a track, Rauch-Tung-Striebel; over the tracks, forward-backward on the indicator, with the chain
-whose forward pass is the filter itself. The states of different tracks are not mixed, so this is an
-approximation when the indicator changes.
+The state of a track is smoothed by Rauch-Tung-Striebel recursion, and the indicator of the tracks by the
+forward-backward algorithm, on the chain whose forward pass is the filter itself. The states of different
+tracks are not mixed, so this is an approximation when the indicator changes.
 """
 
 from typing import NamedTuple

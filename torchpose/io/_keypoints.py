@@ -1,7 +1,7 @@
 """Read and write 2D keypoints of one person: .npz, .csv, and folders of OpenPose JSON.
 
-Pixels, u to the right and v down. A keypoint that was not measured is NaN; a confidence of 0 or NaN
-says so too.
+Pixels, u to the right and v down. A keypoint that was not measured is NaN, or has a confidence
+of 0 or NaN.
 """
 
 import math

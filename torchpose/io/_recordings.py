@@ -1,8 +1,7 @@
 """Read recordings of 3D joints of any supported sensor or software.
 
-Joints come back in camera axes and metres; see `torchpose.io._formats.axes` and
-`torchpose.io._formats.axes` for how. One file per format reads what a file holds; here it is
-checked and converted.
+Joints come back in camera axes and metres; see `torchpose.io._formats.axes`. One module per
+format reads a file; here its contents are checked and converted.
 """
 
 import re
@@ -308,7 +307,7 @@ def _check_shapes(raw: RawRecording) -> None:
 
 
 def _missing(raw: RawRecording, notes: list[str]) -> np.ndarray:
-    """Return the joints with NaN where one coordinate is missing and where they are exactly zero; says so."""
+    """Return the joints, NaN where a coordinate is missing or all are exactly zero, and notes about both."""
     joints = np.where(np.isnan(raw.joints).any(-1, keepdims=True), np.nan, raw.joints)
     zero = (joints == 0).all(-1)
     always = np.flatnonzero(zero[~np.isnan(joints).all((1, 2))].all(0))

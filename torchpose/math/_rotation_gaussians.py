@@ -2,13 +2,13 @@
 
 A vector x in the unit ball stands for the rotation C R(x): R(x) turns by x as a quaternion vector
 (`torchpose.math._rotations`: axis times the sine of half the angle), and the centre C is a
-rotation amid those that are met, given by its own quaternion vector, none being no rotation. Near
+rotation in the middle of the data, given by its own quaternion vector, none being no rotation. Near
 the centre the space is flat and half as long as the angle in radians; at |x| = 1, half a turn from
 the centre, x and -x are one rotation and the space has an edge. A Gaussian that stays well inside is
 a Gaussian over rotations; `angle_to_edge` says how far recorded rotations stay inside. One that
 reaches the edge is cut there: sigma points beyond it are put onto it, and where a mean is turned to
 near |x'| = 1 the points that go across fold back inside, so that the covariance comes out too small
-and the mean too near to the centre. Take another centre then.
+and the mean too near to the centre. Choose another centre in that case.
 """
 
 import torch

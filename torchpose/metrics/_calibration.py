@@ -1,7 +1,7 @@
 """Measure the calibration of covariances: coverage, reliability curve, predictive log-likelihood.
 
 Pure functions on tensors; chi-square needs no scipy. What is missing (NaN or masked) is left out of
-every share, and the counts say how much was not. Also importable from `torchpose.metrics`.
+every share, and the counts say how much was not.
 """
 
 import math

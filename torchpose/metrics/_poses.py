@@ -1,9 +1,8 @@
 """Measure the errors of poses: Procrustes, joint errors, PCP, jitter.
 
-Pure functions on tensors, on any device; those on covariances are in `torchpose.metrics._calibration` and
-can be imported from here as well. Missing values are NaN or masked, and every function says
-what it does with them: errors and coverage leave them out of the mean and report the count; PCP
-counts a missing estimate as wrong. (BL) is Burke & Lasenby, "Single camera pose estimation using
+Pure functions on tensors, on any device; those on covariances are in `torchpose.metrics._calibration`.
+Missing values are NaN or masked: errors leave them out of the mean and report the count; PCP counts
+a missing estimate as wrong. (BL) is Burke & Lasenby, "Single camera pose estimation using
 Bayesian filtering and Kinect motion priors". The same as `torchmetrics.Metric` classes:
 `torchpose.metrics._torchmetrics_adapters`.
 """
@@ -19,16 +18,6 @@ from torch import Tensor
 from torchpose._core.arguments import as_pair, as_values
 from torchpose.errors import InputError, check_shape
 from torchpose.math._rotations import RigidMotion, procrustes
-from torchpose.metrics._calibration import (
-    Coverage,
-    calibration_error,
-    chi2_cdf,
-    chi2_quantile,
-    coverage,
-    mahalanobis_squared,
-    predictive_log_likelihood,
-    reliability,
-)
 from torchpose.skeleton._torso import ALIGN_JOINTS
 
 __all__ = [
@@ -36,24 +25,15 @@ __all__ = [
     "ARM_LIMBS",
     "PCP",
     "Alignment",
-    "Coverage",
     "ErrorSummary",
-    "RigidMotion",
     "align",
-    "calibration_error",
-    "chi2_cdf",
-    "chi2_quantile",
-    "coverage",
     "jitter",
     "joint_errors",
     "joint_errors_2d",
     "joint_errors_3d",
     "limb_hits",
-    "mahalanobis_squared",
     "pcp",
-    "predictive_log_likelihood",
     "procrustes",
-    "reliability",
     "share_below",
     "summarise_errors",
 ]

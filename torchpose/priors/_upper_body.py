@@ -28,9 +28,7 @@ from torchpose.errors import (
 )
 from torchpose.priors._arm_state import (
     STATE_DIM,
-    arm_states,
     check_rotation_order,
-    mirror_arm_state,
     mirror_covariance,
     mirror_mixture,
 )
@@ -38,15 +36,7 @@ from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._prior_file import PriorInfo, check_noise, read_prior, write_prior
 from torchpose.priors._window import WindowPrior
 
-__all__ = [
-    "PriorInfo",
-    "UpperBodyPrior",
-    "arm_states",
-    "known_priors",
-    "load_prior",
-    "mirror_arm_state",
-    "mirror_mixture",
-]
+__all__ = ["UpperBodyPrior", "known_priors", "load_prior"]
 
 WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
 _SIDES = ("left", "right")

@@ -1,9 +1,9 @@
 """Derive head, neck and hands, as priors have them, from MediaPipe's landmarks.
 
 MediaPipe marks nose, eyes and ears but no head, shoulders but no neck, and wrists and fingers but no
-hand; and its shoulders lie higher than Kinect's. A tracker takes place and scale of the body from head
-and neck, so they have to be where the prior has them beside the shoulders: with the ears or the nose
-for the head, a person comes out a third too small.
+hand; and its shoulders lie higher than Kinect's. A tracker takes position and scale of the body from head
+and neck, so they have to be where the prior has them relative to the shoulders. With the ears or the
+nose as head, the estimated person is a third too small.
 """
 
 from collections.abc import Sequence

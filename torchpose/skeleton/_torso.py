@@ -1,7 +1,8 @@
 """Align poses with the torso, and place necks, on which joint sets disagree by up to 12 cm.
 
-It is what the 3D error compares (BL section 6), and what a person does apart from how they stand
-towards the camera, so that estimates from different views and postures may be averaged in it."""
+The 3D error compares such poses (BL section 6). They do not depend on how the person stands towards the
+camera, so that estimates from different views may be averaged.
+"""
 
 from __future__ import annotations
 

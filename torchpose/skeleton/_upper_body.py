@@ -1,7 +1,7 @@
 """Map joint sets to the eight joints of the upper body.
 
-Left and right are the person's own. Three things differ between joint sets under one name, and are
-told apart here:
+Left and right are the person's own. Three joints differ between joint sets under one name, and are
+distinguished here:
 
 - the neck, by its height above the middle of the shoulders: ``"neck"`` (9 to 13 cm: Kinect v1
   shoulder_center, Kinect v2 and Azure Neck, CMU upperneck), ``"low-neck"`` (2 to 5 cm: Berkeley
@@ -21,10 +21,7 @@ from torch import Tensor
 
 from torchpose.errors import SkeletonError, check_shape
 from torchpose.skeleton._joint_sets import (
-    SKELETONS,
     UPPER_BODY,
-    Skeleton,
-    canonical_name,
     canonical_names,
     identify_skeleton,
 )
@@ -37,14 +34,8 @@ __all__ = [
     "NECK_KINDS",
     "OTHER_SIDE",
     "RIGHT_ARM",
-    "SKELETONS",
-    "UPPER_BODY",
-    "Skeleton",
     "UpperBody",
     "UpperBodyMap",
-    "canonical_name",
-    "canonical_names",
-    "identify_skeleton",
     "measure_neck_kind",
     "mirror_pose",
     "scale_bones",

@@ -1,7 +1,7 @@
 """Read poses off the estimates of both arms, and steady their motion.
 
-A filter over windows estimates every frame for itself, so that the noise of keypoints and the change
-from one component to the next show as trembling. `MotionStage` filters (or smooths) what is read out.
+A filter over windows estimates every frame alone, so that the noise of keypoints and the change
+from one component to the next show as jitter. `MotionStage` filters (or smooths) what is read out.
 """
 
 from collections.abc import Mapping

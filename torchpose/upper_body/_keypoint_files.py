@@ -45,7 +45,7 @@ class TrackSettings:
         frame: axes of the 3D poses: of the camera (default) or of the body.
         static_camera: let the body turn in front of a camera that stays where it is.
         window: deprecated: false stands for the method mkf-fixed, true for the default.
-        steady: take the trembling out of what windows give, by filters of constant velocity (default
+        steady: take the jitter out of what windows give, by filters of constant velocity (default
             true for window-mixture).
         neck: kind of the keypoints' neck if their names do not tell: neck, low-neck, mid-shoulder.
         nose_as_head: take a nose for the head where there is none.
@@ -160,7 +160,7 @@ class KeypointFileTracker:
         self._trackers: dict[_Key, UpperBodyTracker] = {}
 
     def check(self) -> None:
-        """Raise what would be raised for every recording, whatever it holds.
+        """Raise the errors that every recording would lead to.
 
         Raises:
             InputError, PriorError, CameraError: settings that suit no recording.
@@ -201,7 +201,7 @@ class KeypointFileTracker:
     def track(
         self, keypoints: Keypoints, prepared: Prepared | None = None, progress: bool = False
     ) -> PoseTrack:
-        """Return the poses of a file; a filter that degenerates is told by `failed_at`.
+        """Return the poses of a file; `failed_at` names the frame in which the filter degenerated.
 
         Args:
             keypoints: of the file. prepared: what `prepare` returned for it, if that was called.

@@ -317,5 +317,5 @@ class SinglePoses(Estimator):
 
 
 def _wide(out: FilterOutput) -> FilterOutput:
-    """Return the estimates in float64, with covariances for sure."""
+    """Return the estimates in float64; raise if they lack covariances."""
     return in_double(out._replace(cov=require_cov(out)))

@@ -48,7 +48,7 @@ from torchpose.upper_body._methods import (
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._reading import PoseReader, check_frame, note_collapse
 
-__all__ = ["METHODS", "PoseTrack", "UpperBodyTracker"]
+__all__ = ["UpperBodyTracker"]
 
 
 class UpperBodyTracker(WideModule):
@@ -89,7 +89,7 @@ class UpperBodyTracker(WideModule):
             stays at the prior's mean place, as the authors' released demo does.
         window: deprecated; False stands for method "mkf-fixed", True for the default.
         steady: pass what windows give through filters of constant velocity (`MotionStage`), which take
-            the trembling out; smoothers if `smoothing` is asked for. By default where there are windows.
+            the jitter out; smoothers if `smoothing` is asked for. By default where there are windows.
         calibrated: recalibrate `covariance3d` as the prior's training persons showed, if it says how.
         neck: kind of neck of the keypoints, where their names do not tell it (see
             `torchpose.skeleton.NECK_KINDS`). A neck of another kind than the prior's is put where the

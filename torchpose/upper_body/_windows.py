@@ -161,7 +161,7 @@ class WindowMixture(Estimator):
     """Estimator that conditions the prior's mixture over windows on each frame and the hands near it.
 
     The motion stage follows, since the noise of keypoints and the change from one component to the
-    next show as trembling.
+    next show as jitter.
 
     Args:
         model: of the tracker; its prior has a window that suits (`suitable_window`).

@@ -1,7 +1,7 @@
 """List the filters over whole bodies by name, with the models and options that each takes.
 
-`METHODS` is the table of all of them. A filter of your own is a subclass of `SilhouetteParticleFilter`
-and one call of `register_body_filter`.
+`METHODS` is the table of all of them. To add a filter, subclass `SilhouetteParticleFilter` and call
+`register_body_filter`.
 """
 
 import inspect

@@ -147,7 +147,7 @@ def find_pose(
 ) -> Float[Tensor, "*B D"]:
     """Find the pose in one frame by annealing: all headings, poses of the prior, the rays' position.
 
-    Every sector of headings is searched by itself, lest the first layers settle on one, and the pose
+    Every sector of headings is searched alone, so that the first layers do not settle on one. The pose
     of the sector that fits best is returned (`find_candidates`).
 
     One frame hardly tells front from back, and left leg from right: without `facing` the person may

@@ -141,7 +141,7 @@ class BodyTracker(nn.Module):
         self.filter = make_filter(self.method, tracked, learnt, fps, n_particles, options)
         self.cameras, self.fps, self.n_particles = as_rig(cameras), float(fps), n_particles
         self.notes = tuple(filter(None, (note for _, note in models.values())))
-        # of the filter where these are the same, lest its tensors be in the state twice
+        # of the filter where these are the same, so that its tensors are in the state once
         self._upright = None if upright is tracked else upright
         self._search = (
             models["manifold"][0] if "manifold" in models and needs != "manifold" else None
@@ -326,7 +326,7 @@ def track_body(
     n_frames: int | None = None,
     progress: bool = False,
 ) -> BodyPoses:
-    """Track one person with a filter of your own making; memory holds the poses and a single frame.
+    """Track one person with any filter; memory holds the poses and a single frame.
 
     Args:
         model: a filter over silhouettes, whose body is a `torchpose.body.Body`.

@@ -148,7 +148,7 @@ def _head_end(head: Any, posed: Any) -> tuple[Any, str]:
 
 
 def _check(path: Path) -> None:
-    """Raise unless the file is whole; bvhio would read on for ever at the end of a truncated one."""
+    """Raise unless the file is whole; bvhio never returns from a truncated one."""
     text = read_text(path, "a BVH file", "utf-8")
     hierarchy, mark, motion = text.partition("MOTION")
     if not hierarchy.lstrip().startswith("HIERARCHY") or not mark:

@@ -34,7 +34,7 @@ from torchpose.priors._actions.stack import (
     stack_spaces,
 )
 
-__all__ = ["NONE", "ActionBank", "BankInfo"]
+__all__ = ["ActionBank"]
 
 
 class ActionBank(nn.Module):
@@ -49,8 +49,8 @@ class ActionBank(nn.Module):
     with c, `spread`, for persons who are not among those of the training set. s^2 is the mean variance
     that the subspaces leave over in a direction, at least (2 degrees)^2, the same for all actions.
     m_0 and C_0 are mean and covariance of the postures of all actions (the mean performances with
-    their deviations, each action alike), its deviations multiplied by `background` and none below s:
-    none of the actions is whoever moves as much, but otherwise. Actions change as a chain
+    their deviations, each action alike), its deviations multiplied by `background` and none below s;
+    so "none" covers postures as varied as those of the actions, but different ones. Actions change as a chain
     (`chain_transition`). Postures of frames that follow each other are no independent evidence: the
     log-likelihood of a frame is multiplied by min(1, evidence_rate / fps).
 

@@ -11,7 +11,7 @@ Axis = tuple[float, float, float]
 
 
 class PolarLimb(NamedTuple):
-    """A bone whose direction is told in the axes of the limb that it hangs on.
+    """Bone whose direction is given in the axes of its parent limb.
 
     Attributes:
         name: of the limb. parent: name of the limb that it hangs on, "" for the root.

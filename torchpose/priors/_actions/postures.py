@@ -1,6 +1,6 @@
 """Convert states to and from postures: relative angles of twelve limbs, 36 numbers without the root.
 
-A limb's posture is the direction u of its bone in the axes of the limb that it hangs on, told by the
+A limb's posture is the direction u of its bone in the axes of its parent limb, given by the
 angles between the bone and the three planes of those axes (x left, y up, z forward),
 
     a = arcsin(u),   each within 90 degrees,   sin^2 a_x + sin^2 a_y + sin^2 a_z = 1,

@@ -26,15 +26,7 @@ from torchpose.priors._actions.gate import (
 )
 from torchpose.priors._actions.polar_limbs import POSTURE_DIM, check_limbs
 
-__all__ = [
-    "CLAMP_ROUNDS",
-    "GATE_WIDTH",
-    "Acceptance",
-    "ActionInfo",
-    "ActionSpace",
-    "clamp_in_rounds",
-    "match_postures",
-]
+__all__ = ["ActionSpace"]
 
 
 class ActionSpace(nn.Module):

@@ -1,6 +1,6 @@
 """Gate postures by an action, or by several, and draw again those that are rejected (AS 6).
 
-Many particles are drawn again at once, a bounded number of times.
+All rejected particles are drawn again together, a bounded number of times.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,7 +1,7 @@
 """Track with large uncertainty in the root: many roots, and a Gaussian per part for each of them.
 
-Sampling spends its particles where it must, on the place and heading of the body; given those, every
-part has a Gaussian, which seven places of the part in the image update in closed form.
+Particles sample the position and heading of the body. Given these, the rotation of every part has a
+Gaussian, which seven positions of the part in the image update in closed form.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Provide what the particle filters over body poses share: likelihood, limits, coasting, estimates.
 
-A filter is its `move`: how the particles of one frame become weighted particles of the next. Batches,
-empty silhouettes, dead particles and the loop over time are handled here.
+A subclass implements `move`, which turns the particles of one frame into weighted particles of the
+next. Batches, empty silhouettes, dead particles and the loop over time are handled here.
 """
 
 import math
@@ -56,7 +56,7 @@ _DIED = (
 
 
 class SilhouetteParticleFilter(nn.Module, ABC):
-    """Base of the particle filters over body poses; a subclass is its `move`.
+    """Base of the particle filters over body poses; a subclass implements `move`.
 
     `forward` tracks whole sequences, `init` and `step` frame by frame, with the same numbers. Estimates have
     no gradients: nothing runs through particles.

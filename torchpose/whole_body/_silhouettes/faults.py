@@ -1,9 +1,9 @@
 """Put faults of background subtraction into clean silhouettes.
 
-What a person in front of a real camera suffers: holes where clothes have the background's colour,
-which stay as long as the person does; a region that is lost for a while; a shadow on the ground;
-ragged borders; salt-and-pepper noise and the median filter that everybody runs against it; frames in
-which everything is worse.
+The faults are those of real recordings: holes where clothes have the background's colour,
+for the whole recording; a region that is lost for a while; a shadow on the ground;
+ragged borders; salt-and-pepper noise and the usual median filter against it; frames in
+which all faults are stronger.
 """
 
 import math

@@ -2,7 +2,7 @@
 
 Each end of a limb projects to a disc: the centre by the camera matrix, the radius f r / z with f the
 geometric mean of both focal lengths. (A ball off the optical axis is really a slightly elongated
-ellipse; silhouette trackers pass over it.) Their hull is bounded by arcs of the discs and by the two
+ellipse; this is neglected.) Their hull is bounded by arcs of the discs and by the two
 outer tangents.
 
 A convex limb covers one interval of each row. The intervals of all limbs, only for rows that a limb
@@ -10,7 +10,7 @@ covers, form a flat list; sorted by place, with a running maximum of what is cov
 become disjoint. The cost depends on limbs times rows, hardly on the width.
 
 Place in a strip: an item's C images lie row after row, so pixel (row i, column j) of camera c is at
-(c H + i) W + j. Item and place are packed into one number, as sorting numbers is what CPUs do fastest.
+(c H + i) W + j. Item and place are packed into one number, so that sorting is fast.
 
 The rectangle of a limb lies along the line through the middles of both discs, is as wide as they are on
 average, and reaches far enough beyond the middles to cover as much as the limb with its round ends:
