@@ -11,12 +11,14 @@ from benchmarks.ub_people import mean_pose, nearest_neighbour, people, sway
 from tests.evaluation.recordings import poses, small_recipe, write_people
 from torchpose.camera import PinholeCamera
 from torchpose.errors import InputError
+from torchpose.evaluation import Report, common
 from torchpose.evaluation.common import (
     TEST_ANGLES,
     TEST_TRANSLATION,
     Estimate,
     cached_prior,
     centred_on_neck,
+    draw_picture,
     make_test_set,
     track,
 )
@@ -174,3 +176,11 @@ def test_back_and_forth_keeps_speeds():
     place = back_and_forth(5, 23)
     assert int(place.max()) == 4 and bool((place.diff().abs() == 1).all())
     assert back_and_forth(1, 3).tolist() == [0, 0, 0]
+
+
+def test_without_matplotlib_the_report_says_what_is_missing(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(common, "find_spec", lambda name: None)
+    report = Report("Protocol")
+    draw_picture(report, tmp_path, "persons.png", lambda: pytest.fail("nothing can be drawn"))
+    assert report.pictures == []
+    assert report.findings == ["persons.png was not drawn: matplotlib is not installed."]

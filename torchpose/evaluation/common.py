@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,6 +42,7 @@ __all__ = [
     "add_picture",
     "cached_prior",
     "centred_on_neck",
+    "draw_picture",
     "keep",
     "make_test_set",
     "read_kept",
@@ -254,6 +256,14 @@ def add_picture(report: Report, out: Path, name: str, figure: Any) -> None:
     with replace_own(out / name, RESULTS) as temporary:
         save_figure(figure, temporary)
     report.pictures.append(name)
+
+
+def draw_picture(report: Report, out: Path, name: str, draw: Callable[[], Any]) -> None:
+    """Draw a figure and add it to the report; without matplotlib, say in the report that it is missing."""
+    if find_spec("matplotlib") is None:
+        report.findings.append(f"{name} was not drawn: matplotlib is not installed.")
+        return
+    add_picture(report, out, name, draw())
 
 
 def _padded(value: Tensor, pad: int) -> Tensor:

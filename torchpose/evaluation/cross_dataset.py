@@ -22,7 +22,7 @@ import torch
 
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
-from torchpose.evaluation.common import Recipe, add_picture
+from torchpose.evaluation.common import Recipe, draw_picture
 from torchpose.evaluation.completion import (
     Completion,
     complete,
@@ -151,7 +151,7 @@ def run(
         if sets.completion is not None:
             heads = f"heads of {', '.join(sets.how.completed)}"
             _add_completion(report, {heads: sets.completion})
-        add_picture(report, out, "cross-dataset.png", plot_cross(report, list(sets.mean)))
+        draw_picture(report, out, "cross-dataset.png", lambda: plot_cross(report, list(sets.mean)))
     if part != "cross":
         left_out = _left_out(folders, added, tested, thin, seed, mocap_share)
         keys = [(held, label) for held, one in left_out.items() for label in one.trains]

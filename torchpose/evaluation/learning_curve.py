@@ -19,7 +19,7 @@ import torch
 
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
-from torchpose.evaluation.common import Recipe, add_picture
+from torchpose.evaluation.common import Recipe, draw_picture
 from torchpose.evaluation.person_tables import (
     Curve,
     add_pose_classes,
@@ -128,7 +128,7 @@ def run(
     _add_classes(report, known[0][0], counts, jobs, scores)
     _add_findings(report, curves)
     title = "Persons never seen: error over the number of training persons"
-    add_picture(report, out, "learning-curve.png", plot_curves(curves, title))
+    draw_picture(report, out, "learning-curve.png", lambda: plot_curves(curves, title))
     report.save(out)
     return report
 

@@ -12,7 +12,7 @@ import torch
 
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
-from torchpose.evaluation.common import Recipe, add_picture
+from torchpose.evaluation.common import Recipe, draw_picture
 from torchpose.evaluation.person_tables import (
     add_persons,
     add_pose_classes,
@@ -101,7 +101,7 @@ def run(
     add_pose_classes(report, {"all": pooled(list(scored.values()))})
     _add_findings(report, scored)
     title = "3D error of each person under a prior of the others"
-    add_picture(report, out, "persons.png", plot_persons(scored, title))
+    draw_picture(report, out, "persons.png", lambda: plot_persons(scored, title))
     report.save(out)
     return report
 

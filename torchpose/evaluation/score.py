@@ -17,7 +17,7 @@ from tqdm.auto import tqdm
 
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
-from torchpose.evaluation.common import CAMERA, MEASURED, Trials, add_picture, make_test_set, track
+from torchpose.evaluation.common import CAMERA, MEASURED, Trials, draw_picture, make_test_set, track
 from torchpose.evaluation.person_tables import (
     add_persons,
     add_pose_classes,
@@ -108,7 +108,7 @@ def run(
     add_pose_classes(report, {"all": pooled(list(scored.values()))})
     _add_findings(report, found, known)
     title = f"3D error of each person under {prior.info.name or 'the prior'}"
-    add_picture(report, out, "persons.png", plot_persons(scored, title))
+    draw_picture(report, out, "persons.png", lambda: plot_persons(scored, title))
     report.save(out)
     return report
 
