@@ -3,7 +3,7 @@
 The fit itself is `torchpose.learning._recipes.actions`.
 """
 
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 
@@ -28,6 +28,8 @@ class ActionData(BodyData):
         InputError: see `Performances.gather`.
     """
 
+    source = Performances
+
     def __init__(
         self,
         paths: list[str],
@@ -40,17 +42,11 @@ class ActionData(BodyData):
         postures: Literal["joints", "body"] = "joints",
         axes: str | None = None,
     ) -> None:
-        super().__init__()
         check_actions(actions, fps)
-        self._paths, self._actions = paths, actions
-        self._chosen: dict[str, Any] = {
-            "persons": persons, "held_out": held_out, "without": without, "fps": fps,
-            "repeated": repeated, "postures": postures, "axes": axes,
-        }  # fmt: skip
-
-    def gather(self) -> Performances:
-        """Performances of everybody."""
-        return Performances.gather(self._paths, self._actions, **self._chosen)
+        super().__init__(
+            paths=paths, actions=actions, persons=persons, held_out=held_out, without=without,
+            fps=fps, repeated=repeated, postures=postures, axes=axes,
+        )  # fmt: skip
 
 
 class ActionFit(BodyFit):

@@ -12,32 +12,34 @@ from torch.optim import Optimizer
 from torchpose.errors import InputError
 from torchpose.io._results import ResultsFolder
 from train.callbacks import PriorWriter
-from train.identity import check_identity
+from train.checkpoints import ENTRY, check_identity
+from train.data import data_of
 
 __all__ = ["BodyData", "BodyFit"]
-
-_ENTRY = "torchpose"  # of a checkpoint: what it is of
 
 
 class BodyData(LightningDataModule):
     """Base of the data of a fit, which are gathered once, in `setup`.
 
     Attributes:
-        gathered: what `gather` of the library has made of the recordings, or None before.
+        source: class of the library whose `gather` reads the recordings.
+        gathered: what it returned, None before `setup`.
+
+    Args:
+        arguments: of `source.gather`.
     """
 
-    def __init__(self) -> None:
+    source: ClassVar[Any]
+
+    def __init__(self, **arguments: Any) -> None:
         super().__init__()
         self.gathered: Any = None
-
-    def gather(self) -> Any:
-        """Read the recordings and turn them into what is fitted to."""
-        raise NotImplementedError
+        self._arguments = arguments
 
     def setup(self, stage: str) -> None:
-        """Gather; the second call does nothing."""
+        """Gather the recordings; the second call does nothing."""
         if self.gathered is None:
-            self.gathered = self.gather()
+            self.gathered = self.source.gather(**self._arguments)
 
     def train_dataloader(self) -> range:
         """One step an epoch."""
@@ -91,11 +93,11 @@ class BodyFit(LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Say what the checkpoint is of."""
-        checkpoint[_ENTRY] = {"identity": self._identity, **self.progress_made()}
+        checkpoint[ENTRY] = {"identity": self._identity, **self.progress_made()}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse a checkpoint of anything else."""
-        kept = check_identity(checkpoint.get(_ENTRY), self._identity, self.trainer.ckpt_path)
+        kept = check_identity(checkpoint.get(ENTRY), self._identity, self.trainer.ckpt_path)
         self.go_on_from(kept)
 
     def progress_made(self) -> dict[str, Any]:
@@ -116,13 +118,7 @@ class BodyFit(LightningModule):
     @property
     def data_module(self) -> BodyData:
         """The data, if they are of the right kind."""
-        data, wanted = getattr(self.trainer, "datamodule", None), self.data_type
-        if not isinstance(data, wanted):
-            raise InputError(
-                f"{type(self).__name__} takes {wanted.__name__}, got {type(data).__name__}; set "
-                f"data.class_path to {wanted.__module__}.{wanted.__name__}"
-            )
-        return data
+        return data_of(self, self.data_type)
 
     @property
     def gathered(self) -> Any:

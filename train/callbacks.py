@@ -6,36 +6,17 @@ from pathlib import Path
 from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import Checkpoint, ProgressBar
+from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 from tqdm.auto import tqdm
 
-from torchpose._core.files import clear_leftovers
 from torchpose._core.terminal import show_progress
 from torchpose.learning._fit_files import check_fit_file, fit_results, write_prior_files
 from torchpose.priors import UpperBodyPrior
 from train.blocks import Sweep
 from train.mixture_em import MixtureEM
 
-__all__ = ["FitPictures", "FitProgress", "LastCheckpoint", "PriorWriter", "checkpoint_file"]
-
-
-def checkpoint_file(folder: str | Path) -> Path:
-    """The last checkpoint of the fit whose logs are in a folder."""
-    return Path(folder) / "checkpoints" / "last.ckpt"
-
-
-class LastCheckpoint(Checkpoint):
-    """After every step, the whole state of the fit in `checkpoints/last.ckpt`."""
-
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Clear what a killed fit left."""
-        if trainer.is_global_zero:
-            clear_leftovers(checkpoint_file(trainer.default_root_dir).parent)
-
-    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Write it."""
-        trainer.save_checkpoint(checkpoint_file(trainer.default_root_dir))
+__all__ = ["FitPictures", "FitProgress", "PriorWriter"]
 
 
 class FitProgress(ProgressBar):

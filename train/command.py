@@ -13,10 +13,14 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
+from torchpose._core.terminal import show_progress
 from torchpose.errors import InputError
-from train import strategy
-from train.callbacks import FitPictures, FitProgress, LastCheckpoint, PriorWriter, checkpoint_file
-from train.selection import SelectingTrainer
+from torchpose.learning._selection import select_n_components
+from train.blocks import Key
+from train.callbacks import FitPictures, FitProgress, PriorWriter
+from train.checkpoints import AtomicCheckpoints, LastCheckpoint, checkpoint_file
+from train.data import RecordingsDataModule
+from train.processes import register_strategy
 from train.stopping import StopAtOnce
 
 __all__ = ["how_to_go_on", "run"]
@@ -51,7 +55,7 @@ def run(arguments: Sequence[str]) -> None:
     # Lightning and the versions of torch and jsonargparse that it is used with here; nothing to change
     warnings.filterwarnings("ignore", r".*LeafSpec", FutureWarning)
     warnings.filterwarnings("ignore", category=DeprecationWarning, module="lightning|jsonargparse")
-    strategy.register()
+    register_strategy()
     _Command.arguments, _Command.folder = list(arguments), None
     quiet: dict[str, Any] = {"exit_on_error": False}
     _Command(
@@ -75,6 +79,47 @@ def how_to_go_on() -> str:
     if folder is not None and checkpoint_file(folder).is_file():
         return "go on with --ckpt_path last, which takes up the fit after its last step"
     return "no step was finished: run the same command again"
+
+
+class SelectingTrainer(Trainer):
+    """Lightning's trainer, which can also choose the number of components."""
+
+    def select(
+        self,
+        model: LightningModule,
+        datamodule: LightningDataModule,
+        candidates: list[int],
+        rule: str = "best",
+        ckpt_path: str | None = None,
+    ) -> None:
+        """Fit a mixture over poses for each number of components and compare held-out persons.
+
+        Args:
+            candidates: numbers of components.
+            rule: best, or one-standard-error for the fewest that are not clearly worse.
+            ckpt_path: not used here; it may stand in the configuration.
+        """
+        if not isinstance(datamodule, RecordingsDataModule):
+            raise InputError(f"select needs RecordingsDataModule, got {type(datamodule).__name__}")
+        datamodule.setup("fit")
+        if not datamodule.watched:
+            raise InputError("select compares held-out persons: name some with --data.held_out")
+        task = datamodule.tasks["pose"]
+        found = select_n_components(
+            datamodule.sources[Key("pose")],
+            datamodule.sources_by_person(),
+            candidates,
+            task.seed,
+            rule=rule,
+            max_iter=task.max_iter,
+            tol=task.tol,
+            progress=show_progress(),
+        )
+        header, rows = found.table()
+        widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+        for row in (header, *rows):
+            print("  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)))
+        print(f"--data.recipe.n_components {found.n_components}")
 
 
 class _Command(LightningCLI):
@@ -120,7 +165,7 @@ class _Command(LightningCLI):
         given["callbacks"] = [*callbacks, *own, StopAtOnce()]
         if given["logger"] in (None, True):
             given["logger"] = _loggers(given["default_root_dir"])
-        given["plugins"] = [*(given["plugins"] or []), strategy.AtomicCheckpoints()]
+        given["plugins"] = [*(given["plugins"] or []), AtomicCheckpoints()]
         return super().instantiate_trainer(**kwargs)
 
     def before_fit(self) -> None:

@@ -3,9 +3,9 @@
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, TypeVar
 
-from lightning.pytorch import LightningDataModule
+from lightning.pytorch import LightningDataModule, LightningModule, Trainer
 
 from torchpose.errors import InputError, OverlapError
 from torchpose.io import Recording, read_recordings
@@ -22,7 +22,9 @@ from torchpose.learning._recipes.choosing import expand_path, fingerprint
 from torchpose.learning._samplers import SampleSource, cached
 from train.blocks import Key, SweepLoader
 
-__all__ = ["RecordingsDataModule", "read_sides", "split"]
+__all__ = ["RecordingsDataModule", "check_double_precision", "data_of", "read_sides", "split"]
+
+D = TypeVar("D", bound=LightningDataModule)
 
 _RECIPE, _CURATION = UpperBodyRecipe(), CurationSettings()
 _HELD_OUT_SHARE = 5  # held-out states: one for so many training states
@@ -176,3 +178,31 @@ def split(
     watched = [r for r in recordings if r.person_id in out]
     refuse_leaks(train, watched)
     return train, watched
+
+
+def data_of(module: LightningModule, wanted: type[D]) -> D:
+    """Return the data of a fit.
+
+    Raises:
+        InputError: data of another kind than `wanted`.
+    """
+    data = getattr(module.trainer, "datamodule", None)
+    if not isinstance(data, wanted):
+        raise InputError(
+            f"{type(module).__name__} takes {wanted.__name__}, got {type(data).__name__}; set "
+            f"data.class_path to {wanted.__module__}.{wanted.__name__}"
+        )
+    return data
+
+
+def check_double_precision(trainer: Trainer) -> None:
+    """Raise `InputError` unless the trainer leaves double precision alone, on a device that has it."""
+    if trainer.strategy.root_device.type == "mps":
+        raise InputError(
+            "a fit needs double precision, which MPS does not have; add --trainer.accelerator cpu"
+        )
+    if trainer.precision not in ("32-true", "64-true"):
+        raise InputError(
+            f"a fit runs in double precision, got --trainer.precision {trainer.precision}; leave it "
+            "out"
+        )

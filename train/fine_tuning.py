@@ -25,15 +25,15 @@ from torchpose.learning._recipes.calibration import HeldOut, calibration_noise, 
 from torchpose.learning._recipes.choosing import fingerprint
 from torchpose.learning._training import collect_poses
 from torchpose.priors import UpperBodyPrior, load_prior
-from train.data import read_sides
+from train.checkpoints import ENTRY, check_identity
+from train.data import data_of, read_sides
 from train.fine_tuning_batches import batches_of
-from train.identity import check_identity, differences
 from train.predict_tracking import digest_of_prior
-from train.processes import first_failure, from_all
+from train.processes import check_processes, first_failure, from_all
 
 __all__ = ["FineTuning", "FineTuningData"]
 
-_IDENTITY, _CURATION = "torchpose", CurationSettings()
+_CURATION = CurationSettings()
 _CENTIMETRES = 100.0
 _MOST_SKIPPED = 20
 _POSITIVE = ("epochs", "patience", "batch_size", "shares", "learning_rate", "warmup", "clip")
@@ -238,10 +238,7 @@ class FineTuning(LightningModule):
 
     def on_train_start(self) -> None:
         """The same settings everywhere, and the score of the prior as it is."""
-        for rank, theirs in enumerate(from_all(self._identity)):
-            found = differences(theirs, self._identity)
-            if found:
-                raise InputError(f"process {rank} differs from this one: {'; '.join(found)}")
+        check_processes(self._identity, self.trainer.global_rank)
         if self._given.shares % self.trainer.world_size:
             raise InputError(
                 f"{self._given.shares} shares of a batch cannot be shared evenly among "
@@ -273,7 +270,7 @@ class FineTuning(LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Say what the checkpoint is of, and keep the best parameters."""
-        checkpoint[_IDENTITY] = {
+        checkpoint[ENTRY] = {
             "identity": self._identity,
             "scores": self.scores,
             "best": self._best,
@@ -283,7 +280,7 @@ class FineTuning(LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse a checkpoint of anything else."""
-        kept = check_identity(checkpoint.get(_IDENTITY), self._identity, self.trainer.ckpt_path)
+        kept = check_identity(checkpoint.get(ENTRY), self._identity, self.trainer.ckpt_path)
         self.scores, self._best = list(kept["scores"]), dict(kept["best"])
         self.skipped, self._stopped, self._resumed = kept["skipped"], kept["stopped"], True
 
@@ -342,13 +339,7 @@ class FineTuning(LightningModule):
 
     @property
     def _data(self) -> FineTuningData:
-        data = getattr(self.trainer, "datamodule", None)
-        if not isinstance(data, FineTuningData):
-            raise InputError(
-                f"{type(self).__name__} takes FineTuningData, got {type(data).__name__}; set "
-                "data.class_path to train.fine_tuning.FineTuningData"
-            )
-        return data
+        return data_of(self, FineTuningData)
 
     def _score(self) -> None:
         """The error on the held-out persons, shared among the processes; keep the best parameters."""

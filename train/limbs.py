@@ -1,10 +1,8 @@
 """Fit limb conditionals with Lightning: one step of `torchpose.learning._recipes.limbs`."""
 
-from typing import Any
-
 import torch
 
-from torchpose.errors import InputError
+from torchpose.errors import check_rate
 from torchpose.learning._fit_files import write_limb_files
 from torchpose.learning._recipes import LimbStates, fit_limbs
 from torchpose.learning._recipes.limbs import check_least_std
@@ -25,6 +23,8 @@ class LimbData(BodyData):
         InputError: see `LimbStates.gather`.
     """
 
+    source = LimbStates
+
     def __init__(
         self,
         paths: list[str],
@@ -35,18 +35,11 @@ class LimbData(BodyData):
         fps: float = 60.0,
         axes: str | None = None,
     ) -> None:
-        super().__init__()
-        if not 0 < fps < float("inf"):
-            raise InputError(f"fps must be positive, got {fps:g}")
-        self._paths = paths
-        self._chosen: dict[str, Any] = {
-            "persons": persons, "held_out": held_out, "actions": actions, "without": without,
-            "fps": fps, "axes": axes,
-        }  # fmt: skip
-
-    def gather(self) -> LimbStates:
-        """States of everybody."""
-        return LimbStates.gather(self._paths, **self._chosen)
+        check_rate("fps", fps)
+        super().__init__(
+            paths=paths, persons=persons, held_out=held_out, actions=actions, without=without,
+            fps=fps, axes=axes,
+        )  # fmt: skip
 
 
 class LimbFit(BodyFit):

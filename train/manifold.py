@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import nn
 
-from torchpose.errors import InputError
 from torchpose.learning._fit_files import write_manifold_files
 from torchpose.learning._recipes import ManifoldFitting, ManifoldPoses, ManifoldRecipe
 from torchpose.learning._recipes.manifold import check_gathering
 from train.body_fit import BodyData, BodyFit
+from train.data import check_double_precision
 
 __all__ = ["ManifoldData", "ManifoldFit"]
 
@@ -29,6 +29,8 @@ class ManifoldData(BodyData):
         InputError: see `ManifoldPoses.gather`.
     """
 
+    source = ManifoldPoses
+
     def __init__(
         self,
         paths: list[str],
@@ -41,17 +43,11 @@ class ManifoldData(BodyData):
         frames: int = 350,
         axes: str | None = None,
     ) -> None:
-        super().__init__()
         check_gathering(validation, frames, fps)
-        self._paths = paths
-        self._chosen: dict[str, Any] = {
-            "persons": persons, "held_out": held_out, "validation": validation, "actions": actions,
-            "without": without, "fps": fps, "frames": frames, "axes": axes,
-        }  # fmt: skip
-
-    def gather(self) -> ManifoldPoses:
-        """Poses of everybody."""
-        return ManifoldPoses.gather(self._paths, **self._chosen)
+        super().__init__(
+            paths=paths, persons=persons, held_out=held_out, validation=validation,
+            actions=actions, without=without, fps=fps, frames=frames, axes=axes,
+        )  # fmt: skip
 
 
 class ManifoldFit(BodyFit):
@@ -92,7 +88,7 @@ class ManifoldFit(BodyFit):
 
     def setup(self, stage: str) -> None:
         """The fit at its start; a checkpoint's state comes later."""
-        _check_trainer(self.trainer)
+        check_double_precision(self.trainer)
         super().setup(stage)
         self.fitting = ManifoldFitting(self.gathered, self._recipe)
 
@@ -122,14 +118,3 @@ class ManifoldFit(BodyFit):
             results, name = self.results
             picture = bool(self.hparams["picture"])
             print(write_manifold_files(self.fitting, results, name, picture, **facts), flush=True)
-
-
-def _check_trainer(trainer: Any) -> None:
-    if trainer.strategy.root_device.type == "mps":
-        raise InputError(
-            "a fit needs double precision, which MPS does not have; add --trainer.accelerator cpu"
-        )
-    if trainer.precision not in ("32-true", "64-true"):
-        raise InputError(
-            f"a fit runs in double precision, got --trainer.precision {trainer.precision}; leave it out"
-        )

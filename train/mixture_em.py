@@ -14,7 +14,7 @@ from lightning.pytorch import LightningModule
 from torch import nn
 from torch.optim import Optimizer
 
-from torchpose.errors import InputError, TorchposeError
+from torchpose.errors import TorchposeError
 from torchpose.learning._blocks import Share
 from torchpose.learning._recipes import MixtureTask
 from torchpose.learning._recipes.calibration import folds
@@ -23,13 +23,11 @@ from torchpose.learning._streamed_em import StreamedEM
 from torchpose.math._mixture_em import SufficientStatistics
 from torchpose.priors import GaussianMixture, UpperBodyPrior
 from train.blocks import Key, Sweep
-from train.data import RecordingsDataModule
-from train.identity import check_identity, differences
-from train.processes import broadcast_state, first_failure, from_all
+from train.checkpoints import ENTRY, check_identity
+from train.data import RecordingsDataModule, check_double_precision, data_of
+from train.processes import broadcast_state, check_processes, first_failure, from_all
 
 __all__ = ["MixtureEM"]
-
-_IDENTITY = "torchpose"
 
 
 class MixtureEM(LightningModule):
@@ -62,15 +60,7 @@ class MixtureEM(LightningModule):
 
     def setup(self, stage: str) -> None:
         """A blank mixture for every task; what is in them comes from their start, or a checkpoint."""
-        device, precision = self.trainer.strategy.root_device, self.trainer.precision
-        if device.type == "mps":
-            raise InputError(
-                "a fit needs double precision, which MPS does not have; add --trainer.accelerator cpu"
-            )
-        if precision not in ("32-true", "64-true"):
-            raise InputError(
-                f"a fit runs in double precision, got --trainer.precision {precision}; leave it out"
-            )
+        check_double_precision(self.trainer)
         data = self._data
         data.setup(stage)
         self._tasks, self._identity = data.tasks, data.identity()
@@ -84,7 +74,7 @@ class MixtureEM(LightningModule):
 
     def on_fit_start(self) -> None:
         """The same recordings everywhere, and a start for every mixture."""
-        self._check_processes()
+        check_processes(self._identity, self.trainer.global_rank)
         if not self._resumed:
             self._start()
 
@@ -117,7 +107,7 @@ class MixtureEM(LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Say what the checkpoint is of."""
-        checkpoint[_IDENTITY] = {
+        checkpoint[ENTRY] = {
             "identity": self._identity,
             "held_out": self.held_out_history,
             "stopped": self.trainer.should_stop,
@@ -125,7 +115,7 @@ class MixtureEM(LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse a checkpoint of anything else."""
-        kept = check_identity(checkpoint.get(_IDENTITY), self._identity, self.trainer.ckpt_path)
+        kept = check_identity(checkpoint.get(ENTRY), self._identity, self.trainer.ckpt_path)
         self.held_out_history = {name: list(v) for name, v in kept["held_out"].items()}
         self._stopped = bool(kept["stopped"])
         self._resumed = True
@@ -149,10 +139,6 @@ class MixtureEM(LightningModule):
     def epoch_of(self, key: Key) -> int | None:
         """How many steps the mixture of a source has taken; None if it needs no more."""
         return None if self._is_finished(key.name) else int(self.em(key.name).steps)
-
-    def fitted(self) -> dict[str, GaussianMixture]:
-        """The mixtures as they are, on the CPU."""
-        return {name: self.em(name).mixture().cpu() for name in self._tasks}
 
     def assembled(self, **facts: str) -> UpperBodyPrior:
         """Prior of the mixtures as they are, not calibrated; facts are name, licence, command."""
@@ -235,23 +221,7 @@ class MixtureEM(LightningModule):
 
     @property
     def _data(self) -> RecordingsDataModule:
-        data = getattr(self.trainer, "datamodule", None)
-        if not isinstance(data, RecordingsDataModule):
-            raise InputError(
-                f"{type(self).__name__} fits the mixtures of RecordingsDataModule, got "
-                f"{type(data).__name__}; set data.class_path to train.data.RecordingsDataModule"
-            )
-        return data
-
-    def _check_processes(self) -> None:
-        """Raise unless all processes have read the same recordings, and run the same recipe."""
-        for rank, theirs in enumerate(from_all(self._identity)):
-            found = differences(theirs, self._identity)
-            if found:
-                raise InputError(
-                    f"process {rank} differs from process {self.trainer.global_rank}: "
-                    f"{'; '.join(found)}; give all of them the same recordings and settings"
-                )
+        return data_of(self, RecordingsDataModule)
 
     def _start(self) -> None:
         """A start for every mixture, shared among the processes."""

@@ -1,14 +1,24 @@
-"""What processes tell each other; with a single process, nothing."""
+"""Run a fit in several processes: what they tell each other, and the strategy that starts them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from datetime import timedelta
 from typing import Any, TypeVar
 
 import torch
+from lightning.pytorch.strategies import DDPStrategy, StrategyRegistry
 from torch import nn
 
 from torchpose.errors import InputError
+from train.checkpoints import differences
 
-__all__ = ["broadcast_state", "first_failure", "from_all"]
+__all__ = [
+    "Processes",
+    "broadcast_state",
+    "check_processes",
+    "first_failure",
+    "from_all",
+    "register_strategy",
+]
 
 T = TypeVar("T")
 
@@ -49,3 +59,49 @@ def broadcast_state(module: nn.Module, source: int) -> None:
         for buffer in module.buffers():
             if buffer.numel():
                 torch.distributed.broadcast(buffer, source)
+
+
+def check_processes(identity: Mapping[str, Any], rank: int) -> None:
+    """Raise unless every process is to do the same fit.
+
+    Args:
+        identity: of the fit in this process. rank: of this process.
+
+    Raises:
+        InputError: another process has other settings or recordings; every difference is named.
+    """
+    for other, theirs in enumerate(from_all(identity)):
+        found = differences(theirs, identity)
+        if found:
+            raise InputError(
+                f"process {other} differs from process {rank}: {'; '.join(found)}; give all of them "
+                "the same recordings and settings"
+            )
+
+
+class Processes(DDPStrategy):
+    """Lightning's DDP, which also takes modules that have nothing to learn by gradients.
+
+    `DistributedDataParallel` refuses a module without trainable parameters, and would send all
+    buffers around in every step. Such a module is left unwrapped and does its own exchange with
+    `reduce`; any other one is wrapped as usual.
+    """
+
+    def configure_ddp(self) -> None:
+        """Wrap the module, if there are gradients to average."""
+        module = self.lightning_module
+        if module is not None and any(p.requires_grad for p in module.parameters()):
+            super().configure_ddp()
+
+
+def register_strategy() -> None:
+    """Take `Processes` wherever Lightning would take DDP: by name, or for several devices."""
+    StrategyRegistry.register(
+        "ddp",
+        Processes,
+        description="DDP; modules without trainable parameters are not wrapped",
+        override=True,
+        start_method="popen",
+        # others wait while one still holds out its persons; one that is dead is noticed at once
+        timeout=timedelta(hours=3),
+    )

@@ -18,7 +18,7 @@ from torchpose.body import BODY_15, Body, body_joints, fit_body, fit_state
 from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError
 from torchpose.learning import fit_gplvm, fit_gplvm_noise
 from torchpose.learning._gplvm_fit import GPLVMFit, median_gamma, run_fit
-from torchpose.learning._manifolds import gplvm_of_fit, thin
+from torchpose.learning._manifolds import fit_target, gplvm_of_fit, thin
 from torchpose.priors import BackConstrainedGPLVM, ManifoldInfo
 from torchpose.priors._manifold.prediction import KernelParameters
 
@@ -189,10 +189,10 @@ def test_several_starts_keep_the_best() -> None:
     poses, other = motion(50), motion(50, phase=1.0, seed=6)
     each = []
     for start in range(3):
-        target = poses - poses.mean(0)
-        fit = run_fit(GPLVMFit(target, 2, median_gamma(target), start=start), 3)
-        scale = torch.ones(30, dtype=torch.float64)
-        each.append((fit.history[-1], gplvm_of_fit(fit, poses, [50], scale)))
+        target = fit_target(poses, (), standardise=False, gamma_x=None, seed=0)
+        centred = poses - poses.mean(0)
+        fit = run_fit(GPLVMFit(centred, 2, median_gamma(centred), start=start), 3)
+        each.append((fit.history[-1], gplvm_of_fit(fit, target)))
     best = fit_gplvm(poses, steps=3, n_init=3)
     assert torch.equal(best.latents, max(each, key=lambda one: one[0])[1].latents)
     watched = fit_gplvm(poses, steps=3, n_init=3, validation=other)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchpose.learning._manifolds import gplvm_of_fit
+from torchpose.learning._manifolds import fit_target, gplvm_of_fit
 
 pytest.importorskip("lightning", reason="lightning is not installed; training needs it")
 
@@ -92,7 +92,7 @@ def test_it_is_the_fit_of_the_library(scene, whole) -> None:
     errors = []
     for step in range(1, 5):
         run_fit(fit, step, tolerance=-math.inf)
-        one = gplvm_of_fit(fit, poses, [30, 30], torch.ones(30).double())
+        one = gplvm_of_fit(fit, fit_target(data.train, (), False, None, 0))
         errors.append(float((data.watched[0] - one.reconstruct(data.watched[0])).square().mean()))
         if errors[-1] == min(errors):
             best = one

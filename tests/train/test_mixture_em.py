@@ -16,8 +16,8 @@ from torchpose.learning._streamed_em import StreamedEM, fit_streamed
 from torchpose.math._mixture_em import SufficientStatistics
 from torchpose.skeleton import UPPER_BODY
 from train.blocks import Key, SweepLoader
+from train.checkpoints import check_identity
 from train.data import RecordingsDataModule, split
-from train.identity import check_identity
 from train.mixture_em import MixtureEM
 from train.processes import first_failure
 
@@ -61,7 +61,7 @@ def test_steps_are_those_of_the_library():
     assert em.finished and em.trainer.should_stop
     for key in (Key("pose"), Key("a.b")):
         wanted = fit_streamed(sources[key], 2, 0, max_iter=3, tol=0.0)
-        found = em.fitted()[key.name]
+        found = em.em(key.name).mixture()
         torch.testing.assert_close(found.means, wanted.means, rtol=0, atol=1e-10)
         assert found.fit_report.log_likelihood == pytest.approx(
             wanted.fit_report.log_likelihood, abs=1e-10
@@ -69,7 +69,7 @@ def test_steps_are_those_of_the_library():
     held_out = sources[Key("pose", held_out=True)].block(0).states
     assert len(em.held_out_history["pose"]) == 4
     assert em.held_out_history["pose"][-1] == pytest.approx(
-        float(em.fitted()["pose"].log_prob(held_out).mean()), abs=1e-9
+        float(em.em("pose").mixture().log_prob(held_out).mean()), abs=1e-9
     )
 
 

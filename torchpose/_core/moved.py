@@ -142,7 +142,7 @@ MODULES = {
     "priors.prior_noise": "priors._prior_file",
     "priors.repetitions": "learning._performances",
     "priors.samplers": "learning._samplers",
-    "priors.seen_keypoints": "learning._seen_keypoints",
+    "priors.seen_keypoints": "learning._training",
     "priors.selection": "learning._selection",
     "priors.share": "learning._blocks",
     "priors.start": "math._mixture_start",

@@ -144,7 +144,7 @@ def _renew_noise(
     recordings: list["Recording"], recipe: dict[str, Any], before: str, command: str
 ) -> "UpperBodyPrior":
     """Return the prior of an earlier version with process noise and calibration learnt anew."""
-    from torchpose.learning._recipes.renewal import renew_noise
+    from torchpose.learning._recipes.earlier import renew_noise
     from torchpose.priors._upper_body import load_prior
 
     return renew_noise(

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import InputError, check_rate, check_shape
 from torchpose.learning._performances import Synchronised, checked_performances, synchronise
 from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.file import ActionInfo
@@ -56,7 +56,10 @@ def fit_action_space(
         InputError: one performance only, one with too few frames, NaN, D or fps not positive,
             nothing moves. ShapeError: postures of other than 36 angles.
     """
-    return _fit(performances, n_dimensions, name, fps, n_postures, prominence, info)[0]
+    return fit_synchronised(
+        performances, n_dimensions, name=name, fps=fps, n_postures=n_postures,
+        prominence=prominence, info=info,
+    )[0]  # fmt: skip
 
 
 def fit_synchronised(
@@ -69,23 +72,11 @@ def fit_synchronised(
     prominence: float = 0.15,
     info: ActionInfo | None = None,
 ) -> tuple[ActionSpace, Synchronised]:
-    """Fit as `fit_action_space`, and return also the performances that were put in step, for pictures."""
-    return _fit(performances, n_dimensions, name, fps, n_postures, prominence, info)
-
-
-def _fit(
-    performances: Sequence[Float[Tensor, "_ 36"]],
-    n_dimensions: int,
-    name: str,
-    fps: float | None,
-    n_postures: int | None,
-    prominence: float,
-    info: ActionInfo | None,
-) -> tuple[ActionSpace, Synchronised]:
+    """Fit as `fit_action_space` does, and return the synchronised performances as well."""
     known = info or ActionInfo()
     name, fps = name or known.name, known.fps if fps is None else fps
-    if fps is not None and not 0 < fps < float("inf"):
-        raise InputError(f"fps must be positive, got {fps:g}")
+    if fps is not None:
+        check_rate("fps", fps)
     parts = _checked(performances, n_dimensions)
     postures = torch.cat(parts)
     mean = postures.mean(0)

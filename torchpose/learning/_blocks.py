@@ -138,7 +138,7 @@ def spread_samples(source: SampleSource, count: int) -> Samples:
         parts.append(samples)
     if not parts:
         return Samples(torch.zeros(0, source.dim).double(), torch.zeros(0).double())
-    return Samples(*(torch.cat(values) for values in zip(*parts, strict=True)))
+    return join_samples(parts)
 
 
 def usable_block(source: SampleSource, index: int, epoch: int = 0) -> Samples:

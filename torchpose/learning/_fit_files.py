@@ -9,7 +9,7 @@ from typing import Any
 from torchpose._core.tensor_file import format_of
 from torchpose.errors import OutputError
 from torchpose.io._results import ResultsFolder
-from torchpose.learning._model_card import BodyModel, body_card, model_card
+from torchpose.learning._model_card import MODES, BodyModel, body_card, model_card
 from torchpose.learning._recipes.actions import FittedActions
 from torchpose.learning._recipes.limbs import LimbStates, fit_limbs, summary
 from torchpose.learning._recipes.manifold import ManifoldFitting
@@ -196,11 +196,10 @@ def _prior_lines(prior: UpperBodyPrior) -> list[str]:
 
 def _expected(held_out: Mapping[str, Mapping[str, float]]) -> list[str]:
     """Return what somebody new can expect, from the errors of the persons that were held out."""
-    names = {"causal": "filtered", "full": "smoothed"}
     lines = []
-    for mode, name in names.items():
+    for mode in ("causal", "full"):
         errors = [100 * error for error in held_out.get(mode, {}).values()]
         if errors:
             spread = f" +- {stdev(errors):.1f}" if len(errors) > 1 else ""
-            lines.append(f"{fmean(errors):.1f}{spread} cm {name} on somebody new")
+            lines.append(f"{fmean(errors):.1f}{spread} cm {MODES[mode]} on somebody new")
     return lines

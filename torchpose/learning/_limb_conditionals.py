@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose.body._kinematics import Body
@@ -20,7 +21,7 @@ from torchpose.priors._limb_conditionals import (
     check_body_frame,
 )
 
-__all__ = ["fit_limb_conditionals"]
+__all__ = ["edge_rotations", "fit_limb_conditionals", "frame_rotations", "part_rotations"]
 
 _LEAST_STD = 0.01  # of a vector: 1.1 degrees, about what joints tell of a rotation
 _MOST_CANDIDATES = 2000  # training rotations that a centre is looked for among
@@ -58,13 +59,12 @@ def fit_limb_conditionals(
     check_body_frame(body)
     check_rate("fps", fps)
     parts = [sequences] if isinstance(sequences, Tensor) else list(sequences)
-    turns = [_part_vectors(body, states) for states in parts]  # [T, P, 3] each
+    turns = [part_rotations(body, states) for states in parts]
     diffusion = _steps(turns, 1) if turns else None
     if diffusion is None:
         raise InputError("limb conditionals need two frames in a row, got none; add recordings")
     pairs = _edge_indices(body.skeleton, edges).to(body.centres.device)
-    above, below = torch.cat(turns)[:, pairs].unbind(2)
-    between = compose(conjugate(above), below).transpose(0, 1)  # q_ij [E, N, 3]
+    between = edge_rotations(torch.cat(turns), pairs).transpose(0, 1)  # q_ij [E, N, 3]
     every = -(-between.shape[1] // _MOST_CANDIDATES)
     centres = safe_centre(between[:, ::every])
     mean, covariance = fit_gaussian(between, centres)
@@ -94,7 +94,7 @@ def _edge_indices(skeleton: BodySkeleton, edges: Sequence[tuple[str, str]]) -> T
 
 def _steps(turns: Sequence[Tensor], stride: int) -> Tensor | None:
     """Second moments [P, 3, 3] of the rotations over so many frames; None without such frames."""
-    steps = torch.cat([compose(conjugate(q[:-stride]), q[stride:]) for q in turns])
+    steps = frame_rotations(turns, stride)
     return torch.einsum("npi,npj->pij", steps, steps) / len(steps) if len(steps) else None
 
 
@@ -113,8 +113,27 @@ def _trace(matrices: Tensor) -> Tensor:
     return matrices.diagonal(dim1=-2, dim2=-1).sum(-1)
 
 
-def _part_vectors(body: Body, states: Tensor) -> Tensor:
-    """Rotations of the parts [T, P, 3] without centres: the root's in the world, others in its axes."""
+def part_rotations(body: Body, states: Tensor) -> Float[Tensor, "T P 3"]:
+    """Return the rotations q_j of the parts without centres, the root's in the world, others in its axes.
+
+    Raises:
+        ShapeError: another number of columns. InputError: states that are not finite.
+    """
     check_shape("states", states, [None, body.dim])
     check_finite("states", states, hint="end the sequence where the recording has a gap")
     return compose(body.centres, states[:, 3:].unflatten(-1, (-1, 3)))
+
+
+def edge_rotations(
+    turns: Float[Tensor, "T P 3"], pairs: Int[Tensor, "E 2"]
+) -> Float[Tensor, "T E 3"]:
+    """Return the rotations q_ij = q_i^-1 q_j from the part above each edge to the part below."""
+    above, below = turns[:, pairs].unbind(2)
+    return compose(conjugate(above), below)
+
+
+def frame_rotations(
+    turns: Sequence[Float[Tensor, "_ P 3"]], stride: int = 1
+) -> Float[Tensor, "steps P 3"]:
+    """Return the rotations of each part over `stride` frames of one sequence, for all sequences."""
+    return torch.cat([compose(conjugate(q[:-stride]), q[stride:]) for q in turns])

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.errors import InputError
+from torchpose.errors import InputError, check_rate
 from torchpose.learning._gplvm_fit import GPLVMFit, best_fit, median_gamma
 from torchpose.priors._manifold.file import ManifoldInfo
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM, MotionNoise, join_sequences
 
 __all__ = [
+    "FitTarget",
     "check_unseen",
     "column_scale",
     "fit_gplvm",
     "fit_gplvm_noise",
+    "fit_target",
     "gplvm_of_fit",
     "motion_noise",
     "principal_axes",
@@ -82,46 +85,78 @@ def fit_gplvm(
             settings. ShapeError: not [T, Q], or sequences with different columns.
     """
     info = ManifoldInfo() if info is None else info
-    joined, lengths = join_sequences(poses, info.columns)
-    scale = column_scale(joined) if standardise else torch.ones_like(joined[0])
-    target = (joined - joined.mean(0)) / scale
-    gamma = median_gamma(target, seed) if gamma_x is None else gamma_x
+    target = fit_target(poses, info.columns, standardise, gamma_x, seed)
     defaults = _ALONE if validation is None else _WATCHED
     steps = defaults["steps"] if steps is None else steps
     n_init = defaults["n_init"] if n_init is None else n_init
     error = None
     if validation is not None:
-        watched, _ = join_sequences(validation, info.columns, joined.shape[1])
+        watched, _ = join_sequences(validation, info.columns, target.poses.shape[1])
         error = lambda fit: (  # noqa: E731
-            gplvm_of_fit(fit, joined, lengths, scale).reconstruction_error(watched)
+            gplvm_of_fit(fit, target).reconstruction_error(watched)
         )
     best = best_fit(
         lambda start: GPLVMFit(
-            target, latent_dim, gamma, optimiser, learning_rate, smoothness, start=start
+            target.scaled, latent_dim, target.gamma_x, optimiser, learning_rate, smoothness,
+            start=start,
         ),
         n_init, steps, tolerance, progress, error, patience,
     )  # fmt: skip
-    return gplvm_of_fit(best, joined, lengths, scale, info)
+    return gplvm_of_fit(best, target, info)
+
+
+class FitTarget(NamedTuple):
+    """Poses of all sequences, and the same poses as the objective sees them.
+
+    Attributes:
+        poses: [T, Q]. lengths: frames of each sequence. scale: s [Q]. scaled: (poses - mean) / s.
+        gamma_x: of (MR 22), for the scaled poses.
+    """
+
+    poses: Float[Tensor, "T Q"]
+    lengths: list[int]
+    scale: Float[Tensor, " Q"]
+    scaled: Float[Tensor, "T Q"]
+    gamma_x: float
+
+
+def fit_target(
+    poses: Float[Tensor, "T Q"] | Sequence[Float[Tensor, "_ Q"]],
+    columns: Sequence[str],
+    standardise: bool,
+    gamma_x: float | None,
+    seed: int,
+) -> FitTarget:
+    """Join sequences, subtract their mean and scale their columns.
+
+    Args:
+        poses, standardise, gamma_x, seed: see `fit_gplvm`. columns: names, for errors.
+
+    Raises:
+        InputError, ShapeError: as `fit_gplvm`.
+    """
+    joined, lengths = join_sequences(poses, columns)
+    scale = column_scale(joined) if standardise else torch.ones_like(joined[0])
+    scaled = (joined - joined.mean(0)) / scale
+    gamma = median_gamma(scaled, seed) if gamma_x is None else gamma_x
+    return FitTarget(joined, lengths, scale, scaled, gamma)
 
 
 def gplvm_of_fit(
-    fit: GPLVMFit,
-    poses: Float[Tensor, "T Q"],
-    lengths: Sequence[int],
-    scale: Float[Tensor, " Q"],
-    info: ManifoldInfo | None = None,
+    fit: GPLVMFit, target: FitTarget, info: ManifoldInfo | None = None
 ) -> BackConstrainedGPLVM:
-    """Return the manifold that a fit stands at, its latent axes turned to the principal ones.
+    """Return the manifold at the fit's current parameters, with latent axes turned to the principal ones.
 
     Args:
-        fit: to (poses - mean) / scale. lengths: frames of each sequence.
+        fit: to the scaled poses of `target`. info: what the poses are of.
     """
     with torch.no_grad():
         latents = fit.features @ fit.coordinates + fit.bias
         turn = principal_axes(latents)
         weights, bias = fit.weights @ turn, fit.bias @ turn
-        sizes = torch.tensor(list(lengths))
-        return BackConstrainedGPLVM(poses, sizes, weights, bias, fit.gamma_x, fit.kernel, scale=scale,
+        sizes = torch.tensor(list(target.lengths))
+        return BackConstrainedGPLVM(
+            target.poses, sizes, weights, bias, fit.gamma_x, fit.kernel, scale=target.scale,
             info=info,
         )  # fmt: skip
 
@@ -145,8 +180,7 @@ def fit_gplvm_noise(
         InputError: fewer than 10 frames, NaN, a frame rate that is not positive, or frames that
             were fitted to. ShapeError: other columns.
     """
-    if not 0 < fps < math.inf:
-        raise InputError(f"fps must be positive, got {fps:g}")
+    check_rate("fps", fps)
     joined, lengths = join_sequences(poses, manifold.info.columns, manifold.dim)
     joined = joined.to(manifold.poses)
     check_unseen(joined, lengths, manifold.poses)

@@ -16,9 +16,18 @@ from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 from torchpose.priors._upper_body import UpperBodyPrior
 from torchpose.priors._window import WindowPrior
 
-__all__ = ["BodyModel", "body_card", "card_table", "card_text", "model_card", "write_model_card"]
+__all__ = [
+    "MODES",
+    "BodyModel",
+    "body_card",
+    "card_table",
+    "card_text",
+    "model_card",
+    "write_model_card",
+]
 
-_MODES = {"pose": "single poses", "causal": "filtered", "full": "smoothed"}
+MODES = {"pose": "single poses", "causal": "filtered", "full": "smoothed"}
+"""What cards and commands call the ways of tracking."""
 
 
 def model_card(prior: UpperBodyPrior, results: Mapping[str, str] | None = None) -> str:
@@ -90,8 +99,8 @@ def _window(name: str, window: WindowPrior) -> str:
 def _data(prior: UpperBodyPrior) -> str:
     info = prior.info
     rows: dict[str, Any] = {
-        "sources": _joined(info.sources),
-        "persons": f"{len(info.persons)}: {_joined(info.persons)}"
+        "sources": "; ".join(info.sources) or "not stated",
+        "persons": f"{len(info.persons)}: {'; '.join(info.persons)}"
         if info.persons
         else "not stated",
         "licence": info.licence or "not stated",
@@ -182,7 +191,7 @@ def _held_out(prior: UpperBodyPrior) -> str:
     if not held_out:
         known = not prior.info.persons or "fine_tuned" in prior.info.extra
         return "" if known else "Not known: no person was held out."
-    modes = sorted(held_out, key=list(_MODES).index)
+    modes = sorted(held_out, key=list(MODES).index)
     persons = sorted(held_out[modes[0]])
     rows = [
         [person, *(f"{100 * held_out[mode].get(person, math.nan):.1f}" for mode in modes)]
@@ -192,7 +201,7 @@ def _held_out(prior: UpperBodyPrior) -> str:
     rows.append(["mean", *(f"{fmean(column):.1f}" for column in values)])
     if len(persons) > 1:
         rows.append(["standard deviation", *(f"{stdev(column):.1f}" for column in values)])
-    lines = ["| person | " + " | ".join(_MODES[mode] for mode in modes) + " |"]
+    lines = ["| person | " + " | ".join(MODES[mode] for mode in modes) + " |"]
     lines.append("|---|" + "---:|" * len(modes))
     lines += ["| " + " | ".join(row) + " |" for row in rows]
     return (
@@ -225,10 +234,6 @@ def _views(views: Mapping[str, Any]) -> str:
     angles = ", ".join(f"|{a}| <= {math.degrees(views[a]):g}°" for a in ("roll", "pitch", "yaw"))
     shifts = ", ".join(f"{t} {views[t][0]:g} to {views[t][1]:g} m" for t in ("tx", "ty", "tz"))
     return f"{angles}, {shifts}"
-
-
-def _joined(items: Iterable[str]) -> str:
-    return "; ".join(items) or "not stated"
 
 
 BodyModel = BackConstrainedGPLVM | LimbConditionals | ActionSpace | ActionBank

@@ -90,8 +90,7 @@ def block_sizes(n_samples: int) -> list[int]:
 
 def all_samples(source: SampleSource, epoch: int = 0) -> Samples:
     """Every state of a source at once."""
-    blocks = [source.block(index, epoch) for index in range(source.n_blocks)]
-    return Samples(*(torch.cat(values) for values in zip(*blocks, strict=True)))
+    return join_samples([source.block(index, epoch) for index in range(source.n_blocks)])
 
 
 def derived_seed(seed: int, purpose: str) -> int:

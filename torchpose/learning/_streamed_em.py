@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,7 +27,7 @@ from torchpose.learning._blocks import (
     usable_block,
     usable_samples,
 )
-from torchpose.learning._samplers import Samples, SampleSource
+from torchpose.learning._samplers import Samples, SampleSource, cached
 from torchpose.math._gaussian import symmetrise
 from torchpose.math._mixture_em import MixtureFit, run_fit, whitening
 from torchpose.math._mixture_start import STARTS, floor_variances, start_mixture
@@ -35,10 +35,9 @@ from torchpose.math._mixture_steps import MixtureParameters, SufficientStatistic
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
 __all__ = [
-    "ALONE",
     "START_SAMPLES",
     "ColumnsSource",
-    "Share",
+    "MixtureTask",
     "StreamedEM",
     "complete_mixture",
     "fit_streamed",
@@ -326,3 +325,33 @@ def complete_mixture(
     covs = symmetrise(covs - means[:, :, None] * means[:, None])
     covs = covs + _FLOOR * torch.eye(dim, dtype=torch.float64)
     return GaussianMixture(mixture.weights, means * scale + shift, covs * scale * scale[:, None])
+
+
+class MixtureTask(NamedTuple):
+    """One mixture to be fitted.
+
+    Attributes:
+        source: of its training states. n_components: K. max_iter, tol: of the steps of EM; a
+            tolerance of 0 takes all of them. seed: of the start.
+    """
+
+    source: SampleSource
+    n_components: int
+    max_iter: int
+    tol: float
+    seed: int
+
+    def fit(self) -> GaussianMixture:
+        """The whole mixture, fitted in this process."""
+        source = cached(self.source)
+        fitted = fit_streamed(
+            source, self.n_components, self.seed, max_iter=self.max_iter, tol=self.tol
+        )
+        return self.whole(fitted)
+
+    def whole(self, mixture: GaussianMixture) -> GaussianMixture:
+        """The mixture over all dimensions of its states, if it was fitted to some of them only."""
+        source = self.source
+        if not isinstance(source, ColumnsSource) or mixture.dim == source.source.dim:
+            return mixture
+        return complete_mixture(mixture, source.source, source.columns)

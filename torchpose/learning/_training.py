@@ -10,9 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.camera._viewpoints import ViewRange
+from torchpose.camera._projection import project
+from torchpose.camera._viewpoints import ViewRange, sample_viewpoints
 from torchpose.errors import InputError, PriorError
 from torchpose.learning._samplers import ArmSource, PoseFrames, derived_seed
+from torchpose.math._rotations import euler_to_matrix
+from torchpose.priors._prior_file import PriorInfo
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import learn_neck_offset, place_neck
 from torchpose.skeleton._upper_body import LEFT_ARM, NECK_KINDS, RIGHT_ARM, upper_body_indices
@@ -24,6 +27,7 @@ __all__ = [
     "RecordingLike",
     "arm_sources",
     "collect_poses",
+    "seen_keypoints",
 ]
 
 TRAINING_VIEWS = ViewRange(
@@ -39,6 +43,7 @@ TRAINING_VIEWS = ViewRange(
 DEFAULT_SAMPLES = 100_000
 DEFAULT_RATE = 30.0  # of recordings that do not say
 _HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
+_UNSEEN = [i for i, name in enumerate(UPPER_BODY) if name.startswith(("elbow", "shoulder"))]
 
 
 @runtime_checkable
@@ -295,3 +300,30 @@ def _count(n: int, n_samples: int | None, views_per_pose: int | None) -> int:
     if count < 1:
         raise InputError(f"the number of samples must be at least 1, got {count}")
     return count
+
+
+def seen_keypoints(
+    poses: Float[Tensor, "B T 8 3"],
+    info: PriorInfo,
+    generator: torch.Generator,
+    *,
+    view_share: float,
+    noise_std: float,
+) -> Float[Tensor, "B T 8 2"]:
+    """Keypoints of sequences, each from a random viewpoint of its own (BL section 3.1).
+
+    Args:
+        poses: body axes, metres. info: of the prior whose camera and viewpoints are taken.
+        generator: of viewpoints and noise. view_share: of the width of the training views.
+        noise_std: of a keypoint, pixels.
+
+    Returns:
+        The prior's pixels; elbows and shoulders are NaN, as is whatever is NaN in the poses.
+    """
+    views = sample_viewpoints(len(poses), ViewRange(**info.views).scaled(view_share), generator)
+    rotation = euler_to_matrix(views.angles, info.rotation_order)  # type: ignore[arg-type]
+    pixels = project(poses, info.matrix, rotation[:, None], views.translation[:, None])[..., :2]
+    noise = torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
+    keypoints = pixels + noise_std * noise
+    keypoints[:, :, _UNSEEN] = torch.nan
+    return keypoints

@@ -23,7 +23,7 @@ from torchpose.learning._fine_tuning.parameters import (
     tuned_info,
     tuned_mixtures,
 )
-from torchpose.learning._seen_keypoints import seen_keypoints
+from torchpose.learning._training import seen_keypoints
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._upper_body import UpperBodyPrior
 from torchpose.priors._window import augment_bodies

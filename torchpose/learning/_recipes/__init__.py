@@ -6,8 +6,8 @@ from torchpose.learning._recipes.calibration import fit_calibration
 from torchpose.learning._recipes.earlier import fit_recipe_2
 from torchpose.learning._recipes.limbs import LimbStates, fit_limbs
 from torchpose.learning._recipes.manifold import ManifoldFitting, ManifoldPoses, ManifoldRecipe
-from torchpose.learning._recipes.mixtures import MixtureTask
 from torchpose.learning._recipes.upper_body import VERSION, UpperBodyRecipe, fit_kinect_prior
+from torchpose.learning._streamed_em import MixtureTask
 
 __all__ = [
     "VERSION",

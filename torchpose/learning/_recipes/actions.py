@@ -10,10 +10,9 @@ from typing import Any, Literal, Self
 import torch
 from torch import Tensor
 
-from torchpose.body._fitting import fit_body, fit_state
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
-from torchpose.errors import InputError
+from torchpose.errors import InputError, check_rate
 from torchpose.io._formats.axes import Axes
 from torchpose.io._recordings import Recording
 from torchpose.learning._action_spaces import Performed, fit_synchronised
@@ -24,11 +23,13 @@ from torchpose.learning._performances import (
     split_repetitions,
 )
 from torchpose.learning._recipes.choosing import (
+    body_of_each,
     choose_recordings,
     fingerprint,
     origin_of,
     recorded_joints,
     recording_name,
+    state_of,
 )
 from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.file import ActionInfo, BankInfo
@@ -252,8 +253,7 @@ def check_actions(actions: Sequence[str], fps: float) -> None:
     """Raise `InputError` unless there are actions, each once, and the rate is positive."""
     if not actions or len(set(actions)) < len(actions):
         raise InputError(f"actions must be names, each once, got {', '.join(actions) or 'none'}")
-    if not 0 < fps < float("inf"):
-        raise InputError(f"fps must be positive, got {fps:g}")
+    check_rate("fps", fps)
 
 
 def _performed(
@@ -294,17 +294,16 @@ def _parts(
 
 def _told(recordings: Sequence[Recording], joints: Sequence[Tensor], postures: str) -> list[Tensor]:
     """Postures [T, 36] of every recording."""
-    found: list[Tensor] = [torch.empty(0)] * len(joints)
-    common = Body.of_height(BODY_15, COMMON_HEIGHT)
-    for person in sorted({r.person_id for r in recordings}):
-        mine = [i for i, r in enumerate(recordings) if r.person_id == person]
-        for i in mine:
-            try:
-                found[i] = posture_angles(joints[i])
-            except InputError as error:
-                raise InputError(f"{recording_name(recordings[i])}: {error}") from error
-        if postures == "body":
-            body = fit_body(torch.cat([joints[i] for i in mine]))
-            for i in mine:
-                found[i] = state_postures(common, fit_state(body, joints[i])).detach()
-    return found
+    found = []
+    for recording, points in zip(recordings, joints, strict=True):
+        try:
+            found.append(posture_angles(points))
+        except InputError as error:
+            raise InputError(f"{recording_name(recording)}: {error}") from error
+    if postures != "body":
+        return found
+    bodies, common = body_of_each(recordings, joints), Body.of_height(BODY_15, COMMON_HEIGHT)
+    return [
+        state_postures(common, state_of(bodies[r.person_id], r, points))
+        for r, points in zip(recordings, joints, strict=True)
+    ]

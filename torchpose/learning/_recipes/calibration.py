@@ -9,8 +9,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from torchpose.errors import InputError
-from torchpose.learning._seen_keypoints import seen_keypoints
-from torchpose.learning._training import PoseSet
+from torchpose.learning._training import PoseSet, seen_keypoints
 from torchpose.metrics._calibration import chi2_quantile
 from torchpose.metrics._poses import align
 from torchpose.priors._upper_body import UpperBodyPrior

@@ -1,6 +1,6 @@
-"""Which recordings of whole bodies a fit takes: files, persons, actions, and who is held out.
+"""Choose recordings of whole bodies to fit to, and turn them into joints, bodies and states.
 
-The fits of manifolds, limbs and actions choose alike, from `torchpose fit` and from the training loop.
+The fits of manifolds, limbs and actions do so alike, from `torchpose fit` and from the training loop.
 """
 
 import hashlib
@@ -9,8 +9,11 @@ import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
+from torchpose.body._fitting import fit_body, fit_state
+from torchpose.body._kinematics import Body, Frame
 from torchpose.body._skeleton import BODY_15, body_joints
 from torchpose.errors import InputError
 from torchpose.io._formats.axes import Axes
@@ -20,12 +23,14 @@ from torchpose.learning._curation.splits import pick_persons, refuse_shared_reco
 
 __all__ = [
     "ChosenRecordings",
+    "body_of_each",
     "choose_recordings",
     "expand_path",
     "fingerprint",
     "origin_of",
     "recorded_joints",
     "recording_name",
+    "state_of",
 ]
 
 
@@ -112,6 +117,40 @@ def recorded_joints(recording: Recording, fps: float) -> Tensor:
             "fill the gap"
         )
     return resample(joints, recording.fps, fps)
+
+
+def body_of_each(
+    recordings: Sequence[Recording], joints: Sequence[Tensor], frame: Frame = "parent"
+) -> dict[str, Body]:
+    """Return the body of each person, fitted to all of their recordings.
+
+    Args:
+        recordings: of everybody. joints: [T, 15, 3] of each recording, see `recorded_joints`.
+        frame: of the bodies, see `fit_body`.
+
+    Raises:
+        InputError: joints that no body can be fitted to; the person is named.
+    """
+    found = {}
+    for person in dict.fromkeys(r.person_id for r in recordings):
+        own = [j for r, j in zip(recordings, joints, strict=True) if r.person_id == person]
+        try:
+            found[person] = fit_body(torch.cat(own), frame=frame)
+        except InputError as error:
+            raise InputError(f"{person}: {error}") from error
+    return found
+
+
+def state_of(body: Body, recording: Recording, joints: Tensor) -> Tensor:
+    """Return the states [T, D] of a recording on its person's body.
+
+    Raises:
+        InputError: joints that no state can be fitted to; the recording is named.
+    """
+    try:
+        return fit_state(body, joints).detach()
+    except InputError as error:
+        raise InputError(f"{recording_name(recording)}: {error}") from error
 
 
 def origin_of(recordings: Sequence[Recording]) -> dict[str, Any]:

@@ -11,18 +11,23 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.body._fitting import fit_body, fit_state
 from torchpose.body._kinematics import Body, centres_of
-from torchpose.errors import InputError
+from torchpose.errors import InputError, check_rate
 from torchpose.io._formats.axes import Axes
 from torchpose.io._recordings import Recording
-from torchpose.learning._limb_conditionals import fit_limb_conditionals
+from torchpose.learning._limb_conditionals import (
+    edge_rotations,
+    fit_limb_conditionals,
+    frame_rotations,
+    part_rotations,
+)
 from torchpose.learning._recipes.choosing import (
+    body_of_each,
     choose_recordings,
     fingerprint,
     origin_of,
     recorded_joints,
-    recording_name,
+    state_of,
 )
 from torchpose.math._rotations import compose, conjugate
 from torchpose.priors._limb_conditionals import LimbConditionals
@@ -68,19 +73,21 @@ class LimbStates:
         Raises:
             InputError: as `choose_recordings` and `recorded_joints`, or a rate that is not positive.
         """
-        if not 0 < fps < float("inf"):
-            raise InputError(f"fps must be positive, got {fps:g}")
+        check_rate("fps", fps)
         learnt, watched = choose_recordings(
             paths, persons=persons, held_out=held_out, actions=actions, without=without, axes=axes
         )
         both = [*learnt, *watched]
         joints, n = [recorded_joints(r, fps) for r in both], len(learnt)
-        bodies = _bodies(both, joints)
+        bodies = body_of_each(both, joints, frame="body")
         first = both[0].person_id
-        centres = centres_of(bodies[first], torch.cat(_states(bodies, learnt, joints[:n])))
+        learnt_states = [
+            state_of(bodies[r.person_id], r, j) for r, j in zip(learnt, joints[:n], strict=True)
+        ]
+        centres = centres_of(bodies[first], torch.cat(learnt_states))
         centred = {person: body.altered(centres=centres) for person, body in bodies.items()}
-        # fitted anew: the twist that joints do not tell is none about the centres
-        states = _states(centred, both, joints)
+        # fitted again, since the twist that joints do not tell is zero about the centres
+        states = [state_of(centred[r.person_id], r, j) for r, j in zip(both, joints, strict=True)]
         return cls(centred[first], fps, states[:n], states[n:], learnt, watched)
 
     def identity(self) -> dict[str, Any]:
@@ -153,12 +160,11 @@ def held_out_spread(
         body: whose states they are, of the conditionals' centres. sequences: [T, D] each, at their
             frame rate.
     """
-    above, below = conditionals.edges.long().unbind(-1)
-    turns = [compose(body.centres, s[:, 3:].unflatten(-1, (-1, 3))) for s in sequences]
+    turns = [part_rotations(body, s) for s in sequences]
     every = torch.cat(turns)
-    between = compose(conjugate(every[:, above]), every[:, below])
+    between = edge_rotations(every, conditionals.edges.long())
     away = compose(conjugate(conditionals.edge_centres), between) - conditionals.mean
-    steps = torch.cat([compose(conjugate(q[:-1]), q[1:]) for q in turns])
+    steps = frame_rotations(turns)
     return HeldOut(
         _ratio(away, conditionals.covariance), _ratio(steps, conditionals.diffusion), len(every)
     )
@@ -182,27 +188,3 @@ def summary(conditionals: LimbConditionals, held_out: HeldOut | None) -> str:
 def _ratio(vectors: Float[Tensor, "N M 3"], covariance: Float[Tensor, "M 3 3"]) -> float:
     learnt = covariance.diagonal(dim1=-2, dim2=-1).sum()
     return float((vectors.square().sum((-2, -1)).mean() / learnt).sqrt())
-
-
-def _bodies(recordings: Sequence[Recording], joints: Sequence[Tensor]) -> dict[str, Body]:
-    found = {}
-    for person in dict.fromkeys(r.person_id for r in recordings):
-        own = [j for r, j in zip(recordings, joints, strict=True) if r.person_id == person]
-        try:
-            found[person] = fit_body(torch.cat(own), frame="body")
-        except InputError as error:
-            raise InputError(f"{person}: {error}") from error
-    return found
-
-
-def _states(
-    bodies: dict[str, Body], recordings: Sequence[Recording], joints: Sequence[Tensor]
-) -> list[Tensor]:
-    """States [T, D] of every recording on its person's body."""
-    found = []
-    for recording, points in zip(recordings, joints, strict=True):
-        try:
-            found.append(fit_state(bodies[recording.person_id], points).detach())
-        except InputError as error:
-            raise InputError(f"{recording_name(recording)}: {error}") from error
-    return found

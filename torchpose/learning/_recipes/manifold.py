@@ -18,26 +18,21 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from torchpose._core.files import atomic_path
-from torchpose.body._fitting import fit_body, fit_state
 from torchpose.body._kinematics import Body
 from torchpose.errors import InputError, OutputError
 from torchpose.io._formats.axes import Axes
 from torchpose.io._recordings import Recording
 from torchpose.learning._curation.splits import refuse_shared_recordings
-from torchpose.learning._gplvm_fit import GPLVMFit, median_gamma
-from torchpose.learning._manifolds import (
-    column_scale,
-    fit_gplvm_noise,
-    gplvm_of_fit,
-    join_sequences,
-    thin,
-)
+from torchpose.learning._gplvm_fit import GPLVMFit
+from torchpose.learning._manifolds import fit_gplvm_noise, fit_target, gplvm_of_fit, thin
 from torchpose.learning._recipes.choosing import (
+    body_of_each,
     choose_recordings,
     fingerprint,
     origin_of,
     recorded_joints,
     recording_name,
+    state_of,
 )
 from torchpose.priors._manifold.file import ManifoldInfo
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
@@ -142,14 +137,16 @@ class ManifoldPoses:
         fitted, watched = chosen
         if not watched:
             fitted, watched = _last_apart(fitted, validation)
-        bodies = _bodies(fitted, watched, fps)
-        both = tqdm([*fitted, *watched], desc="poses", disable=not progress)
-        poses = [_poses(bodies[r.person_id], r, fps) for r in both]
+        both, n = [*fitted, *watched], len(fitted)
+        joints = [recorded_joints(r, fps) for r in both]
+        bodies = _bodies(both, joints, n)
+        bar = tqdm(zip(both, joints, strict=True), "poses", len(both), disable=not progress)
+        states = [(bodies[r.person_id], state_of(bodies[r.person_id], r, j)) for r, j in bar]
+        poses = [body.relative(state) for body, state in states]
         facts: dict[str, Any] = origin_of(fitted)
         several = len(facts["persons"]) > 1
         facts["sequences"] = tuple(r.person_id if several else recording_name(r) for r in fitted)
         info = ManifoldInfo.of_body(bodies[fitted[0].person_id], fps=fps, **facts)
-        n = len(fitted)
         return cls(thin(poses[:n], frames), poses[n:], fps, info, fitted, watched)
 
     def identity(self) -> dict[str, Any]:
@@ -172,13 +169,12 @@ class ManifoldFitting(nn.Module):
     def __init__(self, poses: ManifoldPoses, recipe: ManifoldRecipe) -> None:
         super().__init__()
         self.data, self.recipe = poses, recipe
-        joined, self._lengths = join_sequences(poses.train, poses.info.columns)
-        self._scale = column_scale(joined) if recipe.standardise else torch.ones_like(joined[0])
-        self._poses, target = joined, (joined - joined.mean(0)) / self._scale
-        gamma = median_gamma(target, recipe.seed) if recipe.gamma_x is None else recipe.gamma_x
+        self._target = fit_target(
+            poses.train, poses.info.columns, recipe.standardise, recipe.gamma_x, recipe.seed
+        )
         self.fit = GPLVMFit(
-            target, recipe.latent_dim, gamma, recipe.optimiser, recipe.learning_rate,
-            recipe.smoothness, start=recipe.start,
+            self._target.scaled, recipe.latent_dim, self._target.gamma_x, recipe.optimiser,
+            recipe.learning_rate, recipe.smoothness, start=recipe.start,
         )  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
@@ -238,7 +234,7 @@ class ManifoldFitting(nn.Module):
         )
 
     def _current(self) -> BackConstrainedGPLVM:
-        return gplvm_of_fit(self.fit, self._poses, self._lengths, self._scale, self.data.info).cpu()
+        return gplvm_of_fit(self.fit, self._target, self.data.info).cpu()
 
 
 def run_to_end(
@@ -322,23 +318,11 @@ def _last_apart(
 
 
 def _bodies(
-    fitted: Sequence[Recording], watched: Sequence[Recording], fps: float
+    recordings: Sequence[Recording], joints: Sequence[Tensor], n_fitted: int
 ) -> dict[str, Body]:
-    """A body for everybody, fitted to the recordings that are fitted to where there are any."""
-    bodies = {}
-    for person in dict.fromkeys(r.person_id for r in (*fitted, *watched)):
-        own = [r for r in fitted if r.person_id == person]
-        own = own or [r for r in watched if r.person_id == person]
-        bodies[person] = fit_body(torch.cat([recorded_joints(r, fps) for r in own]))
-    return bodies
-
-
-def _poses(body: Body, recording: Recording, fps: float) -> Tensor:
-    try:
-        return body.relative(fit_state(body, recorded_joints(recording, fps))).detach()
-    except InputError as error:
-        name = f"{recording_name(recording)}: "
-        raise InputError(name + str(error).removeprefix(name)) from error
+    """Return a body for each person, from their recordings among the first `n_fitted` if any."""
+    of_watched = body_of_each(recordings[n_fitted:], joints[n_fitted:])
+    return of_watched | body_of_each(recordings[:n_fitted], joints[:n_fitted])
 
 
 def _digest(poses: Sequence[Tensor]) -> str:

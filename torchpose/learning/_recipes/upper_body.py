@@ -24,9 +24,8 @@ from torchpose.learning._recipes.calibration import (
     folds,
     track_held_out,
 )
-from torchpose.learning._recipes.mixtures import MixtureTask
 from torchpose.learning._samplers import SampleSource, WindowSource, derived_seed
-from torchpose.learning._streamed_em import ColumnsSource
+from torchpose.learning._streamed_em import ColumnsSource, MixtureTask
 from torchpose.learning._training import (
     TRAINING_VIEWS,
     ArmSources,
@@ -42,7 +41,7 @@ from torchpose.priors._prior_file import PriorInfo
 from torchpose.priors._upper_body import UpperBodyPrior
 from torchpose.priors._window import WindowLayout, WindowPrior
 
-__all__ = ["VERSION", "MixtureTask", "UpperBodyRecipe", "fit_kinect_prior"]
+__all__ = ["VERSION", "UpperBodyRecipe", "fit_kinect_prior"]
 
 VERSION = "5"
 """Changes whenever the recipe does, so that priors cached under an older one are not taken for it."""

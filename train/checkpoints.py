@@ -1,0 +1,117 @@
+"""Write checkpoints of fits that are whole, and refuse those of another fit."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import Checkpoint
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+
+from torchpose._core.files import atomic_path, clear_leftovers
+from torchpose.errors import FileFormatError, InputError
+
+__all__ = [
+    "ENTRY",
+    "AtomicCheckpoints",
+    "LastCheckpoint",
+    "check_identity",
+    "checkpoint_file",
+    "differences",
+]
+
+ENTRY = "torchpose"
+"""Key of a checkpoint under which a fit keeps its identity and its progress."""
+
+_ADVICE = (
+    "resume with the settings and recordings it was made with, or start anew without --ckpt_path"
+)
+
+
+def checkpoint_file(folder: str | Path) -> Path:
+    """The last checkpoint of the fit whose logs are in a folder."""
+    return Path(folder) / "checkpoints" / "last.ckpt"
+
+
+class LastCheckpoint(Checkpoint):
+    """After every step, the whole state of the fit in `checkpoints/last.ckpt`."""
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Clear what a killed fit left."""
+        if trainer.is_global_zero:
+            clear_leftovers(checkpoint_file(trainer.default_root_dir).parent)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write it."""
+        trainer.save_checkpoint(checkpoint_file(trainer.default_root_dir))
+
+
+class AtomicCheckpoints(TorchCheckpointIO):
+    """Checkpoints that appear whole or not at all, however the process ends."""
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
+    ) -> None:
+        """Write beside `path`, then rename."""
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path) as temporary:
+            super().save_checkpoint(checkpoint, temporary, storage_options)
+
+    def load_checkpoint(self, path: Any, *args: Any, **options: Any) -> dict[str, Any]:
+        """Read one.
+
+        Raises:
+            FileFormatError: it is truncated, or something else.
+        """
+        try:
+            found = super().load_checkpoint(path, *args, **options)
+        except (RuntimeError, EOFError, ValueError, UnpicklingError) as error:
+            raise FileFormatError(
+                f"{path}: expected a checkpoint; the file is truncated or of another kind"
+            ) from error
+        if not isinstance(found, dict) or "pytorch-lightning_version" not in found:
+            raise FileFormatError(f"{path}: expected a checkpoint, got something that is none")
+        return found
+
+
+def check_identity(kept: Any, wanted: Mapping[str, Any], path: Any) -> dict[str, Any]:
+    """What a checkpoint says about itself, if it is of this fit.
+
+    Args:
+        kept: the entry of the checkpoint. wanted: the identity of this fit. path: of the file.
+
+    Raises:
+        FileFormatError: not a checkpoint of a fit like this one at all.
+        InputError: of another one; every difference is named.
+    """
+    if not isinstance(kept, Mapping) or "identity" not in kept:
+        raise FileFormatError(
+            f"{path}: expected a checkpoint of {wanted.get('model', 'this model')}, got one of "
+            "something else"
+        )
+    found = differences(kept["identity"], wanted)
+    if found:
+        raise InputError(f"{path}: the checkpoint is of another fit: {'; '.join(found)}; {_ADVICE}")
+    return dict(kept)
+
+
+def differences(kept: Any, wanted: Any, name: str = "") -> list[str]:
+    """Sentences about what differs between two nested mappings.
+
+    >>> differences({"recipe": {"seed": 0, "views": [1, 2]}}, {"recipe": {"seed": 3, "views": [1, 2]}})
+    ['recipe seed was 0, is 3']
+    """
+    if isinstance(kept, Mapping) and isinstance(wanted, Mapping):
+        inside = f"{name} " if name else ""
+        return [
+            sentence
+            for key in dict.fromkeys([*kept, *wanted])
+            for sentence in differences(kept.get(key), wanted.get(key), f"{inside}{key}")
+        ]
+    return [] if kept == wanted else [f"{name} was {_short(kept)}, is {_short(wanted)}"]
+
+
+def _short(value: Any) -> str:
+    text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
