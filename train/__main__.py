@@ -1,4 +1,4 @@
-"""`python -m train`: fit, predict."""
+"""Run `python -m train`: fit, select, predict."""
 
 from train.cli import main
 

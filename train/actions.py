@@ -1,4 +1,4 @@
-"""Fit of action spaces, or of a bank, with Lightning: one step.
+"""Fit action spaces, or a bank, with Lightning, in one step.
 
 The fit itself is `torchpose.learning._recipes.actions`.
 """
@@ -17,7 +17,7 @@ __all__ = ["ActionData", "ActionFit"]
 
 
 class ActionData(BodyData):
-    """Performances of one action or several, and those of persons who are held out.
+    """Performances of one action or several, and those of held-out persons.
 
     Args:
         paths: folders (with their subfolders) or files; `$NAME` stands for a variable of the
@@ -82,7 +82,7 @@ class ActionFit(BodyFit):
         self._fitted: FittedActions | None = None
 
     def training_step(self, batch: int, batch_idx: int) -> None:
-        """The fit of every action."""
+        """Fit every action."""
         fitted = self._fit()
         found = {"explained": [s.info.explained or 0.0 for s, _ in fitted.spaces.values()]}
         if fitted.accepted:

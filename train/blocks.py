@@ -1,10 +1,9 @@
-"""How the blocks of all training sources are shared among processes and their workers.
+"""Share the blocks of all training sources among processes and their workers.
 
-Every process takes the blocks rank, rank + world, ... of one list, each exactly once: nothing is
-padded, nothing repeated, and it does not matter if some processes have a block less than others, or
-none at all. Lightning exchanges something in every training step, so that processes with different
-numbers of steps would wait for each other for ever; here one step is one sweep of a process over all
-of its blocks.
+Every process takes the blocks rank, rank + world, ... of one list, each exactly once, without padding or
+repetition. Processes may have different numbers of blocks, or none. Lightning synchronises the processes
+in every training step, so that different numbers of steps would be a deadlock. Therefore one step is one
+sweep of a process over all of its blocks.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -46,12 +45,12 @@ Epochs = Callable[[Key], int | None]
 
 
 def list_blocks(sources: Sources) -> list[Block]:
-    """Every block of every source."""
+    """Return every block of every source."""
     return [Block(key, i) for key, source in sources.items() for i in range(source.n_blocks)]
 
 
 class _Blocks(Dataset[Part]):
-    """Blocks, drawn when they are asked for."""
+    """A data set whose blocks are drawn on demand."""
 
     def __init__(self, sources: Sources) -> None:
         self.sources = dict(sources)
@@ -96,7 +95,7 @@ class ShareSampler(Sampler[Block]):
 
 
 class Sweep:
-    """One pass of a process over its blocks, some of one source at a time.
+    """One pass of a process over its blocks, joined per source.
 
     Args:
         blocks: in order, those of a source together. length: how many.
@@ -121,7 +120,7 @@ class Sweep:
 
 
 class SweepLoader:
-    """What Lightning iterates over: one `Sweep` in every epoch.
+    """A loader for Lightning with one `Sweep` in every epoch.
 
     Args:
         sources: of all mixtures. rank, world, epochs: of `ShareSampler`.

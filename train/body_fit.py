@@ -1,6 +1,6 @@
-"""What fits to whole bodies share: one process, the identity of a fit, and where its file goes.
+"""Run a fit to whole bodies as a module of Lightning: one process, its identity, and its files.
 
-What is fitted, and to which recordings, is `torchpose.learning._recipes`; here are the steps of Lightning.
+The fits themselves are in `torchpose.learning._recipes`.
 """
 
 from collections.abc import Sequence
@@ -42,11 +42,11 @@ class BodyData(LightningDataModule):
             self.gathered = self.source.gather(**self._arguments)
 
     def train_dataloader(self) -> range:
-        """One step an epoch."""
+        """Return one step an epoch."""
         return range(1)
 
     def identity(self) -> dict[str, Any]:
-        """What makes a fit the same one."""
+        """Return settings and digests of the recordings, equal for equal fits."""
         found: dict[str, Any] = self.gathered.identity()
         return found
 
@@ -83,33 +83,33 @@ class BodyFit(LightningModule):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Everything that was set and matters to the result."""
+        """Return all settings that matter to the result."""
         given: Any = self.hparams
         return {k: v for k, v in given.items() if k != "picture" and not k.startswith("_")}
 
     def configure_optimizers(self) -> Sequence[Optimizer]:
-        """None that Lightning knows of."""
+        """Return no optimiser that Lightning would step."""
         return []
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Say what the checkpoint is of."""
+        """Store the identity and the progress of the fit."""
         checkpoint[ENTRY] = {"identity": self._identity, **self.progress_made()}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse a checkpoint of anything else."""
+        """Refuse a checkpoint of another fit, and restore the progress."""
         kept = check_identity(checkpoint.get(ENTRY), self._identity, self.trainer.ckpt_path)
         self.go_on_from(kept)
 
     def progress_made(self) -> dict[str, Any]:
-        """What a checkpoint holds beside the module's state; nothing where the fit is done again."""
+        """Return what a checkpoint holds beside the module's state; nothing where the fit is repeated."""
         return {}
 
     def go_on_from(self, kept: dict[str, Any]) -> None:
-        """Take up what `progress_made` gave."""
+        """Restore what `progress_made` returned."""
 
     @property
     def results(self) -> tuple[ResultsFolder, str] | None:
-        """Where a prior's file would be, and its name; None in other processes."""
+        """Return the folder and name of the prior's file; None in other processes."""
         writers = [c for c in self.trainer.callbacks if isinstance(c, PriorWriter)]  # type: ignore[attr-defined]
         if not writers or not self.trainer.is_global_zero:
             return None
@@ -117,10 +117,10 @@ class BodyFit(LightningModule):
 
     @property
     def data_module(self) -> BodyData:
-        """The data, if they are of the right kind."""
+        """Return the data, if they are of the right kind."""
         return data_of(self, self.data_type)
 
     @property
     def gathered(self) -> Any:
-        """What is fitted to."""
+        """Return what is fitted to."""
         return self.data_module.gathered

@@ -1,4 +1,4 @@
-"""What happens beside the steps of a fit: the bar, the checkpoint, the pictures, the prior's file."""
+"""Show the progress of a fit, draw pictures of it, and write the prior's file."""
 
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -20,7 +20,7 @@ __all__ = ["FitPictures", "FitProgress", "PriorWriter"]
 
 
 class FitProgress(ProgressBar):
-    """Bars over the steps of EM, with the mean log-likelihoods, and over the blocks of a step."""
+    """Progress bars over the steps of EM, with mean log-likelihoods, and over the blocks of a step."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -37,7 +37,7 @@ class FitProgress(ProgressBar):
         self._shown = True
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Begin."""
+        """Open the bars."""
         off = not self._shown
         self._steps = tqdm(desc="EM", unit="step", initial=trainer.current_epoch, disable=off)
         self._blocks = tqdm(desc="step", unit="block", leave=False, disable=off)
@@ -58,7 +58,7 @@ class FitProgress(ProgressBar):
         batch: Any,
         batch_idx: int,
     ) -> None:
-        """Show where the fit stands."""
+        """Show the log-likelihoods after a step."""
         shown = {
             kind.replace("_", " "): f"{float(trainer.callback_metrics[kind]):.4f}"
             for kind in ("log_likelihood", "held_out")
@@ -68,14 +68,14 @@ class FitProgress(ProgressBar):
         self._steps.update()
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """End."""
+        """Close the bars."""
         for bar in (self._blocks, self._steps):
             if bar is not None:
                 bar.close()
 
 
 class FitPictures(Callback):
-    """The components as skeletons, samples, and likelihoods, as files and in TensorBoard.
+    """Pictures of components, samples and likelihoods, as files and in TensorBoard.
 
     Args:
         every: steps between two sets of pictures; 0 draws none but at the end.
@@ -87,12 +87,12 @@ class FitPictures(Callback):
         self._drawn_at = -1
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw if it is time."""
+        """Draw the pictures if they are due."""
         if self._every and (trainer.current_epoch + 1) % self._every == 0:
             self._draw(trainer, pl_module)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw what has come of it."""
+        """Draw the pictures of the finished fit."""
         if self._at_end:
             self._draw(trainer, pl_module)
 
@@ -134,7 +134,7 @@ def _pictures(
 
 
 def _keep(figure: Any, path: Path, trainer: Trainer, step: int) -> None:
-    """A picture as a file, and in TensorBoard."""
+    """Save a picture as a file and in TensorBoard."""
     import numpy as np
 
     from torchpose.viz import save_figure
@@ -149,7 +149,7 @@ def _keep(figure: Any, path: Path, trainer: Trainer, step: int) -> None:
 
 
 class PriorWriter(Callback):
-    """When a fit is done: calibrate, and write the prior, its model card and its picture.
+    """Calibration at the end of a fit, and the files of the prior, its card and its picture.
 
     Args:
         out: the prior, NAME.safetensors. name: in its metadata, that of the file by default.
@@ -173,7 +173,7 @@ class PriorWriter(Callback):
         self._open = ExitStack()
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """See that the prior can be written, and that nothing else is in its place, before any work."""
+        """Check before any work that the prior can be written and that nothing else is in its place."""
         if trainer.is_global_zero and stage == "fit":
             given = [value for value in pl_module.hparams.values() if isinstance(value, str)]
             self.results = fit_results(self.out, given, self._pictures)
@@ -189,11 +189,11 @@ class PriorWriter(Callback):
         print(done, flush=True)
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Remove what is temporary."""
+        """Remove temporary files."""
         self._open.close()
 
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
-        """Remove what is temporary."""
+        """Remove temporary files."""
         self._open.close()

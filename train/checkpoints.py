@@ -1,4 +1,4 @@
-"""Write checkpoints of fits that are whole, and refuse those of another fit."""
+"""Write checkpoints of fits that are complete, and refuse those of another fit."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -30,20 +30,20 @@ _ADVICE = (
 
 
 def checkpoint_file(folder: str | Path) -> Path:
-    """The last checkpoint of the fit whose logs are in a folder."""
+    """Return the last checkpoint of the fit whose logs are in a folder."""
     return Path(folder) / "checkpoints" / "last.ckpt"
 
 
 class LastCheckpoint(Checkpoint):
-    """After every step, the whole state of the fit in `checkpoints/last.ckpt`."""
+    """A checkpoint of the whole fit after every step, in `checkpoints/last.ckpt`."""
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Clear what a killed fit left."""
+        """Remove temporary files of a killed fit."""
         if trainer.is_global_zero:
             clear_leftovers(checkpoint_file(trainer.default_root_dir).parent)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Write it."""
+        """Write the checkpoint."""
         trainer.save_checkpoint(checkpoint_file(trainer.default_root_dir))
 
 
@@ -53,13 +53,13 @@ class AtomicCheckpoints(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
     ) -> None:
-        """Write beside `path`, then rename."""
+        """Write a file beside `path`, then rename it."""
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary:
             super().save_checkpoint(checkpoint, temporary, storage_options)
 
     def load_checkpoint(self, path: Any, *args: Any, **options: Any) -> dict[str, Any]:
-        """Read one.
+        """Read a checkpoint.
 
         Raises:
             FileFormatError: it is truncated, or something else.
@@ -76,7 +76,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
 
 
 def check_identity(kept: Any, wanted: Mapping[str, Any], path: Any) -> dict[str, Any]:
-    """What a checkpoint says about itself, if it is of this fit.
+    """Return what a checkpoint says about itself, if it is of this fit.
 
     Args:
         kept: the entry of the checkpoint. wanted: the identity of this fit. path: of the file.
@@ -97,7 +97,7 @@ def check_identity(kept: Any, wanted: Mapping[str, Any], path: Any) -> dict[str,
 
 
 def differences(kept: Any, wanted: Any, name: str = "") -> list[str]:
-    """Sentences about what differs between two nested mappings.
+    """Return sentences about what differs between two nested mappings.
 
     >>> differences({"recipe": {"seed": 0, "views": [1, 2]}}, {"recipe": {"seed": 3, "views": [1, 2]}})
     ['recipe seed was 0, is 3']

@@ -1,4 +1,4 @@
-"""`python -m train`: which command, and what becomes of its errors."""
+"""Run a command of `python -m train`, and turn its errors into messages and exit codes."""
 
 import os
 import signal
@@ -78,7 +78,7 @@ def _fit(arguments: list[str]) -> int:
 
 
 def _stop(stopped: signal.Signals) -> int:
-    """Say how to go on; the exit code that shells give to a process that a signal has ended."""
+    """Say how to resume, and return the exit code that shells give to a process ended by a signal."""
     from train.command import how_to_go_on
 
     if _rank() == "0":

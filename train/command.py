@@ -1,4 +1,4 @@
-"""`python -m train fit` and `select`: their arguments, and what is set where they say nothing."""
+"""Run `python -m train fit` and `select`: their arguments and defaults."""
 
 import logging
 import os
@@ -74,7 +74,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def how_to_go_on() -> str:
-    """What to do about a command that was stopped, in words."""
+    """Return how to go on after a command was stopped, in words."""
     folder = _Command.folder
     if folder is not None and checkpoint_file(folder).is_file():
         return "go on with --ckpt_path last, which takes up the fit after its last step"
@@ -143,7 +143,7 @@ class _Command(LightningCLI):
         self.config = parser.parse_args(args)
 
     def _parse_ckpt_path(self) -> None:
-        """Settings come from the configuration only; a checkpoint is compared with them."""
+        """Take settings from the configuration only; a checkpoint is compared with them."""
 
     def before_instantiate_classes(self) -> None:
         settings = self.config[self.subcommand]
@@ -186,7 +186,7 @@ _SWITCHES = {LastCheckpoint: "enable_checkpointing", FitProgress: "enable_progre
 
 
 def command_line(arguments: Sequence[str]) -> str:
-    """The command that makes the same prior: without how and where it was run.
+    """Return the command that makes the same prior, without how and where it was run.
 
     >>> command_line(["fit", "--config", "a.yaml", "--trainer.devices", "2", "--ckpt_path=last"])
     'python -m train fit --config a.yaml'
@@ -204,7 +204,7 @@ def command_line(arguments: Sequence[str]) -> str:
 
 
 def _follow_torchrun(trainer: Any) -> None:
-    """As many devices and nodes as torchrun has started processes for.
+    """Set as many devices and nodes as torchrun has started processes for.
 
     Lightning would take one device and fit the same prior in every process.
     """
@@ -224,7 +224,7 @@ def _follow_torchrun(trainer: Any) -> None:
 
 
 def _loggers(folder: str | Path) -> list[Logger]:
-    """Tables and TensorBoard, side by side in a folder of their own for each run."""
+    """Return loggers of tables and for TensorBoard, in a new folder for each run."""
     versions = [p.name.partition("_")[2] for p in Path(folder).glob("version_*")]
     version = max((int(v) for v in versions if v.isdigit()), default=-1) + 1
     return [
@@ -234,7 +234,7 @@ def _loggers(folder: str | Path) -> list[Logger]:
 
 
 def _checkpoint(given: str | None, folder: str | Path) -> str | None:
-    """Path of the checkpoint to go on from: `last`, `auto` (the last one, if there is one) or a file.
+    """Return the checkpoint to resume from: `last`, `auto` (the last one, if there is one) or a file.
 
     Raises:
         InputError: there is none.

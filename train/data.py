@@ -1,4 +1,4 @@
-"""Recordings for training: which files, which persons, and the mixtures to fit to them."""
+"""Read recordings for training, split them by person, and list the mixtures to fit to them."""
 
 import json
 from collections.abc import Sequence
@@ -27,11 +27,11 @@ __all__ = ["RecordingsDataModule", "check_double_precision", "data_of", "read_si
 D = TypeVar("D", bound=LightningDataModule)
 
 _RECIPE, _CURATION = UpperBodyRecipe(), CurationSettings()
-_HELD_OUT_SHARE = 5  # held-out states: one for so many training states
+_HELD_OUT_SHARE = 5  # training states for each held-out state
 
 
 class RecordingsDataModule(LightningDataModule):
-    """Recordings of 3D joints, split by person, and the blocks of states that they give.
+    """Recordings of 3D joints, split by person, and the blocks of states drawn from them.
 
     Args:
         paths: folders (with their subfolders) or files; `$NAME` stands for a variable of the
@@ -71,7 +71,7 @@ class RecordingsDataModule(LightningDataModule):
         self.sources: dict[Key, SampleSource] = {}
 
     def setup(self, stage: str) -> None:
-        """Read, split, and draw up the mixtures; the second call does nothing."""
+        """Read and split recordings, and list the mixtures; the second call does nothing."""
         if self.tasks:
             return
         self.train, self.watched, self.report = read_sides(
@@ -85,7 +85,7 @@ class RecordingsDataModule(LightningDataModule):
                     self.sources[Key(name, held_out=True)] = cached(task.source)
 
     def train_dataloader(self) -> SweepLoader:
-        """This process' share of all blocks, one sweep each epoch."""
+        """Return this process' share of all blocks, one sweep each epoch."""
         trainer: Any = self.trainer
         if trainer is None:
             return SweepLoader(self.sources, num_workers=self._num_workers)
@@ -98,7 +98,7 @@ class RecordingsDataModule(LightningDataModule):
         )
 
     def identity(self) -> dict[str, Any]:
-        """What makes a fit the same fit: the recipe, and the recordings on either side."""
+        """Return the recipe and digests of the recordings, equal for equal fits."""
         return {
             "recipe": json.loads(json.dumps({"version": VERSION} | asdict(self.recipe))),
             "recordings": fingerprint(self.train),
@@ -106,17 +106,17 @@ class RecordingsDataModule(LightningDataModule):
         }
 
     def facts(self) -> dict[str, Any]:
-        """What a prior's file says about the curation, as that of `torchpose fit` does."""
+        """Return what a prior's file says about the curation, as that of `torchpose fit` does."""
         return {} if self.report is None else self.report.for_prior()
 
     def sources_by_person(self) -> list[SampleSource]:
-        """States over poses of each held-out person."""
+        """Return states over poses of each held-out person."""
         recipe, people = self._watched_recipe(), sorted({r.person_id for r in self.watched})
         each = ([r for r in self.watched if r.person_id == person] for person in people)
         return [cached(recipe.tasks(recordings)["pose"].source) for recordings in each]
 
     def _watched_recipe(self) -> UpperBodyRecipe:
-        """The recipe with fewer states, and with the kind of neck that is fitted to."""
+        """Return the recipe with fewer states, and with the kind of neck that is fitted to."""
         recipe, n_samples = self.recipe, self.tasks["pose"].source.n_samples
         windows = [task.source.n_samples for name, task in self.tasks.items() if "." in name]
         return replace(
@@ -134,7 +134,7 @@ def read_sides(
     held_out: Sequence[str],
     curation: CurationSettings | None,
 ) -> tuple[list[Recording], list[Recording], CurationReport | None]:
-    """Recordings to fit to, those of held-out persons, and what was left out of the former.
+    """Read recordings to fit to and those of held-out persons, and report what was left out of the former.
 
     Both sides are curated apart, so that nothing of the held-out persons gets into what is fitted.
 
@@ -153,7 +153,7 @@ def read_sides(
 def split(
     recordings: Sequence[Recording], persons: Sequence[str] | None, held_out: Sequence[str]
 ) -> tuple[list[Recording], list[Recording]]:
-    """Recordings to fit to, and those of held-out persons.
+    """Split recordings into those to fit to and those of held-out persons.
 
     Args:
         recordings: of everybody. persons: to fit to; all others than those held out if None.

@@ -1,8 +1,8 @@
-"""Fine-tuning of a prior through its filters, by one process or by many.
+"""Fine-tune a prior through its filters, in one process or several.
 
 A batch comes in shares, each drawn from (seed, step, share); processes take the shares rank, rank +
 world, ..., and their gradients are averaged, so the steps do not depend on the number of processes.
-The score is the error on persons who are not tuned to; what did best on them is kept.
+The score is the error on held-out persons; the parameters with the lowest error are kept.
 """
 
 import math
@@ -53,7 +53,7 @@ class _Numbers:
 
 
 class FineTuningData(LightningDataModule):
-    """Recordings of 3D joints: persons to tune to, and persons to watch.
+    """Recordings of 3D joints: persons to tune to, and held-out persons.
 
     Args:
         paths: folders (with their subfolders) or files; `$NAME` stands for a variable of the
@@ -88,7 +88,7 @@ class FineTuningData(LightningDataModule):
         self._persons, self._held_out = persons, held_out
 
     def setup(self, stage: str) -> None:
-        """Read and split; the second call does nothing."""
+        """Read and split recordings; the second call does nothing."""
         if self.train:
             return
         if not self._held_out:
@@ -101,15 +101,15 @@ class FineTuningData(LightningDataModule):
         )
 
     def train_dataloader(self) -> _Numbers:
-        """The steps of an epoch."""
+        """Return the steps of an epoch."""
         return _Numbers(self.steps_per_epoch)
 
     def val_dataloader(self) -> _Numbers:
-        """One score for each epoch."""
+        """Return one score for each epoch."""
         return _Numbers(1)
 
     def identity(self) -> dict[str, Any]:
-        """What makes a fine-tuning the same one."""
+        """Return settings and digests of the recordings, equal for equal fine-tunings."""
         return {
             "steps per epoch": self.steps_per_epoch,
             "recordings": fingerprint(self.train),
@@ -118,7 +118,7 @@ class FineTuningData(LightningDataModule):
 
 
 class FineTuning(LightningModule):
-    """Tunes a prior by gradient, through the filter: its noise, and its mixtures if asked for.
+    """Tunes a prior by gradients through the filter: its noise, and its mixtures if asked for.
 
     Logged: `loss` in every step, and in every epoch `held_out`, the 3D error in centimetres, mean over
     the held-out persons. Epoch 0 is the prior as it was; the best epoch is kept.
@@ -178,7 +178,7 @@ class FineTuning(LightningModule):
     # --- what Lightning calls
 
     def setup(self, stage: str) -> None:
-        """The filter of the prior, with its numbers as parameters."""
+        """Set up the filter of the prior, with its numbers as parameters."""
         data = self._data
         data.setup(stage)
         given = self._given
@@ -201,11 +201,11 @@ class FineTuning(LightningModule):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Everything that was set, but for the prior to start from."""
+        """Return all settings but for the prior to start from."""
         return {k: v for k, v in self._given.items() if k != "prior" and not k.startswith("_")}
 
     def configure_optimizers(self) -> Any:
-        """Adam, whose rate rises for the warm-up and then falls to nothing."""
+        """Return Adam, with a rate that rises for the warm-up and then falls to zero."""
         groups = parameter_groups(self.tuned, self._given.learning_rate)
         adam = Adam(groups, lr=self._given.learning_rate, betas=(0.9, 0.99))
         total = self._given.epochs * self._data.steps_per_epoch
@@ -223,7 +223,7 @@ class FineTuning(LightningModule):
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """By this module's own setting; a step whose gradient is not finite is left out."""
+        """Clip by this module's own setting; skip a step whose gradient is not finite."""
         gradients = [p.grad for p in self.parameters() if p.grad is not None]
         if all(bool(torch.isfinite(gradient).all()) for gradient in gradients):
             self.clip_gradients(optimizer, self._given.clip, "norm")
@@ -237,7 +237,7 @@ class FineTuning(LightningModule):
             )
 
     def on_train_start(self) -> None:
-        """The same settings everywhere, and the score of the prior as it is."""
+        """Check that all processes have the same settings, and score the prior as it is."""
         check_processes(self._identity, self.trainer.global_rank)
         if self._given.shares % self.trainer.world_size:
             raise InputError(
@@ -252,7 +252,7 @@ class FineTuning(LightningModule):
             self.trainer.should_stop = True
 
     def training_step(self, batch: int, batch_idx: int) -> Tensor:
-        """The mean loss over this process' shares of a batch."""
+        """Return the mean loss over this process' shares of a batch."""
         rank, world = self.trainer.global_rank, self.trainer.world_size
         own = range(rank, self._given.shares, world)
         losses = [self._batches.loss(self.tuned, self.global_step, share) for share in own]
@@ -261,7 +261,7 @@ class FineTuning(LightningModule):
         return loss
 
     def validation_step(self, batch: int, batch_idx: int) -> None:
-        """The score after this epoch."""
+        """Score the prior after this epoch."""
         self._score()
         score = torch.tensor(self.scores[-1], dtype=torch.float64)
         self.log("held_out", score, sync_dist=True, batch_size=1)
@@ -269,7 +269,7 @@ class FineTuning(LightningModule):
             self.trainer.should_stop = True
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Say what the checkpoint is of, and keep the best parameters."""
+        """Store the identity of the fine-tuning and the best parameters."""
         checkpoint[ENTRY] = {
             "identity": self._identity,
             "scores": self.scores,
@@ -279,7 +279,7 @@ class FineTuning(LightningModule):
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse a checkpoint of anything else."""
+        """Refuse a checkpoint of another fine-tuning, and restore the scores."""
         kept = check_identity(checkpoint.get(ENTRY), self._identity, self.trainer.ckpt_path)
         self.scores, self._best = list(kept["scores"]), dict(kept["best"])
         self.skipped, self._stopped, self._resumed = kept["skipped"], kept["stopped"], True
@@ -288,17 +288,17 @@ class FineTuning(LightningModule):
 
     @property
     def best_epoch(self) -> int:
-        """The epoch with the lowest score, counted from 1; 0 is the prior as it was."""
+        """Return the epoch with the lowest score, counted from 1; 0 is the prior as it was."""
         return min(range(len(self.scores)), key=self.scores.__getitem__)
 
     @property
     def finished(self) -> bool:
-        """Whether all epochs are over, or the last better score is too long ago."""
+        """Return whether all epochs are over, or the last better score is `patience` epochs ago."""
         over = len(self.scores) - 1
         return over >= self._given.epochs or over - self.best_epoch >= self._given.patience
 
     def finished_prior(self, **facts: str) -> UpperBodyPrior | None:
-        """The best prior, calibrated on the held-out persons; None but in the first process.
+        """Return the best prior, calibrated on the held-out persons; None but in the first process.
 
         They are tracked in every way that the prior allows, before and after, for the model card.
         """
@@ -325,7 +325,7 @@ class FineTuning(LightningModule):
     def _facts(
         self, prior: UpperBodyPrior, facts: Mapping[str, str], tuning: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Fields of `PriorInfo` that the tuning changes."""
+        """Return the fields of `PriorInfo` that the tuning changes."""
         info, recordings = prior.info, [*self._data.train, *self._data.watched]
         seen = collect_poses(recordings, info.neck, info.centre).facts
         both = {
@@ -342,7 +342,7 @@ class FineTuning(LightningModule):
         return data_of(self, FineTuningData)
 
     def _score(self) -> None:
-        """The error on the held-out persons, shared among the processes; keep the best parameters."""
+        """Score the held-out persons, shared among the processes, and keep the best parameters."""
         own = self._own_persons()
         parts = from_all([self._batches.error(self.tuned, person) for person in own])
         errors = [error for part in parts for error in part]
@@ -354,12 +354,12 @@ class FineTuning(LightningModule):
         self.scores.append(score)
 
     def _own_persons(self) -> list[str]:
-        """The held-out persons that this process looks after."""
+        """Return the held-out persons that this process scores."""
         persons = sorted({r.person_id for r in self._data.watched})
         return persons[self.trainer.global_rank :: self.trainer.world_size]
 
     def _track(self, prior: UpperBodyPrior) -> dict[str, HeldOut]:
-        """What tracking the held-out persons came to in each way, in every process."""
+        """Track the held-out persons in each way, and return the errors in every process."""
         poses = collect_poses(self._data.watched, prior.info.neck, prior.info.centre)
         found, failure = [], ""
         try:
@@ -373,6 +373,6 @@ class FineTuning(LightningModule):
 
 
 def _mean(found: HeldOut) -> float:
-    """Mean over persons, metres."""
+    """Return the mean over persons, metres."""
     errors = found.error_by_person().values()
     return round(math.fsum(errors) / len(errors), 5)

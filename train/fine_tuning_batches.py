@@ -1,7 +1,7 @@
-"""What fine-tuning draws: shares of a batch, and the fixed views of held-out persons.
+"""Draw the batches of fine-tuning, and the fixed views of held-out persons.
 
-A share is a function of the seed, its step and its number, so it does not matter which process
-draws it; a batch is all the shares of a step.
+A batch is all the shares of a step. A share is a function of the seed, its step and its number, so any
+process can draw it.
 """
 
 from collections.abc import Sequence
@@ -37,11 +37,11 @@ class Batches(Protocol):
     """Training data of one kind of filter."""
 
     def loss(self, tuned: Any, step: int, share: int) -> Tensor:
-        """Loss on one share of a batch; all shares count the same."""
+        """Return the loss on one share of a batch; all shares count the same."""
         ...
 
     def error(self, tuned: Any, person: str) -> float:
-        """Mean 3D error on a held-out person, metres, always on the same views."""
+        """Return the mean 3D error on a held-out person, metres, always on the same views."""
         ...
 
 
@@ -53,7 +53,7 @@ def batches_of(
     share_size: int,
     seed: int,
 ) -> Batches:
-    """What the filter over single poses ("poses"), or the one over a window, is tuned on.
+    """Return the data to tune the filter over single poses ("poses") or over a window.
 
     Args:
         prior: that is tuned. part: "poses", or the name of one of its windows.
@@ -90,7 +90,7 @@ class SequenceBatches:
         }
 
     def loss(self, tuned: TunableKalman, step: int, share: int) -> Tensor:
-        """Loss on one share of a batch."""
+        """Return the loss on one share of a batch."""
         generator = _generator(self._seed, f"step {step} share {share}")
         # bodies of other sizes keep mixtures from the persons they see; noise is better off without
         share_of_bodies = 1.0 if getattr(tuned, "mixtures", None) else 0.0
@@ -102,7 +102,7 @@ class SequenceBatches:
         return tuned.loss(drawn)
 
     def error(self, tuned: TunableKalman, person: str) -> float:
-        """Mean 3D error on a held-out person, metres."""
+        """Return the mean 3D error on a held-out person, metres."""
         generator = _generator(self._seed, f"held out {person}")
         sequences, n = self._watched[person], _HELD_OUT_SEQUENCES
         drawn = draw_sequences(sequences, self._prior, n, generator, view_share=_HELD_OUT_VIEWS)
@@ -140,7 +140,7 @@ class WindowBatches:
         }
 
     def loss(self, tuned: TunableWindow, step: int, share: int) -> Tensor:
-        """Loss on one share of a batch."""
+        """Return the loss on one share of a batch."""
         generator = _generator(self._seed, f"step {step} share {share}")
         epoch = int(torch.randint(1 << 30, (), generator=generator))
         block = int(torch.randint(self._train["left"].n_blocks, (), generator=generator))
@@ -150,7 +150,7 @@ class WindowBatches:
         return tuned.loss(WindowBatch(states, drawn.hands[chosen]), generator)
 
     def error(self, tuned: TunableWindow, person: str) -> float:
-        """Mean 3D error on a held-out person, metres."""
+        """Return the mean 3D error on a held-out person, metres."""
         generator = _generator(self._seed, f"held out {person}")
         return float(tuned.error(self._watched[person], generator))
 
@@ -160,7 +160,7 @@ def _generator(seed: int, what: str) -> torch.Generator:
 
 
 def _complete(prior: UpperBodyPrior, recordings: Sequence[Recording]) -> list[Tensor]:
-    """Sequences without missing joints."""
+    """Return the sequences without missing joints."""
     poses = collect_poses(recordings, prior.info.neck, prior.info.centre)
     found = [s for s in poses.joints.split(poses.lengths) if bool(s.isfinite().all())]
     if not found:
@@ -174,7 +174,7 @@ def _complete(prior: UpperBodyPrior, recordings: Sequence[Recording]) -> list[Te
 def _window_sources(
     recipe: UpperBodyRecipe, recordings: Sequence[Recording]
 ) -> dict[str, WindowSource]:
-    """Windows of both arms, from other viewpoints whenever they are drawn."""
+    """Return windows of both arms, from other viewpoints whenever they are drawn."""
     tasks = recipe.tasks(recordings)
     sources = {}
     for side in ("left", "right"):

@@ -1,4 +1,4 @@
-"""Fit limb conditionals with Lightning: one step of `torchpose.learning._recipes.limbs`."""
+"""Fit limb conditionals with Lightning, in one step."""
 
 import torch
 
@@ -12,7 +12,7 @@ __all__ = ["LimbData", "LimbFit"]
 
 
 class LimbData(BodyData):
-    """Recorded states of all persons, of one body with safe centres (DX 1), at one frame rate.
+    """Recorded states of all persons, on one body with safe centres (DX 1), at one frame rate.
 
     Args:
         paths: folders (with their subfolders) or files; `$NAME` stands for a variable of the
@@ -59,7 +59,7 @@ class LimbFit(BodyFit):
         self.save_hyperparameters()
 
     def training_step(self, batch: int, batch_idx: int) -> None:
-        """The fit, which is done again where the file is written: it takes no time."""
+        """Fit the conditionals; the fit is repeated where the file is written, since it takes no time."""
         _, held_out = fit_limbs(self.gathered, **self.settings)
         found = {"frames": sum(map(len, self.gathered.train))} if held_out is None else {
             "deviation": held_out.deviation, "speed": held_out.speed,

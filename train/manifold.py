@@ -1,6 +1,7 @@
-"""Fit of a manifold of poses with Lightning; the fit itself is `torchpose.learning._recipes.manifold`.
+"""Fit a manifold of poses with Lightning, in epochs of one step.
 
-An epoch is one step, ten iterations of the optimiser over all poses at once.
+A step is ten iterations of the optimiser over all poses at once. The fit itself is
+`torchpose.learning._recipes.manifold`.
 """
 
 from typing import Any
@@ -18,7 +19,7 @@ __all__ = ["ManifoldData", "ManifoldFit"]
 
 
 class ManifoldData(BodyData):
-    """Poses of one motion of one person or several, and of other recordings that are held out.
+    """Poses of one motion of one person or several, and held-out poses of other recordings.
 
     Args:
         paths: folders (with their subfolders) or files; `$NAME` stands for a variable of the
@@ -87,29 +88,29 @@ class ManifoldFit(BodyFit):
         self._stopped = False
 
     def setup(self, stage: str) -> None:
-        """The fit at its start; a checkpoint's state comes later."""
+        """Set up the fit at its start; a checkpoint's state comes later."""
         check_double_precision(self.trainer)
         super().setup(stage)
         self.fitting = ManifoldFitting(self.gathered, self._recipe)
 
     def on_train_start(self) -> None:
-        """Nothing is left to do if the fit was resumed after its last step."""
+        """Stop if the fit was resumed after its last step."""
         if self._stopped or self.fitting.finished:
             self.trainer.should_stop = True
 
     def training_step(self, batch: int, batch_idx: int) -> None:
-        """One step, and what it did to the held-out poses."""
+        """Take one step, and log the error on the held-out poses."""
         found = self.fitting.step()
         self.log_dict({k: torch.tensor(float(v)).double() for k, v in found.items()}, on_step=True)
         if self.fitting.finished:
             self.trainer.should_stop = True
 
     def progress_made(self) -> dict[str, Any]:
-        """Whether the fit had come to its end."""
+        """Return whether the fit had come to its end."""
         return {"stopped": self.trainer.should_stop}
 
     def go_on_from(self, kept: dict[str, Any]) -> None:
-        """Stop at once if it had."""
+        """Stop at once if the fit had come to its end."""
         self._stopped = bool(kept["stopped"])
 
     def finished_prior(self, **facts: str) -> None:

@@ -1,4 +1,4 @@
-"""Exact expectation-maximisation of all mixtures of a recipe at once, by one process or by many.
+"""Fit all mixtures of a recipe at once by exact expectation-maximisation, in one process or several.
 
 An epoch is one EM step. Each process sums up the sufficient statistics of its share of the blocks,
 one exchange at the end of the epoch adds up the sums of all processes, and each of them makes the
@@ -59,7 +59,7 @@ class MixtureEM(LightningModule):
     # --- what Lightning calls
 
     def setup(self, stage: str) -> None:
-        """A blank mixture for every task; what is in them comes from their start, or a checkpoint."""
+        """Create a blank mixture for every task, to be filled by a start or a checkpoint."""
         check_double_precision(self.trainer)
         data = self._data
         data.setup(stage)
@@ -73,22 +73,22 @@ class MixtureEM(LightningModule):
         )
 
     def on_fit_start(self) -> None:
-        """The same recordings everywhere, and a start for every mixture."""
+        """Check that all processes have the same recordings, and start every mixture."""
         check_processes(self._identity, self.trainer.global_rank)
         if not self._resumed:
             self._start()
 
     def on_train_start(self) -> None:
-        """Nothing is left to do if the fit was resumed after its last step."""
+        """Stop if the fit was resumed after its last step."""
         if self._stopped or self.finished:
             self.trainer.should_stop = True
 
     def configure_optimizers(self) -> Sequence[Optimizer]:
-        """None: the maximisation step is in closed form."""
+        """Return none: the maximisation step is in closed form."""
         return []
 
     def training_step(self, batch: Sweep, batch_idx: int) -> None:
-        """One EM step."""
+        """Take one EM step."""
         totals = self._exchange(batch)
         for name, task in self._tasks.items():
             em = self.em(name)
@@ -106,7 +106,7 @@ class MixtureEM(LightningModule):
             self.trainer.should_stop = True
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Say what the checkpoint is of."""
+        """Store the identity and the progress of the fit."""
         checkpoint[ENTRY] = {
             "identity": self._identity,
             "held_out": self.held_out_history,
@@ -114,7 +114,7 @@ class MixtureEM(LightningModule):
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse a checkpoint of anything else."""
+        """Refuse a checkpoint of another fit, and restore the progress."""
         kept = check_identity(checkpoint.get(ENTRY), self._identity, self.trainer.ckpt_path)
         self.held_out_history = {name: list(v) for name, v in kept["held_out"].items()}
         self._stopped = bool(kept["stopped"])
@@ -123,25 +123,25 @@ class MixtureEM(LightningModule):
     # --- where the fit stands
 
     def em(self, name: str) -> StreamedEM:
-        """The fit of one mixture."""
+        """Return the fit of one mixture."""
         return cast(StreamedEM, self.mixtures[_module_name(name)])
 
     @property
     def histories(self) -> dict[str, list[float]]:
-        """Mean log-likelihood of each mixture before every step, and at its end."""
+        """Return the mean log-likelihood of each mixture before every step, and at its end."""
         return {name: self.em(name).history.tolist() for name in self._tasks}
 
     @property
     def finished(self) -> bool:
-        """Whether every mixture has converged or taken all of its steps."""
+        """Return whether every mixture has converged or taken all of its steps."""
         return all(self._is_finished(name) for name in self._tasks)
 
     def epoch_of(self, key: Key) -> int | None:
-        """How many steps the mixture of a source has taken; None if it needs no more."""
+        """Return how many steps the mixture of a source has taken; None if it needs no more."""
         return None if self._is_finished(key.name) else int(self.em(key.name).steps)
 
     def assembled(self, **facts: str) -> UpperBodyPrior:
-        """Prior of the mixtures as they are, not calibrated; facts are name, licence, command."""
+        """Return the prior of the mixtures as they are, not calibrated; facts are name, licence, command."""
         for name, task in self._tasks.items():
             steps = int(self.em(name).steps)
             if self._whole.get(name, (-1, None))[0] != steps:
@@ -150,7 +150,7 @@ class MixtureEM(LightningModule):
         return self._data.recipe.assemble(self._data.train, whole, **facts)
 
     def finished_prior(self, **facts: str) -> UpperBodyPrior | None:
-        """The calibrated prior in the first process, None in the others; all have to call it.
+        """Return the calibrated prior in the first process, None in the others; all have to call it.
 
         The groups of persons that are held out in turn are shared among the processes.
         """
@@ -179,7 +179,7 @@ class MixtureEM(LightningModule):
         return bool(em.converged) or (int(em.steps) >= task.max_iter and recorded)
 
     def _sweep(self, sweep: Sweep) -> dict[Key, SufficientStatistics]:
-        """Sums over this process' share."""
+        """Sum the statistics over this process' share."""
         sums: dict[Key, SufficientStatistics] = {}
         for key, samples in sweep:
             found = self.em(key.name).expect(samples)
@@ -187,7 +187,7 @@ class MixtureEM(LightningModule):
         return sums
 
     def _exchange(self, sweep: Sweep) -> dict[Key, SufficientStatistics]:
-        """Sums over all processes, in a single exchange."""
+        """Sum the statistics over all processes, in a single exchange."""
         wanted = [key for key in self._data.sources if self.epoch_of(key) is not None]
         blank = {
             key: SufficientStatistics.zeros(
@@ -224,7 +224,7 @@ class MixtureEM(LightningModule):
         return data_of(self, RecordingsDataModule)
 
     def _start(self) -> None:
-        """A start for every mixture, shared among the processes."""
+        """Start every mixture, shared among the processes."""
         rank, world, failure = self.trainer.global_rank, self.trainer.world_size, ""
         for number, (name, task) in enumerate(self._tasks.items()):
             if number % world == rank and not failure:

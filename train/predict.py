@@ -1,9 +1,9 @@
-"""`python -m train predict`: track many recordings, in one process or many, whole or resumed.
+"""Track many recordings with `python -m train predict`, in one process or several, resumable.
 
-Every process takes the recordings rank, rank + world, ... of one list, the longest first, and then
-whatever is left, so that nothing is lost when one dies. A recording is claimed before it is worked
-on (`train.predict_claims`), and is done when its result is there, made from the same input, prior and
-settings; so nothing is computed twice, and the next run does what this one did not.
+Every process takes the recordings rank, rank + world, ... of one list, the longest first. Then it takes
+what is left, so that no recording is lost when a process dies. A recording is claimed before work
+begins (`train.predict_claims`). It is done when a result from the same input, prior and settings exists,
+so nothing is computed twice and the next run resumes.
 """
 
 import os
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def build() -> ArgumentParser:
-    """Parser of the command."""
+    """Return the parser of the command."""
     parser = ArgumentParser(
         prog="python -m train predict",
         description="Track many recordings of 2D keypoints; processes of torchrun or srun share them.",
@@ -92,7 +92,7 @@ def build() -> ArgumentParser:
 
 
 def process_rank(rank: int | None = None, world: int | None = None) -> tuple[int, int]:
-    """Number of this process and of all of them: as given, else as torchrun or srun says.
+    """Return the number of this process and of all of them: as given, else as torchrun or srun says.
 
     Raises:
         InputError: one without the other, or a number outside of 0 .. world - 1.
@@ -118,7 +118,7 @@ def predict(
     retry_failed: bool = False,
     progress: bool = False,
 ) -> dict[str, Outcome]:
-    """Track recordings together with other processes; returns when all are done, by whomever.
+    """Track recordings together with other processes; return when all are done.
 
     Args:
         recordings: files and folders of keypoints (`find_keypoints`).
@@ -158,7 +158,7 @@ def predict(
 def _visit(
     claims: Claims, recordings: Sequence[Recording], settle: Callable[[Recording, Claim], None]
 ) -> None:
-    """Settle every recording; those that others are at work on come last, and are waited for."""
+    """Settle every recording; wait at the end for those that other processes work on."""
     others = []
     for recording in recordings:
         with claims.claim(recording.name) as claim:
@@ -173,7 +173,7 @@ def _visit(
 
 
 class Batch(NamedTuple):
-    """What a process does with a recording that it has claimed."""
+    """The work of a process on the recordings that it has claimed."""
 
     tracker: BatchTracker
     out: Path
@@ -182,7 +182,7 @@ class Batch(NamedTuple):
     retry_failed: bool = False
 
     def settle(self, recording: Recording, claim: Claim) -> Outcome:
-        """See that a recording is done: it may be so already, or have failed before.
+        """Track a recording, unless it is done already or has failed before.
 
         Raises:
             OutputError: the result cannot be written.
@@ -221,12 +221,12 @@ class Batch(NamedTuple):
         return Outcome(recording.name, "made", facts)
 
     def _final(self, failure: dict[str, Any]) -> bool:
-        """Whether a failure need not be tried again; what is no fault of the input may pass away."""
+        """Return whether a failure is final; one that the input did not cause may not recur."""
         return failure["run"] == self.run.id or (failure["final"] and not self.retry_failed)
 
 
 def _own_device(device: str) -> str:
-    """One of several devices for each process of a machine."""
+    """Return one of several devices for each process of a machine."""
     if device != "cuda":
         return device
     import torch

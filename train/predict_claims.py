@@ -1,8 +1,8 @@
-"""Who is at work on which recording: claims that vanish with the process that holds them.
+"""Claim recordings for one process by locks that vanish with the process that holds them.
 
-A claim is a lock (`flock`) on a small file, which the system releases when the process ends, however
-it ends; so there is no time after which a claim expires, and no clock to be agreed on. What happened
-to a recording is appended to the same file, a line of JSON for each event.
+A claim is a lock (`flock`) on a small file, which the system releases when the process ends, however it
+ends. So claims need no expiry and no common clock. Events of a recording are appended to the same file, a
+line of JSON each.
 """
 
 import contextlib
@@ -29,14 +29,14 @@ Event = dict[str, Any]
 
 
 class Claim(NamedTuple):
-    """The right to work on a recording, and what happened to it before."""
+    """The right to work on a recording, and its earlier events."""
 
     stream: IO[bytes]
     history: list[Event]
 
     @property
     def deaths(self) -> int:
-        """How many processes in a row have started to work on it and did not come to an end."""
+        """Count how many processes in a row have started to work on it and did not finish."""
         events = [event["event"] for event in reversed(self.history)]
         return next((i for i, event in enumerate(events) if event != "started"), len(events))
 
@@ -77,7 +77,7 @@ class Claims:
         self._folder, self._alone = folder, alone
 
     def path(self, name: str) -> Path:
-        """File of a recording's claim."""
+        """Return the file of a recording's claim."""
         return self._folder / f"{hashlib.sha256(name.encode()).hexdigest()[:20]}.jsonl"
 
     @contextlib.contextmanager
@@ -91,7 +91,7 @@ class Claims:
 
     @contextlib.contextmanager
     def run(self, task: str) -> Iterator[Run]:
-        """Belong to the run that is going on in the folder, or begin one.
+        """Join the run that is going on in the folder, or begin one.
 
         Args:
             task: what the run does; processes of one run have to have the same.
@@ -116,7 +116,7 @@ class Claims:
             yield Run(current["run"], task)
 
     def _lock(self, stream: IO[bytes], exclusive: bool, wait: bool) -> bool:
-        """Lock an open file until it is closed; whether it was to be had."""
+        """Lock an open file until it is closed; return whether that succeeded."""
         if fcntl is None:
             return self._without_locks("this system has none")
         kind = fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH
@@ -138,7 +138,7 @@ class Claims:
 
 
 def _events(stream: IO[bytes]) -> list[Event]:
-    """Events in a file; a line that a killed process did not finish is passed over."""
+    """Return the events in a file, without a line that a killed process did not finish."""
     stream.seek(0)
     events = []
     for line in stream.read().splitlines():

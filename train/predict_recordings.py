@@ -1,4 +1,4 @@
-"""Which recordings of 2D keypoints there are, what their results are called, how long they are."""
+"""Find recordings of 2D keypoints, name their results and count their frames."""
 
 import hashlib
 import zipfile
@@ -29,7 +29,7 @@ class Recording(NamedTuple):
 def find_keypoints(
     paths: Sequence[str | Path], leave_out: str | Path | None = None
 ) -> list[Recording]:
-    """Recordings of keypoints among files and folders, the longest first.
+    """Find recordings of keypoints among files and folders, the longest first.
 
     Folders are searched with their subfolders; files of other content are passed over there, but
     those that cannot be opened are listed, so that reading them says what is wrong. A folder of
@@ -61,7 +61,7 @@ def find_keypoints(
 
 
 def share(recordings: Sequence[Recording], rank: int, world: int) -> list[Recording]:
-    """The recordings of one process, rank, rank + world, ..., and then those of the others.
+    """Return the recordings of one process, rank, rank + world, ..., and then those of the others.
 
     Args:
         recordings: the longest first. rank, world: which process of how many.
@@ -72,7 +72,7 @@ def share(recordings: Sequence[Recording], rank: int, world: int) -> list[Record
 
 
 def content_of(path: Path) -> str:
-    """SHA-256 of a file, or of the names and contents of the files in a folder of OpenPose's."""
+    """Return SHA-256 of a file, or of the names and contents of the files in a folder of OpenPose's."""
     digest = hashlib.sha256()
     for file in sorted(path.glob(_OPENPOSE)) if path.is_dir() else [path]:
         if path.is_dir():
@@ -128,7 +128,7 @@ def _may_hold_keypoints(path: Path) -> bool:
 
 
 def _length(path: Path) -> int:
-    """Frames, or about so many; 0 if that cannot be told."""
+    """Return the number of frames, or about that; 0 if it cannot be told."""
     if path.is_dir():
         return sum(1 for _ in path.glob(_OPENPOSE))
     try:
@@ -144,7 +144,7 @@ def _length(path: Path) -> int:
 
 
 def _rows(stream: IO[bytes]) -> int:
-    """First number of the shape in the header of an .npy."""
+    """Return the first number of the shape in the header of an .npy."""
     version = np.lib.format.read_magic(stream)
     first = version == (1, 0)
     read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0

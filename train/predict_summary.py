@@ -1,4 +1,4 @@
-"""The table of all recordings of a batch, and what became of each."""
+"""Write the table of all recordings of a batch, with the outcome of each."""
 
 import csv
 import io
@@ -19,7 +19,7 @@ _WORDS = {"made": "made", "found": "made before or by others", "failed": "failed
 
 
 class Outcome(NamedTuple):
-    """What became of a recording.
+    """The outcome of tracking a recording.
 
     Attributes:
         recording: its name. state: "made" now, "found" from before, or "failed".
@@ -33,11 +33,11 @@ class Outcome(NamedTuple):
 
     @property
     def good(self) -> bool:
-        """Whether there are poses for all frames."""
+        """Return whether there are poses for all frames."""
         return self.facts is not None and self.facts["failed_at"] < 0
 
     def row(self) -> dict[str, Any]:
-        """Its line in the summary, the same whoever writes it."""
+        """Return its line in the summary, the same whichever process writes it."""
         if self.facts is None:
             return {"recording": self.recording, "state": "failed", "error": self.error}
         facts = dict(self.facts)
@@ -48,7 +48,7 @@ class Outcome(NamedTuple):
 
 
 def check_summary(path: Path) -> None:
-    """See that there is no other table in the place of the summary.
+    """Raise if there is another table in the place of the summary.
 
     Raises:
         OutputError: there is.
@@ -67,7 +67,7 @@ def check_summary(path: Path) -> None:
 
 
 def write_summary(path: Path, outcomes: Mapping[str, Outcome]) -> None:
-    """Write a row for every recording, by name; nothing is done if that is there already.
+    """Write a row for every recording, by name, unless the same table is there already.
 
     Every process that gets to the end does this, so that it does not matter which one is the last.
 
@@ -85,7 +85,7 @@ def write_summary(path: Path, outcomes: Mapping[str, Outcome]) -> None:
 
 
 def count_outcomes(outcomes: Mapping[str, Outcome]) -> str:
-    """How many recordings were made, found and failed, in words."""
+    """Say how many recordings were tracked, found and failed."""
     states = Counter(outcome.state for outcome in outcomes.values())
     parts = [f"{states[state]} {word}" for state, word in _WORDS.items() if states[state]]
     broken = sum(o.facts is not None and not o.good for o in outcomes.values())

@@ -1,4 +1,4 @@
-"""One recording of a batch: tracked as `torchpose track` does it, with where the result came from."""
+"""Track one recording of a batch as `torchpose track` does, and store the origin of its result."""
 
 import hashlib
 import json
@@ -61,7 +61,7 @@ class BatchTracker:
 
     @cached_property
     def task(self) -> dict[str, str]:
-        """What is the same for every recording: digests of prior and settings, the version."""
+        """Return what is the same for every recording: digests of prior and settings, the version."""
         tracker = self._tracker
         settings = {k: v for k, v in asdict(tracker.settings).items() if k != "prior"}
         if tracker.camera_file:
@@ -104,7 +104,7 @@ def save_result(
 
 
 def read_origin(path: Path, known: bool = True) -> dict[str, Any] | None:
-    """Origin and facts of a result, without reading its poses; None if it is damaged.
+    """Return origin and facts of a result, without reading its poses; None if it is damaged.
 
     Args:
         path: of the file. known: whether a result was written there before.
@@ -128,7 +128,7 @@ def read_origin(path: Path, known: bool = True) -> dict[str, Any] | None:
 
 
 def facts_of(track: PoseTrack, started: float) -> dict[str, Any]:
-    """What the summary says about a result.
+    """Return what the summary says about a result.
 
     Args:
         started: `time.monotonic()` before the work.
@@ -153,7 +153,7 @@ def _digest(text: str | bytes) -> str:
 
 
 def digest_of_prior(prior: UpperBodyPrior) -> str:
-    """SHA-256 of everything in a prior: numbers, and what its file says about them."""
+    """Return SHA-256 of everything in a prior: numbers, and what its file says about them."""
     digest = hashlib.sha256(prior.info.to_json().encode())
     for name, value in sorted(prior.state_dict().items()):
         digest.update(f"{name}{tuple(value.shape)}{value.dtype}".encode())

@@ -1,4 +1,4 @@
-"""Run a fit in several processes: what they tell each other, and the strategy that starts them."""
+"""Run a fit in several processes: exchange values, and choose the strategy that starts the processes."""
 
 from collections.abc import Mapping, Sequence
 from datetime import timedelta
@@ -33,7 +33,7 @@ def _several() -> bool:
 
 
 def from_all(value: T) -> list[T]:
-    """The value of every process, in each of them."""
+    """Return the value of every process, in each of them."""
     if not _several():
         return [value]
     found: list[Any] = [None] * torch.distributed.get_world_size()
@@ -42,7 +42,7 @@ def from_all(value: T) -> list[T]:
 
 
 def first_failure(answers: Sequence[tuple[T, str]]) -> list[T]:
-    """What every process found, unless one of them failed: then all of them fail.
+    """Return what every process found, or fail in all of them if one has failed.
 
     Raises:
         InputError: with what the first process that failed had to say.
@@ -95,7 +95,7 @@ class Processes(DDPStrategy):
 
 
 def register_strategy() -> None:
-    """Take `Processes` wherever Lightning would take DDP: by name, or for several devices."""
+    """Use `Processes` wherever Lightning would use DDP: by name, or for several devices."""
     StrategyRegistry.register(
         "ddp",
         Processes,

@@ -1,4 +1,4 @@
-"""Errors about what the user gave, in one sentence that names the key and the file."""
+"""Describe errors in what the user gave in one sentence that names the key and the file."""
 
 import itertools
 import re
@@ -29,7 +29,7 @@ _SETTINGS = "accelerator_connector"  # where Lightning looks at devices and stra
 
 
 def reason(error: BaseException, arguments: Sequence[str]) -> str | None:
-    """What was wrong, in one sentence, or None if it was nothing that the user gave.
+    """Return what was wrong, in one sentence, or None if it was nothing that the user gave.
 
     Args:
         error: that was raised. arguments: of the command.
@@ -71,7 +71,7 @@ def _of_arguments(text: str, arguments: Sequence[str]) -> str:
 
 
 def _innermost(text: str) -> tuple[str, str]:
-    """The key that an error of the parser is about, and what is wrong with it."""
+    """Return the key that an error of the parser is about, and what is wrong with it."""
     keys = []
     while True:
         text = textwrap.dedent(text).strip()
@@ -91,7 +91,7 @@ def _innermost(text: str) -> tuple[str, str]:
 
 
 def _place(key: str, arguments: Sequence[str]) -> str:
-    """The configuration file that has this key in it, if it is not on the command line."""
+    """Return the configuration file that has this key in it, if it is not on the command line."""
     if any(argument.startswith("--") and key in argument.split("=")[0] for argument in arguments):
         return ""
     for file in _files(arguments):
@@ -102,7 +102,7 @@ def _place(key: str, arguments: Sequence[str]) -> str:
 
 
 def _files(arguments: Sequence[str]) -> list[Path]:
-    """The configuration files."""
+    """Return the configuration files."""
     words = [word for argument in arguments for word in argument.split("=", 1)]
     pairs = itertools.pairwise(words)
     return [Path(file) for name, file in pairs if name in ("--config", "-c")]

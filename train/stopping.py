@@ -1,4 +1,4 @@
-"""SIGTERM and Ctrl-C end a command with the exit code that shells and schedulers know them by."""
+"""End a command on SIGTERM and Ctrl-C with the exit code that shells and schedulers expect."""
 
 import contextlib
 import signal
@@ -14,11 +14,11 @@ _received: list[int] = []
 
 
 class _Terminated(SystemExit):
-    """Raised wherever the process is when SIGTERM comes."""
+    """The exit that is raised wherever the process is when SIGTERM comes."""
 
 
 def _terminate(signum: int, _: Any) -> None:
-    """Raise, once: what has to be tidied up is not disturbed again."""
+    """Raise on the first signal only, so that cleaning up is not interrupted."""
     _received.append(signum)
     if len(_received) == 1:
         raise _Terminated(128 + signum)
@@ -42,7 +42,7 @@ def stopped_by_signals() -> Iterator[None]:
 
 
 def signal_of(error: BaseException) -> signal.Signals | None:
-    """The signal that an exception comes from; None if it comes from none.
+    """Return the signal that an exception comes from; None if it comes from none.
 
     Lightning makes an exit of code 1 out of Ctrl-C, and workers that hear a signal themselves fail in
     their own ways.
@@ -54,13 +54,13 @@ def signal_of(error: BaseException) -> signal.Signals | None:
 
 
 class StopAtOnce(Callback):
-    """Keeps SIGTERM from Lightning, which would end the epoch first and exit with code 0.
+    """A callback that keeps SIGTERM from Lightning, which would end the epoch first and exit with code 0.
 
-    The other processes of this machine, if Lightning has started any, are told.
+    The signal is passed on to the other processes that Lightning has started on this machine.
     """
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Take the signal back."""
+        """Set the handler of the signal again, after Lightning has set its own."""
         launcher = trainer.strategy.launcher
 
         def terminate(signum: int, frame: Any) -> None:

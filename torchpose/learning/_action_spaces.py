@@ -1,4 +1,4 @@
-"""Fit action spaces to performances of an action (AS 1), and count how well they tell actions."""
+"""Fit action spaces to performances of an action (AS 1), and test the recognition of actions."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -107,7 +107,7 @@ def fit_synchronised(
 
 
 def _principal_axes(moves: Float[Tensor, "N 36"]) -> tuple[Tensor, Tensor]:
-    """Variances [36], falling, and axes [36, 36] with their largest entry positive."""
+    """Return falling variances [36] and axes [36, 36] whose largest entry is positive."""
     variances, axes = torch.linalg.eigh(moves.mT @ moves / len(moves))
     variances, axes = variances.flip(0).clamp_min(0), axes.flip(1)
     largest = axes.gather(0, axes.abs().argmax(0, keepdim=True))
@@ -115,7 +115,7 @@ def _principal_axes(moves: Float[Tensor, "N 36"]) -> tuple[Tensor, Tensor]:
 
 
 def _checked(performances: Sequence[Tensor], n_dimensions: int) -> list[Tensor]:
-    """The performances in double precision, or what is wrong with them."""
+    """Return the performances in double precision, or raise `InputError`."""
     if n_dimensions < 1:
         raise InputError(f"n_dimensions must be at least 1, got {n_dimensions}")
     if len(performances) < 2:
@@ -146,7 +146,7 @@ class Performed(NamedTuple):
 
 
 class ConfusionTable(NamedTuple):
-    """What recordings of unseen persons were taken for.
+    """Actions of unseen persons against the actions that were recognised.
 
     Attributes:
         truth: the R actions of the rows. columns: the A + 1 states, the last one "none".
@@ -162,7 +162,7 @@ class ConfusionTable(NamedTuple):
     n_recordings: Tensor
 
     def correct(self) -> Float[Tensor, " R"]:
-        """Share of each row's recordings that were told rightly: others than the known are none."""
+        """Return the share of each row's recordings that were recognised; unknown actions count as "none"."""
         right = [self.columns.index(a) if a in self.columns else -1 for a in self.truth]
         return self.recordings[torch.arange(len(right)), torch.tensor(right)]
 
@@ -175,7 +175,7 @@ def recognition_of_unseen(
     n_dimensions: int = 25,
     settings: Mapping[str, Any] | None = None,
 ) -> ConfusionTable:
-    """Leave one person out: fit a bank to everybody else, recognise what the person does.
+    """Recognise the actions of each person with a bank that was fitted to everybody else.
 
     Args:
         performances: single performances of the known actions, of several persons.

@@ -1,4 +1,4 @@
-"""Blocks of samples: which are whose, which of their samples a fit can use, and products of many."""
+"""Share blocks of samples among processes, check their values, and join them for large products."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = [
 ]
 
 K = TypeVar("K")
-_START_BLOCKS = 4  # times as many blocks as the samples would fill, for variety
+_START_BLOCKS = 4  # times the blocks that the samples would fill, for variety
 
 
 def _alone(values: Tensor) -> Tensor:
@@ -36,10 +36,10 @@ def _sum_over_processes(values: Tensor) -> Tensor:
 
 
 class Share(NamedTuple):
-    """Which part of the work this process does.
+    """The share of the blocks that one process takes.
 
     Attributes:
-        rank, size: number of this process, and how many there are.
+        rank, size: number of this process, and of all processes.
         total: the sum of a tensor over all processes, which each of them has to call.
     """
 
@@ -49,23 +49,23 @@ class Share(NamedTuple):
 
     @classmethod
     def of_processes(cls) -> Share:
-        """This process' share in the group of `torch.distributed`; all of it without a group."""
+        """Return this process' share in the group of `torch.distributed`; all of it without a group."""
         if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
             return cls()
         rank, size = torch.distributed.get_rank(), torch.distributed.get_world_size()
         return cls(rank, size, _sum_over_processes)
 
     def blocks(self, n_blocks: int) -> range:
-        """The blocks of this process: every block belongs to exactly one, none is padded."""
+        """Return the blocks of this process; every block belongs to exactly one process."""
         return range(self.rank, n_blocks, self.size)
 
     @contextlib.contextmanager
     def failing_together(self, like: Tensor) -> Iterator[None]:
-        """Work before a `total` of the shape of `like`, which the others get as NaN if it fails."""
+        """Let the other processes get NaN from their `total`, shaped as `like`, if the block raises."""
         try:
             yield
         except Exception:
-            if self.size > 1:  # or the others would wait for this process for ever
+            if self.size > 1:  # or the others would wait for this process
                 self.total(torch.full_like(like, torch.nan))
             raise
 
@@ -75,7 +75,7 @@ ALONE = Share()
 
 
 def usable_samples(samples: Samples, name: str) -> Samples:
-    """Samples of positive weight.
+    """Return the samples of positive weight.
 
     Args:
         samples: states and weights.
@@ -108,13 +108,13 @@ def usable_samples(samples: Samples, name: str) -> Samples:
 
 
 def _all_usable(states: Tensor, weight: Tensor) -> bool:
-    """In one pass over each: NaN and infinity show in a sum and in the extremes."""
+    """Return whether all samples are usable: NaN and infinity show in a sum and in the extremes."""
     low, high = weight.aminmax()
     return bool((low > 0) & (high < torch.inf) & torch.isfinite(states.sum()))
 
 
 def spread_samples(source: SampleSource, count: int) -> Samples:
-    """About `count` usable samples, spread evenly over a source; the same for whoever asks.
+    """Return about `count` usable samples, spread evenly over a source and the same in every process.
 
     Args:
         source: the states; all of them are taken if there are no more than `count`.
@@ -142,13 +142,13 @@ def spread_samples(source: SampleSource, count: int) -> Samples:
 
 
 def usable_block(source: SampleSource, index: int, epoch: int = 0) -> Samples:
-    """Samples of positive weight of a block, which is named in the error if they are not finite."""
+    """Return the samples of positive weight of a block, which errors name."""
     name = f"block {index} of {source.n_blocks}"
     return usable_samples(source.block(index, epoch), name)
 
 
 def joined_blocks(blocks: Iterable[tuple[K, Samples]]) -> Iterator[tuple[K, Samples]]:
-    """Join blocks of one key that follow each other to as many samples as one product takes.
+    """Join consecutive blocks of one key to as many samples as one product takes.
 
     Args:
         blocks: keys, such as the name of their source, and samples; those of one key together.

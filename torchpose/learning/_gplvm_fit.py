@@ -1,4 +1,4 @@
-"""Fit of a back-constrained GPLVM: objective (MR 15, 16), start by PCA, L-BFGS or Adam."""
+"""Fit a back-constrained GPLVM: objective (MR 15, 16), start by PCA, L-BFGS or Adam."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -38,7 +38,7 @@ _START_NOISE = 0.3  # standard deviation of what moves a start at random
 def log_likelihood(
     poses: Float[Tensor, "T Q"], latents: Float[Tensor, "T d"], kernel: KernelParameters
 ) -> Float[Tensor, ""]:
-    """Log-likelihood of poses, every column a Gaussian process over the latent points.
+    """Return the log-likelihood of poses, every column a Gaussian process over the latent points.
 
     ln p(X|Z) = -Q T / 2 ln 2 pi - Q / 2 ln |K| - 1/2 tr(X^T K^-1 X)   (MR 15)
 
@@ -55,12 +55,12 @@ def log_likelihood(
 def objective(
     poses: Float[Tensor, "T Q"], latents: Float[Tensor, "T d"], kernel: KernelParameters
 ) -> Float[Tensor, ""]:
-    """L(Z) = ln p(X|Z) - 1/2 ||Z||_F^2   (MR 16)."""
+    """Return L(Z) = ln p(X|Z) - 1/2 ||Z||_F^2   (MR 16)."""
     return log_likelihood(poses, latents, kernel) - 0.5 * latents.square().sum()
 
 
 def median_gamma(poses: Float[Tensor, "T Q"], seed: int = 0) -> float:
-    """gamma_x such that the kernel of two poses at the median distance is exp(-1/2)   (MR 22).
+    """Return gamma_x such that the kernel of two poses at the median distance is exp(-1/2)   (MR 22).
 
     Args:
         poses: X. seed: of which frames are compared, where there are more than 2,000.
@@ -75,7 +75,7 @@ def median_gamma(poses: Float[Tensor, "T Q"], seed: int = 0) -> float:
     distance = float(torch.pdist(poses).median())
     if not distance > 0:
         raise InputError(
-            "gamma_x cannot be told from the median distance of the poses, which is 0: most of them "
+            "gamma_x cannot be found from the median distance of the poses, which is 0: most of them "
             "are the same; give gamma_x, or frames with motion"
         )
     return 1.0 / distance**2
@@ -84,7 +84,7 @@ def median_gamma(poses: Float[Tensor, "T Q"], seed: int = 0) -> float:
 def principal_start(
     poses: Float[Tensor, "T Q"], latent_dim: int, start: int = 0
 ) -> Float[Tensor, "T d"]:
-    """Principal components of poses, scaled to variance one: latent points to start from.
+    """Return principal components of poses, scaled to variance one: latent points to start from.
 
     Start 0 are the first d components. The second component of a walk often swings twice in a cycle,
     so that the path of the first two crosses itself and two phases share a latent point; other starts
@@ -114,7 +114,7 @@ def principal_start(
 
 
 class GPLVMFit(nn.Module):
-    """A back-constrained GPLVM in the middle of its fit; all there is to know is in its `state_dict`.
+    """The fit of a back-constrained GPLVM, whose whole state is in its `state_dict`.
 
     Maximises (MR 16) over the back constraints z_i = sum_t a_ti k_x(x, x_t) + b_i (MR 21), beta,
     beta_0 and sigma_z. The weights a are optimised as v = L^T a with K_x = L L^T, in which the
@@ -185,23 +185,23 @@ class GPLVMFit(nn.Module):
 
     @property
     def kernel(self) -> KernelParameters:
-        """beta, beta_0, gamma_z and sigma_z."""
+        """Return beta, beta_0, gamma_z and sigma_z."""
         beta, beta0, gamma, sigma = self.log_kernel.unbind()
         return KernelParameters(beta, beta0, gamma if self._free_gamma_z else gamma.detach(), sigma)
 
     @property
     def weights(self) -> Float[Tensor, "T d"]:
-        """a of the back constraints (MR 21)."""
+        """Return the weights a of the back constraints (MR 21)."""
         return torch.linalg.solve_triangular(self.factor.mT, self.coordinates, upper=True)
 
     def forward(self) -> Float[Tensor, ""]:
-        """The objective (MR 16), less the penalty, of a single number of the poses: L / (T Q)."""
+        """Return the objective (MR 16) less the penalty, per number of the poses: L / (T Q)."""
         latents = self.features @ self.coordinates + self.bias
         penalty = 0.5 * self._smoothness * self.coordinates.square().sum()
         return (objective(self.poses, latents, self.kernel) - penalty) / self.poses.numel()
 
     def step(self) -> float:
-        """Ten iterations of the optimiser; returns the objective before them, per number."""
+        """Take ten iterations of the optimiser, and return the objective before them, per number."""
         if isinstance(self._optimiser, torch.optim.LBFGS):
             value = -float(self._optimiser.step(self._closure).detach())
         else:
@@ -217,11 +217,11 @@ class GPLVMFit(nn.Module):
         return value
 
     def converged(self, tolerance: float) -> bool:
-        """Whether the last step gained less than so much per number."""
+        """Return whether the last step gained less than `tolerance` per number."""
         return len(self.history) > 1 and self.history[-1] - self.history[-2] < tolerance
 
     def note(self, score: float) -> None:
-        """Remember the error on other poses after a step, and the parameters if it is the lowest."""
+        """Record the error on other poses after a step, and keep the parameters if it is the lowest."""
         score = score if math.isfinite(score) else math.inf
         if not self.scores or score < min(self.scores):
             self._best = {k: v.detach().clone() for k, v in self.named_parameters()}
@@ -229,7 +229,7 @@ class GPLVMFit(nn.Module):
 
     @property
     def best_step(self) -> int:
-        """The step with the lowest error noted, counted from 1; the last one if none was."""
+        """Return the step with the lowest recorded error, counted from 1; the last one without errors."""
         if not self.scores:
             return len(self.history)
         return 1 + min(range(len(self.scores)), key=self.scores.__getitem__)
@@ -241,7 +241,7 @@ class GPLVMFit(nn.Module):
                 self.get_parameter(name).copy_(value)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Where the optimiser stands, the objective and errors so far, the best parameters."""
+        """Return the optimiser's state, the objective and errors so far, and the best parameters."""
         return {
             "optimiser": self._optimiser.state_dict(),
             "history": list(self.history),
@@ -250,7 +250,7 @@ class GPLVMFit(nn.Module):
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take all of it over."""
+        """Restore what `get_extra_state` returned."""
         self._optimiser.load_state_dict(state["optimiser"])
         self.history, self.scores = list(state["history"]), list(state["scores"])
         self._best = dict(state["best"])
@@ -270,7 +270,7 @@ def run_fit(
     error: Callable[[], float] | None = None,
     patience: int = 3,
 ) -> GPLVMFit:
-    """Take steps until there are so many in all, or they do not help any more.
+    """Take steps until there are `steps` in all, or they no longer help.
 
     Args:
         fit: in whatever state. steps: in all, those already taken included.
@@ -307,7 +307,7 @@ def best_fit(
     error: Callable[[GPLVMFit], float] | None = None,
     patience: int = 3,
 ) -> GPLVMFit:
-    """The best fit of several starts: with the lowest error, or else the highest objective.
+    """Fit from several starts and return the fit with the lowest error, or else the highest objective.
 
     Args:
         make: a fit at start 0, 1, ... n_init: how many. error: on poses that are not fitted to, of a

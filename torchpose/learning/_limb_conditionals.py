@@ -1,4 +1,4 @@
-"""Fit limb conditionals: how limbs stand to each other and how fast they turn, from recorded bodies."""
+"""Fit limb conditionals: rotations between connected limbs and how fast limbs turn, from recorded bodies."""
 
 import math
 from collections.abc import Sequence
@@ -93,13 +93,13 @@ def _edge_indices(skeleton: BodySkeleton, edges: Sequence[tuple[str, str]]) -> T
 
 
 def _steps(turns: Sequence[Tensor], stride: int) -> Tensor | None:
-    """Second moments [P, 3, 3] of the rotations over so many frames; None without such frames."""
+    """Return second moments [P, 3, 3] of the rotations over `stride` frames; None without such frames."""
     steps = frame_rotations(turns, stride)
     return torch.einsum("npi,npj->pij", steps, steps) / len(steps) if len(steps) else None
 
 
 def _growth(turns: Sequence[Tensor], diffusion: Tensor) -> Tensor:
-    """Exponents g [P] of diffusion over time, by least squares over some strides; 0 to 2."""
+    """Return exponents g [P] of diffusion over time, by least squares over some strides; 0 to 2."""
     size = _trace(diffusion)
     found = [(math.log(k), steps) for k in _STRIDES if (steps := _steps(turns, k)) is not None]
     if not found:

@@ -106,7 +106,7 @@ def fit_gplvm(
 
 
 class FitTarget(NamedTuple):
-    """Poses of all sequences, and the same poses as the objective sees them.
+    """Poses of all sequences, with the centred and scaled poses that the objective is of.
 
     Attributes:
         poses: [T, Q]. lengths: frames of each sequence. scale: s [Q]. scaled: (poses - mean) / s.
@@ -199,7 +199,7 @@ def motion_noise(
     returned: Float[Tensor, "T Q"],
     lengths: Sequence[int],
 ) -> MotionNoise:
-    """Root mean squares of g(x_t) - g(x_t-1), of x_t - f(g(x_t)) and of x_t - x_t-1.
+    """Return root mean squares of g(x_t) - g(x_t-1), of x_t - f(g(x_t)) and of x_t - x_t-1.
 
     A column that stands still, such as the twist of an arm, gets a twentieth of the root mean square
     over all columns.
@@ -232,7 +232,7 @@ def check_unseen(
 
 
 def steps_within(values: Float[Tensor, "T D"], lengths: Sequence[int]) -> Float[Tensor, "steps D"]:
-    """Differences of consecutive rows, but not from one sequence to the next.
+    """Return differences of consecutive rows of one sequence, for all sequences.
 
     Raises:
         InputError: no sequence has two frames.
@@ -244,7 +244,7 @@ def steps_within(values: Float[Tensor, "T D"], lengths: Sequence[int]) -> Float[
 
 
 def steps_growth(values: Float[Tensor, "T D"], lengths: Sequence[int]) -> float:
-    """Exponent g with which steps grow with the frames k between them, RMS(x_t+k - x_t) ~ k^g.
+    """Return the exponent g with which steps grow with their frames k, RMS(x_t+k - x_t) ~ k^g.
 
     1/2 for a random walk, 1 for a motion that goes on; by least squares over 2, 3 and 4 frames, from 0
     to 1, and 1/2 where no sequence is long enough.
@@ -267,21 +267,21 @@ def steps_growth(values: Float[Tensor, "T D"], lengths: Sequence[int]) -> float:
 
 
 def column_scale(poses: Float[Tensor, "T Q"]) -> Float[Tensor, " Q"]:
-    """Standard deviation of each column; at least a hundredth of the largest one."""
+    """Return the standard deviation of each column; at least a hundredth of the largest one."""
     spread = poses.std(0)
     largest = spread.max()
     return spread.maximum(0.01 * largest) if bool(largest > 0) else torch.ones_like(spread)
 
 
 def principal_axes(latents: Float[Tensor, "T d"]) -> Float[Tensor, "d d"]:
-    """Rotation or reflection to the axes of largest variance, the first point at positive values."""
+    """Return the rotation or reflection to the axes of largest variance, with the first point positive."""
     _, _, axes = torch.linalg.svd(latents - latents.mean(0), full_matrices=False)
     signs = torch.where(latents[0] @ axes.mT < 0, -1.0, 1.0).to(latents)
     return axes.mT * signs
 
 
 def thin(sequences: Sequence[Float[Tensor, "_ Q"]], frames: int) -> list[Tensor]:
-    """So many poses in all at most, evenly spread over all sequences.
+    """Return at most `frames` poses in all, evenly spread over all sequences.
 
     Poses spread over many trials make a better manifold than as many in a row.
 

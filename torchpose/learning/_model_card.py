@@ -31,7 +31,7 @@ MODES = {"pose": "single poses", "causal": "filtered", "full": "smoothed"}
 
 
 def model_card(prior: UpperBodyPrior, results: Mapping[str, str] | None = None) -> str:
-    """Return Markdown text on what a prior is, what it was fitted on, and what it is not good for.
+    """Return Markdown text on what a prior is, what it was fitted to, and what it is not good for.
 
     Args:
         prior: the prior.
@@ -176,7 +176,7 @@ def _noise(prior: UpperBodyPrior) -> str:
 
 
 def _drawn(prior: UpperBodyPrior) -> str:
-    """Errors of the filters that draw, on fewer frames of the same held-out persons."""
+    """Return errors of the sampling filters, on fewer frames of the same held-out persons."""
     held_out: Mapping[str, Mapping[str, float]] = prior.info.extra.get("held_out_drawn", {})
     errors = ", ".join(
         f"`{mode.replace('_', '-')}` {100 * fmean(persons.values()):.1f}"
@@ -186,7 +186,7 @@ def _drawn(prior: UpperBodyPrior) -> str:
 
 
 def _held_out(prior: UpperBodyPrior) -> str:
-    """Errors on persons held out in turn, for each way of tracking."""
+    """Return a table of errors on held-out persons, for each way of tracking."""
     held_out: Mapping[str, Mapping[str, float]] = prior.info.extra.get("held_out", {})
     if not held_out:
         known = not prior.info.persons or "fine_tuned" in prior.info.extra
@@ -245,7 +245,7 @@ _LIMITS = (
 
 
 def body_card(model: BodyModel, name: str = "", results: str = "") -> str:
-    """Return Markdown text on what a model is, what it was fitted on, and what it is not good for.
+    """Return Markdown text on what a model is, what it was fitted to, and what it is not good for.
 
     Args:
         model: a manifold, limb conditionals, an action space or a bank.

@@ -1,8 +1,8 @@
-"""Performances of one action: cut out of recordings, and put in step by cubic splines and key frames.
+"""Cut performances of one action out of recordings, and synchronise them by splines and key frames.
 
-A key frame is a posture of the mean performance that is farthest from, or nearest to, the mean
-posture. Where a performance is most like each of them, in their order, tells its timing; between two
-key frames every performance gets the same number of postures (aSpace, section 2).
+A key frame is a posture of the mean performance at an extremum of the distance from the mean posture.
+The frames of a performance that are most like the key frames, in their order, define its timing. Between
+two key frames every performance has the same number of postures (aSpace, section 2).
 """
 
 import math
@@ -41,7 +41,7 @@ def synchronise(
     n_postures: int | None = None,
     prominence: float = 0.15,
 ) -> Synchronised:
-    """Put performances in step.
+    """Synchronise performances of one action.
 
     1. Each is resampled to K postures by a natural cubic spline; their mean is the mean performance.
     2. Key frames are the extrema of the mean performance's distance to the mean posture.
@@ -78,7 +78,7 @@ def synchronise(
 
 
 def checked_performances(performances: Sequence[Float[Tensor, "_ R"]]) -> list[Tensor]:
-    """Performances in double precision, if they can be put in step.
+    """Return performances in double precision, if they can be synchronised.
 
     Raises:
         InputError: none at all, one that is too short, NaN. ShapeError: other columns than the first.
@@ -100,7 +100,7 @@ def checked_performances(performances: Sequence[Float[Tensor, "_ R"]]) -> list[T
 def natural_spline(
     values: Float[Tensor, "T R"], times: Float[Tensor, " S"]
 ) -> Float[Tensor, "S R"]:
-    """The natural cubic spline through values at the times 0, 1, ..., T - 1, at other times.
+    """Interpolate values at the times 0, 1, ..., T - 1 by a natural cubic spline.
 
     Its second derivatives m solve m_(t-1) + 4 m_t + m_(t+1) = 6 (y_(t-1) - 2 y_t + y_(t+1)) with
     m_0 = m_(T-1) = 0.
@@ -124,10 +124,10 @@ def natural_spline(
 
 
 def find_key_frames(distance: Float[Tensor, " K"], prominence: float = 0.15) -> tuple[int, ...]:
-    """First and last frame, and between them the extrema of a curve that stand out.
+    """Find the first and last frame, and between them the prominent extrema of a curve.
 
     Maxima and minima alternate; two neighbours that differ by less than a share of the curve's range
-    count for nothing, the smallest such difference first.
+    are removed, the smallest difference first.
 
     Args:
         distance: [K]. prominence: the share, between 0 and 1.
@@ -161,7 +161,7 @@ def find_key_frames(distance: Float[Tensor, " K"], prominence: float = 0.15) -> 
 def match_key_frames(
     performance: Float[Tensor, "T R"], key_postures: Float[Tensor, "n R"]
 ) -> list[int]:
-    """Frames of a performance that are most like the key postures, in their order.
+    """Find the frames of a performance that are most like the key postures, in their order.
 
         argmin sum_i |phi_(t_i) - g_i|^2   over   0 = t_1 < t_2 < ... < t_n = T - 1
 
@@ -193,7 +193,7 @@ def match_key_frames(
 
 
 def _second_derivatives(values: Tensor) -> Tensor:
-    """[T - 2, R], by elimination in the tridiagonal system; the loop is over frames."""
+    """Solve the tridiagonal system for second derivatives [T - 2, R]; the loop is over frames."""
     right = 6 * values.diff(n=2, dim=0)
     factor, rows = 0.0, []
     last = torch.zeros_like(values[0])
@@ -212,7 +212,7 @@ def _second_derivatives(values: Tensor) -> Tensor:
 
 
 def _times(matched: Sequence[int], keys: Sequence[int]) -> Tensor:
-    """[K], frames of a performance that the postures stand for: linear between key frames."""
+    """Return the frames [K] of a performance for each posture, linear between key frames."""
     place, frames = torch.tensor(keys).double(), torch.tensor(matched).double()
     k = torch.arange(keys[-1] + 1, dtype=torch.float64)
     after = torch.searchsorted(place, k).clamp_min(1)
@@ -226,12 +226,12 @@ def _times(matched: Sequence[int], keys: Sequence[int]) -> Tensor:
 def split_repetitions(
     postures: Float[Tensor, "T Q"], fps: float, axis: Float[Tensor, " Q"] | None = None
 ) -> list[slice]:
-    """Frames of every repetition, from where the motion is nearest to its start to where it is again.
+    """Find the frames of every repetition, from one return to the start of the motion to the next.
 
     The motion is s, the recording along an axis, smoothed, with its two ends (the 10 and 90 %
     quantiles) at 0 and 1. It is away once s passes 0.75 and back once it falls below 0.6. A performance
-    begins and ends where s is least between two times away; the first begins, and the last ends, as long
-    from its middle as it takes on its other side, so that getting ready is left out.
+    begins and ends at the minimum of s between two times away. The first one begins, and the last one
+    ends, symmetrically about its middle, so that preparations are left out.
 
     Args:
         postures: [T, Q], or any other columns that show the motion, finite.
@@ -273,7 +273,7 @@ def split_repetitions(
 
 
 def repetition_axis(recordings: Sequence[Float[Tensor, "_ Q"]]) -> Float[Tensor, " Q"]:
-    """The first principal axis of recordings, pointing away from where they start.
+    """Return the first principal axis of recordings, pointing away from where they start.
 
     Args:
         recordings: [T_r, Q] each, of one action, finite.
@@ -295,7 +295,7 @@ def repetition_axis(recordings: Sequence[Float[Tensor, "_ Q"]]) -> Float[Tensor,
 
 
 def _motion(s: Tensor, fps: float) -> Tensor:
-    """The motion along the axis [T], smoothed; 0 at one end, 1 at the other."""
+    """Return the smoothed motion along the axis [T], 0 at one end and 1 at the other."""
     reach = max(1, round(3 * _SMOOTH * fps))
     offset = torch.arange(-reach, reach + 1).to(s) / (_SMOOTH * fps)
     kernel = torch.softmax(-0.5 * offset.square(), 0)
@@ -306,8 +306,8 @@ def _motion(s: Tensor, fps: float) -> Tensor:
 
 
 def _hysteresis(s: Tensor) -> Tensor:
-    """Whether s is away [T]: from where it passes 0.75 until it falls below 0.6."""
+    """Return whether s is away [T]: from where it passes 0.75 until it falls below 0.6."""
     mark = (s > _AWAY).long() - (s < _BACK).long()
     frames = torch.arange(len(s), device=s.device)
-    told = torch.where(mark != 0, frames, torch.zeros_like(frames)).cummax(0).values
-    return mark[told] > 0
+    latest = torch.where(mark != 0, frames, torch.zeros_like(frames)).cummax(0).values
+    return mark[latest] > 0

@@ -1,8 +1,7 @@
-"""Where training states come from: blocks of them, drawn on the fly, whoever asks.
+"""Draw training states in blocks, each a function of its source and its number alone.
 
-A source is a long list of states that is never held in memory. Its block i is a function of the
-source and of i alone, so processes and workers that share the blocks among them see the same states
-as one process that takes them all, without padding or repetition.
+A source stands for many states that are not held in memory. Processes and workers that share its
+blocks see the same states as one process that takes all of them, without padding or repetition.
 """
 
 import math
@@ -44,10 +43,10 @@ _GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 class Samples(NamedTuple):
-    """Training states and how far to trust each.
+    """Training states with a weight each.
 
     Attributes:
-        states: float64. weight: in [0, 1]; a state of weight 0.5 counts as half a state.
+        states: float64. weight: in [0, 1]; a state of weight 0.5 counts half.
     """
 
     states: Float[Tensor, "N D"]
@@ -55,58 +54,58 @@ class Samples(NamedTuple):
 
 
 def join_samples(parts: Sequence[Samples]) -> Samples:
-    """All samples of all parts."""
+    """Join the samples of all parts."""
     return Samples(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 @runtime_checkable
 class SampleSource(Protocol):
-    """Training states in blocks; see the module for what a block may depend on."""
+    """Training states in blocks, each a function of the source, its number and the epoch."""
 
     @property
     def dim(self) -> int:
-        """Dimensions D of a state."""
+        """Return the dimensions D of a state."""
         ...
 
     @property
     def n_samples(self) -> int:
-        """Number of states in all blocks together."""
+        """Return the number of states in all blocks together."""
         ...
 
     @property
     def n_blocks(self) -> int:
-        """Number of blocks of `BLOCK` states; the last may be shorter."""
+        """Return the number of blocks of `BLOCK` states; the last may be shorter."""
         ...
 
     def block(self, index: int, epoch: int = 0) -> Samples:
-        """The states of a block; the epoch counts only where fresh ones are drawn for each."""
+        """Return the states of a block; the epoch matters only where each draws fresh ones."""
         ...
 
 
 def block_sizes(n_samples: int) -> list[int]:
-    """Number of states in each block."""
+    """Return the number of states in each block."""
     return [min(BLOCK, n_samples - start) for start in range(0, n_samples, BLOCK)]
 
 
 def all_samples(source: SampleSource, epoch: int = 0) -> Samples:
-    """Every state of a source at once."""
+    """Return every state of a source."""
     return join_samples([source.block(index, epoch) for index in range(source.n_blocks)])
 
 
 def derived_seed(seed: int, purpose: str) -> int:
-    """A seed of its own for each purpose, so that their random numbers have nothing in common."""
+    """Return a seed for one purpose, so that random numbers of different purposes are independent."""
     words = np.random.SeedSequence([seed, *purpose.encode()]).generate_state(1, np.uint64)
     return int(words[0]) >> 1
 
 
 class _Blocks:
-    """What sources share: how many blocks there are, and which of them exist."""
+    """Base of sources: the number of blocks and their rows."""
 
     n_samples: int
 
     @property
     def n_blocks(self) -> int:
-        """Number of blocks of `BLOCK` states; the last may be shorter."""
+        """Return the number of blocks of `BLOCK` states; the last may be shorter."""
         return -(-self.n_samples // BLOCK)
 
     def _rows(self, index: int) -> tuple[int, int]:
@@ -117,7 +116,7 @@ class _Blocks:
 
 
 class TensorSource(_Blocks):
-    """States that are there already, in memory or in a memory-mapped file.
+    """Given states, in memory or in a memory-mapped file.
 
     Args:
         states: [N, D], tensor or array (`numpy.memmap` for more than memory holds).
@@ -134,7 +133,7 @@ class TensorSource(_Blocks):
         self.n_samples, self.dim = (int(n) for n in states.shape)
 
     def block(self, index: int, epoch: int = 0) -> Samples:
-        """The states of a block."""
+        """Return the states of a block."""
         start, stop = self._rows(index)
         rows = self._states[start:stop]
         states = torch.from_numpy(np.array(rows)) if isinstance(rows, np.ndarray) else rows
@@ -144,7 +143,7 @@ class TensorSource(_Blocks):
 
 
 class CachedSource(_Blocks):
-    """Another source whose blocks are kept once they were drawn.
+    """A source that keeps the blocks of another one once they were drawn.
 
     Args:
         source: whose blocks do not change with the epoch.
@@ -157,18 +156,18 @@ class CachedSource(_Blocks):
         self._kept: dict[int, Samples] = {}
 
     def block(self, index: int, epoch: int = 0) -> Samples:
-        """The states of a block, drawn once."""
+        """Return the states of a block, drawn once."""
         if index not in self._kept:
             self._kept[index] = self.source.block(index)
         return self._kept[index]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what is kept: worker processes draw their own."""
+        """Return the source without its kept blocks: worker processes draw their own."""
         return self.__dict__ | {"_kept": {}}
 
 
 def cached(source: SampleSource, limit: int = _CACHE_BYTES) -> SampleSource:
-    """The source with its blocks kept in memory if all of them fit into `limit` bytes."""
+    """Return the source with its blocks kept in memory if all of them fit into `limit` bytes."""
     fresh = getattr(source, "fresh", False)
     fits = 8 * (source.dim + 1) * source.n_samples <= limit
     return CachedSource(source) if fits and not fresh else source
@@ -191,12 +190,12 @@ class _Drawn(_Blocks):
     fresh: bool
 
     def _generator(self, index: int, epoch: int) -> torch.Generator:
-        """Randomness of one block: the same wherever it is drawn."""
+        """Return the random generator of one block, the same in every process."""
         purpose = f"block {index} epoch {epoch if self.fresh else 0}"
         return torch.Generator().manual_seed(derived_seed(self.seed, purpose))
 
     def _poses(self, index: int, n_poses: int) -> Int[Tensor, " n"]:
-        """Which pose each state of a block is made of; every pose as often as any other up to one.
+        """Return the pose of each state of a block; poses have equal numbers of states, up to one.
 
         State i takes pose (a p + r) mod N of round r = i // N, p = i mod N, where a has no factor in
         common with N and is near the golden section of it: consecutive states come from all over the
@@ -229,11 +228,11 @@ class ArmSource(_Drawn):
 
     @property
     def n_poses(self) -> int:
-        """Number of distinct poses."""
+        """Return the number of distinct poses."""
         return len(self.arms)
 
     def block(self, index: int, epoch: int = 0) -> Samples:
-        """The states of a block."""
+        """Return the states of a block."""
         chosen = self._poses(index, len(self.arms))
         views = sample_viewpoints(len(chosen), self.views, self._generator(index, epoch))
         states = arm_state(self.arms[chosen], views, self.matrix, self.rotation_order)
@@ -242,7 +241,7 @@ class ArmSource(_Drawn):
 
 @dataclass(frozen=True, eq=False)
 class PoseFrames:
-    """Frames of all recordings in one tensor, and where each recording begins and ends.
+    """Frames of all recordings in one tensor, with the first and last frame of each recording.
 
     Attributes:
         joints: [F, 8, 3], centred, metres; NaN where missing. weight: [F, 8], in [0, 1].
@@ -262,7 +261,7 @@ class PoseFrames:
         rates: Sequence[float],
         weights: Sequence[Float[Tensor, "T 8"]] | None = None,
     ) -> "PoseFrames":
-        """Frames of several recordings.
+        """Join the frames of several recordings.
 
         Raises:
             InputError: no recordings.
@@ -279,7 +278,7 @@ class PoseFrames:
         return cls(joints, weight.double(), *each)
 
     def at_lags(self, frames: Int[Tensor, " N"], layout: WindowLayout) -> Int[Tensor, "N W"]:
-        """Indices of the frames of each window; beyond the ends of a recording its ends are held."""
+        """Return the frames of each window, held at the ends of a recording."""
         wanted = self.wanted(frames, layout.lags, layout.fps)
         return torch.minimum(
             torch.maximum(wanted, self.first[frames, None]), self.last[frames, None]
@@ -288,7 +287,7 @@ class PoseFrames:
     def wanted(
         self, frames: Int[Tensor, " N"], lags: Sequence[int], fps: float
     ) -> Int[Tensor, "N L"]:
-        """Where the frames at some lags would be, also beyond the ends of a recording.
+        """Return where the frames at some lags would be, also beyond the ends of a recording.
 
         Args:
             frames: indices. lags: in frames at the rate `fps`; positive is the past.
@@ -297,7 +296,7 @@ class PoseFrames:
         return frames[:, None] - torch.round(torch.tensor(lags).double() * ratio).long()
 
     def complete(self, layout: WindowLayout) -> Int[Tensor, " N"]:
-        """Frames whose whole window has all joints."""
+        """Return the frames whose whole window has all joints."""
         known: Bool[Tensor, " F"] = torch.isfinite(self.joints).flatten(1).all(1)
         frames = torch.arange(len(self.joints))
         return frames[known[self.at_lags(frames, layout)].all(1)]
@@ -324,20 +323,20 @@ class WindowSource(_Drawn):
 
     @property
     def dim(self) -> int:
-        """Dimensions of a window state."""
+        """Return the dimensions of a window state."""
         return self.layout.dim
 
     @property
     def n_poses(self) -> int:
-        """Number of distinct poses."""
+        """Return the number of distinct poses."""
         return len(self.centres)
 
     def centres_of(self, index: int) -> Int[Tensor, " n"]:
-        """The frames that the windows of a block are about."""
+        """Return the frames at the centres of a block's windows."""
         return self.centres[self._poses(index, len(self.centres))]
 
     def block(self, index: int, epoch: int = 0) -> Samples:
-        """The states of a block."""
+        """Return the states of a block."""
         generator = self._generator(index, epoch)
         centres = self.centres_of(index)
         taken = self.frames.at_lags(centres, self.layout)

@@ -1,4 +1,4 @@
-"""How many components: the number under which held-out states are most likely."""
+"""Choose the number of components under which held-out states are most likely."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Candidate(NamedTuple):
 
 
 class Selection(NamedTuple):
-    """Candidates by number of components, the chosen number, the best one, and the rule.
+    """The table of candidates, the chosen number of components, and how it was chosen.
 
     Attributes:
         rows: one for each candidate. n_components: the choice. best: most likely on held-out states.
@@ -60,7 +60,7 @@ class Selection(NamedTuple):
     mixture: GaussianMixture
 
     def table(self) -> tuple[list[str], list[list[str]]]:
-        """Header and rows to show; the choice is marked."""
+        """Return header and rows to show; the choice is marked."""
         header = ["components", "training", "held out", "± (1 s.e.)", "behind best", "±", "steps"]
         rows = [
             [
@@ -156,7 +156,7 @@ def _rows(
 def held_out_scores(
     em: StreamedEM, sources: Sequence[SampleSource], share: Share = ALONE
 ) -> Float[Tensor, "G 2"]:
-    """Sum of log-likelihoods and of weights of each source, or of each block of a single one.
+    """Sum log-likelihoods and weights over each source, or over each block of a single one.
 
     Args:
         em: the mixture. sources: states. share: of this process.
@@ -190,7 +190,7 @@ def held_out_scores(
 
 
 def _standard_error(totals: Tensor, weights: Tensor) -> float:
-    """Of sum_g t_g / sum_g w_g, a ratio estimate over groups; NaN for a single group."""
+    """Return the standard error of sum_g t_g / sum_g w_g, a ratio estimate; NaN for a single group."""
     n = len(weights)
     if n < 2:
         return math.nan

@@ -1,8 +1,8 @@
-"""Stepwise EM: a first pass over the states that moves the mixture many times instead of once.
+"""Take a first pass of stepwise EM, which moves the mixture many times in one pass over the states.
 
-Exact EM takes one step for each pass over all states. Here a few blocks make a step: their statistics
-are blended with those of the blocks before, and the older they are the less they count. One pass over
-50 blocks brings a mixture about as far as eight passes of exact EM, which then goes on from there.
+Exact EM takes one step for each pass over all states. Stepwise EM takes one for every few blocks, and
+blends their statistics with those of earlier blocks, whose weight decays. One pass over 50 blocks improves
+a mixture about as much as eight passes of exact EM, which then continues from there.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ POWER, OFFSET = 0.6, 2.0
 
 
 class StepwiseState(NamedTuple):
-    """What is carried from step to step.
+    """Blended statistics that are carried from step to step.
 
     Attributes:
         table: blended statistics s of `SufficientStatistics`, for one sample of weight one.
@@ -57,7 +57,7 @@ class StepwiseState(NamedTuple):
 def implied_statistics(
     parameters: MixtureParameters, floor: Float[Tensor, "D D"]
 ) -> Float[Tensor, "K F"]:
-    """The statistics, for one sample, from which `m_step` makes this mixture.
+    """Return the statistics of one sample from which `m_step` makes this mixture.
 
     s_k = pi_k [1, mu_k, Sigma_k - floor + mu_k mu_k'], the upper triangle of the last.
 
@@ -72,7 +72,7 @@ def implied_statistics(
 
 
 def stepwise_start(em: StreamedEM, size: float) -> StepwiseState:
-    """State before the first step: the mixture as it is counts as `size` samples."""
+    """Return the state before the first step, with the mixture counting as `size` samples."""
     table = implied_statistics(em.parameters_tuple(), em.floor)
     return StepwiseState(table, table.new_tensor(size), 0)
 

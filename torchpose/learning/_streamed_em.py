@@ -1,13 +1,13 @@
-"""Exact EM over states that no memory has to hold, for all or for some of their dimensions.
+"""Fit mixtures by exact EM to states that need not fit into memory, in all or some of their dimensions.
 
-An EM step needs of the states only a table of sums (`SufficientStatistics`). So the states come block
-by block, each process takes its share of the blocks, one exchange adds up the tables, and every
-process makes the same maximisation step. The result depends neither on the number of processes nor
-on how the blocks are shared out, up to the rounding of sums.
+An EM step needs only a table of sums over the states (`SufficientStatistics`). Each process sums over its
+share of the blocks, one exchange adds up the tables, and every process takes the same maximisation step.
+The result depends neither on the number of processes nor on how blocks are shared, up to rounding.
 
-What an estimate is to be told by and what is wanted most decide which component a state belongs to;
-dimensions that would only pull components apart, such as the camera's angles, follow afterwards by one
-maximisation step with the components' responsibilities for the others."""
+A mixture may be fitted to some dimensions only: those that are measured or wanted most. The others, such as
+the camera's angles, would only split components. They follow by one maximisation step with the
+responsibilities of the fitted dimensions.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ START_SAMPLES = 100_000
 
 
 class StreamedEM(MixtureFit):
-    """The fit of a mixture to sources of states, which come block by block.
+    """The fit of a mixture to sources of states in blocks.
 
     `expect` sums up samples, and `accumulate` a whole source, of which every process does its share.
     Attributes and arguments are those of `MixtureFit`.
@@ -78,7 +78,7 @@ class StreamedEM(MixtureFit):
         init: str | MixtureParameters = "k-means++",
         dtype: torch.dtype = torch.float64,
     ) -> StreamedEM:
-        """Units, floor and start from some samples of a source, without any exchange.
+        """Start a fit from some samples of a source, the same in every process.
 
         Where the source has no more than `start_samples`, these are those of `GaussianMixture.fit`.
 
@@ -116,7 +116,7 @@ class StreamedEM(MixtureFit):
 
     @torch.no_grad()
     def expect(self, samples: Samples) -> SufficientStatistics:
-        """Expectation step over some samples; the sums of parts are merged or added.
+        """Take the expectation step over some samples; sums of parts can be merged or added.
 
         Args:
             samples: states, in their own units, and weights; those of weight zero are left out.
@@ -136,7 +136,7 @@ class StreamedEM(MixtureFit):
     def accumulate(
         self, source: SampleSource, share: Share = ALONE, epoch: int | None = None
     ) -> SufficientStatistics:
-        """Expectation step over a whole source, of which every process does its share.
+        """Take the expectation step over a whole source, shared among processes.
 
         Args:
             source: the states.
@@ -232,7 +232,7 @@ def _check_settings(
 
 
 def _check_enough(source: SampleSource, states: Tensor, n_components: int) -> None:
-    """Raise unless there is a pose for every component."""
+    """Raise `InputError` unless there is a pose for every component."""
     n_poses = getattr(source, "n_poses", len(states))
     if n_poses >= n_components and any(len(x.unique()) >= n_components for x in states.T):
         return
@@ -261,26 +261,26 @@ class ColumnsSource:
 
     @property
     def dim(self) -> int:
-        """Number of dimensions."""
+        """Return the number of dimensions."""
         return len(self.columns)
 
     @property
     def n_samples(self) -> int:
-        """Number of states in all blocks together."""
+        """Return the number of states in all blocks together."""
         return self.source.n_samples
 
     @property
     def n_blocks(self) -> int:
-        """Number of blocks."""
+        """Return the number of blocks."""
         return self.source.n_blocks
 
     @property
     def fresh(self) -> bool:
-        """Whether every epoch draws states of its own."""
+        """Return whether every epoch draws states of its own."""
         return bool(getattr(self.source, "fresh", False))
 
     def block(self, index: int, epoch: int = 0) -> Samples:
-        """The states of a block."""
+        """Return the states of a block."""
         samples = self.source.block(index, epoch)
         return samples._replace(states=samples.states[:, self.columns])
 
@@ -289,11 +289,11 @@ class ColumnsSource:
 def complete_mixture(
     mixture: GaussianMixture, source: SampleSource, columns: Sequence[int]
 ) -> GaussianMixture:
-    """A mixture of whole states from one of some of their dimensions.
+    """Extend a mixture over some dimensions to whole states, by responsibilities.
 
     mu_k = sum_n r_nk x_n / n_k,  Sigma_k = sum_n r_nk (x_n - mu_k)(x_n - mu_k)^T / n_k + floor,
 
-    where r_nk is the share of component k in the given dimensions of state n (BL 53-56).
+    where r_nk is the responsibility of component k for state n in the given dimensions (BL 53-56).
 
     Args:
         mixture: over the dimensions `columns`. source: of whole states.
@@ -342,7 +342,7 @@ class MixtureTask(NamedTuple):
     seed: int
 
     def fit(self) -> GaussianMixture:
-        """The whole mixture, fitted in this process."""
+        """Fit the mixture in this process and extend it to whole states."""
         source = cached(self.source)
         fitted = fit_streamed(
             source, self.n_components, self.seed, max_iter=self.max_iter, tol=self.tol
@@ -350,7 +350,7 @@ class MixtureTask(NamedTuple):
         return self.whole(fitted)
 
     def whole(self, mixture: GaussianMixture) -> GaussianMixture:
-        """The mixture over all dimensions of its states, if it was fitted to some of them only."""
+        """Return the mixture over all dimensions, extended if it was fitted to some of them."""
         source = self.source
         if not isinstance(source, ColumnsSource) or mixture.dim == source.source.dim:
             return mixture

@@ -1,4 +1,4 @@
-"""From recorded poses to sources of training states: which frames, which neck, which viewpoints."""
+"""Turn recorded poses into sources of training states, and into the keypoints of a simulated detector."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _UNSEEN = [i for i, name in enumerate(UPPER_BODY) if name.startswith(("elbow", "
 
 @runtime_checkable
 class RecordingLike(Protocol):
-    """What is used of a `torchpose.io.Recording`."""
+    """The attributes of a `torchpose.io.Recording` that fits use."""
 
     names: tuple[str, ...]
     fps: float | None
@@ -78,7 +78,7 @@ class PoseSet(NamedTuple):
     persons: list[str]
 
     def frames(self) -> PoseFrames:
-        """The frames with where each recording begins and ends."""
+        """Return the frames, with where each recording begins and ends."""
         joints, weight = (values.split(self.lengths) for values in (self.joints, self.weight))
         return PoseFrames.join(joints, self.rates, weight)
 
@@ -103,7 +103,7 @@ def collect_poses(
     centre: str = "neck",
     nose_as_head: bool = False,
 ) -> PoseSet:
-    """Centred upper-body poses of recordings, converted to one kind of neck.
+    """Collect centred upper-body poses of recordings, converted to one kind of neck.
 
     Necks of other kinds, and missing ones, are put where the recordings of the wanted kind have
     theirs (`learn_neck_offset`). Hands and wrists are not converted: mixed, they are refused.
@@ -173,7 +173,7 @@ def arm_sources(
     n_samples: int | None = None,
     views_per_pose: int | None = None,
 ) -> ArmSources:
-    """States of both arms from random viewpoints, every pose as often as any other.
+    """Build sources of both arms' states from random viewpoints, with equal use of all poses.
 
     An arm leaves out the frames in which one of its five joints is missing; `facts` says how many.
     A state weighs as much as the least trusted joint of its pose.
@@ -228,7 +228,7 @@ def arm_sources(
 
 
 class _Arm(NamedTuple):
-    """Poses [N, 5, 3] of an arm, which of them are complete and trusted at all, and weights [N]."""
+    """Poses [N, 5, 3] of an arm, which of them are complete and have weight, and weights [N]."""
 
     points: Tensor
     known: Tensor
@@ -244,7 +244,7 @@ def _arm(poses: PoseSet, arm: tuple[int, ...]) -> _Arm:
 
 
 def _weights(recording: RecordingLike, nose_as_head: bool) -> Float[Tensor, "T 8"]:
-    """Trust in the eight joints; a joint that the recording does not have needs none."""
+    """Return the weights of the eight joints; one for a joint that the recording does not have."""
     given = getattr(recording, "weights", None)
     frames = len(recording.upper_body(nose_as_head).joints)
     weight = torch.ones(frames, len(UPPER_BODY), dtype=torch.float64)
@@ -267,7 +267,7 @@ def _one_kind(joint: str, kinds: Sequence[str | None]) -> str | None:
 
 
 def _origin(recording: RecordingLike) -> str:
-    """Where a recording comes from, without the path inside that place."""
+    """Return where a recording comes from, without the path inside that place."""
     repository, at, rest = recording.source.partition("@")
     if not repository:
         return recording.person_id.partition("#")[0]
@@ -275,7 +275,7 @@ def _origin(recording: RecordingLike) -> str:
 
 
 def _frame_rate(recordings: Sequence[RecordingLike], joints: Sequence[Tensor]) -> float | None:
-    """The frame rate of most frames."""
+    """Return the frame rate of most frames."""
     frames: dict[float, int] = {}
     for recording, poses in zip(recordings, joints, strict=True):
         if recording.fps:
@@ -310,7 +310,7 @@ def seen_keypoints(
     view_share: float,
     noise_std: float,
 ) -> Float[Tensor, "B T 8 2"]:
-    """Keypoints of sequences, each from a random viewpoint of its own (BL section 3.1).
+    """Project sequences from a random viewpoint each, with noise, as a detector would see them.
 
     Args:
         poses: body axes, metres. info: of the prior whose camera and viewpoints are taken.

@@ -112,7 +112,7 @@ def _fit_arm(source: ArmSource, options: dict[str, Any]) -> GaussianMixture:
 def prior_of_arms(
     left: GaussianMixture, right: GaussianMixture | None, info: PriorInfo, seed: int
 ) -> UpperBodyPrior:
-    """Prior of fitted mixtures over poses; a right arm of None is the left one's mirror image.
+    """Build a prior of fitted mixtures over poses; the right one mirrors the left one if None.
 
     Args:
         left, right: mixtures with their `fit_report`, if they were fitted. info: what they were
@@ -138,7 +138,7 @@ def _fit_facts(mixture: GaussianMixture, seed: int) -> dict[str, Any]:
 
 
 _NECK = UPPER_BODY.index("neck")
-_STEPS = 50_000  # at least so many viewpoints, where there are recorded steps at all
+_STEPS = 50_000  # least number of viewpoints, where there are recorded steps
 # rad in 1/30 s. The camera of a recording stands still; what it is believed to be has to move.
 _ANGLE_STEP = 0.03
 
@@ -192,7 +192,7 @@ def increment_covs(
 
 
 def _usable(poses: PoseSet, arm: tuple[int, ...]) -> Tensor:
-    """Frames that have a frame before them in their recording, with the whole arm in both."""
+    """Return frames that follow another one of their recording, with the whole arm in both."""
     whole = torch.isfinite(poses.joints[:, list(arm)]).flatten(1).all(1)
     whole = whole & (poses.weight[:, list(arm)].amin(1) > 0)
     lengths = torch.tensor(poses.lengths)
@@ -219,7 +219,7 @@ def _states(
     matrix: Tensor,
     order: RotationOrder,
 ) -> Float[Tensor, "n 21"]:
-    """States of poses that are centred on their neck, whose place is the camera's translation."""
+    """Return states of poses centred on their neck, whose position goes into the camera's translation."""
     neck = joints[:, _NECK]
     rotation = euler_to_matrix(views.angles, order)
     place = views.translation + (rotation @ neck[..., None])[..., 0]

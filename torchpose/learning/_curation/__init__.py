@@ -1,4 +1,4 @@
-"""Recordings made ready for a prior: what is wrong in them found, left out and said; persons kept apart."""
+"""Prepare recordings for a fit: find errors, leave them out, report them, and split recordings by person."""
 
 from torchpose._core.facade import set_up_facade
 from torchpose.learning._curation.bones import (

@@ -1,4 +1,4 @@
-"""Bones of recorded persons: wrong lengths, mean lengths, mirrored and turned bodies."""
+"""Measure the bones of recorded persons, find wrong ones, and scale, mirror or turn bodies."""
 
 import math
 from collections.abc import Sequence
@@ -56,7 +56,7 @@ class WrongJoints(NamedTuple):
 
 
 def bone_lengths(joints: Float[Tensor, "... 8 3"]) -> Float[Tensor, "... 7"]:
-    """Lengths of `BONES`, NaN where an end is missing.
+    """Return the lengths of `BONES`, NaN where an end is missing.
 
     >>> bone_lengths(torch.zeros(2, 8, 3)).shape
     torch.Size([2, 7])
@@ -66,7 +66,7 @@ def bone_lengths(joints: Float[Tensor, "... 8 3"]) -> Float[Tensor, "... 7"]:
 
 
 def person_bones(recordings: Sequence[Recording]) -> dict[tuple[str, str | None], PersonBones]:
-    """Usual bones of each person, by `person_id` and kind of neck.
+    """Return the usual bones of each person, by `person_id` and kind of neck.
 
     The median over all frames, and 1.4826 times the median distance of the logarithms from it.
     """
@@ -82,7 +82,7 @@ def find_wrong_joints(
     usual: PersonBones,
     ratios: tuple[float, ...] = BONE_RATIOS,
 ) -> WrongJoints:
-    """Joints at the ends of bones of a wrong length l: |log l - log L| > max(log r, 6 s).
+    """Find joints at the ends of bones of a wrong length l: |log l - log L| > max(log r, 6 s).
 
     Of a wrong bone, that end is to blame at which the larger share of bones is wrong, else the more
     of them, else the farther one. A frame in which more than half of the measured bones are wrong
@@ -112,7 +112,7 @@ def find_wrong_joints(
 
 
 def human_size(usual: PersonBones, shoulders: float | None) -> str:
-    """What about these bones is no person's, in words; empty if nothing is.
+    """Return in words which bones are not of human size; an empty text if all are.
 
     Args:
         usual: of the person. shoulders: median width in metres, None if unknown.
@@ -146,7 +146,7 @@ def _places(bones: Bool[Tensor, "T 7"], ends: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def harmonise_bones(recordings: Sequence[Recording]) -> list[Recording]:
-    """Give everybody the bones of the mean person; directions stay.
+    """Give every person the bones of the mean person and keep the directions.
 
     Each of a person's bones is scaled by (mean over persons of median lengths) / (that person's
     median length). Bones that a person lacks stay out of the mean, and keep their length. Joints
@@ -174,7 +174,7 @@ _FLIP = (-1.0, 1.0, 1.0)
 
 
 def mirrored(recording: Recording) -> Recording:
-    """The recording in a mirror at x = 0: left joints become right ones.
+    """Mirror a recording at x = 0, so that left joints become right ones.
 
     It is of the same person, so that splits keep both together. Joints whose counterpart is not in
     the joint set become missing.
@@ -206,7 +206,7 @@ _NECK, _LEFT, _RIGHT = 4, 2, 5  # in UPPER_BODY
 def torso_rotation(
     across: Float[Tensor, "... 3"], up: Float[Tensor, "... 3"] | None = None
 ) -> Float[Tensor, "... 3 3"]:
-    """The rotation after which a torso faces the camera: R with rows x, y, z.
+    """Return the rotation after which a torso faces the camera: R with rows x, y, z.
 
         x = a / |a|,  y = -(u - (u . x) x) / |...|,  z = x × y
 
@@ -278,7 +278,7 @@ def _up(recording: Recording, neck: Tensor) -> Tensor | None:
 
 
 def _columns(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
-    """Columns of joints, empty unless all are there."""
+    """Return the columns of joints, an empty list unless all are there."""
     canonical = canonical_names(names)
     found = [canonical.index(name) for name in wanted if name in canonical]
     return found if len(found) == len(wanted) else []

@@ -1,4 +1,4 @@
-"""Recordings made ready for a prior: everything that curation does, in order."""
+"""Curate recordings: apply all checks and changes in order, and report them."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -44,7 +44,7 @@ _LEFT, _RIGHT = UPPER_BODY.index("shoulder_left"), UPPER_BODY.index("shoulder_ri
 
 
 class CurationSettings(NamedTuple):
-    """What `curate` does.
+    """Settings of `curate`.
 
     Attributes:
         jump_speeds: bounds in m/s of the eight joints (`find_jumps`); None leaves jumps in.
@@ -74,14 +74,14 @@ DEFAULTS = CurationSettings()
 
 
 class Curated(NamedTuple):
-    """Recordings that are left, and what happened to the others."""
+    """Recordings that are left, and a report on what was left out."""
 
     recordings: list[Recording]
     report: CurationReport
 
 
 def curate(recordings: Sequence[Recording], settings: CurationSettings = DEFAULTS) -> Curated:
-    """Leave out of recordings what would spoil a prior, and say what that was.
+    """Leave out of recordings what would spoil a prior, and report it.
 
     In this order: kinds that cannot be mixed and infinite values are refused; other people in a file
     and recordings that are there twice are dropped; joints that jump, joints at the end of bones of a
@@ -259,7 +259,7 @@ def _without(recording: Recording, wrong: Tensor, reason: str, drops: list[Drop]
 
 
 def _usable_frames(recording: Recording) -> int:
-    """Frames in which an arm is whole; joints that the joint set lacks do not count."""
+    """Count the frames in which an arm is complete; joints that the joint set lacks do not count."""
     there = measured(recording.upper_body().joints)
     there = there | ~there.any(0)
     whole = there[:, LEFT_ARM].all(1) | there[:, RIGHT_ARM].all(1)
@@ -306,7 +306,7 @@ def _notes(recordings: Sequence[Recording], settings: CurationSettings) -> tuple
 
 
 def _same_names(recordings: Sequence[Recording]) -> list[str]:
-    """Folders of one name that stand for one person, though they are several."""
+    """Return notes on folders of one name, which count as one person though they are several."""
     folders: dict[str, set[Any]] = {}
     for r in recordings:
         if r.path is not None and not r.person and not r.source:

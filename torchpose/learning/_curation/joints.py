@@ -1,4 +1,4 @@
-"""The eight joints of a recording, and the frames in which they jump."""
+"""Read and change the eight joints of a recording, and find the frames in which they jump."""
 
 from dataclasses import replace
 
@@ -23,17 +23,17 @@ __all__ = [
 
 
 def label(recording: Recording) -> str:
-    """The file of a recording, for people."""
+    """Return the file of a recording, for messages."""
     return str(recording.path) if recording.path is not None else "a recording without a file"
 
 
 def measured(joints: Float[Tensor, "... J 3"]) -> Bool[Tensor, "... J"]:
-    """Which joints are there."""
+    """Return which joints were measured."""
     return torch.isfinite(joints).all(-1)
 
 
 def runs(there: Bool[Tensor, " T"], least: int) -> list[slice]:
-    """The stretches of at least so many frames in which something is there."""
+    """Return the runs of at least `least` consecutive true frames."""
     edge = there.new_zeros(1)
     steps = torch.cat([edge, there, edge]).long().diff()
     starts, ends = (torch.nonzero(steps == sign).flatten().tolist() for sign in (1, -1))
@@ -41,7 +41,7 @@ def runs(there: Bool[Tensor, " T"], least: int) -> list[slice]:
 
 
 def with_upper_joints(recording: Recording, joints: Float[Tensor, "T 8 3"]) -> Recording:
-    """The recording with other places of its eight joints; joints that it has none of stay out.
+    """Return the recording with its eight joints replaced; joints that it lacks are ignored.
 
     Raises:
         ShapeError: another number of frames or joints.
@@ -54,7 +54,7 @@ def with_upper_joints(recording: Recording, joints: Float[Tensor, "T 8 3"]) -> R
 
 
 def with_missing(recording: Recording, missing: Bool[Tensor, "T 8"]) -> Recording:
-    """The recording without some of its eight joints in some frames: NaN, and a weight of zero."""
+    """Return the recording with some of its eight joints set to NaN and weight zero."""
     check_shape("missing", missing, [len(recording), len(UPPER_BODY)])
     if not bool(missing.any()):
         return recording
@@ -92,7 +92,7 @@ def find_jumps(
     speeds: tuple[float, ...] = JUMP_SPEEDS,
     spike_speed: float = SPIKE_SPEED,
 ) -> Bool[Tensor, "T J"]:
-    """Frames in which a joint is somewhere else than just before and after.
+    """Find frames in which a joint is elsewhere than in the frames just before and after.
 
     1. Spikes: up to 0.1 s between two steps that are both faster than `spike_speed` (and longer than
        10 cm) and that lead back to within half of the shorter one. No arm turns round so quickly.
@@ -136,7 +136,7 @@ def find_jumps(
 
 
 def _spikes(joints: Tensor, reach: float, longest: int) -> Tensor:
-    """Frames between two long steps that lead back to where the first began [T, J]."""
+    """Find frames [T, J] between two long steps that lead back to where the first began."""
     wrong = torch.zeros(joints.shape[:2], dtype=torch.bool)
     step = (joints[1:] - joints[:-1]).norm(dim=-1)
     for length in range(1, min(longest, len(joints) - 2) + 1):
@@ -150,7 +150,7 @@ def _spikes(joints: Tensor, reach: float, longest: int) -> Tensor:
 
 
 def _between_jumps(joints: Tensor, fast: Tensor, reach: Tensor, longest: int) -> Tensor:
-    """Frames of short pieces between jumps that are away from their surroundings [T, J]."""
+    """Find frames [T, J] of short pieces between jumps that are far from their surroundings."""
     n_joints = joints.shape[1]
     # number the pieces of all joints together, to count their frames
     piece = fast.long().cumsum(0) + len(joints) * torch.arange(n_joints)
@@ -160,7 +160,7 @@ def _between_jumps(joints: Tensor, fast: Tensor, reach: Tensor, longest: int) ->
 
 
 def _fast_steps(joints: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-    """Which measured joints were reached too fast [T, J], and from which frame."""
+    """Find measured joints [T, J] that were reached too fast, and the frames they came from."""
     there = measured(joints)
     frame = torch.arange(len(joints))[:, None]
     last = torch.where(there, frame, -1).cummax(0).values
@@ -171,7 +171,7 @@ def _fast_steps(joints: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _running_median(joints: Tensor, reach: int) -> Tensor:
-    """Median of each coordinate over up to `reach` frames to both sides, missing ones left out."""
+    """Return the median of each coordinate over `reach` frames to both sides, without missing ones."""
     border = joints.new_full((reach, *joints.shape[1:]), torch.nan)
     windows = torch.cat([border, joints, border]).unfold(0, 2 * reach + 1, 1)
     return windows.nanmedian(-1).values

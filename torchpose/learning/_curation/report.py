@@ -1,4 +1,4 @@
-"""What curation dropped and changed, for people and for model cards."""
+"""Report what curation left out and changed, for the command line and for model cards."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -12,7 +12,7 @@ _SHOWN_NOTES = 20
 
 
 class Drop(NamedTuple):
-    """Something that was left out.
+    """Frames of one recording that were left out for one reason.
 
     Attributes:
         reason: ``jump``, ``bone length``, ``no body``, ``no person's size``, ``companion``,
@@ -31,7 +31,7 @@ class Drop(NamedTuple):
     why: str = ""
 
     def text(self) -> str:
-        """One line for people."""
+        """Return one line for the command line."""
         joint = f"{self.joint} in " if self.joint else ""
         why = f" ({self.why})" if self.why else ""
         return (
@@ -41,7 +41,7 @@ class Drop(NamedTuple):
 
 
 class Size(NamedTuple):
-    """How much there is: persons, recordings, frames, and measured joints among the eight."""
+    """Number of persons, recordings and frames, and of measured joints among the eight."""
 
     persons: int
     recordings: int
@@ -49,7 +49,7 @@ class Size(NamedTuple):
     joints: int
 
     def text(self) -> str:
-        """For people."""
+        """Return the counts in words."""
         return (
             f"{_several(self.recordings, 'recording')} of {_several(self.persons, 'person')}, "
             f"{_several(self.frames, 'frame')}, {_several(self.joints, 'joint')}"
@@ -57,7 +57,7 @@ class Size(NamedTuple):
 
 
 class CurationReport(NamedTuple):
-    """What came, what was left out and why, what is left.
+    """Counts before and after curation, and what was left out.
 
     Attributes:
         before, after: counts. drops: one per file, joint and reason. notes: what reading assumed and
@@ -72,7 +72,7 @@ class CurationReport(NamedTuple):
     settings: dict[str, Any]
 
     def text(self, most: int = 20) -> str:
-        """A few lines for people: totals, then the largest drops, at most this many."""
+        """Return a few lines for the command line: totals, then the largest drops."""
         lines = [f"read     {self.before.text()}", f"kept     {self.after.text()}"]
         lines += [f"dropped  {n} {what}: {reason}" for reason, (n, what) in self.totals().items()]
         largest = sorted(self.drops, key=lambda drop: -drop.n_frames)[:most]
@@ -82,14 +82,14 @@ class CurationReport(NamedTuple):
         return "\n".join([*lines, *(f"note     {note}" for note in self.notes[:_SHOWN_NOTES])])
 
     def totals(self) -> dict[str, tuple[int, str]]:
-        """By reason: how many, and of what (joints or frames)."""
+        """Count what was left out by reason, with its unit (joints or frames)."""
         counts: Counter[tuple[str, str]] = Counter()
         for drop in self.drops:
             counts[drop.reason, "joints" if drop.joint else "frames"] += drop.n_frames
         return {reason: (n, what) for (reason, what), n in sorted(counts.items())}
 
     def facts(self, most: int = 100) -> dict[str, Any]:
-        """The same for a model card: plain values that JSON can hold, the largest drops."""
+        """Return the report as plain values for JSON, with the largest drops."""
         largest = sorted(self.drops, key=lambda drop: -drop.n_frames)[:most]
         return {
             "before": self.before._asdict(),
@@ -103,10 +103,10 @@ class CurationReport(NamedTuple):
         }
 
     def for_prior(self) -> dict[str, Any]:
-        """What the file of a prior says: counts, reasons and notes, without single drops."""
-        told = ("before", "after", "dropped", "by_person", "notes")
+        """Return what the file of a prior says: counts, reasons and notes, without single drops."""
+        shown = ("before", "after", "dropped", "by_person", "notes")
         facts = self.facts()
-        return {"curation": {name: facts[name] for name in told}}
+        return {"curation": {name: facts[name] for name in shown}}
 
     def _by_person(self) -> dict[str, dict[str, int]]:
         found: dict[str, dict[str, int]] = {}
@@ -125,7 +125,7 @@ def drop_frames(
     first: int,
     why: str = "",
 ) -> Drop:
-    """A `Drop` of these frames, counted from 0; `first` is the number of the first in the file."""
+    """Return a `Drop` of these frames, counted from 0; `first` is the number of the first in the file."""
     listed = list(frames)
     return Drop(reason, file, person, joint, frame_ranges(listed, first), len(listed), why)
 

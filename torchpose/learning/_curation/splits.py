@@ -43,7 +43,7 @@ class Duplicate(NamedTuple):
 
 
 def find_duplicates(recordings: Sequence[Recording], shared: float = _SHARED) -> list[Duplicate]:
-    """Pairs of recordings that have at least this share of the shorter one's frames in common.
+    """Find pairs of recordings that share at least this part of the shorter one's frames.
 
     A frame is its eight joints relative to the neck, rounded to 2 cm, as a hash of 64 bits; so copies
     are found that were moved, cut, renamed, or written in whole millimetres. A copy that was turned,
@@ -110,7 +110,7 @@ def refuse_shared_between_persons(
 
 
 def describe_duplicate(found: Duplicate, recordings: Sequence[Recording]) -> str:
-    """Which recording is in which other one, for people."""
+    """Say which recording is contained in which other one."""
     first, second = recordings[found.first], recordings[found.second]
     return (
         f"{100 * found.shared:.0f} % of the frames of {label(second)} (person {second.person_id}) "
@@ -119,7 +119,7 @@ def describe_duplicate(found: Duplicate, recordings: Sequence[Recording]) -> str
 
 
 def _frame_keys(joints: Float[Tensor, "T 8 3"]) -> Int[Tensor, " N"]:
-    """A hash of each frame that has a joint."""
+    """Return a hash of each frame that has a joint."""
     joints = joints[measured(joints).any(1)].double()
     neck = joints[:, _NECK : _NECK + 1]
     joints = joints - torch.where(torch.isfinite(neck), neck, 0.0)
@@ -131,7 +131,7 @@ def _frame_keys(joints: Float[Tensor, "T 8 3"]) -> Int[Tensor, " N"]:
 
 
 class PersonSplit(NamedTuple):
-    """Recordings to train on, recordings of other persons to test on, and who those are."""
+    """Recordings to train on, recordings of other persons to test on, and the test persons."""
 
     train: list[Recording]
     test: list[Recording]
@@ -139,12 +139,12 @@ class PersonSplit(NamedTuple):
 
 
 def persons_of(recordings: Iterable[Recording]) -> list[str]:
-    """The persons (`Recording.person_id`) in order, each once; companions are none of them."""
+    """Return the persons (`Recording.person_id`) in order, each once, without companions."""
     return sorted({r.person_id for r in recordings if not r.companion})
 
 
 def pick_persons(names: Iterable[str], known: Sequence[str]) -> set[str]:
-    """Ids of the persons that are meant by names, which may leave out their origin.
+    """Return the ids of the named persons; a name may leave out its origin.
 
     Where a folder stands for a person, its name is the person's.
 
@@ -171,7 +171,7 @@ def pick_persons(names: Iterable[str], known: Sequence[str]) -> set[str]:
 
 
 def split_persons(recordings: Sequence[Recording], test_persons: Iterable[str]) -> PersonSplit:
-    """Recordings of some persons to test on, those of all others to train on.
+    """Split recordings into those of some persons for the test and those of all others for training.
 
     Other people in a file of a test person are on neither side, because nobody says who they are.
 
@@ -206,7 +206,7 @@ def _split(recordings: Sequence[Recording], wanted: list[str]) -> PersonSplit:
 
 
 def leave_one_person_out(recordings: Sequence[Recording]) -> Iterator[PersonSplit]:
-    """One split per person, in the order of their ids: that person to test, all others to train.
+    """Return one split per person, in the order of their ids, with that person as the test.
 
     Raises:
         InputError: fewer than two persons. OverlapError: as `split_persons`.
@@ -245,7 +245,7 @@ _SHOWN_FILES = 3
 
 
 def check_kinds(recordings: Sequence[Recording]) -> None:
-    """Raise unless all recordings mean the same by hand and head, as `collect_poses` will want.
+    """Raise unless all recordings have the same kind of hand and of head, as `collect_poses` needs.
 
     Necks are no matter: they are converted there.
 
@@ -260,7 +260,7 @@ def check_kinds(recordings: Sequence[Recording]) -> None:
 
 
 def skeleton_counts(recordings: Sequence[Recording]) -> dict[str, int]:
-    """How many recordings there are of each joint set; those of no known set under ``other``."""
+    """Count the recordings of each joint set; those of no known set under ``other``."""
     names = sorted(r.skeleton or "other" for r in recordings)
     return {name: names.count(name) for name in dict.fromkeys(names)}
 

@@ -1,16 +1,16 @@
-"""Fine-tuning of a prior through its filters, by gradients of log-evidence and of the 3D error.
+"""Fine-tune a prior through its filters, by gradients of log-evidence and of the 3D error.
 
-Expectation-maximisation makes a mixture a good density of poses, and Q and R are set by hand. Here
-they are moved to where the filter that uses them does best. Every parameter is free of constraints
-(logarithms, logits, triangular factors with the logarithm of their diagonal), so whatever step an
-optimiser takes, covariances stay positive definite and weights positive.
+Expectation-maximisation fits a mixture to poses, and Q and R are set by hand. Here both are tuned for
+the filter that uses them. Every parameter is free of constraints (logarithms, logits, triangular factors
+with the logarithm of their diagonal), so covariances stay positive definite and weights positive after any
+step of an optimiser.
 
 `TunableKalman` tunes the filter over single poses on short sequences (`draw_sequences`),
 `TunableWindow` the mixtures over windows on single windows (`draw_windows`). Both have
 
     loss(batch) -> Tensor      what is made small: mean 3D error and log-evidence, weighted
     error(batch) -> Tensor     mean 3D error in metres after Procrustes, to stop early by
-    prior() -> UpperBodyPrior  with what is tuned so far
+    prior() -> UpperBodyPrior  at the current parameters
 """
 
 from torchpose._core.facade import set_up_facade

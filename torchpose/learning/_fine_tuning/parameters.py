@@ -1,4 +1,4 @@
-"""Free parameters of mixtures and noise, and the error that they are tuned by."""
+"""Parametrise mixtures and noise without constraints, and measure the error that they are tuned by."""
 
 from dataclasses import replace
 from typing import Any, cast
@@ -36,13 +36,13 @@ _SMOOTH = 1e-3  # metres: distances below it count as squares, so that they have
 
 
 class TunableMixture(nn.Module):
-    """A Gaussian mixture near another one, by steps in the axes of each component.
+    """A Gaussian mixture with free parameters, as steps from a given one along each component's axes.
 
     pi_k prop. to pi0_k exp(a_k),   mu_k = mu0_k + L0_k b_k,   Sigma_k = (L0_k T_k) (L0_k T_k)^T,
 
     where T_k is lower triangular with the diagonal exp(t_k) and Sigma0_k = L0_k L0_k^T. All
-    parameters are zero at the start, one is a change by about a standard deviation, and any values
-    give a mixture.
+    parameters are zero at the start. A change by one is about a standard deviation. Any values give a
+    mixture.
 
     Args:
         start: the mixture to start from.
@@ -67,19 +67,19 @@ class TunableMixture(nn.Module):
         return self.shapes.tril(-1) + torch.diag_embed(diagonal)
 
     def forward(self) -> MixtureParameters:
-        """Weights, means and covariances, with their graph."""
+        """Return weights, means and covariances, with their graph."""
         weights = (self.start_log_weights + self.log_weights).softmax(0)
         means = self.start_means + (self.start_factor @ self.steps[..., None])[..., 0]
         factor = self.start_factor @ self._shape()
         return MixtureParameters(weights, means, factor @ factor.mT)
 
     def mixture(self) -> GaussianMixture:
-        """What is tuned so far, without a graph."""
+        """Return the mixture at its current parameters, without a graph."""
         weights, means, covariances = (value.detach() for value in self())
         return GaussianMixture(weights, means, (covariances + covariances.mT) / 2)
 
     def departure(self) -> Float[Tensor, ""]:
-        """How far it has gone: the divergence KL(tuned, start), bounded by that of the components.
+        """Return an upper bound of the divergence KL(tuned, start), that of the components.
 
         sum_k pi_k (log pi_k / pi0_k + (|T_k|^2 + |b_k|^2 - D) / 2 - sum log diag T_k)
         """
@@ -91,7 +91,7 @@ class TunableMixture(nn.Module):
 
 
 def departure_of(mixtures: nn.ModuleDict) -> Float[Tensor, ""]:
-    """Sum over both arms, zero where mixtures are not tuned."""
+    """Return the sum of the departures of both arms, zero where mixtures are not tuned."""
     parts = [module.departure() for module in mixtures.values()]  # type: ignore[operator]
     return torch.stack(parts).sum() if parts else torch.zeros((), dtype=torch.float64)
 
@@ -99,7 +99,7 @@ def departure_of(mixtures: nn.ModuleDict) -> Float[Tensor, ""]:
 def tuned_mixtures(
     mixtures: nn.ModuleDict, start: UpperBodyPrior | WindowPrior
 ) -> tuple[GaussianMixture, GaussianMixture]:
-    """Mixtures of the left and right arm: what is tuned so far, or those of the start."""
+    """Return the mixtures of the left and right arm, those of the start where they are not tuned."""
     found = [
         cast(TunableMixture, mixtures[side]).mixture() if side in mixtures else getattr(start, side)
         for side in ARMS
@@ -108,7 +108,7 @@ def tuned_mixtures(
 
 
 class Positive(nn.Module):
-    """Positive numbers near others: start exp(parameter)."""
+    """Positive numbers with a free parameter each: start exp(parameter)."""
 
     def __init__(self, start: Tensor) -> None:
         super().__init__()
@@ -122,7 +122,7 @@ class Positive(nn.Module):
 
 
 class Fraction(nn.Module):
-    """Numbers in (0, 1) near others, by their logits."""
+    """Numbers in (0, 1) with a logit each as free parameter."""
 
     def __init__(self, start: Tensor) -> None:
         super().__init__()
@@ -133,7 +133,7 @@ class Fraction(nn.Module):
 
 
 def parameter_groups(model: nn.Module, learning_rate: float) -> list[dict[str, Any]]:
-    """Parameters for an optimiser: mixtures take steps of a twenty-fifth of those of the noise.
+    """Return parameters for an optimiser; mixtures have a twenty-fifth of the noise's learning rate.
 
     Args:
         model: `TunableKalman` or `TunableWindow`. learning_rate: of the noise, such as 0.1.
@@ -150,7 +150,7 @@ def parameter_groups(model: nn.Module, learning_rate: float) -> list[dict[str, A
 def pose_error(
     estimate: Float[Tensor, "*batch 8 3"], truth: Float[Tensor, "*batch 8 3"]
 ) -> Float[Tensor, "*batch 8"]:
-    """Distances after fixed-scale Procrustes on head, neck and shoulders (BL section 6), metres.
+    """Return distances after fixed-scale Procrustes on head, neck and shoulders (BL section 6), metres.
 
     The motion itself is taken as given by the gradient, since what it does to the joints that it is
     made of is little beside the arms; distances below a millimetre count as squares.
@@ -165,7 +165,7 @@ def pose_error(
 def arm_in_body_axes(
     state: Float[Tensor, "*batch D"], matrix: Tensor, order: str
 ) -> Float[Tensor, "*batch 5 3"]:
-    """Joints of an arm in the axes of the body (BL 5)."""
+    """Return the joints of an arm in the axes of the body (BL 5)."""
     rotation = euler_to_matrix(state[..., 15:18], order)  # type: ignore[arg-type]
     joints = state[..., :15].unflatten(-1, (5, 3))
     return lift(joints, matrix.to(state), rotation, state[..., 18:21])

@@ -1,4 +1,4 @@
-"""The filter over single poses, tuned on short sequences: Q, R, gamma and the mixtures."""
+"""Tune the filter over single poses on short sequences: Q, R, gamma and the mixtures."""
 
 import math
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ _ROWS = [ARM_JOINTS.index(joint) for joint in MEASURED]
 
 
 class SequenceBatch(NamedTuple):
-    """Sequences from viewpoints of their own; NaN past the end of each.
+    """Sequences from one random viewpoint each; NaN past the end of each.
 
     Attributes:
         keypoints: head, neck and hands of the eight joints, noisy, the prior's pixels.
@@ -51,7 +51,7 @@ class SequenceBatch(NamedTuple):
 
     @property
     def inside(self) -> Bool[Tensor, "B T"]:
-        """True up to the length of each sequence."""
+        """Return True up to the length of each sequence."""
         frames = torch.arange(self.poses.shape[1], device=self.lengths.device)
         return frames < self.lengths[:, None]
 
@@ -68,7 +68,7 @@ def draw_sequences(
     body_size: float = 0.0,
     bone_lengths: float = 0.0,
 ) -> SequenceBatch:
-    """Pieces of recorded sequences, each as often as its length, from random viewpoints.
+    """Draw pieces of recorded sequences in proportion to their length, from random viewpoints.
 
     Args:
         sequences: complete poses, centred as the prior's are, body axes, metres.
@@ -157,7 +157,7 @@ class TunableKalman(nn.Module):
         )
 
     def forward(self, batch: SequenceBatch) -> tuple[Float[Tensor, "B T 8 3"], Tensor]:
-        """Joints in the body's axes, and the log-evidence of both arms, mean over frames."""
+        """Return joints in the body's axes, and the log-evidence of both arms, mean over frames."""
         info = self._prior[0].info
         arms, evidence = {}, torch.zeros((), dtype=torch.float64)
         for side, arm in ARMS.items():
@@ -170,7 +170,7 @@ class TunableKalman(nn.Module):
         return join_arms(arms["left"], arms["right"]), evidence / batch.lengths.sum()
 
     def loss(self, batch: SequenceBatch) -> Float[Tensor, ""]:
-        """Weighted sum of 3D error, negative log-evidence and departure from the start."""
+        """Return the weighted sum of 3D error, negative log-evidence and departure from the start."""
         error, evidence, departure = self.weights_of_loss
         joints, log_evidence = self(batch)
         total = -evidence * log_evidence
@@ -179,11 +179,11 @@ class TunableKalman(nn.Module):
 
     @torch.no_grad()
     def error(self, batch: SequenceBatch) -> Float[Tensor, ""]:
-        """Mean 3D error after Procrustes, metres."""
+        """Return the mean 3D error after Procrustes, metres."""
         return _mean_error(self(batch)[0], batch.poses, batch.inside)
 
     def prior(self) -> UpperBodyPrior:
-        """The prior with what is tuned so far."""
+        """Return the prior at the current parameters."""
         start = self._prior[0]
         noise = {name: value.clone() for name, value in start.noise.items()}
         for side in ARMS:

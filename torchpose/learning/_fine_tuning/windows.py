@@ -1,4 +1,4 @@
-"""Mixtures over windows, tuned on single windows through the closed form of their filter."""
+"""Tune mixtures over windows on single windows, through the closed form of their filter."""
 
 import math
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ __all__ = ["TunableWindow", "WindowBatch", "draw_windows"]
 
 
 class WindowBatch(NamedTuple):
-    """Windows of both arms: the same bodies from the same viewpoints.
+    """Windows of both arms, of the same bodies from the same viewpoints.
 
     Attributes:
         states: true window states by side, [N, D]. hands: which hands of the window lie inside the
@@ -48,11 +48,11 @@ class WindowBatch(NamedTuple):
 def draw_windows(
     sources: Mapping[str, WindowSource], index: int, epoch: int = 0, n: int | None = None
 ) -> WindowBatch:
-    """The windows of a block, with those of their hands known that a tracker would have seen.
+    """Draw the windows of a block, with those of their hands known that a tracker would have seen.
 
     Args:
         sources: of the left and right arm, from the same seed. index, epoch: of the block.
-        n: only every so many of them that about n remain; all if None.
+        n: number of windows to take, about, evenly spread; all if None.
 
     Raises:
         InputError: sources of different windows.
@@ -122,22 +122,22 @@ class TunableWindow(nn.Module):
         return getattr(self._prior[0].windows[self.name], side).parameters_tuple()
 
     def _measured(self) -> list[int]:
-        """Dimensions of a state that are measured: hand, head and neck, and the window's hands."""
+        """Return the measured dimensions of a state: hand, head and neck, and the window's hands."""
         return [*pixel_indices(MEASURED), *self.layout.hands]
 
     def _wanted(self) -> list[int]:
-        """Dimensions of a state that the pose is read from."""
+        """Return the dimensions of a state that the pose is read from."""
         return list(self.layout.in_torso or range(STATE_DIM))
 
     def _noise(self) -> Float[Tensor, " Z"]:
-        """Variances of all measured pixels: of this frame, then of the window's hands."""
+        """Return the variances of all measured pixels: of this frame, then of the window's hands."""
         hand = self.measured_cov[:1] + self.hand_variance()
         return torch.cat([self.measured_cov, hand.expand(2 * self.layout.n_hands)])
 
     def _condition(
         self, side: str, z: Float[Tensor, "N Z"], known: Bool[Tensor, "N Z"]
     ) -> tuple[list[Tensor], list[tuple[Tensor, Tensor, Tensor]]]:
-        """Rows that measure the same, each with log weights, means and covariances of what is wanted."""
+        """Return groups of rows with the same measured dimensions, and the posterior mixture of each."""
         weights, means, covariances = self._parameters_of(side)
         columns, wanted = torch.tensor(self._measured()), torch.tensor(self._wanted())
         noise, rows, found = self._noise(), [], []
@@ -164,7 +164,7 @@ class TunableWindow(nn.Module):
     def forward(
         self, batch: WindowBatch, generator: torch.Generator | None = None
     ) -> tuple[Float[Tensor, "N 8 3"], Float[Tensor, ""]]:
-        """Joints in the body's axes, and log p(arm | measured) of both arms, mean over windows.
+        """Return joints in the body's axes, and log p(arm | measured) of both arms, mean over windows.
 
         Args:
             batch: windows. generator: of the noise that is added to their pixels.
@@ -197,7 +197,7 @@ class TunableWindow(nn.Module):
     def loss(
         self, batch: WindowBatch, generator: torch.Generator | None = None
     ) -> Float[Tensor, ""]:
-        """Weighted sum of 3D error, negative log density and departure from the start."""
+        """Return the weighted sum of 3D error, negative log density and departure from the start."""
         error, evidence, departure = self.weights_of_loss
         joints, density = self(batch, generator)
         total = 10 * error * pose_error(joints, self._truth(batch)).mean() - evidence * density
@@ -207,7 +207,7 @@ class TunableWindow(nn.Module):
     def error(
         self, batch: WindowBatch, generator: torch.Generator | None = None
     ) -> Float[Tensor, ""]:
-        """Mean 3D error after Procrustes, metres."""
+        """Return the mean 3D error after Procrustes, metres."""
         return pose_error(self(batch, generator)[0], self._truth(batch)).mean()
 
     def _truth(self, batch: WindowBatch) -> Float[Tensor, "N 8 3"]:
@@ -218,7 +218,7 @@ class TunableWindow(nn.Module):
         return join_arms(*(arm[None] for arm in arms))[0]
 
     def window(self) -> WindowPrior:
-        """The window with what is tuned so far."""
+        """Return the window at the current parameters."""
         window = self._prior[0].windows[self.name]
         left, right = tuned_mixtures(self.mixtures, window)
         settings = window.settings | {
@@ -228,7 +228,7 @@ class TunableWindow(nn.Module):
         return WindowPrior(left, right, window.layout, settings)
 
     def prior(self) -> UpperBodyPrior:
-        """The prior with what is tuned so far."""
+        """Return the prior at the current parameters."""
         start = self._prior[0]
         info = tuned_info(start, f"window {self.name}")
         windows = dict(start.windows) | {self.name: self.window()}
@@ -236,7 +236,7 @@ class TunableWindow(nn.Module):
 
 
 def _log_det(factor: Float[Tensor, "K Z Z"]) -> Float[Tensor, " K"]:
-    """Half of the log determinant, and the constant of the density."""
+    """Return half of the log determinant plus the constant of the density."""
     n = factor.shape[-1]
     return factor.diagonal(dim1=-2, dim2=-1).log().sum(-1) + 0.5 * n * math.log(2 * math.pi)
 
@@ -247,7 +247,7 @@ def _log_density(
     covariances: Float[Tensor, "K D D"],
     x: Float[Tensor, "N D"],
 ) -> Float[Tensor, " N"]:
-    """log sum_j w_j N(x; m_j, C_j)."""
+    """Return log sum_j w_j N(x; m_j, C_j)."""
     ridge = 1e-9 * covariances.diagonal(dim1=-2, dim2=-1)
     factor = torch.linalg.cholesky(covariances + torch.diag_embed(ridge))
     white = torch.linalg.solve_triangular(factor, (x - means).mT, upper=False)

@@ -1,4 +1,4 @@
-"""How priors are made: every setting of a fit in one place, and the steps from recordings to a file."""
+"""Make priors from recordings: settings of each fit, and the steps from recordings to a file."""
 
 from torchpose._core.facade import set_up_facade
 from torchpose.learning._recipes.actions import ActionRecipe, Performances, fit_actions

@@ -1,6 +1,6 @@
-"""Fit of action spaces, or of a bank of several actions, to recordings of whole bodies.
+"""Fit action spaces, or a bank of several actions, to recordings of whole bodies.
 
-The fit is in closed form. The gate is then tried on persons who were held out.
+The fit is in closed form. The gate is then tested on held-out persons.
 """
 
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ from torchpose.priors._actions.space import ActionSpace
 __all__ = ["COMMON_HEIGHT", "ActionRecipe", "FittedActions", "Performances", "fit_actions"]
 
 COMMON_HEIGHT = 1.75
-"""Metres, of the body on which everybody's postures are told."""
+"""Height in metres of the body that everybody's postures are transferred to."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class ActionRecipe:
 
 @dataclass(frozen=True)
 class Performances:
-    """Performances of one action or several, and those of persons who are held out.
+    """Performances of one action or several, and those of held-out persons.
 
     Attributes:
         actions: in the order asked for. fps: of the postures. postures: "joints" or "body".
@@ -103,7 +103,7 @@ class Performances:
         repeated: bool = True,
         postures: Literal["joints", "body"] = "joints",
     ) -> Self:
-        """Read, turn joints into postures, and cut recordings into performances.
+        """Read recordings, turn joints into postures, and cut recordings into performances.
 
         Args:
             paths, persons, without, axes: see `choose_recordings`.
@@ -124,8 +124,8 @@ class Performances:
             paths, persons=persons, held_out=held_out, actions=actions, without=without, axes=axes
         )
         recordings = [*chosen.train, *chosen.watched]
-        told = _told(recordings, [recorded_joints(r, fps) for r in recordings], postures)
-        found, left_out = _performed(recordings, told, actions, fps, repeated, len(chosen.train))
+        angles = _postures(recordings, [recorded_joints(r, fps) for r in recordings], postures)
+        found, left_out = _performed(recordings, angles, actions, fps, repeated, len(chosen.train))
         out = {r.person_id for r in chosen.watched}
         train = [p for p in found if p.person not in out]
         for action in actions:
@@ -140,7 +140,7 @@ class Performances:
         )  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
-        """What makes a fit to them the same one."""
+        """Return settings and a digest of the recordings, equal for equal fits."""
         return {
             "fps": self.fps, "actions": list(self.actions), "repeated": self.repeated,
             "held out": sorted({p.person for p in self.watched}), "postures": self.postures,
@@ -148,7 +148,7 @@ class Performances:
         }  # fmt: skip
 
     def facts(self, action: str) -> ActionInfo:
-        """What is known of an action before it is fitted."""
+        """Return what is known of an action before it is fitted."""
         learnt = {p.person for p in self.train if p.action == action}
         mine = [r for r in self.recordings if r.action == action and r.person_id in learnt]
         return ActionInfo(
@@ -162,7 +162,7 @@ class Performances:
 
 @dataclass(frozen=True)
 class FittedActions:
-    """Action spaces by name, with the performances in step, and how their gates did.
+    """Action spaces by name, with the synchronised performances, and how many postures their gates accept.
 
     Attributes:
         spaces: by action. accepted: share of the held-out postures that pass the gate when j is drawn
@@ -175,7 +175,7 @@ class FittedActions:
     recipe: ActionRecipe
 
     def result(self, **facts: str) -> ActionSpace | ActionBank:
-        """The action space, or the bank of all actions.
+        """Return the action space, or the bank of all actions.
 
         Args:
             facts: name, licence, command; in a bank the actions keep their own names.
@@ -208,7 +208,7 @@ class FittedActions:
         return bank
 
     def summary(self) -> str:
-        """What was fitted, a line for each action."""
+        """Say what was fitted, a line for each action."""
         lines = []
         for action, (space, _) in self.spaces.items():
             line = (
@@ -228,7 +228,7 @@ class FittedActions:
 
 
 def fit_actions(performances: Performances, recipe: ActionRecipe) -> FittedActions:
-    """Fit every action, and try its gate on who is held out.
+    """Fit every action, and test its gate on held-out persons.
 
     Raises:
         InputError: as `fit_action_space`.
@@ -258,24 +258,24 @@ def check_actions(actions: Sequence[str], fps: float) -> None:
 
 def _performed(
     recordings: Sequence[Recording],
-    told: Sequence[Tensor],
+    angles: Sequence[Tensor],
     actions: Sequence[str],
     fps: float,
     repeated: bool,
     n_train: int,
 ) -> tuple[list[Performed], int]:
-    """Single performances, and how many repetitions were left out because they are too short.
+    """Return single performances, and how many repetitions are too short and left out.
 
     Recordings are cut along an axis of the first `n_train` of them.
     """
     found = []
     for action in actions:
         mine = [i for i, r in enumerate(recordings) if r.action == action]
-        learnt = [told[i] for i in mine if i < n_train]
-        parts_of_mine = _parts([told[i] for i in mine], learnt, fps, repeated)
+        learnt = [angles[i] for i in mine if i < n_train]
+        parts_of_mine = _parts([angles[i] for i in mine], learnt, fps, repeated)
         for i, parts in zip(mine, parts_of_mine, strict=True):
             person = recordings[i].person_id
-            found += [Performed(person, action, told[i][part]) for part in parts]
+            found += [Performed(person, action, angles[i][part]) for part in parts]
     if not repeated:  # then every recording counts, and a short one is refused
         return found, 0
     kept = [p for p in found if len(p.postures) >= LEAST_FRAMES]
@@ -283,17 +283,19 @@ def _performed(
 
 
 def _parts(
-    told: Sequence[Tensor], learnt: Sequence[Tensor], fps: float, repeated: bool
+    angles: Sequence[Tensor], learnt: Sequence[Tensor], fps: float, repeated: bool
 ) -> list[list[slice]]:
-    """Frames of the single performances in each recording of an action."""
+    """Return the frames of the single performances in each recording of an action."""
     if not learnt or not repeated:
-        return [[slice(0, len(postures))] for postures in told]
+        return [[slice(0, len(postures))] for postures in angles]
     axis = repetition_axis(learnt)
-    return [split_repetitions(postures, fps, axis) for postures in told]
+    return [split_repetitions(postures, fps, axis) for postures in angles]
 
 
-def _told(recordings: Sequence[Recording], joints: Sequence[Tensor], postures: str) -> list[Tensor]:
-    """Postures [T, 36] of every recording."""
+def _postures(
+    recordings: Sequence[Recording], joints: Sequence[Tensor], postures: str
+) -> list[Tensor]:
+    """Return the postures [T, 36] of every recording."""
     found = []
     for recording, points in zip(recordings, joints, strict=True):
         try:

@@ -1,4 +1,4 @@
-"""Covariances that hold what they say: a scale and a floor per joint, from persons held out in turn."""
+"""Calibrate covariances by a scale and a floor per joint, from persons held out in turn."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -39,7 +39,7 @@ DRAWN = {
     for method in METHODS
     if method not in {options["method"] for options in MODES.values()}
 }
-"""Those that follow a sample of what is possible. They take longer, and are tried on fewer frames."""
+"""The ways that draw samples; they take longer, and are tested on fewer frames."""
 
 _VIEWS = 0.5  # of the training views' width: cameras are mostly in front of a person
 _FRAMES, _SEQUENCES = 8000, 48  # in all, and of each group of persons
@@ -49,7 +49,7 @@ _NOISE = 3.0  # pixels
 
 
 class HeldOut(NamedTuple):
-    """What tracking persons whom a fit did not see came to.
+    """Errors and covariances from tracking persons whom a fit did not see.
 
     Attributes:
         errors: estimate minus truth after fixed-scale Procrustes, metres. covs: of the estimates.
@@ -62,12 +62,12 @@ class HeldOut(NamedTuple):
 
     @classmethod
     def join(cls, parts: Sequence["HeldOut"]) -> "HeldOut":
-        """Rows of all parts."""
+        """Join the rows of all parts."""
         errors, covs, persons = zip(*parts, strict=True)
         return cls(torch.cat(errors), torch.cat(covs), [p for part in persons for p in part])
 
     def error_by_person(self) -> dict[str, float]:
-        """Mean distance over joints and frames of each person, metres."""
+        """Return the mean distance over joints and frames of each person, metres."""
         distance = self.errors.norm(dim=-1).mean(-1)
         names = sorted(set(self.persons))
         rows = torch.tensor([names.index(person) for person in self.persons])
@@ -76,7 +76,7 @@ class HeldOut(NamedTuple):
 
 
 def folds(persons: Sequence[str], n_folds: int) -> list[set[str]]:
-    """Groups of persons to hold out in turn; none if there are not enough."""
+    """Return groups of persons to hold out in turn; none if there are not enough."""
     distinct = sorted(set(persons))
     n_folds = min(n_folds, len(distinct))
     return [set(distinct[fold::n_folds]) for fold in range(n_folds)] if n_folds > 1 else []
@@ -85,7 +85,7 @@ def folds(persons: Sequence[str], n_folds: int) -> list[set[str]]:
 def track_held_out(
     prior: UpperBodyPrior, poses: PoseSet, persons: set[str], seed: int, drawn_pieces: int = 0
 ) -> dict[str, HeldOut]:
-    """Track recordings of some persons in every way that the prior allows; score complete frames.
+    """Track recordings of some persons in every way that the prior allows, and score complete frames.
 
     Args:
         prior: fitted without these persons. poses: of everybody, centred as the prior's are.
@@ -116,7 +116,7 @@ def _track(
     modes: Mapping[str, dict[str, Any]],
     seed: int,
 ) -> dict[str, HeldOut]:
-    """What tracking pieces of recordings in some ways comes to."""
+    """Track pieces of recordings in several ways, and return errors and covariances of each."""
     keypoints, truth, inside = _seen(prior, [piece for piece, _ in pieces], seed)
     scored = inside & torch.isfinite(truth).flatten(2).all(2)
     who = [pieces[i][1] for i in scored.nonzero()[:, 0].tolist()]
@@ -137,7 +137,7 @@ def _track(
 def _seen(
     prior: UpperBodyPrior, sequences: list[Tensor], seed: int
 ) -> tuple[Float[Tensor, "B T 8 2"], Float[Tensor, "B T 8 3"], Bool[Tensor, "B T"]]:
-    """Noisy keypoints of head, neck and hands, each sequence from a viewpoint of its own."""
+    """Return noisy keypoints of head, neck and hands, each sequence from a viewpoint of its own."""
     generator = torch.Generator().manual_seed(seed + 1)
     lengths = torch.tensor([len(sequence) for sequence in sequences])
     poses = pad_sequence(sequences, batch_first=True).double()
@@ -148,7 +148,7 @@ def _seen(
 
 
 def calibration_noise(held_out: Mapping[str, HeldOut]) -> dict[str, Tensor]:
-    """Scale and floor of each way of tracking, by the names that the tracker looks for."""
+    """Return scale and floor of each way of tracking, by the names that the tracker looks for."""
     found = {}
     for mode, part in held_out.items():
         scale, floor = fit_calibration(part.errors, part.covs)
@@ -162,7 +162,7 @@ def fit_calibration(
     covs: Float[Tensor, "N J 3 3"],
     levels: tuple[float, ...] = (0.5, 0.9),
 ) -> tuple[Float[Tensor, " J"], Float[Tensor, " J"]]:
-    """A scale s and a floor f per joint so that the ellipsoids of s C + f I cover what they say.
+    """Fit a scale s and a floor f per joint such that ellipsoids of s C + f I have nominal coverage.
 
     Of a grid of 40 scales and 40 floors, the pair with the least sum of squared differences between
     coverage and level is taken, for each joint.

@@ -35,7 +35,7 @@ __all__ = [
 
 
 class ChosenRecordings(NamedTuple):
-    """Recordings to fit to, and those of persons who are held out, each in the order of the files."""
+    """Recordings to fit to, and those of held-out persons, each in the order of the files."""
 
     train: list[Recording]
     watched: list[Recording]
@@ -50,7 +50,7 @@ def choose_recordings(
     without: Sequence[str] | None = None,
     axes: Axes | None = None,
 ) -> ChosenRecordings:
-    """Read recordings and split them by person; other people in a file are on neither side.
+    """Read recordings and split them by person; other people in a file are left out.
 
     Args:
         paths: folders (with their subfolders) or files, see `expand_path`.
@@ -94,12 +94,12 @@ def choose_recordings(
 
 
 def recording_name(recording: Recording) -> str:
-    """What messages call a recording: its file without the suffix, or its person."""
+    """Return what messages call a recording: its file without the suffix, or its person."""
     return recording.person_id if recording.path is None else recording.path.stem
 
 
 def recorded_joints(recording: Recording, fps: float) -> Tensor:
-    """Joints [T, 15, 3] of the body at a frame rate; those that are never there are NaN.
+    """Return joints [T, 15, 3] of the body at a frame rate; those that are never there are NaN.
 
     Raises:
         InputError: no frame rate in the file, or a joint that is missing in some frames.
@@ -154,7 +154,7 @@ def state_of(body: Body, recording: Recording, joints: Tensor) -> Tensor:
 
 
 def origin_of(recordings: Sequence[Recording]) -> dict[str, Any]:
-    """Persons, actions and sources of recordings, as models say what they were fitted on."""
+    """Return persons, actions and sources of recordings, as models record what they were fitted to."""
     return {
         "persons": tuple(sorted({r.person_id for r in recordings})),
         "actions": tuple(sorted({r.action for r in recordings if r.action})),
@@ -163,7 +163,7 @@ def origin_of(recordings: Sequence[Recording]) -> dict[str, Any]:
 
 
 def expand_path(path: str) -> str:
-    """A path with its `$NAME` and `~` filled in.
+    """Return a path with its `$NAME` and `~` filled in.
 
     Raises:
         InputError: a variable that is not set.
@@ -179,7 +179,7 @@ def expand_path(path: str) -> str:
 
 
 def fingerprint(recordings: Sequence[Recording]) -> dict[str, Any]:
-    """How many recordings, frames and persons there are, and a digest of all of it."""
+    """Return the number of recordings, frames and persons, and a digest of all of it."""
     return {
         "count": len(recordings),
         "frames": sum(len(r) for r in recordings),

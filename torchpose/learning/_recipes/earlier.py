@@ -1,4 +1,4 @@
-"""Fit an earlier version of the upper-body recipe, and give priors of earlier versions new noise."""
+"""Fit an earlier version of the upper-body recipe, and renew the noise of priors from earlier versions."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,7 +15,7 @@ __all__ = ["fit_recipe_2", "renew_noise"]
 
 
 def fit_recipe_2(recordings: Sequence[RecordingLike], **settings: Any) -> UpperBodyPrior:
-    """The recipe of the first shipped prior: windows without torso axes, bodies of less variety.
+    """Fit the recipe of the first shipped prior: windows without torso axes, bodies of less variety.
 
     Args:
         recordings: in camera axes. settings: to `fit_kinect_prior`.

@@ -1,6 +1,6 @@
-"""Fit of limb conditionals, and of how limbs turn from frame to frame, to recordings of whole bodies.
+"""Fit limb conditionals and the diffusion of limbs to recordings of whole bodies.
 
-The fit is in closed form. Persons who are held out then tell how far others are from it.
+The fit is in closed form. Held-out persons then show how far others are from it.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ __all__ = ["HeldOut", "LimbStates", "check_least_std", "fit_limbs", "held_out_sp
 
 @dataclass(frozen=True)
 class LimbStates:
-    """Recorded states of all persons, of one body with safe centres (DX 1), at one frame rate.
+    """Recorded states of all persons, on one body with safe centres (DX 1), at one frame rate.
 
     Attributes:
         body: whose frame and centres the states have. fps: of the states.
@@ -64,7 +64,7 @@ class LimbStates:
         fps: float = 60.0,
         axes: Axes | None = None,
     ) -> Self:
-        """Read, fit everybody's body, and turn joints into states.
+        """Read recordings, fit everybody's body, and turn joints into states.
 
         Args:
             paths, persons, held_out, actions, without, axes: see `choose_recordings`.
@@ -91,7 +91,7 @@ class LimbStates:
         return cls(centred[first], fps, states[:n], states[n:], learnt, watched)
 
     def identity(self) -> dict[str, Any]:
-        """What makes a fit to them the same one."""
+        """Return frame rate and digests of the recordings, equal for equal fits."""
         return {
             "fps": self.fps,
             "recordings": fingerprint(self.fitted),
@@ -100,10 +100,10 @@ class LimbStates:
 
 
 class HeldOut(NamedTuple):
-    """Persons who were held out, against those who were learnt from.
+    """Deviation and speed of held-out persons, relative to those of the persons fitted to.
 
     Attributes:
-        deviation: of their limbs, in deviations of the conditionals; 1 if they are as the others.
+        deviation: of their limbs, in standard deviations of the conditionals; 1 if they are alike.
         speed: of their limbs, in deviations of the diffusion. frames: how many there were.
     """
 
@@ -149,7 +149,7 @@ def check_least_std(least_std: float) -> None:
 def held_out_spread(
     conditionals: LimbConditionals, body: Body, sequences: Sequence[Float[Tensor, "_ D"]]
 ) -> HeldOut:
-    """How far states that were not learnt from are from limb conditionals.
+    """Return how far states that were not fitted to are from limb conditionals.
 
     deviation^2 = sum_ij E|x_ij - mu_ij|^2 / sum_ij tr Sigma_ij,
     speed^2 = sum_j E|q'_j|^2 / sum_j tr Sigma'_j,
@@ -171,7 +171,7 @@ def held_out_spread(
 
 
 def summary(conditionals: LimbConditionals, held_out: HeldOut | None) -> str:
-    """What was fitted, in a sentence."""
+    """Say what was fitted, in a sentence."""
     info = conditionals.info
     text = (
         f"{info.name}: {len(conditionals.edges)} limbs from {info.n_frames} frames of "

@@ -1,7 +1,7 @@
-"""Fit of a manifold of poses, a back-constrained GPLVM, to recordings of whole bodies.
+"""Fit a manifold of poses, a back-constrained GPLVM, to recordings of whole bodies.
 
-After each step, ten iterations of the optimiser, the poses that are held out are sent to the manifold
-and back; the step that did best on them is kept, and its standard deviations come from them.
+After each step of ten iterations the held-out poses are mapped to the manifold and back. The step with
+the lowest error is kept, and its standard deviations are measured on the held-out poses.
 """
 
 import hashlib
@@ -85,7 +85,7 @@ class ManifoldRecipe:
 
 @dataclass(frozen=True)
 class ManifoldPoses:
-    """Poses to fit a manifold to, and poses of other recordings that are held out.
+    """Poses to fit a manifold to, and held-out poses of other recordings.
 
     Attributes:
         train, watched: [T, Q] for each recording. fps: of `watched`; `train` is thinned out.
@@ -114,7 +114,7 @@ class ManifoldPoses:
         frames: int = 350,
         progress: bool = False,
     ) -> Self:
-        """Read, split, and turn joints into poses of a body fitted to each person.
+        """Read and split recordings, and turn joints into poses of a body fitted to each person.
 
         Args:
             paths, persons, actions, without, axes: see `choose_recordings`.
@@ -150,7 +150,7 @@ class ManifoldPoses:
         return cls(thin(poses[:n], frames), poses[n:], fps, info, fitted, watched)
 
     def identity(self) -> dict[str, Any]:
-        """What makes a fit to them the same one."""
+        """Return frame rate and digests of poses and recordings, equal for equal fits."""
         return {
             "fps": self.fps,
             "poses": _digest(self.train),
@@ -160,7 +160,7 @@ class ManifoldPoses:
 
 
 class ManifoldFitting(nn.Module):
-    """A fit in its midst; all there is to know beside its arguments is in its `state_dict`.
+    """The fit of a manifold, whose whole state beside its arguments is in its `state_dict`.
 
     Args:
         poses: to fit to. recipe: settings.
@@ -178,11 +178,11 @@ class ManifoldFitting(nn.Module):
         )  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
-        """Settings and poses: what makes a fit the same one."""
+        """Return settings and digests of the poses, equal for equal fits."""
         return {"settings": asdict(self.recipe), **self.data.identity()}
 
     def step(self) -> dict[str, float]:
-        """One step, and what it did to the held-out poses.
+        """Take one step, and return the error on the held-out poses after it.
 
         Returns:
             `step`, counted from 1; `log_likelihood`, the objective (MR 16) before it, per number of
@@ -195,17 +195,17 @@ class ManifoldFitting(nn.Module):
 
     @property
     def finished(self) -> bool:
-        """Whether all steps are taken, or the last better score is too long ago."""
+        """Return whether all steps are taken, or the last better score is `patience` steps ago."""
         taken = len(self.fit.scores)
         over = taken - self.fit.best_step
         return taken >= self.recipe.steps or over >= self.recipe.patience
 
     def held_out_error(self) -> float:
-        """Root mean square of x - f(g(x)) over the held-out poses, as the fit stands."""
+        """Return the root mean square of x - f(g(x)) over the held-out poses at the current step."""
         return self._current().reconstruction_error(torch.cat(self.data.watched))
 
     def manifold(self, **facts: str) -> BackConstrainedGPLVM:
-        """The best manifold, its standard deviations from the held-out poses.
+        """Return the best manifold, its standard deviations from the held-out poses.
 
         Args:
             facts: name, licence, command; those that are empty are left out.
@@ -225,7 +225,7 @@ class ManifoldFitting(nn.Module):
         return found
 
     def summary(self, manifold: BackConstrainedGPLVM) -> str:
-        """What was fitted, in a sentence."""
+        """Say what was fitted, in a sentence."""
         persons = ", ".join(manifold.info.persons)
         return (
             f"{manifold.info.name}: {len(manifold.poses)} frames of {persons}, best after "
@@ -263,7 +263,7 @@ def run_to_end(
 
 
 def taken_up(fitting: ManifoldFitting, kept: str | Path) -> int:
-    """Take up a fit that `run_to_end` kept, if it is the same; return its steps so far, or 0.
+    """Restore a fit that `run_to_end` kept, if it is the same one; return its steps so far, or 0.
 
     Raises:
         OutputError: the file is something else, which `run_to_end` would write over.
@@ -301,7 +301,7 @@ def check_gathering(validation: int, frames: int, fps: float) -> None:
 def _last_apart(
     recordings: Sequence[Recording], count: int
 ) -> tuple[list[Recording], list[Recording]]:
-    """The last recordings of each person, person after person, apart from the others."""
+    """Hold out the last recordings of each person."""
     fitted: list[Recording] = []
     watched: list[Recording] = []
     for person in sorted({r.person_id for r in recordings}):

@@ -1,8 +1,8 @@
-"""The recipe of the upper-body priors: mixtures over poses and windows, their noise, calibration.
+"""Fit upper-body priors: mixtures over poses and windows, their noise, and calibration.
 
-`torchpose fit`, the training loop and the evaluation protocols all run it, in one go or step by step:
-`tasks` says which mixtures are to be fitted to what, anything that runs expectation-maximisation fits
-them, `assemble` makes a prior of them and `calibrate` finds out how good it is on somebody new.
+`torchpose fit`, the training loop and the evaluation protocols run the recipe as a whole or by steps.
+`tasks` lists the mixtures and the states to fit them to. Any implementation of EM can fit them.
+`assemble` builds a prior of them, and `calibrate` measures it on held-out persons.
 """
 
 from collections.abc import Mapping, Sequence
@@ -44,7 +44,7 @@ from torchpose.priors._window import WindowLayout, WindowPrior
 __all__ = ["VERSION", "UpperBodyRecipe", "fit_kinect_prior"]
 
 VERSION = "5"
-"""Changes whenever the recipe does, so that priors cached under an older one are not taken for it."""
+"""Version of the recipe; cached priors of another version are not used."""
 
 _SIDES = ("left", "right")
 # Chosen on held-out training persons; see the benchmarks page for what each was worth.
@@ -61,7 +61,7 @@ _FRAMES_PER_COMPONENT = 180  # of a mixture over windows; fewer explain the pers
 
 @dataclass(frozen=True)
 class UpperBodyRecipe:
-    """Every setting of a fit.
+    """Settings and steps of the fit of an upper-body prior.
 
     1. One mixture per arm over single poses (BL section 3.1), and process noise for the filters, from
        how far a frame moves the recorded bodies (`increment_covs`).
@@ -132,16 +132,16 @@ class UpperBodyRecipe:
 
     @property
     def layouts(self) -> dict[str, WindowLayout]:
-        """The hands of a window, by the window's name."""
+        """Return the hands of a window, by the window's name."""
         return {"causal": self.causal, "full": self.full}
 
     @property
     def matrix(self) -> Tensor:
-        """Camera matrix K [3, 3] of the states, pixels."""
+        """Return the camera matrix K [3, 3] of the states, pixels."""
         return PinholeCamera(*self.camera_matrix).matrix
 
     def smaller(self) -> "UpperBodyRecipe":
-        """Half of everything and no calibration, for the fits that only serve the calibration."""
+        """Return a recipe of half the size without calibration, for the fits to all but some persons."""
 
         def half(value: int | None) -> int | None:
             return None if value is None else -(-value // 2)
@@ -157,7 +157,7 @@ class UpperBodyRecipe:
         )
 
     def poses(self, recordings: Sequence[RecordingLike]) -> PoseSet:
-        """The poses that are fitted, centred on the neck.
+        """Return the poses that are fitted, centred on the neck.
 
         Raises:
             InputError, PriorError: as `collect_poses`.
@@ -165,7 +165,7 @@ class UpperBodyRecipe:
         return collect_poses(recordings, self.neck, "neck", self.nose_as_head)
 
     def tasks(self, recordings: Sequence[RecordingLike]) -> dict[str, MixtureTask]:
-        """The mixtures to fit, by name: "pose" (and "pose.right"), "causal.left", ... "full.right".
+        """Return the mixtures to fit, by name: "pose" (and "pose.right"), "causal.left", ... "full.right".
 
         Raises:
             InputError: no usable frames. PriorError: kinds of joints that cannot be mixed.
@@ -209,7 +209,7 @@ class UpperBodyRecipe:
         return tasks
 
     def _window_size(self, n_frames: int) -> tuple[int, int]:
-        """Components and samples of a mixture over windows of so many complete frames."""
+        """Return components and samples of a mixture over windows, for so many complete frames."""
         components, samples = self.window_components, self.window_samples
         if components is None:
             most = max(1, n_frames // _FRAMES_PER_COMPONENT)
@@ -227,7 +227,7 @@ class UpperBodyRecipe:
         licence: str = "",
         command: str = "",
     ) -> UpperBodyPrior:
-        """Prior of fitted mixtures, with noise and windows; not calibrated.
+        """Build a prior of fitted mixtures, with noise and windows; it is not calibrated.
 
         Args:
             recordings: what `tasks` was given. mixtures: whole ones (`MixtureTask.whole`), by the
@@ -275,7 +275,7 @@ class UpperBodyRecipe:
         return noise
 
     def window(self, mode: str, mixtures: Mapping[str, GaussianMixture]) -> WindowPrior:
-        """Windows of one name, of the mixtures that were fitted to them."""
+        """Return the window prior of one mode, of the mixtures that were fitted to it."""
         # Single precision moves estimates by a thousandth of a millimetre, and files are half as large.
         left, right = (mixtures[f"{mode}.{side}"].rounded() for side in _SIDES)
         return WindowPrior(left, right, self.layouts[mode], _window_settings(mode))
@@ -283,7 +283,7 @@ class UpperBodyRecipe:
     def calibrate(
         self, prior: UpperBodyPrior, recordings: Sequence[RecordingLike], progress: bool = False
     ) -> UpperBodyPrior:
-        """Hold groups of persons out in turn, and learn from their errors how good the prior is.
+        """Hold groups of persons out in turn, and calibrate the prior by the errors on them.
 
         Sets the calibration of the covariances, and notes the error of each person, tracked by a fit
         of half the size to the others, in `info.extra["held_out"]`.
@@ -305,14 +305,14 @@ class UpperBodyRecipe:
     def hold_out(
         self, recordings: Sequence[RecordingLike], persons: set[str]
     ) -> dict[str, HeldOut]:
-        """Errors of some persons, tracked by a fit of half the size to all others."""
+        """Return errors on some persons, tracked with a fit of half the size to all others."""
         seen = [r for r in recordings if r.person_id not in persons]
         partial = self.smaller().fit(seen)
         poses = self.poses(recordings)
         return track_held_out(partial, poses, persons, self.seed, self.drawn_pieces)
 
     def finish(self, prior: UpperBodyPrior, parts: Sequence[dict[str, HeldOut]]) -> UpperBodyPrior:
-        """Calibrate a prior by what `hold_out` found for each group of persons."""
+        """Calibrate a prior by the errors that `hold_out` returned for each group of persons."""
         modes = dict.fromkeys(mode for part in parts for mode in part)
         found = {mode: HeldOut.join([p[mode] for p in parts if mode in p]) for mode in modes}
         for key, value in calibration_noise(found).items():
@@ -338,7 +338,7 @@ class UpperBodyRecipe:
         command: str = "",
         progress: bool = False,
     ) -> UpperBodyPrior:
-        """Fit, assemble and calibrate in one go, in this process.
+        """Fit, assemble and calibrate a prior in this process.
 
         Raises:
             InputError, PriorError: as `tasks`.
@@ -377,7 +377,7 @@ def fit_kinect_prior(
 
 
 def _window_settings(mode: str) -> dict[str, float]:
-    """Settings of the filter over windows, and of the motion stage behind it."""
+    """Return settings of the filter over windows, and of the motion stage behind it."""
     return {
         "hand_std": _MEASUREMENT_STD,
         "likelihood_power": _POWER[mode],
