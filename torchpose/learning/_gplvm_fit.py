@@ -75,7 +75,7 @@ def median_gamma(poses: Float[Tensor, "T Q"], seed: int = 0) -> float:
     distance = float(torch.pdist(poses).median())
     if not distance > 0:
         raise InputError(
-            "gamma_x cannot be found from the median distance of the poses, which is 0: most of them "
+            "gamma_x cannot be told from the median distance of the poses, which is 0: most of them "
             "are the same; give gamma_x, or frames with motion"
         )
     return 1.0 / distance**2
