@@ -29,7 +29,7 @@ from train.checkpoints import ENTRY, check_identity
 from train.data import data_of, read_sides
 from train.fine_tuning_batches import batches_of
 from train.predict_tracking import digest_of_prior
-from train.processes import check_processes, first_failure, from_all
+from train.processes import check_processes, from_all, results_of_all
 
 __all__ = ["FineTuning", "FineTuningData"]
 
@@ -361,15 +361,9 @@ class FineTuning(LightningModule):
     def _track(self, prior: UpperBodyPrior) -> dict[str, HeldOut]:
         """Track the held-out persons in each way, and return the errors in every process."""
         poses = collect_poses(self._data.watched, prior.info.neck, prior.info.centre)
-        found, failure = [], ""
-        try:
-            for person in self._own_persons():
-                found.append(track_held_out(prior, poses, {person}, self._given.seed))
-        except InputError as error:
-            failure = str(error)
-        parts = [part for own in first_failure(from_all((found, failure))) for part in own]
-        modes = dict.fromkeys(mode for part in parts for mode in part)
-        return {mode: HeldOut.join([p[mode] for p in parts if mode in p]) for mode in modes}
+        persons, seed = self._own_persons(), self._given.seed
+        parts = results_of_all(lambda: [track_held_out(prior, poses, {p}, seed) for p in persons])
+        return HeldOut.join_modes([part for own in parts for part in own])
 
 
 def _mean(found: HeldOut) -> float:

@@ -45,7 +45,7 @@ class LimbData(BodyData):
 class LimbFit(BodyFit):
     """Fits `LimbConditionals` to the states of `LimbData`.
 
-    Logged, with persons held out: `deviation` and `speed` of `HeldOut`.
+    Logged, with persons held out: `deviation` and `speed` of `LimbSpread`.
 
     Args:
         least_std: floor of the standard deviations of q_ij, see `fit_limb_conditionals`.

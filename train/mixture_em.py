@@ -14,7 +14,7 @@ from lightning.pytorch import LightningModule
 from torch import nn
 from torch.optim import Optimizer
 
-from torchpose.errors import TorchposeError
+from torchpose.errors import InputError, TorchposeError
 from torchpose.learning._blocks import Share
 from torchpose.learning._recipes import MixtureTask
 from torchpose.learning._recipes.calibration import folds
@@ -25,7 +25,7 @@ from torchpose.priors import GaussianMixture, UpperBodyPrior
 from train.blocks import Key, Sweep
 from train.checkpoints import ENTRY, check_identity
 from train.data import RecordingsDataModule, check_double_precision, data_of
-from train.processes import broadcast_state, check_processes, first_failure, from_all
+from train.processes import broadcast_state, check_processes, results_of_all
 
 __all__ = ["MixtureEM"]
 
@@ -157,13 +157,10 @@ class MixtureEM(LightningModule):
         data, trainer = self._data, self.trainer
         groups = folds([r.person_id for r in data.train], data.recipe.calibration_folds)
         mine = range(trainer.global_rank, len(groups), trainer.world_size)
-        done, failure = {}, ""
-        try:
-            done = {i: data.recipe.hold_out(data.train, groups[i]) for i in mine}
-        except TorchposeError as error:
-            failure = str(error)
         parts: dict[int, Any] = {}
-        for share in first_failure(from_all((done, failure))):
+        for share in results_of_all(
+            lambda: {i: data.recipe.hold_out(data.train, groups[i]) for i in mine}
+        ):
             parts |= share
         if not trainer.is_global_zero:
             return None
@@ -225,21 +222,26 @@ class MixtureEM(LightningModule):
 
     def _start(self) -> None:
         """Start every mixture, shared among the processes."""
-        rank, world, failure = self.trainer.global_rank, self.trainer.world_size, ""
-        for number, (name, task) in enumerate(self._tasks.items()):
-            if number % world == rank and not failure:
-                source = self._data.sources[Key(name)]
-                try:
-                    em = StreamedEM.start(source, task.n_components, task.seed)
-                    self.em(name).load_state_dict(em.state_dict())
-                except TorchposeError as error:
-                    failure = f"mixture {name!r}: {error}"
-        first_failure(from_all((None, failure)))
+        rank, world = self.trainer.global_rank, self.trainer.world_size
+
+        def start() -> None:
+            for name in list(self._tasks)[rank::world]:
+                self._start_one(name)
+
+        results_of_all(start)
         for number, (name, task) in enumerate(self._tasks.items()):
             broadcast_state(self.em(name), number % world)
             if self._first_pass:
                 source, share = self._data.sources[Key(name)], Share.of_processes()
                 stepwise_pass(self.em(name), source, task.seed, share=share)
+
+    def _start_one(self, name: str) -> None:
+        task = self._tasks[name]
+        try:
+            em = StreamedEM.start(self._data.sources[Key(name)], task.n_components, task.seed)
+        except TorchposeError as error:
+            raise InputError(f"mixture {name!r}: {error}") from error
+        self.em(name).load_state_dict(em.state_dict())
 
 
 def _module_name(name: str) -> str:

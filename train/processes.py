@@ -1,14 +1,14 @@
 """Run a fit in several processes: exchange values, and choose the strategy that starts the processes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import timedelta
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 from lightning.pytorch.strategies import DDPStrategy, StrategyRegistry
 from torch import nn
 
-from torchpose.errors import InputError
+from torchpose.errors import InputError, TorchposeError
 from train.checkpoints import differences
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "first_failure",
     "from_all",
     "register_strategy",
+    "results_of_all",
 ]
 
 T = TypeVar("T")
@@ -51,6 +52,21 @@ def first_failure(answers: Sequence[tuple[T, str]]) -> list[T]:
         if failure:
             raise InputError(failure)
     return [found for found, _ in answers]
+
+
+def results_of_all(work: Callable[[], T]) -> list[T]:
+    """Do each process' share of the work, and return the results of all processes in each of them.
+
+    Raises:
+        InputError: with the message of the first process whose work raised a `TorchposeError`.
+    """
+    found: T | None = None
+    failure = ""
+    try:
+        found = work()
+    except TorchposeError as error:
+        failure = str(error)
+    return cast(list[T], first_failure(from_all((found, failure))))
 
 
 def broadcast_state(module: nn.Module, source: int) -> None:

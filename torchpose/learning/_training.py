@@ -21,12 +21,16 @@ from torchpose.skeleton._torso import learn_neck_offset, place_neck
 from torchpose.skeleton._upper_body import LEFT_ARM, NECK_KINDS, RIGHT_ARM, upper_body_indices
 
 __all__ = [
+    "MIRROR",
     "TRAINING_VIEWS",
+    "ArmPoses",
     "ArmSources",
     "PoseSet",
     "RecordingLike",
+    "arm_poses",
     "arm_sources",
     "collect_poses",
+    "one_kind",
     "seen_keypoints",
 ]
 
@@ -40,8 +44,12 @@ TRAINING_VIEWS = ViewRange(
 )
 """Viewpoints of the shipped priors: a person about 2 m in front of the camera."""
 
+MIRROR = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
+"""Factors that mirror points at x = 0."""
+
 DEFAULT_SAMPLES = 100_000
 DEFAULT_RATE = 30.0  # of recordings that do not say
+_SHOWN_NAMES = 3  # recordings of each kind in a message
 _HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
 _UNSEEN = [i for i, name in enumerate(UPPER_BODY) if name.startswith(("elbow", "shoulder"))]
 
@@ -122,8 +130,8 @@ def collect_poses(
     if not recordings:
         raise InputError("a prior needs at least one recording, got none")
     bodies = [r.upper_body(nose_as_head) for r in recordings]
-    hand = _one_kind("hand", [b.hand for b in bodies])
-    head = _one_kind("head", [b.head for b in bodies])
+    hand = one_kind("hand", [b.hand for b in bodies])
+    head = one_kind("head", [b.head for b in bodies])
     kinds = [b.neck for b in bodies]
     wanted = neck or min((k for k in kinds if k in NECK_KINDS), key=NECK_KINDS.index, default=None)
     if wanted not in NECK_KINDS:
@@ -199,13 +207,12 @@ def arm_sources(
             f"mirrored arms need views with tx the same to both sides, got {view_range.tx}; "
             "make it symmetric or use mirror=False"
         )
-    left, right = (_arm(poses, arm) for arm in (LEFT_ARM, RIGHT_ARM))
+    left, right = (arm_poses(poses, arm) for arm in (LEFT_ARM, RIGHT_ARM))
     dropped = {"left": int((~left.known).sum()), "right": int((~right.known).sum())}
     arms = {"left": left.usable(), "right": right.usable()}
     if mirror:
-        flip = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
         (own, trust), (other, also) = arms["left"], arms["right"]
-        arms = {"left": (torch.cat([own, other * flip]), torch.cat([trust, also]))}
+        arms = {"left": (torch.cat([own, other * MIRROR]), torch.cat([trust, also]))}
     sources = {}
     for side, (points, weight) in arms.items():
         if not len(points):
@@ -227,7 +234,7 @@ def arm_sources(
     return ArmSources(sources["left"], sources.get("right"), facts)
 
 
-class _Arm(NamedTuple):
+class ArmPoses(NamedTuple):
     """Poses [N, 5, 3] of an arm, which of them are complete and have weight, and weights [N]."""
 
     points: Tensor
@@ -238,9 +245,10 @@ class _Arm(NamedTuple):
         return self.points[self.known], self.weight[self.known]
 
 
-def _arm(poses: PoseSet, arm: tuple[int, ...]) -> _Arm:
+def arm_poses(poses: PoseSet, arm: tuple[int, ...]) -> ArmPoses:
+    """Return the joints of one arm with their weights."""
     points, weight = poses.joints[:, list(arm)], poses.weight[:, list(arm)].amin(1)
-    return _Arm(points, torch.isfinite(points).flatten(1).all(1) & (weight > 0), weight)
+    return ArmPoses(points, torch.isfinite(points).flatten(1).all(1) & (weight > 0), weight)
 
 
 def _weights(recording: RecordingLike, nose_as_head: bool) -> Float[Tensor, "T 8"]:
@@ -256,14 +264,34 @@ def _weights(recording: RecordingLike, nose_as_head: bool) -> Float[Tensor, "T 8
     return weight
 
 
-def _one_kind(joint: str, kinds: Sequence[str | None]) -> str | None:
+def one_kind(
+    joint: str, kinds: Sequence[str | None], names: Sequence[str] | None = None
+) -> str | None:
+    """Return the kind of joint that all recordings have; None if none says its kind.
+
+    Args:
+        joint: its name, for messages. kinds: of each recording. names: of the recordings, for messages.
+
+    Raises:
+        PriorError: kinds are mixed; recordings of each kind are named.
+    """
     found = sorted({k for k in kinds if k is not None})
     if len(found) > 1:
+        listed = "" if names is None else f" ({_names_by_kind(kinds, names, found)})"
         raise PriorError(
-            f"recordings must agree on what a {joint} is, got {' and '.join(found)}; "
-            "fit them apart, or leave one kind out"
+            f"recordings must agree on what a {joint} is, got {' and '.join(found)}{listed}; fit them "
+            "apart, or leave one kind out"
         )
     return found[0] if found else None
+
+
+def _names_by_kind(kinds: Sequence[str | None], names: Sequence[str], found: list[str]) -> str:
+    each = []
+    for kind in found:
+        own = [name for name, other in zip(names, kinds, strict=True) if other == kind]
+        more = f" and {len(own) - _SHOWN_NAMES} more" if len(own) > _SHOWN_NAMES else ""
+        each.append(f"{kind}: {', '.join(own[:_SHOWN_NAMES])}{more}")
+    return "; ".join(each)
 
 
 def _origin(recording: RecordingLike) -> str:

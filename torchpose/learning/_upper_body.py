@@ -16,9 +16,11 @@ from torchpose.errors import PriorError
 from torchpose.learning._samplers import ArmSource, all_samples, derived_seed
 from torchpose.learning._training import (
     DEFAULT_RATE,
+    MIRROR,
     TRAINING_VIEWS,
     PoseSet,
     RecordingLike,
+    arm_poses,
     arm_sources,
     collect_poses,
 )
@@ -37,9 +39,10 @@ from torchpose.priors._upper_body import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM
 
-__all__ = ["fit_upper_body_prior", "increment_covs", "prior_of_arms"]
+__all__ = ["KINECT_CAMERA", "fit_upper_body_prior", "increment_covs", "prior_of_arms"]
 
-_KINECT_CAMERA = (525.0, 525.0, 319.5, 239.5)
+KINECT_CAMERA = (525.0, 525.0, 319.5, 239.5)
+"""fx, fy, cx, cy of a Kinect's camera at 640 x 480, pixels."""
 
 
 def fit_upper_body_prior(
@@ -85,7 +88,7 @@ def fit_upper_body_prior(
             mixed, unknown rotation order.
     """
     check_rotation_order(rotation_order)
-    camera = camera or PinholeCamera(*_KINECT_CAMERA, width=640, height=480)
+    camera = camera or PinholeCamera(*KINECT_CAMERA, width=640, height=480)
     (fx, skew, cx), (_, fy, cy), _ = camera.matrix.tolist()
     if skew:
         raise PriorError(f"the camera of a prior must have no skew, got {skew:g} pixels")
@@ -170,14 +173,13 @@ def increment_covs(
     order = check_rotation_order(rotation_order)
     rate = poses.facts["fps"] or DEFAULT_RATE
     found = {}
-    flip = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
     for side, arm in (("left", LEFT_ARM), ("right", RIGHT_ARM)):
         used = _usable(poses, arm)
         if len(used):
             generator = torch.Generator().manual_seed(derived_seed(seed, f"increments {side}"))
             used = used.repeat(-(-_STEPS // len(used)))
             sampled = sample_viewpoints(len(used), views, generator)
-            joints = poses.joints * flip if mirror and side == "right" else poses.joints
+            joints = poses.joints * MIRROR if mirror and side == "right" else poses.joints
             steps = _states(joints[used], arm, sampled, matrix, order)
             steps = steps - _states(joints[used - 1], arm, sampled, matrix, order)
             trust = _trust(poses, arm, used)
@@ -193,8 +195,7 @@ def increment_covs(
 
 def _usable(poses: PoseSet, arm: tuple[int, ...]) -> Tensor:
     """Return frames that follow another one of their recording, with the whole arm in both."""
-    whole = torch.isfinite(poses.joints[:, list(arm)]).flatten(1).all(1)
-    whole = whole & (poses.weight[:, list(arm)].amin(1) > 0)
+    whole = arm_poses(poses, arm).known
     lengths = torch.tensor(poses.lengths)
     begins = torch.zeros_like(whole)
     begins[(lengths.cumsum(0) - lengths)[lengths > 0]] = True
@@ -202,7 +203,7 @@ def _usable(poses: PoseSet, arm: tuple[int, ...]) -> Tensor:
 
 
 def _trust(poses: PoseSet, arm: tuple[int, ...], frames: Tensor) -> Tensor:
-    weight = poses.weight[:, list(arm)].amin(1)
+    weight = arm_poses(poses, arm).weight
     return torch.minimum(weight[frames], weight[frames - 1])
 
 

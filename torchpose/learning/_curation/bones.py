@@ -13,6 +13,7 @@ from torch.nn.functional import normalize
 from torchpose.errors import InputError, check_shape
 from torchpose.io._recordings import Recording
 from torchpose.learning._curation.joints import with_upper_joints
+from torchpose.learning._training import MIRROR
 from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
 from torchpose.skeleton._upper_body import BONES, scale_bones
 
@@ -170,9 +171,6 @@ def harmonise_bones(recordings: Sequence[Recording]) -> list[Recording]:
     return harmonised
 
 
-_FLIP = (-1.0, 1.0, 1.0)
-
-
 def mirrored(recording: Recording) -> Recording:
     """Mirror a recording at x = 0, so that left joints become right ones.
 
@@ -183,7 +181,7 @@ def mirrored(recording: Recording) -> Recording:
     other = [names.index(n) if n in names else -1 for n in map(_counterpart, names)]
     absent = torch.tensor(other) < 0
     order = torch.tensor(other).clamp_min(0)
-    joints = recording.joints[:, order] * recording.joints.new_tensor(_FLIP)
+    joints = recording.joints[:, order] * MIRROR.to(recording.joints)
     joints = torch.where(absent[:, None], torch.nan, joints)
     weights = recording.weights
     if weights is not None:

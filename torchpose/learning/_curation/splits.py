@@ -7,9 +7,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.errors import InputError, OverlapError, PriorError
+from torchpose.errors import InputError, OverlapError
 from torchpose.io._recordings import Recording
 from torchpose.learning._curation.joints import label, measured
+from torchpose.learning._training import one_kind
 
 __all__ = [
     "Duplicate",
@@ -241,9 +242,6 @@ def refuse_leaks(train: Sequence[Recording], test: Sequence[Recording]) -> None:
     refuse_shared_recordings(train, test)
 
 
-_SHOWN_FILES = 3
-
-
 def check_kinds(recordings: Sequence[Recording]) -> None:
     """Raise unless all recordings have the same kind of hand and of head, as `collect_poses` needs.
 
@@ -255,28 +253,12 @@ def check_kinds(recordings: Sequence[Recording]) -> None:
     if not recordings:
         raise InputError("expected at least one recording, got none")
     bodies = [recording.upper_body() for recording in recordings]
-    _check("hand", recordings, [body.hand for body in bodies])
-    _check("head", recordings, [body.head for body in bodies])
+    files = [label(recording) for recording in recordings]
+    one_kind("hand", [body.hand for body in bodies], files)
+    one_kind("head", [body.head for body in bodies], files)
 
 
 def skeleton_counts(recordings: Sequence[Recording]) -> dict[str, int]:
     """Count the recordings of each joint set; those of no known set under ``other``."""
     names = sorted(r.skeleton or "other" for r in recordings)
     return {name: names.count(name) for name in dict.fromkeys(names)}
-
-
-def _check(joint: str, recordings: Sequence[Recording], kinds: Sequence[str | None]) -> None:
-    found = sorted({kind for kind in kinds if kind is not None})
-    if len(found) < 2:
-        return
-    shown = "; ".join(f"{kind}: {_files(recordings, kinds, kind)}" for kind in found)
-    raise PriorError(
-        f"recordings must agree on what a {joint} is, got {' and '.join(found)} ({shown}); fit them "
-        "apart, or leave one kind out"
-    )
-
-
-def _files(recordings: Sequence[Recording], kinds: Sequence[str | None], kind: str) -> str:
-    files = [label(r) for r, own in zip(recordings, kinds, strict=True) if own == kind]
-    more = len(files) - _SHOWN_FILES
-    return ", ".join(files[:_SHOWN_FILES]) + (f" and {more} more" if more > 0 else "")

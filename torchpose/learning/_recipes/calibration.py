@@ -66,6 +66,12 @@ class HeldOut(NamedTuple):
         errors, covs, persons = zip(*parts, strict=True)
         return cls(torch.cat(errors), torch.cat(covs), [p for part in persons for p in part])
 
+    @classmethod
+    def join_modes(cls, parts: Sequence[Mapping[str, "HeldOut"]]) -> dict[str, "HeldOut"]:
+        """Join the rows of all parts for each way of tracking."""
+        modes = dict.fromkeys(mode for part in parts for mode in part)
+        return {mode: cls.join([part[mode] for part in parts if mode in part]) for mode in modes}
+
     def error_by_person(self) -> dict[str, float]:
         """Return the mean distance over joints and frames of each person, metres."""
         distance = self.errors.norm(dim=-1).mean(-1)

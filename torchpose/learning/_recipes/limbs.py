@@ -32,7 +32,7 @@ from torchpose.learning._recipes.choosing import (
 from torchpose.math._rotations import compose, conjugate
 from torchpose.priors._limb_conditionals import LimbConditionals
 
-__all__ = ["HeldOut", "LimbStates", "check_least_std", "fit_limbs", "held_out_spread", "summary"]
+__all__ = ["LimbSpread", "LimbStates", "check_least_std", "fit_limbs", "held_out_spread", "summary"]
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class LimbStates:
         }
 
 
-class HeldOut(NamedTuple):
+class LimbSpread(NamedTuple):
     """Deviation and speed of held-out persons, relative to those of the persons fitted to.
 
     Attributes:
@@ -114,8 +114,8 @@ class HeldOut(NamedTuple):
 
 def fit_limbs(
     states: LimbStates, least_std: float = 0.01, **facts: str
-) -> tuple[LimbConditionals, HeldOut | None]:
-    """Return limb conditionals of recorded states, and how far the persons held out are from them, if any.
+) -> tuple[LimbConditionals, LimbSpread | None]:
+    """Fit limb conditionals to recorded states, and compare held-out persons with them, if any.
 
     Args:
         states: to fit to.
@@ -148,7 +148,7 @@ def check_least_std(least_std: float) -> None:
 
 def held_out_spread(
     conditionals: LimbConditionals, body: Body, sequences: Sequence[Float[Tensor, "_ D"]]
-) -> HeldOut:
+) -> LimbSpread:
     """Return how far states that were not fitted to are from limb conditionals.
 
     deviation^2 = sum_ij E|x_ij - mu_ij|^2 / sum_ij tr Sigma_ij,
@@ -165,12 +165,12 @@ def held_out_spread(
     between = edge_rotations(every, conditionals.edges.long())
     away = compose(conjugate(conditionals.edge_centres), between) - conditionals.mean
     steps = frame_rotations(turns)
-    return HeldOut(
+    return LimbSpread(
         _ratio(away, conditionals.covariance), _ratio(steps, conditionals.diffusion), len(every)
     )
 
 
-def summary(conditionals: LimbConditionals, held_out: HeldOut | None) -> str:
+def summary(conditionals: LimbConditionals, held_out: LimbSpread | None) -> str:
     """Say what was fitted, in a sentence."""
     info = conditionals.info
     text = (

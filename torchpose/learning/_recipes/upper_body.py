@@ -34,7 +34,7 @@ from torchpose.learning._training import (
     arm_sources,
     collect_poses,
 )
-from torchpose.learning._upper_body import increment_covs, prior_of_arms
+from torchpose.learning._upper_body import KINECT_CAMERA, increment_covs, prior_of_arms
 from torchpose.priors._arm_state import check_rotation_order
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._prior_file import PriorInfo
@@ -113,7 +113,7 @@ class UpperBodyRecipe:
     calibration_folds: int = 6
     drawn_pieces: int = 6
     seed: int = 0
-    camera_matrix: tuple[float, float, float, float] = (525.0, 525.0, 319.5, 239.5)
+    camera_matrix: tuple[float, float, float, float] = KINECT_CAMERA
     rotation_order: str = "zxy"
     neck: str | None = None
     mirror: bool = True
@@ -313,11 +313,13 @@ class UpperBodyRecipe:
 
     def finish(self, prior: UpperBodyPrior, parts: Sequence[dict[str, HeldOut]]) -> UpperBodyPrior:
         """Calibrate a prior by the errors that `hold_out` returned for each group of persons."""
-        modes = dict.fromkeys(mode for part in parts for mode in part)
-        found = {mode: HeldOut.join([p[mode] for p in parts if mode in p]) for mode in modes}
+        found = HeldOut.join_modes(parts)
         for key, value in calibration_noise(found).items():
             prior.set_noise(key, value)
-        errors = {mode: _rounded(held_out.error_by_person()) for mode, held_out in found.items()}
+        errors = {
+            mode: {person: round(error, 5) for person, error in part.error_by_person().items()}
+            for mode, part in found.items()
+        }
         before = prior.info.extra
         extra: dict[str, Any] = {
             "calibrated": sorted(name for name in prior.noise if name.startswith("calibration"))
@@ -385,7 +387,3 @@ def _window_settings(mode: str) -> dict[str, float]:
         "pixel_ratio": _PIXEL_RATIO,
         "placement_ratio": _PLACEMENT_RATIO,
     }
-
-
-def _rounded(errors: dict[str, float]) -> dict[str, float]:
-    return {person: round(error, 5) for person, error in errors.items()}
