@@ -48,7 +48,7 @@ def test_configurations_on_top_of_each_other(monkeypatch, capsys):
     assert "ckpt_path: auto" in printed and "n_components: 10" in printed
 
 
-@pytest.mark.parametrize("name", ["command", "identity"])
+@pytest.mark.parametrize("name", ["command", "checkpoints"])
 def test_examples_in_docstrings(name):
     result = doctest.testmod(import_module(f"train.{name}"))
     assert result.attempted and not result.failed
