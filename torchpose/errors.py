@@ -4,7 +4,8 @@ Every message says what was expected, what came, and what to do about it. Messag
 printable characters, whatever the file or the name that they quote.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+import math
+from collections.abc import Callable, Collection, Iterable, Sequence
 from numbers import Real
 from typing import Any
 
@@ -207,6 +208,19 @@ def check_rate(name: str, fps: Any) -> float:
             f"{name} must be positive and at most {_FASTEST:g} frames per second, got {fps!r:.60}"
         )
     return float(fps)
+
+
+def check_choice(name: str, value: object, choices: Collection[str]) -> None:
+    """Raise `InputError` unless an option is one of these words."""
+    if not (isinstance(value, str) and value in choices):
+        raise InputError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
+
+
+def check_positive(name: str, value: float) -> float:
+    """Return a number, or raise `InputError` unless it is above 0 and finite."""
+    if not 0 < value < math.inf:
+        raise InputError(f"{name} must be positive and finite, got {value}")
+    return value
 
 
 def check_weights(name: str, weights: Tensor) -> None:

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchpose._core.module_state import derived
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import InputError, check_positive, check_shape
 from torchpose.math._gaussian import kalman_gain, safe_cholesky, symmetrise
 
 __all__ = ["ConstantVelocityFilter", "ConstantVelocityState"]
@@ -65,8 +65,7 @@ class ConstantVelocityFilter(nn.Module):
     def __init__(self, ratio: float, fps: float) -> None:
         super().__init__()
         for name, value in (("ratio", ratio), ("fps", fps)):
-            if not 0 < value < float("inf"):
-                raise InputError(f"{name} must be positive and finite, got {value}")
+            check_positive(name, value)
         for name, value in (("ratio", ratio), ("fps", fps)):
             self.register_buffer(name, torch.tensor(float(value), dtype=torch.float64))
 

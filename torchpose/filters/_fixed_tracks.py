@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchpose._core.value_checks import values_visible
-from torchpose.errors import InputError
+from torchpose.errors import InputError, check_choice
 from torchpose.filters._base import Generators
 from torchpose.filters._columns import run_columns, suits_columns
 from torchpose.filters._gain_graph import find_history
@@ -226,8 +226,7 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
 def _check_weighting(
     weighting: str, uniform_weight: float | None, reset_below: float | None
 ) -> None:
-    if weighting not in _WEIGHTINGS:
-        raise InputError(f"weighting must be one of {', '.join(_WEIGHTINGS)}, got {weighting!r}")
+    check_choice("weighting", weighting, _WEIGHTINGS)
     if weighting == "frame" and not (reset_below is None and uniform_weight is None):
         raise InputError(
             "weighting 'frame' takes every frame's weights from that frame alone: uniform_weight and "

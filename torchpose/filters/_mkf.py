@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose._core.module_state import derived, one_run, register_given, wide_or_parameter
-from torchpose.errors import InputError
+from torchpose.errors import InputError, check_choice
 from torchpose.filters._base import Generators, RecursiveFilter, require_state
 from torchpose.filters._measurements import (
     Measurements,
@@ -332,8 +332,7 @@ def _defaults(kind: type[MixtureKalmanFilter]) -> dict[str, Any]:
 def _kind_of(tracks: str) -> type[MixtureKalmanFilter]:
     """Return the class of these tracks."""
     kinds = MixtureKalmanFilter._kinds
-    if tracks not in kinds:
-        raise InputError(f"tracks must be one of {', '.join(kinds)}, got {tracks!r}")
+    check_choice("tracks", tracks, kinds)
     return kinds[tracks]
 
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import InputError, check_choice, check_positive, check_shape
 from torchpose.filters._base import Generators, uniform
 
 __all__ = [
@@ -139,8 +139,7 @@ def resample(
     >>> resample(weights.log(), generator=torch.Generator().manual_seed(0)).tolist()
     [[0, 0, 2, 3]]
     """
-    if method not in RESAMPLING:
-        raise InputError(f"resampling must be one of {', '.join(RESAMPLING)}, got {method!r}")
+    check_choice("resampling", method, RESAMPLING)
     check_shape("log_weights", log_weights, ["B", "N"])
     if log_weights.numel() == 0:
         raise InputError(f"log_weights must hold particles, got {list(log_weights.shape)}")
@@ -314,6 +313,5 @@ def survival_rate_per_frame(per_second: float, fps: float) -> float:
     """
     if not 0 < per_second < 1:
         raise InputError(f"a survival rate must lie between 0 and 1, got {per_second}")
-    if not 0 < fps < math.inf:
-        raise InputError(f"fps must be positive and finite, got {fps}")
+    check_positive("fps", fps)
     return per_second ** (1 / fps)

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchpose._core.value_checks import values_visible
-from torchpose.errors import InputError, check_finite, check_shape
+from torchpose.errors import InputError, check_choice, check_finite, check_shape
 from torchpose.filters._weights import normalise
 from torchpose.math._gaussian import safe_cholesky, symmetrise
 from torchpose.priors._gaussian_mixture import GaussianMixture
@@ -58,8 +58,7 @@ def check_transition_options(
     Raises:
         InputError: an unknown kind, an option without use, or a burn-in out of range.
     """
-    if kind not in TRANSITIONS:
-        raise InputError(f"transition must be one of {', '.join(TRANSITIONS)}, got {kind!r}")
+    check_choice("transition", kind, TRANSITIONS)
     for name, value in (("gamma", gamma), ("subspace", subspace)):
         if kind != "ou" and value is not None:
             raise InputError(f"{name} does not apply to transition {kind!r}; it is of 'ou'")
@@ -116,8 +115,7 @@ def make_transition(
     """
     if kind == "ou":
         return _scalar_rate(means, covariances, gamma, subspace)
-    if kind not in TRANSITIONS:
-        raise InputError(f"transition must be one of {', '.join(TRANSITIONS)}, got {kind!r}")
+    check_choice("transition", kind, TRANSITIONS)
     factor = safe_cholesky(covariances + process_cov)
     matrix = torch.cholesky_solve(covariances, factor).mT
     rest = torch.cholesky_solve(process_cov.expand_as(covariances), factor).mT

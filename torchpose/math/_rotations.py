@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose._core.arguments import as_pair
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import check_choice, check_shape
 
 __all__ = [
     "ROTATION_ORDERS",
@@ -136,10 +136,7 @@ def rotvec_to_matrix(rotvec: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch
 
 
 def _check_order(order: str) -> None:
-    if order not in ROTATION_ORDERS:
-        raise InputError(
-            f"rotation order must be one of {', '.join(ROTATION_ORDERS)}, got {order!r}"
-        )
+    check_choice("rotation order", order, ROTATION_ORDERS)
 
 
 def within_unit_ball(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import InputError, check_choice, check_shape
 from torchpose.math._gaussian import condition, safe_cholesky, symmetrise
 
 __all__ = [
@@ -66,8 +66,7 @@ def sigma_points(
     """
     dim = mean.shape[-1]
     check_shape("covariance", covariance, ["...", dim, dim])
-    if directions not in DIRECTIONS:
-        raise InputError(f"directions must be one of {', '.join(DIRECTIONS)}, got {directions!r}")
+    check_choice("directions", directions, DIRECTIONS)
     if directions == "cholesky":
         axes = safe_cholesky(covariance)
     else:

@@ -15,6 +15,7 @@ from torchpose._core.module_state import register_given
 from torchpose.errors import (
     InputError,
     ShapeError,
+    check_choice,
     check_covariance,
     check_finite,
     check_real,
@@ -366,8 +367,7 @@ def _check_fit(
         )
     if not covariance_floor > 0 or math.isinf(covariance_floor):
         raise InputError(f"covariance_floor must be positive, got {covariance_floor}")
-    if init not in STARTS:
-        raise InputError(f"init must be one of {', '.join(STARTS)}, got {init!r}")
+    check_choice("init", init, STARTS)
 
 
 @torch.no_grad()

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from torchpose.errors import InputError, refuse_unused
+from torchpose.errors import InputError, check_choice, refuse_unused
 from torchpose.filters._fixed_tracks import FixedTrackFilter
 from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._particle import BootstrapParticleFilter
@@ -187,8 +187,7 @@ def choose_method(
 
 
 def _find(method: str) -> Method:
-    if method not in METHODS:
-        raise InputError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    check_choice("method", method, METHODS)
     return METHODS[method]
 
 

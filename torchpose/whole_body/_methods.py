@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 
 from torchpose.body._kinematics import Body
-from torchpose.errors import InputError, PriorError, refuse_unused
+from torchpose.errors import InputError, PriorError, check_choice, refuse_unused
 from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 from torchpose.priors._shipped import load_action, load_limb_conditionals, load_manifold
@@ -290,5 +290,4 @@ def make_filter(
 
 
 def _check_method(method: str) -> None:
-    if method not in METHODS:
-        raise InputError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    check_choice("method", method, METHODS)

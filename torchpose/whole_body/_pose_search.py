@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.camera._rig import CameraRig, Cameras, as_rig
-from torchpose.errors import InputError, check_finite, check_shape
+from torchpose.errors import InputError, check_choice, check_finite, check_shape
 from torchpose.filters._base import Generators, standard_normal, uniform
 from torchpose.math._rotations import compose, minimal_rotation, quaternion_vector_to_matrix
 from torchpose.whole_body._filters.annealed import anneal
@@ -216,8 +216,7 @@ def find_candidates(
         InputError: no camera sees the person, or a bad setting. ShapeError, CameraError: silhouettes,
         cameras or prior of other sizes. PriorError: a manifold of another skeleton.
     """
-    if likelihood not in LIKELIHOODS:
-        raise InputError(f"likelihood must be one of {', '.join(LIKELIHOODS)}, got {likelihood!r}")
+    check_choice("likelihood", likelihood, LIKELIHOODS)
     if n_headings < 1 or n_particles < n_headings or n_layers < 2:
         raise InputError(
             "a search needs at least 1 heading, 1 particle for each and 2 layers, got "

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol, TypedDict, runtime_checkable
 
 import torch
@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchpose.body._kinematics import Body
-from torchpose.errors import DegenerateFilterWarning, InputError
+from torchpose.errors import DegenerateFilterWarning
 from torchpose.filters._base import Generators
 from torchpose.filters._outputs import effective_sample_size
 from torchpose.filters._resampling import resample
@@ -23,7 +23,6 @@ __all__ = [
     "PoseSpace",
     "WeightedParticles",
     "best_particle",
-    "check_choice",
     "first_true",
     "joint_covariance",
     "particle_std",
@@ -271,9 +270,3 @@ def warn_of_frames(failed: Bool[Tensor, "B T"], text: str) -> None:
         DegenerateFilterWarning,
         stacklevel=4,
     )
-
-
-def check_choice(name: str, value: object, choices: Collection[str]) -> None:
-    """Raise `InputError` unless an option is one of these words."""
-    if not (isinstance(value, str) and value in choices):
-        raise InputError(f"{name} must be one of {', '.join(choices)}, got {value!r}")

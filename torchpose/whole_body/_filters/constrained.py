@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
-from torchpose.errors import InputError
+from torchpose.errors import InputError, check_choice
 from torchpose.filters._base import Generators, standard_normal
 from torchpose.math._rotations import within_unit_ball
 from torchpose.priors._actions.bank import ActionBank
@@ -21,7 +21,6 @@ from torchpose.whole_body._filters.body_particles import (
     BodyTrack,
     PoseSpace,
     WeightedParticles,
-    check_choice,
     reweight,
     warn_of_frames,
 )

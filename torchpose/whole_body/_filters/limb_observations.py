@@ -15,10 +15,9 @@ from torchpose.body._kinematics import Body
 from torchpose.body._limbs import Limbs
 from torchpose.body._skeleton import BodySkeleton, other_side
 from torchpose.camera._rig import Cameras
-from torchpose.errors import InputError, SkeletonError, check_shape
+from torchpose.errors import SkeletonError, check_choice, check_positive, check_shape
 from torchpose.math._rotations import quaternion_vector_to_matrix
 from torchpose.math._unscented import floor_eigenvalues, moments
-from torchpose.whole_body._filters.body_particles import check_choice
 from torchpose.whole_body._silhouettes.limb_counts import PartCounts, count_parts
 from torchpose.whole_body._silhouettes.rendering import PreparedSilhouettes
 
@@ -226,8 +225,7 @@ def check_rules(normalisation: str, cameras: str, sharpness: float) -> None:
     """Raise `InputError` unless both rules are known and the sharpness is positive."""
     check_choice("normalisation", normalisation, NORMALISATIONS)
     check_choice("cameras", cameras, CAMERA_RULES)
-    if not 0 < sharpness < math.inf:
-        raise InputError(f"sharpness must be positive and finite, got {sharpness}")
+    check_positive("sharpness", sharpness)
 
 
 # --- helpers --------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.errors import PriorError, check_shape
+from torchpose.errors import PriorError, check_choice, check_shape
 from torchpose.filters._base import Generators, standard_normal
 from torchpose.whole_body._filters.body_frames import Frame
 from torchpose.whole_body._filters.body_particles import (
@@ -14,7 +14,6 @@ from torchpose.whole_body._filters.body_particles import (
     BodyFilterState,
     PoseSpace,
     WeightedParticles,
-    check_choice,
     reweight,
 )
 from torchpose.whole_body._filters.motion import default_step_std

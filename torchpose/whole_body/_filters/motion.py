@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose.errors import InputError, check_finite, check_shape
+from torchpose.errors import InputError, check_finite, check_positive, check_shape
 from torchpose.whole_body._filters.body_particles import PoseSpace
 
 __all__ = [
@@ -45,7 +45,7 @@ def default_step_std(body: PoseSpace, fps: float = _RATE) -> Float[Tensor, " D"]
     """
     std = torch.full((body.dim,), _PART_STD, dtype=torch.float64)
     std[:3], std[3:6] = _POSITION_STD, _HEADING_STD
-    return std if fps == _RATE else std * (_RATE / _positive("fps", fps)) ** _DIFFUSION_POWER
+    return std if fps == _RATE else std * (_RATE / check_positive("fps", fps)) ** _DIFFUSION_POWER
 
 
 def motion_std(
@@ -205,7 +205,7 @@ def constant_velocity_std(
     states = [sequences] if isinstance(sequences, Tensor) else list(sequences)
     stride, ratio = 1, 1.0
     if fps is not None and target_fps is not None:
-        ratio = _positive("fps", fps) / _positive("target_fps", target_fps)
+        ratio = check_positive("fps", fps) / check_positive("target_fps", target_fps)
         stride = max(round(ratio), 1)
     slices = [one[first::stride] for one in states for first in range(stride)]
     errors = [_errors(body, one, velocity_rate) for one in slices if len(one) > 2]
@@ -232,7 +232,9 @@ def rescale_std(
     >>> rescale_std(torch.ones(1), 1 / 30, 1 / 60)
     tensor([0.3536])
     """
-    ratio = _positive("target_interval", target_interval) / _positive("interval", interval)
+    ratio = check_positive("target_interval", target_interval) / check_positive(
+        "interval", interval
+    )
     return std * ratio**_RATE_POWER
 
 
@@ -250,9 +252,3 @@ def _smoothed(steps: Tensor, rate: float) -> Tensor:
         velocity = rate * velocity + (1 - rate) * step.nan_to_num()  # a gap leads nowhere
         smoothed.append(velocity)
     return torch.stack(smoothed)
-
-
-def _positive(name: str, value: float) -> float:
-    if not 0 < value < float("inf"):
-        raise InputError(f"{name} must be positive and finite, got {value}")
-    return value

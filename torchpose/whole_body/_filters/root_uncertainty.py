@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchpose.body._kinematics import Body
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import InputError, check_choice, check_shape
 from torchpose.filters._base import Generators, standard_normal
 from torchpose.filters._resampling import (
     LEAST_SURVIVORS,
@@ -39,7 +39,6 @@ from torchpose.whole_body._filters.body_particles import (
     BodyFilterOptions,
     BodyFilterState,
     WeightedParticles,
-    check_choice,
     reweight,
 )
 from torchpose.whole_body._filters.legs import leg_permutation

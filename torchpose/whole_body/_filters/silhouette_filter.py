@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from torchpose.errors import InputError, check_finite, check_shape
+from torchpose.errors import InputError, check_choice, check_finite, check_positive, check_shape
 from torchpose.filters._base import Generators, standard_normal
 from torchpose.filters._outputs import effective_sample_size
 from torchpose.filters._resampling import RESAMPLING
@@ -33,7 +33,6 @@ from torchpose.whole_body._filters.body_particles import (
     PoseSpace,
     WeightedParticles,
     best_particle,
-    check_choice,
     joint_covariance,
     particle_std,
     resample_state,
@@ -123,8 +122,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         check_leg_swap(body, leg_swap)
         check_limb_shape(limb_shape)
         for name, value in (("sharpness", sharpness), ("respread_scale", respread_scale)):
-            if not 0 < value < math.inf:
-                raise InputError(f"{name} must be positive and finite, got {value}")
+            check_positive(name, value)
         self.body, self.limits, self.limit_mode = body, limits, limit_mode
         self.n_particles, self.sharpness = n_particles, float(sharpness)
         self.likelihood, self.limb_shape, self.estimate = likelihood, limb_shape, estimate

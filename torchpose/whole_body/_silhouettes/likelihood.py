@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.errors import InputError
+from torchpose.errors import InputError, check_choice
 from torchpose.whole_body._silhouettes.rendering import SilhouetteCounts
 
 __all__ = ["LIKELIHOODS", "bidirectional", "intersection_over_union", "silhouette_log_likelihood"]
@@ -80,8 +80,7 @@ def silhouette_log_likelihood(
     Raises:
         InputError: another kind, or a negative sharpness.
     """
-    if kind not in LIKELIHOODS:
-        raise InputError(f"likelihood must be one of {', '.join(LIKELIHOODS)}, got {kind!r}")
+    check_choice("likelihood", kind, LIKELIHOODS)
     if not 0 <= sharpness < float("inf"):
         raise InputError(f"sharpness must be 0 or more and finite, got {sharpness}")
     if sharpness == 0:

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from torchpose.body._limbs import Limbs
 from torchpose.camera._rig import CameraRig
-from torchpose.errors import InputError
+from torchpose.errors import check_choice
 
 __all__ = [
     "LEVEL",
@@ -396,5 +396,4 @@ LIMB_SHAPES = {"cylinders": outline, "rectangles": outline_rectangles}
 
 def check_limb_shape(limb_shape: str) -> None:
     """Raise `InputError` unless there are outlines of this name."""
-    if limb_shape not in LIMB_SHAPES:
-        raise InputError(f"limb_shape must be one of {', '.join(LIMB_SHAPES)}, got {limb_shape!r}")
+    check_choice("limb_shape", limb_shape, LIMB_SHAPES)
