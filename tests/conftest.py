@@ -4,17 +4,13 @@ TORCHPOSE_SHAPE_CHECKS=0 switches the shape checks off, for profiling or a debug
 """
 
 import os
-import sys
 
 import pytest
-from jaxtyping import install_import_hook
 
-import tests.shape_checks  # the hook finds it by this name  # noqa: F401
+from tests import shape_checks
 
 if os.environ.get("TORCHPOSE_SHAPE_CHECKS", "1") != "0":
-    if any(name.startswith("torchpose.") for name in sys.modules):
-        raise RuntimeError("torchpose was imported before the shape checks were set up")
-    install_import_hook("torchpose", "tests.shape_checks.check_after_call")
+    shape_checks.install("torchpose")
 
 
 def pytest_addoption(parser):

@@ -1,13 +1,46 @@
-"""The type checker that `tests/conftest.py` hands to jaxtyping."""
+"""Check the annotated shapes, dtypes and types of every call in torchpose.
 
+`install` is called before the package is imported. Every annotated function of it, nested ones
+included, is then checked by jaxtyping and beartype once it has returned. The outcome of a check
+depends on types, dtypes and shapes alone, so a function is checked once for each combination of them,
+and later calls with the same combination go through.
+"""
+
+import ast
+import dataclasses
+import functools
 import inspect
-from collections.abc import Callable
+import sys
+import types
+from collections import deque
+from collections.abc import Callable, Hashable, Mapping, Sequence, Set
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from typing import Any
 
+import numpy as np
 from beartype import BeartypeConf, beartype
 from beartype.roar import BeartypeDecorHintPep673Exception
+from jaxtyping import jaxtyped
+from torch import Tensor
+
+__all__ = ["check_after_call", "checked", "install"]
 
 _beartype = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float
+_NAME = "@checked"  # of the decorator in a module; no name of the module itself can be like it
+_MOST_ITEMS = 32  # of a collection that is told from others by its items
+_ARRAYS, _SEQUENCES = (Tensor, np.ndarray), (tuple, list)
+
+
+def install(package: str) -> None:
+    """Have the functions of a package checked, from its import on.
+
+    Raises:
+        RuntimeError: a module of the package was imported before.
+    """
+    if any(name.startswith(f"{package}.") for name in sys.modules):
+        raise RuntimeError(f"{package} was imported before the shape checks were set up")
+    sys.meta_path.insert(0, _Finder(package))
 
 
 def check_after_call(function: Callable) -> Callable:
@@ -26,3 +59,172 @@ def check_after_call(function: Callable) -> Callable:
         return _beartype(function)
     except BeartypeDecorHintPep673Exception:  # it takes `Self` only where it decorates the class
         return function
+
+
+# --- one function
+
+
+def checked(function: Any) -> Any:
+    """Decorate a function, or the initialiser of a dataclass, so that its calls are checked."""
+    if inspect.isclass(function):
+        init = vars(function).get("__init__")
+        if dataclasses.is_dataclass(function) and inspect.isfunction(init):
+            function.__init__ = checked(init)  # type: ignore[misc]
+        return function
+    if not inspect.isfunction(function) or hasattr(function, "__wrapped__"):
+        return function
+    check = _check_of(function)
+
+    @functools.wraps(function)
+    def wrapper(*args: Any, **kwargs: Any) -> Any:
+        __tracebackhide__ = True
+        returned = function(*args, **kwargs)
+        check(args, kwargs, returned)
+        return returned
+
+    return wrapper
+
+
+_checks: dict[int, tuple[types.CodeType, "_Check"]] = {}
+
+
+def _check_of(function: types.FunctionType) -> "_Check":
+    """Return the check of a function: one for all closures that the same lines define."""
+    code = function.__code__
+    if id(code) not in _checks:
+        _checks[id(code)] = code, _Check(function)  # the code is kept, so that its id stays its own
+    return _checks[id(code)][1]
+
+
+class _Check:
+    """The check of one function's arguments and result, made at the first call."""
+
+    def __init__(self, function: types.FunctionType) -> None:
+        self.function = function
+        names = function.__code__.co_varnames[: function.__code__.co_argcount]
+        self.first = int(bool(names) and names[0] not in function.__annotations__)  # after `self`
+        self.call: Callable | None = None
+        self.being_made = False
+        self.passed: set[Hashable] = set()
+
+    def __call__(self, args: tuple, kwargs: dict[str, Any], returned: Any) -> None:
+        """Raise `jaxtyping.TypeCheckError` if a value is not what its annotation says."""
+        __tracebackhide__ = True
+        key = None
+        try:
+            given = args[self.first :]
+            key = (*map(_facts, given), *kwargs, *map(_facts, kwargs.values()), _facts(returned))
+            if key in self.passed:
+                return
+        except TypeError:  # unhashable, as symbolic sizes are
+            key = None
+        if self.call is None:
+            if self.being_made:  # making it imports modules, and torchpose has a finder of these
+                return
+            self.being_made = True
+            self.call = _make_check(self.function)
+        self.call(*args, **kwargs, _returned=returned)
+        if key is not None:
+            self.passed.add(key)
+
+
+def _pass_on(*args, _returned, **kwargs):
+    return _returned
+
+
+def _make_check(function: types.FunctionType) -> Callable:
+    """Return a function of the same arguments and their result, `_returned`, that is checked."""
+    signature = inspect.signature(function)
+    parameters = list(signature.parameters.values())
+    place = len(parameters) - any(p.kind is p.VAR_KEYWORD for p in parameters)
+    extra = inspect.Parameter("_returned", inspect.Parameter.KEYWORD_ONLY, annotation=Any)
+    expected = signature.return_annotation
+    if expected in (Any, signature.empty):  # the arguments are checked all the same
+        expected = object
+    made = types.FunctionType(_pass_on.__code__, function.__globals__)  # where names are looked up
+    functools.update_wrapper(made, function)
+    made.__signature__ = signature.replace(  # type: ignore[attr-defined]
+        parameters=[*parameters[:place], extra, *parameters[place:]], return_annotation=expected
+    )
+    return jaxtyped(made, typechecker=check_after_call)
+
+
+def _facts(value: Any) -> Hashable:
+    """Return what the outcome of a check of `value` depends on.
+
+    Raises:
+        TypeError: a collection too large to be told from others by its items.
+    """
+    kind = type(value)
+    if isinstance(value, _ARRAYS):
+        return kind, value.dtype, value.shape
+    if kind is str or kind is bool:  # of a Literal
+        return kind, value
+    if isinstance(value, _SEQUENCES) and len(value) <= _MOST_ITEMS:
+        return kind, *map(_facts, value)
+    if kind is dict and len(value) <= _MOST_ITEMS:
+        return kind, *value, *map(_facts, value.values())
+    if _is_collection(kind):
+        raise TypeError(f"{kind.__name__} with items that may be of any type")
+    return (kind, value) if isinstance(value, type) else kind
+
+
+@functools.cache
+def _is_collection(kind: type) -> bool:
+    return kind is not range and issubclass(kind, Sequence | Mapping | Set | deque)
+
+
+# --- a package
+
+
+class _Finder(MetaPathFinder):
+    """Finds the modules of a package, with a loader that decorates their functions."""
+
+    def __init__(self, package: str) -> None:
+        self.package = package
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, target: types.ModuleType | None = None
+    ) -> ModuleSpec | None:
+        if name != self.package and not name.startswith(f"{self.package}."):
+            return None
+        spec = PathFinder.find_spec(name, path, target)
+        if spec is not None and isinstance(spec.loader, SourceFileLoader):
+            spec.loader = _Loader(spec.loader.name, spec.loader.path)
+        return spec
+
+
+class _Loader(SourceFileLoader):
+    def get_code(self, fullname: str) -> types.CodeType:
+        path = self.get_filename(fullname)
+        tree = ast.parse(self.get_data(path), path)
+        _decorate(tree.body)
+        return compile(tree, path, "exec", dont_inherit=True)
+
+    def exec_module(self, module: types.ModuleType) -> None:
+        setattr(module, _NAME, checked)
+        super().exec_module(module)
+
+
+def _decorate(body: Sequence[ast.AST]) -> None:
+    """Decorate every annotated function and every class in statements, and in the blocks of these."""
+    for node in body:
+        if isinstance(node, ast.ClassDef):
+            node.decorator_list.insert(0, _decorator(node))  # after `dataclass`
+        elif isinstance(node, ast.FunctionDef) and _is_annotated(node):
+            node.decorator_list.append(_decorator(node))  # before `property` and the like
+        for block in ("body", "orelse", "finalbody", "handlers", "cases"):
+            inner = getattr(node, block, None)
+            if isinstance(inner, list):
+                _decorate(inner)
+
+
+def _decorator(node: ast.AST) -> ast.Name:
+    return ast.copy_location(ast.Name(_NAME, ast.Load()), node)
+
+
+def _is_annotated(node: ast.FunctionDef) -> bool:
+    arguments = node.args
+    several = (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs)
+    every = (*several, arguments.vararg, arguments.kwarg)
+    return node.returns is not None or any(a is not None and a.annotation for a in every)

@@ -1,11 +1,15 @@
 """The suite itself: wrong shapes are caught, and typed errors come through."""
 
+import contextlib
+import importlib
 import os
+import sys
 
 import pytest
 import torch
 from jaxtyping import TypeCheckError
 
+from tests import shape_checks
 from torchpose.camera import _projection as projection
 from torchpose.errors import ShapeError
 from torchpose.math import _gaussian as gaussian
@@ -30,3 +34,115 @@ def test_typed_error_of_the_function_wins():
     eye = torch.eye(3)
     with pytest.raises(ShapeError, match="points"):
         projection.project(torch.zeros(4, 2), eye, eye, torch.zeros(3))
+
+
+PACKAGE = '''
+"""Functions whose shapes disagree on purpose."""
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+def head(x: Float[Tensor, "N D"], n: int) -> Float[Tensor, "n D"]:
+    return x[0] if n == 0 else x[:n]
+
+
+def noted(x: Float[Tensor, "N D"], notes: list[str]) -> Any:
+    notes.append("called")
+
+
+def nested(x):
+    def inner(x: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
+        return x[1:] if len(x) == 3 else x
+
+    return inner(x)
+
+
+@dataclass
+class Pair:
+    a: Float[Tensor, "N"]
+    b: Float[Tensor, "N"]
+
+    @property
+    def width(self) -> int:
+        return len(self.a) or "none"
+
+    @classmethod
+    def of(cls, a: Float[Tensor, "N"]) -> Self:
+        return cls(a, a)
+
+
+def joined(parts: dict[str, Float[Tensor, "N"]], *more: Float[Tensor, "N"], **named: str) -> int:
+    return len(parts)
+'''
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory):
+    """A package of which every call is checked."""
+    folder = tmp_path_factory.mktemp("packages")
+    (folder / "shaped_on_purpose").mkdir()
+    (folder / "shaped_on_purpose" / "__init__.py").write_text("")
+    (folder / "shaped_on_purpose" / "functions.py").write_text(PACKAGE)
+    before = list(sys.meta_path)
+    shape_checks.install("shaped_on_purpose")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(folder))
+        yield importlib.import_module("shaped_on_purpose.functions")
+    sys.meta_path[:] = before
+
+
+def test_every_new_combination_of_shapes_is_checked(package):
+    x = torch.zeros(3, 2)
+    for _ in range(3):
+        assert package.head(x, 2).shape == (2, 2)
+    with pytest.raises(TypeCheckError, match=r"functions\.head"):
+        package.head(x, 0)  # the arguments are as before, the result is not
+    with pytest.raises(TypeCheckError):
+        package.head(x.long(), 2)
+    with pytest.raises(TypeCheckError):
+        package.head(x, torch.tensor(2))
+    with pytest.raises(TypeCheckError):  # what failed fails again
+        package.head(x, 0)
+    assert package.head(x, n=1).shape == (1, 2)
+
+
+def test_arguments_are_checked_whatever_is_returned_and_after_the_call(package):
+    notes = []
+    package.noted(torch.zeros(2, 2), notes)
+    with pytest.raises(TypeCheckError):
+        package.noted(torch.zeros(2), notes)
+    assert notes == ["called", "called"]
+
+
+def test_nested_functions_and_methods_are_checked(package):
+    for n in (2, 3, 2):
+        context = pytest.raises(TypeCheckError) if n == 3 else contextlib.nullcontext()
+        with context:
+            package.nested(torch.zeros(n))
+    assert package.Pair.of(torch.zeros(2)).width == 2
+    with pytest.raises(TypeCheckError):
+        package.Pair(torch.zeros(2), torch.zeros(3))
+    with pytest.raises(TypeCheckError):
+        package.Pair.of(torch.zeros(2, 2))
+    with pytest.raises(TypeCheckError):
+        _ = package.Pair.of(torch.zeros(0)).width
+
+
+def test_items_of_collections_are_checked(package):
+    two, three = torch.zeros(2), torch.zeros(3)
+    for _ in range(2):
+        assert package.joined({"a": two}, two, two, more="words") == 1
+    for bad in (({"a": three}, two), ({"a": two}, two, three), ({"a": two.long()},), ({1: two},)):
+        with pytest.raises(TypeCheckError):
+            package.joined(*bad)
+    with pytest.raises(TypeCheckError):
+        package.joined({}, more=two)
+
+
+def test_a_package_that_was_imported_already_is_refused():
+    with pytest.raises(RuntimeError, match="torchpose was imported before"):
+        shape_checks.install("torchpose")
