@@ -8,6 +8,10 @@ export OMP_NUM_THREADS ?= 1
 # No advertisement in the output of mkdocs.
 export NO_MKDOCS_2_WARNING := 1
 TEST_PROCESSES ?= 2
+# The tests of a file stay in one process, which makes what they share once.
+PYTEST := $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
+# The suite starts many processes: they share compiled modules.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DELETE_ON_ERROR:
 .PHONY: help demo test test-quick wheel lint format docs docs-serve install clean
@@ -28,13 +32,13 @@ demo: $(VENV)/.installed-plots
 	$(BIN)/torchpose demo --input walk --out demo-output/walk
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n $(TEST_PROCESSES) $(PYTEST_ARGS)
+	$(PYTEST) $(PYTEST_ARGS)
 
 # What most changes break first, and nothing that tracks more than a few frames.
 QUICK := tests/_core tests/math tests/skeleton tests/camera tests/metrics tests/docs/test_reference.py \
          tests/test_import.py tests/test_structure.py
 test-quick: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -n $(TEST_PROCESSES) -m "not slow and not data" $(PYTEST_ARGS) $(QUICK)
+	$(PYTEST) -m "not slow and not data" $(PYTEST_ARGS) $(QUICK)
 
 wheel:
 	PYTHON="$(PYTHON)" .ci/wheel
