@@ -47,6 +47,7 @@ def main() -> None:
     torch.set_num_threads(args.threads)
     prior = load_prior(args.prior or "kinect-upper-body")
     _, tested = people(args.data, args.quick)
+    tested = tested[:: 3 if args.quick else 1]
     poses = [centred_on_neck(recording.upper_body().joints) for recording in tested]
     fps = tested[0].fps or 30.0
     still = make_test_set(poses, CAMERA, fps)
