@@ -17,8 +17,8 @@ def pytest_addoption(parser):
     parser.addoption(
         "--fuzz-seconds",
         type=float,
-        default=30.0,
-        help="processor time for damaged files and odd calls (tests/fuzz; default 30)",
+        default=10.0,
+        help="processor time for damaged files and odd calls (tests/fuzz; default 10)",
     )
 
 
