@@ -30,15 +30,18 @@ def assert_differentiable(
         torch.testing.assert_close(ours.detach(), expected, rtol=same, atol=same, equal_nan=True)
     generator = torch.Generator().manual_seed(0)
     weights = [_random_like(out, generator) / out.abs().nanmean().clamp_min(1e-3) for out in plain]
+    gradients = []
+    for i, weight in enumerate(weights):
+        (gradient,) = torch.autograd.grad(
+            (learning[i] * weight).nansum(), leaf, retain_graph=True, allow_unused=True
+        )
+        assert gradient is not None, f"output {i} has no gradient"
+        assert bool(gradient.isfinite().all()), f"the gradient of output {i} is not finite"
+        gradients.append(gradient)
     for direction in (_random_like(x, generator), _random_like(x, generator)):
         ahead, behind = _outputs(function, x, step * direction)
-        for i, weight in enumerate(weights):
+        for i, (weight, gradient) in enumerate(zip(weights, gradients, strict=True)):
             slope = ((ahead[i] - behind[i]) * weight).nansum() / (2 * step)
-            (gradient,) = torch.autograd.grad(
-                (learning[i] * weight).nansum(), leaf, retain_graph=True, allow_unused=True
-            )
-            assert gradient is not None, f"output {i} has no gradient"
-            assert bool(gradient.isfinite().all()), f"the gradient of output {i} is not finite"
             found = (gradient * direction).sum()
             scale = gradient.norm() * direction.norm() / max(direction.numel(), 1) ** 0.5
             assert abs(found - slope) <= tolerance * max(scale, abs(slope), 1e-6), (
