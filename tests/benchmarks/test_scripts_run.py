@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.speed._timing import THREAD_VARIABLES
 from tests.data import data_dir_or_skip
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -47,7 +48,9 @@ def run_here(monkeypatch, capsys):
     def run(script: str, *options: str) -> str:
         module = importlib.import_module(f"benchmarks.{script}")
         monkeypatch.setattr(sys, "argv", [script, "--threads", "1", *options])
-        monkeypatch.setattr(module, "limit_threads", lambda threads: None)
+        monkeypatch.setattr(os, "sched_setaffinity", lambda *_: None, raising=False)
+        for library in THREAD_VARIABLES:  # which the script sets; they are put back afterwards
+            monkeypatch.setenv(f"{library}_NUM_THREADS", "1")
         monkeypatch.setenv("PYTHONPATH", str(ROOT))  # of processes that the script starts
         capsys.readouterr()
         module.main()
