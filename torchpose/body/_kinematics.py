@@ -24,14 +24,7 @@ from torchpose.body._limbs import (
     point_weights,
 )
 from torchpose.body._skeleton import BodySkeleton
-from torchpose.errors import (
-    InputError,
-    ShapeError,
-    SkeletonError,
-    check_choice,
-    check_finite,
-    check_shape,
-)
+from torchpose.errors import InputError, ShapeError, SkeletonError, check_finite, check_shape
 from torchpose.math._rotations import (
     compose,
     conjugate,
@@ -121,7 +114,8 @@ class Body(nn.Module):
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
-        check_choice("frame", frame, FRAMES)
+        if frame not in FRAMES:
+            raise InputError(f"frame must be one of {', '.join(FRAMES)}, got {frame!r}")
         self.skeleton, self.frame, self.dim = skeleton, frame, skeleton.dim
         device = bone_lengths.device
         lengths = checked_lengths(skeleton, bone_lengths.double())
