@@ -1,19 +1,10 @@
-"""Define the typed errors, and the private checks of arguments that raise them.
+"""Define the typed errors.
 
 Every message says what was expected, what came, and what to do about it. Messages are one line of
 printable characters, whatever the file or the name that they quote.
 """
 
-import math
-from collections.abc import Callable, Collection, Iterable, Sequence
-from numbers import Real
 from typing import Any
-
-import torch
-from torch import Tensor
-
-from torchpose._core.facade import set_up_facade
-from torchpose._core.value_checks import values_visible
 
 __all__ = [
     "CameraError",
@@ -31,10 +22,8 @@ __all__ = [
     "TorchposeError",
 ]
 
-set_up_facade(__name__)
 
 _LONGEST, _TAIL = 1200, 300  # characters of a message, and how many of those are of its end
-_FASTEST = 1000.0  # frames per second
 
 
 def printable(text: str, longest: int = _LONGEST) -> str:
@@ -111,187 +100,5 @@ class DegenerateFilterWarning(UserWarning):
     """Some elements of a batch degenerated; the others finished."""
 
 
-def refuse_export(what: str, instead: str) -> None:
-    """Raise `InputError` while `torch.export` traces what depends on values.
-
-    Args:
-        what: cannot be exported. instead: what can.
-    """
-    is_exporting = getattr(torch.compiler, "is_exporting", None)  # not in all releases
-    if is_exporting is not None and is_exporting():
-        raise InputError(f"{what} cannot be exported; export {instead}")
-
-
-def check_shape(name: str, tensor: Tensor, expected: Sequence[int | str | None]) -> None:
-    """Raise `ShapeError` unless `tensor` has the expected sizes.
-
-    Args:
-        name: what the tensor is called in the message.
-        tensor: the tensor to look at.
-        expected: one entry per dimension; an int is a fixed size, a str or None is any size. A
-            leading ``"..."`` stands for any number of leading dimensions.
-
-    Raises:
-        ShapeError: with the expected and the given shape.
-    """
-    sizes = list(expected)
-    open_ended = bool(sizes) and sizes[0] == "..."
-    if open_ended:
-        sizes = sizes[1:]
-    shape = tuple(tensor.shape)
-    tail = shape[len(shape) - len(sizes) :] if len(shape) >= len(sizes) else ()
-    wrong_rank = len(shape) < len(sizes) or (not open_ended and len(shape) != len(sizes))
-    wrong_size = any(isinstance(e, int) and e != s for e, s in zip(sizes, tail, strict=False))
-    if wrong_rank or wrong_size:
-        wanted = ", ".join("any" if e is None else str(e) for e in expected)
-        raise ShapeError(f"{name} must have shape [{wanted}], got {list(shape)}")
-
-
-def check_finite(name: str, tensor: Tensor, where: Tensor | None = None, hint: str = "") -> None:
-    """Raise `InputError` if an element is NaN or infinite (where `where` is True, if given)."""
-    if not values_visible():
-        return
-    bad = ~torch.isfinite(tensor)
-    if where is not None:
-        bad = bad & where
-    if bool(bad.any()):
-        index = tuple(int(i) for i in torch.nonzero(bad)[0])
-        value = float(tensor[index])
-        count = int(bad.sum())
-        message = f"{name} must be finite, got {value} at index {index} ({count} such values)"
-        raise InputError(f"{message}; {hint}" if hint else message)
-
-
-def check_floating(name: str, tensor: Any) -> None:
-    """Raise `InputError` unless `tensor` holds real floating-point numbers."""
-    if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
-        kind = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
-        raise InputError(
-            f"{name} must be a floating-point tensor, got {kind}; convert it with .double()"
-        )
-
-
-def check_real(name: str, values: Any) -> None:
-    """Raise `InputError` for complex numbers, whose imaginary parts a conversion would drop."""
-    dtype = getattr(values, "dtype", None)
-    if getattr(dtype, "is_complex", False) or getattr(dtype, "kind", "") == "c":
-        raise InputError(f"{name} must be real, got {dtype}")
-
-
-def check_rgb(name: str, image: Any, empty: bool = True) -> None:
-    """Raise `InputError` unless `image` is an array [H, W, 3] of uint8; `empty` ones may pass."""
-    _check_image(name, image, "RGB, [H, W, 3]", 3, empty)
-
-
-def check_grey(name: str, image: Any) -> None:
-    """Raise `InputError` unless `image` is an array [H, W] of uint8."""
-    _check_image(name, image, "grey, [H, W]", None, True)
-
-
-def _check_image(name: str, image: Any, kind: str, channels: int | None, empty: bool) -> None:
-    shape = tuple(getattr(image, "shape", ()))
-    dtype = getattr(image, "dtype", type(image))
-    fits = len(shape) == (2 if channels is None else 3) and channels in (None, shape[-1])
-    if not fits or str(dtype) != "uint8" or (not empty and 0 in shape):
-        raise InputError(f"{name} must be {kind} of uint8, got {list(shape)} of {dtype}")
-
-
-def check_rate(name: str, fps: Any) -> float:
-    """Return `fps` as a float, or raise `InputError` unless it is in (0, 1000] frames per second.
-
-    Filters and windows look back for so many frames; a rate that no camera has takes the memory for
-    them.
-    """
-    number = isinstance(fps, Real) and not isinstance(fps, bool)
-    if not number or not 0 < fps <= _FASTEST:
-        raise InputError(
-            f"{name} must be positive and at most {_FASTEST:g} frames per second, got {fps!r:.60}"
-        )
-    return float(fps)
-
-
-def check_choice(name: str, value: object, choices: Collection[str]) -> None:
-    """Raise `InputError` unless an option is one of these words."""
-    if not (isinstance(value, str) and value in choices):
-        raise InputError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
-
-
-def check_positive(name: str, value: float) -> float:
-    """Return a number, or raise `InputError` unless it is above 0 and finite."""
-    if not 0 < value < math.inf:
-        raise InputError(f"{name} must be positive and finite, got {value}")
-    return value
-
-
-def check_weights(name: str, weights: Tensor) -> None:
-    """Raise `InputError` unless all weights are positive and finite."""
-    check_finite(name, weights)
-    if weights.numel() == 0:
-        raise InputError(f"{name} must hold at least one weight, got none")
-    if values_visible() and bool((weights <= 0).any()):
-        index = int(torch.nonzero((weights <= 0).reshape(-1))[0])
-        raise InputError(
-            f"{name} must be positive, got {float(weights.reshape(-1)[index]):g} at index {index}; "
-            "drop components of zero weight"
-        )
-
-
-def check_covariance(name: str, covariance: Tensor, tolerance: float = 1e-6) -> None:
-    """Raise `CovarianceError` unless every matrix is symmetric and positive definite.
-
-    Args:
-        name: what the covariance is called in the message.
-        covariance: [..., D, D].
-        tolerance: largest asymmetry, relative to the largest entry of each matrix.
-
-    Raises:
-        ShapeError: not square. InputError: not finite. CovarianceError: not symmetric or not
-            positive definite (the index of the first such matrix is named).
-    """
-    if covariance.ndim < 2 or covariance.shape[-1] != covariance.shape[-2]:
-        raise ShapeError(f"{name} must have shape [..., D, D], got {list(covariance.shape)}")
-    if not values_visible():
-        return
-    check_finite(name, covariance)
-    scale = covariance.abs().amax((-2, -1)).clamp_min(torch.finfo(covariance.dtype).tiny)
-    skew = (covariance - covariance.mT).abs().amax((-2, -1)) / scale
-    if bool((skew > tolerance).any()):
-        index = tuple(int(i) for i in torch.nonzero(skew > tolerance)[0])
-        raise CovarianceError(
-            f"{name} must be symmetric, got a matrix with relative asymmetry {float(skew.max()):.2g} "
-            f"at index {index}; pass (C + C.mT) / 2 if that is what you mean"
-        )
-    info = torch.linalg.cholesky_ex((covariance + covariance.mT) / 2).info
-    if bool((info != 0).any()):
-        index = tuple(int(i) for i in torch.nonzero(info)[0])
-        raise CovarianceError(
-            f"{name} must be positive definite, got a matrix that is not at index {index}; "
-            "add a small multiple of the identity or drop its dependent dimensions"
-        )
-
-
-def refuse_unused(
-    options: Iterable[str],
-    said: str,
-    method: str,
-    methods: Iterable[str],
-    options_of: Callable[[str], tuple[str, ...]],
-) -> None:
-    """Raise for the first option that a method does not use, and name the methods that do.
-
-    Args:
-        options: names given. said: what is wrong with such an option, after its name.
-        method: the one that was chosen, of `methods`. options_of: the options of a method.
-
-    Raises:
-        InputError: such an option.
-    """
-    own = options_of(method)
-    for name in options:
-        if name in own:
-            continue
-        others = [other for other in methods if name in options_of(other)]
-        raise InputError(
-            f"option {name!r} {said}, which has {', '.join(own)}; "
-            + (f"it is of {', '.join(others)}" if others else "it is of no method")
-        )
+def __dir__() -> list[str]:
+    return sorted({*__all__, "__all__", "__doc__", "__file__", "__name__"})

@@ -2,7 +2,7 @@
 
 import torch
 
-from torchpose.errors import check_rate
+from torchpose._core.checks import check_rate
 from torchpose.learning._fit_files import write_limb_files
 from torchpose.learning._recipes import LimbStates, fit_limbs
 from torchpose.learning._recipes.limbs import check_least_std

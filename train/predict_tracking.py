@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 import torchpose
+from torchpose._core.checks import check_positive
 from torchpose._core.files import atomic_path
-from torchpose._core.terminal import check_positive
 from torchpose.errors import InputError, OutputError
 from torchpose.io import read_keypoints
 from torchpose.priors import UpperBodyPrior
@@ -47,7 +47,8 @@ class BatchTracker:
 
     def __init__(self, settings: TrackSettings, device: str = "cpu") -> None:
         for option, value in (("track.fps", settings.fps), ("track.max_gap", settings.max_gap)):
-            check_positive(option, value)
+            if value is not None:
+                check_positive(option, value)
         self._tracker = KeypointFileTracker(settings, device)
         self._tracker.check()
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from torchpose._core.checks import check_rate
 from torchpose._core.reading import check_span, npz_keys, read_json, read_npz, reading, require_file
 from torchpose.camera import PinholeCamera, load_cameras
 from torchpose.errors import (
@@ -22,7 +23,6 @@ from torchpose.errors import (
     MissingDependencyError,
     OutputError,
     TorchposeError,
-    check_rate,
     printable,
 )
 from torchpose.io import read_keypoints, read_recording

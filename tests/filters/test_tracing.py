@@ -24,8 +24,9 @@ from tests.filters.traced_steps import (
     seeded,
     sequences,
 )
+from torchpose._core.checks import check_covariance
 from torchpose._core.value_checks import values_visible
-from torchpose.errors import CovarianceError, InputError, ShapeError, check_covariance
+from torchpose.errors import CovarianceError, InputError, ShapeError
 from torchpose.math._gaussian import mended_cholesky
 
 FILTERS = (*KALMAN, *PARTICLES)

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchpose.errors import InputError, ShapeError, check_floating, check_shape
+from torchpose._core.checks import check_floating, check_shape
+from torchpose.errors import InputError, ShapeError
 
 __all__ = ["as_pair", "as_values", "check_mask"]
 

@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.checks import check_rate
 from torchpose._core.reading import one_number, texts
-from torchpose.errors import FileFormatError, InputError, check_rate
+from torchpose.errors import FileFormatError, InputError
 
 __all__ = ["check_estimates", "check_number_range", "frame_facts", "to_tensor"]
 

@@ -20,16 +20,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from torchpose._core.checks import check_covariance, check_finite, check_rate
 from torchpose._core.files import atomic_path
 from torchpose._core.reading import reading, require_file, sizes_fit
-from torchpose.errors import (
-    FileFormatError,
-    OutputError,
-    PriorError,
-    check_covariance,
-    check_finite,
-    check_rate,
-)
+from torchpose.errors import FileFormatError, OutputError, PriorError
 
 __all__ = [
     "FileKind",

@@ -3,17 +3,11 @@
 import re
 import sys
 
-from torchpose.errors import InputError, printable
+from torchpose.errors import printable
 
-__all__ = ["check_positive", "one_line", "show_progress"]
+__all__ = ["one_line", "show_progress"]
 
 _POSITIONALS = {"input": "INPUT", "recordings": "DIR"}
-
-
-def check_positive(option: str, value: float | None) -> None:
-    """Raise `InputError` unless the value of an option is None or above zero."""
-    if value is not None and not 0 < value < float("inf"):
-        raise InputError(f"{option} must be positive, got {value:g}")
 
 
 def one_line(error: BaseException) -> str:

@@ -27,7 +27,7 @@ def without_value_checks() -> Iterator[None]:
 
     Example:
         >>> import torch, torchpose
-        >>> from torchpose.errors import check_finite
+        >>> from torchpose._core.checks import check_finite
         >>> with torchpose.without_value_checks():
         ...     check_finite("z", torch.tensor(float("nan")))
     """

@@ -18,9 +18,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose._core.checks import check_shape
 from torchpose.body._kinematics import Body, Frame
 from torchpose.body._skeleton import BODY_15, BodySkeleton
-from torchpose.errors import InputError, SkeletonError, check_shape
+from torchpose.errors import InputError, SkeletonError
 from torchpose.math._rotations import cross_matrix, minimal_rotation, quaternion_vector_to_matrix
 
 __all__ = ["fit_body", "fit_state", "joint_errors", "swing_parts"]

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from torchpose._core.checks import check_finite, check_shape
 from torchpose._core.module_state import derived, register_given
 from torchpose.body._limbs import (
     Limbs,
@@ -24,7 +25,7 @@ from torchpose.body._limbs import (
     point_weights,
 )
 from torchpose.body._skeleton import BodySkeleton
-from torchpose.errors import InputError, ShapeError, SkeletonError, check_finite, check_shape
+from torchpose.errors import InputError, ShapeError, SkeletonError
 from torchpose.math._rotations import (
     compose,
     conjugate,

@@ -6,8 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.checks import check_finite, check_shape
 from torchpose.body._skeleton import BodySkeleton
-from torchpose.errors import InputError, ShapeError, check_finite, check_shape
+from torchpose.errors import InputError, ShapeError
 
 __all__ = [
     "Limbs",

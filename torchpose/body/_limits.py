@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from torchpose.errors import InputError, ShapeError, check_finite, check_shape
+from torchpose._core.checks import check_finite, check_shape
+from torchpose.errors import InputError, ShapeError
 from torchpose.math._rotations import within_unit_ball
 
 __all__ = ["JointLimits"]

@@ -13,7 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.errors import InputError, SkeletonError, check_shape
+from torchpose._core.checks import check_shape
+from torchpose.errors import InputError, SkeletonError
 from torchpose.math._tree_messages import tree_levels
 from torchpose.skeleton._joint_sets import canonical_names
 

@@ -15,12 +15,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from torchpose._core.checks import check_floating, check_real
 from torchpose.camera._projection import (
     check_intrinsics,
     intrinsics,
     project,
 )
-from torchpose.errors import CameraError, FileFormatError, InputError, check_floating, check_real
+from torchpose.errors import CameraError, FileFormatError, InputError
 from torchpose.math._rotations import (
     rotvec_to_matrix,
 )

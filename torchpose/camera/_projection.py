@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.errors import CameraError, check_shape
+from torchpose._core.checks import check_shape
+from torchpose.errors import CameraError
 from torchpose.math._rotations import RotationOrder, euler_to_matrix
 from torchpose.math._unscented import unscented_transform
 

@@ -10,8 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from torchpose._core.checks import check_floating, check_shape
 from torchpose.camera._pinhole import PinholeCamera, load_cameras
-from torchpose.errors import CameraError, InputError, check_floating, check_shape
+from torchpose.errors import CameraError, InputError
 
 __all__ = ["CameraRig", "Cameras", "RigView", "as_rig", "scale_matrix", "undistortion_maps"]
 

@@ -4,7 +4,8 @@ from argparse import ArgumentError
 from pathlib import Path
 from typing import Any
 
-from torchpose._core.terminal import check_positive, show_progress
+from torchpose._core.checks import check_positive
+from torchpose._core.terminal import show_progress
 from torchpose.cli.command import Command, Given
 from torchpose.cli.common import pictures_possible
 from torchpose.cli.options import Option, options_of, options_of_methods
@@ -121,7 +122,8 @@ def run(
     if settings["prior"] is None:  # as a configuration may say it
         raise InputError("--prior must be a name or a file, got null")
     for option in ("fps", "max_gap"):
-        check_positive(f"--{option.replace('_', '-')}", settings[option])
+        if settings[option] is not None:
+            check_positive(f"--{option.replace('_', '-')}", settings[option])
     options = {name: value for name, value in method_options.items() if value is not None}
     job = Job(input, out, given.files(), TrackSettings(**settings), options, pictures)
     if is_video(input):

@@ -7,7 +7,8 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from torchpose._core.terminal import check_positive, show_progress
+from torchpose._core.checks import check_positive
+from torchpose._core.terminal import show_progress
 from torchpose.cli.command import Command, Given
 from torchpose.cli.common import pictures_possible, share_cores
 from torchpose.cli.options import Option, options_of, options_of_methods
@@ -173,7 +174,8 @@ def run(
 def _check(values: dict[str, Any]) -> None:
     """Raise `InputError` for values out of range, and for lists that do not go with the videos."""
     for key in ("height", "sharpness", "rows", "n_particles", "fps"):
-        check_positive(f"--{key.replace('_', '-')}", values[key])
+        if values[key] is not None:
+            check_positive(f"--{key.replace('_', '-')}", values[key])
     facing, n_videos = values["facing"], len(values["videos"])
     if facing is not None and len(facing) != 3:
         raise InputError(f"--facing must be three numbers, got {facing}")

@@ -19,7 +19,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.errors import InputError, check_finite, check_shape
+from torchpose._core.checks import check_finite, check_shape
+from torchpose.errors import InputError
 from torchpose.math._rotations import euler_to_matrix, rotvec_to_matrix
 
 __all__ = ["ANGLE_LIMITS", "BodyAngles", "BodySize", "angles_to_joints", "hands_to_arms"]

@@ -12,10 +12,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.checks import check_shape
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import project
 from torchpose.demo._mannequin import ANGLE_LIMITS, BodyAngles, BodySize, angles_to_joints
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import InputError
 from torchpose.math._rotations import euler_to_matrix
 from torchpose.skeleton._joint_sets import UPPER_BODY
 

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from torchpose._core.checks import check_shape
 from torchpose._core.module_state import (
     WideModule,
     derived,
@@ -21,7 +22,7 @@ from torchpose._core.module_state import (
     register_given,
     working_precision,
 )
-from torchpose.errors import InputError, ShapeError, check_shape
+from torchpose.errors import InputError, ShapeError
 from torchpose.filters._measurements import (
     Measurements,
     as_covariance,

@@ -6,8 +6,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.checks import check_positive, check_shape
 from torchpose._core.module_state import derived
-from torchpose.errors import InputError, check_positive, check_shape
+from torchpose.errors import InputError
 from torchpose.math._gaussian import kalman_gain, safe_cholesky, symmetrise
 
 __all__ = ["ConstantVelocityFilter", "ConstantVelocityState"]

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchpose._core.checks import check_choice
 from torchpose._core.value_checks import values_visible
-from torchpose.errors import InputError, check_choice
+from torchpose.errors import InputError
 from torchpose.filters._base import Generators
 from torchpose.filters._columns import run_columns, suits_columns
 from torchpose.filters._gain_graph import find_history

@@ -6,16 +6,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from torchpose._core.value_checks import values_visible
-from torchpose.errors import (
-    InputError,
-    ShapeError,
+from torchpose._core.checks import (
     check_covariance,
     check_finite,
     check_floating,
     check_real,
     check_shape,
 )
+from torchpose._core.value_checks import values_visible
+from torchpose.errors import InputError, ShapeError
 
 __all__ = [
     "Measurements",

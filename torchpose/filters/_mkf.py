@@ -12,8 +12,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose._core.checks import check_choice
 from torchpose._core.module_state import derived, one_run, register_given, wide_or_parameter
-from torchpose.errors import InputError, check_choice
+from torchpose.errors import InputError
 from torchpose.filters._base import Generators, RecursiveFilter, require_state
 from torchpose.filters._measurements import (
     Measurements,

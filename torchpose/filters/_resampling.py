@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.errors import InputError, check_choice, check_positive, check_shape
+from torchpose._core.checks import check_choice, check_positive, check_shape
+from torchpose.errors import InputError
 from torchpose.filters._base import Generators, uniform
 
 __all__ = [

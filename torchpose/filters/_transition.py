@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose._core.checks import check_choice, check_finite, check_shape
 from torchpose._core.value_checks import values_visible
-from torchpose.errors import InputError, check_choice, check_finite, check_shape
+from torchpose.errors import InputError
 from torchpose.filters._weights import normalise
 from torchpose.math._gaussian import safe_cholesky, symmetrise
 from torchpose.priors._gaussian_mixture import GaussianMixture

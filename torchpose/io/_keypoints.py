@@ -14,10 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpose._core.checks import check_rate
 from torchpose._core.files import atomic_path, write_npz
 from torchpose._core.reading import reading, require_file
 from torchpose.camera._projection import check_intrinsics
-from torchpose.errors import CameraError, FileFormatError, InputError, SkeletonError, check_rate
+from torchpose.errors import CameraError, FileFormatError, InputError, SkeletonError
 from torchpose.io._formats.keypoint_files import (
     RawKeypoints,
     read_csv_keypoints,

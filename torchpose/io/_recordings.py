@@ -13,8 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpose._core.checks import check_rate
 from torchpose._core.reading import npz_keys, reading, require_file
-from torchpose.errors import FileFormatError, InputError, SkeletonError, check_rate
+from torchpose.errors import FileFormatError, InputError, SkeletonError
 from torchpose.io._formats.axes import axes_rotation, body_unit, check_upright, default_axes
 from torchpose.io._formats.kinect_csv import ROW_LENGTHS, header_joints, read_kinect_csv, split_row
 from torchpose.io._formats.mocap_files import read_bvh, read_c3d

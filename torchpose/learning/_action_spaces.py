@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.errors import InputError, check_rate, check_shape
+from torchpose._core.checks import check_rate, check_shape
+from torchpose.errors import InputError
 from torchpose.learning._performances import Synchronised, checked_performances, synchronise
 from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.file import ActionInfo

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose.errors import InputError, check_shape
+from torchpose._core.checks import check_shape
+from torchpose.errors import InputError
 from torchpose.math._gaussian import safe_cholesky
 from torchpose.priors._manifold.prediction import KernelParameters, covariance, rbf
 

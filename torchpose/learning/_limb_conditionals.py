@@ -8,9 +8,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose._core.checks import check_finite, check_rate, check_shape
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BodySkeleton
-from torchpose.errors import InputError, check_finite, check_rate, check_shape
+from torchpose.errors import InputError
 from torchpose.math._rotation_gaussians import fit_gaussian, safe_centre
 from torchpose.math._rotations import compose, conjugate
 from torchpose.math._unscented import floor_eigenvalues

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.errors import InputError, check_rate
+from torchpose._core.checks import check_rate
+from torchpose.errors import InputError
 from torchpose.learning._gplvm_fit import GPLVMFit, best_fit, median_gamma
 from torchpose.priors._manifold.file import ManifoldInfo
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM, MotionNoise, join_sequences

@@ -13,7 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.errors import InputError, check_finite, check_shape
+from torchpose._core.checks import check_finite, check_shape
+from torchpose.errors import InputError
 from torchpose.priors._actions.file import Synchronised
 
 __all__ = [

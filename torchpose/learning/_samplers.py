@@ -14,8 +14,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose._core.checks import check_shape
 from torchpose.camera._viewpoints import ViewRange, sample_viewpoints
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import InputError
 from torchpose.priors._arm_state import arm_state
 from torchpose.priors._window import WindowLayout, augment_bodies, mirror_bodies, window_state
 

@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchpose.errors import InputError, check_shape
+from torchpose._core.checks import check_shape
+from torchpose.errors import InputError
 from torchpose.learning._blocks import (
     ALONE,
     Share,

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.errors import check_finite, check_shape, check_weights
+from torchpose._core.checks import check_finite, check_shape, check_weights
 from torchpose.math._mixture_steps import MixtureParameters
 
 __all__ = ["STARTS", "floor_variances", "k_means", "start_mixture"]

@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.errors import InputError, check_finite, check_shape
+from torchpose._core.checks import check_finite, check_shape
+from torchpose.errors import InputError
 from torchpose.math._rotations import compose, conjugate, vector_to_quaternion
 from torchpose.math._unscented import Directions, moments, sigma_points
 

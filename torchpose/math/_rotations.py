@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose._core.arguments import as_pair
-from torchpose.errors import check_choice, check_shape
+from torchpose._core.checks import check_choice, check_shape
 
 __all__ = [
     "ROTATION_ORDERS",

@@ -12,7 +12,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchpose.errors import ShapeError, SkeletonError, check_shape
+from torchpose._core.checks import check_shape
+from torchpose.errors import ShapeError, SkeletonError
 from torchpose.math._gaussian import safe_cholesky
 
 __all__ = ["MessageTree", "Transport", "TreeLevel", "message_tree", "propagate", "tree_levels"]

@@ -14,7 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchpose.errors import InputError, check_choice, check_shape
+from torchpose._core.checks import check_choice, check_shape
+from torchpose.errors import InputError
 from torchpose.math._gaussian import condition, safe_cholesky, symmetrise
 
 __all__ = [

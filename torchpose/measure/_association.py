@@ -6,8 +6,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.checks import check_shape
 from torchpose._core.images import Image
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import InputError
 from torchpose.measure._edges import ARM_LIMBS, Segments, limb_votes, segments_of_arms
 from torchpose.measure._persons import match_states
 from torchpose.skeleton._joint_sets import UPPER_BODY

@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from torchpose._core.checks import check_rgb, check_shape
 from torchpose._core.images import Image
-from torchpose.errors import InputError, check_rgb, check_shape
+from torchpose.errors import InputError
 from torchpose.measure._body_window import CELLS, EVIDENCE, move_maps
 
 __all__ = ["BackgroundModel", "Motion", "MotionState", "dense_flow", "person_region"]

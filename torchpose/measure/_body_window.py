@@ -15,8 +15,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpose._core.checks import check_shape
 from torchpose._core.images import Image
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import InputError
 from torchpose.measure._skin import SkinModel
 
 __all__ = [

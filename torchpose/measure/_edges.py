@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose._core.checks import check_shape
 from torchpose._core.images import Image
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import InputError
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
 __all__ = ["ARM_LIMBS", "Segments", "edge_map", "find_segments", "limb_votes", "segments_of_arms"]

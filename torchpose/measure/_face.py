@@ -11,8 +11,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.checks import check_finite, check_grey, check_shape
 from torchpose._core.images import Image
-from torchpose.errors import InputError, check_finite, check_grey, check_shape
+from torchpose.errors import InputError
 from torchpose.math._gaussian import kalman_predict, kalman_update
 
 __all__ = [

@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.checks import check_finite, check_rgb, check_shape
 from torchpose._core.images import Image
-from torchpose.errors import InputError, check_finite, check_rgb, check_shape
+from torchpose.errors import InputError
 from torchpose.measure._body_window import CELL, CELLS, EVIDENCE, cell_centres, halve
 from torchpose.measure._face import check_faces
 

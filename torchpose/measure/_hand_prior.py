@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose.errors import InputError, check_shape
+from torchpose._core.checks import check_shape
+from torchpose.errors import InputError
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._upper_body import UpperBodyPrior
 

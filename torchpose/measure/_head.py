@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
-from torchpose.errors import InputError, check_shape
+from torchpose._core.checks import check_shape
+from torchpose.errors import InputError
 from torchpose.measure._body_window import CELL, COLOURS, EVIDENCE, cell_centres, faces_in_window
 
 __all__ = [

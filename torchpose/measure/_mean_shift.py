@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose.errors import InputError, check_finite, check_shape
+from torchpose._core.checks import check_finite, check_shape
+from torchpose.errors import InputError
 
 __all__ = ["MeanShift", "mean_shift"]
 

@@ -15,8 +15,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.checks import check_grey, check_rgb
 from torchpose._core.images import Image
-from torchpose.errors import InputError, MissingDependencyError, check_grey, check_rgb
+from torchpose.errors import InputError, MissingDependencyError
 from torchpose.measure._face import Region
 from torchpose.skeleton._mediapipe_landmarks import DERIVED_JOINTS, LANDMARKS, derive_joints
 

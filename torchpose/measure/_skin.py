@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
-from torchpose.errors import InputError, check_shape
+from torchpose._core.checks import check_shape
+from torchpose.errors import InputError
 from torchpose.measure._face import check_faces
 
 __all__ = ["FACE_PATCH", "SkinModel", "SkinState", "rgb_to_lab"]

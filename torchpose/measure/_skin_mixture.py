@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from torchpose.errors import InputError, check_shape
+from torchpose._core.checks import check_shape
+from torchpose.errors import InputError
 from torchpose.math._mixture_steps import MixtureParameters, natural_parameters
 from torchpose.measure._face import check_faces
 from torchpose.measure._skin import FACE_PATCH

@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.checks import check_rgb
 from torchpose._core.images import Image
-from torchpose.errors import InputError, check_rgb
+from torchpose.errors import InputError
 from torchpose.measure._background import BackgroundModel
 from torchpose.measure._face import FaceDetector, FaceTracker, FaceTracks
 from torchpose.measure._hand_likelihood import HandMeasurements

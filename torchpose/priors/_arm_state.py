@@ -10,9 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.checks import check_finite, check_shape
 from torchpose.camera._projection import project
 from torchpose.camera._viewpoints import Viewpoints
-from torchpose.errors import InputError, PriorError, check_finite, check_shape
+from torchpose.errors import InputError, PriorError
 from torchpose.math._rotations import ROTATION_ORDERS, RotationOrder, euler_to_matrix
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM

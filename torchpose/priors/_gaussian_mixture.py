@@ -11,10 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from torchpose._core.module_state import register_given
-from torchpose.errors import (
-    InputError,
-    ShapeError,
+from torchpose._core.checks import (
     check_choice,
     check_covariance,
     check_finite,
@@ -22,6 +19,8 @@ from torchpose.errors import (
     check_shape,
     check_weights,
 )
+from torchpose._core.module_state import register_given
+from torchpose.errors import InputError, ShapeError
 from torchpose.math._gaussian import mixture_moments, symmetrise
 from torchpose.math._mixture_em import FitReport, MixtureParameters, expectation_maximisation
 from torchpose.math._mixture_start import STARTS, floor_variances, start_mixture

@@ -14,12 +14,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.checks import check_finite, check_rate, check_shape
 from torchpose._core.module_state import derived, register_given
 from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import FileKind, read_tensors, write_tensors
 from torchpose.body._kinematics import Body, centres_of
-from torchpose.errors import InputError, PriorError, check_finite, check_rate, check_shape
+from torchpose.errors import InputError, PriorError
 from torchpose.math._rotation_gaussians import (
     left_matrix,
     quaternion_moments,

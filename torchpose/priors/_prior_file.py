@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchpose._core.checks import check_covariance
 from torchpose._core.tensor_file import (
     FileKind,
     info_from_json,
@@ -19,7 +20,7 @@ from torchpose._core.tensor_file import (
     write_tensors,
 )
 from torchpose.camera._pinhole import PinholeCamera
-from torchpose.errors import FileFormatError, InputError, PriorError, check_covariance
+from torchpose.errors import FileFormatError, InputError, PriorError
 from torchpose.priors._arm_state import check_rotation_order
 
 __all__ = ["SKELETON", "PriorInfo", "check_noise", "read_prior", "write_prior"]

@@ -12,20 +12,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from torchpose._core.checks import check_covariance, check_finite
 from torchpose._core.module_state import register_given
 from torchpose._core.reading import read_npz, reading
 from torchpose._core.tensor_file import require_tensor
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import arm_in_body_frame, join_arms
-from torchpose.errors import (
-    FileFormatError,
-    InputError,
-    OverlapError,
-    PriorError,
-    TorchposeError,
-    check_covariance,
-    check_finite,
-)
+from torchpose.errors import FileFormatError, InputError, OverlapError, PriorError, TorchposeError
 from torchpose.priors._arm_state import (
     STATE_DIM,
     check_rotation_order,

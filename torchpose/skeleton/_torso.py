@@ -12,7 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.errors import PriorError, check_shape
+from torchpose._core.checks import check_shape
+from torchpose.errors import PriorError
 from torchpose.math._rotations import procrustes
 from torchpose.skeleton._joint_sets import UPPER_BODY
 

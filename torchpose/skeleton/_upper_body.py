@@ -19,7 +19,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.errors import SkeletonError, check_shape
+from torchpose._core.checks import check_shape
+from torchpose.errors import SkeletonError
 from torchpose.skeleton._joint_sets import (
     UPPER_BODY,
     canonical_names,

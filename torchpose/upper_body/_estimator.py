@@ -8,9 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from torchpose._core.checks import check_rate
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._virtual_camera import BodyView
-from torchpose.errors import CameraError, PriorError, check_rate
+from torchpose.errors import CameraError, PriorError
 from torchpose.filters._base import Generators
 from torchpose.filters._outputs import FilterOutput, StepOutput
 from torchpose.priors._upper_body import UpperBodyPrior

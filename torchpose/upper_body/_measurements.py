@@ -8,9 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose._core.checks import check_covariance, check_finite, check_floating, check_shape
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import map_pixel_covariance, map_pixels
-from torchpose.errors import InputError, check_covariance, check_finite, check_floating, check_shape
+from torchpose.errors import InputError
 from torchpose.priors._upper_body import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import KINECT_NECK, NeckFraction

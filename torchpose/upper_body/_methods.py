@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from torchpose.errors import InputError, check_choice, refuse_unused
+from torchpose._core.checks import check_choice, refuse_unused
+from torchpose.errors import InputError
 from torchpose.filters._fixed_tracks import FixedTrackFilter
 from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._particle import BootstrapParticleFilter

@@ -10,8 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.checks import check_shape
 from torchpose._core.files import atomic_path
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import InputError
 from torchpose.math._rotations import matrix_to_euler
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._pose_track import PoseTrack

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose._core.checks import check_floating, check_shape, refuse_export
 from torchpose._core.module_state import (
     WideModule,
     derived,
@@ -17,7 +18,7 @@ from torchpose._core.module_state import (
     working_precision,
 )
 from torchpose.camera._pinhole import PinholeCamera
-from torchpose.errors import InputError, check_floating, check_shape, refuse_export
+from torchpose.errors import InputError
 from torchpose.filters._base import Generators
 from torchpose.priors._upper_body import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY

@@ -4,7 +4,8 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol, runtime_checkable
 
-from torchpose.errors import FileFormatError, InputError, check_rate
+from torchpose._core.checks import check_rate
+from torchpose.errors import FileFormatError, InputError
 from torchpose.video._base import VideoFrame, VideoSource
 
 __all__ = ["CameraSource", "Capture"]

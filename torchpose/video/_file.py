@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from torchpose._core.checks import check_rate
 from torchpose._core.images import Image
 from torchpose._core.reading import require_file
-from torchpose.errors import FileFormatError, check_rate
+from torchpose.errors import FileFormatError
 from torchpose.video._base import VideoFrame, VideoSource
 from torchpose.video._timing import (
     Rate,

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from torchpose._core.checks import check_rate
 from torchpose._core.images import Image
-from torchpose.errors import FileFormatError, InputError, check_rate
+from torchpose.errors import FileFormatError, InputError
 from torchpose.video._base import VideoFrame, VideoSource
 
 __all__ = ["FolderSource", "find_images", "natural_key"]

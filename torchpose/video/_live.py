@@ -11,8 +11,9 @@ from collections.abc import Iterator
 from types import TracebackType
 from typing import Any, Self
 
+from torchpose._core.checks import check_rgb
 from torchpose._core.images import Image
-from torchpose.errors import InputError, OutputError, check_rgb
+from torchpose.errors import InputError, OutputError
 
 __all__ = ["LiveView"]
 

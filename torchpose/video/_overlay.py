@@ -15,9 +15,10 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpose._core.checks import check_rgb, check_shape
 from torchpose._core.images import Image
 from torchpose.body._skeleton import BODY_15, BodySkeleton
-from torchpose.errors import InputError, check_rgb, check_shape
+from torchpose.errors import InputError
 from torchpose.metrics._calibration import chi2_quantile
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import LIMBS

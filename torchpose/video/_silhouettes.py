@@ -11,11 +11,12 @@ from jaxtyping import Bool, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpose._core.checks import check_rgb
 from torchpose._core.images import Image
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import intrinsics
 from torchpose.camera._rig import scale_matrix, undistortion_maps
-from torchpose.errors import CameraError, InputError, check_rgb
+from torchpose.errors import CameraError, InputError
 from torchpose.measure._brightness_background import BrightnessBackground, PixelKind
 from torchpose.video._base import VideoFrame, VideoSource
 

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
+from torchpose._core.checks import check_rgb
 from torchpose._core.images import Image
 from torchpose._core.module_state import derived
 from torchpose.camera._pinhole import PinholeCamera
-from torchpose.errors import InputError, check_rgb
+from torchpose.errors import InputError
 from torchpose.measure._association import HandAssociation
 from torchpose.measure._face import FaceDetector, FaceTracks
 from torchpose.measure._head import HeadNeck

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.errors import InputError, check_shape
+from torchpose._core.checks import check_shape
+from torchpose.errors import InputError
 from torchpose.metrics._calibration import Coverage, chi2_quantile
 from torchpose.metrics._poses import PCP
 from torchpose.skeleton._joint_sets import UPPER_BODY

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchpose.errors import InputError, check_shape
+from torchpose._core.checks import check_shape
+from torchpose.errors import InputError
 from torchpose.math._rotations import compose, quaternion_vector_to_matrix
 from torchpose.math._unscented import sigma_points
 from torchpose.viz._style import (

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.errors import InputError, ShapeError, check_shape
+from torchpose._core.checks import check_shape
+from torchpose.errors import InputError, ShapeError
 from torchpose.metrics._calibration import chi2_quantile
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import LIMBS

@@ -8,11 +8,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from torchpose._core.checks import check_shape
 from torchpose.body._fitting import fit_state
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import other_side
 from torchpose.camera._rig import Cameras, as_rig
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import InputError
 from torchpose.whole_body._filters.annealed import AnnealedParticleFilter
 from torchpose.whole_body._filters.body_frames import is_seen, silhouette_score
 from torchpose.whole_body._filters.motion import default_step_std

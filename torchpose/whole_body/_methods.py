@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 import torch
 
+from torchpose._core.checks import check_choice, refuse_unused
 from torchpose.body._kinematics import Body
-from torchpose.errors import InputError, PriorError, check_choice, refuse_unused
+from torchpose.errors import InputError, PriorError
 from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 from torchpose.priors._shipped import load_action, load_limb_conditionals, load_manifold

@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose._core.checks import check_choice, check_finite, check_shape
 from torchpose.camera._rig import CameraRig, Cameras, as_rig
-from torchpose.errors import InputError, check_choice, check_finite, check_shape
+from torchpose.errors import InputError
 from torchpose.filters._base import Generators, standard_normal, uniform
 from torchpose.math._rotations import compose, minimal_rotation, quaternion_vector_to_matrix
 from torchpose.whole_body._filters.annealed import anneal

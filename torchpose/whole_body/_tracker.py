@@ -10,10 +10,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
+from torchpose._core.checks import check_rate, check_shape
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig, Cameras, as_rig
-from torchpose.errors import InputError, NobodySeenError, check_rate, check_shape
+from torchpose.errors import InputError, NobodySeenError
 from torchpose.filters._base import Generators
 from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.space import ActionSpace

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchpose.errors import InputError, check_shape
+from torchpose._core.checks import check_shape
+from torchpose.errors import InputError
 from torchpose.io._recordings import Recording
 from torchpose.learning._curation.joints import with_upper_joints
 from torchpose.learning._training import MIRROR

@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.errors import InputError, check_shape
+from torchpose._core.checks import check_shape
+from torchpose.errors import InputError
 from torchpose.io._recordings import Recording
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import upper_body_indices

@@ -10,9 +10,10 @@ from typing import Any, Literal, Self
 import torch
 from torch import Tensor
 
+from torchpose._core.checks import check_rate
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
-from torchpose.errors import InputError, check_rate
+from torchpose.errors import InputError
 from torchpose.io._formats.axes import Axes
 from torchpose.io._recordings import Recording
 from torchpose.learning._action_spaces import Performed, fit_synchronised

@@ -11,8 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.checks import check_rate
 from torchpose.body._kinematics import Body, centres_of
-from torchpose.errors import InputError, check_rate
+from torchpose.errors import InputError
 from torchpose.io._formats.axes import Axes
 from torchpose.io._recordings import Recording
 from torchpose.learning._limb_conditionals import (

@@ -8,10 +8,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.checks import check_finite, check_shape
 from torchpose._core.estimates import check_number_range
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import read_tensors, write_tensors
-from torchpose.errors import FileFormatError, InputError, check_finite, check_shape
+from torchpose.errors import FileFormatError, InputError
 from torchpose.priors._actions.file import BANK_FILE, BankInfo
 from torchpose.priors._actions.gate import (
     CLAMP_ROUNDS,

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from torchpose._core.checks import check_shape
 from torchpose.body._kinematics import Body
-from torchpose.errors import check_shape
 from torchpose.math._tree_messages import tree_levels
 from torchpose.priors._actions.polar_limbs import LIMB_PARENTS, LIMBS_12, POSTURE_DIM
 from torchpose.priors._actions.postures import check_body

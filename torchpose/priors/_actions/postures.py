@@ -21,10 +21,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.checks import check_finite, check_shape
 from torchpose.body._fitting import swing_parts
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
-from torchpose.errors import InputError, ShapeError, SkeletonError, check_finite, check_shape
+from torchpose.errors import InputError, ShapeError, SkeletonError
 from torchpose.math._rotations import minimal_rotation, quaternion_vector_to_matrix
 from torchpose.math._tree_messages import tree_levels
 from torchpose.priors._actions.polar_limbs import (

@@ -9,10 +9,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.checks import check_finite, check_shape
 from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import read_tensors, write_tensors
-from torchpose.errors import InputError, PriorError, check_finite, check_shape
+from torchpose.errors import InputError, PriorError
 from torchpose.priors._actions.file import SPACE_FILE, ActionInfo
 from torchpose.priors._actions.gate import (
     CLAMP_ROUNDS,

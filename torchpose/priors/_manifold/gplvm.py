@@ -18,9 +18,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.checks import check_finite, check_shape
 from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
-from torchpose.errors import FileFormatError, InputError, ShapeError, check_finite, check_shape
+from torchpose.errors import FileFormatError, InputError, ShapeError
 from torchpose.priors._manifold import prediction as gplvm_prediction
 from torchpose.priors._manifold.file import TENSORS, ManifoldInfo, read_manifold, write_manifold
 from torchpose.priors._manifold.prediction import Fitted, KernelParameters, Prepared

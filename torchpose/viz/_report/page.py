@@ -14,9 +14,10 @@ from urllib.parse import quote
 import torch
 from torch import Tensor
 
+from torchpose._core.checks import check_shape
 from torchpose._core.files import atomic_path
 from torchpose._core.reading import require_file
-from torchpose.errors import InputError, check_shape
+from torchpose.errors import InputError
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import LIMBS
 from torchpose.viz._report.packing import (

@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from torchpose.errors import InputError, ShapeError, check_shape
+from torchpose._core.checks import check_shape
+from torchpose.errors import InputError, ShapeError
 from torchpose.filters._base import Generators
 from torchpose.whole_body._silhouettes.likelihood import silhouette_log_likelihood
 from torchpose.whole_body._silhouettes.rendering import (

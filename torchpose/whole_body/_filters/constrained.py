@@ -6,9 +6,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchpose._core.checks import check_choice
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
-from torchpose.errors import InputError, check_choice
+from torchpose.errors import InputError
 from torchpose.filters._base import Generators, standard_normal
 from torchpose.math._rotations import within_unit_ball
 from torchpose.priors._actions.bank import ActionBank

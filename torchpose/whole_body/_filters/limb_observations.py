@@ -11,11 +11,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.checks import check_choice, check_positive, check_shape
 from torchpose.body._kinematics import Body
 from torchpose.body._limbs import Limbs
 from torchpose.body._skeleton import BodySkeleton, other_side
 from torchpose.camera._rig import Cameras
-from torchpose.errors import SkeletonError, check_choice, check_positive, check_shape
+from torchpose.errors import SkeletonError
 from torchpose.math._rotations import quaternion_vector_to_matrix
 from torchpose.math._unscented import floor_eigenvalues, moments
 from torchpose.whole_body._silhouettes.limb_counts import PartCounts, count_parts

@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.errors import PriorError, check_choice, check_shape
+from torchpose._core.checks import check_choice, check_shape
+from torchpose.errors import PriorError
 from torchpose.filters._base import Generators, standard_normal
 from torchpose.whole_body._filters.body_frames import Frame
 from torchpose.whole_body._filters.body_particles import (

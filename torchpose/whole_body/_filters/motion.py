@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchpose.errors import InputError, check_finite, check_positive, check_shape
+from torchpose._core.checks import check_finite, check_positive, check_shape
+from torchpose.errors import InputError
 from torchpose.whole_body._filters.body_particles import PoseSpace
 
 __all__ = [

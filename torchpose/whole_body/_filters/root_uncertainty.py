@@ -13,8 +13,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchpose._core.checks import check_choice, check_shape
 from torchpose.body._kinematics import Body
-from torchpose.errors import InputError, check_choice, check_shape
+from torchpose.errors import InputError
 from torchpose.filters._base import Generators, standard_normal
 from torchpose.filters._resampling import (
     LEAST_SURVIVORS,

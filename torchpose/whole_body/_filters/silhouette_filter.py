@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from torchpose.errors import InputError, check_choice, check_finite, check_positive, check_shape
+from torchpose._core.checks import check_choice, check_finite, check_positive, check_shape
+from torchpose.errors import InputError
 from torchpose.filters._base import Generators, standard_normal
 from torchpose.filters._outputs import effective_sample_size
 from torchpose.filters._resampling import RESAMPLING

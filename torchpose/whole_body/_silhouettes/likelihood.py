@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.errors import InputError, check_choice
+from torchpose._core.checks import check_choice
+from torchpose.errors import InputError
 from torchpose.whole_body._silhouettes.rendering import SilhouetteCounts
 
 __all__ = ["LIKELIHOODS", "bidirectional", "intersection_over_union", "silhouette_log_likelihood"]

@@ -28,9 +28,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose._core.checks import check_choice
 from torchpose.body._limbs import Limbs
 from torchpose.camera._rig import CameraRig
-from torchpose.errors import check_choice
 
 __all__ = [
     "LEVEL",

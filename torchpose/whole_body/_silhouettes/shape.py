@@ -4,11 +4,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose._core.checks import check_finite, check_shape
 from torchpose.body._kinematics import Body
 from torchpose.body._limbs import Limbs
 from torchpose.body._skeleton import BodySkeleton
 from torchpose.camera._rig import CameraRig
-from torchpose.errors import InputError, ShapeError, check_finite, check_shape
+from torchpose.errors import InputError, ShapeError
 from torchpose.whole_body._silhouettes.likelihood import intersection_over_union
 from torchpose.whole_body._silhouettes.rendering import (
     PreparedSilhouettes,
