@@ -14,12 +14,13 @@ PYTEST := $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
 unexport PYTHONDONTWRITEBYTECODE
 
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-quick wheel lint format docs docs-serve install clean
+.PHONY: help demo test test-quick fuzz wheel lint format docs docs-serve install clean
 
 help:
 	@echo "make demo       track the animated performer, and a walk in three cameras; see demo-output/"
 	@echo "make test       run the tests"
 	@echo "make test-quick run those that take less than a minute: foundations, mathematics, structure"
+	@echo "make fuzz       damage files for a minute; none may end in anything but a typed error"
 	@echo "make wheel      build the wheel, and use it in an environment of its own"
 	@echo "make lint       ruff, mypy, and who may import whom"
 	@echo "make docs       build the documentation into site/, warnings are errors"
@@ -39,6 +40,11 @@ QUICK := tests/_core tests/math tests/skeleton tests/camera tests/metrics tests/
          tests/test_import.py tests/test_structure.py
 test-quick: $(VENV)/.installed-dev
 	$(PYTEST) -m "not slow and not data" $(PYTEST_ARGS) $(QUICK)
+
+FUZZ_SECONDS ?= 60
+FUZZ_SEED ?= 0
+fuzz: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.fuzz --seconds $(FUZZ_SECONDS) --seed $(FUZZ_SEED)
 
 wheel:
 	PYTHON="$(PYTHON)" .ci/wheel
