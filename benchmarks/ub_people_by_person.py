@@ -48,7 +48,7 @@ def hold_out(
     own = [r for r in recordings if r.person == person][:: arguments.every]
     settings = {"seed": arguments.seed, "calibration_folds": 0, "name": "ub-people-by-person"}
     if arguments.quick:
-        settings |= {"n_components": 4}
+        settings |= {"n_components": 4, "n_samples": 3000, "window_steps": 5}
     settings |= {
         "window_components": 8 if arguments.quick else arguments.window_components,
         "window_samples": 3000 if arguments.quick else arguments.window_samples,

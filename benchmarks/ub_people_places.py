@@ -70,6 +70,8 @@ def main() -> None:
     settings = dict(
         zip(("n_components", "window_components", "window_samples"), sizes, strict=True)
     )
+    if arguments.quick:
+        settings |= {"n_samples": 3000, "window_steps": 5}
     prior = cached_prior(
         out, [r for r in recordings if r.person in FITTED], fit_kinect_prior, True,
         seed=arguments.seed, calibration_folds=0, name="ub-people-places", **settings,

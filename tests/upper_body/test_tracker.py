@@ -444,8 +444,9 @@ def test_the_recipe_is_repeatable(tmp_path):
     recordings = [recording(performer(50, seed=s).body, person=f"p{s}") for s in (1, 2)]
     for name in ("once", "again"):
         prior = fit_kinect_prior(
-            recordings, 3, window_components=3, window_samples=1000, n_samples=1000, pose_steps=5
-        )
+            recordings, 3, window_components=3, window_samples=1000, n_samples=1000, pose_steps=5,
+            drawn_pieces=1,
+        )  # fmt: skip
         assert set(prior.windows) == {"causal", "full"} and "calibration_scale_full" in prior.noise
         prior.save(tmp_path / name)
     assert (tmp_path / "once").read_bytes() == (tmp_path / "again").read_bytes()
