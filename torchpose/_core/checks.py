@@ -17,6 +17,7 @@ from torchpose.errors import (
 
 __all__ = [
     "check_choice",
+    "check_count",
     "check_covariance",
     "check_finite",
     "check_floating",
@@ -144,6 +145,12 @@ def check_positive(name: str, value: float) -> float:
     if not 0 < value < math.inf:
         raise InputError(f"{name} must be positive and finite, got {value}")
     return value
+
+
+def check_count(name: str, value: int) -> None:
+    """Raise `InputError` unless a number of things is at least 1."""
+    if value < 1:
+        raise InputError(f"{name} must be at least 1, got {value}")
 
 
 def check_weights(name: str, weights: Tensor) -> None:

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from torchpose._core.checks import check_count
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
 from torchpose.evaluation.common import CAMERA, MEASURED, Trials, draw_picture, make_test_set, track
@@ -120,8 +121,7 @@ def _check(method: str | None, joints: str, noise_std: float, every: int) -> Non
         raise InputError(f"joints must be one of {', '.join(_SEEN)}, got {joints!r}")
     if not 0 < noise_std < float("inf"):
         raise InputError(f"noise_std must be positive, got {noise_std:g}")
-    if every < 1:
-        raise InputError(f"every must be at least 1, got {every}")
+    check_count("every", every)
 
 
 def _score(

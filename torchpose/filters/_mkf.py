@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose._core.checks import check_choice
+from torchpose._core.checks import check_choice, check_count
 from torchpose._core.module_state import derived, one_run, register_given, wide_or_parameter
 from torchpose.errors import InputError
 from torchpose.filters._base import Generators, RecursiveFilter, require_state
@@ -254,8 +254,7 @@ class MixtureKalmanFilter(RecursiveFilter):
         Raises:
             InputError: batch_size below 1.
         """
-        if batch_size < 1:
-            raise InputError(f"batch_size must be at least 1, got {batch_size}")
+        check_count("batch_size", batch_size)
         return MKFState(
             normalise(self.log_prior).to(self.dtype).expand(batch_size, -1),
             self.means.to(self.dtype).expand(batch_size, -1, -1),

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from torchpose._core.checks import check_count
 from torchpose._core.module_state import derived, register_given, wide_or_parameter
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
@@ -225,8 +226,7 @@ class BootstrapParticleFilter(RecursiveFilter):
         Args:
             batch_size: B. generator: one generator, or a list of one for each element.
         """
-        if batch_size < 1:
-            raise InputError(f"batch_size must be at least 1, got {batch_size}")
+        check_count("batch_size", batch_size)
         weights = self.weights.double().expand(batch_size, -1)
         white = self._draw(weights, self._constants().initial, generator)
         return self._evenly(white, 0)

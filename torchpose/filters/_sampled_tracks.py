@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchpose._core.checks import check_count
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
 from torchpose.filters._base import Generators, uniform
@@ -76,8 +77,7 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
         Raises:
             InputError: batch_size below 1.
         """
-        if batch_size < 1:
-            raise InputError(f"batch_size must be at least 1, got {batch_size}")
+        check_count("batch_size", batch_size)
         drawn = self._draw_components(batch_size, generator)
         log_weights = torch.zeros(drawn.shape, dtype=self.dtype, device=drawn.device)
         group = torch.arange(batch_size, device=drawn.device)

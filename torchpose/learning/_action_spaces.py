@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose._core.checks import check_rate, check_shape
+from torchpose._core.checks import check_count, check_rate, check_shape
 from torchpose.errors import InputError
 from torchpose.learning._performances import Synchronised, checked_performances, synchronise
 from torchpose.priors._actions.bank import ActionBank
@@ -117,8 +117,7 @@ def _principal_axes(moves: Float[Tensor, "N 36"]) -> tuple[Tensor, Tensor]:
 
 def _checked(performances: Sequence[Tensor], n_dimensions: int) -> list[Tensor]:
     """Return the performances in double precision, or raise `InputError`."""
-    if n_dimensions < 1:
-        raise InputError(f"n_dimensions must be at least 1, got {n_dimensions}")
+    check_count("n_dimensions", n_dimensions)
     if len(performances) < 2:
         raise InputError(
             f"an action space needs the deviation between performances: expected two or more, got "

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.checks import check_count
 from torchpose.errors import InputError
 from torchpose.learning._blocks import ALONE, Share
 from torchpose.learning._samplers import Samples, SampleSource
@@ -151,8 +152,7 @@ def stepwise_pass(
     Raises:
         InputError: settings out of range, samples that are not finite.
     """
-    if blocks_per_step < 1:
-        raise InputError(f"blocks_per_step must be at least 1, got {blocks_per_step}")
+    check_count("blocks_per_step", blocks_per_step)
     _check_schedule(power, offset)
     order = torch.randperm(source.n_blocks, generator=torch.Generator().manual_seed(seed))
     steps = order.split(blocks_per_step)

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchpose._core.checks import check_shape
+from torchpose._core.checks import check_count, check_shape
 from torchpose.errors import InputError
 from torchpose.learning._blocks import (
     ALONE,
@@ -219,8 +219,7 @@ def run_streamed(
 def _check_settings(
     n_components: int, start_samples: int, covariance_floor: float, init: Any
 ) -> None:
-    if n_components < 1:
-        raise InputError(f"n_components must be at least 1, got {n_components}")
+    check_count("n_components", n_components)
     if start_samples < n_components:
         raise InputError(
             f"start_samples must be at least the number of components, got {start_samples} for "

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose._core.checks import check_grey, check_rgb
+from torchpose._core.checks import check_count, check_grey, check_rgb
 from torchpose._core.images import Image
 from torchpose.errors import InputError, MissingDependencyError
 from torchpose.measure._face import Region
@@ -80,8 +80,7 @@ class MediaPipeFaceDetector(_Task):
         raise_by: float = 0.13,
     ) -> None:
         _check_confidence(min_confidence)
-        if tiles < 1:
-            raise InputError(f"tiles must be at least 1, got {tiles}")
+        check_count("tiles", tiles)
         if not (scale > 0 and math.isfinite(scale) and math.isfinite(raise_by)):
             raise InputError(
                 f"scale must be positive and raise_by finite, got {scale} and {raise_by}"
@@ -197,8 +196,7 @@ class MediaPipePose(_Task):
 
     def __init__(self, model: str | Path, max_people: int = 1, min_confidence: float = 0.5) -> None:
         _check_confidence(min_confidence)
-        if max_people < 1:
-            raise InputError(f"max_people must be at least 1, got {max_people}")
+        check_count("max_people", max_people)
         path = _require_model(model, "a pose landmarker (.task)")
         mediapipe = _require_mediapipe()
         vision = mediapipe.tasks.vision

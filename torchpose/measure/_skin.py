@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
-from torchpose._core.checks import check_shape
+from torchpose._core.checks import check_count, check_shape
 from torchpose.errors import InputError
 from torchpose.measure._face import check_faces
 
@@ -120,8 +120,7 @@ class SkinModel(nn.Module):
 
     def init(self, batch_size: int) -> SkinState:
         """Return the state before the first frame."""
-        if batch_size < 1:
-            raise InputError(f"batch_size must be at least 1, got {batch_size}")
+        check_count("batch_size", batch_size)
         even = self.lowest.new_full((batch_size, *BINS), 1 / np.prod(BINS))
         frames = torch.zeros(batch_size, dtype=torch.long, device=even.device)
         return SkinState(even, even.clone(), even.clone(), frames)

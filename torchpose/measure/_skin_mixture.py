@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from torchpose._core.checks import check_shape
+from torchpose._core.checks import check_count, check_shape
 from torchpose.errors import InputError
 from torchpose.math._mixture_steps import MixtureParameters, natural_parameters
 from torchpose.measure._face import check_faces
@@ -104,8 +104,7 @@ class SkinMixtureModel(nn.Module):
 
     def init(self, batch_size: int) -> SkinMixtureState:
         """Return the state before the first frame."""
-        if batch_size < 1:
-            raise InputError(f"batch_size must be at least 1, got {batch_size}")
+        check_count("batch_size", batch_size)
         shape = (batch_size, self.n_components)
         weights = self.samples.new_full(shape, 1 / self.n_components)
         eye = torch.eye(3).to(self.samples)

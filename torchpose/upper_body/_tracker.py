@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose._core.checks import check_floating, check_shape, refuse_export
+from torchpose._core.checks import check_count, check_floating, check_shape, refuse_export
 from torchpose._core.module_state import (
     WideModule,
     derived,
@@ -270,8 +270,7 @@ class UpperBodyTracker(WideModule):
                 "frame by frame an estimate cannot use later frames: expected smoothing=None, got "
                 f"{self.smoothing!r}"
             )
-        if batch_size < 1:
-            raise InputError(f"batch_size must be at least 1, got {batch_size}")
+        check_count("batch_size", batch_size)
         n_keypoints = len(UPPER_BODY) if names is None else len(names)
         picked = self._pick(n_keypoints, names)
         joints = arm_joints([i >= 0 for i in picked.indices])

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Generator, Iterable
 from typing import Any, Generic, TypeVar
 
-from torchpose.errors import InputError
+from torchpose._core.checks import check_count
 
 __all__ = ["prefetch"]
 
@@ -37,8 +37,7 @@ def prefetch(iterable: Iterable[T], size: int = 4) -> Generator[T, None, None]:
     >>> list(prefetch(range(5), size=2))
     [0, 1, 2, 3, 4]
     """
-    if size < 1:
-        raise InputError(f"size must be at least 1, got {size}")
+    check_count("size", size)
     return _consume(iterable, size)
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from torchpose._core.checks import check_count
 from torchpose.errors import InputError, ShapeError
 from torchpose.viz._style import (
     INK,
@@ -258,8 +259,7 @@ def plot_action_space(
 
     Reference: Rius, Varona, Roca & Gonzalez, 2006, Figure 1.
     """
-    if n_dimensions < 1:
-        raise InputError(f"n_dimensions must be at least 1, got {n_dimensions}")
+    check_count("n_dimensions", n_dimensions)
     if synchronised.after.shape[1:] != space.performance.shape:
         raise ShapeError(
             f"the performances have {list(synchronised.after.shape[1:])} postures and dimensions, the "

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchpose._core.checks import check_count
 from torchpose.camera._projection import lift
 from torchpose.errors import InputError
 from torchpose.math._rotations import RotationOrder, euler_to_matrix
@@ -83,8 +84,7 @@ def plot_prior_components(
 
     Reference: Burke & Lasenby, Figure 6.
     """
-    if n_shown < 1:
-        raise InputError(f"n_shown must be at least 1, got {n_shown}")
+    check_count("n_shown", n_shown)
     blocks = _components(prior, mixture, n_shown, seed)
     n_columns = min(_PER_ROW, max(len(block) for block in blocks.values()))
     n_rows = [math.ceil(len(block) / n_columns) for block in blocks.values()]

@@ -1,6 +1,5 @@
 """Render performers: video with ground truth, for the demo, the benchmarks and the tests."""
 
-from torchpose._core.facade import set_up_facade
 from torchpose.demo._rendering.look import LOOKS, Look
 from torchpose.demo._rendering.performances import PERFORMANCES, crossing, performance
 from torchpose.demo._rendering.performer import (
@@ -23,5 +22,3 @@ __all__ = [
     "render_performance",
     "render_video",
 ]
-
-set_up_facade(__name__)

@@ -1,6 +1,5 @@
 """Prepare recordings for a fit: find errors, leave them out, report them, and split recordings by person."""
 
-from torchpose._core.facade import set_up_facade
 from torchpose.learning._curation.bones import (
     BONE_RATIOS,
     bone_lengths,
@@ -53,5 +52,3 @@ __all__ = [
     "split_persons",
     "torso_rotation",
 ]
-
-set_up_facade(__name__)

@@ -13,7 +13,6 @@ step of an optimiser.
     prior() -> UpperBodyPrior  at the current parameters
 """
 
-from torchpose._core.facade import set_up_facade
 from torchpose.learning._fine_tuning.parameters import TunableMixture, parameter_groups, pose_error
 from torchpose.learning._fine_tuning.poses import SequenceBatch, TunableKalman, draw_sequences
 from torchpose.learning._fine_tuning.windows import TunableWindow, WindowBatch, draw_windows
@@ -29,5 +28,3 @@ __all__ = [
     "parameter_groups",
     "pose_error",
 ]
-
-set_up_facade(__name__)

@@ -1,6 +1,5 @@
 """Make priors from recordings: settings of each fit, and the steps from recordings to a file."""
 
-from torchpose._core.facade import set_up_facade
 from torchpose.learning._recipes.actions import ActionRecipe, Performances, fit_actions
 from torchpose.learning._recipes.calibration import fit_calibration
 from torchpose.learning._recipes.earlier import fit_recipe_2
@@ -25,5 +24,3 @@ __all__ = [
     "fit_limbs",
     "fit_recipe_2",
 ]
-
-set_up_facade(__name__)

@@ -1,8 +1,5 @@
 """Write the report of a tracked video: one self-contained HTML page that needs no network."""
 
-from torchpose._core.facade import set_up_facade
 from torchpose.viz._report.page import write_report
 
 __all__ = ["write_report"]
-
-set_up_facade(__name__)

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose._core.checks import check_count
 from torchpose.errors import InputError
 from torchpose.filters._base import Generators
 from torchpose.filters._resampling import (
@@ -135,8 +136,7 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
         **options: Unpack[BodyFilterOptions],
     ) -> None:
         super().__init__(body, n_particles, **options)
-        if n_layers < 1:
-            raise InputError(f"n_layers must be at least 1, got {n_layers}")
+        check_count("n_layers", n_layers)
         if schedule is None:
             check_survival_rate(survival_rate, n_particles)
         else:

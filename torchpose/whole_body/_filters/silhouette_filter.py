@@ -14,7 +14,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from torchpose._core.checks import check_choice, check_finite, check_positive, check_shape
+from torchpose._core.checks import (
+    check_choice,
+    check_count,
+    check_finite,
+    check_positive,
+    check_shape,
+)
 from torchpose.errors import InputError
 from torchpose.filters._base import Generators, standard_normal
 from torchpose.filters._outputs import effective_sample_size
@@ -116,8 +122,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         check_choice("limit_mode", limit_mode, ("clamp", "discard"))
         check_choice("resampling", resampling, RESAMPLING)
         check_choice("estimate", estimate, ("mean", "map"))
-        if n_particles < 1:
-            raise InputError(f"n_particles must be at least 1, got {n_particles}")
+        check_count("n_particles", n_particles)
         if not 0 <= resample_threshold <= 1:
             raise InputError(f"resample_threshold must be from 0 to 1, got {resample_threshold}")
         check_leg_swap(body, leg_swap)
