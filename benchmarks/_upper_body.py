@@ -161,11 +161,11 @@ def score(estimate: Estimate, test: Trials) -> Scores:
     moved = estimate.joints3d.masked_fill(~inside[..., None], torch.nan)
     triples = (test.lengths - 2).clamp_min(0).double()
     per_sequence = jitter(moved, test.fps) if moved.shape[1] > 2 else torch.full((1, 8), torch.nan)
-    trembling = (per_sequence.nan_to_num() * triples[:, None]).sum(0) / triples.sum()
+    per_joint = (per_sequence.nan_to_num() * triples[:, None]).sum(0) / triples.sum()
     if estimate.covariance3d is None:
-        return Scores(errors3d, errors2d, limbs, trembling, None, None)
+        return Scores(errors3d, errors2d, limbs, per_joint, None, None)
     aligned = align(estimate.joints3d, test.truth3d, covariance=estimate.covariance3d)
     turned: Any = aligned.covariance
     hits = coverage(aligned.points, turned, test.truth3d, mask=inside)
     curve = reliability(aligned.points, turned, test.truth3d, mask=inside)
-    return Scores(errors3d, errors2d, limbs, trembling, hits, curve)
+    return Scores(errors3d, errors2d, limbs, per_joint, hits, curve)

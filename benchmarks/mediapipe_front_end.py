@@ -2,7 +2,7 @@
 
 On the seven webcam clips of `video_asl` (three signers) the tracker is fed with MediaPipe's head, neck
 and hands, and with all eight joints. Against MediaPipe's own 2D and 3D joints (`*_pose1.npz`, the full
-model): how much they tremble, how gaps are bridged, how far elbows and shoulders that follow from
+model): how much they jitter, how gaps are bridged, how far elbows and shoulders that follow from
 the hands are off, and how much the poses in space differ. MediaPipe is no truth, in space least of all:
 beside it stands how much its own full and heavy models differ.
 

@@ -22,6 +22,8 @@ _TOP, _WIDEST = (1.0, -1.2), (2.8, 2.0)  # and so wide from there to the bottom 
 _BODY = (1.4, 1.2)  # the same for head and torso alone
 _ANOTHER, _SAME = 30, 16  # grey levels between what is something else, and within what is at rest
 _UNKNOWN = (255, 0, 255)  # colour for unknown background
+# Differences from the last frame and from the median, steps of Lab: noise up to the first, range above it.
+_DIFFERENCE, _UNUSUAL = (2.0, 20.0), (4.0, 30.0)
 
 
 def person_region(
@@ -224,9 +226,6 @@ def _paste(source: Image, where: NDArray[np.bool_], target: Image) -> None:
     import cv2
 
     cv2.copyTo(source, where.view(np.uint8), target)
-
-
-_DIFFERENCE, _UNUSUAL = (2.0, 20.0), (4.0, 30.0)  # below: noise; range above it; steps of Lab
 
 
 class MotionState(NamedTuple):

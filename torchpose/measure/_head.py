@@ -21,6 +21,19 @@ __all__ = [
     "head_part",
 ]
 
+_ROWS, _COLUMNS = 104, 72  # of the remembered patch: head and neck
+_HALF_WIDTH, _TOP, _HEIGHT = 1.0, -1.0, 2.6  # of the patch, in B from the face's centre
+_SEARCH = 8  # pixels of the patch to each side
+_MODEL, _INNER = (slice(4, 58), slice(2, 70)), (slice(12, 50), slice(10, 62))
+_EYES = (slice(14, 56, 2), slice(18, 56, 2))
+_BLUR = 13  # pixels of the patch: about a third of a face, half a hand
+_LEAST_MATCH = 0.6
+_FIRST = 7  # frames that are averaged with equal weights
+_HAND = 0.2  # probability of a hand above which the average adapts slowly
+# Ellipse of the head, and rectangle of the neck, in B from the face's centre.
+_HEAD_AXES, _HEAD_DOWN, _NECK, _SOFT = (0.575, 0.8), -0.05, (0.42, 0.4, 1.05), 0.06
+_PART_ROWS, _PART_COLUMNS = slice(0, 54), slice(24, 72)  # cells of the window where a head can be
+
 
 class FaceOffsets(NamedTuple):
     """Holds the offsets of head and neck below the centre of the face, in sizes B of its bounding box.
@@ -94,20 +107,6 @@ class HeadNeck(nn.Module):
             slope[:, :, 2] = self.offset
             cov = cov + slope @ face_cov.to(faces)[:, None] @ slope.mT
         return centre + size * self.offset, cov
-
-
-_ROWS, _COLUMNS = 104, 72  # of the remembered patch: head and neck
-_HALF_WIDTH, _TOP, _HEIGHT = 1.0, -1.0, 2.6  # of the patch, in B from the face's centre
-_SEARCH = 8  # pixels of the patch to each side
-_MODEL, _INNER = (slice(4, 58), slice(2, 70)), (slice(12, 50), slice(10, 62))
-_EYES = (slice(14, 56, 2), slice(18, 56, 2))
-_BLUR = 13  # pixels of the patch: about a third of a face, half a hand
-_LEAST_MATCH = 0.6
-_FIRST = 7  # frames that are averaged with equal weights
-_HAND = 0.2  # probability of a hand above which the average adapts slowly
-# Ellipse of the head, and rectangle of the neck, in B from the face's centre.
-_HEAD_AXES, _HEAD_DOWN, _NECK, _SOFT = (0.575, 0.8), -0.05, (0.42, 0.4, 1.05), 0.06
-_PART_ROWS, _PART_COLUMNS = slice(0, 54), slice(24, 72)  # cells of the window where a head can be
 
 
 def head_part(per_cell: int) -> tuple[slice, slice]:
