@@ -31,3 +31,11 @@ def _one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def small_windows_file(tmp_path_factory):
+    """The file of a prior with windows, fitted once in a run; a module that uses it reads it."""
+    from tests.shared_fits import fit_small_windows, fitted_once
+
+    return fitted_once(tmp_path_factory, "small-windows", fit_small_windows)

@@ -3,10 +3,9 @@
 import pytest
 import torch
 
-from tests.priors.poses import recording
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.errors import InputError, ShapeError, SkeletonError
-from torchpose.learning._recipes import fit_kinect_prior
+from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import METHODS, UpperBodyTracker, method_options
 
 NAMES = list(KEYPOINT_NAMES)
@@ -14,12 +13,8 @@ FIELDS = ("joints2d", "joints3d", "covariance2d", "covariance3d", "log_evidence"
 
 
 @pytest.fixture(scope="module")
-def prior():
-    """As small as it may be: only the arithmetic is of interest."""
-    people = [recording(performer(120, seed=1).body, person="p", fps=30.0)]
-    return fit_kinect_prior(
-        people, 3, window_components=4, window_samples=1000, n_samples=2000, pose_steps=5
-    )
+def prior(small_windows_file):
+    return UpperBodyPrior.load(small_windows_file)
 
 
 @pytest.fixture(scope="module")

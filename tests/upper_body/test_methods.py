@@ -6,11 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tests.priors.poses import recording
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.errors import InputError
 from torchpose.filters import MixtureKalmanFilter
-from torchpose.learning._recipes import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import (
     METHODS,
@@ -27,11 +25,8 @@ NAMES = list(KEYPOINT_NAMES)
 
 
 @pytest.fixture(scope="module")
-def prior():
-    people = [recording(performer(120, seed=1).body, person="p", fps=30.0)]
-    return fit_kinect_prior(
-        people, 3, window_components=4, window_samples=1000, n_samples=2000, pose_steps=5
-    )
+def prior(small_windows_file):
+    return UpperBodyPrior.load(small_windows_file)
 
 
 @pytest.fixture(scope="module")

@@ -3,11 +3,10 @@
 import pytest
 import torch
 
-from tests.priors.poses import recording
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
-from torchpose.learning._recipes import fit_kinect_prior
 from torchpose.measure._hand_likelihood import HandMeasurements
 from torchpose.measure._upper_body import MEASURED, FrameMeasurements, rounded_covariance
+from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import UpperBodyTracker
 from torchpose.video._person_stream import PersonStream
 from torchpose.video._recording import TrackedRecording
@@ -17,11 +16,8 @@ GAP = 20
 
 
 @pytest.fixture(scope="module")
-def tracker():
-    people = [recording(performer(120, seed=1).body, person="p", fps=30.0)]
-    prior = fit_kinect_prior(
-        people, 3, window_components=4, window_samples=1000, n_samples=2000, pose_steps=5
-    )
+def tracker(small_windows_file):
+    prior = UpperBodyPrior.load(small_windows_file)
     return UpperBodyTracker(prior, demo_camera(), fps=30.0, max_gap=None)
 
 

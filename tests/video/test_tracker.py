@@ -4,22 +4,18 @@ import numpy as np
 import pytest
 import torch
 
-from tests.priors.poses import recording
 from torchpose import VideoTracker
 from torchpose.demo import demo_camera, performer
 from torchpose.errors import InputError
-from torchpose.learning._recipes import fit_kinect_prior
+from torchpose.priors import UpperBodyPrior
 
 pytest.importorskip("matplotlib", reason="the performer's face comes from matplotlib")
 FACE = 3  # the head, in `UPPER_BODY`
 
 
 @pytest.fixture(scope="module")
-def prior():
-    people = [recording(performer(120, seed=1).body, person="p", fps=30.0)]
-    return fit_kinect_prior(
-        people, 3, window_components=4, window_samples=1000, n_samples=2000, pose_steps=5
-    )
+def prior(small_windows_file):
+    return UpperBodyPrior.load(small_windows_file)
 
 
 def rendered(*performances):
@@ -45,7 +41,7 @@ def test_somebody_who_leaves_and_comes_back_is_the_same_person(prior):
 
 
 def test_two_who_cross_stay_who_they_are(prior):
-    from torchpose.demo._rendering import crossing
+    from benchmarks._performances import crossing
 
     pair = crossing(100, seconds=3.0)
     tracker = VideoTracker(prior, demo_camera())
@@ -66,7 +62,7 @@ def test_two_who_cross_stay_who_they_are(prior):
 
 
 def test_only_the_largest_face_is_followed_if_asked_for(prior):
-    from torchpose.demo._rendering import crossing
+    from benchmarks._performances import crossing
 
     tracker = VideoTracker(prior, demo_camera(), max_persons=1)
     people = tracker(rendered(*crossing(30)))
