@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from benchmarks._asl import CLIPS, SIZE, read_clip
+from benchmarks._table_file import table_file
 from torchpose.camera import PinholeCamera
 from torchpose.measure import HeadNeck
 from torchpose.measure._face import FaceTracker
@@ -39,7 +40,7 @@ def main() -> None:
     """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", type=Path, required=True, help="folder of the data sets")
-    parser.add_argument("--out", type=Path, help="write the same as Markdown")
+    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
     parser.add_argument("--quick", action="store_true", help="one person, one clip, two offsets")
     parser.add_argument("--threads", type=int, default=1, help="cores")
     args = parser.parse_args()

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import torch
 
+from benchmarks._table_file import table_file
 from benchmarks._upper_body import score
 from benchmarks.ub_people import TEST_PERSONS, people, sway
 from torchpose.camera import PinholeCamera
@@ -39,7 +40,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder with kinect_utd_mhad/")
     parser.add_argument("--prior", type=Path, help="fitted without the test persons")
     parser.add_argument("--threads", type=int, default=2, help="cores")
-    parser.add_argument("--out", type=Path, help="write the same as Markdown")
+    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
     parser.add_argument(
         "--quick", action="store_true", help="a few sequences, to see that it works"
     )

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, pad, read_clip
+from benchmarks._table_file import table_file
 from torchpose.camera import PinholeCamera
 from torchpose.evaluation import Report
 from torchpose.metrics import jitter, joint_errors_3d
@@ -333,7 +334,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder with video_asl/")
     parser.add_argument("--prior", default="kinect-upper-body", help="name or file")
     parser.add_argument("--threads", type=int, default=2, help="cores")
-    parser.add_argument("--out", type=Path, help="write the same as Markdown")
+    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
     parser.add_argument("--quick", action="store_true", help="one clip, to see that it works")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)

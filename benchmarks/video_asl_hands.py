@@ -30,6 +30,7 @@ import torch
 from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, FPS, Clip, read_clip
+from benchmarks._table_file import table_file
 from benchmarks.speed._timing import Report, limit_threads, machine_line
 from torchpose.measure import HandTracker
 from torchpose.measure._edges import edge_map
@@ -115,7 +116,7 @@ def main() -> None:
     parser.add_argument("--clips", nargs="+", default=list(CLIPS), choices=CLIPS)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--quick", action="store_true", help="one clip only")
-    parser.add_argument("--out", type=Path, help="write what is printed to this file as Markdown")
+    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
     args = parser.parse_args()
     limit_threads(args.threads)
     cv2.setNumThreads(args.threads)  # faces differ a little with the number of threads

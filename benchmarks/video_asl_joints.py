@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, read_clip
+from benchmarks._table_file import table_file
 from torchpose._core.files import check_output_folder
 from torchpose.camera import PinholeCamera
 from torchpose.evaluation import Report
@@ -211,7 +212,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder with video_asl/")
     parser.add_argument("--prior", default="kinect-upper-body", help="name or file")
     parser.add_argument("--threads", type=int, default=2, help="cores")
-    parser.add_argument("--out", type=Path, help="write the same as Markdown")
+    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
     parser.add_argument("--pictures", type=Path, help="folder for pcp.png and errors-over-time.png")
     parser.add_argument("--quick", action="store_true", help="one clip, to see that it works")
     args = parser.parse_args()

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, read_clip
+from benchmarks._table_file import table_file
 from benchmarks.speed._timing import markdown_table, processor_model
 from torchpose.measure import SkinMixtureModel
 from torchpose.measure._face import FaceTracker
@@ -77,7 +78,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", type=Path, required=True, help="folder with video_asl/")
     parser.add_argument("--quick", action="store_true", help="one clip, every tenth frame scored")
-    parser.add_argument("--out", type=Path, help="write what is printed to this file as Markdown")
+    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
     args = parser.parse_args()
     torch.set_num_threads(1)
     folder = args.data / "video_asl" if (args.data / "video_asl").is_dir() else args.data

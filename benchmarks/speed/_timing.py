@@ -18,6 +18,8 @@ from typing import Any, NamedTuple
 
 import torch
 
+from benchmarks._table_file import table_file
+
 THREAD_VARIABLES = ("OMP", "MKL", "OPENBLAS", "NUMBA")
 
 
@@ -84,7 +86,7 @@ def parser(text: str | None, runs: int) -> argparse.ArgumentParser:
     made.add_argument("--threads", type=int, default=2, help="cores for every library")
     made.add_argument("--runs", type=int, default=runs, help="timed runs of each method")
     made.add_argument("--quick", action="store_true", help="a tiny problem, to see that it runs")
-    made.add_argument("--out", type=Path, help="write what is printed to this file as Markdown")
+    made.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
     return made
 
 

@@ -1,5 +1,6 @@
 """Every benchmark runs on a tiny problem and finds that results agree; times are not tested."""
 
+import argparse
 import importlib
 import os
 import subprocess
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks._table_file import table_file
 from benchmarks.speed._timing import THREAD_VARIABLES
 from tests.data import data_dir_or_skip
 
@@ -67,6 +69,22 @@ def test_quick_run_agrees_and_is_written(script, run_here, tmp_path):
     assert "Agreement" in text
     assert "| ---" in text
     assert text.split() == printed.split()
+
+
+def test_a_table_goes_to_a_file_or_into_a_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["/checkout/benchmarks/speed/gplvm.py"])
+    (tmp_path / "v0.2").mkdir()
+    wanted = {
+        "new/table.md": "new/table.md", "folder": "folder/gplvm.md", "v0.2": "v0.2/gplvm.md",
+    }  # fmt: skip
+    for given, file in wanted.items():
+        assert table_file(str(tmp_path / given)) == tmp_path / file
+        assert (tmp_path / file).parent.is_dir() and not (tmp_path / file).exists()
+    (tmp_path / "file.md").write_text("")
+    (tmp_path / "folder" / "gplvm.md").mkdir()
+    for given in ("file.md/table.md", "folder"):
+        with pytest.raises(argparse.ArgumentTypeError, match="file or a folder that can be"):
+            table_file(str(tmp_path / given))
 
 
 def test_levers_run_without_the_test_persons_and_go_on_where_they_stopped(tmp_path):
