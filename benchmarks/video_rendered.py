@@ -24,11 +24,12 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._performances import PERFORMANCES, performance
 from benchmarks.speed._timing import markdown_table, processor_model
 from torchpose import VideoTracker, load_prior, viz
 from torchpose._core.files import check_output_folder
 from torchpose.demo import KEYPOINT_NAMES, demo_camera
-from torchpose.demo._rendering import LOOKS, PERFORMANCES, performance, render_video
+from torchpose.demo._rendering import LOOKS, render_video
 from torchpose.metrics import joint_errors_3d
 from torchpose.priors import UpperBodyPrior
 from torchpose.skeleton import UPPER_BODY

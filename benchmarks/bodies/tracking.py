@@ -21,7 +21,7 @@ PUBLISHED_SURVIVAL = 0.5
 
 MADE_WITH = (
     "torchpose/body", "torchpose/camera", "torchpose/filters", "torchpose/math", "torchpose/priors",
-    "torchpose/whole_body", "benchmarks/bodies/tracking.py",
+    "torchpose/whole_body", "benchmarks/bodies/faults.py", "benchmarks/bodies/tracking.py",
 )  # fmt: skip
 """What the numbers of every run depend on: files and folders of a checkout."""
 

@@ -10,9 +10,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from benchmarks.bodies.clips import AZIMUTHS, Split, in_view, place_cameras, whole_frames
+from benchmarks.bodies.silhouettes import true_silhouettes
 from torchpose.body import Body, fit_body, fit_state
 from torchpose.camera import CameraRig
-from torchpose.demo._rendering.clothed_body import TrueShape, true_silhouettes
+from torchpose.demo._rendering.clothed_body import TrueShape
 from torchpose.errors import InputError
 from torchpose.evaluation.common import settings_hash
 from torchpose.io._mocap import MocapClip

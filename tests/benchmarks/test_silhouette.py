@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from benchmarks.bodies import clips as body_clips
+from benchmarks.bodies.silhouettes import true_silhouettes
 from benchmarks.bodies.tracking import PARTS, Run, drift, part_error
 from benchmarks.bodies.views import Conditions
 from benchmarks.engine import Results, Row, Setting, Tuning, pooled_std, read_settings
@@ -20,7 +21,7 @@ from benchmarks.silhouette.filters import METHODS, make_filter, prepare
 from tests.benchmarks.walkers import write_walkers
 from torchpose.body import BODY_15
 from torchpose.camera import save_cameras
-from torchpose.demo._rendering.clothed_body import TrueShape, true_limbs, true_silhouettes
+from torchpose.demo._rendering.clothed_body import TrueShape, true_limbs
 from torchpose.errors import InputError
 from torchpose.io import read_mocap
 from torchpose.whole_body import AnnealedParticleFilter, SIRParticleFilter

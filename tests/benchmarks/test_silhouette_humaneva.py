@@ -9,11 +9,12 @@ import torch
 
 from benchmarks import humaneva_files as humaneva
 from benchmarks.bodies import clips as body_clips
+from benchmarks.bodies.silhouettes import true_silhouettes
 from benchmarks.silhouette import humaneva as silhouette_humaneva
 from benchmarks.silhouette import protocol as silhouette
 from benchmarks.silhouette.humaneva import HumanEvaFootage, humaneva_splits
 from tests.io.humaneva_files import clip_of, walking_joints, write_avi, write_humaneva
-from torchpose.demo._rendering.clothed_body import TrueShape, true_silhouettes
+from torchpose.demo._rendering.clothed_body import TrueShape
 from torchpose.errors import InputError
 
 SIZE = (120, 160)

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from benchmarks.bodies.clips import place_cameras
+from benchmarks.bodies.silhouettes import true_silhouettes
 from tests.benchmarks.walkers import NAMES, walker
 from torchpose.body import body_joints
-from torchpose.demo._rendering.clothed_body import TrueShape, true_silhouettes
+from torchpose.demo._rendering.clothed_body import TrueShape
 from torchpose.io._mocap import MocapClip
 
 WIDTH, HEIGHT = 640, 480

@@ -29,7 +29,6 @@ MODULES = {
     "arm_windows": "upper_body._windows",
     "arms": "upper_body._estimator",
     "body.body_parameters": "body._limbs",
-    "body.faults": "whole_body._silhouettes.faults",
     "body.limb_batches": "whole_body._silhouettes.limb_batches",
     "body.limb_counts": "whole_body._silhouettes.limb_counts",
     "body.limb_outlines": "whole_body._silhouettes.outlines",
@@ -184,6 +183,7 @@ A module that only became private (`filters.mkf` is `filters._mkf`) does not sta
 
 LABORATORY = frozenset(
     [
+        "body.faults",
         "io.humaneva",
         "io.humaneva_joints",
         "protocols.bend",
@@ -217,6 +217,7 @@ LABORATORY = frozenset(
         "protocols.ub_one",
         "protocols.ub_people",
         "protocols.uncommon_poses",
+        "rendering.performances",
     ]
 )
 """Modules that belong to the benchmarks of a checkout now, and are no part of the package."""
@@ -443,8 +444,8 @@ class _OldNames:
             return None
         if fullname.removeprefix("torchpose.") in LABORATORY:
             raise ModuleNotFoundError(
-                f"{fullname} is no part of the package any more; from a checkout of torchpose it is "
-                "run by python -m benchmarks.NAME (docs/benchmarks.md)",
+                f"{fullname} is no part of the package any more; it belongs to the benchmarks of a "
+                "checkout of torchpose, python -m benchmarks.NAME (docs/benchmarks.md)",
                 name=fullname,
             )
         present = present_module(fullname)

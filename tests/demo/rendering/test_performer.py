@@ -7,16 +7,14 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks._performances import PERFORMANCES, crossing, performance
 from tests.demo.rendering.frames import CAMERA, K, painted, posture, sampled
 from torchpose.camera import PinholeCamera
 from torchpose.demo import performer
 from torchpose.demo._rendering import (
     LOOKS,
-    PERFORMANCES,
     Look,
     Scene,
-    crossing,
-    performance,
     performance_truth,
     render_performance,
 )

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from benchmarks._performances import crossing
 from tests.demo.rendering.frames import CAMERA
 from torchpose.demo import performer
 from torchpose.demo._rendering import (
     Scene,
-    crossing,
     performance_truth,
     render_performance,
     render_video,

@@ -1,4 +1,4 @@
-"""Render silhouettes of recorded joints with another body than the tracker's.
+"""Clothe recorded joints in another body than the tracker's.
 
 A tracker's body has constant bone lengths and one or two tapered cylinders for each part. Here the
 joints are the recorded ones, with all of the joint set (spine, hands, toes). The torso is a bundle of
@@ -10,19 +10,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchpose.body._limbs import Limbs
 from torchpose.body._skeleton import BODY_15
-from torchpose.camera._rig import CameraRig
 from torchpose.io._mocap import MocapClip
 from torchpose.skeleton._joint_sets import canonical_names
-from torchpose.whole_body._silhouettes.faults import add_faults
-from torchpose.whole_body._silhouettes.rendering import render_limbs
 
-__all__ = ["TrueShape", "limb_kinds", "true_limbs", "true_silhouettes"]
+__all__ = ["TrueShape", "limb_kinds", "true_limbs"]
 
 _SIDES = ("left", "right")
 _LEG = 0.84
@@ -78,28 +75,6 @@ class TrueShape:
         factors = (spread * drawn).clamp(-2.5 * spread, 2.5 * spread).exp().tolist()
         lengths = dict(zip(("hand", "foot", "head"), factors[n : n + 3], strict=True))
         return cls(dict(zip(kinds, factors[:n], strict=True)), lengths, factors[-1])
-
-
-def true_silhouettes(
-    clip: MocapClip,
-    shape: TrueShape,
-    cameras: CameraRig,
-    faults: float = 0.0,
-    generator: torch.Generator | None = None,
-) -> Bool[Tensor, "T C H W"]:
-    """Return the silhouettes of a clip, with the faults of background subtraction.
-
-    Args:
-        clip: recorded joints. shape: of the person. cameras: with their image sizes.
-        faults: severity for `torchpose.whole_body._silhouettes.faults.add_faults`; 0 renders without any.
-        generator: of the faults.
-
-    Returns:
-        [T, C, H, W], True where the person is seen.
-    """
-    height, width = cameras.size or (480, 640)
-    clean = render_limbs(true_limbs(clip, shape), cameras, height, width)
-    return add_faults(clean, faults, generator) if faults > 0 else clean
 
 
 def true_limbs(clip: MocapClip, shape: TrueShape) -> Limbs:

@@ -78,10 +78,6 @@ def performance(
 
     Reference:
         Burke & Lasenby, figure 8: hands that merge, and clapping, are what trackers fail at.
-
-    Example:
-        >>> performance("clapping", n_frames=30).joints.shape
-        torch.Size([30, 8, 3])
     """
     if name not in PERFORMANCES:
         raise InputError(f"name must be one of {', '.join(PERFORMANCES)}, got {name!r}")

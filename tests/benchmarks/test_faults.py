@@ -4,10 +4,10 @@ import pytest
 import torch
 from torch.nn.functional import max_pool2d
 
+from benchmarks.bodies.faults import FAULTS, add_faults
 from torchpose.body import Limbs
 from torchpose.camera import PinholeCamera
 from torchpose.errors import InputError, ShapeError
-from torchpose.whole_body._silhouettes.faults import FAULTS, add_faults
 from torchpose.whole_body._silhouettes.rendering import render_limbs
 
 

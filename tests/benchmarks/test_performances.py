@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks._performances import PERFORMANCES, crossing, performance
 from torchpose.demo._mannequin import ANGLE_LIMITS, BodySize
-from torchpose.demo._rendering import PERFORMANCES, crossing, performance
 from torchpose.errors import InputError
 from torchpose.math import euler_to_matrix
 from torchpose.skeleton._upper_body import LIMBS
