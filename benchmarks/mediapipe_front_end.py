@@ -101,7 +101,7 @@ def jitter_tables(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) ->
     space = report.table(
         "jitter3d",
         "Jitter in space, relative to the middle of the shoulders: mean acceleration (m/s²)",
-        GROUPS,
+        list(GROUPS),
         digits=1,
     )
 
@@ -246,7 +246,7 @@ def space_table(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) -> N
         "space",
         "Difference from MediaPipe's 3D joints after fixed-scale Procrustes on head, neck and "
         "shoulders: mean (cm)",
-        GROUPS,
+        list(GROUPS),
         note="MediaPipe's 3D joints (full model) come from a single image, and are no truth; the "
         "last row shows how much its own two models differ. Its shoulders are 0.34 to "
         "0.36 m apart in the full and 0.28 to 0.31 m in the heavy model.",

@@ -4,8 +4,8 @@
 
 100 frames of head and hands through `UpperBodyTracker` as it is by default, over windows, and over
 single poses: without gradients, and forward and backward with gradients for every keypoint. Each case
-runs in a process of its own and reports CPU seconds and the peak of its resident memory beyond what
-was resident before; gains and libraries are loaded before, by a short run.
+runs in a process of its own (all in one with --quick) and reports CPU seconds and the peak of its
+resident memory beyond what was resident before; gains and libraries are loaded before, by a short run.
 """
 
 import argparse
@@ -37,14 +37,18 @@ def main() -> None:
     args = parse_args()
     limit_threads(args.threads)
     if args.worker:
-        *case, gradients = args.worker
-        print(json.dumps(measure(Case(*case), bool(gradients))))
+        print(json.dumps([measure(Case(*case), on) for *case, on in json.loads(args.worker)]))
         return
     report = Report("Gradients of poses", args.out, args.threads)
     cases = [Case(method, batch, 100) for method in (0, 1) for batch in (1, 16)]
     if args.quick:
         cases = [Case(0, 1, 6), Case(1, 1, 6)]
-    found = [[in_a_process(case, on, args.threads) for on in (False, True)] for case in cases]
+    ways = [(*case, on) for case in cases for on in (False, True)]
+    if args.quick:  # whose peaks mean nothing
+        results = in_a_process(ways, args.threads)
+    else:
+        results = [result for way in ways for result in in_a_process([way], args.threads)]
+    found = list(zip(results[::2], results[1::2], strict=True))
     report.table(HEADER, table_rows(cases, found))
     moved = max(result["moved"] for _, result in found)
     slope = max(result["slope"] for _, result in found)
@@ -60,14 +64,14 @@ def main() -> None:
 
 def parse_args() -> argparse.Namespace:
     made = parser(__doc__, runs=1)
-    made.add_argument("--worker", type=int, nargs=4, help=argparse.SUPPRESS)
+    made.add_argument("--worker", help=argparse.SUPPRESS)
     return made.parse_args()
 
 
-def in_a_process(case: Case, gradients: bool, threads: int) -> dict[str, Any]:
-    """`measure` in a new process, so that the peak is that of one case."""
+def in_a_process(ways: list[tuple[Any, ...]], threads: int) -> list[dict[str, Any]]:
+    """`measure` in a new process for some cases, with and without gradients; a peak is that of one."""
     command = [sys.executable, __file__, "--threads", str(threads)]
-    command += ["--worker", *(str(int(value)) for value in (*case, gradients))]
+    command += ["--worker", json.dumps(ways)]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -87,25 +91,24 @@ def measure(case: Case, gradients: bool) -> dict[str, Any]:
         keypoints = keypoints.requires_grad_()
         tracker(keypoints[:1, :2], names=NAMES).joints3d.sum().backward()
         keypoints.grad = None
-    else:
-        torch.set_grad_enabled(False)
     return_free_memory()
     before = resident()
     forget_peak()
     start = time.process_time()
-    track = tracker(keypoints, names=NAMES)
-    if gradients:
-        track.joints3d.sum().backward()
+    with torch.set_grad_enabled(gradients):
+        track = tracker(keypoints, names=NAMES)
+        if gradients:
+            track.joints3d.sum().backward()
     numbers = {"seconds": time.process_time() - start, "beyond": peak_resident() - before}
     if not gradients:
         return numbers
-    torch.set_grad_enabled(False)
-    moved = max(
-        float(((getattr(track, name) - value).abs() / value.abs().clamp_min(1)).max())
-        for name in ("joints2d", "joints3d", "covariance2d", "covariance3d", "log_evidence")
-        for value in (getattr(plain, name),)
-    )
-    return {**numbers, "moved": moved, "slope": slope_error(tracker, keypoints)}
+    with torch.no_grad():
+        moved = max(
+            float(((getattr(track, name) - value).abs() / value.abs().clamp_min(1)).max())
+            for name in ("joints2d", "joints3d", "covariance2d", "covariance3d", "log_evidence")
+            for value in (getattr(plain, name),)
+        )
+        return {**numbers, "moved": moved, "slope": slope_error(tracker, keypoints)}
 
 
 def slope_error(tracker: Any, keypoints: Any) -> float:
@@ -133,7 +136,9 @@ def draw_keypoints(batch: int, frames: int) -> Any:
     return place + 2 * steps.cumsum(1)
 
 
-def table_rows(cases: list[Case], found: list[list[dict[str, Any]]]) -> Iterator[list[str]]:
+def table_rows(
+    cases: list[Case], found: list[tuple[dict[str, Any], dict[str, Any]]]
+) -> Iterator[list[str]]:
     for case, (plain, learning) in zip(cases, found, strict=True):
         name = METHODS[case.method]
         seconds = [number(result["seconds"]) for result in (plain, learning)]

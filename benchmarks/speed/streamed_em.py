@@ -9,19 +9,17 @@ states that they can hold, all from one start.
 """
 
 import argparse
-import json
 import os
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple
 
 import torch
 
+from benchmarks.speed._memory import MB
+from benchmarks.speed._streamed_jobs import Job, Run, in_processes
 from benchmarks.speed._timing import (
     Case,
     Report,
@@ -33,7 +31,6 @@ from benchmarks.speed._timing import (
     ratio,
     take_turns,
 )
-from benchmarks.speed.batch_memory import forget_peak, peak_resident, resident, return_free_memory
 from benchmarks.speed.expectation_maximisation import (
     PACKAGES,
     TOLERANCE,
@@ -46,16 +43,14 @@ from benchmarks.speed.expectation_maximisation import (
     torchpose_fit,
     wide,
 )
-from torchpose.learning._blocks import Share
-from torchpose.learning._samplers import ArmSource, SampleSource, TensorSource
+from torchpose.learning._samplers import TensorSource
 from torchpose.learning._streamed_em import StreamedEM, run_streamed
 from torchpose.math._mixture_em import MixtureParameters
 
-MB, MILLION = 2**20, 1_000_000
-STEPS, COMPONENTS, POSES = 20, 30, 60_000
+MILLION = 1_000_000
+STEPS, COMPONENTS = 20, 30
 SAME = 1e-8  # of the log-likelihoods of one process and of two
 AIM = 1.7
-CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 IDLE = 0.9  # share of both cores that has to be free for the two processes to mean anything
 STREAMED = (
     "states", "processes x threads", "start s", "s/step", "s for 20 steps", "CPU s/step",
@@ -73,61 +68,8 @@ PEERS = (
 )
 
 
-class Job(NamedTuple):
-    """What a worker has to do: some steps over some states, as process `rank` of `size`."""
-
-    samples: int
-    components: int
-    steps: int
-    data: str | None = None
-    threads: int = 1
-    rank: int = 0
-    size: int = 1
-    store: str = ""
-
-
-class Run(NamedTuple):
-    """Results of all processes of a job."""
-
-    job: Job
-    found: list[dict[str, Any]]
-
-    @property
-    def step(self) -> float:
-        """Median time of a step; all processes end it together."""
-        return median(self.found[0]["steps"])
-
-    @property
-    def best(self) -> float:
-        """Smallest time of a step."""
-        return min(self.found[0]["steps"])
-
-    @property
-    def cpu(self) -> float:
-        """CPU time of a step, over all processes."""
-        return sum(result["cpu"] for result in self.found) / self.job.steps
-
-    @property
-    def peak(self) -> float:
-        """Peak of the resident memory of the largest process, MB."""
-        return max(result["peak"] for result in self.found) / MB
-
-    @property
-    def log_likelihood(self) -> float:
-        """Mean, before the last step."""
-        return self.found[0]["log_likelihood"]
-
-    @property
-    def name(self) -> str:
-        """Processes and threads of each."""
-        return f"{self.job.size} x {self.job.threads}"
-
-
 def main() -> None:
     args = parse_args()
-    if args.worker:
-        print(json.dumps(work(Job(**json.loads(args.worker)))))
-        return
     limit_threads(args.threads)
     report = Report("EM over states that are not held in memory", args.out, args.threads)
     limits = measure_limits(args.quick)
@@ -143,100 +85,7 @@ def parse_args() -> argparse.Namespace:
     made = parser(__doc__, runs=3)
     made.add_argument("--samples", type=int, default=10 * MILLION, help="of the longest fit")
     made.add_argument("--data", help="folder of recordings, such as kinect_utd_mhad")
-    made.add_argument("--worker", help=argparse.SUPPRESS)
     return made.parse_args()
-
-
-# --- one process
-
-
-def work(job: Job) -> dict[str, Any]:
-    """Take the steps of a job; seconds of each, memory, and the log-likelihood before the last."""
-    limit_threads(job.threads)
-    share = join(job)
-    began, source = time.perf_counter(), make_source(job)
-    em = StreamedEM.start(source, job.components)
-    started = time.perf_counter() - began
-    em.accumulate(TensorSource(source.block(0).states))  # loads libraries
-    return_free_memory()
-    before = resident()
-    forget_peak()
-    share.total(torch.zeros(1))
-    steps, cpu = [], time.process_time()
-    for _ in range(job.steps):
-        began = time.perf_counter()
-        value = em.maximise(em.accumulate(source, share))
-        steps.append(time.perf_counter() - began)
-    cpu = time.process_time() - cpu
-    peak = peak_resident()
-    drawing = time.process_time()
-    blocks = min(source.n_blocks, 400)
-    count = sum(len(source.block(block).states) for block in range(blocks))
-    drawing = (time.process_time() - drawing) * source.n_samples / count
-    times = {"start": started, "steps": steps, "cpu": cpu, "drawing": drawing}
-    return {**times, "before": before, "peak": peak, "log_likelihood": value}
-
-
-def join(job: Job) -> Share:
-    """The group of processes, each on a core of its own."""
-    if job.size == 1:
-        return Share()
-    torch.distributed.init_process_group(
-        "gloo", init_method=f"file://{job.store}", rank=job.rank, world_size=job.size
-    )
-    return Share.of_processes()
-
-
-def make_source(job: Job) -> SampleSource:
-    """States of left arms from random viewpoints, drawn whenever they are asked for."""
-    from torchpose.learning import TRAINING_VIEWS
-
-    matrix = torch.tensor([[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]])
-    if job.data is not None:
-        from torchpose.io import read_recordings
-        from torchpose.learning._training import arm_sources, collect_poses
-
-        poses = collect_poses(read_recordings([job.data]))
-        return arm_sources(poses, matrix.double(), n_samples=job.samples).left
-    arms = made_up_arms()
-    return ArmSource(
-        matrix=matrix.double(), views=TRAINING_VIEWS, rotation_order="zxy", n_samples=job.samples,
-        seed=0, fresh=False, arms=arms, weight=torch.ones(len(arms), dtype=torch.float64),
-    )  # fmt: skip
-
-
-def made_up_arms() -> torch.Tensor:
-    """Hand, elbow, shoulder, head and neck of arms that go from one of 40 gestures to the next."""
-    g = torch.Generator().manual_seed(0)
-    gestures = torch.randn(40, 2, 3, generator=g, dtype=torch.float64)
-    gestures = gestures / gestures.norm(dim=-1, keepdim=True)
-    way = torch.linspace(0, 39, POSES, dtype=torch.float64)
-    low, between = way.long().clamp_max(38), (way % 1)[:, None, None]
-    limbs = (1 - between) * gestures[low] + between * gestures[low + 1]
-    limbs = limbs + 0.1 * torch.randn(limbs.shape, generator=g, dtype=torch.float64)
-    limbs = limbs / limbs.norm(dim=-1, keepdim=True)
-    trunk = torch.tensor([[0.18, 0.08, 0.0], [0.0, -0.2, 0.02], [0.0, 0.0, 0.0]]).double()
-    trunk = trunk + 0.01 * torch.randn(POSES, 3, 3, generator=g, dtype=torch.float64)
-    elbow = trunk[:, 0] + 0.28 * limbs[:, 0]
-    hand = elbow + 0.26 * limbs[:, 1]
-    return torch.cat([torch.stack([hand, elbow], 1), trunk], 1)
-
-
-def in_processes(job: Job) -> Run:
-    """`work` in `job.size` new processes, each with cores of its own where there are enough."""
-    with tempfile.TemporaryDirectory() as folder:
-        started = []
-        for rank in range(job.size):
-            own = job._replace(rank=rank, store=f"{folder}/store")
-            command = [sys.executable, __file__, "--worker", json.dumps(own._asdict())]
-            started.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
-            if len(CORES) >= job.size * job.threads:
-                own_cores = CORES[rank * job.threads : (rank + 1) * job.threads]
-                os.sched_setaffinity(started[-1].pid, own_cores)
-        outputs = [process.communicate()[0] for process in started]
-    if any(process.returncode for process in started):
-        raise RuntimeError(f"a process of {job} failed, see above")
-    return Run(job, [json.loads(output.splitlines()[-1]) for output in outputs])
 
 
 # --- tables
@@ -246,11 +95,11 @@ def report_scaling(report: Report, args: argparse.Namespace) -> bool:
     """One process of one thread and two of one thread each, in turn; True if they disagree."""
     samples, components = (20_000, 4) if args.quick else (2 * MILLION, COMPONENTS)
     job = Job(samples, components, 3, args.data)
-    idle = report_load(report)
+    idle = report_load(report, args.quick)
     runs: dict[int, list[Run]] = {1: [], 2: []}
     for _ in range(args.runs):
         for size, found in runs.items():
-            found.append(in_processes(job._replace(size=size)))
+            found.append(in_processes(job._replace(size=size), args.quick))
     gain = median(r.step for r in runs[1]) / median(r.step for r in runs[2])
     rows = []
     for found in runs.values():
@@ -275,15 +124,15 @@ def report_scaling(report: Report, args: argparse.Namespace) -> bool:
     return not difference < SAME
 
 
-def report_load(report: Report) -> float:
+def report_load(report: Report, quick: bool) -> float:
     """Say how busy the machine is before anything is measured; the share of it that is free."""
-    before = _cpu_ticks()
-    time.sleep(2)
+    before, seconds = _cpu_ticks(), 0.1 if quick else 2
+    time.sleep(seconds)
     spent = [after - first for after, first in zip(_cpu_ticks(), before, strict=True)]
     idle = spent[0] / spent[1] if spent[1] else 1.0
     load = f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
     report.add(
-        f"Before the runs: load {load}, {100 * idle:.0f} % of {os.cpu_count()} cores idle over 2 s"
+        f"Before the runs: load {load}, {100 * idle:.0f} % of {os.cpu_count()} cores idle over {seconds:g} s"
         f"{'' if idle >= IDLE else ' (BUSY)'}."
     )
     return idle
@@ -309,8 +158,8 @@ def report_streamed(report: Report, args: argparse.Namespace) -> bool:
     ]
     if threads > 1:
         jobs.append(jobs[-1]._replace(threads=1, size=threads))
-    report_load(report)
-    runs = [in_processes(job) for job in jobs]
+    report_load(report, args.quick)
+    runs = [in_processes(job, args.quick) for job in jobs]
     report.table(STREAMED, (streamed_row(run) for run in runs))
     small, large = runs[0], runs[1]
     share = large.found[0]["drawing"] / large.cpu

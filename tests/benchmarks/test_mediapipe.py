@@ -3,7 +3,7 @@
 import ast
 from pathlib import Path
 
-from tests.benchmarks.test_scripts_run import ROOT, run
+from tests.benchmarks.conftest import ROOT
 from tests.data import data_dir_or_skip
 
 
@@ -14,11 +14,10 @@ def rows(text: str, title: str) -> dict[str, list[str]]:
     return {row[0]: row[1:] for row in cells[2:]}
 
 
-def test_landmarks_as_the_front_end(tmp_path):
+def test_landmarks_as_the_front_end(run_here, tmp_path):
     written = tmp_path / "table.md"
     data = data_dir_or_skip("video_asl").parent
-    done = run("mediapipe_front_end", "--quick", "--data", str(data), "--out", str(written))
-    assert done.returncode == 0, done.stdout + done.stderr
+    run_here("mediapipe_front_end", "--quick", "--data", str(data), "--out", str(written))
     text = written.read_text()
     jitter = {name: float(row[-1]) for name, row in rows(text, "Jitter in space").items()}
     assert jitter["all eight, smoothed"] < jitter["all eight, filtered"] < jitter["MediaPipe full"]
@@ -29,12 +28,11 @@ def test_landmarks_as_the_front_end(tmp_path):
     assert {"interpolation", "all eight, filtered, elbow hidden too"} <= gaps.keys()
 
 
-def test_joints_from_video(tmp_path):
+def test_joints_from_video(run_here, tmp_path):
     written, pictures = tmp_path / "joints.md", tmp_path / "joints"
     data = data_dir_or_skip("video_asl").parent
     options = ("--data", str(data), "--out", str(written), "--pictures", str(pictures))
-    done = run("video_asl_joints", "--quick", *options)
-    assert done.returncode == 0, done.stdout + done.stderr
+    run_here("video_asl_joints", "--quick", *options)
     text = written.read_text()
     means = rows(text, "Mean 2D distance")
     elbows = {name: float(row[2].split()[0]) for name, row in means.items()}

@@ -2,6 +2,7 @@
 
 import math
 from collections import namedtuple
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,12 +11,14 @@ from tests.priors.poses import lowered_neck, poses, recording
 from torchpose.camera import ViewRange, lift
 from torchpose.errors import InputError, PriorError
 from torchpose.learning import TRAINING_VIEWS
+from torchpose.learning._recipes import UpperBodyRecipe
 from torchpose.learning._samplers import all_samples
-from torchpose.learning._training import arm_sources, collect_poses
+from torchpose.learning._training import arm_sources, collect_poses, short_paths
 from torchpose.math import euler_to_matrix as rotate
 from torchpose.skeleton import UPPER_BODY
 
 Fitted = namedtuple("Fitted", "left right facts")
+NECK = UPPER_BODY.index("neck")
 MATRIX = torch.tensor([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]], dtype=torch.float64)
 
 
@@ -141,3 +144,39 @@ def test_bad_settings_are_refused():
         states(recording(), n_samples=0)
     with pytest.raises(InputError, match="tx"):
         states(recording(), view_range=ViewRange(tx=(0.0, 0.5)))
+
+
+def walking(n_frames, step):
+    """Somebody who goes on without moving a limb."""
+    ahead = torch.arange(n_frames, dtype=torch.float64)[:, None, None] * step
+    return recording(poses(1, 0) + ahead, person="walker", fps=30.0)
+
+
+def test_long_paths_are_cut_into_short_ones():
+    far, still = walking(100, torch.tensor([0.0, 0.0, -0.04])), walking(20, torch.zeros(3))
+    gap = far.joints.clone()
+    gap[30:35] = torch.nan
+    whole = collect_poses([replace(far, joints=gap), still], centre="sequence")
+    found = short_paths(whole, 0.4)
+    assert sum(found.lengths) == 120 and found.lengths[-1] == 20
+    assert len(found.rates) == len(found.persons) == len(found.lengths)
+    parts = found.joints.split(found.lengths)
+    for part in parts:
+        necks = part[:, NECK]
+        assert float((necks.nan_to_num().amax(0) - necks.nan_to_num().amin(0)).norm()) <= 0.4
+        assert float(necks.nanmean(0).abs().max()) < 1e-12
+    assert min(found.lengths[:-2]) >= 10  # no part is shorter than it has to be
+    bodies = [set_of.joints - set_of.joints[:, NECK, None] for set_of in (found, whole)]
+    torch.testing.assert_close(*bodies, equal_nan=True)
+
+
+def test_somebody_who_walks_past_the_camera_has_steps_too():
+    """Four metres towards the camera, whose usual place is two metres away."""
+    step = torch.tensor([0.0, 0.0, -0.04])
+    recipe = UpperBodyRecipe(
+        2, 500, pose_steps=3, window_components=0, calibration_folds=0, mirror=False
+    )
+    prior = recipe.fit([walking(100, step), recording(person="other")])
+    found = recipe.process_noise(prior, [walking(100, step)])["increment_cov_left"]
+    # turned by the views' angles, and as long as it was; less than a thousandth more keeps Q regular
+    assert float(found[18:, 18:].trace()) == pytest.approx(0.04**2, rel=1e-3)

@@ -32,6 +32,7 @@ __all__ = [
     "collect_poses",
     "one_kind",
     "seen_keypoints",
+    "short_paths",
 ]
 
 TRAINING_VIEWS = ViewRange(
@@ -169,6 +170,38 @@ def collect_poses(
         [float(r.fps or rate or DEFAULT_RATE) for r in recordings],
         [r.person_id for r in recordings],
     )
+
+
+def short_paths(poses: PoseSet, room: float) -> PoseSet:
+    """Return recordings cut where the neck has gone far, each part centred on the mean of its neck.
+
+    Args:
+        poses: from `collect_poses`. room: diagonal of the box that holds a part's necks, at most;
+            metres.
+    """
+    parts: list[Tensor] = []
+    lengths, rates, persons = [], [], []
+    recorded = poses.joints.split(poses.lengths)
+    for joints, rate, person in zip(recorded, poses.rates, poses.persons, strict=True):
+        own = joints.split(_near(joints[:, _NECK], room))
+        parts += [_centred(part, "sequence") for part in own]
+        lengths += [len(part) for part in own]
+        rates += [rate] * len(own)
+        persons += [person] * len(own)
+    return poses._replace(joints=torch.cat(parts), lengths=lengths, rates=rates, persons=persons)
+
+
+def _near(path: Float[Tensor, "T 3"], room: float) -> list[int]:
+    """Return lengths of the parts of a path, each of which stays within a box of some diagonal."""
+    lengths = [0]
+    low = high = path.new_full((3,), torch.nan)
+    for place in path:
+        low, high = torch.fmin(low, place), torch.fmax(high, place)
+        if float((high - low).norm()) > room:  # never where no place is known
+            lengths.append(0)
+            low = high = place
+        lengths[-1] += 1
+    return lengths
 
 
 def arm_sources(

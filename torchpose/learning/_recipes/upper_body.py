@@ -33,6 +33,7 @@ from torchpose.learning._training import (
     RecordingLike,
     arm_sources,
     collect_poses,
+    short_paths,
 )
 from torchpose.learning._upper_body import KINECT_CAMERA, increment_covs, prior_of_arms
 from torchpose.priors._arm_state import check_rotation_order
@@ -56,6 +57,7 @@ _PIXEL_RATIO, _PLACEMENT_RATIO = 1e5, 1e2
 _MEASUREMENT_STD = 3.0
 _WINDOW_COMPONENTS = 8  # times those over poses
 _WINDOW_SAMPLES, _WINDOWS_PER_FRAME = 120_000, 60
+_REACH = 1.1  # metres from the neck to the farthest joint, at most
 _FRAMES_PER_COMPONENT = 180  # of a mixture over windows; fewer explain the person, not the motion
 
 
@@ -259,14 +261,19 @@ class UpperBodyRecipe:
     ) -> dict[str, Tensor]:
         """Return the second moments of recorded steps, by the names that the filters look for.
 
+        Recordings of people who walk past the camera are cut into parts near its usual place.
+
         Args:
             prior: mixtures over poses; a millionth of their variance keeps Q regular. recordings: what
                 they were fitted on.
         """
         poses = collect_poses(recordings, self.neck, "sequence", self.nose_as_head)
-        covs = increment_covs(
-            poses, self.matrix, self.views, self.rotation_order, self.mirror, self.seed
-        )
+        seen = self.matrix, self.views, self.rotation_order, self.mirror, self.seed
+        try:
+            covs = increment_covs(poses, *seen)
+        except InputError:  # joints behind the camera
+            near = short_paths(poses, max(self.views.tz[0] - _REACH, 0.0))
+            covs = increment_covs(near, *seen)
         noise = {}
         for side, cov in covs.items():
             mixture = getattr(prior, side)

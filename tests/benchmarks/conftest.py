@@ -1,0 +1,45 @@
+"""Scripts run in the process of their test, and a few recordings of every person of UTD-MHAD."""
+
+import importlib
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.speed._timing import THREAD_VARIABLES
+from tests.data import data_dir_or_skip
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def run_here(monkeypatch, capsys):
+    """Run a script in this process, which keeps its cores: what it prints."""
+
+    def run(script: str, *options: str) -> str:
+        module = importlib.import_module(f"benchmarks.{script}")
+        file = f"{script.rpartition('.')[2]}.py"
+        monkeypatch.setattr(sys, "argv", [file, "--threads", "1", *options])
+        monkeypatch.setattr(os, "sched_setaffinity", lambda *_: None, raising=False)
+        for library in THREAD_VARIABLES:  # which the script sets; they are put back afterwards
+            monkeypatch.setenv(f"{library}_NUM_THREADS", "1")
+        monkeypatch.setenv("PYTHONPATH", str(ROOT))  # of processes that the script starts
+        capsys.readouterr()
+        module.main()
+        return capsys.readouterr().out
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def few_people(tmp_path_factory) -> Path:
+    """A folder kinect_utd_mhad with three recordings of each person: reading all takes seconds."""
+    whole = data_dir_or_skip("kinect_utd_mhad")
+    folder = tmp_path_factory.mktemp("few-people") / whole.name
+    folder.mkdir()
+    for person in range(1, 9):
+        paths = sorted(whole.glob(f"s{person:02d}_*.npz"))
+        for path in paths[:: -(-len(paths) // 3)]:
+            (folder / path.name).symlink_to(path)
+    return folder
