@@ -16,3 +16,22 @@ def data_dir_or_skip(name: str) -> Path:
             f"data set {name!r} is not at {folder}; set TORCHPOSE_DATA to its parent folder"
         )
     return folder
+
+
+def few_recordings(name: str, into: Path, per_person: int) -> Path:
+    """A folder with links to evenly spread recordings of each person: to read all takes seconds.
+
+    Args:
+        name: of a data set whose files begin with their person, such as s01_. into: where the folder is
+            made, under its own name. per_person: recordings, at most.
+    """
+    whole = data_dir_or_skip(name)
+    folder = into / name
+    folder.mkdir(parents=True)
+    persons: dict[str, list[Path]] = {}
+    for path in sorted(whole.glob("s[0-9][0-9]_*.npz")):
+        persons.setdefault(path.name[:3], []).append(path)
+    for paths in persons.values():
+        for path in paths[:: -(-len(paths) // per_person)]:
+            (folder / path.name).symlink_to(path)
+    return folder

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.speed._timing import THREAD_VARIABLES
-from tests.data import data_dir_or_skip
+from tests.data import few_recordings
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -34,12 +34,5 @@ def run_here(monkeypatch, capsys):
 
 @pytest.fixture(scope="session")
 def few_people(tmp_path_factory) -> Path:
-    """A folder kinect_utd_mhad with three recordings of each person: reading all takes seconds."""
-    whole = data_dir_or_skip("kinect_utd_mhad")
-    folder = tmp_path_factory.mktemp("few-people") / whole.name
-    folder.mkdir()
-    for person in range(1, 9):
-        paths = sorted(whole.glob(f"s{person:02d}_*.npz"))
-        for path in paths[:: -(-len(paths) // 3)]:
-            (folder / path.name).symlink_to(path)
-    return folder
+    """A folder kinect_utd_mhad with three recordings of each person."""
+    return few_recordings("kinect_utd_mhad", tmp_path_factory.mktemp("few-people"), 3)

@@ -8,7 +8,6 @@ import torch
 
 from benchmarks import ub_people
 from benchmarks._people_tables import BASELINE, MAIN, MEAN_POSE, SMOOTHED, UNCALIBRATED
-from tests.data import data_dir_or_skip
 from tests.evaluation.recordings import small_recipe, write_people
 from torchpose.errors import InputError, OutputError, OverlapError
 from torchpose.priors import UpperBodyPrior
@@ -84,10 +83,9 @@ def test_bad_folders(data, tmp_path):
 
 @pytest.mark.data
 @pytest.mark.slow
-def test_real_persons(tmp_path):
-    folder = data_dir_or_skip("kinect_utd_mhad")
+def test_real_persons(few_people, tmp_path):
     report = ub_people.run(
-        folder, tmp_path, progress=False, quick=True, n_gap_sequences=0, recipe=small_recipe
+        few_people, tmp_path, progress=False, quick=True, n_gap_sequences=0, recipe=small_recipe
     )
     errors = report["errors_3d"]
     assert errors[BASELINE, "mean"] < 0.8 * errors[MEAN_POSE, "mean"]

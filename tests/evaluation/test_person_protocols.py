@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from benchmarks import uncommon_poses
-from tests.data import data_dir_or_skip
+from tests.data import few_recordings
 from tests.evaluation.recordings import V1, poses, small_recipe, write_one, write_people
 from torchpose.cli import evaluate
 from torchpose.errors import InputError, OutputError
@@ -326,10 +326,10 @@ def test_raised_share_counts_frames_of_either_hand(data):
 @pytest.mark.data
 @pytest.mark.slow
 def test_real_data_sets(tmp_path):
-    folder = data_dir_or_skip("kinect_utd_mhad").parent
-    data_dir_or_skip("mocap_berkeley_mhad")
+    folder = few_recordings("kinect_utd_mhad", tmp_path / "data", 24).parent
+    few_recordings("mocap_berkeley_mhad", tmp_path / "data", 9)
     report = cross_dataset.run(
-        folder, tmp_path, progress=False, quick=True, part="cross", recipe=recipe
+        folder, tmp_path / "out", progress=False, quick=True, part="cross", recipe=recipe
     )
     cross = report["cross"]
     own, far = (cross[f"{name} → UTD (s7, s8)", "filtered"] for name in ("UTD", "MHAD"))
