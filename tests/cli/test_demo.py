@@ -1,11 +1,14 @@
 """`torchpose demo`: files, scores, exit code."""
 
+import contextlib
+import io
+
 import numpy as np
 import pytest
 import torch
 
 from torchpose.camera import lift
-from torchpose.cli import demo_keypoints
+from torchpose.cli import demo_keypoints, demo_walk, main
 from torchpose.io import read_keypoints
 from torchpose.math import euler_to_matrix
 from torchpose.priors import load_prior
@@ -107,16 +110,22 @@ def test_refusals(torchpose, shipped, tmp_path):
         assert not (tmp_path / "out").exists()
 
 
-def test_a_walk_in_three_cameras_needs_no_data(torchpose, tmp_path, monkeypatch):
-    from torchpose.cli import demo_walk
+@pytest.fixture(scope="module")
+def walked(tmp_path_factory):
+    """The folder of a walk that was rendered and tracked, and what was printed."""
+    out, printed = tmp_path_factory.mktemp("walk") / "walk", io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
+        patch.setattr(demo_walk, "_PARTICLES", 100)
+        patch.delenv("TORCHPOSE_DATA", raising=False)
+        options = ["--input", "walk", "--seconds", "1", "--pictures", "false"]
+        assert main(["demo", *options, "--out", str(out)]) == 0
+    return out, printed.getvalue()
 
-    monkeypatch.setattr(demo_walk, "_PARTICLES", 100)
-    monkeypatch.delenv("TORCHPOSE_DATA", raising=False)
-    out = tmp_path / "walk"
-    done = torchpose("demo", "--input", "walk", "--seconds", 1, "--out", out, "--pictures", "false")
-    assert done.code == 0, done.err
-    assert "neither recorded nor drawn from the manifold" in " ".join(done.out.split())
-    cells = next(row.split() for row in done.out.splitlines() if row.startswith("all joints"))
+
+def test_a_walk_in_three_cameras_needs_no_data(walked):
+    out, printed = walked
+    assert "neither recorded nor drawn from the manifold" in " ".join(printed.split())
+    cells = next(row.split() for row in printed.splitlines() if row.startswith("all joints"))
     tracked, still = float(cells[2]), float(cells[3])
     with np.load(out / "body.npz") as found, np.load(out / "truth.npz") as truth:
         apart = np.linalg.norm(found["joints3d"] - truth["joints"], axis=-1)
@@ -127,13 +136,14 @@ def test_a_walk_in_three_cameras_needs_no_data(torchpose, tmp_path, monkeypatch)
     assert {"cameras.toml", "cam_03.mp4", "cam_03-empty.png", "truth.npz", "report.html"} <= names
 
 
-def test_standing_still_that_is_no_worse_fails_the_demo(torchpose, tmp_path, monkeypatch):
-    from torchpose.cli import demo_walk
-
-    monkeypatch.setattr(demo_walk, "_PARTICLES", 20)
+def test_standing_still_that_is_no_worse_fails_the_demo(torchpose, walked, monkeypatch):
+    """Of the walk that is tracked already."""
+    out, _ = walked
+    monkeypatch.setattr(demo_walk, "_render", lambda *_: ([], []))
+    monkeypatch.setattr("torchpose.cli.track_body.main", lambda _: 0)
     monkeypatch.setattr(demo_walk, "_still", lambda truth: torch.zeros(len(truth), 15))
     options = ("--input", "walk", "--seconds", 1, "--pictures", "false")
-    done = torchpose("demo", *options, "--out", tmp_path / "out")
+    done = torchpose("demo", *options, "--out", out)
     assert done.code == 1 and "no better than standing still" in done.err
-    done = torchpose("demo", "--input", "walk", "--seconds", 9, "--out", tmp_path / "out")
+    done = torchpose("demo", "--input", "walk", "--seconds", 9, "--out", out / "other")
     assert done.code == 2 and "from 1 to 4" in done.err
