@@ -149,10 +149,10 @@ def test_a_checkpoint_of_other_settings_is_refused(scene, whole, capsys) -> None
 
 def test_two_processes_make_the_same_prior(scene, whole) -> None:
     out = scene.home / "shared.safetensors"
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node"]
-    command += ["2", "-m", "train", *scene.arguments, "--prior.out", str(out)]
-    command += ["--prior.pictures", "false"]
+    command = [sys.executable, "-m", "train", *scene.arguments, "--prior.out", str(out)]
+    command += ["--prior.pictures", "false", "--trainer.devices", "2"]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    environment |= {"MASTER_ADDR": "127.0.0.1", "GLOO_SOCKET_IFNAME": "lo"}
     done = subprocess.run(
         command, env=environment, cwd=scene.home, capture_output=True, text=True, timeout=300
     )

@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("lightning", reason="training needs the extra `train`")
 pytest.importorskip("tensorboard", reason="training needs the extra `train`")
 
+from tests.train.forked import ForkedFit
 from tests.train.people import settings, write_recordings, write_settings
 from tests.train.test_fit import assert_same
 from torchpose.priors import load_prior
@@ -21,8 +22,6 @@ from train.cli import main
 ROOT = Path(__file__).parents[2]
 LOCAL = {"OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1", "GLOO_SOCKET_IFNAME": "lo"}
 STRICT = {"PYTHONWARNINGS": "error,ignore::DeprecationWarning"}
-# A signal may come while Lightning writes its metrics, whose file nobody closes then.
-INTERRUPTED = {"PYTHONWARNINGS": STRICT["PYTHONWARNINGS"] + ",ignore::ResourceWarning"}
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +29,11 @@ def recordings(tmp_path_factory):
     return write_recordings(tmp_path_factory.mktemp("people"))
 
 
-def start(arguments, *launcher, warnings=STRICT):
+def start(arguments, *launcher):
     """`python -m train fit ...` in a process of its own; torchrun warns, so only without it strictly."""
     command = [sys.executable, "-m", *launcher, "train", "fit", *map(str, arguments)]
     return subprocess.Popen(
-        command, cwd=ROOT, env={**os.environ, **LOCAL, **({} if launcher else warnings)},
+        command, cwd=ROOT, env={**os.environ, **LOCAL, **({} if launcher else STRICT)},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
 
@@ -56,14 +55,15 @@ def test_a_signal_has_its_exit_code(recordings, tmp_path, signum, code, what):
     """From outside, after the first step of very many; the same command then goes on."""
     values = settings(recordings, tmp_path, pose_steps=10_000)
     config = write_settings(tmp_path, values)
-    process = start(["--config", config], warnings=INTERRUPTED)
+    # A signal may come while Lightning writes its metrics, whose file nobody closes then.
+    process = ForkedFit(["--config", config], tmp_path / "errors", (ResourceWarning,))
     last = tmp_path / "runs" / "checkpoints" / "last.ckpt"
     while process.poll() is None and not last.is_file():
         time.sleep(0.05)
     process.send_signal(signum)
     assert end(process) == GO_ON.format(what)
     assert process.returncode == code
-    assert {p.name for p in tmp_path.iterdir()} == {"fit.yaml", "runs"}
+    assert {p.name for p in tmp_path.iterdir()} == {"fit.yaml", "runs", "errors"}
     assert [p.name for p in last.parent.iterdir()] == ["last.ckpt"]
 
 
@@ -122,7 +122,7 @@ def test_killed_and_resumed_on_one_and_two_processes(recordings, tmp_path):
     kill = {"class_path": "tests.train.people.Kill", "init_args": {"step": 2}}
     values["trainer"]["callbacks"] = [kill]
     dying = write_settings(tmp_path / "dying", values)
-    killed = start(["--config", dying, "--ckpt_path", "auto"])
+    killed = ForkedFit(["--config", dying, "--ckpt_path", "auto"], tmp_path / "errors")
     assert end(killed) == "" and killed.returncode == -signal.SIGKILL
     assert last.is_file() and not out.exists()
 
