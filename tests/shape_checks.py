@@ -30,6 +30,8 @@ _beartype = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a flo
 _NAME = "@checked"  # of the decorator in a module; no name of the module itself can be like it
 _MOST_ITEMS = 32  # of a collection that is told from others by its items
 _ARRAYS, _SEQUENCES = (Tensor, np.ndarray), (tuple, list)
+_COLLECTIONS = (Sequence, Mapping, Set, deque)
+_PLAIN: set[type] = {str, range, int, float, types.NoneType}  # types that are facts enough
 
 
 def install(package: str) -> None:
@@ -74,12 +76,25 @@ def checked(function: Any) -> Any:
     if not inspect.isfunction(function) or hasattr(function, "__wrapped__"):
         return function
     check = _check_of(function)
+    first, facts, passed = check.first, check.facts, check.passed
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         __tracebackhide__ = True
         returned = function(*args, **kwargs)
-        check(args, kwargs, returned)
+        # Nearly all calls end here, millions in a run: no call is made that can be left out.
+        try:
+            key = (
+                *map(facts, args[first:]),
+                *kwargs,
+                *map(facts, kwargs.values()),
+                facts(returned),
+            )
+            if key in passed:
+                return returned
+        except TypeError:  # unhashable, as symbolic sizes are
+            key = None
+        check(args, kwargs, returned, key)
         return returned
 
     return wrapper
@@ -103,21 +118,21 @@ class _Check:
         self.function = function
         names = function.__code__.co_varnames[: function.__code__.co_argcount]
         self.first = int(bool(names) and names[0] not in function.__annotations__)  # after `self`
+        self.facts = _facts if _may_have_literals(function) else _facts_but_words
         self.call: Callable | None = None
         self.being_made = False
         self.passed: set[Hashable] = set()
 
-    def __call__(self, args: tuple, kwargs: dict[str, Any], returned: Any) -> None:
-        """Raise `jaxtyping.TypeCheckError` if a value is not what its annotation says."""
+    def __call__(
+        self, args: tuple, kwargs: dict[str, Any], returned: Any, key: Hashable | None
+    ) -> None:
+        """Raise `jaxtyping.TypeCheckError` if a value is not what its annotation says.
+
+        Args:
+            args, kwargs, returned: of the call. key: what the outcome depends on, None if it is not
+                known.
+        """
         __tracebackhide__ = True
-        key = None
-        try:
-            given = args[self.first :]
-            key = (*map(_facts, given), *kwargs, *map(_facts, kwargs.values()), _facts(returned))
-            if key in self.passed:
-                return
-        except TypeError:  # unhashable, as symbolic sizes are
-            key = None
         if self.call is None:
             if self.being_made:  # making it imports modules, and torchpose has a finder of these
                 return
@@ -149,29 +164,45 @@ def _make_check(function: types.FunctionType) -> Callable:
     return jaxtyped(made, typechecker=check_after_call)
 
 
+def _may_have_literals(function: types.FunctionType) -> bool:
+    """Return whether an annotation has a Literal, or is a string that may stand for one."""
+    hints = function.__annotations__.values()
+    return any(isinstance(hint, str) or "Literal" in repr(hint) for hint in hints)
+
+
 def _facts(value: Any) -> Hashable:
     """Return what the outcome of a check of `value` depends on.
 
     Raises:
         TypeError: a collection too large to be told from others by its items.
     """
+    return (str, value) if type(value) is str else _facts_of(value, _facts)
+
+
+def _facts_but_words(value: Any) -> Hashable:
+    """Return what `_facts` does, with all strings alike: only a Literal tells them apart."""
+    return _facts_of(value, _facts_but_words)
+
+
+def _facts_of(value: Any, facts: Callable[[Any], Hashable]) -> Hashable:
+    """Return the facts of a value, whose items are told by `facts`."""
     kind = type(value)
+    if kind in _PLAIN:
+        return kind
     if isinstance(value, _ARRAYS):
         return kind, value.dtype, value.shape
-    if kind is str or kind is bool:  # of a Literal
+    if kind is bool:  # of a Literal
         return kind, value
     if isinstance(value, _SEQUENCES) and len(value) <= _MOST_ITEMS:
-        return kind, *map(_facts, value)
+        return kind, *map(facts, value)
     if kind is dict and len(value) <= _MOST_ITEMS:
-        return kind, *value, *map(_facts, value.values())
-    if _is_collection(kind):
+        return kind, *map(facts, value), *map(facts, value.values())
+    if isinstance(value, type):
+        return kind, value
+    if issubclass(kind, _COLLECTIONS):
         raise TypeError(f"{kind.__name__} with items that may be of any type")
-    return (kind, value) if isinstance(value, type) else kind
-
-
-@functools.cache
-def _is_collection(kind: type) -> bool:
-    return kind is not range and issubclass(kind, Sequence | Mapping | Set | deque)
+    _PLAIN.add(kind)
+    return kind
 
 
 # --- a package

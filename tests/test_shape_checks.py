@@ -40,7 +40,7 @@ PACKAGE = '''
 """Functions whose shapes disagree on purpose."""
 
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from jaxtyping import Float
 from torch import Tensor
@@ -77,6 +77,14 @@ class Pair:
 
 def joined(parts: dict[str, Float[Tensor, "N"]], *more: Float[Tensor, "N"], **named: str) -> int:
     return len(parts)
+
+
+def turned(x: Float[Tensor, "N"], order: Literal["up", "down"]) -> str:
+    return order
+
+
+def called(name: str, parts: list[str]) -> str:
+    return name
 '''
 
 
@@ -141,6 +149,18 @@ def test_items_of_collections_are_checked(package):
             package.joined(*bad)
     with pytest.raises(TypeCheckError):
         package.joined({}, more=two)
+
+
+def test_words_are_told_apart_where_an_annotation_lists_them(package):
+    x = torch.zeros(2)
+    assert package.turned(x, "up") == "up" and package.turned(x, "down") == "down"
+    for bad in ("left", "left"):
+        with pytest.raises(TypeCheckError):
+            package.turned(x, bad)
+    assert package.called("a", ["b"]) == "a" and package.called("c", ["d"]) == "c"
+    for bad in ((1, ["b"]), ("a", [1]), ("a", ["b", None])):
+        with pytest.raises(TypeCheckError):
+            package.called(*bad)
 
 
 def test_a_package_that_was_imported_already_is_refused():
