@@ -7,6 +7,7 @@ state that is known already, its edge leads back there; so long sequences need f
 """
 
 from collections.abc import Sequence
+from itertools import groupby
 from typing import NamedTuple
 
 import torch
@@ -206,6 +207,8 @@ def find_history(model: MixtureKalmanFilter, frames: Measurements) -> History | 
     graph = _gain_graph(model, frames.cov)
     patterns = _patterns(frames)
     distinct, group = torch.unique(patterns, dim=0, return_inverse=True)
+    if len(distinct) == 1:
+        return _one_history(graph, distinct[0].tolist(), group)
     nodes = [0] * distinct.shape[0]
     edges, steady = [], []
     for row in distinct.T.tolist():
@@ -219,6 +222,23 @@ def find_history(model: MixtureKalmanFilter, frames: Measurements) -> History | 
         taken = [found[key] for key in zip(nodes, row, strict=True)]
         edges.append(taken[:1] if same else taken)
         nodes = [edge.target for edge in taken]
+    return History(graph, edges, steady, group)
+
+
+def _one_history(graph: GainGraph, row: list[int], group: Tensor) -> History | None:
+    """Return the walk of a single history; what is steady is walked through in one stride."""
+    node, edges, steady = 0, [], []
+    for pattern, run in groupby(row):
+        left = sum(1 for _ in run)
+        while left:
+            edge = graph.edge(node, pattern)
+            if len(graph.edges) > _MOST_EDGES:
+                return None
+            stays = graph.is_steady(node, pattern)
+            count = left if stays else 1
+            edges += [[edge]] * count
+            steady += [node if stays else -1] * count
+            node, left = edge.target, left - count
     return History(graph, edges, steady, group)
 
 

@@ -282,12 +282,13 @@ def _stepped_stretch(
     span: range,
 ) -> tuple[_Stretch, Tensor]:
     matrix = model.transition(model.burn_in).matrix.to(model.dtype).mT.contiguous()
-    offset = model.means[:, None, model.observed].to(model.dtype)
+    observed = model.observed
+    offset = model.means[:, None, observed].to(model.dtype)
     deviations, likelihoods, covs = [], [], []
     for t in span:
         inverse, white, log_norm = _frame_gains(model, history, t)
         state = torch.bmm(state, matrix)
-        residual = frames.z[:, t] - offset - state[..., model.observed]
+        residual = frames.z[:, t] - offset - state.index_select(-1, observed)
         if inverse.ndim == 3:
             residual = torch.bmm(residual, inverse.mT)
             state = torch.baddbmm(state, residual, white)
