@@ -8,8 +8,11 @@ import torch
 from safetensors.torch import save
 from torch import nn
 
+from tests.filters.oracles import tensor
+from tests.filters.small_problem import Problem
 from torchpose.errors import CovarianceError, InputError
 from torchpose.filters import BootstrapParticleFilter, MixtureKalmanFilter
+from torchpose.filters._gain_graph import GainGraph
 from torchpose.priors import GaussianMixture
 
 DIM = 4
@@ -157,6 +160,21 @@ def test_a_learnt_noise_that_leaves_the_cone_is_named():
         process[1] = -0.1
     with pytest.raises(CovarianceError, match="process_cov"):
         run(model)
+
+
+def test_a_filter_made_in_inference_mode_keeps_its_gains(monkeypatch):
+    made, make = [], GainGraph._make
+    monkeypatch.setattr(GainGraph, "_make", lambda *given: made.append(1) or make(*given))
+    problem = Problem(batch=2, n_frames=9)
+    z = tensor(problem.z)
+    with torch.inference_mode():
+        model = problem.filter()
+        first = model(z)
+        count = len(made)
+        assert torch.equal(model(z).mean, first.mean) and 0 < count == len(made)
+        model.process_cov.mul_(2.0)
+        assert not torch.equal(model(z).mean, first.mean) and len(made) > count
+    assert torch.equal(problem.filter()(z).mean, first.mean)
 
 
 def test_running_in_inference_mode_first_does_not_spoil_gradients():

@@ -30,7 +30,8 @@ def register_given(module: nn.Module, name: str, value: Tensor | None) -> None:
 
     A parameter stays that very parameter, which an optimiser may hold. A tensor with a graph is kept
     as it is, since gradients are to flow through it; it lasts for one backward pass. Anything else is
-    copied: state shares no memory with the caller's tensors or with other entries.
+    copied: state shares no memory with the caller's tensors or with other entries, and a module that is
+    made in inference mode keeps what it derives as any other does.
 
     Args:
         module: where to. name: of the entry. value: None is registered as an empty entry.
@@ -40,7 +41,9 @@ def register_given(module: nn.Module, name: str, value: Tensor | None) -> None:
     elif value is None or value.requires_grad:
         module.register_buffer(name, value)
     else:
-        module.register_buffer(name, value.detach().clone(memory_format=torch.contiguous_format))
+        with outside_inference():  # where its versions tell whether what was derived still holds
+            own = value.detach().clone(memory_format=torch.contiguous_format)
+        module.register_buffer(name, own)
 
 
 @overload
