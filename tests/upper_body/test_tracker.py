@@ -171,7 +171,7 @@ def test_a_doubtful_hand_pulls_less(prior, scene):
     camera, keypoints = demo_camera(), scene[1]
     points = keypoints[None, :20].clone()
     points[:, 10, NAMES.index("hand_left")] += 60
-    tracker = UpperBodyTracker(prior, camera)
+    tracker = UpperBodyTracker(prior, camera, outliers=False)
     cov = torch.eye(2, dtype=torch.float64).repeat(1, 20, 4, 1, 1) * 9
     sure = tracker(points, names=NAMES, covariance=cov)
     cov[:, 10, NAMES.index("hand_left")] *= 100

@@ -1,10 +1,13 @@
 """Blocks of poses on disk are the poses."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from torchpose.errors import InputError, OutputError
 from torchpose.upper_body import PoseTrack
+from torchpose.upper_body._outlier_notes import outlier_notes
 from torchpose.video._recording import PoseSpool
 
 FIELDS = ("joints2d", "joints3d", "covariance2d", "covariance3d", "observed", "log_evidence")
@@ -71,3 +74,16 @@ def test_misuse_is_refused(tmp_path):
         spool.track(3)
     with pytest.raises(OutputError, match="cannot be kept"):
         PoseSpool(tmp_path / "missing")
+
+
+def test_outliers_of_all_blocks_are_in_one_note():
+    spool = PoseSpool()
+    for seed, exchanged in ((1, 2), (2, 0), (3, 4)):
+        block = poses(4, seed)
+        block.inlier_probability[0, 1, 3] = 0.1
+        own = outlier_notes(block.inlier_probability, exchanged)
+        spool.append(replace(block, notes=("a note", *own)))
+    note, found = spool.track().notes
+    assert note == "a note"
+    assert found.startswith("3 keypoints taken as outliers") and "head 3; " in found
+    assert found.endswith("exchanged back in 6 frames")

@@ -52,6 +52,7 @@ class TrackSettings:
         fps: frames per second, if the input does not say or errs; a video file is resampled to it.
         max_gap: longest stretch without any keypoint, in seconds, null for no bound (default 5); in
             video, somebody who is away for longer has no pose until they come back.
+        outliers: leave out keypoints that belong to no body, and exchange hands back that are exchanged.
         seed: of the methods that draw; every recording starts from it.
     """
 
@@ -71,10 +72,11 @@ class TrackSettings:
     nose_as_head: bool = False
     fps: float | None = None
     max_gap: float | None = 5.0
+    outliers: bool = True
     seed: int = 0
 
     def tracker_options(self) -> dict[str, Any]:
-        """Return method, smoothing, frame and the filter's options, as `UpperBodyTracker` takes them.
+        """Return the settings of the tracker and of its filter, as `UpperBodyTracker` takes them.
 
         Raises:
             InputError: an option that the method does not have.
@@ -87,7 +89,7 @@ class TrackSettings:
                 file=sys.stderr,
             )
             method, steady = options_of_before(method, self.window, steady)
-        names = ("smoothing", "frame", "static_camera")
+        names = ("smoothing", "frame", "static_camera", "outliers")
         options = {name: getattr(self, name) for name in names}
         options |= {"method": method, "steady": steady}
         for name in ("n_particles", "n_tracks"):

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchpose.upper_body._fusion import MotionState
 from torchpose.upper_body._measurements import Picked
 from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
+from torchpose.upper_body._screening import ScreenState
 
 __all__ = ["LivePose", "StreamState", "live_pose", "unseen_frames"]
 
@@ -21,6 +22,7 @@ class StreamState(NamedTuple):
         motion: state of the motion stage; None before the first frame, and where there is no stage.
         unseen: number of frames since any joint was measured, [B].
         n_keypoints: J. picked: where the eight joints are among them, and what was assumed.
+        screen: state of the search for outliers; None where there is none.
     """
 
     estimator: Any
@@ -28,6 +30,7 @@ class StreamState(NamedTuple):
     unseen: Int[Tensor, " B"]
     n_keypoints: int
     picked: Picked
+    screen: ScreenState | None = None
 
 
 class LivePose(NamedTuple):
@@ -37,11 +40,12 @@ class LivePose(NamedTuple):
         joints2d: [B, 8, 2], pixels of the camera; joints in the order of `UPPER_BODY`.
         joints3d: [B, 8, 3], metres, in the tracker's frame.
         covariance2d: [B, 8, 2, 2]. covariance3d: [B, 8, 3, 3].
-        observed: [B, 8], True where the joint was measured in this frame.
+        observed: [B, 8], True where the joint was measured in this frame, by no outlier.
         log_evidence: of the left and the right arm, [B, 2].
         effective_sample_size: of the particles or tracks of each arm, [B, 2]; see `PoseTrack`.
         unseen: seconds since any joint was measured, [B]; 0 where one is.
         failed: [B], True where the filter degenerated: poses are NaN until the stream is begun anew.
+        inlier_probability: that the keypoint of a joint is no outlier, [B, 8]; see `PoseTrack`.
     """
 
     joints2d: Tensor
@@ -53,6 +57,7 @@ class LivePose(NamedTuple):
     effective_sample_size: Tensor
     unseen: Tensor
     failed: Tensor
+    inlier_probability: Tensor
 
 
 def live_pose(track: PoseTrack, unseen: Tensor) -> LivePose:

@@ -30,6 +30,7 @@ __all__ = [
     "method_options",
     "noise_options",
     "options_of_before",
+    "options_of_window",
     "process_cov",
     "register_method",
 ]
@@ -246,3 +247,16 @@ def options_of_before(
     if method in (None, SINGLE_POSES):
         method = None if window else SINGLE_POSES
     return method, None if steady else steady
+
+
+def options_of_window(
+    method: str | None, window: bool, steady: bool | None
+) -> tuple[str | None, bool | None]:
+    """Return `options_of_before`, and warn whoever made the tracker."""
+    warnings.warn(
+        f"window={window} is deprecated: method={WINDOWS!r} follows windows of motion, "
+        f"{SINGLE_POSES!r} single poses, and without a method the tracker chooses",
+        DeprecationWarning,
+        stacklevel=3,
+    )
+    return options_of_before(method, window, steady)

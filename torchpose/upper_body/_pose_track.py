@@ -25,10 +25,11 @@ FRAME_FIELDS = (
     "observed",
     "log_evidence",
     "effective_sample_size",
+    "inlier_probability",
 )
 """What a `PoseTrack` holds for every frame."""
 
-_ADDED = "effective_sample_size"  # files of older releases have none
+_ADDED = ("effective_sample_size", "inlier_probability")  # files of older releases have none
 _FIELDS = {
     "joints2d": ("f", "T 8 2"),
     "joints3d": ("f", "T 8 3"),
@@ -36,7 +37,8 @@ _FIELDS = {
     "covariance3d": ("f", "T 8 3 3"),
     "observed": ("b", "T 8"),
     "log_evidence_arms": ("f", "T 2"),
-    _ADDED: ("f", "T 2"),
+    "effective_sample_size": ("f", "T 2"),
+    "inlier_probability": ("f", "T 8"),
     "lengths": ("i", ""),
     "failed_at": ("i", ""),
     "K": ("f", "3 3"),
@@ -53,7 +55,8 @@ class PoseTrack:
         joints2d: [B, T, 8, 2], pixels of the input's camera.
         joints3d: [B, T, 8, 3], metres, in `frame`.
         covariance2d: [B, T, 8, 2, 2], pixels squared. covariance3d: [B, T, 8, 3, 3], metres squared.
-        observed: [B, T, 8], True where the joint was measured, False where it was inferred.
+        observed: [B, T, 8], True where the joint was measured, False where it was inferred: nothing was
+            given, or an outlier.
         log_evidence: increments log p(z_t | z_1:t-1) of the left and of the right arm, [B, T, 2].
             Both arms contain head and neck, so their sum is a score and not an evidence.
         names: of the joints. fps: frames per second, or None. lengths: [B].
@@ -68,6 +71,8 @@ class PoseTrack:
         effective_sample_size: 1 / sum_j w_j^2 (BL 25) of the particles or tracks of the left and of the
             right arm, [B, T, 2]; NaN in files of older releases. One particle that has all the weight
             is no estimate; one track that has it is a Gaussian, sure of its component.
+        inlier_probability: that the keypoint of a joint is no outlier, [B, T, 8]; below 1/2 it was taken
+            as missing. NaN where none was given or looked for, and in files of older releases.
     """
 
     joints2d: Tensor
@@ -86,10 +91,13 @@ class PoseTrack:
     first_frame: int = 0
     method: str = "unknown"
     effective_sample_size: Tensor = field(default_factory=lambda: torch.empty(0))
+    inlier_probability: Tensor = field(default_factory=lambda: torch.empty(0))
 
     def __post_init__(self) -> None:
         if self.effective_sample_size.numel() == 0:
             self.effective_sample_size = torch.full_like(self.log_evidence, torch.nan)
+        if self.inlier_probability.numel() == 0:
+            self.inlier_probability = torch.full_like(self.joints2d[..., 0], torch.nan)
 
     def __len__(self) -> int:
         return self.joints3d.shape[0]
@@ -120,8 +128,8 @@ class PoseTrack:
 
         `log_evidence` in the file is the score, the sum over both arms; `log_evidence_arms` has them
         apart. Keys: joints2d, joints3d, covariance2d, covariance3d, observed, log_evidence,
-        log_evidence_arms, effective_sample_size, names, fps (NaN if unknown), K, frame, failed_at,
-        lengths, notes, first_frame, method.
+        log_evidence_arms, effective_sample_size, inlier_probability, names, fps (NaN if unknown), K,
+        frame, failed_at, lengths, notes, first_frame, method.
 
         Raises:
             OutputError: the file cannot be written.
@@ -155,8 +163,14 @@ class PoseTrack:
                 agree: other shapes or types, joints without a covariance, values out of range.
             CameraError: K is no camera matrix.
         """
-        required = (*(key for key in _FIELDS if key != _ADDED), "names", "frame", "fps", "notes")
-        arrays = read_npz(path, required, ("first_frame", "method", _ADDED))
+        required = (
+            *(key for key in _FIELDS if key not in _ADDED),
+            "names",
+            "frame",
+            "fps",
+            "notes",
+        )
+        arrays = read_npz(path, required, ("first_frame", "method", *_ADDED))
         fields = {key: size for key, size in _FIELDS.items() if key in arrays}
         single = arrays["joints3d"].ndim == 3
         batch = "" if single else "B "
@@ -199,6 +213,9 @@ class PoseTrack:
         check_number_range(path, "failed_at", self.failed_at, -1, n_frames - 1)
         check_estimates(path, "joints2d", self.joints2d, self.covariance2d)
         check_estimates(path, "joints3d", self.joints3d, self.covariance3d)
+        outside = (self.inlier_probability < 0) | (self.inlier_probability > 1)
+        if bool(outside.any()):
+            raise FileFormatError(f"{path}: expected inlier_probability between 0 and 1, or NaN")
         failed = torch.nonzero(self.failed_at >= 0).reshape(-1)
         whole = self.joints3d[failed, self.failed_at[failed]].isfinite().flatten(1).all(-1)
         if bool(whole.any()) or bool(self.log_evidence.isposinf().any()):

@@ -96,12 +96,14 @@ class PoseReader(NamedTuple):
         observed: Bool[Tensor, "B T 8"],
         lengths: Int[Tensor, " B"] | None = None,
         notes: tuple[str, ...] = (),
+        probability: Float[Tensor, "B T 8"] | None = None,
     ) -> PoseTrack:
         """Return the result.
 
         Args:
             reading: of the poses. estimates: that it was read from. observed: what was measured.
             lengths: frames of each sequence, None for all. notes: what was assumed.
+            probability: that the keypoints are no outliers, None where nobody asked.
         """
         left, right = estimates.left, estimates.right
         matrix, own = (m.to(reading.uv) for m in (self.prior.info.matrix, self.camera.matrix))
@@ -126,6 +128,7 @@ class PoseReader(NamedTuple):
             frame=self.frame,
             notes=(*notes, *mending_notes(left, right)),
             method=self.method,
+            inlier_probability=torch.empty(0) if probability is None else probability.to(matrix),
         )
 
     def _placed(

@@ -1,6 +1,5 @@
 """Track upper bodies: from 2D keypoints of head, neck and hands to 2D and 3D poses of eight joints."""
 
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -39,17 +38,19 @@ from torchpose.upper_body._measurements import (
     joint_covariances,
     pick_joints,
 )
-from torchpose.upper_body._methods import (
-    METHODS,
-    SINGLE_POSES,
-    WINDOWS,
-    choose_method,
-    options_of_before,
-)
+from torchpose.upper_body._methods import METHODS, WINDOWS, choose_method, options_of_window
+from torchpose.upper_body._outlier_notes import outlier_notes
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._reading import PoseReader, check_frame, note_collapse
+from torchpose.upper_body._screen_model import ScreenModel, kept_screen_model
+from torchpose.upper_body._screening import screen_joints
 
 __all__ = ["UpperBodyTracker"]
+
+_NO_EXPORT = (
+    "UpperBodyTracker, which chooses its filters by what was measured,",
+    "a step of a filter of torchpose.filters",
+)
 
 
 class UpperBodyTracker(WideModule):
@@ -70,10 +71,10 @@ class UpperBodyTracker(WideModule):
     - ``pf-mixture``, ``pf-walk``, ``pf-walk-unscaled``: particles over single poses (BL section 3.3),
       see `BootstrapParticleFilter`.
 
-    A frame passes through four stages, each of which takes and returns values: the keypoints become
-    `MeasuredJoints` in the prior's pixels, an `Estimator` turns these into the `Estimates` of both
-    arms, `read_out` joins them into a `ReadOut` of the body, which `MotionStage` steadies, and that
-    becomes a `PoseTrack`.
+    A frame passes through five stages, each of which takes and returns values: the keypoints become
+    `MeasuredJoints` in the prior's pixels, of which `screen_joints` leaves out outliers, an `Estimator`
+    turns them into the `Estimates` of both arms, `read_out` joins these into a `ReadOut` of the body, which
+    `MotionStage` steadies, and that becomes a `PoseTrack`.
 
     Args:
         prior: from `load_prior` or `fit_upper_body_prior`.
@@ -96,6 +97,8 @@ class UpperBodyTracker(WideModule):
             `torchpose.skeleton.NECK_KINDS`). A neck of another kind than the prior's is put where the
             prior has it, between the middle of the shoulders and the head, or else not measured.
         max_gap: seconds over which nothing at all may be measured; None is no bound.
+        outliers: look for keypoints that belong to no body, which count as missing, and for exchanged hands,
+            which are exchanged back, frame by frame. False takes keypoints as they are.
         options: of the method (`torchpose.upper_body.method_options`), such as n_particles,
             n_tracks, uniform_weight or transition.
 
@@ -130,19 +133,14 @@ class UpperBodyTracker(WideModule):
         calibrated: bool = True,
         neck: str | None = None,
         max_gap: float | None = 5.0,
+        outliers: bool = True,
         **options: Any,
     ) -> None:
         super().__init__()
         self.camera = check_model(prior, camera, fps)
         check_frame(frame, static_camera)
         if window is not None:
-            warnings.warn(
-                f"window={window} is deprecated: method={WINDOWS!r} follows windows of motion, "
-                f"{SINGLE_POSES!r} single poses, and without a method the tracker chooses",
-                DeprecationWarning,
-                stacklevel=2,
-            )
-            method, steady = options_of_before(method, window, steady)
+            method, steady = options_of_window(method, window, steady)
         self.prior = prior
         self.fps = fps or prior.info.fps
         self.method, self.notes = choose_method(prior, method, smoothing, self.fps, options)
@@ -152,6 +150,7 @@ class UpperBodyTracker(WideModule):
         self.static_camera = static_camera
         self.neck = neck
         self.max_gap = max_gap
+        self.outliers = outliers
         self.dtype = working_precision("dtype", options.get("dtype", torch.float64))
         register_given(self, "measurement_std", wide_or_parameter(measurement_std))
         self.options = options
@@ -227,20 +226,21 @@ class UpperBodyTracker(WideModule):
             ShapeError, InputError: wrong shapes, infinite values, nothing measured in a sequence or
             for longer than `max_gap`. SkeletonError: unknown names.
         """
-        _refuse_export()
+        refuse_export(*_NO_EXPORT)
         with one_run(self.measurement_cov.device):
             keypoints = self._checked(keypoints)
             picked = self._pick(keypoints.shape[2], names)
-            measured = self._measure(keypoints, confidence, mask, covariance, picked)
-            check_gaps(measured.mask, lengths, self.max_gap, self.fps or 30.0)
-            joints = arm_joints(measured.mask.flatten(0, 1).any(0).tolist())
+            given = self._measure(keypoints, confidence, mask, covariance, picked)
+            check_gaps(given.mask, lengths, self.max_gap, self.fps or 30.0)
+            joints = arm_joints(given.mask.flatten(0, 1).any(0).tolist())
+            _, found = screen_joints(self._screen(picked), None, given)
             estimator = self.estimator
-            estimates = estimator.forward(
-                measured, joints, generators_of_arms(generator), lengths, progress
-            )
-            reader, notes = self._reader(estimator), self.notes + picked.notes
+            arms = generators_of_arms(generator)
+            estimates = estimator.forward(found.measured, joints, arms, lengths, progress)
+            notes = self.notes + picked.notes + outlier_notes(*found[1:], lengths)
+            reader, seen = self._reader(estimator), found.measured.mask
             reading = reader.whole(estimates, lengths)
-            track = reader.track(reading, estimates, measured.mask, lengths, notes)
+            track = reader.track(reading, estimates, seen, lengths, notes, found.probability)
         return note_collapse(track.in_precision(self.dtype))
 
     def init(
@@ -330,21 +330,23 @@ class UpperBodyTracker(WideModule):
         Raises:
             ShapeError, InputError: wrong shapes, no frames, infinite values.
         """
-        _refuse_export()
+        refuse_export(*_NO_EXPORT)
         check_floating("keypoints", keypoints)
         check_shape("keypoints", keypoints, [len(state.unseen), "T", state.n_keypoints, 2])
         if keypoints.shape[1] == 0:
             raise InputError("keypoints must hold at least one frame, got none")
         with one_run(self.measurement_cov.device):
             keypoints = keypoints.to(self.measurement_cov)
-            measured = self._measure(keypoints, confidence, mask, covariance, state.picked)
-            estimator = self.estimator
-            own, estimates = estimator.advance(state.estimator, measured)
+            given = self._measure(keypoints, confidence, mask, covariance, state.picked)
+            screen, found = screen_joints(self._screen(state.picked), state.screen, given)
+            estimator, seen = self.estimator, found.measured.mask
+            own, estimates = estimator.advance(state.estimator, found.measured)
             reader = self._reader(estimator)
             motion, reading = reader.more(state.motion, estimates)
-            track = reader.track(reading, estimates, measured.mask, notes=self.notes)
-        unseen = unseen_frames(state.unseen, measured.mask.any(-1))
-        state = state._replace(estimator=own, motion=motion, unseen=unseen)
+            notes = self.notes + outlier_notes(*found[1:])
+            track = reader.track(reading, estimates, seen, None, notes, found.probability)
+        unseen = unseen_frames(state.unseen, seen.any(-1))
+        state = state._replace(estimator=own, motion=motion, unseen=unseen, screen=screen)
         return state, track.in_precision(self.dtype)
 
     def _checked(self, keypoints: Tensor) -> Float[Tensor, "B T J 2"]:
@@ -374,6 +376,11 @@ class UpperBodyTracker(WideModule):
             self.measurement_cov,
         )  # fmt: skip
 
+    def _screen(self, picked: Picked) -> ScreenModel | None:
+        """Return what finds outliers, unless keypoints are taken as they are."""
+        given = (self.prior, self.camera, self.fps, picked, self.measurement_cov)
+        return kept_screen_model(self, *given) if self.outliers else None
+
     def _reader(self, estimator: Estimator) -> PoseReader:
         """Return what makes poses of the estimates, as the settings ask for."""
         stage, ratios, cov = None, estimator.steadied_by, self.measurement_cov
@@ -391,10 +398,3 @@ class UpperBodyTracker(WideModule):
             self.prior, self.camera, self.method, estimator, stage, lag, self.frame,
             self.static_camera, self.calibrated, self.fps,
         )  # fmt: skip
-
-
-def _refuse_export() -> None:
-    refuse_export(
-        "UpperBodyTracker, which chooses its filters by what was measured,",
-        "a step of a filter of torchpose.filters",
-    )

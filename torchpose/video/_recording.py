@@ -16,6 +16,11 @@ from torchpose._core.facade import set_up_facade
 from torchpose._core.images import Image
 from torchpose.errors import InputError, OutputError
 from torchpose.measure._upper_body import FrameMeasurements
+from torchpose.upper_body._outlier_notes import (
+    exchanged_frames,
+    outlier_notes,
+    without_outliers,
+)
 from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
 from torchpose.upper_body._reading import note_collapse
 from torchpose.upper_body._tracker import UpperBodyTracker
@@ -55,6 +60,7 @@ class PoseSpool:
         weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
         self._like: PoseTrack | None = None
         self._n_frames = 0
+        self._exchanged = 0
         self.failed_at = -1
 
     def __len__(self) -> int:
@@ -78,6 +84,7 @@ class PoseSpool:
             ) from error
         if self.failed_at < 0 <= int(block.failed_at[0]):
             self.failed_at = self._n_frames + int(block.failed_at[0])
+        self._exchanged += exchanged_frames(block.notes)
         self._like = block if self._like is None else self._like
         self._n_frames += block.joints3d.shape[1]
 
@@ -98,6 +105,8 @@ class PoseSpool:
             fields[name] = torch.from_numpy(stored[:count])[None]
         fields["lengths"] = torch.tensor([count])
         fields["failed_at"] = torch.tensor([self.failed_at])
+        fields["notes"] = without_outliers(like.notes)
+        fields["notes"] += outlier_notes(fields["inlier_probability"], self._exchanged)
         return note_collapse(replace(like, **fields))
 
     def _path(self, name: str) -> Path:

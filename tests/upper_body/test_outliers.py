@@ -1,0 +1,221 @@
+"""Keypoints that belong to no body are left out, and exchanged hands exchanged back."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchpose.camera import PinholeCamera
+from torchpose.demo import demo_camera, performer
+from torchpose.errors import FileFormatError
+from torchpose.priors import UpperBodyPrior
+from torchpose.skeleton import UPPER_BODY
+from torchpose.upper_body import PoseTrack, UpperBodyTracker
+
+NAMES = ["head", "neck", "hand_left", "hand_right"]
+ROWS = [UPPER_BODY.index(name) for name in NAMES]
+FRAME = 30
+
+
+def seen(joints, names):
+    """Joints in the image, with 3 pixels of noise."""
+    uv = demo_camera()(joints.double())[:, [UPPER_BODY.index(name) for name in names], :2]
+    generator = torch.Generator().manual_seed(0)
+    return uv + 3 * torch.randn(uv.shape, generator=generator, dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def prior(small_windows_file):
+    return UpperBodyPrior.load(small_windows_file)
+
+
+@pytest.fixture(scope="module")
+def tracker(prior):
+    return UpperBodyTracker(prior, demo_camera(), max_gap=None)
+
+
+@pytest.fixture(scope="module")
+def keypoints():
+    """Three performers, who never are in one place."""
+    return torch.stack([seen(performer(60, seed=s).joints, NAMES) for s in range(3)])
+
+
+@pytest.fixture(scope="module")
+def clean(tracker, keypoints):
+    return tracker(keypoints, names=NAMES)
+
+
+def moved(track, other, frames=slice(None)):
+    """Largest distance between the poses of two tracks, metres."""
+    return float((track.joints3d - other.joints3d)[:, frames].norm(dim=-1).max())
+
+
+def test_clean_keypoints_are_tracked_bit_by_bit_as_without_a_search(prior, keypoints, clean):
+    assert bool((clean.inlier_probability[..., ROWS] > 0.5).all())
+    unmeasured = [i for i in range(8) if i not in ROWS]
+    assert bool(clean.inlier_probability[..., unmeasured].isnan().all())
+    assert not any("outlier" in note or "exchanged" in note for note in clean.notes)
+    without = UpperBodyTracker(prior, demo_camera(), max_gap=None, outliers=False)
+    track = without(keypoints, names=NAMES)
+    for name in ("joints2d", "joints3d", "covariance3d", "log_evidence", "observed"):
+        assert torch.equal(getattr(track, name), getattr(clean, name))
+    assert bool(track.inlier_probability.isnan().all())
+
+
+@pytest.mark.parametrize("size", [300.0, 1e3, 1e4, 1e6])
+@pytest.mark.parametrize("joint", NAMES)
+def test_one_outlier_moves_nobody(tracker, keypoints, clean, joint, size):
+    wild = keypoints.clone()
+    directions = torch.tensor([[1.0, 0.0], [0.0, -1.0], [-0.6, 0.8]], dtype=torch.float64)
+    wild[:, FRAME, NAMES.index(joint)] += size * directions
+    track = tracker(wild, names=NAMES)
+    row = UPPER_BODY.index(joint)
+    assert bool((track.inlier_probability[:, FRAME, row] < 0.5).all())
+    expected = clean.observed.clone()
+    expected[:, FRAME, row] = False
+    assert torch.equal(track.observed, expected)
+    missing = keypoints.clone()
+    missing[:, FRAME, NAMES.index(joint)] = torch.nan
+    assert moved(track, tracker(missing, names=NAMES)) < 1e-9
+    (note,) = [note for note in track.notes if "outlier" in note]
+    assert note.startswith("3 keypoints") and f"{joint} 3" in note
+
+
+@pytest.mark.parametrize("joint", ["head", "neck"])
+def test_head_and_neck_are_held_to_less(tracker, keypoints, joint):
+    wild = keypoints.clone()
+    wild[:, FRAME, NAMES.index(joint), 0] += 100
+    track = tracker(wild, names=NAMES)
+    assert not bool(track.observed[:, FRAME, UPPER_BODY.index(joint)].any())
+    assert int((~track.observed[..., ROWS]).sum()) == 3  # and it drags no other joint with it
+
+
+@pytest.mark.parametrize("joint", NAMES)
+def test_an_outlier_in_the_first_frame_is_told_by_the_other_joints(tracker, keypoints, joint):
+    wild = keypoints.clone()
+    wild[:, 0, NAMES.index(joint), 0] += 500
+    track = tracker(wild, names=NAMES)
+    assert not bool(track.observed[:, 0, UPPER_BODY.index(joint)].any())
+    assert int((~track.observed[..., ROWS]).sum()) == 3
+
+
+def test_hands_are_exchanged_back_for_some_frames_and_not_for_good(tracker, keypoints, clean):
+    swapped = keypoints.clone()
+    apart = (keypoints[:, :, 2] - keypoints[:, :, 3]).norm(dim=-1)
+    assert bool((apart[:, FRAME : FRAME + 4] > 80).all())
+    swapped[:, FRAME : FRAME + 4, 2:] = keypoints[:, FRAME : FRAME + 4, [3, 2]]
+    track = tracker(swapped, names=NAMES)
+    assert torch.equal(track.joints3d, clean.joints3d)
+    assert any("exchanged back in 12 frames" in note for note in track.notes)
+    swapped[:, FRAME:, 2:] = keypoints[:, FRAME:, [3, 2]]
+    track = tracker(swapped, names=NAMES)
+    apart = (track.joints2d[:, -1, ROWS[2:]] - swapped[:, -1, 2:]).norm(dim=-1)
+    assert bool((apart < 30).all())
+    assert torch.equal(track.observed, clean.observed)
+
+
+def test_elbows_are_exchanged_with_the_hands(prior):
+    names = [*NAMES, "elbow_left", "elbow_right"]
+    points = seen(performer(60, seed=0).joints, names)[None]
+    tracker = UpperBodyTracker(prior, demo_camera())
+    expected = tracker(points, names=names)
+    swapped = points.clone()
+    swapped[:, FRAME : FRAME + 3] = points[:, FRAME : FRAME + 3, [0, 1, 3, 2, 5, 4]]
+    assert torch.equal(tracker(swapped, names=names).joints3d, expected.joints3d)
+
+
+def test_somebody_who_is_elsewhere_is_followed_after_a_quarter_of_a_second(tracker, keypoints):
+    jumped = keypoints.clone()
+    jumped[:, FRAME:, :, 0] += 250
+    track = tracker(jumped, names=NAMES)
+    there = track.observed[..., ROWS]
+    assert not bool(there[:, FRAME : FRAME + 5, :2].any())
+    assert bool(there[:, FRAME + 9 :].all())
+
+
+def test_after_a_gap_any_place_is_plausible(tracker, keypoints):
+    gap = keypoints.clone()
+    gap[:, 15:45] = torch.nan
+    gap[:, 45:, :, 0] += 150
+    track = tracker(gap, names=NAMES)
+    assert bool(track.observed[:, 45:, ROWS].all())
+
+
+def test_frames_one_by_one_and_streams_alone_are_the_same(tracker, keypoints):
+    generator = torch.Generator().manual_seed(1)
+    wild = keypoints.clone()
+    out = torch.rand(wild.shape[:3], generator=generator) < 0.1
+    wild[out] = torch.rand(int(out.sum()), 2, generator=generator).double() * 640
+    wild[:, 20:23, 2:] = wild[:, 20:23, [3, 2]]
+    wild[torch.rand(wild.shape[:3], generator=generator) < 0.05] = torch.nan
+    whole = tracker(wild, names=NAMES)
+    assert bool((~whole.observed[..., ROWS]).any())
+    state, poses = tracker.init(3, names=NAMES), []
+    for t in range(wild.shape[1]):
+        state, pose = tracker.step(state, wild[:, t])
+        poses.append(pose)
+    live = torch.stack([pose.inlier_probability for pose in poses], 1)
+    torch.testing.assert_close(live, whole.inlier_probability, rtol=0, atol=1e-12, equal_nan=True)
+    assert torch.equal(torch.stack([pose.observed for pose in poses], 1), whole.observed)
+    joints = torch.stack([pose.joints3d for pose in poses], 1)
+    torch.testing.assert_close(joints, whole.joints3d, rtol=1e-9, atol=1e-9)
+    alone = tracker(wild[1:2, :40], names=NAMES)
+    one = tracker(wild, names=NAMES, lengths=torch.tensor([60, 40, 50])).sequence(1)
+    assert torch.equal(one.observed, alone.observed)
+    torch.testing.assert_close(one.joints3d, alone.joints3d, rtol=1e-9, atol=1e-9)
+
+
+def test_frames_past_the_end_are_not_counted(tracker, keypoints):
+    wild = keypoints.clone()
+    wild[:, FRAME + 5, 2] = 5000.0
+    assert tracker(wild, names=NAMES, lengths=torch.tensor([30, 31, 32])).notes == tracker.notes
+
+
+def test_gradients_flow_through_what_is_kept(tracker, keypoints):
+    wild = keypoints[:1, :40].clone()
+    wild[:, 20, 2] = 3000.0
+    wild[:, 25:27, 2:] = wild[:, 25:27, [3, 2]]
+    wild.requires_grad_()
+    tracker(wild, names=NAMES).joints3d.sum().backward()
+    gradient = wild.grad.norm(dim=-1)[0]
+    assert bool(wild.grad.isfinite().all()) and float(gradient[20, 2]) == 0
+    assert bool((gradient[25:27] > 0).all()) and bool((gradient[20, [0, 1, 3]] > 0).all())
+
+
+def test_outliers_lie_in_the_image_of_another_camera(prior, keypoints, clean):
+    """The image is told by the camera, and guessed from its centre where it is not."""
+    own = demo_camera().matrix
+    twice = [2 * float(x) for x in (own[0, 0], own[1, 1], own[0, 2], own[1, 2])]
+    for size in ((), (1280, 960)):
+        tracker = UpperBodyTracker(prior, PinholeCamera(*twice, *size), measurement_std=6.0)
+        assert bool(tracker(2 * keypoints, names=NAMES).observed[..., ROWS].all())
+
+
+def test_single_precision_finds_the_same(prior, keypoints):
+    wild = keypoints.float()
+    wild[:, FRAME, 1] = 900.0
+    tracker = UpperBodyTracker(prior, demo_camera(), max_gap=None, dtype=torch.float32)
+    track = tracker(wild, names=NAMES)
+    assert track.inlier_probability.dtype == torch.float32
+    assert not bool(track.observed[:, FRAME, ROWS[1]].any())
+
+
+def test_files_hold_the_probabilities_and_older_ones_are_read_without(tracker, keypoints, tmp_path):
+    wild = keypoints[:1].clone()
+    wild[:, FRAME, 0] = 9000.0
+    track = tracker(wild, names=NAMES)
+    track.save(tmp_path / "poses.npz")
+    loaded = PoseTrack.load(tmp_path / "poses.npz")
+    torch.testing.assert_close(
+        loaded.inlier_probability, track.inlier_probability, rtol=0, atol=0, equal_nan=True
+    )
+    assert loaded.notes == track.notes
+    with np.load(tmp_path / "poses.npz") as arrays:
+        older = {key: arrays[key] for key in arrays if key != "inlier_probability"}
+    np.savez(tmp_path / "older.npz", **older)
+    assert PoseTrack.load(tmp_path / "older.npz").inlier_probability.isnan().all()
+    older["inlier_probability"] = np.full_like(track.inlier_probability[0].numpy(), math.pi)
+    np.savez(tmp_path / "wrong.npz", **older)
+    with pytest.raises(FileFormatError, match="inlier_probability"):
+        PoseTrack.load(tmp_path / "wrong.npz")

@@ -1,0 +1,55 @@
+"""Say in words how many keypoints were outliers, and how often hands were exchanged."""
+
+import re
+from collections.abc import Iterable
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, arange
+
+from torchpose.skeleton._joint_sets import UPPER_BODY
+
+__all__ = ["exchanged_frames", "outlier_notes", "without_outliers"]
+
+_TAKEN, _EXCHANGED = "taken as outliers, as if missing", "left and right exchanged back in"
+
+
+def outlier_notes(
+    probability: Float[Tensor, "B T 8"],
+    exchanged: Bool[Tensor, "B T"] | int = 0,
+    lengths: Int[Tensor, " B"] | None = None,
+) -> tuple[str, ...]:
+    """Return a note about outliers and exchanged hands; nothing where there were none.
+
+    Args:
+        probability: that keypoints are no outliers. exchanged: whether left and right were, or in how
+            many frames. lengths: frames of each sequence, None for all.
+    """
+    outliers = probability < 0.5
+    if lengths is not None:
+        inside = (
+            arange(outliers.shape[1], device=outliers.device) < lengths.to(outliers.device)[:, None]
+        )
+        outliers = outliers & inside[..., None]
+        exchanged = exchanged & inside if isinstance(exchanged, Tensor) else exchanged
+    counts, frames, said = outliers.flatten(0, 1).sum(0).tolist(), _count(exchanged), []
+    if any(counts):
+        joints = [f"{name} {n}" for name, n in zip(UPPER_BODY, counts, strict=True) if n]
+        said.append(f"{sum(counts)} keypoints {_TAKEN}: {', '.join(joints)}")
+    if frames:
+        said.append(f"{_EXCHANGED} {frames} frames")
+    return ("; ".join(said),) if said else ()
+
+
+def without_outliers(notes: Iterable[str]) -> tuple[str, ...]:
+    """Return the notes that are about something else."""
+    return tuple(note for note in notes if _TAKEN not in note and _EXCHANGED not in note)
+
+
+def exchanged_frames(notes: Iterable[str]) -> int:
+    """Return in how many frames `outlier_notes` says that hands were exchanged."""
+    found = (re.search(rf"{_EXCHANGED} (\d+) frames", note) for note in notes)
+    return sum(int(match[1]) for match in found if match)
+
+
+def _count(frames: Bool[Tensor, "B T"] | int) -> int:
+    return int(frames.sum()) if isinstance(frames, Tensor) else frames

@@ -1,0 +1,228 @@
+"""Say how keypoints of a body move and go wrong: the constants of the search for outliers."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from torchpose._core.module_state import derived
+from torchpose.camera._pinhole import PinholeCamera
+from torchpose.camera._projection import map_pixels
+from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.skeleton._upper_body import OTHER_SIDE
+from torchpose.upper_body._measurements import Picked, pixels_per_metre
+
+__all__ = [
+    "APART",
+    "BRISK",
+    "CERTAIN",
+    "OUTLIERS",
+    "SLACK",
+    "TAKEOVER",
+    "ScreenModel",
+    "kept_screen_model",
+    "screen_model",
+]
+
+
+class _Kind(NamedTuple):
+    """What a joint of one kind can do.
+
+    Attributes:
+        below, spread: its place below the neck and the spread about it, metres.
+        speed: its usual speed. brisk: how much that changes at once where it is brisk, m/s.
+    """
+
+    below: float
+    spread: float
+    speed: float
+    brisk: float
+
+
+# Speeds, shares and distances were chosen on s1 to s6 of UTD-MHAD. A place beside the neck is believed up
+# to 3.3 spreads where nothing else is known of the joint: a hand within an arm's reach, and beyond it less.
+_KINDS = {
+    "hand": _Kind(0.1, 0.38, 2.5, 6.0),
+    "elbow": _Kind(0.2, 0.27, 1.0, 3.0),
+    "shoulder": _Kind(0.08, 0.16, 0.7, 1.5),
+    "head": _Kind(-0.2, 0.12, 0.7, 1.5),
+    "neck": _Kind(0.0, 0.06, 0.7, 1.5),
+}
+BRISK = 0.01
+"""Share of the frames in which a joint is brisk."""
+
+OUTLIERS = 0.02
+"""Share of outliers among the keypoints."""
+
+SLACK = 0.015
+"""Metres by which keypoints miss a joint that moves smoothly, beside their R."""
+
+TAKEOVER = 0.25
+"""Seconds for which a joint has to be seen elsewhere to be there."""
+
+CERTAIN = 5.0
+"""Log-odds that a track has which was seen for so long."""
+
+APART = 0.25
+"""Metres between hands that can be told apart."""
+
+_NECK = UPPER_BODY.index("neck")
+_ENLARGED = 3.0  # sides of the place where outliers lie, over those of the image
+_PERSISTENCE = 0.2  # seconds over which a velocity is forgotten
+_SCALES = (0.3, 0.45, 0.67, 1.0, 1.5, 2.25, 3.4)  # of the person, over that of the prior's mean
+_SCALE_SPREAD, _SCALE_MEMORY = 0.5, 1.0  # of its log; seconds
+_EXCHANGED, _STILL_EXCHANGED = 0.01, 0.7  # probability that hands are, and that they stay so
+
+
+class ScreenModel(NamedTuple):
+    """Model of how keypoints move and go wrong, at one frame rate, in the prior's pixels.
+
+    Attributes:
+        dt: seconds between two frames. scale: pixels per metre of the prior's mean pose.
+        low, high: corners of the place where pixels are believed at all [2]. broad: variance of a joint
+            that may be anywhere in the image. start: log (1 - o) / (o u 2 pi), o the share of outliers
+            and u their density.
+        moving: makes (var x, cov x v, var v) of a frame ago those of now [3, 3]. drift, kept: seconds for
+            which a velocity moves a joint, and its share that is left.
+        agitation: what is added, at 1 pixel per metre [8, 3]. jump: variance of a brisk joint's place
+            beyond that [8]. speed: variance of a velocity [8].
+        log_scales: of the person, over `scale` [G]. usual: their log-probability [G]. memory: its share
+            that a frame leaves. below, spread: of each joint for each of them, pixels and squared [G, 8].
+        subsets: every choice of the joints that may be right [S, 8].
+        exchanges: for each way to exchange left and right, the joints to take [X, 8].
+        switching: log-probability of each way after each other one [X, X].
+    """
+
+    dt: float
+    scale: float
+    low: Tensor
+    high: Tensor
+    broad: float
+    start: float
+    moving: Tensor
+    drift: float
+    kept: float
+    agitation: Tensor
+    jump: Tensor
+    speed: Tensor
+    log_scales: Tensor
+    usual: Tensor
+    memory: float
+    below: Tensor
+    spread: Tensor
+    subsets: Tensor
+    exchanges: Tensor
+    switching: Tensor
+
+
+def kept_screen_model(
+    owner: nn.Module,
+    prior: UpperBodyPrior,
+    camera: PinholeCamera,
+    fps: float | None,
+    picked: Picked,
+    like: Tensor,
+) -> ScreenModel:
+    """Return `screen_model`, the same one as long as it holds.
+
+    Args:
+        owner: the module with which it is kept. prior, camera, fps: of the tracker.
+        picked: where the joints are among the keypoints. like: tells the device.
+    """
+    info, joints = prior.info, tuple(i >= 0 for i in picked.indices)
+    joints = tuple(given or (picked.middle and i == _NECK) for i, given in enumerate(joints))
+    sources = (*prior.left.parameters_tuple(), *prior.right.parameters_tuple(), camera.matrix)
+    wide = torch.zeros((), dtype=torch.float64, device=like.device)
+    return derived(
+        owner,
+        ("screen", info.fx, info.fy, info.cx, info.cy, camera.image_size, joints, fps, like.device),
+        sources,
+        lambda: screen_model(prior, camera, fps or 30.0, joints, wide),
+    )
+
+
+def screen_model(
+    prior: UpperBodyPrior,
+    camera: PinholeCamera,
+    fps: float,
+    joints: tuple[bool, ...],
+    like: Tensor,
+) -> ScreenModel:
+    """Return the model for keypoints of a camera.
+
+    Args:
+        prior: whose pixels are meant. camera: of the keypoints; without an image size the image is taken to
+            be twice as wide and high as its principal point is far from the origin. fps: frame rate.
+        joints: which of `UPPER_BODY` are among the keypoints. like: tells device and dtype.
+    """
+    own, wanted = camera.matrix.to(like), prior.info.matrix.to(like)
+    corners = map_pixels(
+        torch.stack([like.new_zeros(2), _image_size(camera).to(like)]), own, wanted
+    )
+    size, middle = (corners[1] - corners[0]).abs(), corners.mean(0)
+    outlier = math.log(OUTLIERS / (1 - OUTLIERS)) - float((_ENLARGED * size).log().sum())
+    dt, scale = 1.0 / fps, pixels_per_metre(prior)
+    kept = math.exp(-dt / _PERSISTENCE)
+    drift = _PERSISTENCE * (1 - kept)
+    moving = [[1.0, 0.0, 0.0], [2 * drift, kept, 0.0], [drift**2, kept * drift, kept**2]]
+    path = _PERSISTENCE**2 * (2 * dt / _PERSISTENCE - 3 + 4 * kept - kept**2)
+    grown = like.new_tensor([path, _PERSISTENCE * (1 - kept) ** 2, 1 - kept**2])
+    below, spread, speed, brisk = like.new_tensor([_KINDS[_kind(name)] for name in UPPER_BODY]).mT
+    log_scales = like.new_tensor(_SCALES).log()
+    sizes = scale * log_scales.exp()[:, None]
+    exchanges = _exchanges(joints)
+    return ScreenModel(
+        dt, scale, middle - _ENLARGED / 2 * size, middle + _ENLARGED / 2 * size,
+        float(size.amax() / 2) ** 2, -outlier - math.log(2 * math.pi),
+        like.new_tensor(moving), drift, kept, speed.square()[:, None] * grown,
+        (brisk * dt).square(), speed.square(), log_scales,
+        (-(log_scales / _SCALE_SPREAD).square() / 2).log_softmax(0),
+        math.exp(-dt / _SCALE_MEMORY), sizes * below, (sizes * spread).square(),
+        _subsets(joints).to(like), torch.tensor(exchanges, device=like.device),
+        _switching(len(exchanges)).to(like),
+    )  # fmt: skip
+
+
+def _kind(name: str) -> str:
+    return name.split("_")[0]
+
+
+def _image_size(camera: PinholeCamera) -> Float[Tensor, "2"]:
+    """Return width and height of the image, or a guess that is not much too small."""
+    if camera.image_size is not None:
+        return torch.tensor(camera.image_size, dtype=torch.float64)
+    matrix = camera.matrix
+    return torch.maximum(2 * matrix[:2, 2], matrix.diagonal()[:2] / 2)
+
+
+def _subsets(present: tuple[bool, ...]) -> Float[Tensor, "S 8"]:
+    """Return every choice of the joints that are there."""
+    there = [i for i, given in enumerate(present) if given]
+    rows = torch.arange(2 ** len(there))
+    chosen = torch.zeros(len(rows), len(present))
+    chosen[:, there] = (rows[:, None] >> torch.arange(len(there)) & 1).to(chosen)
+    return chosen
+
+
+def _exchanges(present: tuple[bool, ...]) -> list[list[int]]:
+    """Return the joints to take as measured, with hands exchanged, and with hands and elbows exchanged."""
+    ways = [list(range(8))]
+    for kinds in (("hand",), ("hand", "elbow")):
+        pairs = [i for i, name in enumerate(UPPER_BODY) if _kind(name) in kinds]
+        if all(present[i] for i in pairs):
+            ways.append([OTHER_SIDE[i] if i in pairs else i for i in range(8)])
+    return ways
+
+
+def _switching(n_ways: int) -> Float[Tensor, "X X"]:
+    """Return the log-probability of each way of exchange after each other one."""
+    switching = torch.eye(n_ways, dtype=torch.float64)
+    if n_ways > 1:
+        switching *= _STILL_EXCHANGED
+        switching[:, 0] = 1 - _STILL_EXCHANGED
+        switching[0, 1:] = _EXCHANGED / (n_ways - 1)
+        switching[0, 0] = 1 - _EXCHANGED
+    return switching.log()
