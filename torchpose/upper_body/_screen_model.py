@@ -45,7 +45,7 @@ class _Kind(NamedTuple):
 # Speeds, shares and distances were chosen on s1 to s6 of UTD-MHAD. A place beside the neck is believed up
 # to 3.3 spreads where nothing else is known of the joint: a hand within an arm's reach, and beyond it less.
 _KINDS = {
-    "hand": _Kind(0.1, 0.38, 2.5, 6.0),
+    "hand": _Kind(0.1, 0.38, 5.0, 6.0),
     "elbow": _Kind(0.2, 0.27, 1.0, 3.0),
     "shoulder": _Kind(0.08, 0.16, 0.7, 1.5),
     "head": _Kind(-0.2, 0.12, 0.7, 1.5),
