@@ -131,7 +131,7 @@ def add_many(report: Report, prior: UpperBodyPrior, test: Trials, wild: Wild) ->
         f"{100 * float(wild.exchanged.sum() / test.inside.sum()):.1f} % of the frames",
         ["clean (cm)", "with outliers (cm)", "over the best clean", "clean, inside 50 %", "90 %",
          "with outliers, inside 50 %", "90 %"],
-        digits=(2, 2, 3, 0, 0, 0, 0),
+        digits=(3, 3, 3, 0, 0, 0, 0),
     )  # fmt: skip
     for method in METHODS:
         numbers = {}

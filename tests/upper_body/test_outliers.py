@@ -134,6 +134,22 @@ def test_somebody_who_is_elsewhere_is_followed_after_a_quarter_of_a_second(track
     assert bool(there[:, FRAME + 9 :].all())
 
 
+def test_a_hand_that_stays_where_no_arm_reaches_is_never_believed(tracker, keypoints):
+    stuck = keypoints.clone()
+    stuck[:, 5:, 2] = 5.0  # a corner of the image
+    track = tracker(stuck, names=NAMES)
+    assert not bool(track.observed[:, 5:, ROWS[2]].any())
+    assert bool(track.observed[:, :, [ROWS[i] for i in (0, 1, 3)]].all())
+
+
+def test_a_frame_in_which_all_is_wrong_leaves_nothing_behind(tracker, keypoints):
+    wild = keypoints.clone()
+    wild[:, FRAME] = torch.tensor([[900.0, 50.0], [-200.0, 400.0], [600.0, -90.0], [20.0, 700.0]])
+    track = tracker(wild, names=NAMES)
+    assert not bool(track.observed[:, FRAME].any())
+    assert bool(track.observed[:, FRAME + 1 :, ROWS].all())
+
+
 def test_after_a_gap_any_place_is_plausible(tracker, keypoints):
     gap = keypoints.clone()
     gap[:, 15:45] = torch.nan

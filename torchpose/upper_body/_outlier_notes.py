@@ -34,9 +34,9 @@ def outlier_notes(
     counts, frames, said = outliers.flatten(0, 1).sum(0).tolist(), _count(exchanged), []
     if any(counts):
         joints = [f"{name} {n}" for name, n in zip(UPPER_BODY, counts, strict=True) if n]
-        said.append(f"{sum(counts)} keypoints {_TAKEN}: {', '.join(joints)}")
+        said.append(f"{_number(sum(counts), 'keypoint')} {_TAKEN}: {', '.join(joints)}")
     if frames:
-        said.append(f"{_EXCHANGED} {frames} frames")
+        said.append(f"{_EXCHANGED} {_number(frames, 'frame')}")
     return ("; ".join(said),) if said else ()
 
 
@@ -47,9 +47,13 @@ def without_outliers(notes: Iterable[str]) -> tuple[str, ...]:
 
 def exchanged_frames(notes: Iterable[str]) -> int:
     """Return in how many frames `outlier_notes` says that hands were exchanged."""
-    found = (re.search(rf"{_EXCHANGED} (\d+) frames", note) for note in notes)
+    found = (re.search(rf"{_EXCHANGED} (\d+) frame", note) for note in notes)
     return sum(int(match[1]) for match in found if match)
 
 
 def _count(frames: Bool[Tensor, "B T"] | int) -> int:
     return int(frames.sum()) if isinstance(frames, Tensor) else frames
+
+
+def _number(count: int, thing: str) -> str:
+    return f"{count} {thing}{'s' * (count != 1)}"

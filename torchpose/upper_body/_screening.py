@@ -114,7 +114,8 @@ def advance_screen(
         p = sigmoid(log ((1 - o) f(z) / (o u)) + log phi),
         f(z) = (1 - b) N(z; x, P + R) + b N(z; x, P + R + J),
     o and u the share and density of outliers, phi how well z goes with the other joints
-    (`_beside_others`). The track becomes the mixture of what it would be with z and without.
+    (`_beside_others`). The track becomes the mixture of what it would be with z and without; it goes on
+    without where z does not go with the others, so that no outlier that stays draws it to its place.
 
     Args:
         state: from `init_screen` or the call before. measured: of T frames, in the prior's pixels.
@@ -174,9 +175,12 @@ def _step(
     state, total = _take_over(model, state, both.total, body, known)
     odds_now = torch.stack([total[:, 0] + body, total[:, 1]], 1)
     probability = odds_now.sigmoid() * known[:, None]
-    state = _update(state, z, noise, probability)
+    nowhere = (probability < 0.5) & (body < -_DOUBTFUL)[:, None]
+    state = _update(state, z, noise, torch.where(nowhere, 0.0, probability))
     new = known & (probability < 0.5).all(1) & (state.evidence[:, 1] <= 0)
-    return _started(model, state, z, noise, square[:, 0], new), probability[:, 0], way
+    if bool(new.any()):
+        state = _started(model, state, z, noise, square[:, 0], new)
+    return state, probability[:, 0], way
 
 
 def _predict(model: ScreenModel, state: ScreenState, square: Float[Tensor, "B 1 1"]) -> ScreenState:
@@ -226,6 +230,9 @@ def _exchange(
     way = torch.where(log_weights[:, 0] < math.log(0.5), log_weights[:, 1:].argmax(-1) + 1, 0)
     lasting = torch.where(way > 0, state.lasting + model.dt, 0.0)
     turned = lasting > TAKEOVER
+    state = state._replace(exchange=log_weights, lasting=lasting)
+    if not bool(turned.any()):
+        return state, way
     order = ways[torch.where(turned, way, 0)][:, None]
     none = torch.full_like(log_weights, -math.inf)
     none[:, 0] = 0.0
@@ -288,10 +295,13 @@ def _take_over(
         (state.evidence[:, 0] + model.dt * (right & known)).clamp_max(TAKEOVER),
         (state.evidence[:, 1] + change * known).clamp(0.0, 2 * TAKEOVER),
     ], 1)  # fmt: skip
-    needed = evidence[:, 0] - (body + _DOUBTFUL).clamp_max(0.0) * (TAKEOVER / CERTAIN)
+    doubt = -(body + _DOUBTFUL).clamp_max(0.0) / (CERTAIN - _DOUBTFUL)
+    needed = evidence[:, 0] + TAKEOVER * doubt
     taken = known & again & (evidence[:, 1] > needed)
-    order = torch.stack([taken, ~taken], 1).long()
     state = state._replace(evidence=evidence)
+    if not bool(taken.any()):
+        return state, odds
+    order = torch.stack([taken, ~taken], 1).long()
     tracks = {name: _in_order(getattr(state, name), order, 1) for name in _TRACKS}
     return state._replace(**tracks), _in_order(odds, order, 1)
 
