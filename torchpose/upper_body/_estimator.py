@@ -24,6 +24,7 @@ __all__ = [
     "Estimates",
     "Estimator",
     "MotionRatios",
+    "ReadOut",
     "TrackerModel",
     "arm_joints",
     "check_model",
@@ -47,6 +48,7 @@ class TrackerModel(NamedTuple):
         prior: mixtures and noise. measurement_cov: R of the eight joints, [8, 2, 2], prior's pixels.
         fps: frame rate, or None. smoothing: None, the number of later frames that an estimate may
             use, or "full".
+        hand: kind of the measured hands, "hand" or "wrist"; None is the prior's.
     """
 
     owner: nn.Module
@@ -54,6 +56,7 @@ class TrackerModel(NamedTuple):
     measurement_cov: Float[Tensor, "8 2 2"]
     fps: float | None
     smoothing: int | str | None = None
+    hand: str | None = None
 
     @property
     def rate(self) -> float:
@@ -84,6 +87,24 @@ def check_model(
     return camera
 
 
+class ReadOut(NamedTuple):
+    """Poses, and where their bodies are.
+
+    Attributes:
+        joints: in the body's frame [B, T, 8, 3], metres. covs: [B, T, 8, 3, 3].
+        angles: roll, pitch, yaw that turn the body's axes into the camera's [B, T, 3], radians.
+        place: of the body's centre in camera axes [B, T, 3], metres.
+        uv: [B, T, 8, 2], pixels of the prior's camera. uv_covs: [B, T, 8, 2, 2].
+    """
+
+    joints: Tensor
+    covs: Tensor
+    angles: Tensor
+    place: Tensor
+    uv: Tensor
+    uv_covs: Tensor
+
+
 class Estimates(NamedTuple):
     """The states of both arms in T frames.
 
@@ -91,11 +112,13 @@ class Estimates(NamedTuple):
         left, right: with covariances, float64; the first 21 dimensions are those of
             `torchpose.priors._arm_state`.
         view: the virtual camera in whose pixels the states are; None is the prior's camera.
+        reading: the poses themselves, of estimators that do not estimate states of arms apart.
     """
 
     left: FilterOutput
     right: FilterOutput
     view: BodyView | None = None
+    reading: ReadOut | None = None
 
 
 class MotionRatios(NamedTuple):

@@ -25,12 +25,11 @@ from torchpose.math._rotations import RotationOrder, euler_to_matrix, matrix_to_
 from torchpose.priors._arm_state import STATE_DIM
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import onto_torso
-from torchpose.upper_body._estimator import Estimates, require_cov
+from torchpose.upper_body._estimator import Estimates, ReadOut, require_cov
 
 __all__ = [
     "MotionStage",
     "MotionState",
-    "ReadOut",
     "calibration_mode",
     "in_camera_axes",
     "on_their_rays",
@@ -45,25 +44,8 @@ _HAND_OF = tuple(
     UPPER_BODY.index(f"hand_{'right' if 'right' in j else 'left'}") for j in UPPER_BODY
 )
 _WINDOWS = ("causal", "full")
+_OWN = (*_WINDOWS, "articulated")  # calibrations that nothing else stands for
 _NEAREST = 0.1  # metres before the camera, from where a projection means something
-
-
-class ReadOut(NamedTuple):
-    """Poses, and where their bodies are.
-
-    Attributes:
-        joints: in the body's frame [B, T, 8, 3], metres. covs: [B, T, 8, 3, 3].
-        angles: roll, pitch, yaw that turn the body's axes into the camera's [B, T, 3], radians.
-        place: of the body's centre in camera axes [B, T, 3], metres.
-        uv: [B, T, 8, 2], pixels of the prior's camera. uv_covs: [B, T, 8, 2, 2].
-    """
-
-    joints: Tensor
-    covs: Tensor
-    angles: Tensor
-    place: Tensor
-    uv: Tensor
-    uv_covs: Tensor
 
 
 def read_out(estimates: Estimates, matrix: Float[Tensor, "3 3"], order: RotationOrder) -> ReadOut:
@@ -72,7 +54,9 @@ def read_out(estimates: Estimates, matrix: Float[Tensor, "3 3"], order: Rotation
     Args:
         estimates: of both arms. matrix: K of the prior's camera. order: of roll, pitch and yaw.
     """
-    left, right, view = estimates
+    if estimates.reading is not None:
+        return estimates.reading
+    left, right, view = estimates[:3]
     outputs = left, right
     means = [out.mean[..., :STATE_DIM] for out in outputs]
     covs = [require_cov(out)[..., :STATE_DIM, :STATE_DIM] for out in outputs]
@@ -176,7 +160,7 @@ def recalibrated(
         covs: C, metres squared. noise: of a prior. mode: name of the window, or `calibration_mode`;
             without a calibration of its own, a method over single poses has that of "pose".
     """
-    if f"calibration_scale_{mode}" not in noise and mode not in _WINDOWS:
+    if f"calibration_scale_{mode}" not in noise and mode not in _OWN:
         mode = "pose"
     scale = noise.get(f"calibration_scale_{mode}")
     floor = noise.get(f"calibration_floor_{mode}")

@@ -35,6 +35,10 @@ __all__ = [
 
 _DEFAULT_STD = 3.0  # pixels
 _LEAST_CONFIDENCE = 0.05
+_NECK_HEIGHT, _NECK_SPREAD = (
+    0.105,
+    0.035,
+)  # metres above the middle of the shoulders, without a head
 _LEFT, _HEAD, _NECK, _RIGHT = (
     UPPER_BODY.index(name) for name in ("shoulder_left", "head", "neck", "shoulder_right")
 )
@@ -62,11 +66,13 @@ class Picked(NamedTuple):
         middle: whether the neck is to be put between that, or else the middle of the measured
             shoulders, and the head (`place_measured_neck`).
         notes: what was assumed.
+        hand: kind of the hands, "hand" or "wrist"; None where the names do not tell.
     """
 
     indices: tuple[int, ...]
     middle: bool
     notes: tuple[str, ...]
+    hand: str | None = None
 
 
 def pick_joints(
@@ -105,15 +111,13 @@ def pick_joints(
     if other or indices[_NECK] < 0:
         indices[_NECK] = indices[_NECK] if kind == "mid-shoulder" else -1
         shoulders = min(indices[_LEFT], indices[_RIGHT]) >= 0
-        middle = (
-            wanted_neck == "neck" and indices[_HEAD] >= 0 and (shoulders or indices[_NECK] >= 0)
-        )
+        middle = wanted_neck == "neck" and (shoulders or indices[_NECK] >= 0)
         if not middle:
             indices[_NECK] = -1
         notes += _neck_notes(kind if other else None, wanted_neck, middle)
     if found.hand is not None and wanted_hand is not None and found.hand != wanted_hand:
         notes.append(f"the keypoints' {found.hand}s stand for the prior's {wanted_hand}s")
-    return Picked(tuple(indices), middle, tuple(notes))
+    return Picked(tuple(indices), middle, tuple(notes), found.hand)
 
 
 def _neck_notes(kind: str | None, wanted: str | None, middle: bool) -> list[str]:
@@ -125,7 +129,10 @@ def _neck_notes(kind: str | None, wanted: str | None, middle: bool) -> list[str]
             else (f"the keypoints' neck ({kind}) is not the prior's ({wanted})")
         )
         share = f"{100 * KINECT_NECK.fraction:.0f} %"
-        return [f"{own}: put {share} of the way from the middle of the shoulders to the head"]
+        return [
+            f"{own}: put {share} of the way from the middle of the shoulders to the head, and upright "
+            "above them where there is no head"
+        ]
     if kind is None:
         return []
     return [f"the keypoints' neck ({kind}) is not the prior's ({wanted}): not measured"]
@@ -144,7 +151,8 @@ def place_measured_neck(
 
     n = m + f (h - m),   R_n = (1 - f)^2 R_m + f^2 R_h + s^2 I
 
-    Where head or middle is missing, so is the neck. Its errors go with those of the head, which the
+    Where the head is missing, the neck is put upright above the middle, as high as Kinect's usually is;
+    where the middle is missing, so is the neck. Its errors go with those of the head, which the
     filter does not know.
 
     Args:
@@ -157,8 +165,10 @@ def place_measured_neck(
     middle = torch.where(
         both[..., None], (uv[..., _LEFT, :] + uv[..., _RIGHT, :]) / 2, uv[..., _NECK, :]
     )
-    known = (mask[..., _NECK] | both) & mask[..., _HEAD]
-    place = middle + neck.fraction * (uv[..., _HEAD, :] - middle)
+    known, head = mask[..., _NECK] | both, mask[..., _HEAD]
+    above = middle - uv.new_tensor([0.0, _NECK_HEIGHT * pixels_per_metre])
+    between = middle + neck.fraction * (uv[..., _HEAD, :] - middle)
+    place = torch.where(head[..., None], between, above)
     uv[..., _NECK, :] = torch.where(known[..., None], place, torch.zeros_like(place))
     mask[..., _NECK] = known
     spread = (neck.spread * pixels_per_metre) ** 2 * torch.eye(
@@ -169,7 +179,12 @@ def place_measured_neck(
     if cov.ndim > 3:
         of_shoulders = (cov[..., _LEFT, :, :] + cov[..., _RIGHT, :, :]) / 4
         of_middle = torch.where(both[..., None, None], of_shoulders, of_middle)
-    cov[..., _NECK, :, :] = (1 - share) ** 2 * of_middle + share**2 * cov[..., _HEAD, :, :] + spread
+    with_head = (1 - share) ** 2 * of_middle + share**2 * cov[..., _HEAD, :, :] + spread
+    if bool((known & ~head).any()):
+        alone = of_middle + spread * (_NECK_SPREAD / neck.spread) ** 2
+        cov = cov.expand(*uv.shape[:-2], *cov.shape[-3:]).clone()
+        with_head = torch.where(head[..., None, None], with_head, alone)
+    cov[..., _NECK, :, :] = with_head
     return MeasuredJoints(uv, mask, cov)
 
 

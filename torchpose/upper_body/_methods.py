@@ -15,6 +15,7 @@ from torchpose.filters._particle import BootstrapParticleFilter
 from torchpose.filters._sampled_tracks import SampledTrackFilter
 from torchpose.filters._split_tracks import SplitTrackFilter
 from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.upper_body._articulated import ArticulatedFilter
 from torchpose.upper_body._estimator import Estimator
 from torchpose.upper_body._single_poses import PoseFilter, ProcessNoise
 from torchpose.upper_body._windows import WindowMixture, suitable_window
@@ -60,6 +61,7 @@ def _particles(proposal: str, noise: ProcessNoise) -> PoseFilter:
 
 METHODS: dict[str, Method] = {
     WINDOWS: WindowMixture,
+    "articulated": ArticulatedFilter,
     SINGLE_POSES: _kalman_bank(FixedTrackFilter, 100.0, ("transition", "gamma", "uniform_weight")),
     "mkf-sampled": _kalman_bank(SampledTrackFilter, 10.0, ("transition", "gamma")),
     "mkf-split": _kalman_bank(SplitTrackFilter, 10.0, ("transition", "gamma")),

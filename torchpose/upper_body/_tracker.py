@@ -190,8 +190,12 @@ class UpperBodyTracker(WideModule):
     @property
     def estimator(self) -> Estimator:
         """Return the estimator of the method, on prior, noise and options as they are now."""
+        return self._estimator_of(None)
+
+    def _estimator_of(self, hand: str | None) -> Estimator:
+        """Return the estimator for measured hands of a kind; None is that of the prior."""
         make: Callable[..., Estimator] = METHODS[self.method]
-        model = TrackerModel(self, self.prior, self.measurement_cov, self.fps, self.smoothing)
+        model = TrackerModel(self, self.prior, self.measurement_cov, self.fps, self.smoothing, hand)
         return make(model, **self.given_options)
 
     def forward(
@@ -234,7 +238,7 @@ class UpperBodyTracker(WideModule):
             check_gaps(given.mask, lengths, self.max_gap, self.fps or 30.0)
             joints = arm_joints(given.mask.flatten(0, 1).any(0).tolist())
             _, found = screen_joints(self._screen(picked), None, given)
-            estimator = self.estimator
+            estimator = self._estimator_of(picked.hand)
             arms = generators_of_arms(generator)
             estimates = estimator.forward(found.measured, joints, arms, lengths, progress)
             notes = self.notes + picked.notes + outlier_notes(*found[1:], lengths)
@@ -275,7 +279,8 @@ class UpperBodyTracker(WideModule):
         picked = self._pick(n_keypoints, names)
         joints = arm_joints([i >= 0 for i in picked.indices])
         with one_run(self.measurement_cov.device):
-            state = self.estimator.init(batch_size, joints, generators_of_arms(generator))
+            estimator = self._estimator_of(picked.hand)
+            state = estimator.init(batch_size, joints, generators_of_arms(generator))
         unseen = torch.zeros(batch_size, dtype=torch.long, device=self.measurement_cov.device)
         return StreamState(state, None, unseen, n_keypoints, picked)
 
@@ -339,7 +344,7 @@ class UpperBodyTracker(WideModule):
             keypoints = keypoints.to(self.measurement_cov)
             given = self._measure(keypoints, confidence, mask, covariance, state.picked)
             screen, found = screen_joints(self._screen(state.picked), state.screen, given)
-            estimator, seen = self.estimator, found.measured.mask
+            estimator, seen = self._estimator_of(state.picked.hand), found.measured.mask
             own, estimates = estimator.advance(state.estimator, found.measured)
             reader = self._reader(estimator)
             motion, reading = reader.more(state.motion, estimates)

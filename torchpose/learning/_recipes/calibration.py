@@ -15,6 +15,7 @@ from torchpose.metrics._poses import align
 from torchpose.priors._upper_body import UpperBodyPrior
 from torchpose.upper_body._fusion import calibration_mode
 from torchpose.upper_body._methods import METHODS
+from torchpose.upper_body._single_poses import PoseFilter
 from torchpose.upper_body._tracker import UpperBodyTracker
 
 __all__ = [
@@ -36,8 +37,9 @@ MODES: dict[str, dict[str, Any]] = {
 
 DRAWN = {
     calibration_mode(method): {"method": method}
-    for method in METHODS
-    if method not in {options["method"] for options in MODES.values()}
+    for method, made_by in METHODS.items()
+    if isinstance(made_by, PoseFilter)
+    and method not in {options["method"] for options in MODES.values()}
 }
 """The ways that draw samples; they take longer, and are tested on fewer frames."""
 

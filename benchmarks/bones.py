@@ -1,0 +1,304 @@
+"""Arms of strangers: methods with and without bones beside elementary geometry.
+
+Error: the vector from the shoulder to the wrist (or hand) of the same side, in camera axes, so that
+nothing is aligned. Berkeley MHAD is seen by one camera with 3 px of noise at 2.5 m; the four views of
+a balancing person (Pose2Sim) are OpenPose's keypoints of the upper body, one camera at a time, against
+its triangulation. The prior over arms is fitted to all sets but the one that is scored.
+
+    python -m benchmarks.bones --data DIR [--out FILE]
+    python -m benchmarks.bones --data DIR --fit FILE.safetensors
+
+The second line fits the prior over arms that comes with torchpose, to all sets.
+
+Lifts put elbow and wrist on the rays of their pixels at the depth that the length of the bone leaves,
+all forward; with the person's own lengths they know what a tracker has to find out.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+import torchpose
+from benchmarks._table_file import table_file
+from torchpose.io import read_recordings
+from torchpose.learning._arms import fit_arm_prior
+from torchpose.priors import UpperBodyPrior
+from torchpose.priors._arms import ArmPrior
+from torchpose.skeleton import UPPER_BODY
+
+SETS = {
+    "kinect_utd_mhad": 0.4,
+    "burke_kinect/kinect_joints.npz": 0.12,
+    "kinect_laban": 0.08,
+    "mocap_berkeley_mhad": 0.25,
+    "mocap_cmu_actions": 0.12,
+    "mocap_cmu_walk": 0.03,
+}
+"""Share of each set in the fit of a prior over arms."""
+
+HEADER = ("seen", "method", "wrist (cm)", "elbow (cm)", "elbow before or behind (%)",
+          "spread of the forearm (%)")  # fmt: skip
+_SEVEN = ("wrist_left", "elbow_left", "shoulder_left", "neck", "shoulder_right", "elbow_right",
+          "wrist_right")  # fmt: skip
+_MHAD = ("left_wrist", "left_elbow", "left_shoulder", "neck", "right_shoulder", "right_elbow",
+         "right_wrist")  # fmt: skip
+_PLACE, _EVERY, _FRAMES, _STD = (0.05, -0.2, 2.5), 15, 150, 3.0
+_FEW = (0, 3, 6)  # neck and wrists
+_SETTLED = 90  # frames, from where on the spread of a bone's length counts
+
+
+class View(NamedTuple):
+    """A recording seen by one camera.
+
+    Attributes:
+        keypoints: [T, 7, 2], NaN where missing, in the order of `names`. confidence: [T, 7].
+        names: of the keypoints. camera: of the pixels. neck: kind of the keypoints' neck.
+        truth: of left and right: shoulder, elbow, wrist, camera axes, [T, 2, 3, 3].
+        fps: frames per second.
+    """
+
+    keypoints: Tensor
+    confidence: Tensor
+    names: Sequence[str]
+    camera: torchpose.PinholeCamera
+    neck: str
+    truth: Tensor
+    fps: float
+
+
+class Chains(NamedTuple):
+    """Vectors from the shoulder to the elbow and on to the wrist, [T, 2, 3] each."""
+
+    upper: Tensor
+    lower: Tensor
+
+
+def mhad_views(data: Path, every: int = _EVERY) -> list[View]:
+    """Return one recording in fifteen of Berkeley MHAD, 150 frames each, in a camera at 2.5 m.
+
+    Args:
+        data: folder with mocap_berkeley_mhad/. every: one recording in so many.
+    """
+    camera = torchpose.PinholeCamera(525.0, 525.0, 319.5, 239.5)
+    rng = np.random.default_rng(0)
+    views = []
+    for path in sorted((data / "mocap_berkeley_mhad").rglob("*.npz"))[7::every]:
+        with np.load(path) as file:
+            names = [str(name) for name in file["names"]]
+            picked = [names.index(name) for name in _MHAD]
+            joints = file["joints"][:_FRAMES, picked].astype(float) * np.array([1, -1, -1.0])
+        joints = joints - joints[:, [3]] + np.array(_PLACE)
+        pixels = joints[..., :2] / joints[..., 2:] * 525 + np.array([319.5, 239.5])
+        pixels = torch.tensor(pixels + rng.normal(0, _STD, pixels.shape))
+        truth = torch.tensor(joints)[:, [[2, 1, 0], [4, 5, 6]]]
+        views.append(
+            View(pixels, torch.ones(pixels.shape[:2]), _SEVEN, camera, "mid-shoulder", truth, 30.0)
+        )
+    return views
+
+
+def openpose_views(data: Path) -> list[View]:
+    """Return the balancing person in each of four cameras, as OpenPose saw the upper body.
+
+    Args:
+        data: folder with multicam_pose2sim/.
+    """
+    views = []
+    for path in sorted((data / "multicam_pose2sim").rglob("*.npz")):
+        with np.load(path) as file:
+            if "openpose_2d" not in file:
+                continue
+            arrays = {key: file[key] for key in file.files}
+        joints = [str(name) for name in arrays["names"]]
+        seen = [str(name) for name in arrays["openpose_names"]]
+        limbs = ("Wrist", "Elbow", "Shoulder")
+        wanted = [f"L{limb}" for limb in limbs] + ["Neck"] + [f"R{limb}" for limb in limbs[::-1]]
+        ends = [[joints.index(f"{s}{limb}") for limb in limbs[::-1]] for s in "LR"]
+        for k, rotation, t, found in zip(
+            *(arrays[key] for key in ("K", "R", "t", "openpose_2d")), strict=True
+        ):
+            world = arrays["joints"].astype(float)[:, ends]
+            truth = torch.tensor(world @ np.asarray(rotation, float).T + np.ravel(t))
+            keypoints = torch.tensor(
+                found[:, [seen.index(name) for name in wanted]], dtype=torch.float64
+            )
+            sure = keypoints[..., 2].clamp(0, 1)
+            camera = torchpose.PinholeCamera(
+                float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])
+            )
+            fps = float(arrays["fps"])
+            views.append(View(keypoints[..., :2], sure, _SEVEN, camera, "mid-shoulder", truth, fps))
+    return views
+
+
+def fit_without(data: Path, left_out: str | None) -> ArmPrior:
+    """Return the prior over arms that is fitted to all sets but one.
+
+    Args:
+        data: folder with the sets. left_out: name of a set, None for none.
+    """
+    kept = {name: share for name, share in SETS.items() if name != left_out}
+    recordings = [read_recordings(data / name) for name in kept]
+    return fit_arm_prior(recordings, shares=list(kept.values()))
+
+
+def fit_shipped(data: Path, path: Path) -> None:
+    """Fit the prior over arms to all sets, and write it."""
+    fitted = fit_without(data, None)
+    info = replace(
+        fitted.info,
+        name="upper-body-arms",
+        sources=tuple(name.split("/")[0] for name in SETS),
+        licence="MIT; see the card for the recordings",
+        command=f"python -m benchmarks.bones --data DIR --fit {path.name}",
+    )
+    lengths, spread = fitted.lengths, fitted.spread
+    ArmPrior(fitted.directions.rounded(), lengths, spread, fitted.broad, info).save(path)
+
+
+def tracked(
+    view: View, prior: UpperBodyPrior, chosen: Sequence[int] | None, **options: object
+) -> Chains:
+    """Return the chains of a tracker.
+
+    Args:
+        view: what is seen. prior: of the tracker. chosen: keypoints that are measured, None for all.
+        options: of the tracker.
+    """
+    rows = list(range(len(view.names))) if chosen is None else list(chosen)
+    tracker = torchpose.UpperBodyTracker(
+        prior, view.camera, neck=view.neck, fps=view.fps, max_gap=None, **options
+    )  # type: ignore[arg-type]
+    with torch.inference_mode():
+        poses = tracker(
+            view.keypoints[None, :, rows],
+            view.confidence[None, :, rows].double(),
+            names=[view.names[i] for i in rows],
+        )
+    joints = dict(zip(UPPER_BODY, poses.joints3d[0].unbind(1), strict=True))
+    arms = [[joints[f"{j}_{s}"] for j in ("shoulder", "elbow", "hand")] for s in ("left", "right")]
+    ends = torch.stack([torch.stack(arm, 1) for arm in arms], 1)
+    return Chains(ends[:, :, 1] - ends[:, :, 0], ends[:, :, 2] - ends[:, :, 1])
+
+
+def lifted(view: View, lengths: Float[Tensor, "2 2"], depth: float) -> Chains:
+    """Return arms in front of the image plane through the shoulders, at one depth.
+
+    Args:
+        view: what is seen. lengths: of upper arm and forearm, left and right. depth: of the body.
+    """
+    matrix = view.camera.matrix
+    focal = torch.stack([matrix[0, 0], matrix[1, 1]])
+    rows = [[2, 1, 0], [4, 5, 6]]
+    flat = view.keypoints[:, rows] / focal * depth
+    bones = flat.diff(dim=2)
+    away = (lengths.square() - bones.square().sum(-1)).clamp_min(0).sqrt()
+    whole = torch.cat([bones, -away[..., None]], -1)
+    return Chains(whole[:, :, 0], whole[:, :, 1])
+
+
+def errors(chains: Chains, truth: Float[Tensor, "T 2 3 3"]) -> list[float]:
+    """Return what the table has of a method: two errors, the share of right signs, a bone's spread."""
+    upper, lower = truth[:, :, 1] - truth[:, :, 0], truth[:, :, 2] - truth[:, :, 1]
+    wrist = (chains.upper + chains.lower - upper - lower).norm(dim=-1).nanmean()
+    elbow = (chains.upper - upper).norm(dim=-1).nanmean()
+    sign = (chains.upper[..., 2] * upper[..., 2] > 0).double().mean()
+    length = chains.lower.norm(dim=-1)[_SETTLED:] if len(upper) > _SETTLED + 10 else None
+    spread = torch.nan
+    if length is not None:
+        spread = float((length.std(0) / length.mean(0)).mean())
+    return [100 * float(wrist), 100 * float(elbow), 100 * float(sign), 100 * spread]
+
+
+def true_lengths(view: View) -> Float[Tensor, "2 2"]:
+    """Return the mean lengths of upper arm and forearm of left and right."""
+    return view.truth.diff(dim=2).norm(dim=-1).nanmean(0)
+
+
+def methods(
+    prior: UpperBodyPrior, arms: ArmPrior, mean: Float[Tensor, "2 2"]
+) -> dict[str, Callable[[View], Chains]]:
+    """Return what is compared, by name; all keypoints are measured.
+
+    Args:
+        prior: of the trackers. arms: fitted without the scored set. mean: lengths of other persons.
+    """
+
+    def far(view: View) -> float:
+        return float(view.truth[..., 0, 2].mean())
+
+    def mean_arm(view: View) -> Chains:
+        hanging = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+        upper, lower = (mean[:, i, None] * hanging for i in (0, 1))
+        return Chains(*(bone.expand(len(view.truth), 2, 3) for bone in (upper, lower)))
+
+    return {
+        "window-mixture": lambda v: tracked(v, prior, None, method="window-mixture"),
+        "articulated": lambda v: tracked(v, prior, None, method="articulated", arms=arms),
+        "single poses (mkf-fixed)": lambda v: tracked(v, prior, None, method="mkf-fixed"),
+        "lift, own lengths and depth": lambda v: lifted(v, true_lengths(v), far(v)),
+        "lift, others' lengths, own depth": lambda v: lifted(v, mean, far(v)),
+        "hanging arms": mean_arm,
+    }
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--data", type=Path, required=True, help="folder with the sets")
+    parser.add_argument("--threads", type=int, default=2, help="cores")
+    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
+    parser.add_argument("--quick", action="store_true", help="few recordings, to see that it works")
+    parser.add_argument(
+        "--fit", type=Path, help="file for a prior over arms, in place of the table"
+    )
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    if args.fit is not None:
+        fit_shipped(args.data, args.fit)
+        return
+    prior = torchpose.load_prior("kinect-upper-body")
+    lines = [f"| {' | '.join(HEADER)} |", f"|{' --- |' * len(HEADER)}"]
+    print("\n".join(lines))
+
+    def add(seen: str, name: str, views: Sequence[View], method: Callable[[View], Chains]) -> None:
+        rows = torch.tensor([errors(method(view), view.truth) for view in views])
+        figures = " | ".join(f"{value:.1f}" for value in rows.nanmean(0).tolist())
+        lines.append(f"| {seen} | {name} | {figures} |")
+        print(lines[-1], flush=True)
+
+    for seen, left_out, views in (
+        (
+            "MHAD, seven joints",
+            "mocap_berkeley_mhad",
+            mhad_views(args.data, 60 if args.quick else _EVERY),
+        ),
+        (
+            "OpenPose, one of four views",
+            None,
+            openpose_views(args.data)[: 1 if args.quick else None],
+        ),
+    ):
+        arms = fit_without(args.data, left_out)
+        mean = arms.lengths[:2].expand(2, 2)
+        for name, method in methods(prior, arms, mean).items():
+            add(seen, name, views, method)
+        if left_out is not None:
+            for name, options in (("window-mixture", {}), ("articulated", {"arms": arms})):
+                add("MHAD, neck and wrists", name, views,
+                    lambda v, n=name, o=options: tracked(v, prior, _FEW, method=n, **o))  # fmt: skip
+    if args.out is not None:
+        args.out.write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

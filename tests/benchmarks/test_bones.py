@@ -1,0 +1,37 @@
+"""The table of arms of strangers is printed, and geometry that is told everything is exact."""
+
+import pytest
+import torch
+
+from benchmarks.bones import errors, lifted, mhad_views, openpose_views, true_lengths
+from tests.data import data_dir_or_skip
+
+
+@pytest.fixture(scope="module")
+def data():
+    return data_dir_or_skip("mocap_berkeley_mhad").parent
+
+
+def test_views_are_projections_of_their_truth(data):
+    for view in (mhad_views(data, 200)[0], *openpose_views(data)):
+        ends = view.truth[:, :, 2] @ view.camera.matrix.T
+        seen = ends[..., :2] / ends[..., 2:]
+        off = torch.linalg.vector_norm(seen - view.keypoints[:, [0, 6]], dim=-1)
+        assert float(off.median()) < (10 if view.fps == 30 else 40)
+
+
+def test_errors_of_the_truth_are_none(data):
+    view = mhad_views(data, 200)[0]
+    chain = lifted(view, true_lengths(view), 2.5)
+    true = chain._replace(upper=view.truth[:, :, 1] - view.truth[:, :, 0],
+                          lower=view.truth[:, :, 2] - view.truth[:, :, 1])  # fmt: skip
+    assert errors(true, view.truth)[:3] == [0.0, 0.0, 100.0]
+    assert 2 < errors(chain, view.truth)[0] < 30
+
+
+def test_quick_run_prints_every_method(run_here, data, tmp_path):
+    printed = run_here("bones", "--quick", "--data", str(data), "--out", str(tmp_path))
+    for row in ("MHAD, seven joints | articulated", "MHAD, neck and wrists | articulated",
+                "OpenPose, one of four views | lift, own lengths and depth"):  # fmt: skip
+        assert row in printed
+    assert (tmp_path / "bones.md").read_text().split() == printed.split()

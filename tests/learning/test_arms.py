@@ -1,0 +1,63 @@
+"""A prior over arms says what the recordings it was fitted to do."""
+
+import math
+
+import pytest
+import torch
+
+from torchpose.demo import performer
+from torchpose.errors import InputError
+from torchpose.io import Recording
+from torchpose.learning._arms import arm_directions, fit_arm_prior, upright_axes
+from torchpose.math import euler_to_matrix
+from torchpose.skeleton import UPPER_BODY, mirror_pose
+
+
+def recording(joints, person):
+    return Recording(joints=joints, names=UPPER_BODY, fps=30.0, person=person, source="made")
+
+
+@pytest.fixture(scope="module")
+def joints():
+    return performer(200, seed=0).joints.double()
+
+
+def test_directions_do_not_change_as_a_person_turns_moves_or_grows(joints):
+    angles = torch.tensor([0.0, 0.0, 0.7], dtype=torch.float64)
+    turned = 1.2 * joints @ euler_to_matrix(angles, "zxy").mT + torch.tensor([1.0, 0.2, 3.0])
+    torch.testing.assert_close(arm_directions(turned), arm_directions(joints))
+
+
+def test_the_right_arm_is_the_mirror_image_of_the_left_one(joints):
+    mirrored = arm_directions(mirror_pose(joints))
+    torch.testing.assert_close(mirrored.flip(1), arm_directions(joints))
+
+
+def test_upright_axes_keep_the_vertical():
+    across = torch.tensor([0.3, 0.1, -0.2], dtype=torch.float64)
+    axes = upright_axes(across)
+    torch.testing.assert_close(axes @ axes.mT, torch.eye(3, dtype=torch.float64))
+    turned = axes @ across
+    assert turned[0] > 0 and abs(float(turned[2])) < 1e-12
+    assert float(turned[1]) == pytest.approx(0.1)
+
+
+def test_lengths_are_those_of_the_persons_and_poses_the_likelier(joints):
+    people = [recording(joints * s, f"p{i}") for i, s in enumerate((0.9, 1.0, 1.1))]
+    prior = fit_arm_prior([people], n_components=4, n_samples=3000)
+    left = [joints[:, UPPER_BODY.index(f"{j}_left")] for j in ("shoulder", "elbow")]
+    upper = float(torch.linalg.vector_norm(left[0] - left[1], dim=-1).median())
+    assert float(prior.lengths[0]) == pytest.approx(upper, rel=0.03)
+    assert 0.04 <= float(prior.spread[0]) < 0.12
+    seen = prior.log_prob(arm_directions(joints).flatten(0, 1)).mean()
+    assert float(seen) > -2 * math.log(4 * math.pi) + 1
+    assert len(prior.info.persons) == 3
+    again = fit_arm_prior([people], n_components=4, n_samples=3000)
+    torch.testing.assert_close(again.directions.means, prior.directions.means, rtol=0, atol=0)
+
+
+def test_sets_without_arms_are_refused(joints):
+    with pytest.raises(InputError, match="at least one recording"):
+        fit_arm_prior([[]])
+    with pytest.raises(InputError, match="no frame"):
+        fit_arm_prior([[recording(torch.full_like(joints, torch.nan), "p")]])

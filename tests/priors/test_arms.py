@@ -1,0 +1,89 @@
+"""The prior over arms is a density over pairs of directions, and survives its file."""
+
+import math
+
+import pytest
+import torch
+
+from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError
+from torchpose.priors import GaussianMixture
+from torchpose.priors._arms import LENGTHS, ArmPrior, shipped_arm_prior
+from torchpose.upper_body._arm_chain import DirectionDensity
+from torchpose.upper_body._limb_nodes import nodes_on_ray, sphere_points
+
+DOUBLE = torch.float64
+
+
+def pairs(n, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.randn(n, 2, 3, generator=generator, dtype=DOUBLE)
+    return torch.nn.functional.normalize(points, dim=-1).flatten(1)
+
+
+@pytest.fixture(scope="module")
+def prior():
+    return shipped_arm_prior()
+
+
+def test_it_integrates_to_one_over_both_spheres(prior):
+    density = prior.log_prob(pairs(200_000, seed=5)).exp()
+    assert float(density.mean() * (4 * math.pi) ** 2) == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_broad_part_keeps_it_above_its_share(prior):
+    least = math.log(prior.broad) - 2 * math.log(4 * math.pi)
+    assert float(prior.log_prob(pairs(2000)).min()) >= least - 1e-9
+
+
+def test_the_filters_density_is_the_priors(prior):
+    points = pairs(500)
+    torch.testing.assert_close(
+        DirectionDensity(prior)(points), prior.log_prob(points), rtol=0, atol=2e-4
+    )
+
+
+def test_it_is_read_as_it_was_written(prior, tmp_path):
+    prior.save(tmp_path / "arms.safetensors")
+    again = ArmPrior.load(tmp_path / "arms.safetensors")
+    assert again.info == prior.info and again.broad == prior.broad
+    points = pairs(50)
+    torch.testing.assert_close(again.log_prob(points), prior.log_prob(points), rtol=0, atol=0)
+    torch.testing.assert_close(again.lengths, prior.lengths, rtol=0, atol=0)
+    (tmp_path / "cut.safetensors").write_bytes((tmp_path / "arms.safetensors").read_bytes()[:-100])
+    with pytest.raises(FileFormatError):
+        ArmPrior.load(tmp_path / "cut.safetensors")
+
+
+def test_what_cannot_be_is_refused(prior):
+    other = GaussianMixture(torch.ones(1), torch.zeros(1, 3), torch.eye(3)[None])
+    with pytest.raises(PriorError, match="6 dimensions"):
+        ArmPrior(other, prior.lengths, prior.spread)
+    with pytest.raises(PriorError, match="lengths must be positive"):
+        ArmPrior(prior.directions, -prior.lengths, prior.spread)
+    with pytest.raises(ShapeError):
+        ArmPrior(prior.directions, prior.lengths[:2], prior.spread)
+    with pytest.raises(InputError, match="broad"):
+        ArmPrior(prior.directions, prior.lengths, prior.spread, broad=0.0)
+    with pytest.raises(ShapeError):
+        prior.log_prob(torch.zeros(3, 5))
+    assert len(prior.lengths) == len(LENGTHS)
+
+
+def test_nodes_integrate_a_pixels_likelihood_over_the_sphere():
+    """The sum over nodes is the integral over all directions, by many points on the sphere."""
+    start = torch.tensor([0.1, -0.2, 2.0], dtype=DOUBLE)
+    length, std = torch.tensor(0.3, dtype=DOUBLE), torch.tensor(0.03, dtype=DOUBLE)
+    directions = sphere_points(200_000)
+    for end in ([0.3, -0.1, 2.15], [0.1, 0.08, 1.95], [0.27, -0.4, 1.9]):
+        ray = torch.tensor(end, dtype=DOUBLE)
+        along = ray / ray.norm()
+        off = start + length * directions
+        off = off - (off @ along)[:, None] * along
+        density = torch.exp(-0.5 * (off.norm(dim=-1) / std) ** 2) / (2 * math.pi * std**2)
+        facing = directions @ along  # nodes stop 10 degrees before the ray
+        density = density * (facing.abs() < math.sin(math.radians(80)))
+        wanted = float(density.mean() * 4 * math.pi)
+        nodes = nodes_on_ray(start, ray, length, std, 81)
+        assert float(nodes.log_weight.exp().sum()) == pytest.approx(wanted, rel=0.05)
+        apart = torch.linalg.vector_norm(nodes.ends - start, dim=-1)
+        torch.testing.assert_close(apart, length.expand(81))

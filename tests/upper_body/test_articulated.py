@@ -1,0 +1,169 @@
+"""Arms of bones that keep their lengths: exact geometry, streams, gaps, and what is not to be seen."""
+
+import math
+
+import pytest
+import torch
+
+import torchpose
+from torchpose.math import euler_to_matrix
+from torchpose.priors._arms import shipped_arm_prior
+from torchpose.skeleton import UPPER_BODY
+from torchpose.upper_body import UpperBodyTracker
+
+CAMERA = torchpose.PinholeCamera(525.0, 525.0, 319.5, 239.5)
+ROW = {name: i for i, name in enumerate(UPPER_BODY)}
+PRIOR = torchpose.load_prior("kinect-upper-body-small")
+
+
+def body(n_frames=60, turn=0.0, depth=2.2, scale=1.0):
+    """Return a stiff body that waves both arms in front of itself, camera axes, [T, 8, 3]."""
+    time = torch.arange(n_frames, dtype=torch.float64) / 30
+    joints = torch.zeros(n_frames, 8, 3, dtype=torch.float64)
+    joints[:, ROW["head"], 1] = -0.185
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        joints[:, ROW[f"shoulder_{side}"]] = torch.tensor([sign * 0.165, 0.105, 0.0])
+        lift = 0.6 + 0.5 * torch.sin(2 * time + sign)
+        bend = 0.9 + 0.4 * torch.cos(3 * time)
+        upper = torch.stack([sign * 0.35 + 0 * lift, lift.cos(), -lift.sin()], -1)
+        lower = torch.stack([-sign * 0.2 + 0 * bend, (lift + bend).cos(), -(lift + bend).sin()], -1)
+        bones = torch.nn.functional.normalize(torch.stack([upper, lower], 1), dim=-1)
+        bones = bones * torch.tensor([0.2686, 0.2888])[:, None]
+        ends = joints[:, ROW[f"shoulder_{side}"], None] + bones.cumsum(1)
+        joints[:, ROW[f"elbow_{side}"]], joints[:, ROW[f"hand_{side}"]] = ends.unbind(1)
+    angles = torch.tensor([0.0, 0.0, turn], dtype=torch.float64)
+    turned = scale * joints @ euler_to_matrix(angles, "zxy").mT
+    return turned + torch.tensor([0.05, -0.2, depth])
+
+
+def pixels(joints, noise=0.0, seed=0):
+    uv = 525.0 * joints[..., :2] / joints[..., 2:] + torch.tensor([319.5, 239.5])
+    generator = torch.Generator().manual_seed(seed)
+    return uv + noise * torch.randn(uv.shape, generator=generator, dtype=uv.dtype)
+
+
+def tracker(**options):
+    return UpperBodyTracker(PRIOR, CAMERA, "articulated", fps=30.0, **options)
+
+
+def bones(joints, side):
+    ends = [joints[..., ROW[f"{j}_{side}"], :] for j in ("shoulder", "elbow", "hand")]
+    return ends[1] - ends[0], ends[2] - ends[1]
+
+
+def test_a_waving_body_is_followed_in_space():
+    joints = body()
+    found = tracker()(pixels(joints, 2.0)[None]).joints3d[0]
+    settled = slice(15, None)
+    off = torch.linalg.vector_norm(found - joints, dim=-1)[settled]
+    apart = found - found[:, [ROW["neck"]]] - (joints - joints[:, [ROW["neck"]]])
+    still = torch.linalg.vector_norm(joints - joints[0], dim=-1)
+    assert float(torch.linalg.vector_norm(apart, dim=-1)[settled].mean()) < 0.1
+    assert float(off.mean()) < 0.35  # the scale of a body is not to be seen
+    assert float(still.max()) > 0.2
+    for side in ("left", "right"):
+        for bone, true in zip(bones(found, side), bones(joints, side), strict=True):
+            assert float((bone[settled, 2] * true[settled, 2] > 0).double().mean()) > 0.9
+
+
+def test_bones_keep_their_lengths():
+    found = tracker()(pixels(body(150), 3.0)[None]).joints3d[0, 90:]
+    for side in ("left", "right"):
+        for bone in bones(found, side):
+            length = torch.linalg.vector_norm(bone, dim=-1)
+            assert float(length.std() / length.mean()) < 0.02
+
+
+@pytest.mark.parametrize("turn", [-2.4, -0.9, 0.9, 3.0])
+def test_turned_bodies_are_seen_as_turned(turn):
+    joints = body(45, turn=turn)
+    found = tracker()(pixels(joints, 2.0)[None]).joints3d[0]
+    width = found[:, ROW["shoulder_left"]] - found[:, ROW["shoulder_right"]]
+    true = joints[:, ROW["shoulder_left"]] - joints[:, ROW["shoulder_right"]]
+    cosine = torch.nn.functional.cosine_similarity(width[-1], true[-1], dim=0)
+    assert float(cosine) > math.cos(math.radians(25))
+
+
+def test_scale_and_depth_are_one():
+    """A body twice as large at twice the distance has the same pixels, so the scale stays the prior's."""
+    torch.testing.assert_close(pixels(2 * body(12)), pixels(body(12)))
+    near, far = (
+        tracker()(pixels(j)[None]).joints3d[0, -1] for j in (body(12), body(12, depth=4.4))
+    )
+    assert float(far[ROW["neck"], 2] / near[ROW["neck"], 2]) > 1.5
+    upper = torch.linalg.vector_norm(bones(far, "left")[0])
+    torch.testing.assert_close(upper, torch.linalg.vector_norm(bones(near, "left")[0]))
+
+
+def test_the_prior_may_come_from_a_file(tmp_path):
+    file = tmp_path / "arms.safetensors"
+    shipped_arm_prior().save(file)
+    uv = pixels(body(4), 3.0)[None]
+    torch.testing.assert_close(
+        tracker(arms=str(file))(uv).joints3d, tracker()(uv).joints3d, rtol=0, atol=1e-9
+    )
+
+
+def test_a_stream_gives_the_numbers_of_the_whole_recording():
+    uv = pixels(body(20), 3.0)
+    uv[5:9, ROW["elbow_left"]] = torch.nan
+    uv[7:12, ROW["hand_right"]] = torch.nan
+    uv[10] = torch.nan
+    whole = tracker()(uv[None])
+    live = tracker()
+    state = live.init(1)
+    for t, frame in enumerate(uv):
+        state, pose = live.step(state, frame[None])
+        torch.testing.assert_close(pose.joints3d, whole.joints3d[:, t], rtol=0, atol=1e-9)
+        torch.testing.assert_close(pose.log_evidence, whole.log_evidence[:, t], rtol=0, atol=1e-9)
+    assert bool(whole.joints3d.isfinite().all())
+
+
+def test_sequences_of_a_batch_do_not_know_of_each_other():
+    uv = torch.stack([pixels(body(18), 3.0), pixels(body(18, turn=0.5, depth=3.0), 3.0, seed=1)])
+    uv[1, 6:, ROW["elbow_left"]] = torch.nan
+    together = tracker()(uv, lengths=torch.tensor([18, 11]))
+    for row, n in enumerate((18, 11)):
+        alone = tracker()(uv[row : row + 1, :n])
+        torch.testing.assert_close(together.joints3d[row, :n], alone.joints3d[0], rtol=0, atol=1e-7)
+    last = together.joints3d[1, 10]
+    torch.testing.assert_close(together.joints3d[1, 11:], last.expand(7, 8, 3), rtol=0, atol=0)
+
+
+SUBSETS = (
+    ("head", "neck", "hand_left", "hand_right"),
+    ("neck", "hand_left", "hand_right"),
+    ("shoulder_left", "shoulder_right", "elbow_left", "elbow_right"),
+    ("head", "hand_left"),
+)
+
+
+@pytest.mark.parametrize("names", SUBSETS)
+def test_any_subset_gives_poses_and_covariances(names):
+    rows = [ROW[name] for name in names]
+    poses = tracker()(pixels(body(8), 3.0)[None, :, rows], names=names)
+    assert bool(poses.joints3d.isfinite().all())
+    assert bool((torch.linalg.eigvalsh(poses.covariance3d) > 0).all())
+    assert bool((torch.linalg.eigvalsh(poses.covariance2d) > 0).all())
+    assert bool(poses.observed[..., [i for i in rows if i != ROW["neck"]]].all())
+
+
+def test_hidden_joints_are_less_sure():
+    uv = pixels(body(20), 3.0)
+    rows = [i for i, name in enumerate(UPPER_BODY) if not name.startswith("elbow")]
+    all_, some = (
+        tracker()(uv[None, :, r], names=[UPPER_BODY[i] for i in r]) for r in (list(range(8)), rows)
+    )
+    elbows = [ROW["elbow_left"], ROW["elbow_right"]]
+    trace = [p.covariance3d[0, :, elbows].diagonal(dim1=-2, dim2=-1).sum(-1) for p in (all_, some)]
+    assert float(trace[0].mean()) < float(trace[1].mean())
+
+
+def test_wrists_end_shorter_forearms_than_hands():
+    uv = pixels(body(6), 3.0)[None]
+    lengths = []
+    for end in ("hand", "wrist"):
+        names = [name.replace("hand", end) for name in UPPER_BODY]
+        found = tracker()(uv, names=names).joints3d[0, 0]
+        lengths.append(float(torch.linalg.vector_norm(bones(found, "left")[1])))
+    assert lengths[1] < 0.85 * lengths[0]

@@ -1,0 +1,211 @@
+"""Fit a prior over arms that knows no camera, to recordings of any sets together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from torchpose.errors import InputError
+from torchpose.io import Recording
+from torchpose.math._gaussian import symmetrise
+from torchpose.priors._arms import ArmPrior, ArmPriorInfo
+from torchpose.priors._gaussian_mixture import GaussianMixture
+from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
+from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM
+
+__all__ = ["arm_directions", "fit_arm_prior", "upright_axes"]
+
+_LEAST_SPREAD = 0.04  # of the log of a length over persons: fewer persons know no less
+_OUTLYING = 0.25  # log of a length beyond which a joint means something else
+_FEW = 4.0  # persons whose weight a default spread has
+_DEFAULT_SPREAD = torch.tensor([0.07, 0.07, 0.09, 0.12, 0.10], dtype=torch.float64)
+_DEFAULT_LENGTHS = torch.tensor([0.27, 0.24, 0.30, 0.32, 0.19], dtype=torch.float64)
+_FLOOR = 0.01  # variance added to each coordinate of a direction: a tenth of a radian
+_TILT = 8.0  # degrees by which cameras stand askew to what they look at
+_RATE = 30.0
+_ARMS = (LEFT_ARM, RIGHT_ARM)
+_SHOULDERS = tuple(UPPER_BODY.index(f"shoulder_{side}") for side in ("left", "right"))
+
+
+def upright_axes(across: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Return the rotation from camera axes to upright axes whose x is the level part of a direction.
+
+    Args:
+        across: from the right to the left shoulder, camera axes.
+    """
+    level = across * across.new_tensor([1.0, 0.0, 1.0])
+    x = normalize(level, dim=-1)
+    down = torch.zeros_like(x)
+    down[..., 1] = 1.0
+    return torch.stack([x, down, torch.linalg.cross(x, down)], -2)
+
+
+def arm_directions(joints: Float[Tensor, "N 8 3"]) -> Float[Tensor, "N 2 6"]:
+    """Return the directions of both bones of left and mirrored right arms in upright axes; see `ArmPrior`.
+
+    Args:
+        joints: in the order of `UPPER_BODY`, camera axes; NaN where missing.
+    """
+    left, right = (joints[:, i] for i in _SHOULDERS)
+    axes = upright_axes(left - right)
+    arms = []
+    for arm, sign in zip(_ARMS, (1.0, -1.0), strict=True):
+        hand, elbow, shoulder = (joints[:, i] for i in arm[:3])
+        bones = torch.stack([elbow - shoulder, hand - elbow], 1)
+        turned = normalize(bones, dim=-1) @ axes.mT
+        arms.append((turned * turned.new_tensor([sign, 1.0, 1.0])).flatten(1))
+    return torch.stack(arms, 1)
+
+
+class _Person(NamedTuple):
+    """What the recordings of a person say: directions [N, 6], and the medians of lengths [5]."""
+
+    directions: Tensor
+    lengths: Tensor
+
+
+def fit_arm_prior(
+    recordings: Sequence[Sequence[Recording]],
+    n_components: int = 48,
+    seed: int = 0,
+    *,
+    n_samples: int = 40_000,
+    shares: Sequence[float] | None = None,
+    broad: float = 0.1,
+    info: ArmPriorInfo | None = None,
+) -> ArmPrior:
+    """Fit a mixture over directions of limbs, and lengths over persons, to sets of recordings.
+
+    Each set has its share of the samples, whatever its size, so that one large set does not decide what
+    people do. Samples are tilted and turned by random angles with a standard deviation of 8 degrees,
+    since cameras are not level.
+
+    Args:
+        recordings: of each set, in camera axes. n_components: Gaussians. seed: of samples and start.
+        n_samples: arms that are drawn. shares: of each set; equal by default.
+        broad: share of the part that expects nothing. info: what is said about the fit.
+
+    Raises:
+        InputError: no set, or one without a frame in which an arm and both shoulders are known.
+    """
+    if not recordings or not all(recordings):
+        raise InputError("a prior over arms needs sets of at least one recording, got none")
+    shares = [1 / len(recordings)] * len(recordings) if shares is None else list(shares)
+    generator = torch.Generator().manual_seed(seed)
+    samples, lengths, persons, trust = [], [], [], []
+    for of_set, share in zip(recordings, shares, strict=True):
+        by_person = _persons(of_set)
+        directions = torch.cat([person.directions for person in by_person.values()])
+        if not len(directions):
+            raise InputError("a set of recordings has no frame with an arm and both shoulders")
+        count = round(n_samples * share / sum(shares))
+        rows = torch.randint(len(directions), (count,), generator=generator)
+        samples.append(directions[rows])
+        lengths += [person.lengths for person in by_person.values()]
+        persons += list(by_person)
+        trust += [share / sum(shares) / len(by_person)] * len(by_person)
+    points = _tilted(torch.cat(samples), generator)
+    mixture = GaussianMixture.fit(
+        points, n_components=n_components, seed=seed, max_iter=60, covariance_floor=_FLOOR
+    )
+    medians, spread = _length_statistics(
+        torch.stack(lengths), torch.tensor(trust, dtype=torch.float64)
+    )
+    rounded = GaussianMixture(
+        mixture.weights.detach(), mixture.means.detach(), symmetrise(mixture.covariances.detach())
+    )
+    return ArmPrior(rounded, medians, spread, broad, info or ArmPriorInfo(persons=tuple(persons)))
+
+
+def _persons(recordings: Sequence[Recording]) -> dict[str, _Person]:
+    """Return what each person's recordings say, at 30 frames a second."""
+    directions: dict[str, list[Tensor]] = {}
+    lengths: dict[str, list[Tensor]] = {}
+    for recording in recordings:
+        body = recording.upper_body(False)
+        step = max(1, round(float(recording.fps or _RATE) / _RATE))
+        joints = body.joints.double()[::step]
+        arms = arm_directions(joints).flatten(0, 1)
+        person = recording.person_id
+        directions.setdefault(person, []).append(arms[arms.isfinite().all(-1)])
+        lengths.setdefault(person, []).append(_lengths(recording, joints, body.hand, step))
+    return {
+        person: _Person(torch.cat(found), torch.cat(lengths[person]).nanmedian(0).values)
+        for person, found in directions.items()
+    }
+
+
+def _lengths(
+    recording: Recording, joints: Float[Tensor, "T 8 3"], hand: str | None, step: int
+) -> Float[Tensor, "T 5"]:
+    """Return the lengths of `ArmPrior` in each frame, NaN where they are not known."""
+
+    def apart(a: Tensor, b: Tensor) -> Tensor:
+        return torch.linalg.vector_norm(a - b, dim=-1)
+
+    names = dict(zip(UPPER_BODY, joints.unbind(1), strict=True))
+    unknown = torch.full_like(joints[:, 0, 0], math.nan)
+    arms, wrists = [], _wrists(recording, step)
+    for i, side in enumerate(("left", "right")):
+        elbow = names[f"elbow_{side}"]
+        ends = {hand: apart(names[f"hand_{side}"], elbow)}
+        if wrists is not None:
+            ends["wrist"] = apart(wrists[:, i], elbow)
+        upper = apart(elbow, names[f"shoulder_{side}"])
+        arms.append(torch.stack([upper, ends.get("wrist", unknown), ends.get("hand", unknown)], 1))
+    width = apart(names["shoulder_left"], names["shoulder_right"])
+    height = (
+        apart(names["head"], names["neck"])
+        if recording.upper_body(False).neck == "neck"
+        else unknown
+    )
+    return torch.cat([(arms[0] + arms[1]) / 2, width[:, None], height[:, None]], 1)
+
+
+def _wrists(recording: Recording, step: int) -> Tensor | None:
+    """Return both wrists [T, 2, 3] of recordings that have wrists beside hands."""
+    names = canonical_names(recording.names)
+    if not {"wrist_left", "wrist_right"} <= set(names):
+        return None
+    columns = [names.index(f"wrist_{side}") for side in ("left", "right")]
+    return recording.joints.double()[::step, columns]
+
+
+def _tilted(directions: Float[Tensor, "N 6"], generator: torch.Generator) -> Float[Tensor, "N 6"]:
+    """Return the directions as level cameras would see them that are tilted and turned at random."""
+    angles = torch.randn(2, len(directions), generator=generator, dtype=torch.float64)
+    (c, d), (s, r) = (f(angles * math.radians(_TILT)) for f in (torch.cos, torch.sin))
+    bones = directions.unflatten(-1, (2, 3))
+    x, y, z = bones.unbind(-1)
+    c, d, s, r = (value[:, None] for value in (c, d, s, r))
+    y, z = c * y - s * z, s * y + c * z
+    x, z = d * x + r * z, -r * x + d * z
+    return torch.stack([x, y, z], -1).flatten(1)
+
+
+def _length_statistics(
+    lengths: Float[Tensor, "P 5"], trust: Float[Tensor, " P"]
+) -> tuple[Tensor, Tensor]:
+    """Return the weighted median of each length, and the spread of its log, shrunk to what is usual.
+
+    Args:
+        lengths: of each person, NaN where not known. trust: weight of each person, of sum one.
+    """
+    logs = lengths.log()
+    known = logs.isfinite()
+    weight = torch.where(known, trust[:, None], 0.0)
+    count = known.sum(0)
+    order = logs.where(known, math.inf).argsort(0)
+    passed = weight.gather(0, order).cumsum(0) >= weight.sum(0) / 2
+    middle = logs.gather(0, order).gather(0, passed.to(torch.uint8).argmax(0, keepdim=True))[0]
+    centre = torch.where(count > 0, middle, _DEFAULT_LENGTHS.log())
+    off = torch.where(known, (logs - centre).clamp(-_OUTLYING, _OUTLYING), 0.0)
+    variance = (weight * off.square()).sum(0) / weight.sum(0).clamp_min(1e-12)
+    spread = ((count * variance + _FEW * _DEFAULT_SPREAD**2) / (count + _FEW)).sqrt()
+    return centre.exp(), spread.clamp_min(_LEAST_SPREAD)

@@ -1,0 +1,225 @@
+"""Hold hypotheses about both arms, weigh them, and tie them from frame to frame."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from torchpose.priors._arms import ArmPrior
+from torchpose.priors._gaussian_mixture import LOG_2PI
+from torchpose.upper_body._limb_nodes import nodes_anywhere, nodes_on_ray
+
+__all__ = ["ArmChain", "ArmInput", "ArmState", "Arms", "DirectionDensity"]
+
+_SLACK = 0.018  # metres: joints of recordings are not the ends of stiff bones
+_ANGLES = 17  # of a bone whose end is measured
+_AROUND = 68  # directions of one whose end is not
+_STEP = math.radians(7.0)  # of a direction from frame to frame at 30 frames a second
+_ANEW = 0.3  # share of an arm's belief that starts anew in a frame at 30 frames a second
+_RATE = 30.0
+_NOTHING = -60.0
+_ROWS = 2048  # directions at a time, so that what is worked out stays in the cache
+
+
+class ArmInput(NamedTuple):
+    """Measurements of both arms, the right one mirrored; shapes [B, 2, M] for M hypotheses of the root.
+
+    Attributes:
+        shoulder: [B, 2, M, 3], metres. rays: of elbow and hand, [B, 2, 2, 3]. known: [B, 2, 2].
+        std: of a pixel over the focal length, of elbow and hand with their near ends, [B, 2, 2].
+        axes: from camera to upright axes, [B, 2, M, 3, 3]. lengths: of both bones, [B, 2, M, 2].
+        slack: standard deviation of the ends of both bones for want of their lengths, [B, 2], metres.
+    """
+
+    shoulder: Tensor
+    rays: Tensor
+    known: Tensor
+    std: Tensor
+    axes: Tensor
+    lengths: Tensor
+    slack: Tensor
+
+
+class Arms(NamedTuple):
+    """Hypotheses about both arms.
+
+    Attributes:
+        directions: of upper arm and forearm in upright axes, [B, 2, M, N, 6].
+        log_weight: log of the likelihood times the node's share of the directions, [B, 2, M, N].
+        log_prior: log density of the prior, [B, 2, M, N].
+    """
+
+    directions: Tensor
+    log_weight: Tensor
+    log_prior: Tensor
+
+    @property
+    def log_evidence(self) -> Float[Tensor, "B 2 M"]:
+        """Return the log of the prior predictive density of what is measured of each arm."""
+        return torch.logsumexp(self.log_weight + self.log_prior, -1)
+
+
+class ArmState(NamedTuple):
+    """Belief about both arms after a frame.
+
+    Attributes:
+        directions: of the hypotheses, upright axes, [B, 2, N, 6]. weight: normalised, [B, 2, N].
+        log_evidence: of the frame, [B, 2].
+    """
+
+    directions: Tensor
+    weight: Tensor
+    log_evidence: Tensor
+
+
+class DirectionDensity:
+    """Log density of an `ArmPrior`, with what does not depend on the directions worked out once."""
+
+    def __init__(self, prior: ArmPrior) -> None:
+        mixture = prior.directions
+        k, dim = mixture.means.shape
+        factor = torch.linalg.cholesky(mixture.covariances.double())
+        eye = torch.eye(dim, dtype=factor.dtype, device=factor.device).expand(k, dim, dim)
+        inverse = torch.linalg.solve_triangular(factor, eye, upper=False)
+        self.rows = inverse.transpose(0, 1).reshape(dim * k, dim).mT.contiguous().float()
+        self.shift = (inverse @ mixture.means.double()[..., None])[..., 0].mT.reshape(-1).float()
+        logs = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        constant = mixture.weights.double().log() - 0.5 * dim * LOG_2PI - logs - prior.log_mass
+        self.constant = (constant + math.log1p(-prior.broad)).float()
+        self.broad = math.log(prior.broad) - 2 * math.log(4 * math.pi)
+        self.size = dim, k
+
+    def __call__(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
+        """Return log p(d_u, d_f), worked out in float32: unit vectors and a tenth of a radian."""
+        flat = directions.reshape(-1, 6).float()
+        parts = [self._known(rows) for rows in flat.split(_ROWS)]
+        known = torch.cat(parts).to(directions.dtype)
+        return torch.logaddexp(known, known.new_tensor(self.broad)).view(directions.shape[:-1])
+
+    def _known(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, " N"]:
+        """Return the log density of the mixture."""
+        off = torch.addmm(self.shift, rows, self.rows, beta=-1).square_()
+        squared = off.view(len(rows), *self.size).sum(1)
+        logs = squared.mul_(-0.5).add_(self.constant)
+        most = logs.amax(-1, keepdim=True)
+        # exp of what is far below is slow where it is denormal, and adds nothing
+        return (logs - most).clamp_min_(_NOTHING).exp_().sum(-1).log() + most[:, 0]
+
+
+class ArmChain:
+    """Point-mass filter over the directions of both bones of both arms.
+
+    A hypothesis of the frame before goes to one of this frame with the density of a heavy-tailed walk on
+    the directions, or starts anew from the prior:
+
+        p(x' | x) = (1 - e) t_4(x'; x, s^2) + e p(x')
+
+    Args:
+        density: of directions. fps: frames per second.
+    """
+
+    def __init__(self, density: DirectionDensity, fps: float) -> None:
+        self.density = density
+        self.step = _STEP * math.sqrt(_RATE / fps)
+        self.anew = 1 - (1 - _ANEW) ** (_RATE / fps)
+
+    def hypotheses(self, arm: ArmInput, angles: int = _ANGLES, around: int = _AROUND) -> Arms:
+        """Return hypotheses that agree with what is measured of each arm, for each hypothesis of the root.
+
+        Args:
+            arm: what is measured. angles: number of angles of a bone whose end is measured.
+            around: number of directions of one whose end is not.
+        """
+        count = angles * angles
+        known = arm.known[..., None, :]
+        patterns = {
+            (upper, lower): (known[..., 0] == upper) & (known[..., 1] == lower)
+            for upper in (True, False)
+            for lower in (True, False)
+        }
+        found: Arms | None = None
+        for (upper, lower), here in patterns.items():
+            if not bool(here.any()):
+                continue
+            sizes = (angles if upper else around), (angles if lower else around)
+            arms = self._weighed(arm, upper, lower, sizes, count)
+            found = arms if found is None else _where(here, arms, found)
+        assert found is not None
+        return found
+
+    def _weighed(
+        self, arm: ArmInput, upper: bool, lower: bool, sizes: tuple[int, int], count: int
+    ) -> Arms:
+        """Return the `count` weightiest hypotheses of arms of which these ends are measured."""
+        lengths, noise = arm.lengths, self._noise(arm)
+        start = arm.shoulder
+        ray = arm.rays[:, :, None, 0].expand_as(start)
+        first = (
+            nodes_on_ray(start, ray, lengths[..., 0], noise[..., 0], sizes[0])
+            if upper
+            else nodes_anywhere(start, lengths[..., 0], sizes[0])
+        )
+        start = first.ends
+        ray = arm.rays[:, :, None, None, 1].expand_as(start)
+        if not upper:  # the elbow is known as well as its directions are dense
+            grain = math.sqrt(4 * math.pi / sizes[0] / 12) * lengths[..., 0]
+            noise = (noise.square() + grain.square()[..., None]).sqrt()
+        length, std = (x[..., 1, None].expand(start.shape[:-1]) for x in (lengths, noise))
+        second = (
+            nodes_on_ray(start, ray, length, std, sizes[1])
+            if lower
+            else nodes_anywhere(start, length, sizes[1])
+        )
+        bones = first.directions[..., None, :].expand_as(second.directions), second.directions
+        directions = torch.cat([bone.flatten(-3, -2) @ arm.axes.mT for bone in bones], -1)
+        weight = (first.log_weight[..., None] + second.log_weight).flatten(-2)
+        prior = self.density(directions)
+        if weight.shape[-1] <= count:
+            return Arms(directions, weight, prior)
+        rows = (weight + prior).topk(count, -1).indices
+        chosen = directions.gather(-2, rows[..., None].expand(*rows.shape, 6))
+        return Arms(chosen, weight.gather(-1, rows), prior.gather(-1, rows))
+
+    @staticmethod
+    def _noise(arm: ArmInput) -> Float[Tensor, "B 2 M 2"]:
+        """Return the standard deviation across the rays of elbow and hand, metres."""
+        depth = arm.shoulder[..., 2:].clamp_min(0.1)
+        slack = arm.slack.square()[:, None, None] + _SLACK**2
+        return ((arm.std[:, :, None] * depth).square() + slack).sqrt()
+
+    def start(self, arms: Arms) -> ArmState:
+        """Return the belief after the first frame, of arms with one hypothesis of the root each."""
+        return _belief(arms, arms.log_prior[:, :, 0].exp())
+
+    def advance(self, state: ArmState, arms: Arms) -> ArmState:
+        """Return the belief after one more frame."""
+        directions, prior = arms.directions[:, :, 0], arms.log_prior[:, :, 0].exp()
+        apart = torch.cdist(state.directions, directions).square_()
+        scale = self.step**2
+        walk = (1 + apart / (4 * scale)).reciprocal_().square_().square_()
+        walk *= 6 / (16 * math.pi**2 * scale**2)
+        moved = (state.weight[..., None, :] @ walk)[..., 0, :]
+        return _belief(arms, (1 - self.anew) * moved + self.anew * prior)
+
+    @staticmethod
+    def mean_directions(state: ArmState) -> Float[Tensor, "B 2 2 3"]:
+        """Return the mean direction of each bone, upright axes."""
+        mean = (state.weight[..., None] * state.directions).sum(-2)
+        return normalize(mean.unflatten(-1, (2, 3)), dim=-1)
+
+
+def _belief(arms: Arms, predicted: Float[Tensor, "B 2 N"]) -> ArmState:
+    log_weight = arms.log_weight[:, :, 0] + predicted.clamp_min(1e-30).log()
+    evidence = torch.logsumexp(log_weight, -1)
+    weight = (log_weight - evidence[..., None]).exp()
+    return ArmState(arms.directions[:, :, 0], weight, evidence)
+
+
+def _where(here: Bool[Tensor, "B 2 1"], new: Arms, old: Arms) -> Arms:
+    picks = zip((here[..., None, None], here[..., None], here[..., None]), new, old, strict=True)
+    return Arms(*(torch.where(mask, a, b) for mask, a, b in picks))
