@@ -16,10 +16,8 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from torchpose._core.module_state import derived
-from torchpose.camera._projection import project
 from torchpose.filters._base import Generators
-from torchpose.filters._outputs import FilterOutput
-from torchpose.math._rotations import RotationOrder, euler_to_matrix, matrix_to_euler
+from torchpose.math._rotations import RotationOrder
 from torchpose.priors._arms import LENGTHS, ArmPrior, shipped_arm_prior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._arm_chain import (
@@ -29,13 +27,8 @@ from torchpose.upper_body._arm_chain import (
     ArmState,
     DirectionDensity,
 )
-from torchpose.upper_body._estimator import (
-    ArmJoints,
-    Estimates,
-    Estimator,
-    ReadOut,
-    TrackerModel,
-)
+from torchpose.upper_body._articulated_poses import FramePose, estimates_of, upright
+from torchpose.upper_body._estimator import ArmJoints, Estimates, Estimator, TrackerModel
 from torchpose.upper_body._measurements import MeasuredJoints
 from torchpose.upper_body._root_grid import (
     SHRUG,
@@ -104,16 +97,6 @@ class _Frame(NamedTuple):
     std: Tensor
 
 
-class _Pose(NamedTuple):
-    """Estimate of one frame: joints and covariances in camera axes, turn, and evidence of both arms."""
-
-    joints: Tensor
-    covs: Tensor
-    turn: Tensor
-    log_evidence: Tensor
-    log_weights: Tensor
-
-
 class ArticulatedFilter(Estimator):
     """Estimator of arms whose bones keep their lengths, from any of the eight joints.
 
@@ -168,7 +151,7 @@ class ArticulatedFilter(Estimator):
         for frame in self._frames(measured):
             state, pose = self._step(state, frame)
             poses.append(pose)
-        return state, self._estimates(poses)
+        return state, estimates_of(poses, self.matrix, self.order)
 
     def forward(
         self,
@@ -184,7 +167,7 @@ class ArticulatedFilter(Estimator):
         for frame in tqdm(self._frames(measured), disable=not progress, desc="frames"):
             state, pose = self._step(state, frame)
             poses.append(pose)
-        return self._estimates(poses, lengths)
+        return estimates_of(poses, self.matrix, self.order, lengths)
 
     def _frames(self, measured: MeasuredJoints) -> list[_Frame]:
         """Return the frames one by one, as rays."""
@@ -197,7 +180,7 @@ class ArticulatedFilter(Estimator):
         parts = zip(rays.unbind(1), measured.mask.unbind(1), std.unbind(1), strict=True)
         return [_Frame(*part) for part in parts]
 
-    def _step(self, state: ArticulatedState, frame: _Frame) -> tuple[ArticulatedState, _Pose]:
+    def _step(self, state: ArticulatedState, frame: _Frame) -> tuple[ArticulatedState, FramePose]:
         """Return the next state and the estimate of one frame."""
         lengths = self._lengths(state.lengths)
         slack = lengths[:, :2] * state.lengths.precision[:, :2].rsqrt()
@@ -273,7 +256,7 @@ class ArticulatedFilter(Estimator):
         noise = torch.where(frame.known[:, [_SHOULDERS, _ELBOWS, _HANDS]], noise, 0.0)
         std = torch.stack([noise[:, 0] + noise[:, 1], noise[:, 1] + noise[:, 2]], -1).sqrt()
         known = torch.stack([frame.known[:, _ELBOWS], frame.known[:, _HANDS]], -1)
-        axes = _upright(root.turn)
+        axes = upright(root.turn)
         axes = torch.stack([axes, flip[1, :, None] * axes * flip[1]], 1)
         bones = lengths[:, None, None, :2].expand(*shoulder.shape[:3], 2)
         arm = ArmInput(shoulder, rays, known, std, axes, bones, slack)
@@ -349,10 +332,10 @@ class ArticulatedFilter(Estimator):
         middle: Tensor,
         lengths: Tensor,
         size: TorsoLengths,
-    ) -> _Pose:
+    ) -> FramePose:
         """Return joints and covariances in camera axes."""
         flip = root.depth.new_tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]])
-        axes = _upright(root.turn[:, 0])
+        axes = upright(root.turn[:, 0])
         shoulder = self._shoulders(frame, root, middle, lengths[:, 2])[:, :, 0]
         bones = self.chain.mean_directions(belief) * flip[:, None]
         bones = bones @ axes[:, None] * lengths[:, None, :2, None]
@@ -372,7 +355,7 @@ class ArticulatedFilter(Estimator):
         count = frame.known[:, [_ELBOWS, _HANDS]].sum(1).to(root.depth)
         area = 2 * root.depth.log() - (self.matrix[0, 0] * self.matrix[1, 1]).log()
         evidence = torch.where(seen, belief.log_evidence + count * area, 0.0)
-        return _Pose(joints, covs, root.turn[:, 0], evidence, weight)
+        return FramePose(joints, covs, root.turn[:, 0], evidence, weight)
 
     def _covs(
         self, belief: ArmState, joints: Tensor, axes: Tensor, lengths: Tensor, flip: Tensor
@@ -387,38 +370,6 @@ class ArticulatedFilter(Estimator):
         apart = joints - joints[:, _JOINT["neck"], None]
         return covs + self.spread[0] ** 2 * apart[..., :, None] * apart[..., None, :]
 
-    def _estimates(self, poses: list[_Pose], lengths: Tensor | None = None) -> Estimates:
-        """Return the estimates of both arms and the poses; past the lengths the last ones again."""
-        stacked = _Pose(*(torch.stack(values, 1) for values in zip(*poses, strict=True)))
-        if lengths is not None:
-            frames = torch.arange(len(poses), device=lengths.device)
-            past = frames >= lengths[:, None]
-            last = frames.minimum(lengths[:, None] - 1).to(stacked.joints.device)
-            rows = torch.arange(len(last), device=last.device)[:, None]
-            stacked = _Pose(*(values[rows, last] for values in stacked))
-            unmeasured = past.to(last.device)[..., None]
-            evidence = stacked.log_evidence.masked_fill(unmeasured, 0.0)
-            stacked = stacked._replace(log_evidence=evidence)
-        neck = stacked.joints[:, :, _JOINT["neck"]]
-        back = _upright(stacked.turn)
-        joints = (stacked.joints - neck[:, :, None]) @ back.mT
-        covs = back[:, :, None] @ stacked.covs @ back.mT[:, :, None]
-        angles = matrix_to_euler(back.mT, self.order)
-        turned = euler_to_matrix(angles, self.order)
-        uv = project(joints, self.matrix, turned, neck)[..., :2]
-        uv_covs = _pixel_covs(stacked.joints, stacked.covs, self.matrix)
-        reading = ReadOut(joints, covs, angles, neck, uv, uv_covs)
-        outputs = []
-        failed = torch.full((len(neck),), -1, dtype=torch.long, device=neck.device)
-        for arm in (0, 1):
-            outputs.append(
-                FilterOutput(
-                    joints.flatten(2), stacked.log_weights[:, :, arm],
-                    stacked.log_evidence[:, :, arm], None, failed,
-                )
-            )  # fmt: skip
-        return Estimates(outputs[0], outputs[1], None, reading)
-
 
 def _kept(owner: nn.Module, path: str | None, like: Tensor) -> ArmPrior:
     """Return the prior of a file, or that of the package; read once for each tracker."""
@@ -428,24 +379,3 @@ def _kept(owner: nn.Module, path: str | None, like: Tensor) -> ArmPrior:
         (like,),
         lambda: ArmPrior.load(path) if path else shipped_arm_prior(),
     )
-
-
-def _upright(turn: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
-    """Return the rotation from camera axes to upright axes of shoulders that are turned by psi."""
-    c, s = turn.cos(), turn.sin()
-    zero, one = torch.zeros_like(c), torch.ones_like(c)
-    rows = ((c, zero, -s), (zero, one, zero), (s, zero, c))
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
-
-
-def _pixel_covs(
-    joints: Float[Tensor, "*batch 3"],
-    covs: Float[Tensor, "*batch 3 3"],
-    matrix: Float[Tensor, "3 3"],
-) -> Float[Tensor, "*batch 2 2"]:
-    """Return the covariances of the joints' pixels, to first order."""
-    depth = joints[..., 2:].clamp_min(0.1)
-    eye = torch.eye(2).to(joints).expand(*joints.shape[:-1], 2, 2)
-    slopes = torch.cat([eye, -(joints[..., :2] / depth)[..., None]], -1) / depth[..., None]
-    slopes = matrix[:2, :2] @ slopes
-    return slopes @ covs @ slopes.mT
