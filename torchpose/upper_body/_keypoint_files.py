@@ -42,6 +42,7 @@ class TrackSettings:
             window-mixture and mkf-fixed.
         n_particles: particles of the pf methods (default 10000).
         n_tracks: tracks of mkf-sampled and mkf-split.
+        arms: file of a prior over arms, of articulated; by default the one that comes with torchpose.
         frame: axes of the 3D poses: of the camera (default) or of the body.
         static_camera: let the body turn in front of a camera that stays where it is.
         window: deprecated: false stands for the method mkf-fixed, true for the default.
@@ -64,6 +65,7 @@ class TrackSettings:
     smoothing: int | str | None = None
     n_particles: int | None = None
     n_tracks: int | None = None
+    arms: str | None = None
     frame: str = "camera"
     static_camera: bool = False
     window: bool | None = None
@@ -97,7 +99,7 @@ class TrackSettings:
             if value is not None:
                 _check_count(name, value, method)
                 options[name] = value
-        return options
+        return options if self.arms is None else options | {"arms": self.arms}
 
 
 class Prepared(NamedTuple):

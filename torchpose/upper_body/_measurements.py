@@ -165,7 +165,7 @@ def place_measured_neck(
     middle = torch.where(
         both[..., None], (uv[..., _LEFT, :] + uv[..., _RIGHT, :]) / 2, uv[..., _NECK, :]
     )
-    known, head = mask[..., _NECK] | both, mask[..., _HEAD]
+    known, head = mask[..., _NECK] | both, mask[..., _HEAD].clone()
     above = middle - uv.new_tensor([0.0, _NECK_HEIGHT * pixels_per_metre])
     between = middle + neck.fraction * (uv[..., _HEAD, :] - middle)
     place = torch.where(head[..., None], between, above)
