@@ -13,13 +13,13 @@ from torch.nn.functional import normalize
 
 from torchpose.errors import InputError
 from torchpose.io import Recording
-from torchpose.math._gaussian import symmetrise
 from torchpose.priors._arms import ArmPrior, ArmPriorInfo
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
-from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM
+from torchpose.skeleton._torso import upright_axes
+from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM, UpperBody
 
-__all__ = ["arm_directions", "fit_arm_prior", "upright_axes"]
+__all__ = ["arm_directions", "fit_arm_prior"]
 
 _LEAST_SPREAD = 0.04  # of the log of a length over persons: fewer persons know no less
 _OUTLYING = 0.25  # log of a length beyond which a joint means something else
@@ -33,19 +33,6 @@ _ARMS = (LEFT_ARM, RIGHT_ARM)
 _SHOULDERS = tuple(UPPER_BODY.index(f"shoulder_{side}") for side in ("left", "right"))
 
 
-def upright_axes(across: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Return the rotation from camera axes to upright axes whose x is the level part of a direction.
-
-    Args:
-        across: from the right to the left shoulder, camera axes.
-    """
-    level = across * across.new_tensor([1.0, 0.0, 1.0])
-    x = normalize(level, dim=-1)
-    down = torch.zeros_like(x)
-    down[..., 1] = 1.0
-    return torch.stack([x, down, torch.linalg.cross(x, down)], -2)
-
-
 def arm_directions(joints: Float[Tensor, "N 8 3"]) -> Float[Tensor, "N 2 6"]:
     """Return the directions of both bones of left and mirrored right arms in upright axes; see `ArmPrior`.
 
@@ -53,7 +40,8 @@ def arm_directions(joints: Float[Tensor, "N 8 3"]) -> Float[Tensor, "N 2 6"]:
         joints: in the order of `UPPER_BODY`, camera axes; NaN where missing.
     """
     left, right = (joints[:, i] for i in _SHOULDERS)
-    axes = upright_axes(left - right)
+    across = left - right
+    axes = upright_axes(torch.atan2(-across[..., 2], across[..., 0]))
     arms = []
     for arm, sign in zip(_ARMS, (1.0, -1.0), strict=True):
         hand, elbow, shoulder = (joints[:, i] for i in arm[:3])
@@ -78,7 +66,6 @@ def fit_arm_prior(
     n_samples: int = 40_000,
     shares: Sequence[float] | None = None,
     broad: float = 0.1,
-    info: ArmPriorInfo | None = None,
 ) -> ArmPrior:
     """Fit a mixture over directions of limbs, and lengths over persons, to sets of recordings.
 
@@ -89,7 +76,7 @@ def fit_arm_prior(
     Args:
         recordings: of each set, in camera axes. n_components: Gaussians. seed: of samples and start.
         n_samples: arms that are drawn. shares: of each set; equal by default.
-        broad: share of the part that expects nothing. info: what is said about the fit.
+        broad: share of the part that expects nothing.
 
     Raises:
         InputError: no set, or one without a frame in which an arm and both shoulders are known.
@@ -117,10 +104,7 @@ def fit_arm_prior(
     medians, spread = _length_statistics(
         torch.stack(lengths), torch.tensor(trust, dtype=torch.float64)
     )
-    rounded = GaussianMixture(
-        mixture.weights.detach(), mixture.means.detach(), symmetrise(mixture.covariances.detach())
-    )
-    return ArmPrior(rounded, medians, spread, broad, info or ArmPriorInfo(persons=tuple(persons)))
+    return ArmPrior(mixture, medians, spread, broad, ArmPriorInfo(persons=tuple(persons)))
 
 
 def _persons(recordings: Sequence[Recording]) -> dict[str, _Person]:
@@ -128,13 +112,13 @@ def _persons(recordings: Sequence[Recording]) -> dict[str, _Person]:
     directions: dict[str, list[Tensor]] = {}
     lengths: dict[str, list[Tensor]] = {}
     for recording in recordings:
-        body = recording.upper_body(False)
+        body = recording.upper_body()
         step = max(1, round(float(recording.fps or _RATE) / _RATE))
         joints = body.joints.double()[::step]
         arms = arm_directions(joints).flatten(0, 1)
         person = recording.person_id
         directions.setdefault(person, []).append(arms[arms.isfinite().all(-1)])
-        lengths.setdefault(person, []).append(_lengths(recording, joints, body.hand, step))
+        lengths.setdefault(person, []).append(_lengths(recording, joints, body, step))
     return {
         person: _Person(torch.cat(found), torch.cat(lengths[person]).nanmedian(0).values)
         for person, found in directions.items()
@@ -142,7 +126,7 @@ def _persons(recordings: Sequence[Recording]) -> dict[str, _Person]:
 
 
 def _lengths(
-    recording: Recording, joints: Float[Tensor, "T 8 3"], hand: str | None, step: int
+    recording: Recording, joints: Float[Tensor, "T 8 3"], body: UpperBody, step: int
 ) -> Float[Tensor, "T 5"]:
     """Return the lengths of `ArmPrior` in each frame, NaN where they are not known."""
 
@@ -154,17 +138,13 @@ def _lengths(
     arms, wrists = [], _wrists(recording, step)
     for i, side in enumerate(("left", "right")):
         elbow = names[f"elbow_{side}"]
-        ends = {hand: apart(names[f"hand_{side}"], elbow)}
+        ends = {body.hand: apart(names[f"hand_{side}"], elbow)}
         if wrists is not None:
             ends["wrist"] = apart(wrists[:, i], elbow)
         upper = apart(elbow, names[f"shoulder_{side}"])
         arms.append(torch.stack([upper, ends.get("wrist", unknown), ends.get("hand", unknown)], 1))
     width = apart(names["shoulder_left"], names["shoulder_right"])
-    height = (
-        apart(names["head"], names["neck"])
-        if recording.upper_body(False).neck == "neck"
-        else unknown
-    )
+    height = apart(names["head"], names["neck"]) if body.neck == "neck" else unknown
     return torch.cat([(arms[0] + arms[1]) / 2, width[:, None], height[:, None]], 1)
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchpose._core.checks import check_shape
 from torchpose.errors import PriorError
-from torchpose.math._rotations import procrustes
+from torchpose.math._rotations import euler_to_matrix, procrustes
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
 __all__ = [
@@ -28,6 +28,7 @@ __all__ = [
     "learn_neck_offset",
     "onto_torso",
     "place_neck",
+    "upright_axes",
 ]
 
 ALIGN_JOINTS = (3, 4, 2, 5)
@@ -47,6 +48,18 @@ def in_torso_axes(joints: Float[Tensor, "*batch 8 3"]) -> Float[Tensor, "*batch 
     torso = joints.new_tensor(TORSO).expand(*joints.shape[:-2], -1, -1)
     motion = procrustes(joints[..., chosen, :], torso)
     return joints @ motion.rotation.mT + motion.translation[..., None, :]
+
+
+def upright_axes(turn: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
+    """Return the rotation from camera axes to upright axes that turn with the shoulders.
+
+    x points to the person's left along the level part of the line between the shoulders, y down.
+
+    Args:
+        turn: of the shoulders about the vertical, radians: (cos, 0, -sin) points to the left one.
+    """
+    level = torch.zeros_like(turn)
+    return euler_to_matrix(torch.stack([level, level, turn], -1), "zxy").mT
 
 
 def onto_torso(

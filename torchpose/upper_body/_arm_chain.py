@@ -80,16 +80,17 @@ class ArmState(NamedTuple):
 class DirectionDensity:
     """Log density of an `ArmPrior`, with what does not depend on the directions worked out once."""
 
-    def __init__(self, prior: ArmPrior) -> None:
-        mixture = prior.directions
-        k, dim = mixture.means.shape
-        factor = torch.linalg.cholesky(mixture.covariances.double())
+    def __init__(self, prior: ArmPrior, device: torch.device | None = None) -> None:
+        parts = (*prior.directions.parameters_tuple(), prior.log_mass)
+        weights, means, covariances, log_mass = (part.to(device).double() for part in parts)
+        k, dim = means.shape
+        factor = torch.linalg.cholesky(covariances)
         eye = torch.eye(dim, dtype=factor.dtype, device=factor.device).expand(k, dim, dim)
         inverse = torch.linalg.solve_triangular(factor, eye, upper=False)
         self.rows = inverse.transpose(0, 1).reshape(dim * k, dim).mT.contiguous().float()
-        self.shift = (inverse @ mixture.means.double()[..., None])[..., 0].mT.reshape(-1).float()
+        self.shift = (inverse @ means[..., None])[..., 0].mT.reshape(-1).float()
         logs = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        constant = mixture.weights.double().log() - 0.5 * dim * LOG_2PI - logs - prior.log_mass
+        constant = weights.log() - 0.5 * dim * LOG_2PI - logs - log_mass
         self.constant = (constant + math.log1p(-prior.broad)).float()
         self.broad = math.log(prior.broad) - 2 * math.log(4 * math.pi)
         self.size = dim, k
@@ -142,15 +143,18 @@ class ArmChain:
             for upper in (True, False)
             for lower in (True, False)
         }
-        found: Arms | None = None
-        for (upper, lower), here in patterns.items():
-            if not bool(here.any()):
-                continue
-            sizes = (angles if upper else around), (angles if lower else around)
-            arms = self._weighed(arm, upper, lower, sizes, count)
-            found = arms if found is None else _where(here, arms, found)
-        assert found is not None
-        return found
+        there = {ends: here for ends, here in patterns.items() if bool(here.any())}
+        found = {
+            (upper, lower): self._weighed(
+                arm, upper, lower, (angles if upper else around, angles if lower else around), count
+            )
+            for upper, lower in there
+        }
+        first, *others = found
+        arms = found[first]
+        for ends in others:
+            arms = _where(there[ends], found[ends], arms)
+        return arms
 
     def _weighed(
         self, arm: ArmInput, upper: bool, lower: bool, sizes: tuple[int, int], count: int

@@ -17,9 +17,9 @@ from tqdm.auto import tqdm
 
 from torchpose._core.module_state import derived
 from torchpose.filters._base import Generators
-from torchpose.math._rotations import RotationOrder
 from torchpose.priors._arms import LENGTHS, ArmPrior, shipped_arm_prior
 from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.skeleton._torso import upright_axes
 from torchpose.upper_body._arm_chain import (
     ArmChain,
     ArmInput,
@@ -27,7 +27,7 @@ from torchpose.upper_body._arm_chain import (
     ArmState,
     DirectionDensity,
 )
-from torchpose.upper_body._articulated_poses import FramePose, estimates_of, upright
+from torchpose.upper_body._articulated_poses import FramePose, estimates_of
 from torchpose.upper_body._estimator import ArmJoints, Estimates, Estimator, TrackerModel
 from torchpose.upper_body._measurements import MeasuredJoints
 from torchpose.upper_body._root_grid import (
@@ -57,6 +57,7 @@ _MOST = 0.1  # of a log-length that one frame may change it by
 _SHARE = 0.2  # seconds over which frames say the same about a length
 _WIDTH_STD, _HEIGHT_STD = 0.05, 0.05  # metres: shoulders and heads move in their torsos
 _MODE = math.radians(45.0)  # turns farther than that from the likeliest are another mode
+_SIDES = ((1.0, 1.0, 1.0), (-1.0, 1.0, 1.0))  # right arms are mirrored
 _TORSO_STD = 0.03  # metres: of torso joints in space
 
 
@@ -120,18 +121,22 @@ class ArticulatedFilter(Estimator):
         owner = model.owner
         like = model.measurement_cov
         self.prior = arms if isinstance(arms, ArmPrior) else _kept(owner, arms, like)
-        sources = (self.prior.directions.means, self.prior.log_mass)
+        sources = (*self.prior.directions.parameters_tuple(), self.prior.log_mass)
         density = derived(
-            owner, ("arm density",), sources, lambda: DirectionDensity(self.prior.to(like.device))
+            owner,
+            ("arm density", self.prior.broad, like.device),
+            sources,
+            lambda: DirectionDensity(self.prior, like.device),
         )
         self.stride = max(1, round(_SHARE * model.rate))
         self.chain = ArmChain(density, model.rate)
-        self.grid = RootGrid(model.rate, like)
+        self.grid = derived(
+            owner, ("root grid", model.rate), (like,), lambda: RootGrid(model.rate, like)
+        )
         hand = "forearm" if (model.hand or model.prior.info.hand) == "wrist" else "forearm_to_hand"
         rows = [LENGTHS.index(n) for n in ("upper_arm", hand, "shoulder_width", "head_height")]
         self.usual = self.prior.lengths[rows].to(like)
         self.spread = self.prior.spread[rows].to(like)
-        self.order: RotationOrder = model.prior.info.rotation_order  # type: ignore[assignment]
         self.matrix = model.prior.info.matrix.to(like)
 
     def init(
@@ -147,11 +152,8 @@ class ArticulatedFilter(Estimator):
         self, state: ArticulatedState, measured: MeasuredJoints
     ) -> tuple[ArticulatedState, Estimates]:
         """Return the next state and the estimates of T more frames; see `Estimator`."""
-        poses = []
-        for frame in self._frames(measured):
-            state, pose = self._step(state, frame)
-            poses.append(pose)
-        return state, estimates_of(poses, self.matrix, self.order)
+        state, poses = self._run(state, measured)
+        return state, estimates_of(poses, self.matrix)
 
     def forward(
         self,
@@ -163,11 +165,18 @@ class ArticulatedFilter(Estimator):
     ) -> Estimates:
         """Return the estimates of whole sequences; see `Estimator`."""
         state = self.init(len(measured.uv), joints, generators)
+        _, poses = self._run(state, measured, progress)
+        return estimates_of(poses, self.matrix, lengths)
+
+    def _run(
+        self, state: ArticulatedState, measured: MeasuredJoints, progress: bool = False
+    ) -> tuple[ArticulatedState, list[FramePose]]:
+        """Return the next state, and the estimate of each frame."""
         poses = []
         for frame in tqdm(self._frames(measured), disable=not progress, desc="frames"):
             state, pose = self._step(state, frame)
             poses.append(pose)
-        return estimates_of(poses, self.matrix, self.order, lengths)
+        return state, poses
 
     def _frames(self, measured: MeasuredJoints) -> list[_Frame]:
         """Return the frames one by one, as rays."""
@@ -249,14 +258,14 @@ class ArticulatedFilter(Estimator):
         around: int | None = None,
     ) -> Arms:
         """Return the hypotheses about both arms for each hypothesis of the root."""
-        flip = root.depth.new_tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]])
+        flip = root.depth.new_tensor(_SIDES)
         shoulder = self._shoulders(frame, root, middle, lengths[:, 2]) * flip[:, None]
         rays = torch.stack([frame.rays[:, _ELBOWS], frame.rays[:, _HANDS]], 2) * flip[:, None]
         noise = frame.std[:, [_SHOULDERS, _ELBOWS, _HANDS]].square()
         noise = torch.where(frame.known[:, [_SHOULDERS, _ELBOWS, _HANDS]], noise, 0.0)
         std = torch.stack([noise[:, 0] + noise[:, 1], noise[:, 1] + noise[:, 2]], -1).sqrt()
         known = torch.stack([frame.known[:, _ELBOWS], frame.known[:, _HANDS]], -1)
-        axes = upright(root.turn)
+        axes = upright_axes(root.turn)
         axes = torch.stack([axes, flip[1, :, None] * axes * flip[1]], 1)
         bones = lengths[:, None, None, :2].expand(*shoulder.shape[:3], 2)
         arm = ArmInput(shoulder, rays, known, std, axes, bones, slack)
@@ -282,11 +291,10 @@ class ArticulatedFilter(Estimator):
         width, height = self._torso_slopes(lengths, torso, root)
         slope = torch.cat([slope, width[0], height[0]], 1)
         bend = torch.cat([bend, width[1], height[1]], 1).clamp_min(0.0)
-        start = self.spread.square().reciprocal()
         precision = lengths.precision + bend
         mean = lengths.mean + (slope / precision).clamp(-_MOST, _MOST)
         mean = mean - mean[:, :1]  # the common scale is not to be seen: upper arms stay the prior's
-        limit = 3 * start.rsqrt()
+        limit = 3 * self.spread
         return Lengths(mean.clamp(-limit, limit), precision)
 
     def _slopes(
@@ -334,14 +342,14 @@ class ArticulatedFilter(Estimator):
         size: TorsoLengths,
     ) -> FramePose:
         """Return joints and covariances in camera axes."""
-        flip = root.depth.new_tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]])
-        axes = upright(root.turn[:, 0])
+        flip = root.depth.new_tensor(_SIDES)
+        axes = upright_axes(root.turn[:, 0])
         shoulder = self._shoulders(frame, root, middle, lengths[:, 2])[:, :, 0]
         bones = self.chain.mean_directions(belief) * flip[:, None]
         bones = bones @ axes[:, None] * lengths[:, None, :2, None]
         elbow = shoulder + bones[:, :, 0]
         hand = elbow + bones[:, :, 1]
-        torso = middle + torso_places(root.turn, size, (slice(None), None))[:, 0, 2:]
+        torso = middle + torso_places(root.turn, size)[:, 0, 2:]
         joints = middle.new_zeros(len(middle), 8, 3)
         for rows, value in ((_SHOULDERS, shoulder), (_ELBOWS, elbow), (_HANDS, hand)):
             joints[:, rows] = value

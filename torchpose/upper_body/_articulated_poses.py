@@ -11,11 +11,11 @@ from torch import Tensor
 
 from torchpose.camera._projection import project
 from torchpose.filters._outputs import FilterOutput
-from torchpose.math._rotations import RotationOrder, euler_to_matrix, matrix_to_euler
 from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.skeleton._torso import upright_axes
 from torchpose.upper_body._estimator import Estimates, ReadOut
 
-__all__ = ["FramePose", "estimates_of", "upright"]
+__all__ = ["FramePose", "estimates_of"]
 
 _NECK = UPPER_BODY.index("neck")
 
@@ -38,24 +38,24 @@ class FramePose(NamedTuple):
 def estimates_of(
     poses: Sequence[FramePose],
     matrix: Float[Tensor, "3 3"],
-    order: RotationOrder,
     lengths: Int[Tensor, " B"] | None = None,
 ) -> Estimates:
     """Return the estimates of both arms and the poses; past the lengths the last ones again.
 
     Args:
-        poses: of each frame. matrix: K of their pixels. order: of roll, pitch and yaw.
+        poses: of each frame. matrix: K of their pixels.
         lengths: frames of each sequence, None for all.
     """
     stacked = FramePose(*(torch.stack(values, 1) for values in zip(*poses, strict=True)))
     if lengths is not None:
         stacked = _repeated(stacked, lengths.to(stacked.joints.device))
     neck = stacked.joints[:, :, _NECK]
-    back = upright(stacked.turn)
+    back = upright_axes(stacked.turn)
     joints = (stacked.joints - neck[:, :, None]) @ back.mT
     covs = back[:, :, None] @ stacked.covs @ back.mT[:, :, None]
-    angles = matrix_to_euler(back.mT, order)
-    uv = project(joints, matrix, euler_to_matrix(angles, order), neck)[..., :2]
+    level = torch.zeros_like(stacked.turn)
+    angles = torch.stack([level, level, stacked.turn], -1)  # the same in either order
+    uv = project(joints, matrix, back.mT, neck)[..., :2]
     uv_covs = _pixel_covs(stacked.joints, stacked.covs, matrix)
     never = torch.full((len(neck),), -1, dtype=torch.long, device=neck.device)
     left, right = (
@@ -76,14 +76,6 @@ def _repeated(poses: FramePose, lengths: Int[Tensor, " B"]) -> FramePose:
     poses = FramePose(*(values[rows, last] for values in poses))
     past = (frames >= lengths[:, None])[..., None]
     return poses._replace(log_evidence=poses.log_evidence.masked_fill(past, 0.0))
-
-
-def upright(turn: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
-    """Return the rotation from camera axes to upright axes of shoulders that are turned by psi."""
-    c, s = turn.cos(), turn.sin()
-    zero, one = torch.zeros_like(c), torch.ones_like(c)
-    rows = ((c, zero, -s), (zero, one, zero), (s, zero, c))
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
 def _pixel_covs(

@@ -11,7 +11,17 @@ from torch import Tensor
 
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
-__all__ = ["SHRUG", "Root", "RootGrid", "Torso", "TorsoLengths", "see_torso", "shoulder_offsets"]
+__all__ = [
+    "SHRUG",
+    "Root",
+    "RootGrid",
+    "Torso",
+    "TorsoLengths",
+    "middle_of_shoulders",
+    "see_torso",
+    "shoulder_offsets",
+    "torso_places",
+]
 
 _TORSO = tuple(UPPER_BODY.index(n) for n in ("shoulder_left", "shoulder_right", "neck", "head"))
 _NECK_HEIGHT = 0.105  # metres above the middle of the shoulders (Kinect's neck)
@@ -157,25 +167,46 @@ class RootGrid:
         return flat.scatter(1, root.cell, weight).unflatten(1, (len(self.depth), len(self.turn)))
 
 
+class _Middle(NamedTuple):
+    """Where the middle of the shoulders is by one axis of the image, from each torso joint.
+
+    Attributes:
+        value: by each joint, [..., 4]. precision: of each, 0 where it is not known. mean: of all, [...].
+    """
+
+    value: Tensor
+    precision: Tensor
+    mean: Tensor
+
+
+def _middles(torso: Torso, depth: Tensor, turn: Tensor, lengths: TorsoLengths) -> list[_Middle]:
+    """Return the middle of the shoulders by x and y, given depth and turn [B, ...]."""
+    lead = (slice(None),) + (None,) * (depth.ndim - 1)
+    place, known = torso_places(turn, lengths), torso.known[lead].to(depth)
+    rays, std = torso.rays[lead], torso.std[lead]
+    away = depth[..., None] + place[..., 2]
+    stiff = _stiffness(lengths, torso.raised)[lead]
+    found = []
+    for axis in (0, 1):
+        value = rays[..., axis] * away - place[..., axis]
+        precision = known / (stiff[..., axis] + (std * away).square())
+        mean = (precision * value).sum(-1) / precision.sum(-1).clamp_min(1e-12)
+        found.append(_Middle(value, precision, mean))
+    return found
+
+
 def _log_likelihood(
     torso: Torso, depth: Tensor, turn: Tensor, lengths: TorsoLengths
 ) -> Float[Tensor, "B *grid"]:
     """Return the log-likelihood of the torso's joints wherever its middle is."""
-    lead = (slice(None),) + (None,) * (depth.ndim - 1)
-    place, known = torso_places(turn, lengths, lead), torso.known[lead].to(depth)
-    rays, std = torso.rays[lead], torso.std[lead]
-    away = depth[..., None] + place[..., 2]
-    stiff = _stiffness(lengths, torso.raised)[lead]
-    total, count = torch.zeros_like(depth), known.sum(-1)
-    for axis in (0, 1):
-        value = rays[..., axis] * away - place[..., axis]
-        precision = known / (stiff[..., axis] + (std * away).square())
-        mass = precision.sum(-1)
-        mean = (precision * value).sum(-1) / mass.clamp_min(1e-12)
+    count = torso.known.sum(-1).to(depth)[(...,) + (None,) * (depth.ndim - 1)]
+    total = torch.zeros_like(depth)
+    for value, precision, mean in _middles(torso, depth, turn, lengths):
         off = (precision * (value - mean[..., None]).square()).sum(-1)
-        logs = torch.where(known > 0, precision, 1.0).log().sum(-1)
+        logs = torch.where(precision > 0, precision, 1.0).log().sum(-1)
         heavy = -0.5 * (_FREEDOM + 1) * torch.log1p(off / _FREEDOM)
-        total = total + heavy + 0.5 * (logs - torch.where(count > 0, mass, 1.0).log())
+        mass = torch.where(count > 0, precision.sum(-1), 1.0)
+        total = total + heavy + 0.5 * (logs - mass.log())
     return total + 2 * (count - 1).clamp_min(0) * depth.log()
 
 
@@ -189,9 +220,10 @@ def _stiffness(lengths: TorsoLengths, raised: Float[Tensor, "B 2"]) -> Float[Ten
 
 
 def torso_places(
-    turn: Float[Tensor, "B *grid"], lengths: TorsoLengths, lead: tuple[slice | None, ...]
+    turn: Float[Tensor, "B *grid"], lengths: TorsoLengths
 ) -> Float[Tensor, "B *grid 4 3"]:
     """Return both shoulders, neck and head relative to the middle of the shoulders, camera axes."""
+    lead = (slice(None),) + (None,) * (turn.ndim - 1)
     width, height = (value[lead].expand_as(turn) for value in lengths[:2])
     left = shoulder_offsets(turn, width)
     neck = torch.zeros_like(left)
@@ -205,16 +237,8 @@ def middle_of_shoulders(
     torso: Torso, depth: Float[Tensor, "B M"], turn: Float[Tensor, "B M"], lengths: TorsoLengths
 ) -> Float[Tensor, "B M 3"]:
     """Return where the middle of the shoulders is, given depth and turn; on the axis if nothing is known."""
-    place = torso_places(turn, lengths, (slice(None), None))
-    away = depth[..., None] + place[..., 2]
-    stiff = _stiffness(lengths, torso.raised)[:, None]
-    known = torso.known[:, None].to(depth)
-    parts = []
-    for axis in (0, 1):
-        value = torso.rays[:, None, :, axis] * away - place[..., axis]
-        precision = known / (stiff[..., axis] + (torso.std[:, None] * away).square())
-        parts.append((precision * value).sum(-1) / precision.sum(-1).clamp_min(1e-12))
-    return torch.stack([*parts, depth], -1)
+    u, v = _middles(torso, depth, turn, lengths)
+    return torch.stack([u.mean, v.mean, depth], -1)
 
 
 def _share_that_moves(std: float, step: float) -> float:
