@@ -48,9 +48,12 @@ def frames(keypoints, present):
 
 
 def record(tracker, found, size, smoother=None):
-    kept = TrackedRecording(PersonStream(tracker, MEASURED), GAP)
+    stream, states = PersonStream(tracker, MEASURED), {}
+    kept = TrackedRecording(tracker, MEASURED, GAP)
     for start in range(0, len(found), size):
-        kept.append(found[start : start + size])
+        block = found[start : start + size]
+        states, tracked = stream.advance_all(states, block, (), GAP)
+        kept.append(tracked, len(block))
     return kept.finish(smoother)
 
 

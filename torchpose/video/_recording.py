@@ -1,9 +1,9 @@
-"""Track the persons of a recording block by block, and keep their poses in files meanwhile."""
+"""Keep the poses of the persons of a recording in files, block by block, until it has ended."""
 
 import shutil
 import tempfile
 import weakref
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,7 @@ import torch
 from torch import Tensor
 
 from torchpose._core.facade import set_up_facade
-from torchpose._core.images import Image
 from torchpose.errors import InputError, OutputError
-from torchpose.measure._upper_body import FrameMeasurements
 from torchpose.upper_body._outlier_notes import (
     exchanged_frames,
     outlier_notes,
@@ -26,8 +24,6 @@ from torchpose.upper_body._reading import note_collapse
 from torchpose.upper_body._tracker import UpperBodyTracker
 from torchpose.video._person_stream import (
     Measured,
-    PersonStream,
-    PersonStreamState,
     TrackedBlock,
     unmeasured,
     without_long_gaps,
@@ -151,37 +147,37 @@ class _Person:
 
 
 class TrackedRecording:
-    """Tracks all persons whose measurements are appended, each with a stream of its own.
+    """Collects the tracked blocks of all persons (`PersonStream.advance_all`), and joins them at the end.
 
     Args:
-        stream: of every person.
-        gap: frames without measurements after which a person has no pose; the tracker is
-            reinitialised when the person returns.
+        tracker: of the poses. names: of the measured joints.
+        gap: frames without measurements after which a person has no pose.
         folder: for temporary files.
     """
 
-    def __init__(self, stream: PersonStream, gap: int, folder: str | Path | None = None) -> None:
-        self.stream, self.gap, self.folder = stream, gap, folder
+    def __init__(
+        self,
+        tracker: UpperBodyTracker,
+        names: Sequence[str],
+        gap: int,
+        folder: str | Path | None = None,
+    ) -> None:
+        self.tracker, self.names, self.gap, self.folder = tracker, tuple(names), gap, folder
         self.n_frames = 0
         self._people: dict[int, _Person] = {}
-        self._streams: dict[int, PersonStreamState] = {}
 
-    def append(
-        self, block: Sequence[FrameMeasurements], images: Sequence[Image] = ()
-    ) -> dict[int, PoseTrack]:
-        """Track the next frames, with their images if the stream uses them.
+    def append(self, tracked: Mapping[int, TrackedBlock], n_frames: int) -> None:
+        """Keep the next block.
 
-        Returns:
-            The poses in the last frames of the block, by number, of all persons present.
+        Args:
+            tracked: by person. n_frames: of the block.
 
         Raises:
             OutputError: the disk is full.
         """
-        self._streams, tracked = self.stream.advance_all(self._streams, block, images, self.gap)
         for number, part in tracked.items():
             self._keep(number, part)
-        self.n_frames += len(block)
-        return {number: part.poses for number, part in tracked.items()}
+        self.n_frames += n_frames
 
     def _keep(self, number: int, part: TrackedBlock) -> None:
         """Append a person's part of a block, after NaN for the frames of an absence."""
@@ -192,8 +188,8 @@ class TrackedRecording:
         place = frame - person.first_frame
         absent = place - len(person.poses)
         if absent:
-            person.measured.append(unmeasured(absent, len(self.stream.names)))
-            person.poses.append(_nobody(absent, self.stream.tracker))
+            person.measured.append(unmeasured(absent, len(self.names)))
+            person.poses.append(_nobody(absent, self.tracker))
         person.measured.append(part.measured)
         person.poses.append(part.poses)
         seen = torch.nonzero(part.measured.seen).flatten()
@@ -207,7 +203,7 @@ class TrackedRecording:
         Args:
             smoother: of the whole recording; None keeps the filtered poses.
         """
-        least = _LEAST_SECONDS * (self.stream.tracker.fps or 30.0)
+        least = _LEAST_SECONDS * (self.tracker.fps or 30.0)
         lasting = [person for person in self._people.values() if person.n_seen >= least]
         lasting.sort(key=lambda person: -person.n_seen)
         return [self._finish(person, smoother) for person in lasting]
@@ -222,7 +218,7 @@ class TrackedRecording:
         found = TrackedPerson(person.number, person.first_frame, track, keypoints, cov)
         if smoother is None:
             return found
-        return replace(found, track=smoothed(found, smoother, self.stream.names, self.gap))
+        return replace(found, track=smoothed(found, smoother, self.names, self.gap))
 
 
 def smoothed(

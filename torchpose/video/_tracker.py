@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -60,7 +61,10 @@ class LivePerson(NamedTuple):
 class VideoTracker(nn.Module):
     """Tracks all persons in a video: `UpperBodyMeasurer`, then an `UpperBodyTracker` for each person.
 
-    `forward` tracks a recording, `init` and `step` a camera.
+    `forward` tracks a recording, `init` and `step` a camera. A frame passes three stages, each of which
+    takes and returns values: the measurer gives `FrameMeasurements`, the streams of the persons
+    (`PersonStream.advance_all`) turn these into a `TrackedBlock` for each, by the `UpperBodyTracker`. A
+    recording's blocks are kept in files until it has ended (`TrackedRecording`).
 
     Args:
         prior: from `load_prior` or `fit_upper_body_prior`.
@@ -196,27 +200,22 @@ class VideoTracker(nn.Module):
         Raises:
             InputError: another kind of image. OutputError: the disk is full.
         """
-        recording = TrackedRecording(self.stream, self.gap, folder)
+        recording = TrackedRecording(self.tracker, self.stream.names, self.gap, folder)
         size = _BLOCK if watch is None and not self.candidates else 1
+        streams: dict[int, PersonStreamState] = {}
         last: dict[int, PoseTrack] = {}
-        block: list[FrameMeasurements] = []
-        images: list[Image] = []
         measured = self._measure(frames, last)
         if not self.candidates:
             measured = prefetch(measured, size)  # while the block before is filtered
-        for image, now in tqdm(measured, total=n_frames, disable=not progress, unit="frame"):
-            block.append(now)
-            images.append(image)
-            if len(block) < size:
-                continue
-            poses = recording.append(block, images)
-            block, images = [], []
+        shown = iter(tqdm(measured, total=n_frames, disable=not progress, unit="frame"))
+        while block := list(islice(shown, size)):
+            images, found = zip(*block, strict=True)
+            streams, tracked = self.stream.advance_all(streams, found, images, self.gap)
+            recording.append(tracked, len(block))
             last.clear()
-            last.update({n: pose for n, pose in poses.items() if _is_pose(pose)})
+            last.update({n: part.poses for n, part in tracked.items() if _is_pose(part.poses)})
             if watch is not None:
-                watch(image, now, dict(last))
-        if block:
-            recording.append(block, images)
+                watch(images[-1], found[-1], dict(last))
         return recording.finish(self.smoother)
 
     def _measure(
