@@ -13,7 +13,7 @@ import inspect
 import sys
 import types
 from collections import deque
-from collections.abc import Callable, Hashable, Mapping, Sequence, Set
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence, Set
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from typing import Any
@@ -31,7 +31,8 @@ _NAME = "@checked"  # of the decorator in a module; no name of the module itself
 _MOST_ITEMS = 32  # of a collection that is told from others by its items
 _ARRAYS, _SEQUENCES = (Tensor, np.ndarray), (tuple, list)
 _COLLECTIONS = (Sequence, Mapping, Set, deque)
-_PLAIN: set[type] = {str, range, int, float, types.NoneType}  # types that are facts enough
+_PLAIN: set[type] = {range, int, float, types.NoneType}  # types that are facts enough
+_PLAIN_AND_WORDS: set[type] = {*_PLAIN, str}  # where no Literal tells words apart
 
 
 def install(package: str) -> None:
@@ -76,7 +77,7 @@ def checked(function: Any) -> Any:
     if not inspect.isfunction(function) or hasattr(function, "__wrapped__"):
         return function
     check = _check_of(function)
-    first, facts, passed = check.first, check.facts, check.passed
+    first, plain, passed = check.first, check.plain, check.passed
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
@@ -84,12 +85,12 @@ def checked(function: Any) -> Any:
         returned = function(*args, **kwargs)
         # Nearly all calls end here, millions in a run: no call is made that can be left out.
         try:
-            key = (
-                *map(facts, args[first:]),
-                *kwargs,
-                *map(facts, kwargs.values()),
-                facts(returned),
-            )
+            facts: list[Hashable] = [*kwargs]
+            _add_facts(args[first:], facts, plain)
+            if kwargs:
+                _add_facts(kwargs.values(), facts, plain)
+            _add_facts((returned,), facts, plain)
+            key = tuple(facts)
             if key in passed:
                 return returned
         except TypeError:  # unhashable, as symbolic sizes are
@@ -118,7 +119,7 @@ class _Check:
         self.function = function
         names = function.__code__.co_varnames[: function.__code__.co_argcount]
         self.first = int(bool(names) and names[0] not in function.__annotations__)  # after `self`
-        self.facts = _facts if _may_have_literals(function) else _facts_but_words
+        self.plain = _PLAIN if _may_have_literals(function) else _PLAIN_AND_WORDS
         self.call: Callable | None = None
         self.being_made = False
         self.passed: set[Hashable] = set()
@@ -170,39 +171,43 @@ def _may_have_literals(function: types.FunctionType) -> bool:
     return any(isinstance(hint, str) or "Literal" in repr(hint) for hint in hints)
 
 
-def _facts(value: Any) -> Hashable:
-    """Return what the outcome of a check of `value` depends on.
+def _add_facts(values: Iterable[Any], facts: list[Hashable], plain: set[type]) -> None:
+    """Append what the outcome of a check of these values depends on.
+
+    Args:
+        plain: types of which nothing else counts.
 
     Raises:
         TypeError: a collection too large to be told from others by its items.
     """
-    return (str, value) if type(value) is str else _facts_of(value, _facts)
+    for value in values:
+        kind = type(value)
+        facts.append(kind)
+        if kind is Tensor:
+            facts.append(value.dtype)
+            facts.append(value.shape)
+        elif kind not in plain:
+            _add_more(value, kind, facts, plain)
 
 
-def _facts_but_words(value: Any) -> Hashable:
-    """Return what `_facts` does, with all strings alike: only a Literal tells them apart."""
-    return _facts_of(value, _facts_but_words)
-
-
-def _facts_of(value: Any, facts: Callable[[Any], Hashable]) -> Hashable:
-    """Return the facts of a value, whose items are told by `facts`."""
-    kind = type(value)
-    if kind in _PLAIN:
-        return kind
-    if isinstance(value, _ARRAYS):
-        return kind, value.dtype, value.shape
-    if kind is bool:  # of a Literal
-        return kind, value
+def _add_more(value: Any, kind: type, facts: list[Hashable], plain: set[type]) -> None:
+    """Append what counts of a value beside its type."""
     if isinstance(value, _SEQUENCES) and len(value) <= _MOST_ITEMS:
-        return kind, *map(facts, value)
-    if kind is dict and len(value) <= _MOST_ITEMS:
-        return kind, *map(facts, value), *map(facts, value.values())
-    if isinstance(value, type):
-        return kind, value
-    if issubclass(kind, _COLLECTIONS):
+        facts.append(len(value))
+        _add_facts(value, facts, plain)
+    elif isinstance(value, _ARRAYS):
+        facts += value.dtype, value.shape
+    elif kind is bool or kind is str or isinstance(value, type):  # bools and words of a Literal
+        facts.append(value)
+    elif kind is dict and len(value) <= _MOST_ITEMS:
+        facts.append(len(value))
+        _add_facts(value, facts, plain)
+        _add_facts(value.values(), facts, plain)
+    elif issubclass(kind, _COLLECTIONS):
         raise TypeError(f"{kind.__name__} with items that may be of any type")
-    _PLAIN.add(kind)
-    return kind
+    else:
+        _PLAIN.add(kind)
+        _PLAIN_AND_WORDS.add(kind)
 
 
 # --- a package
