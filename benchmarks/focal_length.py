@@ -38,7 +38,9 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", type=Path, required=True, help="folder with kinect_utd_mhad/")
-    parser.add_argument("--prior", type=Path, help="fitted without the test persons")
+    parser.add_argument(
+        "--prior", default="kinect-upper-body", help="name or file; best of others than the test persons"
+    )
     parser.add_argument("--threads", type=int, default=2, help="cores")
     parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
     parser.add_argument(
@@ -46,7 +48,7 @@ def main() -> None:
     )
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    prior = load_prior(args.prior or "kinect-upper-body")
+    prior = load_prior(args.prior)
     _, tested = people(args.data, args.quick)
     tested = tested[:: 3 if args.quick else 1]
     poses = [centred_on_neck(recording.upper_body().joints) for recording in tested]

@@ -23,6 +23,7 @@ from benchmarks.ub_people import TEST_PERSONS, TRAIN_PERSONS
 from torchpose._core.files import check_output_folder
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import CAMERA, Estimate, Trials, cached_prior
+from torchpose.evaluation.unseen import QUICK
 from torchpose.io import read_recordings
 from torchpose.learning import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
@@ -267,7 +268,7 @@ def run(arguments: argparse.Namespace) -> Report:
         "n_components": 10, "window_components": 48, "calibration_folds": 2,
     }  # fmt: skip
     if arguments.quick:
-        small = {"n_components": 2, "window_components": 4, "calibration_folds": 0}
+        small = QUICK | {"n_components": 2, "n_samples": 3000, "calibration_folds": 0}
     prior = cached_prior(
         arguments.out,
         fitted,

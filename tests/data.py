@@ -18,19 +18,20 @@ def data_dir_or_skip(name: str) -> Path:
     return folder
 
 
-def few_recordings(name: str, into: Path, per_person: int) -> Path:
+def few_recordings(name: str, into: Path, per_person: int, chosen: tuple[str, ...] = ()) -> Path:
     """A folder with links to evenly spread recordings of each person: to read all takes seconds.
 
     Args:
         name: of a data set whose files begin with their person, such as s01_. into: where the folder is
-            made, under its own name. per_person: recordings, at most.
+            made, under its own name. per_person: recordings, at most. chosen: persons; all if there are none.
     """
     whole = data_dir_or_skip(name)
     folder = into / name
     folder.mkdir(parents=True)
     persons: dict[str, list[Path]] = {}
     for path in sorted(whole.glob("s[0-9][0-9]_*.npz")):
-        persons.setdefault(path.name[:3], []).append(path)
+        if not chosen or path.name[:3] in chosen:
+            persons.setdefault(path.name[:3], []).append(path)
     for paths in persons.values():
         for path in paths[:: -(-len(paths) // per_person)]:
             (folder / path.name).symlink_to(path)

@@ -17,7 +17,8 @@ def rows(text: str, title: str) -> dict[str, list[str]]:
 def test_landmarks_as_the_front_end(run_here, tmp_path):
     written = tmp_path / "table.md"
     data = data_dir_or_skip("video_asl").parent
-    run_here("mediapipe_front_end", "--quick", "--data", str(data), "--out", str(written))
+    options = ("--data", str(data), "--out", str(written), "--prior", "kinect-upper-body-small")
+    run_here("mediapipe_front_end", "--quick", *options)
     text = written.read_text()
     jitter = {name: float(row[-1]) for name, row in rows(text, "Jitter in space").items()}
     assert jitter["all eight, smoothed"] < jitter["all eight, filtered"] < jitter["MediaPipe full"]
