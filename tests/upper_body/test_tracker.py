@@ -444,7 +444,7 @@ def test_what_the_recipe_made_is_saved(prior, tmp_path):
 
 
 def test_the_recipe_is_repeatable(tmp_path):
-    recordings = [recording(performer(24, seed=s).body, person=f"p{s}") for s in (1, 2)]
+    recordings = [recording(performer(12, seed=s).body, person=f"p{s}") for s in (1, 2)]
     for name in ("once", "again"):
         prior = fit_kinect_prior(
             recordings, 3, window_components=3, window_samples=1000, n_samples=1000, pose_steps=5,
