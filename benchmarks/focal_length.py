@@ -39,7 +39,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", type=Path, required=True, help="folder with kinect_utd_mhad/")
     parser.add_argument(
-        "--prior", default="kinect-upper-body", help="name or file; best of others than the test persons"
+        "--prior",
+        default="kinect-upper-body",
+        help="name or file; best of others than the test persons",
     )
     parser.add_argument("--threads", type=int, default=2, help="cores")
     parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")

@@ -4,13 +4,14 @@ For each of s1 to s6 a prior is fitted to the other five, without calibration, a
 in the test camera. Scale and floor of the covariances then come from the errors of the other five,
 each under the prior that did not know them (`torchpose.learning._recipes.fit_calibration`). The table
 shows the error and the share of true joints inside the 50 % and 90 % ellipsoids, person by person:
-its spread
-is what a calibration on a handful of persons can promise for the next one.
+its spread is what a calibration on a handful of persons can promise for the next one. What was fitted
+and tracked is kept in the folder of the report.
 
     python -m benchmarks.ub_people_by_person --data DIR --out DIR
 """
 
 import argparse
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,11 +19,14 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from benchmarks._upper_body import trials_of
+from benchmarks._upper_body import TRACKING, Tracker, trials_of
+from benchmarks.engine import Grid, describe
 from benchmarks.ub_people import people
 from torchpose._core.files import check_output_folder
-from torchpose.evaluation.common import CAMERA, cached_prior, track
+from torchpose.evaluation import Report
+from torchpose.evaluation.common import Estimate, Trials, cached_prior
 from torchpose.evaluation.person_tables import SHORT_NAMES
+from torchpose.evaluation.unseen import QUICK
 from torchpose.io import Recording
 from torchpose.learning import fit_kinect_prior
 from torchpose.learning._recipes import fit_calibration
@@ -40,30 +44,34 @@ class HeldOut(NamedTuple):
 
 
 def hold_out(
-    person: str, recordings: list[Recording], arguments: argparse.Namespace, bar: "tqdm[str]"
-) -> HeldOut:
-    """Track a person with a prior of all others."""
-    bar.set_postfix_str(person)
-    seen = [r for r in recordings if r.person != person]
-    own = [r for r in recordings if r.person == person][:: arguments.every]
+    recordings: list[Recording], arguments: argparse.Namespace
+) -> Iterator[tuple[str, Trials, Tracker]]:
+    """Yield every person with sequences and a tracker whose prior is of all others."""
     settings = {"seed": arguments.seed, "calibration_folds": 0, "name": "ub-people-by-person"}
     if arguments.quick:
-        settings |= {"n_components": 4, "n_samples": 3000, "window_steps": 5}
-    settings |= {
-        "window_components": 8 if arguments.quick else arguments.window_components,
-        "window_samples": 3000 if arguments.quick else arguments.window_samples,
-    }
-    prior = cached_prior(arguments.out, seen, fit_kinect_prior, False, **settings)
-    test = trials_of(own, arguments.seed)
-    found = track(prior, CAMERA, test)
+        settings |= QUICK | {"n_samples": 3000, "window_steps": 5}
+    else:
+        settings |= {
+            "window_components": arguments.window_components,
+            "window_samples": arguments.window_samples,
+        }
+    for person in tqdm(sorted({r.person for r in recordings if r.person}), desc="persons held out"):
+        seen = [r for r in recordings if r.person != person]
+        own = [r for r in recordings if r.person == person][:: arguments.every]
+        prior = cached_prior(arguments.out, seen, fit_kinect_prior, False, **settings)
+        yield person, trials_of(own, arguments.seed), Tracker(prior, {})
+
+
+def aligned(found: Estimate, test: Trials) -> HeldOut:
+    """Return estimates, covariances and truth of the frames of a person."""
     if found.covariance3d is None:
         raise RuntimeError("the tracker returned no covariances")
     inside = test.inside
     truth = test.truth3d[inside]
-    aligned = align(found.joints3d[inside], truth, covariance=found.covariance3d[inside])
-    if aligned.covariance is None:
+    turned = align(found.joints3d[inside], truth, covariance=found.covariance3d[inside])
+    if turned.covariance is None:
         raise RuntimeError("align was given covariances and returned none")
-    return HeldOut(aligned.points, aligned.covariance, truth)
+    return HeldOut(turned.points, turned.covariance, truth)
 
 
 def calibrated_coverage(person: str, parts: dict[str, HeldOut]) -> Tensor:
@@ -76,29 +84,34 @@ def calibrated_coverage(person: str, parts: dict[str, HeldOut]) -> Tensor:
     return coverage(own.points, covs, own.truth, levels=LEVELS).per_joint
 
 
-def table(parts: dict[str, HeldOut]) -> str:
-    """Errors and coverage as a Markdown table, with mean and standard deviation over persons."""
-    errors = {name: (p.points - p.truth).norm(dim=-1).mean() * 100 for name, p in parts.items()}
-    shares = {name: 100 * calibrated_coverage(name, parts) for name in parts}
-    head = ["person", "error (cm)", *(f"{joint}, 50 / 90 %" for joint in SHORT_NAMES)]
-    rows = [
-        [name, f"{errors[name]:.2f}", *(f"{low:.0f} / {high:.0f}" for low, high in shares[name].T)]
-        for name in parts
-    ]
-    stacked = torch.stack(list(shares.values()))
-    all_errors = torch.stack(list(errors.values()))
-    for label, function in (("mean", torch.mean), ("standard deviation", torch.std)):
-        pairs = (f"{low:.0f} / {high:.0f}" for low, high in function(stacked, 0).T)
-        rows.append([label, f"{function(all_errors):.2f}", *pairs])
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(row) + " |" for row in lines)
+def fill(report: Report, parts: dict[str, HeldOut]) -> None:
+    """Add errors and coverage, with mean and standard deviation over persons."""
+    numbers = {
+        name: torch.cat([
+            100 * (part.points - part.truth).norm(dim=-1).mean()[None],
+            100 * calibrated_coverage(name, parts).flatten(),
+        ])
+        for name, part in parts.items()
+    }  # fmt: skip
+    over = torch.stack(list(numbers.values()))
+    numbers |= {"mean": over.mean(0), "standard deviation": over.std(0)}
+
+    def pair(joint: int) -> Callable[[Tensor], str]:
+        return lambda row: f"{row[1 + joint]:.0f} / {row[1 + len(SHORT_NAMES) + joint]:.0f}"
+
+    columns: dict[str, Callable[[Tensor], float | str]] = {"error (cm)": lambda row: float(row[0])}
+    columns |= {f"{name}, 50 / 90 %": pair(joint) for joint, name in enumerate(SHORT_NAMES)}
+    title = "3D error, and true joints inside the ellipsoids calibrated on all other persons"
+    describe(report, "persons", title, numbers, columns, digits=2)
 
 
 def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", required=True, type=Path, help="folder of kinect_utd_mhad")
-    parser.add_argument("--out", required=True, type=Path, help="folder for the fitted priors")
+    parser.add_argument(
+        "--out", required=True, type=Path, help="folder for what is kept, and the report"
+    )
     parser.add_argument("--window-components", type=int, help="by default as the shipped prior")
     parser.add_argument("--window-samples", type=int, help="by default as the shipped prior")
     parser.add_argument("--every", type=int, default=1, help="track every n-th sequence")
@@ -109,9 +122,17 @@ def main() -> None:
     arguments.out = check_output_folder(arguments.out)
     torch.set_num_threads(arguments.threads)
     recordings, _ = people(arguments.data, arguments.quick)
-    bar = tqdm(sorted({r.person for r in recordings if r.person}), desc="persons held out")
-    parts = {person: hold_out(person, recordings, arguments, bar) for person in bar}
-    print(table(parts))
+    tests, grids = {}, {}
+    for person, test, tracker in hold_out(recordings, arguments):
+        tests[person] = test
+        grids[person] = Grid({person: test}, {"prior of the others": tracker})
+    found = TRACKING.run(grids, (arguments.seed,), arguments.out)
+    parts = {row.subject: aligned(row.run, tests[row.subject]) for row in found.rows}
+    shown = ("window_components", "window_samples", "every", "seed", "quick")
+    report = Report("UB-people by person", {name: getattr(arguments, name) for name in shown})
+    fill(report, parts)
+    report.save(arguments.out)
+    print(report.to_markdown())
 
 
 if __name__ == "__main__":
