@@ -19,6 +19,7 @@ from typing import NamedTuple
 __all__ = [
     "Room",
     "circles",
+    "code_lines",
     "distinct_names",
     "module_files",
     "module_imports",
@@ -36,6 +37,8 @@ class Room(NamedTuple):
 
     files: int
     lines: int
+    code: int
+    """Lines without docstrings, comments and blank ones."""
     public: int
     """Names in `__all__` of the room itself; those of its subpackages are not counted."""
     imports: frozenset[str]
@@ -158,6 +161,22 @@ def _room_of(path: Path) -> str:
     return path.parent.name if path.name == "__init__.py" else path.stem
 
 
+def code_lines(text: str) -> int:
+    """Return the number of lines of a module that hold code: no docstring, comment or blank line.
+
+    >>> code_lines("# one\\n\\nx = 1  # two\\n")
+    1
+    """
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    told: set[int] = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, documented) and ast.get_docstring(node, clean=False) is not None:
+            first = node.body[0]
+            told.update(range(first.lineno, (first.end_lineno or first.lineno) + 1))
+    kept = (line.strip() for i, line in enumerate(text.splitlines(), 1) if i not in told)
+    return sum(bool(line) and not line.startswith("#") for line in kept)
+
+
 def rooms(root: Path) -> dict[str, Room]:
     """Return the rooms of a checkout by name."""
     files = module_files(root)
@@ -169,11 +188,11 @@ def rooms(root: Path) -> dict[str, Room]:
     for name, modules in sorted(members.items()):
         head = name if name in files else f"torchpose.{name}"
         others = {room_of(found) for module in modules for found in imports[module]} - {name}
-        lines = sum(len(files[m].read_text(encoding="utf-8").splitlines()) for m in modules)
-        result[name] = Room(
-            len(modules), lines, len(public_names(files[head])) if head in files else 0,
-            frozenset(others),
-        )  # fmt: skip
+        texts = [files[module].read_text(encoding="utf-8") for module in modules]
+        lines = sum(len(text.splitlines()) for text in texts)
+        public = len(public_names(files[head])) if head in files else 0
+        code = sum(map(code_lines, texts))
+        result[name] = Room(len(modules), lines, code, public, frozenset(others))
     return result
 
 
@@ -183,10 +202,10 @@ def main(argv: list[str] | None = None) -> int:
     root = Path(arguments[0]) if arguments else _ROOT
     found = rooms(root)
     inside = {n: room for n, room in found.items() if n not in PROGRAMS}
-    print(f"{'room':<12} {'files':>5} {'lines':>6} {'public':>6}  imports")
+    print(f"{'room':<12} {'files':>5} {'lines':>6} {'code':>6} {'public':>6}  imports")
     for name, room in found.items():
         print(
-            f"{name:<12} {room.files:>5} {room.lines:>6} {room.public:>6}  "
+            f"{name:<12} {room.files:>5} {room.lines:>6} {room.code:>6} {room.public:>6}  "
             f"{' '.join(sorted(room.imports)) or '-'}"
         )
     # The root re-exports from its rooms, so it is left out where circles between rooms are sought.
@@ -198,7 +217,7 @@ def main(argv: list[str] | None = None) -> int:
     print(
         f"torchpose: {len(inside)} rooms, {sum(len(r.imports) for r in inside.values())} edges, "
         f"{sum(r.files for r in inside.values())} files, {sum(r.lines for r in inside.values())} lines, "
-        f"{len(distinct_names(root))} public names"
+        f"{sum(r.code for r in inside.values())} of code, {len(distinct_names(root))} public names"
     )
     return 0
 
