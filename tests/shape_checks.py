@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from beartype import BeartypeConf, beartype
 from beartype.roar import BeartypeDecorHintPep673Exception
-from jaxtyping import jaxtyped
+from jaxtyping import AbstractArray, jaxtyped
 from torch import Tensor
 
 __all__ = ["check_after_call", "checked", "install"]
@@ -77,7 +77,9 @@ def checked(function: Any) -> Any:
     if not inspect.isfunction(function) or hasattr(function, "__wrapped__"):
         return function
     check = _check_of(function)
-    first, plain, passed = check.first, check.plain, check.passed
+    told, named, returns, plain, passed = (
+        check.told, check.named, check.returns, check.plain, check.passed
+    )  # fmt: skip
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
@@ -85,11 +87,19 @@ def checked(function: Any) -> Any:
         returned = function(*args, **kwargs)
         # Nearly all calls end here, millions in a run: no call is made that can be left out.
         try:
-            facts: list[Hashable] = [*kwargs]
-            _add_facts(args[first:], facts, plain)
-            if kwargs:
-                _add_facts(kwargs.values(), facts, plain)
-            _add_facts((returned,), facts, plain)
+            if len(args) > len(told):
+                raise TypeError("more values than are told apart")
+            facts: list[Hashable] = [len(args), *map(type, args), type(returned), *kwargs]
+            for value, is_told in zip(args, told, strict=False):
+                if not is_told:
+                    _add_facts((value,), facts, plain)
+            for name, value in kwargs.items():
+                if name in named:
+                    facts.append(type(value))
+                else:
+                    _add_facts((value,), facts, plain)
+            if not returns:
+                _add_facts((returned,), facts, plain)
             key = tuple(facts)
             if key in passed:
                 return returned
@@ -117,8 +127,13 @@ class _Check:
 
     def __init__(self, function: types.FunctionType) -> None:
         self.function = function
-        names = function.__code__.co_varnames[: function.__code__.co_argcount]
-        self.first = int(bool(names) and names[0] not in function.__annotations__)  # after `self`
+        code, hints = function.__code__, function.__annotations__
+        names = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
+        self.named = {name for name in names if _told_by_type(hints.get(name))}
+        self.told = [name in self.named for name in names[: code.co_argcount]]
+        if code.co_flags & inspect.CO_VARARGS:
+            self.told += [False] * _MOST_ITEMS
+        self.returns = _told_by_type(hints.get("return"))
         self.plain = _PLAIN if _may_have_literals(function) else _PLAIN_AND_WORDS
         self.call: Callable | None = None
         self.being_made = False
@@ -169,6 +184,15 @@ def _may_have_literals(function: types.FunctionType) -> bool:
     """Return whether an annotation has a Literal, or is a string that may stand for one."""
     hints = function.__annotations__.values()
     return any(isinstance(hint, str) or "Literal" in repr(hint) for hint in hints)
+
+
+def _told_by_type(hint: Any) -> bool:
+    """Return whether the type of a value says all about an annotation: classes, no shapes or items."""
+    if isinstance(hint, types.UnionType):
+        return all(map(_told_by_type, hint.__args__))
+    if hint is None or hint is Any:
+        return True
+    return isinstance(hint, type) and not issubclass(hint, AbstractArray)
 
 
 def _add_facts(values: Iterable[Any], facts: list[Hashable], plain: set[type]) -> None:

@@ -149,6 +149,9 @@ def test_items_of_collections_are_checked(package):
             package.joined(*bad)
     with pytest.raises(TypeCheckError):
         package.joined({}, more=two)
+    assert package.joined({}, *[two] * 40) == 0
+    with pytest.raises(TypeCheckError):
+        package.joined({}, *[two] * 39, three)
 
 
 def test_words_are_told_apart_where_an_annotation_lists_them(package):
