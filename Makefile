@@ -8,8 +8,9 @@ export OMP_NUM_THREADS ?= 1
 # No advertisement in the output of mkdocs.
 export NO_MKDOCS_2_WARNING := 1
 TEST_PROCESSES ?= 2
-# The tests of a file stay in one process, which makes what they share once.
-PYTEST := $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
+# The tests of a file stay in one process, which makes what they share once. Files keep their order, in
+# which those with few and long tests are not the last, when one process would wait for the other.
+PYTEST := $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
 # The suite starts many processes: they share compiled modules.
 unexport PYTHONDONTWRITEBYTECODE
 
