@@ -129,16 +129,8 @@ def see_in_view(
     now = to_view(uv[:, start:], view, matrix)
     now = torch.where(mask[:, start:, :, None], now, torch.zeros_like(now))
     cov = measured.cov if measured.cov.ndim == 3 else measured.cov[:, start:]
-    cov = _enlarged(cov, view)
     log_scale = -view_jacobian(now, view, matrix).det().abs().log()
     return SeenInView(MeasuredJoints(now, mask[:, start:], cov), hands, view, log_scale)
-
-
-def _enlarged(cov: Tensor, view: BodyView) -> Tensor:
-    """Return R in the pixels of the virtual camera, which zooms; the same R where it does not."""
-    if not bool((view.zoom != 1).any()):
-        return cov
-    return cov * view.zoom.square()[..., None, None, None]
 
 
 def _path_model(prior: UpperBodyPrior, measurement_cov: Tensor, like: Tensor) -> PathModel:
@@ -232,8 +224,7 @@ class WindowMixture(Estimator):
         n_frames = measured.uv.shape[1]
         frames = _append(state.recent, measured)
         seen = self._see(frames, None, -n_frames)
-        cov = _enlarged(measured.cov, seen.view)
-        seen = seen._replace(measured=seen.measured._replace(cov=cov))
+        seen = seen._replace(measured=seen.measured._replace(cov=measured.cov))
         recent = MeasuredJoints(*(x[:, n_frames:] for x in frames))
         return WindowState(recent, state.joints), self._estimate(seen, state.joints)
 
