@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import torchpose
+from torchpose.errors import InputError
 from torchpose.math import euler_to_matrix
 from torchpose.priors._arms import shipped_arm_prior
 from torchpose.skeleton import UPPER_BODY
@@ -102,6 +103,34 @@ def test_the_prior_may_come_from_a_file(tmp_path):
     torch.testing.assert_close(
         tracker(arms=str(file))(uv).joints3d, tracker()(uv).joints3d, rtol=0, atol=1e-9
     )
+
+
+@pytest.mark.parametrize("arms", [3, ["arms.safetensors"], torch.zeros(5)])
+def test_arms_of_another_kind_are_refused(arms):
+    with pytest.raises(InputError, match="arms must be a prior over arms or the path of its file"):
+        tracker(arms=arms)
+
+
+@pytest.mark.parametrize("hidden", [False, True], ids=["all-seen", "some-hidden"])
+def test_gradients_are_slopes(hidden):
+    seen = pixels(body(6), 1.0)[None]
+    if hidden:
+        seen[:, 3, [ROW["shoulder_left"], ROW["elbow_left"], ROW["hand_right"]]] = torch.nan
+    generator = torch.Generator().manual_seed(1)
+    weight = torch.randn(1, 6, 8, 3, generator=generator, dtype=torch.float64)
+    way = torch.randn(seen.shape, generator=generator, dtype=torch.float64)
+    filter_ = tracker(outliers=False)
+
+    def value(keypoints):
+        return (filter_(keypoints).joints3d * weight).sum()
+
+    keypoints = seen.clone().requires_grad_()
+    value(keypoints).backward()
+    assert bool(keypoints.grad.isfinite().all())
+    step = 1e-3  # pixels; densities are worked out in float32
+    with torch.no_grad():
+        slope = (value(seen + step * way) - value(seen - step * way)) / (2 * step)
+    assert float((keypoints.grad * way).nansum()) == pytest.approx(float(slope), rel=0.05)
 
 
 def test_a_stream_gives_the_numbers_of_the_whole_recording():

@@ -104,12 +104,12 @@ class DirectionDensity:
 
     def _known(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, " N"]:
         """Return the log density of the mixture."""
-        off = torch.addmm(self.shift, rows, self.rows, beta=-1).square_()
+        off = torch.addmm(self.shift, rows, self.rows, beta=-1).square()
         squared = off.view(len(rows), *self.size).sum(1)
-        logs = squared.mul_(-0.5).add_(self.constant)
-        most = logs.amax(-1, keepdim=True)
+        logs = self.constant - 0.5 * squared
+        most = logs.amax(-1, keepdim=True).detach()
         # exp of what is far below is slow where it is denormal, and adds nothing
-        return (logs - most).clamp_min_(_NOTHING).exp_().sum(-1).log() + most[:, 0]
+        return (logs - most).clamp_min(_NOTHING).exp().sum(-1).log() + most[:, 0]
 
 
 class ArmChain:
@@ -203,10 +203,10 @@ class ArmChain:
     def advance(self, state: ArmState, arms: Arms) -> ArmState:
         """Return the belief after one more frame."""
         directions, prior = arms.directions[:, :, 0], arms.log_prior[:, :, 0].exp()
-        apart = torch.cdist(state.directions, directions).square_()
         scale = self.step**2
-        walk = (1 + apart / (4 * scale)).reciprocal_().square_().square_()
-        walk *= 6 / (16 * math.pi**2 * scale**2)
+        alike = state.directions @ directions.mT  # of two pairs of unit vectors: 2 where they agree
+        near = 1 / (1 + (2 - alike).clamp_min(0.0) / (2 * scale))
+        walk = 6 / (16 * math.pi**2 * scale**2) * near.square().square()
         moved = (state.weight[..., None, :] @ walk)[..., 0, :]
         return _belief(arms, (1 - self.anew) * moved + self.anew * prior)
 

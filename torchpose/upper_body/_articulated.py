@@ -8,6 +8,7 @@ learnt on the way.
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -16,6 +17,7 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from torchpose._core.module_state import derived
+from torchpose.errors import InputError
 from torchpose.filters._base import Generators
 from torchpose.priors._arms import LENGTHS, ArmPrior, shipped_arm_prior
 from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -112,11 +114,18 @@ class ArticulatedFilter(Estimator):
     Args:
         model: of the tracker. arms: prior over arms, or its file; by default the one that comes with
             the package.
+
+    Raises:
+        InputError: arms of another kind, or no such file. FileFormatError: a file of another kind.
     """
 
     calibration = "articulated"
 
-    def __init__(self, model: TrackerModel, arms: ArmPrior | str | None = None) -> None:
+    def __init__(self, model: TrackerModel, arms: ArmPrior | str | Path | None = None) -> None:
+        if not isinstance(arms, ArmPrior | str | Path | None):
+            raise InputError(
+                f"arms must be a prior over arms or the path of its file, got {type(arms).__name__}"
+            )
         self.model = model
         owner = model.owner
         like = model.measurement_cov
@@ -379,11 +388,11 @@ class ArticulatedFilter(Estimator):
         return covs + self.spread[0] ** 2 * apart[..., :, None] * apart[..., None, :]
 
 
-def _kept(owner: nn.Module, path: str | None, like: Tensor) -> ArmPrior:
+def _kept(owner: nn.Module, path: str | Path | None, like: Tensor) -> ArmPrior:
     """Return the prior of a file, or that of the package; read once for each tracker."""
     return derived(
         owner,
-        ("arm prior", path),
+        ("arm prior", str(path)),
         (like,),
         lambda: ArmPrior.load(path) if path else shipped_arm_prior(),
     )
