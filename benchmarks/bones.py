@@ -3,7 +3,9 @@
 Error: the vector from the shoulder to the wrist (or hand) of the same side, in camera axes, so that
 nothing is aligned. Berkeley MHAD is seen by one camera with 3 px of noise at 2.5 m; the four views of
 a balancing person (Pose2Sim) are OpenPose's keypoints of the upper body, one camera at a time, against
-its triangulation. The prior over arms is fitted to all sets but the one that is scored.
+its triangulation; persons s7 and s8 of UTD-MHAD are seen by the test camera of UB-people. The prior over
+arms is fitted without the set that is scored, for UTD-MHAD without these two persons. The other
+methods have the prior that comes with torchpose, which knows s7 and s8 and nobody else here.
 
     python -m benchmarks.bones --data DIR [--out FILE]
     python -m benchmarks.bones --data DIR --fit FILE.safetensors
@@ -17,8 +19,10 @@ all forward; with the person's own lengths they know what a tracker has to find 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,6 +33,7 @@ from torch import Tensor
 
 import torchpose
 from benchmarks._table_file import table_file
+from torchpose.evaluation.common import CAMERA, centred_on_neck, make_test_set
 from torchpose.io import read_recordings
 from torchpose.learning._arms import fit_arm_prior
 from torchpose.priors import UpperBodyPrior
@@ -53,6 +58,12 @@ _MHAD = ("left_wrist", "left_elbow", "left_shoulder", "neck", "right_shoulder", 
          "right_wrist")  # fmt: skip
 _PLACE, _EVERY, _FRAMES, _STD = (0.05, -0.2, 2.5), 15, 150, 3.0
 _FEW = (0, 3, 6)  # neck and wrists
+_KINECT = (*(name.replace("wrist", "hand") for name in _SEVEN), "head")
+_FOUR = (0, 3, 6, 7)  # neck, hands and head
+_UTD, _UTD_PERSONS, _UTD_EVERY = "kinect_utd_mhad", ("s7", "s8"), 8
+TRACKERS = ("window-mixture", "articulated", "mkf-fixed")
+"""Methods that are scored in single views, and where few joints are measured, too."""
+
 _SETTLED = 90  # frames, from where on the spread of a bone's length counts
 
 
@@ -60,7 +71,7 @@ class View(NamedTuple):
     """A recording seen by one camera.
 
     Attributes:
-        keypoints: [T, 7, 2], NaN where missing, in the order of `names`. confidence: [T, 7].
+        keypoints: [T, J, 2], NaN where missing, in the order of `names`. confidence: [T, J].
         names: of the keypoints. camera: of the pixels. neck: kind of the keypoints' neck.
         truth: of left and right: shoulder, elbow, wrist, camera axes, [T, 2, 3, 3].
         fps: frames per second.
@@ -140,15 +151,40 @@ def openpose_views(data: Path) -> list[View]:
     return views
 
 
-def fit_without(data: Path, left_out: str | None) -> ArmPrior:
-    """Return the prior over arms that is fitted to all sets but one.
+def kinect_views(data: Path, every: int = _UTD_EVERY) -> list[View]:
+    """Return sequences of s7 and s8 of UTD-MHAD in the test camera of UB-people, 3 px of noise.
 
     Args:
-        data: folder with the sets. left_out: name of a set, None for none.
+        data: folder with kinect_utd_mhad/. every: one sequence in so many.
+    """
+    chosen = [r for r in read_recordings(data / _UTD) if r.person in _UTD_PERSONS][::every]
+    poses = [centred_on_neck(r.upper_body().joints.double()) for r in chosen]
+    test = make_test_set(poses, CAMERA, 30.0, noise_std=_STD, names=_KINECT)
+    ends = [[UPPER_BODY.index(f"{j}_{s}") for j in ("shoulder", "elbow", "hand")]
+            for s in ("left", "right")]  # fmt: skip
+    views = []
+    for keypoints, truth, n in zip(
+        test.keypoints, test.truth3d, test.lengths.tolist(), strict=True
+    ):
+        sure = torch.ones(n, len(_KINECT))
+        views.append(View(keypoints[:n], sure, _KINECT, CAMERA, "neck", truth[:n][:, ends], 30.0))
+    return views
+
+
+def fit_without(
+    data: Path, left_out: str | None, persons: Sequence[str] = (), **options: int
+) -> ArmPrior:
+    """Return the prior over arms that is fitted to all sets but one, and without some persons.
+
+    Args:
+        data: folder with the sets. left_out: name of a set, None for none. persons: left out of all
+            sets. options: of `fit_arm_prior`.
     """
     kept = {name: share for name, share in SETS.items() if name != left_out}
-    recordings = [read_recordings(data / name) for name in kept]
-    return fit_arm_prior(recordings, shares=list(kept.values()))
+    recordings = [
+        [r for r in read_recordings(data / name) if r.person not in persons] for name in kept
+    ]
+    return fit_arm_prior(recordings, shares=list(kept.values()), **options)
 
 
 def fit_shipped(data: Path, path: Path) -> None:
@@ -244,11 +280,74 @@ def methods(
     return {
         "window-mixture": lambda v: tracked(v, prior, None, method="window-mixture"),
         "articulated": lambda v: tracked(v, prior, None, method="articulated", arms=arms),
-        "single poses (mkf-fixed)": lambda v: tracked(v, prior, None, method="mkf-fixed"),
+        "mkf-fixed": lambda v: tracked(v, prior, None, method="mkf-fixed"),
         "lift, own lengths and depth": lambda v: lifted(v, true_lengths(v), far(v)),
         "lift, others' lengths, own depth": lambda v: lifted(v, mean, far(v)),
         "hanging arms": mean_arm,
     }
+
+
+class Group(NamedTuple):
+    """Views that are scored together.
+
+    Attributes:
+        seen: what they are, for the table. views: of them. left_out, persons: of the fit (`fit_without`).
+        few: keypoints that are measured in some more rows. few_seen: what these are.
+    """
+
+    seen: str
+    views: Sequence[View]
+    left_out: str | None = None
+    persons: Sequence[str] = ()
+    few: Sequence[int] = ()
+    few_seen: str = ""
+
+
+def groups(data: Path, quick: bool) -> Iterator[Group]:
+    """Yield what is scored, set by set."""
+    every = 60 if quick else _EVERY
+    yield Group("MHAD, seven joints", mhad_views(data, every), "mocap_berkeley_mhad",
+                few=_FEW, few_seen="MHAD, neck and wrists")  # fmt: skip
+    yield Group("OpenPose, one of four views", openpose_views(data)[: 1 if quick else None])
+    every = 100 if quick else _UTD_EVERY
+    yield Group("UTD-MHAD, eight joints", kinect_views(data, every), persons=_UTD_PERSONS,
+                few=_FOUR, few_seen="UTD-MHAD, head, neck and hands")  # fmt: skip
+
+
+class Table:
+    """Rows that are printed as they come, and kept."""
+
+    def __init__(self) -> None:
+        self.lines = [f"| {' | '.join(HEADER)} |", f"|{' --- |' * len(HEADER)}"]
+        print("\n".join(self.lines))
+
+    def add(self, seen: str, method: str, rows: Float[Tensor, "V 4"]) -> None:
+        """Add the mean over views; a dash stands where no view has a figure."""
+        figures = ["-" if math.isnan(x) else f"{x:.1f}" for x in rows.nanmean(0).tolist()]
+        self.lines.append(f"| {seen} | {method} | {' | '.join(figures)} |")
+        print(self.lines[-1], flush=True)
+
+
+def score_group(table: Table, group: Group, prior: UpperBodyPrior, arms: ArmPrior) -> None:
+    """Add the rows of a group; of OpenPose's views also each one by itself."""
+
+    def scored(method: Callable[[View], Chains]) -> Tensor:
+        return torch.tensor([errors(method(view), view.truth) for view in group.views])
+
+    single = {}
+    for name, method in methods(prior, arms, arms.lengths[:2].expand(2, 2)).items():
+        rows = scored(method)
+        table.add(group.seen, name, rows)
+        if group.seen.startswith("OpenPose") and name in TRACKERS:
+            single[name] = rows
+    for i in range(len(group.views)):
+        for name, rows in single.items():
+            table.add(f"OpenPose, view {i + 1}", name, rows[i : i + 1])
+    if group.few:
+        for name in TRACKERS:
+            options = {"arms": arms} if name == "articulated" else {}
+            few = partial(tracked, prior=prior, chosen=group.few, method=name, **options)
+            table.add(group.few_seen, name, scored(few))
 
 
 def main() -> None:
@@ -267,37 +366,13 @@ def main() -> None:
         fit_shipped(args.data, args.fit)
         return
     prior = torchpose.load_prior("kinect-upper-body")
-    lines = [f"| {' | '.join(HEADER)} |", f"|{' --- |' * len(HEADER)}"]
-    print("\n".join(lines))
-
-    def add(seen: str, name: str, views: Sequence[View], method: Callable[[View], Chains]) -> None:
-        rows = torch.tensor([errors(method(view), view.truth) for view in views])
-        figures = " | ".join(f"{value:.1f}" for value in rows.nanmean(0).tolist())
-        lines.append(f"| {seen} | {name} | {figures} |")
-        print(lines[-1], flush=True)
-
-    for seen, left_out, views in (
-        (
-            "MHAD, seven joints",
-            "mocap_berkeley_mhad",
-            mhad_views(args.data, 60 if args.quick else _EVERY),
-        ),
-        (
-            "OpenPose, one of four views",
-            None,
-            openpose_views(args.data)[: 1 if args.quick else None],
-        ),
-    ):
-        arms = fit_without(args.data, left_out)
-        mean = arms.lengths[:2].expand(2, 2)
-        for name, method in methods(prior, arms, mean).items():
-            add(seen, name, views, method)
-        if left_out is not None:
-            for name, options in (("window-mixture", {}), ("articulated", {"arms": arms})):
-                add("MHAD, neck and wrists", name, views,
-                    lambda v, n=name, o=options: tracked(v, prior, _FEW, method=n, **o))  # fmt: skip
+    size = {"n_samples": 2000, "n_components": 8} if args.quick else {}
+    table = Table()
+    for group in groups(args.data, args.quick):
+        arms = fit_without(args.data, group.left_out, group.persons, **size)
+        score_group(table, group, prior, arms)
     if args.out is not None:
-        args.out.write_text("\n".join(lines) + "\n")
+        args.out.write_text("\n".join(table.lines) + "\n")
 
 
 if __name__ == "__main__":

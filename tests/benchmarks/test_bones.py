@@ -32,6 +32,9 @@ def test_errors_of_the_truth_are_none(data):
 def test_quick_run_prints_every_method(run_here, data, tmp_path):
     printed = run_here("bones", "--quick", "--data", str(data), "--out", str(tmp_path))
     for row in ("MHAD, seven joints | articulated", "MHAD, neck and wrists | articulated",
-                "OpenPose, one of four views | lift, own lengths and depth"):  # fmt: skip
+                "OpenPose, one of four views | lift, own lengths and depth",
+                "OpenPose, view 1 | mkf-fixed", "UTD-MHAD, eight joints | hanging arms",
+                "UTD-MHAD, head, neck and hands | articulated"):  # fmt: skip
         assert row in printed
+    assert "nan" not in printed
     assert (tmp_path / "bones.md").read_text().split() == printed.split()

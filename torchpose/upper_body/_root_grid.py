@@ -25,7 +25,7 @@ __all__ = [
 
 _TORSO = tuple(UPPER_BODY.index(n) for n in ("shoulder_left", "shoulder_right", "neck", "head"))
 _NECK_HEIGHT = 0.105  # metres above the middle of the shoulders (Kinect's neck)
-_DEPTH, _DEPTH_STD = 2.0, 0.6  # metres, and of its log: where people stand before a camera
+_DEPTH, _DEPTH_STD = 2.6, 0.4  # metres, and of its log: as the Kinect recordings have it
 _NEAREST, _FARTHEST, _DEPTH_STEP = 0.4, 9.0, 0.04  # metres, and the step of log depth
 _TURN_STEP, _TURN_STD = 15.0, 20.0  # degrees
 _BROAD_TURN = 0.2  # share of the turns that are all alike likely
