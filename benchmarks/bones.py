@@ -22,7 +22,7 @@ import argparse
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,7 +34,7 @@ from torch import Tensor
 import torchpose
 from benchmarks._table_file import table_file
 from torchpose.evaluation.common import CAMERA, centred_on_neck, make_test_set
-from torchpose.io import read_recordings
+from torchpose.io import Recording, read_recordings
 from torchpose.learning._arms import fit_arm_prior
 from torchpose.priors import UpperBodyPrior
 from torchpose.priors._arms import ArmPrior
@@ -151,13 +151,19 @@ def openpose_views(data: Path) -> list[View]:
     return views
 
 
+@cache
+def _recordings(folder: Path) -> list[Recording]:
+    """Return the recordings of a set, read once."""
+    return read_recordings(folder)
+
+
 def kinect_views(data: Path, every: int = _UTD_EVERY) -> list[View]:
     """Return sequences of s7 and s8 of UTD-MHAD in the test camera of UB-people, 3 px of noise.
 
     Args:
         data: folder with kinect_utd_mhad/. every: one sequence in so many.
     """
-    chosen = [r for r in read_recordings(data / _UTD) if r.person in _UTD_PERSONS][::every]
+    chosen = [r for r in _recordings(data / _UTD) if r.person in _UTD_PERSONS][::every]
     poses = [centred_on_neck(r.upper_body().joints.double()) for r in chosen]
     test = make_test_set(poses, CAMERA, 30.0, noise_std=_STD, names=_KINECT)
     ends = [[UPPER_BODY.index(f"{j}_{s}") for j in ("shoulder", "elbow", "hand")]
@@ -181,9 +187,7 @@ def fit_without(
             sets. options: of `fit_arm_prior`.
     """
     kept = {name: share for name, share in SETS.items() if name != left_out}
-    recordings = [
-        [r for r in read_recordings(data / name) if r.person not in persons] for name in kept
-    ]
+    recordings = [[r for r in _recordings(data / name) if r.person not in persons] for name in kept]
     return fit_arm_prior(recordings, shares=list(kept.values()), **options)
 
 
@@ -305,11 +309,11 @@ class Group(NamedTuple):
 
 def groups(data: Path, quick: bool) -> Iterator[Group]:
     """Yield what is scored, set by set."""
-    every = 60 if quick else _EVERY
+    every = 150 if quick else _EVERY
     yield Group("MHAD, seven joints", mhad_views(data, every), "mocap_berkeley_mhad",
                 few=_FEW, few_seen="MHAD, neck and wrists")  # fmt: skip
     yield Group("OpenPose, one of four views", openpose_views(data)[: 1 if quick else None])
-    every = 100 if quick else _UTD_EVERY
+    every = 200 if quick else _UTD_EVERY
     yield Group("UTD-MHAD, eight joints", kinect_views(data, every), persons=_UTD_PERSONS,
                 few=_FOUR, few_seen="UTD-MHAD, head, neck and hands")  # fmt: skip
 
