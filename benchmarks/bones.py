@@ -5,7 +5,8 @@ nothing is aligned. Berkeley MHAD is seen by one camera with 3 px of noise at 2.
 a balancing person (Pose2Sim) are OpenPose's keypoints of the upper body, one camera at a time, against
 its triangulation; persons s7 and s8 of UTD-MHAD are seen by the test camera of UB-people. The prior over
 arms is fitted without the set that is scored, for UTD-MHAD without these two persons. The other
-methods have the prior that comes with torchpose, which knows s7 and s8 and nobody else here.
+methods have the prior that comes with torchpose, which knows none of the persons of the first two; for
+UTD-MHAD one that is fitted to s1 to s6 as in UB-people.
 
     python -m benchmarks.bones --data DIR [--out FILE]
     python -m benchmarks.bones --data DIR --fit FILE.safetensors
@@ -19,7 +20,6 @@ all forward; with the person's own lengths they know what a tracker has to find 
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache, partial
@@ -33,11 +33,14 @@ from torch import Tensor
 
 import torchpose
 from benchmarks._table_file import table_file
+from torchpose.evaluation import Report
 from torchpose.evaluation.common import CAMERA, centred_on_neck, make_test_set
 from torchpose.io import Recording, read_recordings
+from torchpose.learning import fit_kinect_prior
 from torchpose.learning._arms import fit_arm_prior
+from torchpose.metrics import coverage
 from torchpose.priors import UpperBodyPrior
-from torchpose.priors._arms import ArmPrior
+from torchpose.priors._arms import ArmPrior, shipped_arm_prior
 from torchpose.skeleton import UPPER_BODY
 
 SETS = {
@@ -50,20 +53,29 @@ SETS = {
 }
 """Share of each set in the fit of a prior over arms."""
 
-HEADER = ("seen", "method", "wrist (cm)", "elbow (cm)", "elbow before or behind (%)",
-          "spread of the forearm (%)")  # fmt: skip
+_DIGITS = (1, 1, 0, 1, 0, 0)
+COLUMNS = (
+    "wrist (cm)",
+    "elbow (cm)",
+    "elbow before or behind (%)",
+    "spread of the forearm (%)",
+    "inside 50 %",
+    "inside 90 %",
+)
 _SEVEN = ("wrist_left", "elbow_left", "shoulder_left", "neck", "shoulder_right", "elbow_right",
           "wrist_right")  # fmt: skip
 _MHAD = ("left_wrist", "left_elbow", "left_shoulder", "neck", "right_shoulder", "right_elbow",
          "right_wrist")  # fmt: skip
+_OPENPOSE_FACE = ("Nose", "LEye", "REye", "LEar", "REar")
+_FACE = ("nose", "eye_left", "eye_right", "ear_left", "ear_right")
 _PLACE, _EVERY, _FRAMES, _STD = (0.05, -0.2, 2.5), 15, 150, 3.0
 _FEW = (0, 3, 6)  # neck and wrists
 _KINECT = (*(name.replace("wrist", "hand") for name in _SEVEN), "head")
 _FOUR = (0, 3, 6, 7)  # neck, hands and head
 _UTD, _UTD_PERSONS, _UTD_EVERY = "kinect_utd_mhad", ("s7", "s8"), 8
-TRACKERS = ("window-mixture", "articulated", "mkf-fixed")
-"""Methods that are scored in single views, and where few joints are measured, too."""
-
+_FIT = {"n_components": 10, "window_components": 48, "calibration_folds": 0}
+_ENDS = [[UPPER_BODY.index(f"{joint}_{side}") for joint in ("shoulder", "elbow", "hand")]
+         for side in ("left", "right")]  # fmt: skip
 _SETTLED = 90  # frames, from where on the spread of a bone's length counts
 
 
@@ -87,10 +99,15 @@ class View(NamedTuple):
 
 
 class Chains(NamedTuple):
-    """Vectors from the shoulder to the elbow and on to the wrist, [T, 2, 3] each."""
+    """Vectors from the shoulder to the elbow and on to the wrist, [T, 2, 3] each.
+
+    Attributes:
+        inside: shares of true elbows and wrists in the 50 % and the 90 % ellipsoids, NaN without any.
+    """
 
     upper: Tensor
     lower: Tensor
+    inside: Sequence[float] = (float("nan"), float("nan"))
 
 
 def mhad_views(data: Path, every: int = _EVERY) -> list[View]:
@@ -140,14 +157,19 @@ def openpose_views(data: Path) -> list[View]:
             world = arrays["joints"].astype(float)[:, ends]
             truth = torch.tensor(world @ np.asarray(rotation, float).T + np.ravel(t))
             keypoints = torch.tensor(
-                found[:, [seen.index(name) for name in wanted]], dtype=torch.float64
+                found[:, [seen.index(name) for name in wanted + list(_OPENPOSE_FACE)]],
+                dtype=torch.float64,
             )
             sure = keypoints[..., 2].clamp(0, 1)
             camera = torchpose.PinholeCamera(
                 float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])
             )
             fps = float(arrays["fps"])
-            views.append(View(keypoints[..., :2], sure, _SEVEN, camera, "mid-shoulder", truth, fps))
+            views.append(
+                View(
+                    keypoints[..., :2], sure, (*_SEVEN, *_FACE), camera, "mid-shoulder", truth, fps
+                )
+            )
     return views
 
 
@@ -166,14 +188,12 @@ def kinect_views(data: Path, every: int = _UTD_EVERY) -> list[View]:
     chosen = [r for r in _recordings(data / _UTD) if r.person in _UTD_PERSONS][::every]
     poses = [centred_on_neck(r.upper_body().joints.double()) for r in chosen]
     test = make_test_set(poses, CAMERA, 30.0, noise_std=_STD, names=_KINECT)
-    ends = [[UPPER_BODY.index(f"{j}_{s}") for j in ("shoulder", "elbow", "hand")]
-            for s in ("left", "right")]  # fmt: skip
     views = []
     for keypoints, truth, n in zip(
         test.keypoints, test.truth3d, test.lengths.tolist(), strict=True
     ):
         sure = torch.ones(n, len(_KINECT))
-        views.append(View(keypoints[:n], sure, _KINECT, CAMERA, "neck", truth[:n][:, ends], 30.0))
+        views.append(View(keypoints[:n], sure, _KINECT, CAMERA, "neck", truth[:n][:, _ENDS], 30.0))
     return views
 
 
@@ -224,10 +244,12 @@ def tracked(
             view.confidence[None, :, rows].double(),
             names=[view.names[i] for i in rows],
         )
-    joints = dict(zip(UPPER_BODY, poses.joints3d[0].unbind(1), strict=True))
-    arms = [[joints[f"{j}_{s}"] for j in ("shoulder", "elbow", "hand")] for s in ("left", "right")]
-    ends = torch.stack([torch.stack(arm, 1) for arm in arms], 1)
-    return Chains(ends[:, :, 1] - ends[:, :, 0], ends[:, :, 2] - ends[:, :, 1])
+    ends = poses.joints3d[0][:, _ENDS]
+    covariance = poses.covariance3d[0][:, _ENDS]
+    found, true = (x - x[:, :, :1].mean(1, keepdim=True) for x in (ends, view.truth))
+    parts = (x[:, :, 1:].flatten(1, 2) for x in (found, covariance, true))
+    bones = ends.diff(dim=2)
+    return Chains(bones[:, :, 0], bones[:, :, 1], coverage(*parts).overall.tolist())
 
 
 def lifted(view: View, lengths: Float[Tensor, "2 2"], depth: float) -> Chains:
@@ -247,7 +269,7 @@ def lifted(view: View, lengths: Float[Tensor, "2 2"], depth: float) -> Chains:
 
 
 def errors(chains: Chains, truth: Float[Tensor, "T 2 3 3"]) -> list[float]:
-    """Return what the table has of a method: two errors, the share of right signs, a bone's spread."""
+    """Return a row of a method: two errors, share of right signs, a bone's spread, and coverages."""
     upper, lower = truth[:, :, 1] - truth[:, :, 0], truth[:, :, 2] - truth[:, :, 1]
     wrist = (chains.upper + chains.lower - upper - lower).norm(dim=-1).nanmean()
     elbow = (chains.upper - upper).norm(dim=-1).nanmean()
@@ -256,7 +278,8 @@ def errors(chains: Chains, truth: Float[Tensor, "T 2 3 3"]) -> list[float]:
     spread = torch.nan
     if length is not None:
         spread = float((length.std(0) / length.mean(0)).mean())
-    return [100 * float(wrist), 100 * float(elbow), 100 * float(sign), 100 * spread]
+    inside = [100 * share for share in chains.inside]
+    return [100 * float(wrist), 100 * float(elbow), 100 * float(sign), 100 * spread, *inside]
 
 
 def true_lengths(view: View) -> Float[Tensor, "2 2"]:
@@ -264,17 +287,21 @@ def true_lengths(view: View) -> Float[Tensor, "2 2"]:
     return view.truth.diff(dim=2).norm(dim=-1).nanmean(0)
 
 
-def methods(
-    prior: UpperBodyPrior, arms: ArmPrior, mean: Float[Tensor, "2 2"]
-) -> dict[str, Callable[[View], Chains]]:
-    """Return what is compared, by name; all keypoints are measured.
+def trackers(arms: ArmPrior) -> dict[str, dict[str, object]]:
+    """Return the options of the trackers that are compared, by the method's name."""
+    own = {"window-mixture": {}, "articulated": {"arms": arms}, "mkf-fixed": {}}
+    return {name: {"method": name, **options} for name, options in own.items()}
+
+
+def lifts(mean: Float[Tensor, "2 2"]) -> dict[str, Callable[[View], Chains]]:
+    """Return what needs no tracker, by name.
 
     Args:
-        prior: of the trackers. arms: fitted without the scored set. mean: lengths of other persons.
+        mean: lengths of other persons.
     """
 
     def far(view: View) -> float:
-        return float(view.truth[..., 0, 2].mean())
+        return float(view.truth[..., 0, 2].nanmean())
 
     def mean_arm(view: View) -> Chains:
         hanging = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
@@ -282,9 +309,6 @@ def methods(
         return Chains(*(bone.expand(len(view.truth), 2, 3) for bone in (upper, lower)))
 
     return {
-        "window-mixture": lambda v: tracked(v, prior, None, method="window-mixture"),
-        "articulated": lambda v: tracked(v, prior, None, method="articulated", arms=arms),
-        "mkf-fixed": lambda v: tracked(v, prior, None, method="mkf-fixed"),
         "lift, own lengths and depth": lambda v: lifted(v, true_lengths(v), far(v)),
         "lift, others' lengths, own depth": lambda v: lifted(v, mean, far(v)),
         "hanging arms": mean_arm,
@@ -295,14 +319,18 @@ class Group(NamedTuple):
     """Views that are scored together.
 
     Attributes:
-        seen: what they are, for the table. views: of them. left_out, persons: of the fit (`fit_without`).
-        few: keypoints that are measured in some more rows. few_seen: what these are.
+        seen: what they are, for the title. views: of them.
+        left_out, persons: of the fit of arms (`fit_without`); of the persons' own set the prior of the
+            other trackers is fitted to everybody else.
+        each: whether each view has rows of its own.
+        few: keypoints that are measured in one more table. few_seen: what these are.
     """
 
     seen: str
     views: Sequence[View]
     left_out: str | None = None
     persons: Sequence[str] = ()
+    each: bool = False
     few: Sequence[int] = ()
     few_seen: str = ""
 
@@ -312,50 +340,56 @@ def groups(data: Path, quick: bool) -> Iterator[Group]:
     every = 150 if quick else _EVERY
     yield Group("MHAD, seven joints", mhad_views(data, every), "mocap_berkeley_mhad",
                 few=_FEW, few_seen="MHAD, neck and wrists")  # fmt: skip
-    yield Group("OpenPose, one of four views", openpose_views(data)[: 1 if quick else None])
+    yield Group("OpenPose, upper body and face, one of four views",
+                openpose_views(data)[: 1 if quick else None], each=True)  # fmt: skip
     every = 200 if quick else _UTD_EVERY
     yield Group("UTD-MHAD, eight joints", kinect_views(data, every), persons=_UTD_PERSONS,
                 few=_FOUR, few_seen="UTD-MHAD, head, neck and hands")  # fmt: skip
 
 
-class Table:
-    """Rows that are printed as they come, and kept."""
+def priors_of(group: Group, data: Path, quick: bool) -> tuple[UpperBodyPrior, ArmPrior]:
+    """Return the priors of a group, which know nobody in it."""
+    size = {"n_samples": 2000, "n_components": 8} if quick else {}
+    if group.left_out is None and not group.persons:
+        arms = shipped_arm_prior()
+    else:
+        arms = fit_without(data, group.left_out, group.persons, **size)
+    if quick or not group.persons:
+        return torchpose.load_prior(
+            "kinect-upper-body-small" if quick else "kinect-upper-body"
+        ), arms
+    others = [r for r in _recordings(data / _UTD) if r.person not in group.persons]
+    return fit_kinect_prior(others, seed=0, **_FIT), arms
 
-    def __init__(self) -> None:
-        self.lines = [f"| {' | '.join(HEADER)} |", f"|{' --- |' * len(HEADER)}"]
-        print("\n".join(self.lines))
 
-    def add(self, seen: str, method: str, rows: Float[Tensor, "V 4"]) -> None:
-        """Add the mean over views; a dash stands where no view has a figure."""
-        figures = ["-" if math.isnan(x) else f"{x:.1f}" for x in rows.nanmean(0).tolist()]
-        self.lines.append(f"| {seen} | {method} | {' | '.join(figures)} |")
-        print(self.lines[-1], flush=True)
+def add_group(report: Report, group: Group, prior: UpperBodyPrior, arms: ArmPrior) -> None:
+    """Add the tables of a group: all keypoints measured, and few."""
 
-
-def score_group(table: Table, group: Group, prior: UpperBodyPrior, arms: ArmPrior) -> None:
-    """Add the rows of a group; of OpenPose's views also each one by itself."""
-
-    def scored(method: Callable[[View], Chains]) -> Tensor:
+    def rows(method: Callable[[View], Chains]) -> Float[Tensor, "V 6"]:
         return torch.tensor([errors(method(view), view.truth) for view in group.views])
 
-    single = {}
-    for name, method in methods(prior, arms, arms.lengths[:2].expand(2, 2)).items():
-        rows = scored(method)
-        table.add(group.seen, name, rows)
-        if group.seen.startswith("OpenPose") and name in TRACKERS:
-            single[name] = rows
-    for i in range(len(group.views)):
-        for name, rows in single.items():
-            table.add(f"OpenPose, view {i + 1}", name, rows[i : i + 1])
+    def of_trackers(chosen: Sequence[int] | None) -> dict[str, Tensor]:
+        return {
+            name: rows(partial(tracked, prior=prior, chosen=chosen, **options))
+            for name, options in trackers(arms).items()
+        }
+
+    table = report.table(group.seen, group.seen, COLUMNS, digits=_DIGITS)
+    found = of_trackers(None)
+    others = {name: rows(lift) for name, lift in lifts(arms.lengths[:2].expand(2, 2)).items()}
+    for name, scored in (found | others).items():
+        table.add(name, scored.nanmean(0))
+    for i in range(len(group.views) if group.each else 0):
+        for name, scored in found.items():
+            table.add(f"view {i + 1}, {name}", scored[i])
     if group.few:
-        for name in TRACKERS:
-            options = {"arms": arms} if name == "articulated" else {}
-            few = partial(tracked, prior=prior, chosen=group.few, method=name, **options)
-            table.add(group.few_seen, name, scored(few))
+        table = report.table(group.few_seen, group.few_seen, COLUMNS, digits=_DIGITS)
+        for name, scored in of_trackers(group.few).items():
+            table.add(name, scored.nanmean(0))
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", type=Path, required=True, help="folder with the sets")
     parser.add_argument("--threads", type=int, default=2, help="cores")
@@ -369,14 +403,13 @@ def main() -> None:
     if args.fit is not None:
         fit_shipped(args.data, args.fit)
         return
-    prior = torchpose.load_prior("kinect-upper-body")
-    size = {"n_samples": 2000, "n_components": 8} if args.quick else {}
-    table = Table()
+    report = Report("Arms of strangers")
     for group in groups(args.data, args.quick):
-        arms = fit_without(args.data, group.left_out, group.persons, **size)
-        score_group(table, group, prior, arms)
+        add_group(report, group, *priors_of(group, args.data, args.quick))
+    tables = [table.to_markdown() for table in report.values()]
+    print("\n\n".join(tables))
     if args.out is not None:
-        args.out.write_text("\n".join(table.lines) + "\n")
+        args.out.write_text("\n\n".join(tables) + "\n")
 
 
 if __name__ == "__main__":

@@ -137,6 +137,11 @@ def test_options_reach_the_tracker(track, files):
     stds = (5.0, 6.0, 6.0, 2.0, 3.0)
     text = ",".join(str(s) for s in stds)
     same(track("--measurement-std", text)[1], expected(files, measurement_std=stds))
+    given, lengths = "upper_arm=0.3,forearm=0.25", {"upper_arm": 0.3, "forearm": 0.25}
+    same(
+        track("--method", "articulated", "--bone-lengths", given)[1],
+        expected(files, method="articulated", bone_lengths=lengths),
+    )
     same(track("--steady", "false")[1], expected(files, steady=False))
     same(track("--static-camera", "true")[1], expected(files, static_camera=True))
 
@@ -280,6 +285,8 @@ BAD_INPUT = {
     "negative smoothing": ([CLIP, "--smoothing", "-1"], "a number of frames or 'full'"),
     "bad std": ([CLIP, "--measurement-std", "wide"], "a number or five"),
     "four stds": ([CLIP, "--measurement-std", "1,2,3,4"], "one number or five"),
+    "bad lengths": ([CLIP, "--bone-lengths", "long"], "must be NAME=METRES with commas"),
+    "lengths of the default": ([CLIP, "--bone-lengths", "forearm=0.2"], "it is of articulated"),
     "negative std": ([CLIP, "--measurement-std=-2"], "must be positive"),
     "three numbers": ([CLIP, "--camera", "1,2,3"], "fx,fy,cx,cy"),
     "no focal length": ([CLIP, "--camera", "0,0,320,240"], "positive focal lengths"),

@@ -1,5 +1,7 @@
 """Arms of bones that keep their lengths: exact geometry, streams, gaps, and what is not to be seen."""
 
+import copy
+import dataclasses
 import math
 
 import pytest
@@ -196,3 +198,56 @@ def test_wrists_end_shorter_forearms_than_hands():
         found = tracker()(uv, names=names).joints3d[0, 0]
         lengths.append(float(torch.linalg.vector_norm(bones(found, "left")[1])))
     assert lengths[1] < 0.85 * lengths[0]
+
+
+def test_shoulders_of_raised_arms_are_no_turn():
+    """Raised arms bring the shoulders together, which must not be taken for a turned body."""
+    joints = body(30)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        rows = [ROW[f"{j}_{side}"] for j in ("shoulder", "elbow", "hand")]
+        shoulder = torch.tensor([sign * 0.12, 0.08, 0.0]) + joints[:, ROW["neck"]]
+        up = torch.tensor([sign * 0.25, -1.0, -0.1], dtype=torch.float64)
+        up = up / torch.linalg.vector_norm(up)
+        ends = [shoulder, shoulder + 0.2686 * up, shoulder + (0.2686 + 0.2888) * up]
+        joints[:, rows] = torch.stack(ends, 1)
+    found = tracker()(pixels(joints, 2.0)[None]).joints3d[0, -1]
+    across = found[ROW["shoulder_left"]] - found[ROW["shoulder_right"]]
+    assert abs(math.degrees(float(torch.atan2(-across[2], across[0])))) < 25
+
+
+def test_a_neck_in_the_middle_of_the_shoulders_is_put_there():
+    """A prior whose neck is the middle of the shoulders gives the depth that one with Kinect's neck gives."""
+    prior = copy.deepcopy(PRIOR)
+    prior.info = dataclasses.replace(prior.info, neck="mid-shoulder")
+    joints = body(12)
+    lower = joints.clone()
+    lower[:, ROW["neck"]] = lower[:, [ROW["shoulder_left"], ROW["shoulder_right"]]].mean(1)
+    usual = tracker()(pixels(joints)[None]).joints3d[0, -1]
+    other = UpperBodyTracker(prior, CAMERA, "articulated", fps=30.0, neck="mid-shoulder")
+    found = other(pixels(lower)[None]).joints3d[0, -1]
+    names = ("shoulder_left", "shoulder_right", "head")
+    rows = [ROW[name] for name in names]
+    torch.testing.assert_close(found[rows], usual[rows], rtol=0, atol=0.03)
+    middle = found[[ROW["shoulder_left"], ROW["shoulder_right"]]].mean(0)
+    torch.testing.assert_close(found[ROW["neck"]], middle, rtol=0, atol=0.02)
+
+
+def test_given_lengths_are_kept_and_the_others_go_with_them():
+    uv = pixels(body(30), 2.0)[None]
+    usual, given = (tracker(bone_lengths=x)(uv).joints3d[0, -1] for x in (None, {"forearm": 0.25}))
+    for side in ("left", "right"):
+        upper, lower = (torch.linalg.vector_norm(x) for x in bones(given, side))
+        assert float(lower) == pytest.approx(0.25, abs=0.005)
+        before = torch.linalg.vector_norm(bones(usual, side)[0])
+        assert float(upper) < float(before)
+    assert float(given[ROW["neck"], 2]) < float(usual[ROW["neck"], 2])
+
+
+@pytest.mark.parametrize(
+    ("lengths", "said"),
+    [({"thigh": 0.4}, "bone_lengths must be one of .*upper_arm"), ({"forearm": 25.0}, "between 0.05 and 1"),
+     ({}, "at least one length"), (0.3, "a mapping of upper_arm")],
+)  # fmt: skip
+def test_lengths_that_nobody_has_are_refused(lengths, said):
+    with pytest.raises(InputError, match=said):
+        tracker(bone_lengths=lengths)

@@ -11,6 +11,7 @@ from torchpose.errors import InputError
 from torchpose.filters import MixtureKalmanFilter
 from torchpose.priors import UpperBodyPrior
 from torchpose.priors._arms import ArmPrior, shipped_arm_prior
+from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import (
     METHODS,
     PoseFilter,
@@ -49,6 +50,26 @@ def test_windows_are_the_default_where_the_prior_has_them(prior, keypoints):
     assert track.method == "window-mixture" and track.notes == ()
     named = poses(UpperBodyTracker(prior, demo_camera(), "window-mixture"), keypoints)
     assert torch.equal(track.joints3d, named.joints3d)
+
+
+def test_bones_are_the_default_where_shoulders_and_elbows_are_measured(prior):
+    joints = performer(8, seed=0).joints
+    rays = joints @ demo_camera().matrix.mT
+    seen = (rays[..., :2] / rays[..., 2:])[None]
+    tracker = UpperBodyTracker(prior, demo_camera())
+    assert tracker.method == "window-mixture" and tracker(seen).method == "articulated"
+    assert UpperBodyTracker(prior, demo_camera(), smoothing=1)(seen).method != "articulated"
+    assert UpperBodyTracker(prior, demo_camera(), steady=False)(seen).method == "window-mixture"
+    assert (
+        UpperBodyTracker(prior, demo_camera(), likelihood_power=0.5)(seen).method != "articulated"
+    )
+    elbows = [UPPER_BODY.index(f"elbow_{side}") for side in ("left", "right")]
+    hidden = seen.clone()
+    hidden[:, :, elbows] = torch.nan
+    assert tracker(hidden).method == "window-mixture"
+    _, track = tracker.advance(tracker.init(1), seen)
+    assert track.method == "articulated"
+    torch.testing.assert_close(track.joints3d, tracker(seen).joints3d, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("smoothing", [None, 3, "full"])
@@ -93,7 +114,7 @@ VALUES = {
     "initial_cov": 1e3 * torch.ones(21), "transition": "stationary", "gamma": 0.5, "burn_in": 20,
     "resample_threshold": 1.0, "burn_in_scale": 7.0, "likelihood_power": 0.01, "weighting": "frame",
     "reset_below": 1e6, "dtype": torch.float32, "n_particles": 30, "resampling": "multinomial",
-    "start": "prior",
+    "start": "prior", "bone_lengths": {"upper_arm": 0.32},
 }  # fmt: skip
 BESIDE = {
     "subspace": {"transition": "ou", "gamma": 0.5},

@@ -17,8 +17,9 @@ __all__ = ["Command", "Given", "add_options", "new_parser", "parse_seed"]
 
 _METAVARS = {
     "action": "NAME|FILE", "actions": "ACTION", "body": "FILE",
-    "camera": "FILE|fx,fy,cx,cy", "camera_name": "NAME", "camera_names": "NAMES",
-    "components": "K", "conditionals": "NAME|FILE", "delays": "[n,n,...]", "face_model": "FILE",
+    "bone_lengths": "NAME=M,...", "camera": "FILE|fx,fy,cx,cy", "camera_name": "NAME",
+    "camera_names": "NAMES", "components": "K", "conditionals": "NAME|FILE",
+    "delays": "[n,n,...]", "face_model": "FILE",
     "facing": "[x,y,z]", "fps": "HZ", "height": "M", "held_out": "PERSON",
     "initial_pose": "FILE", "licence": "TEXT", "manifold": "NAME|FILE", "max_gap": "S",
     "measurement_std": "PX", "neck": "KIND", "noise_of": "PRIOR", "out": "DIR",

@@ -8,6 +8,8 @@ learnt on the way.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +21,7 @@ from tqdm.auto import tqdm
 from torchpose._core.module_state import derived
 from torchpose.errors import InputError
 from torchpose.filters._base import Generators
-from torchpose.priors._arms import LENGTHS, ArmPrior, shipped_arm_prior
+from torchpose.priors._arms import ArmPrior, shipped_arm_prior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import upright_axes
 from torchpose.upper_body._arm_chain import (
@@ -30,14 +32,17 @@ from torchpose.upper_body._arm_chain import (
     DirectionDensity,
 )
 from torchpose.upper_body._articulated_poses import FramePose, estimates_of
+from torchpose.upper_body._body_lengths import BodyLengths, Lengths
 from torchpose.upper_body._estimator import ArmJoints, Estimates, Estimator, TrackerModel
+from torchpose.upper_body._face import FacePoints, face_evidence
+from torchpose.upper_body._lean import lean_angle, rolled, seen_lean
 from torchpose.upper_body._measurements import MeasuredJoints
 from torchpose.upper_body._root_grid import (
-    SHRUG,
     Root,
     RootGrid,
     Torso,
     TorsoLengths,
+    half_widths,
     middle_of_shoulders,
     see_torso,
     shoulder_offsets,
@@ -54,25 +59,10 @@ _SHOULDERS, _ELBOWS, _HANDS = (
 _ROOTS = 10  # hypotheses of the root that arms are weighed for
 _COARSE_ANGLES, _COARSE_AROUND = 11, 24  # of limbs, while roots are weighed
 _POWER = 0.3  # of the evidence of arms about the root: those of near frames are alike
-_NUDGE = 0.03  # of a log-length, to see what a frame says about it
-_MOST = 0.1  # of a log-length that one frame may change it by
 _SHARE = 0.2  # seconds over which frames say the same about a length
-_WIDTH_STD, _HEIGHT_STD = 0.05, 0.05  # metres: shoulders and heads move in their torsos
 _MODE = math.radians(45.0)  # turns farther than that from the likeliest are another mode
 _SIDES = ((1.0, 1.0, 1.0), (-1.0, 1.0, 1.0))  # right arms are mirrored
 _TORSO_STD = 0.03  # metres: of torso joints in space
-
-
-class Lengths(NamedTuple):
-    """Gaussian over the logs of the lengths of a person, relative to the prior's.
-
-    Attributes:
-        mean: of upper arm, forearm, width between the shoulders and height of the head, [B, 4].
-        precision: [B, 4].
-    """
-
-    mean: Tensor
-    precision: Tensor
 
 
 class ArticulatedState(NamedTuple):
@@ -81,7 +71,8 @@ class ArticulatedState(NamedTuple):
     Attributes:
         root: belief over depth and turn, [B, Z, P]. lengths: of the bones.
         arms: belief over the arms; None before the first frame.
-        middle: of the shoulders, camera axes, [B, 3], NaN before anything of the torso was seen.
+        middle: of the shoulders, camera axes, [B, 3]; on the axis before any of the torso was seen.
+        lean: moments of the line between the shoulders (`seen_lean`), [B, 2].
         frame: number of frames before.
     """
 
@@ -89,22 +80,48 @@ class ArticulatedState(NamedTuple):
     lengths: Lengths
     arms: ArmState | None
     middle: Tensor
+    lean: Tensor
     frame: int
 
 
 class _Frame(NamedTuple):
-    """One frame as rays: [B, 8, 3], which are known [B, 8], and their noise over the focal length [B, 8]."""
+    """One frame as rays.
+
+    Attributes:
+        rays: [B, 8, 3]. known: [B, 8]. std: of their pixels over the focal length, [B, 8].
+        face: rays of nose, eyes and ears, None if there are none.
+    """
 
     rays: Tensor
     known: Tensor
     std: Tensor
+    face: FacePoints | None
+
+    def level(self, lean: Float[Tensor, " B"]) -> _LevelFrame:
+        """Return the frame as a camera sees it that leans as the torso does."""
+        rays, face = rolled(self.rays, -lean), self.face
+        if face is not None:
+            face = face._replace(places=rolled(face.places, -lean))
+        torso = see_torso(rays, self.known, self.std)
+        return _LevelFrame(rays, self.known, self.std, face, torso)
+
+
+class _LevelFrame(NamedTuple):
+    """One frame in which torsos are upright: as `_Frame`, and what the joints say about the torso."""
+
+    rays: Tensor
+    known: Tensor
+    std: Tensor
+    face: FacePoints | None
+    torso: Torso
 
 
 class ArticulatedFilter(Estimator):
     """Estimator of arms whose bones keep their lengths, from any of the eight joints.
 
-    1. The torso: depth and turn of the shoulders on a grid, weighed by what torso joints and arms say
-       (`RootGrid`).
+    0. The lean of the torso to a side, by which the frame is turned about the optical axis (`seen_lean`).
+    1. The torso: depth and turn of the shoulders on a grid, weighed by what torso joints, the face and
+       the arms say (`RootGrid`, `face_evidence`).
     2. The lengths of upper arm, forearm, shoulders and head, a Gaussian over their logs that starts as
        the prior over persons and sharpens (assumed-density filter). One camera does not tell a large
        body that is far from a small one that is near, so the common scale stays the prior's.
@@ -113,15 +130,23 @@ class ArticulatedFilter(Estimator):
 
     Args:
         model: of the tracker. arms: prior over arms, or its file; by default the one that comes with
-            the package.
+            the package. bone_lengths: of the person, metres, where they were measured: any of
+            upper_arm, forearm (to the measured hand or wrist), shoulder_width and head_height (above the
+            neck). The others are expected in proportion.
 
     Raises:
-        InputError: arms of another kind, or no such file. FileFormatError: a file of another kind.
+        InputError: arms of another kind, no such file, or a length that nobody has. FileFormatError: a
+            file of another kind.
     """
 
     calibration = "articulated"
 
-    def __init__(self, model: TrackerModel, arms: ArmPrior | str | Path | None = None) -> None:
+    def __init__(
+        self,
+        model: TrackerModel,
+        arms: ArmPrior | str | Path | None = None,
+        bone_lengths: Mapping[str, float] | None = None,
+    ) -> None:
         if not isinstance(arms, ArmPrior | str | Path | None):
             raise InputError(
                 f"arms must be a prior over arms or the path of its file, got {type(arms).__name__}"
@@ -142,20 +167,18 @@ class ArticulatedFilter(Estimator):
         self.grid = derived(
             owner, ("root grid", model.rate), (like,), lambda: RootGrid(model.rate, like)
         )
-        hand = "forearm" if (model.hand or model.prior.info.hand) == "wrist" else "forearm_to_hand"
-        rows = [LENGTHS.index(n) for n in ("upper_arm", hand, "shoulder_width", "head_height")]
-        self.usual = self.prior.lengths[rows].to(like)
-        self.spread = self.prior.spread[rows].to(like)
-        self.matrix = model.prior.info.matrix.to(like)
+        info, hand = model.prior.info, model.hand or model.prior.info.hand
+        self.lengths = BodyLengths(self.prior, hand, info.neck, bone_lengths, like)
+        self.matrix = info.matrix.to(like)
 
     def init(
         self, batch_size: int, joints: ArmJoints, generators: dict[str, Generators]
     ) -> ArticulatedState:
         """Return the state before the first frame; see `Estimator`."""
-        precision = self.spread.square().reciprocal().expand(batch_size, -1)
-        lengths = Lengths(torch.zeros_like(precision), precision)
-        middle = precision.new_full((batch_size, 3), math.nan)
-        return ArticulatedState(self.grid.init(batch_size), lengths, None, middle, 0)
+        root = self.grid.init(batch_size)
+        middle = root.new_tensor([0.0, 0.0, 1.0]).expand(batch_size, -1)
+        lean = root.new_zeros(batch_size, 2)
+        return ArticulatedState(root, self.lengths.init(batch_size), None, middle, lean, 0)
 
     def advance(
         self, state: ArticulatedState, measured: MeasuredJoints
@@ -196,24 +219,49 @@ class ArticulatedFilter(Estimator):
         variance = measured.cov.diagonal(dim1=-2, dim2=-1).mean(-1)
         std = (variance.sqrt() / focal).expand(uv.shape[:3])
         parts = zip(rays.unbind(1), measured.mask.unbind(1), std.unbind(1), strict=True)
-        return [_Frame(*part) for part in parts]
+        faces = self._faces(measured)
+        return [_Frame(*part, face) for part, face in zip(parts, faces, strict=True)]
+
+    def _faces(self, measured: MeasuredJoints) -> Sequence[FacePoints | None]:
+        """Return the face in each frame, as rays."""
+        face = measured.face
+        if face is None:
+            return [None] * measured.uv.shape[1]
+        focal, centre = self.matrix.diagonal()[:2], self.matrix[:2, 2]
+        places = (face.places - centre) / focal
+        parts = zip(places.unbind(1), face.confidence.unbind(1), strict=True)
+        return [FacePoints(*part, face.expected) for part in parts]
 
     def _step(self, state: ArticulatedState, frame: _Frame) -> tuple[ArticulatedState, FramePose]:
-        """Return the next state and the estimate of one frame."""
-        lengths = self._lengths(state.lengths)
-        slack = lengths[:, :2] * state.lengths.precision[:, :2].rsqrt()
-        slack[:, 0] = 0.0  # the common scale moves the body, not the pixels
-        torso = see_torso(frame.rays, frame.known, frame.std)
-        size = self._torso_lengths(state.lengths)
+        """Return the next state and the estimate of one frame, in a camera that leans as the torso does."""
+        depth = (state.root.sum(2) @ self.grid.depth.log()).exp()
+        lean = seen_lean(state.lean, frame.rays, frame.known, depth, self.model.rate)
+        angle = lean_angle(lean)
+        level = state._replace(middle=rolled(state.middle, -angle), lean=lean)
+        new, pose = self._level_step(level, frame.level(angle))
+        covs = rolled(rolled(pose.covs, angle).mT, angle)
+        pose = pose._replace(joints=rolled(pose.joints, angle), covs=covs, lean=angle)
+        return new._replace(middle=rolled(new.middle, angle)), pose
+
+    def _level_step(
+        self, state: ArticulatedState, frame: _LevelFrame
+    ) -> tuple[ArticulatedState, FramePose]:
+        """Return the next state and the estimate of one frame in which torsos are upright."""
+        torso = frame.torso
+        lengths, slack = self.lengths.metres(state.lengths), self.lengths.slack(state.lengths)
+        size = self.lengths.torso(state.lengths)
         predicted = self.grid.predict(state.root)
         believed = predicted.log() + self.grid.evidence(torso, size)
+        if frame.face is not None:
+            std = frame.std.amin(1)
+            believed = believed + face_evidence(frame.face, std, self.grid.depth, self.grid.turn)
         root = self.grid.best(believed, _ROOTS)
         middle = self._middle(state, torso, root, size)
         weighed = self._arms(frame, root, middle, lengths, slack, _COARSE_ANGLES, _COARSE_AROUND)
         seen = frame.known[:, [_ELBOWS, _HANDS]].sum((1, 2)).to(root.depth)
         evidence = weighed.log_evidence.sum(1) + 2 * seen[:, None] * root.depth.log()
-        root = root._replace(log_weight=root.log_weight + _POWER * evidence)
-        likely = self._likely(root)
+        after = self.grid.belief(believed, root, _POWER * evidence)
+        likely = self._likely(root._replace(log_weight=root.log_weight + _POWER * evidence))
         centre = self._middle(state, torso, likely, size)
         arms = self._arms(frame, likely, centre, lengths, slack)
         belief = (
@@ -221,44 +269,34 @@ class ArticulatedFilter(Estimator):
         )
         learnt = state.lengths
         if state.frame % self.stride == 0:
-            learnt = self._learn(learnt, frame, torso, likely, centre)
+            of_lengths = partial(self._evidence_of, frame, likely, centre)
+            learnt = self.lengths.learn(learnt, torso, likely, of_lengths)
         pose = self._pose(belief, frame, likely, centre, lengths, size)
-        new = ArticulatedState(
-            self.grid.belief(root), learnt, belief, centre[:, 0], state.frame + 1
-        )
+        new = ArticulatedState(after, learnt, belief, centre[:, 0], state.lean, state.frame + 1)
         return new, pose
-
-    def _lengths(self, lengths: Lengths) -> Float[Tensor, "B 4"]:
-        return self.usual * lengths.mean.exp()
-
-    def _torso_lengths(self, lengths: Lengths) -> TorsoLengths:
-        metres = self._lengths(lengths)[:, 2:]
-        std = metres * lengths.precision[:, 2:].rsqrt()
-        return TorsoLengths(*metres.unbind(1), *std.unbind(1))
 
     def _middle(
         self, state: ArticulatedState, torso: Torso, root: Root, size: TorsoLengths
     ) -> Float[Tensor, "B M 3"]:
         """Return the middle of the shoulders, where it was last if nothing of the torso is measured."""
         found = middle_of_shoulders(torso, root.depth, root.turn, size)
-        start = found.new_tensor([0.0, 0.0, 1.0])
-        ray = torch.where(state.middle.isnan().any(-1, True), start, state.middle)
-        before = ray[:, None] / ray[:, None, 2:] * root.depth[..., None]
+        before = (state.middle / state.middle[:, 2:])[:, None] * root.depth[..., None]
         return torch.where(torso.known.any(1)[:, None, None], found, before)
 
     def _shoulders(
-        self, frame: _Frame, root: Root, middle: Tensor, width: Tensor
+        self, frame: _LevelFrame, root: Root, middle: Tensor, width: Tensor
     ) -> Float[Tensor, "B 2 M 3"]:
         """Return both shoulders: on their rays where they are measured."""
-        half = shoulder_offsets(root.turn, width[:, None].expand_as(root.turn))
-        inferred = torch.stack([middle + half, middle - half], 1)
+        half = half_widths(frame.torso, root.depth, width)
+        offsets = shoulder_offsets(root.turn, half)
+        inferred = (middle[..., None, :] + offsets).transpose(1, 2)
         ray = frame.rays[:, _SHOULDERS, None]
         on_ray = ray / ray[..., 2:] * inferred[..., 2:]
         return torch.where(frame.known[:, _SHOULDERS, None, None], on_ray, inferred)
 
     def _arms(
         self,
-        frame: _Frame,
+        frame: _LevelFrame,
         root: Root,
         middle: Tensor,
         lengths: Tensor,
@@ -292,59 +330,18 @@ class ArticulatedFilter(Estimator):
         turn = best + (near * off).sum(1, keepdim=True)
         return Root(depth, turn, torch.zeros_like(depth), torch.zeros_like(root.cell[:, :1]))
 
-    def _learn(
-        self, lengths: Lengths, frame: _Frame, torso: Torso, root: Root, middle: Tensor
-    ) -> Lengths:
-        """Return the lengths after a frame, one of a fifth of a second: the others say the same."""
-        slope, bend = self._slopes(lengths, frame, root, middle)
-        width, height = self._torso_slopes(lengths, torso, root)
-        slope = torch.cat([slope, width[0], height[0]], 1)
-        bend = torch.cat([bend, width[1], height[1]], 1).clamp_min(0.0)
-        precision = lengths.precision + bend
-        mean = lengths.mean + (slope / precision).clamp(-_MOST, _MOST)
-        mean = mean - mean[:, :1]  # the common scale is not to be seen: upper arms stay the prior's
-        limit = 3 * self.spread
-        return Lengths(mean.clamp(-limit, limit), precision)
-
-    def _slopes(
-        self, lengths: Lengths, frame: _Frame, root: Root, middle: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return slope and bend of the evidence over the log-lengths of upper arm and forearm, [B, 2]."""
-        nudges = lengths.mean.new_tensor(
-            [[0, 0, 0, 0], [1, 0, 0, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0]]
-        )
-        values, stiff = [], torch.zeros_like(lengths.mean[:, :2])
-        for nudge in nudges * _NUDGE:
-            nudged = self._lengths(lengths._replace(mean=lengths.mean + nudge))
-            arms = self._arms(frame, root, middle, nudged, stiff, _COARSE_ANGLES, _COARSE_AROUND)
-            values.append(arms.log_evidence.sum((1, 2)))
-        at, *pairs = values
-        slope = [(pairs[i] - pairs[i + 1]) / (2 * _NUDGE) for i in (0, 2)]
-        bend = [(2 * at - pairs[i] - pairs[i + 1]) / _NUDGE**2 for i in (0, 2)]
-        return torch.stack(slope, 1), torch.stack(bend, 1)
-
-    def _torso_slopes(
-        self, lengths: Lengths, torso: Torso, root: Root
-    ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-        """Return slope and bend of the evidence over the log-width and the log-height, [B, 1] each."""
-        size = self._lengths(lengths)
-        pairs = (
-            (0, 1, 0, size[:, 2:3] * root.turn.cos(), _WIDTH_STD),
-            (2, 3, 1, size[:, 3:], _HEIGHT_STD),
-        )
-        found = []
-        for a, b, axis, expected, std in pairs:
-            free = std**2 + (axis == 0) * (torso.raised * SHRUG).square().sum(1, keepdim=True)
-            seen = (torso.rays[:, a, axis] - torso.rays[:, b, axis])[:, None] * root.depth
-            both = (torso.known[:, a] & torso.known[:, b])[:, None].to(seen)
-            slope = both * expected * (seen - expected) / free
-            found.append((slope, both * expected.square() / free))
-        return found[0], found[1]
+    def _evidence_of(
+        self, frame: _LevelFrame, root: Root, middle: Tensor, lengths: Float[Tensor, "B 4"]
+    ) -> Float[Tensor, " B"]:
+        """Return the log-evidence of both arms under bones of these lengths, metres."""
+        stiff = torch.zeros_like(lengths[:, :2])
+        arms = self._arms(frame, root, middle, lengths, stiff, _COARSE_ANGLES, _COARSE_AROUND)
+        return arms.log_evidence.sum((1, 2))
 
     def _pose(
         self,
         belief: ArmState,
-        frame: _Frame,
+        frame: _LevelFrame,
         root: Root,
         middle: Tensor,
         lengths: Tensor,
@@ -358,7 +355,8 @@ class ArticulatedFilter(Estimator):
         bones = bones @ axes[:, None] * lengths[:, None, :2, None]
         elbow = shoulder + bones[:, :, 0]
         hand = elbow + bones[:, :, 1]
-        torso = middle + torso_places(root.turn, size)[:, 0, 2:]
+        half = half_widths(frame.torso, root.depth, size.width)
+        torso = middle + torso_places(root.turn, half, size)[:, 0, 2:]
         joints = middle.new_zeros(len(middle), 8, 3)
         for rows, value in ((_SHOULDERS, shoulder), (_ELBOWS, elbow), (_HANDS, hand)):
             joints[:, rows] = value
@@ -372,7 +370,8 @@ class ArticulatedFilter(Estimator):
         count = frame.known[:, [_ELBOWS, _HANDS]].sum(1).to(root.depth)
         area = 2 * root.depth.log() - (self.matrix[0, 0] * self.matrix[1, 1]).log()
         evidence = torch.where(seen, belief.log_evidence + count * area, 0.0)
-        return FramePose(joints, covs, root.turn[:, 0], evidence, weight)
+        turn = root.turn[:, 0]
+        return FramePose(joints, covs, turn, torch.zeros_like(turn), evidence, weight)
 
     def _covs(
         self, belief: ArmState, joints: Tensor, axes: Tensor, lengths: Tensor, flip: Tensor
@@ -385,7 +384,8 @@ class ArticulatedFilter(Estimator):
             off = ends[..., limb, :] - (joints[:, rows] - joints[:, _SHOULDERS])[:, :, None]
             covs[:, rows] += (belief.weight[..., None] * off).mT @ off
         apart = joints - joints[:, _JOINT["neck"], None]
-        return covs + self.spread[0] ** 2 * apart[..., :, None] * apart[..., None, :]
+        scale = self.lengths.spread.amin().square()
+        return covs + scale * apart[..., :, None] * apart[..., None, :]
 
 
 def _kept(owner: nn.Module, path: str | Path | None, like: Tensor) -> ArmPrior:

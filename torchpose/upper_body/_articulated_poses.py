@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchpose.camera._projection import project
 from torchpose.filters._outputs import FilterOutput
+from torchpose.math._rotations import euler_to_matrix
 from torchpose.skeleton._joint_sets import UPPER_BODY
-from torchpose.skeleton._torso import upright_axes
 from torchpose.upper_body._estimator import Estimates, ReadOut
 
 __all__ = ["FramePose", "estimates_of"]
@@ -24,13 +24,14 @@ class FramePose(NamedTuple):
     """Estimate of one frame, or of T of them.
 
     Attributes:
-        joints: camera axes, [B, 8, 3]. covs: [B, 8, 3, 3]. turn: of the shoulders, [B].
+        joints: camera axes, [B, 8, 3]. covs: [B, 8, 3, 3]. turn, lean: of the shoulders, [B].
         log_evidence: of both arms, [B, 2]. log_weights: of their hypotheses, [B, 2, N].
     """
 
     joints: Tensor
     covs: Tensor
     turn: Tensor
+    lean: Tensor
     log_evidence: Tensor
     log_weights: Tensor
 
@@ -50,11 +51,11 @@ def estimates_of(
     if lengths is not None:
         stacked = _repeated(stacked, lengths.to(stacked.joints.device))
     neck = stacked.joints[:, :, _NECK]
-    back = upright_axes(stacked.turn)
+    level = torch.zeros_like(stacked.turn)
+    angles = torch.stack([stacked.lean, level, stacked.turn], -1)
+    back = euler_to_matrix(angles).mT  # the same in either order
     joints = (stacked.joints - neck[:, :, None]) @ back.mT
     covs = back[:, :, None] @ stacked.covs @ back.mT[:, :, None]
-    level = torch.zeros_like(stacked.turn)
-    angles = torch.stack([level, level, stacked.turn], -1)  # the same in either order
     uv = project(joints, matrix, back.mT, neck)[..., :2]
     uv_covs = _pixel_covs(stacked.joints, stacked.covs, matrix)
     never = torch.full((len(neck),), -1, dtype=torch.long, device=neck.device)

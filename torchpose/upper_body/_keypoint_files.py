@@ -31,8 +31,8 @@ class TrackSettings:
 
     Args:
         prior: a prior that comes with torchpose, or a .safetensors file.
-        method: name of the estimator; by default window-mixture if the prior brings windows that suit, else
-            mkf-fixed.
+        method: name of the estimator; by default articulated if both shoulders and an elbow are measured,
+            else window-mixture if the prior brings windows that suit, else mkf-fixed.
         camera: TOML file or four numbers fx,fy,cx,cy in pixels; without it K or the image size of the
             input.
         camera_name: which camera of a file with several.
@@ -43,6 +43,8 @@ class TrackSettings:
         n_particles: particles of the pf methods (default 10000).
         n_tracks: tracks of mkf-sampled and mkf-split.
         arms: file of a prior over arms, of articulated; by default the one that comes with torchpose.
+        bone_lengths: of articulated, metres, as measured on the person, with commas: any of upper_arm=,
+            forearm= (to the measured hand or wrist), shoulder_width= and head_height= (above the neck).
         frame: axes of the 3D poses: of the camera (default) or of the body.
         static_camera: let the body turn in front of a camera that stays where it is.
         window: deprecated: false stands for the method mkf-fixed, true for the default.
@@ -66,6 +68,7 @@ class TrackSettings:
     n_particles: int | None = None
     n_tracks: int | None = None
     arms: str | None = None
+    bone_lengths: str | None = None
     frame: str = "camera"
     static_camera: bool = False
     window: bool | None = None
@@ -99,7 +102,25 @@ class TrackSettings:
             if value is not None:
                 _check_count(name, value, method)
                 options[name] = value
+        if self.bone_lengths is not None:
+            options["bone_lengths"] = _lengths_of(self.bone_lengths)
         return options if self.arms is None else options | {"arms": self.arms}
+
+
+def _lengths_of(text: str) -> dict[str, float]:
+    """Return lengths by name, from text such as upper_arm=0.28,forearm=0.25.
+
+    Raises:
+        InputError: anything else.
+    """
+    try:
+        pairs = (part.split("=") for part in text.split(","))
+        return {name.strip(): float(metres) for name, metres in pairs}
+    except ValueError as error:
+        raise InputError(
+            f"bone_lengths must be NAME=METRES with commas, such as upper_arm=0.28,forearm=0.25, got "
+            f"{text!r}"
+        ) from error
 
 
 class Prepared(NamedTuple):

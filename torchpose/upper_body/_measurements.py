@@ -13,9 +13,10 @@ from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import map_pixel_covariance, map_pixels
 from torchpose.errors import InputError
 from torchpose.priors._upper_body import UpperBodyPrior
-from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
 from torchpose.skeleton._torso import KINECT_NECK, NeckFraction
 from torchpose.skeleton._upper_body import ARM_JOINTS, upper_body_indices
+from torchpose.upper_body._face import FACE, FacePoints, measure_face
 
 __all__ = [
     "MeasuredJoints",
@@ -50,11 +51,13 @@ class MeasuredJoints(NamedTuple):
     Attributes:
         uv: [B, T, 8, 2], zero where missing. mask: [B, T, 8], True where measured.
         cov: R of each joint, [8, 2, 2], or [B, T, 8, 2, 2] if it changes.
+        face: pixels of nose, eyes and ears, None if none is among the keypoints.
     """
 
     uv: Tensor
     mask: Tensor
     cov: Tensor
+    face: FacePoints | None = None
 
 
 class Picked(NamedTuple):
@@ -67,12 +70,19 @@ class Picked(NamedTuple):
             shoulders, and the head (`place_measured_neck`).
         notes: what was assumed.
         hand: kind of the hands, "hand" or "wrist"; None where the names do not tell.
+        face: places of nose, eyes and ears (`FACE`) among the keypoints, -1 if absent.
     """
 
     indices: tuple[int, ...]
     middle: bool
     notes: tuple[str, ...]
     hand: str | None = None
+    face: tuple[int, ...] = (-1,) * len(FACE)
+
+    @property
+    def there(self) -> list[bool]:
+        """Return which of the eight joints are among the keypoints."""
+        return [i >= 0 for i in self.indices]
 
 
 def pick_joints(
@@ -117,7 +127,9 @@ def pick_joints(
         notes += _neck_notes(kind if other else None, wanted_neck, middle)
     if found.hand is not None and wanted_hand is not None and found.hand != wanted_hand:
         notes.append(f"the keypoints' {found.hand}s stand for the prior's {wanted_hand}s")
-    return Picked(tuple(indices), middle, tuple(notes), found.hand)
+    known = canonical_names(names)
+    face = tuple(known.index(name) if name in known else -1 for name in FACE)
+    return Picked(tuple(indices), middle, tuple(notes), found.hand, face)
 
 
 def _neck_notes(kind: str | None, wanted: str | None, middle: bool) -> list[str]:
@@ -160,7 +172,7 @@ def place_measured_neck(
             middle of two measured shoulders does. pixels_per_metre: at the body's usual distance.
         neck: f and s.
     """
-    uv, mask, cov = (x.clone() for x in measured)
+    uv, mask, cov = (x.clone() for x in measured[:3])
     both = mask[..., _LEFT] & mask[..., _RIGHT] & ~mask[..., _NECK]
     middle = torch.where(
         both[..., None], (uv[..., _LEFT, :] + uv[..., _RIGHT, :]) / 2, uv[..., _NECK, :]
@@ -185,7 +197,7 @@ def place_measured_neck(
         cov = cov.expand(*uv.shape[:-2], *cov.shape[-3:]).clone()
         with_head = torch.where(head[..., None, None], with_head, alone)
     cov[..., _NECK, :, :] = with_head
-    return MeasuredJoints(uv, mask, cov)
+    return measured._replace(uv=uv, mask=mask, cov=cov)
 
 
 def known_covariances(
@@ -273,6 +285,10 @@ def in_prior_pixels(
         keypoints, confidence, mask, picked.indices, measurement_cov, covariance
     )
     measured = measured._replace(uv=map_pixels(measured.uv, own, wanted))
+    if max(picked.face) >= 0:
+        face = measure_face(keypoints, confidence, mask, picked.face)
+        face = face._replace(places=map_pixels(face.places, own, wanted))
+        measured = measured._replace(face=face)
     if not picked.middle:
         return measured
     return place_measured_neck(measured, pixels_per_metre(prior))

@@ -2,7 +2,7 @@
 
 import inspect
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from torch import Tensor
@@ -15,12 +15,14 @@ from torchpose.filters._particle import BootstrapParticleFilter
 from torchpose.filters._sampled_tracks import SampledTrackFilter
 from torchpose.filters._split_tracks import SplitTrackFilter
 from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._articulated import ArticulatedFilter
 from torchpose.upper_body._estimator import Estimator
 from torchpose.upper_body._single_poses import PoseFilter, ProcessNoise
 from torchpose.upper_body._windows import WindowMixture, suitable_window
 
 __all__ = [
+    "BONES",
     "METHODS",
     "SINGLE_POSES",
     "WINDOWS",
@@ -42,6 +44,9 @@ WINDOWS = "window-mixture"
 SINGLE_POSES = "mkf-fixed"
 """The bank of Kalman filters over single poses."""
 
+BONES = "articulated"
+"""Arms of bones that keep their lengths."""
+
 Method = type[Estimator] | PoseFilter
 """What makes an estimator from a `TrackerModel` and, by name, the options in its signature."""
 
@@ -61,7 +66,7 @@ def _particles(proposal: str, noise: ProcessNoise) -> PoseFilter:
 
 METHODS: dict[str, Method] = {
     WINDOWS: WindowMixture,
-    "articulated": ArticulatedFilter,
+    BONES: ArticulatedFilter,
     SINGLE_POSES: _kalman_bank(FixedTrackFilter, 100.0, ("transition", "gamma", "uniform_weight")),
     "mkf-sampled": _kalman_bank(SampledTrackFilter, 10.0, ("transition", "gamma")),
     "mkf-split": _kalman_bank(SplitTrackFilter, 10.0, ("transition", "gamma")),
@@ -151,10 +156,27 @@ def check_options(method: str, options: Iterable[str]) -> None:
 
 
 class Chosen(NamedTuple):
-    """The estimator that runs, and what is to be said about the choice."""
+    """The estimator that runs, and what is to be said about the choice.
+
+    Attributes:
+        method: one of `METHODS`. notes: in plain words.
+        free: whether nobody asked for it, or for what only some methods can do.
+    """
 
     method: str
     notes: tuple[str, ...]
+    free: bool = False
+
+    def with_joints(self, there: Sequence[bool]) -> str:
+        """Return the method for these joints: one with bones where shoulders and elbows are measured.
+
+        Args:
+            there: whether each of `UPPER_BODY` is measured.
+        """
+        seen = {name for name, known in zip(UPPER_BODY, there, strict=True) if known}
+        whole = {"shoulder_left", "shoulder_right"} <= seen
+        bent = not seen.isdisjoint({"elbow_left", "elbow_right"})
+        return BONES if self.free and whole and bent else self.method
 
 
 def choose_method(
@@ -187,7 +209,7 @@ def choose_method(
             f"{SINGLE_POSES!r}"
         )
     check_options(chosen.method, options)
-    return chosen
+    return chosen._replace(free=method is None and smoothing is None and not list(options))
 
 
 def _find(method: str) -> Method:

@@ -12,11 +12,13 @@ from torch import Tensor
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
 __all__ = [
-    "SHRUG",
+    "NECK_HEIGHT",
     "Root",
     "RootGrid",
     "Torso",
     "TorsoLengths",
+    "half_widths",
+    "inward_shares",
     "middle_of_shoulders",
     "see_torso",
     "shoulder_offsets",
@@ -24,8 +26,13 @@ __all__ = [
 ]
 
 _TORSO = tuple(UPPER_BODY.index(n) for n in ("shoulder_left", "shoulder_right", "neck", "head"))
-_NECK_HEIGHT = 0.105  # metres above the middle of the shoulders (Kinect's neck)
-_DEPTH, _DEPTH_STD = 2.6, 0.4  # metres, and of its log: as the Kinect recordings have it
+NECK_HEIGHT = 0.105
+"""Metres of Kinect's neck above the middle of the shoulders."""
+
+_DEPTH, _DEPTH_STD = (
+    2.6,
+    0.6,
+)  # metres, as the Kinect recordings have it, and of its log: webcams, halls
 _NEAREST, _FARTHEST, _DEPTH_STEP = 0.4, 9.0, 0.04  # metres, and the step of log depth
 _TURN_STEP, _TURN_STD = 15.0, 20.0  # degrees
 _BROAD_TURN = 0.2  # share of the turns that are all alike likely
@@ -33,9 +40,14 @@ _SPEED, _TURN_SPEED = 0.08, 60.0  # share of the depth, and degrees, after one s
 _LOST = 1e-4  # share of a frame's belief that starts anew
 # Standard deviation of each torso joint about its place in a stiff torso, metres: x and y.
 _STIFF = ((0.03, 0.035), (0.03, 0.035), (0.03, 0.035), (0.05, 0.035))
-_RAISED = 0.5  # sine of the angle from which on an arm is raised altogether
-SHRUG = 0.07
-"""Metres by which the shoulder of a raised arm moves in and up."""
+# Shoulders of raised arms move in, by a share of half the width that differs from one to the next, and up.
+# As in UTD-MHAD (s1 to s6): from 0.164 m to 0.141.
+_INWARD, _INWARD_STD, _UPWARD_STD = 0.15, 0.2, 0.03
+_HANGING, _RAISED = -0.7, 0.2  # sines of the elevation from which, and to which, they do
+_REACH = (
+    0.27,
+    0.48,
+)  # metres, to the elbow and to the hand: the elevation does not have to be exact
 
 _ARMS = tuple(
     tuple(UPPER_BODY.index(f"{joint}_{side}") for joint in ("shoulder", "elbow", "hand"))
@@ -45,12 +57,19 @@ _FREEDOM = 4.0  # of the heavy tails of torso joints
 
 
 class TorsoLengths(NamedTuple):
-    """Width between the shoulders, height of the head above the neck, and their deviations, [B], metres."""
+    """Lengths of a torso, metres.
+
+    Attributes:
+        width: between the shoulders, [B]. height: of the head above the neck, [B].
+        width_std, height_std: their deviations, [B].
+        neck: height of the neck above the middle of the shoulders.
+    """
 
     width: Tensor
     height: Tensor
     width_std: Tensor
     height_std: Tensor
+    neck: float = NECK_HEIGHT
 
 
 class Root(NamedTuple):
@@ -68,13 +87,18 @@ class Torso(NamedTuple):
     Attributes:
         rays: K^-1 [u, v, 1] of both shoulders, neck and head, [B, 4, 3]. known: [B, 4].
         std: of a pixel over the focal length, [B, 4].
-        raised: from 0 to 1, how far the arm at each shoulder is raised above it, [B, 2].
+        rise: sine of each arm's elevation above its shoulder over the depth, 1 / m, [B, 2].
     """
 
     rays: Tensor
     known: Tensor
     std: Tensor
-    raised: Tensor
+    rise: Tensor
+
+    def raised(self, depth: Float[Tensor, "B *grid"]) -> Float[Tensor, "B *grid 2"]:
+        """Return how far each arm is raised, from 0 (hanging) to 1."""
+        rise = self.rise[(slice(None),) + (None,) * (depth.ndim - 1)]
+        return ((rise * depth[..., None] - _HANGING) / (_RAISED - _HANGING)).clamp(0.0, 1.0)
 
 
 def see_torso(
@@ -82,31 +106,43 @@ def see_torso(
 ) -> Torso:
     """Return the torso's part of all joints of `UPPER_BODY`."""
     chosen = list(_TORSO)
-    raised = torch.stack([_raised(rays, known, *arm) for arm in _ARMS], 1)
-    return Torso(rays[:, chosen], known[:, chosen], std[:, chosen], raised)
+    rise = torch.stack([_rise(rays, known, *arm) for arm in _ARMS], 1)
+    return Torso(rays[:, chosen], known[:, chosen], std[:, chosen], rise)
 
 
-def _raised(
-    rays: Tensor, known: Tensor, shoulder: int, elbow: int, hand: int
-) -> Float[Tensor, " B"]:
-    """Return how far an elbow, or else a hand, is seen above its shoulder, from 0 to 1."""
-    end = torch.where(known[:, elbow, None], rays[:, elbow], rays[:, hand])
-    apart = rays[:, shoulder] - end
-    rise = apart[:, 1] / torch.linalg.vector_norm(apart, dim=-1).clamp_min(1e-9)
+def _rise(rays: Tensor, known: Tensor, shoulder: int, elbow: int, hand: int) -> Float[Tensor, " B"]:
+    """Return by how much an elbow, or else a hand, is seen above its shoulder, over its reach."""
+    end = torch.where(known[:, elbow], rays[:, elbow, 1], rays[:, hand, 1])
+    reach = torch.where(known[:, elbow], end.new_tensor(_REACH[0]), end.new_tensor(_REACH[1]))
     there = known[:, shoulder] & (known[:, elbow] | known[:, hand])
-    return torch.where(there, (rise / _RAISED).clamp(0.0, 1.0), 0.0)
+    return torch.where(there, (rays[:, shoulder, 1] - end) / reach, _HANGING)
 
 
-def shoulder_offsets(turn: Float[Tensor, "*batch"], width: Float[Tensor, "*batch"]) -> Tensor:
-    """Return the left shoulder relative to the middle of both, camera axes; the right one is opposite.
+def half_widths(
+    torso: Torso, depth: Float[Tensor, "B *grid"], width: Float[Tensor, " B"]
+) -> Float[Tensor, "B *grid 2"]:
+    """Return how far left and right shoulder are from the middle, metres: less where an arm is raised."""
+    half = width[(slice(None),) + (None,) * depth.ndim] / 2
+    return half * (1 - _INWARD * torso.raised(depth))
 
-        W / 2 (cos psi, 0, -sin psi)
+
+def inward_shares(torso: Torso, depth: Float[Tensor, " B"]) -> tuple[Tensor, Tensor]:
+    """Return the share by which raised arms narrow the shoulders, and its standard deviation, [B]."""
+    raised = torso.raised(depth)
+    return _INWARD * raised.mean(-1), _INWARD_STD / 2 * torch.linalg.vector_norm(raised, dim=-1)
+
+
+def shoulder_offsets(turn: Float[Tensor, "*batch"], half: Float[Tensor, "*batch 2"]) -> Tensor:
+    """Return left and right shoulder relative to the middle of both, camera axes, [..., 2, 3].
+
+        h_left (cos psi, 0, -sin psi),   -h_right (cos psi, 0, -sin psi)
 
     Args:
-        turn: psi. width: W, metres.
+        turn: psi. half: h of both, metres.
     """
-    half = width / 2
-    return torch.stack([half * turn.cos(), torch.zeros_like(half), -half * turn.sin()], -1)
+    level = torch.stack([turn.cos(), torch.zeros_like(turn), -turn.sin()], -1)
+    signed = half * half.new_tensor([1.0, -1.0])
+    return signed[..., None] * level[..., None, :]
 
 
 class RootGrid:
@@ -155,16 +191,33 @@ class RootGrid:
         return _log_likelihood(torso, depth, self.turn.expand(shape), lengths)
 
     def best(self, log_belief: Float[Tensor, "B Z P"], count: int) -> Root:
-        """Return the likeliest hypotheses."""
-        values, index = log_belief.flatten(1).topk(count, 1)
-        n_turns = len(self.turn)
+        """Return the likeliest hypotheses, half of them turned to either side.
+
+        A turn and its mirror image look alike, so that the wrong one may be the likelier for a while.
+        """
+        n_turns, half = len(self.turn), len(self.turn) // 2
+        sides = []
+        for first in (0, half):
+            index = log_belief[:, :, first : first + half].flatten(1).topk(count // 2, 1).indices
+            sides.append(index // half * n_turns + index % half + first)
+        index = torch.cat(sides, 1)
+        values = log_belief.flatten(1).gather(1, index)
         return Root(self.depth[index // n_turns], self.turn[index % n_turns], values, index)
 
-    def belief(self, root: Root) -> Float[Tensor, "B Z P"]:
-        """Return the hypotheses as a belief over the whole grid."""
-        weight = torch.softmax(root.log_weight, 1)
-        flat = weight.new_zeros(len(weight), len(self.depth) * len(self.turn))
-        return flat.scatter(1, root.cell, weight).unflatten(1, (len(self.depth), len(self.turn)))
+    def belief(
+        self, log_belief: Float[Tensor, "B Z P"], root: Root, said: Float[Tensor, "B M"]
+    ) -> Float[Tensor, "B Z P"]:
+        """Return the belief over the grid after hypotheses were weighed.
+
+        Of the others is believed that they would have been as likely as these on average.
+
+        Args:
+            log_belief: before. root: hypotheses, before. said: log-evidence about them.
+        """
+        share = torch.log_softmax(root.log_weight, 1)
+        usual = torch.logsumexp(share + said, 1, keepdim=True)
+        flat = log_belief.flatten(1).scatter_add(1, root.cell, said - usual)
+        return torch.softmax(flat, 1).view_as(log_belief)
 
 
 class _Middle(NamedTuple):
@@ -182,10 +235,11 @@ class _Middle(NamedTuple):
 def _middles(torso: Torso, depth: Tensor, turn: Tensor, lengths: TorsoLengths) -> list[_Middle]:
     """Return the middle of the shoulders by x and y, given depth and turn [B, ...]."""
     lead = (slice(None),) + (None,) * (depth.ndim - 1)
-    place, known = torso_places(turn, lengths), torso.known[lead].to(depth)
+    half = half_widths(torso, depth, lengths.width)
+    place, known = torso_places(turn, half, lengths), torso.known[lead].to(depth)
     rays, std = torso.rays[lead], torso.std[lead]
     away = depth[..., None] + place[..., 2]
-    stiff = _stiffness(lengths, torso.raised)[lead]
+    stiff = _stiffness(lengths, torso.raised(depth))
     found = []
     for axis in (0, 1):
         value = rays[..., axis] * away - place[..., axis]
@@ -210,27 +264,34 @@ def _log_likelihood(
     return total + 2 * (count - 1).clamp_min(0) * depth.log()
 
 
-def _stiffness(lengths: TorsoLengths, raised: Float[Tensor, "B 2"]) -> Float[Tensor, "B 4 2"]:
-    """Return the variance of each torso joint about its place, metres squared."""
-    stiff = lengths.width.new_tensor(_STIFF).square().expand(len(lengths.width), 4, 2).clone()
-    stiff[:, :2, 0] += (lengths.width_std / 2).square()[:, None]
-    stiff[:, :2] += (raised * SHRUG).square()[..., None]
-    stiff[:, 3, 1] += lengths.height_std.square()
+def _stiffness(
+    lengths: TorsoLengths, raised: Float[Tensor, "B *grid 2"]
+) -> Float[Tensor, "B *grid 4 2"]:
+    """Return the variance of each torso joint about its place in x and y, metres squared."""
+    lead = (slice(None),) + (None,) * (raised.ndim - 2)
+    stiff = raised.new_tensor(_STIFF).square().expand(*raised.shape[:-1], 4, 2).clone()
+    width, width_std, height_std = (x[lead] for x in (lengths.width, *lengths[2:4]))
+    stiff[..., :2, 0] += (width_std / 2).square()[..., None]
+    stiff[..., :2, 0] += (raised * _INWARD_STD * width[..., None] / 2).square()
+    stiff[..., :2, 1] += (raised * _UPWARD_STD).square()
+    stiff[..., 3, 1] += height_std.square()
     return stiff
 
 
 def torso_places(
-    turn: Float[Tensor, "B *grid"], lengths: TorsoLengths
+    turn: Float[Tensor, "B *grid"], half: Float[Tensor, "B *grid 2"], lengths: TorsoLengths
 ) -> Float[Tensor, "B *grid 4 3"]:
-    """Return both shoulders, neck and head relative to the middle of the shoulders, camera axes."""
-    lead = (slice(None),) + (None,) * (turn.ndim - 1)
-    width, height = (value[lead].expand_as(turn) for value in lengths[:2])
-    left = shoulder_offsets(turn, width)
-    neck = torch.zeros_like(left)
-    neck[..., 1] = -_NECK_HEIGHT
+    """Return both shoulders, neck and head relative to the middle of the shoulders, camera axes.
+
+    Args:
+        turn: psi. half: of the shoulders (`half_widths`). lengths: of the torso.
+    """
+    shoulders = shoulder_offsets(turn, half)
+    neck = torch.zeros_like(shoulders[..., 0, :])
+    neck[..., 1] = -lengths.neck
     head = neck.clone()
-    head[..., 1] = head[..., 1] - height
-    return torch.stack([left, -left, neck, head], -2)
+    head[..., 1] -= lengths.height[(slice(None),) + (None,) * (turn.ndim - 1)]
+    return torch.cat([shoulders, torch.stack([neck, head], -2)], -2)
 
 
 def middle_of_shoulders(

@@ -364,7 +364,7 @@ def _screened(
     measured: MeasuredJoints, probability: Float[Tensor, "B T 8"], joints: Int[Tensor, "B T 8"]
 ) -> MeasuredJoints:
     """Return the measurements that are probable, of these joints; the same value if those are all."""
-    uv, mask, cov = measured
+    uv, mask, cov = measured[:3]
     exchanged = bool((joints != torch.arange(8, device=mask.device)).any())
     if exchanged:
         mask = mask.gather(2, joints)
@@ -374,4 +374,5 @@ def _screened(
     kept = mask & (probability >= 0.5)
     if not exchanged and bool((kept == mask).all()):
         return measured
-    return MeasuredJoints(torch.where(kept[..., None], uv, torch.zeros_like(uv)), kept, cov)
+    uv = torch.where(kept[..., None], uv, torch.zeros_like(uv))
+    return measured._replace(uv=uv, mask=kept, cov=cov)

@@ -66,6 +66,8 @@ class UpperBodyTracker(WideModule):
       frame and the hands round it, each frame by itself; filters of constant velocity follow. The body
       is seen through a virtual camera that follows it, so that it may move about, farther away or
       beside the views that the prior was fitted to.
+    - ``articulated``: arms of bones that keep their lengths, under a prior over directions that knows
+      no camera and no size; for all joints measured, of anybody.
     - ``mkf-fixed``, ``mkf-sampled``, ``mkf-split``: banks of Kalman filters over single poses (BL
       section 3.4), see `MixtureKalmanFilter`.
     - ``pf-mixture``, ``pf-walk``, ``pf-walk-unscaled``: particles over single poses (BL section 3.3),
@@ -79,8 +81,10 @@ class UpperBodyTracker(WideModule):
     Args:
         prior: from `load_prior` or `fit_upper_body_prior`.
         camera: of the keypoints. One other than the prior's is mapped to it.
-        method: one of `METHODS`; by default "window-mixture" where the prior has windows that suit, else
-            "mkf-fixed". The attribute `method` and `PoseTrack.method` say which one runs.
+        method: one of `METHODS`. By default "articulated" where both shoulders and an elbow are
+            measured and neither `smoothing`, `steady` nor an option is asked for; else "window-mixture"
+            where the prior has windows that suit, else "mkf-fixed". The attribute `method` is the one
+            for few joints, `PoseTrack.method` the one that ran.
         measurement_std: standard deviation of a keypoint in the camera's pixels, one number or one
             for each of hand, elbow, shoulder, head, neck; by default what the prior brings, else 3.
         fps: frame rate of the keypoints; by default that of the prior. Process noise is scaled.
@@ -143,7 +147,9 @@ class UpperBodyTracker(WideModule):
             method, steady = options_of_window(method, window, steady)
         self.prior = prior
         self.fps = fps or prior.info.fps
-        self.method, self.notes = choose_method(prior, method, smoothing, self.fps, options)
+        chosen = choose_method(prior, method, smoothing, self.fps, options)
+        self._chosen = chosen._replace(free=chosen.free and steady is None and window is None)
+        self.method, self.notes = chosen.method, chosen.notes
         self.smoothing = smoothing
         self.calibrated = calibrated
         self.frame = frame
@@ -190,11 +196,11 @@ class UpperBodyTracker(WideModule):
     @property
     def estimator(self) -> Estimator:
         """Return the estimator of the method, on prior, noise and options as they are now."""
-        return self._estimator_of(None)
+        return self._estimator_of(self.method, None)
 
-    def _estimator_of(self, hand: str | None) -> Estimator:
-        """Return the estimator for measured hands of a kind; None is that of the prior."""
-        make: Callable[..., Estimator] = METHODS[self.method]
+    def _estimator_of(self, method: str, hand: str | None) -> Estimator:
+        """Return the estimator of a method for measured hands of a kind; None is that of the prior."""
+        make: Callable[..., Estimator] = METHODS[method]
         model = TrackerModel(self, self.prior, self.measurement_cov, self.fps, self.smoothing, hand)
         return make(model, **self.given_options)
 
@@ -216,7 +222,8 @@ class UpperBodyTracker(WideModule):
             confidence: [B, T, J] in 0..1; 0 or NaN is missing, and the measurement covariance is
                 divided by what is between.
             names: of the J joints, in any order and spelling that `torchpose.skeleton` knows; may be
-                left out if J = 8 and they are in the order of `UPPER_BODY`.
+                left out if J = 8 and they are in the order of `UPPER_BODY`. Nose, eyes and ears tell
+                "articulated" where the body faces.
             mask: [B, T, J], False = ignore the keypoint.
             generator: for the methods that draw: one, or a list of one for each sequence.
             lengths: [B], frames of each sequence. progress: whether to show a bar.
@@ -236,13 +243,14 @@ class UpperBodyTracker(WideModule):
             picked = self._pick(keypoints.shape[2], names)
             given = self._measure(keypoints, confidence, mask, covariance, picked)
             check_gaps(given.mask, lengths, self.max_gap, self.fps or 30.0)
-            joints = arm_joints(given.mask.flatten(0, 1).any(0).tolist())
+            there = given.mask.flatten(0, 1).any(0).tolist()
+            joints, method = arm_joints(there), self._chosen.with_joints(there)
             _, found = screen_joints(self._screen(picked), None, given)
-            estimator = self._estimator_of(picked.hand)
+            estimator = self._estimator_of(method, picked.hand)
             arms = generators_of_arms(generator)
             estimates = estimator.forward(found.measured, joints, arms, lengths, progress)
             notes = self.notes + picked.notes + outlier_notes(*found[1:], lengths)
-            reader, seen = self._reader(estimator), found.measured.mask
+            reader, seen = self._reader(method, estimator), found.measured.mask
             reading = reader.whole(estimates, lengths)
             track = reader.track(reading, estimates, seen, lengths, notes, found.probability)
         return note_collapse(track.in_precision(self.dtype))
@@ -277,9 +285,10 @@ class UpperBodyTracker(WideModule):
         check_count("batch_size", batch_size)
         n_keypoints = len(UPPER_BODY) if names is None else len(names)
         picked = self._pick(n_keypoints, names)
-        joints = arm_joints([i >= 0 for i in picked.indices])
+        joints = arm_joints(picked.there)
+        method = self._chosen.with_joints(picked.there)
         with one_run(self.measurement_cov.device):
-            estimator = self._estimator_of(picked.hand)
+            estimator = self._estimator_of(method, picked.hand)
             state = estimator.init(batch_size, joints, generators_of_arms(generator))
         unseen = torch.zeros(batch_size, dtype=torch.long, device=self.measurement_cov.device)
         return StreamState(state, None, unseen, n_keypoints, picked)
@@ -344,9 +353,11 @@ class UpperBodyTracker(WideModule):
             keypoints = keypoints.to(self.measurement_cov)
             given = self._measure(keypoints, confidence, mask, covariance, state.picked)
             screen, found = screen_joints(self._screen(state.picked), state.screen, given)
-            estimator, seen = self._estimator_of(state.picked.hand), found.measured.mask
+            method = self._chosen.with_joints(state.picked.there)
+            estimator = self._estimator_of(method, state.picked.hand)
+            seen = found.measured.mask
             own, estimates = estimator.advance(state.estimator, found.measured)
-            reader = self._reader(estimator)
+            reader = self._reader(method, estimator)
             motion, reading = reader.more(state.motion, estimates)
             notes = self.notes + outlier_notes(*found[1:])
             track = reader.track(reading, estimates, seen, None, notes, found.probability)
@@ -386,7 +397,7 @@ class UpperBodyTracker(WideModule):
         given = (self.prior, self.camera, self.fps, picked, self.measurement_cov)
         return kept_screen_model(self, *given) if self.outliers else None
 
-    def _reader(self, estimator: Estimator) -> PoseReader:
+    def _reader(self, method: str, estimator: Estimator) -> PoseReader:
         """Return what makes poses of the estimates, as the settings ask for."""
         stage, ratios, cov = None, estimator.steadied_by, self.measurement_cov
         if self.steady and ratios is not None:
@@ -400,6 +411,6 @@ class UpperBodyTracker(WideModule):
         if self.smoothing is not None:
             lag = None if self.smoothing == "full" else int(self.smoothing) - estimator.ahead
         return PoseReader(
-            self.prior, self.camera, self.method, estimator, stage, lag, self.frame,
+            self.prior, self.camera, method, estimator, stage, lag, self.frame,
             self.static_camera, self.calibrated, self.fps,
         )  # fmt: skip

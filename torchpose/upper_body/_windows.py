@@ -225,7 +225,8 @@ class WindowMixture(Estimator):
         frames = _append(state.recent, measured)
         seen = self._see(frames, None, -n_frames)
         seen = seen._replace(measured=seen.measured._replace(cov=measured.cov))
-        recent = MeasuredJoints(*(x[:, n_frames:] for x in frames))
+        uv, mask, covs = (x[:, n_frames:] for x in frames[:3])
+        recent = MeasuredJoints(uv, mask, covs)
         return WindowState(recent, state.joints), self._estimate(seen, state.joints)
 
     def forward(
@@ -287,8 +288,9 @@ class WindowMixture(Estimator):
 def _append(frames: MeasuredJoints, new: MeasuredJoints) -> MeasuredJoints:
     """Return the last frames, and the new ones after them."""
     cov = new.cov.expand(*new.uv.shape[:2], *new.cov.shape[-3:])
-    pairs = zip(frames, new._replace(cov=cov), strict=True)
-    return MeasuredJoints(*(torch.cat([old, latest], 1) for old, latest in pairs))
+    pairs = zip(frames[:3], (new.uv, new.mask, cov), strict=True)
+    uv, mask, covs = (torch.cat([old, latest], 1) for old, latest in pairs)
+    return MeasuredJoints(uv, mask, covs)
 
 
 def _window_filter(

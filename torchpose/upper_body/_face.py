@@ -1,0 +1,119 @@
+"""Tell from nose, eyes and ears which way a head faces."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+__all__ = ["FACE", "FacePoints", "face_evidence", "measure_face"]
+
+FACE = ("nose", "eye_left", "eye_right", "ear_left", "ear_right")
+"""Keypoints that tell where a head faces."""
+
+# Of each of `FACE`: metres to the left of the middle of the ears and before it, the direction in which
+# it looks out of the head (degrees to the left), and the cosine to the camera from which on it is seen.
+_LEFT = (0.0, 0.032, -0.032, 0.075, -0.075)
+_FORWARD = (0.11, 0.085, 0.085, 0.0, 0.0)
+_OUTWARD = (0.0, 20.0, -20.0, 90.0, -90.0)
+_HIDDEN = (-0.1, 0.0, 0.0, -0.3, -0.3)
+_SOFT = 0.15  # of that cosine
+_SEEN, _IMAGINED = (
+    0.9,
+    0.1,
+)  # probabilities that a detector gives what is visible, and what is hidden
+_SURE = 0.4  # confidence from which on a keypoint counts as given
+_NOISE = 0.02  # metres: faces and detectors differ
+_FREEDOM = 4.0  # of the heavy tails
+_NECK_STD = math.radians(25.0)  # between head and shoulders
+_ANYWHERE = 0.1  # share of the heads that are turned by any angle
+
+
+class FacePoints(NamedTuple):
+    """Measured `FACE`.
+
+    Attributes:
+        places: pixels, or the first two of K^-1 [u, v, 1], [..., 5, 2], 0 where missing.
+        confidence: [..., 5], 1 where a detector gives none, 0 where missing.
+        expected: which of them are among the keypoints at all, [5].
+    """
+
+    places: Tensor
+    confidence: Tensor
+    expected: Tensor
+
+
+def measure_face(
+    keypoints: Float[Tensor, "B T J 2"],
+    confidence: Float[Tensor, "B T J"] | None,
+    mask: Bool[Tensor, "B T J"] | None,
+    indices: Sequence[int],
+) -> FacePoints:
+    """Return nose, eyes and ears among the keypoints, in their pixels.
+
+    Args:
+        keypoints, confidence, mask: as in `UpperBodyTracker.forward`. indices: of `FACE`, -1 if absent.
+    """
+    rows = [max(i, 0) for i in indices]
+    expected = torch.tensor([i >= 0 for i in indices], device=keypoints.device)
+    places = keypoints[:, :, rows]
+    sure = torch.ones_like(places[..., 0])
+    if confidence is not None:
+        sure = confidence.to(places)[:, :, rows].nan_to_num(0.0)
+    if mask is not None:
+        sure = sure * mask.to(places)[:, :, rows]
+    sure = sure * (places.isfinite().all(-1) & expected)
+    places = torch.where(sure[..., None] > 0, places, torch.zeros_like(places))
+    return FacePoints(places, sure, expected)
+
+
+def face_evidence(
+    face: FacePoints,
+    std: Float[Tensor, " B"],
+    depth: Float[Tensor, " Z"],
+    turn: Float[Tensor, " P"],
+) -> Float[Tensor, "B Z P"]:
+    """Return the log-likelihood of a face for each depth and turn of the shoulders.
+
+    A head at angle h from the camera has its points at x_i = c + left_i cos h - forward_i sin h, for an
+    unknown middle c; and a detector gives those that are visible at that angle more often than others.
+    Heads are turned against shoulders by some 30 degrees, and now and then by any angle.
+
+    Args:
+        face: rays. std: of a pixel over the focal length. depth: of the shoulders, metres.
+        turn: of the shoulders, at even steps round the circle.
+    """
+    at_angle = _places(face, std, depth, turn) + _visibility(face, turn)[:, None]
+    off = torch.remainder(turn[:, None] - turn + math.pi, 2 * math.pi) - math.pi
+    near = torch.softmax(-0.5 * (off / _NECK_STD).square(), 1)
+    share = (1 - _ANYWHERE) * near + _ANYWHERE / len(turn)
+    most = at_angle.amax(-1, keepdim=True)
+    return ((at_angle - most).exp() @ share.mT).log() + most
+
+
+def _places(face: FacePoints, std: Tensor, depth: Tensor, turn: Tensor) -> Float[Tensor, "B Z P"]:
+    """Return the log-likelihood of where the points of a face are to each other."""
+    left, forward = (turn.new_tensor(x) for x in (_LEFT, _FORWARD))
+    expected = left * turn.cos()[:, None] - forward * turn.sin()[:, None]
+    seen = face.places[..., None, None, :, 0] * depth[:, None, None]
+    off = seen - expected
+    noise = _NOISE**2 + (std[:, None] * depth).square()[..., None, None]
+    precision = face.confidence[:, None, None] / noise
+    total = precision.sum(-1)
+    mean = (precision * off).sum(-1) / total.clamp_min(1e-12)
+    squared = (precision * (off - mean[..., None]).square()).sum(-1)
+    return -0.5 * (_FREEDOM + 1) * torch.log1p(squared / _FREEDOM)
+
+
+def _visibility(face: FacePoints, turn: Tensor) -> Float[Tensor, "B P"]:
+    """Return the log-probability of what a detector gives and does not give."""
+    outward, hidden = torch.deg2rad(turn.new_tensor(_OUTWARD)), turn.new_tensor(_HIDDEN)
+    visible = torch.sigmoid(((turn[:, None] - outward).cos() - hidden) / _SOFT)
+    given = _IMAGINED + (_SEEN - _IMAGINED) * visible
+    sure = (face.confidence / _SURE).clamp(0.0, 1.0)[:, None]
+    logs = sure * given.log() + (1 - sure) * torch.log1p(-given)
+    return (logs * face.expected.to(logs)).sum(-1)
