@@ -1,12 +1,18 @@
 """Arms of strangers: methods with and without bones beside elementary geometry.
 
 Error: the vector from the shoulder to the wrist (or hand) of the same side, in camera axes, so that
-nothing is aligned. Berkeley MHAD is seen by one camera with 3 px of noise at 2.5 m; the four views of
-a balancing person (Pose2Sim) are OpenPose's keypoints of the upper body, one camera at a time, against
-its triangulation; persons s7 and s8 of UTD-MHAD are seen by the test camera of UB-people. The prior over
-arms is fitted without the set that is scored, for UTD-MHAD without these two persons. The other
-methods have the prior that comes with torchpose, which knows none of the persons of the first two; for
-UTD-MHAD one that is fitted to s1 to s6 as in UB-people.
+nothing is aligned.
+
+- Berkeley MHAD is seen by one camera with 3 px of noise at 2.5 m.
+- The four views of a balancing person (Pose2Sim) are OpenPose's keypoints of the upper body, one camera at
+  a time, against its triangulation.
+- Clips of strangers at webcams are MediaPipe's 2D against its own 3D landmarks, which are a network's and
+  no truth.
+- Persons s7 and s8 of UTD-MHAD are seen by the test camera of UB-people.
+
+The prior over arms is fitted without the set that is scored, for UTD-MHAD without these two persons. The
+other methods have the prior that comes with torchpose, which knows none of these persons; for UTD-MHAD one
+that is fitted to s1 to s6 as in UB-people.
 
     python -m benchmarks.bones --data DIR [--out FILE]
     python -m benchmarks.bones --data DIR --fit FILE.safetensors
@@ -42,6 +48,7 @@ from torchpose.metrics import coverage
 from torchpose.priors import UpperBodyPrior
 from torchpose.priors._arms import ArmPrior, shipped_arm_prior
 from torchpose.skeleton import UPPER_BODY
+from torchpose.skeleton._joint_sets import canonical_names
 
 SETS = {
     "kinect_utd_mhad": 0.4,
@@ -76,6 +83,7 @@ _UTD, _UTD_PERSONS, _UTD_EVERY = "kinect_utd_mhad", ("s7", "s8"), 8
 _FIT = {"n_components": 10, "window_components": 48, "calibration_folds": 0}
 _ENDS = [[UPPER_BODY.index(f"{joint}_{side}") for joint in ("shoulder", "elbow", "hand")]
          for side in ("left", "right")]  # fmt: skip
+_VISIBLE, _UNSEEN = 0.6, 0.3  # MediaPipe's visibility: of an arm that is scored, of a missing joint
 _SETTLED = 90  # frames, from where on the spread of a bone's length counts
 
 
@@ -86,7 +94,7 @@ class View(NamedTuple):
         keypoints: [T, J, 2], NaN where missing, in the order of `names`. confidence: [T, J].
         names: of the keypoints. camera: of the pixels. neck: kind of the keypoints' neck.
         truth: of left and right: shoulder, elbow, wrist, camera axes, [T, 2, 3, 3].
-        fps: frames per second.
+        fps: frames per second. depth: of the shoulders, metres; None is that of the truth.
     """
 
     keypoints: Tensor
@@ -96,6 +104,12 @@ class View(NamedTuple):
     neck: str
     truth: Tensor
     fps: float
+    depth: float | None = None
+
+    @property
+    def far(self) -> float:
+        """Return the depth of the shoulders, metres."""
+        return float(self.truth[..., 0, 2].nanmean()) if self.depth is None else self.depth
 
 
 class Chains(NamedTuple):
@@ -170,6 +184,41 @@ def openpose_views(data: Path) -> list[View]:
                     keypoints[..., :2], sure, (*_SEVEN, *_FACE), camera, "mid-shoulder", truth, fps
                 )
             )
+    return views
+
+
+def webcam_views(data: Path) -> list[View]:
+    """Return clips of strangers as MediaPipe saw them, with its own 3D landmarks in place of a truth.
+
+    Frames in which it is not sure of an arm have no truth. Clips without a visible arm are left out. The
+    depth is the one at which the landmarks have the size of the image.
+
+    Args:
+        data: folder with video_people/ and video_asl/.
+    """
+    views = []
+    folders = (data / name for name in ("video_people", "video_asl"))
+    for path in (p for folder in folders for p in sorted(folder.glob("*_mediapipe_pose1.npz"))):
+        with np.load(path) as file:
+            arrays = {key: file[key] for key in file.files}
+        names = [str(name) for name in arrays["names"]]
+        kept = [i for i, name in enumerate(names) if not name.endswith(("hip", "index"))]
+        ends = [[names.index(f"{s}_{j}") for j in ("shoulder", "elbow", "wrist")]
+                for s in ("left", "right")]  # fmt: skip
+        sure = torch.tensor(arrays["visibility"]).double().clamp(0, 1)
+        keypoints = torch.tensor(arrays["joints2d"]).double()
+        truth = torch.tensor(arrays["joints3d"]).double()[:, ends]
+        truth[(sure[:, ends] < _VISIBLE).any(-1)] = torch.nan
+        if not bool(truth.isfinite().any()):
+            continue
+        camera = torchpose.PinholeCamera.from_image_size(*(int(x) for x in arrays["image_size"]))
+        flat = keypoints[:, ends].diff(dim=2).norm(dim=-1) / float(camera.matrix[0, 0])
+        depth = float((truth.diff(dim=2)[..., :2].norm(dim=-1) / flat).nanmedian())
+        sure, fps = torch.where(sure < _UNSEEN, 0.0, sure)[:, kept], float(arrays["fps"])
+        seen = [names[i] for i in kept]
+        views.append(
+            View(keypoints[:, kept], sure, seen, camera, "mid-shoulder", truth, fps, depth)
+        )
     return views
 
 
@@ -260,7 +309,10 @@ def lifted(view: View, lengths: Float[Tensor, "2 2"], depth: float) -> Chains:
     """
     matrix = view.camera.matrix
     focal = torch.stack([matrix[0, 0], matrix[1, 1]])
-    rows = [[2, 1, 0], [4, 5, 6]]
+    known = canonical_names(view.names)
+    end = "wrist" if "wrist_left" in known else "hand"
+    rows = [[known.index(f"{joint}_{side}") for joint in ("shoulder", "elbow", end)]
+            for side in ("left", "right")]  # fmt: skip
     flat = view.keypoints[:, rows] / focal * depth
     bones = flat.diff(dim=2)
     away = (lengths.square() - bones.square().sum(-1)).clamp_min(0).sqrt()
@@ -273,7 +325,8 @@ def errors(chains: Chains, truth: Float[Tensor, "T 2 3 3"]) -> list[float]:
     upper, lower = truth[:, :, 1] - truth[:, :, 0], truth[:, :, 2] - truth[:, :, 1]
     wrist = (chains.upper + chains.lower - upper - lower).norm(dim=-1).nanmean()
     elbow = (chains.upper - upper).norm(dim=-1).nanmean()
-    sign = (chains.upper[..., 2] * upper[..., 2] > 0).double().mean()
+    known = upper[..., 2].isfinite()
+    sign = (chains.upper[..., 2] * upper[..., 2] > 0)[known].double().mean()
     length = chains.lower.norm(dim=-1)[_SETTLED:] if len(upper) > _SETTLED + 10 else None
     spread = torch.nan
     if length is not None:
@@ -300,17 +353,14 @@ def lifts(mean: Float[Tensor, "2 2"]) -> dict[str, Callable[[View], Chains]]:
         mean: lengths of other persons.
     """
 
-    def far(view: View) -> float:
-        return float(view.truth[..., 0, 2].nanmean())
-
     def mean_arm(view: View) -> Chains:
         hanging = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
         upper, lower = (mean[:, i, None] * hanging for i in (0, 1))
         return Chains(*(bone.expand(len(view.truth), 2, 3) for bone in (upper, lower)))
 
     return {
-        "lift, own lengths and depth": lambda v: lifted(v, true_lengths(v), far(v)),
-        "lift, others' lengths, own depth": lambda v: lifted(v, mean, far(v)),
+        "lift, own lengths and depth": lambda v: lifted(v, true_lengths(v), v.far),
+        "lift, others' lengths, own depth": lambda v: lifted(v, mean, v.far),
         "hanging arms": mean_arm,
     }
 
@@ -342,6 +392,8 @@ def groups(data: Path, quick: bool) -> Iterator[Group]:
                 few=_FEW, few_seen="MHAD, neck and wrists")  # fmt: skip
     yield Group("OpenPose, upper body and face, one of four views",
                 openpose_views(data)[: 1 if quick else None], each=True)  # fmt: skip
+    yield Group("Webcams, MediaPipe's 2D against its own 3D landmarks",
+                webcam_views(data)[: 1 if quick else None])  # fmt: skip
     every = 200 if quick else _UTD_EVERY
     yield Group("UTD-MHAD, eight joints", kinect_views(data, every), persons=_UTD_PERSONS,
                 few=_FOUR, few_seen="UTD-MHAD, head, neck and hands")  # fmt: skip
@@ -374,8 +426,13 @@ def add_group(report: Report, group: Group, prior: UpperBodyPrior, arms: ArmPrio
             for name, options in trackers(arms).items()
         }
 
+    def measured_first(view: View) -> Chains:
+        upper, lower = true_lengths(view).nanmean(0).tolist()
+        own = {"upper_arm": upper, "forearm": lower}
+        return tracked(view, prior, None, **trackers(arms)["articulated"], bone_lengths=own)
+
     table = report.table(group.seen, group.seen, COLUMNS, digits=_DIGITS)
-    found = of_trackers(None)
+    found = of_trackers(None) | {"articulated, own lengths of arms": rows(measured_first)}
     others = {name: rows(lift) for name, lift in lifts(arms.lengths[:2].expand(2, 2)).items()}
     for name, scored in (found | others).items():
         table.add(name, scored.nanmean(0))

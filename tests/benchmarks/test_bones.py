@@ -31,11 +31,12 @@ def test_errors_of_the_truth_are_none(data):
 
 def test_quick_run_prints_every_method(run_here, data, tmp_path):
     printed = run_here("bones", "--quick", "--data", str(data), "--out", str(tmp_path))
-    for title in ("MHAD, seven joints", "MHAD, neck and wrists", "UTD-MHAD, eight joints",
+    for title in ("MHAD, seven joints", "Webcams, MediaPipe's 2D against its own 3D landmarks",
+                  "MHAD, neck and wrists", "UTD-MHAD, eight joints",
                   "OpenPose, upper body and face, one of four views",
                   "UTD-MHAD, head, neck and hands"):  # fmt: skip
         assert f"**{title}**" in printed
-    for row, times in (("articulated", 5), ("view 1, mkf-fixed", 1), ("hanging arms", 3)):
+    for row, times in (("articulated", 6), ("view 1, mkf-fixed", 1), ("hanging arms", 4)):
         assert printed.count(f"| {row} |") == times
     assert "nan" not in printed
     assert (tmp_path / "bones.md").read_text().split() == printed.split()

@@ -22,6 +22,7 @@ shoulders, and from the neck up to the head."""
 
 _NUDGE = 0.03  # of a log-length, to see what a frame says about it
 _MOST = 0.1  # of a log-length that one frame may change it by
+_POWER = 0.1  # of what arms say about their lengths: frames of one pose are alike
 _WIDTH_STD, _HEIGHT_STD = 0.05, 0.05  # metres: shoulders and heads move in their torsos
 _GIVEN = 0.02  # of the log of a length that was measured on the person
 _SHORTEST, _LONGEST = 0.05, 1.0  # metres
@@ -140,7 +141,7 @@ class BodyLengths:
     def _slopes_of_arms(
         self, lengths: Lengths, evidence: Callable[[Tensor], Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """Return slope and bend of the evidence over the log-lengths of upper arm and forearm, [B, 2]."""
+        """Return what arms say about the log-lengths of upper arm and forearm: slope and bend, [B, 2]."""
         nudges = lengths.mean.new_tensor(
             [[0, 0, 0, 0], [1, 0, 0, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0]]
         )
@@ -150,7 +151,7 @@ class BodyLengths:
         )
         slope = [(pairs[i] - pairs[i + 1]) / (2 * _NUDGE) for i in (0, 2)]
         bend = [(2 * at - pairs[i] - pairs[i + 1]) / _NUDGE**2 for i in (0, 2)]
-        return torch.stack(slope, 1), torch.stack(bend, 1)
+        return _POWER * torch.stack(slope, 1), _POWER * torch.stack(bend, 1)
 
     def _slopes_of_torso(
         self, lengths: Lengths, torso: Torso, root: Root
