@@ -13,6 +13,7 @@ from torchpose.math import euler_to_matrix
 from torchpose.priors._arms import shipped_arm_prior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import UpperBodyTracker
+from torchpose.upper_body._root_grid import half_widths, see_torso
 
 CAMERA = torchpose.PinholeCamera(525.0, 525.0, 319.5, 239.5)
 ROW = {name: i for i, name in enumerate(UPPER_BODY)}
@@ -251,3 +252,16 @@ def test_given_lengths_are_kept_and_the_others_go_with_them():
 def test_lengths_that_nobody_has_are_refused(lengths, said):
     with pytest.raises(InputError, match=said):
         tracker(bone_lengths=lengths)
+
+
+def test_shoulders_without_arms_keep_their_width_at_any_distance():
+    uv = pixels(body(1, depth=0.6))
+    rays = torch.cat([(uv - torch.tensor([319.5, 239.5])) / 525, torch.ones(1, 8, 1)], -1).double()
+    shoulders = torch.tensor([[name.startswith("shoulder") for name in UPPER_BODY]])
+    torso = see_torso(rays, shoulders, torch.full((1, 8), 0.006, dtype=torch.float64))
+    depth = torch.tensor([[0.4, 0.6, 3.0]], dtype=torch.float64)
+    assert float(torso.raised(depth).abs().max()) == 0.0
+    width = torch.tensor([0.33], dtype=torch.float64)
+    torch.testing.assert_close(
+        half_widths(torso, depth, width), torch.full((1, 3, 2), 0.165).double()
+    )

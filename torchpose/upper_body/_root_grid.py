@@ -29,10 +29,8 @@ _TORSO = tuple(UPPER_BODY.index(n) for n in ("shoulder_left", "shoulder_right", 
 NECK_HEIGHT = 0.105
 """Metres of Kinect's neck above the middle of the shoulders."""
 
-_DEPTH, _DEPTH_STD = (
-    2.6,
-    0.6,
-)  # metres, as the Kinect recordings have it, and of its log: webcams, halls
+# Metres, as the Kinect recordings have it, and of its log: others sit at webcams, or stand in halls.
+_DEPTH, _DEPTH_STD = 2.6, 0.6
 _NEAREST, _FARTHEST, _DEPTH_STEP = 0.4, 9.0, 0.04  # metres, and the step of log depth
 _TURN_STEP, _TURN_STD = 15.0, 20.0  # degrees
 _BROAD_TURN = 0.2  # share of the turns that are all alike likely
@@ -44,10 +42,9 @@ _STIFF = ((0.03, 0.035), (0.03, 0.035), (0.03, 0.035), (0.05, 0.035))
 # As in UTD-MHAD (s1 to s6): from 0.164 m to 0.141.
 _INWARD, _INWARD_STD, _UPWARD_STD = 0.15, 0.2, 0.03
 _HANGING, _RAISED = -0.7, 0.2  # sines of the elevation from which, and to which, they do
-_REACH = (
-    0.27,
-    0.48,
-)  # metres, to the elbow and to the hand: the elevation does not have to be exact
+# Metres to the elbow and to the hand; the elevation does not have to be exact.
+_REACH = (0.27, 0.48)
+_NOT_RAISED = -1e3  # where no arm is seen
 
 _ARMS = tuple(
     tuple(UPPER_BODY.index(f"{joint}_{side}") for joint in ("shoulder", "elbow", "hand"))
@@ -115,7 +112,7 @@ def _rise(rays: Tensor, known: Tensor, shoulder: int, elbow: int, hand: int) -> 
     end = torch.where(known[:, elbow], rays[:, elbow, 1], rays[:, hand, 1])
     reach = torch.where(known[:, elbow], end.new_tensor(_REACH[0]), end.new_tensor(_REACH[1]))
     there = known[:, shoulder] & (known[:, elbow] | known[:, hand])
-    return torch.where(there, (rays[:, shoulder, 1] - end) / reach, _HANGING)
+    return torch.where(there, (rays[:, shoulder, 1] - end) / reach, _NOT_RAISED)
 
 
 def half_widths(
