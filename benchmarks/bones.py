@@ -246,18 +246,16 @@ def kinect_views(data: Path, every: int = _UTD_EVERY) -> list[View]:
     return views
 
 
-def fit_without(
-    data: Path, left_out: str | None, persons: Sequence[str] = (), **options: int
-) -> ArmPrior:
+def fit_without(data: Path, left_out: str | None, persons: Sequence[str] = ()) -> ArmPrior:
     """Return the prior over arms that is fitted to all sets but one, and without some persons.
 
     Args:
         data: folder with the sets. left_out: name of a set, None for none. persons: left out of all
-            sets. options: of `fit_arm_prior`.
+            sets.
     """
     kept = {name: share for name, share in SETS.items() if name != left_out}
     recordings = [[r for r in _recordings(data / name) if r.person not in persons] for name in kept]
-    return fit_arm_prior(recordings, shares=list(kept.values()), **options)
+    return fit_arm_prior(recordings, shares=list(kept.values()))
 
 
 def fit_shipped(data: Path, path: Path) -> None:
@@ -400,16 +398,13 @@ def groups(data: Path, quick: bool) -> Iterator[Group]:
 
 
 def priors_of(group: Group, data: Path, quick: bool) -> tuple[UpperBodyPrior, ArmPrior]:
-    """Return the priors of a group, which know nobody in it."""
-    size = {"n_samples": 2000, "n_components": 8} if quick else {}
-    if group.left_out is None and not group.persons:
-        arms = shipped_arm_prior()
-    else:
-        arms = fit_without(data, group.left_out, group.persons, **size)
-    if quick or not group.persons:
-        return torchpose.load_prior(
-            "kinect-upper-body-small" if quick else "kinect-upper-body"
-        ), arms
+    """Return the priors of a group, which know nobody in it; of a quick run those at hand."""
+    if quick:
+        return torchpose.load_prior("kinect-upper-body-small"), shipped_arm_prior()
+    known = group.left_out is not None or group.persons
+    arms = fit_without(data, group.left_out, group.persons) if known else shipped_arm_prior()
+    if not group.persons:
+        return torchpose.load_prior("kinect-upper-body"), arms
     others = [r for r in _recordings(data / _UTD) if r.person not in group.persons]
     return fit_kinect_prior(others, seed=0, **_FIT), arms
 
