@@ -49,6 +49,7 @@ from torchpose.priors import UpperBodyPrior
 from torchpose.priors._arms import ArmPrior, shipped_arm_prior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.skeleton._joint_sets import canonical_names
+from torchpose.upper_body._face import FACE
 
 SETS = {
     "kinect_utd_mhad": 0.4,
@@ -74,17 +75,25 @@ _SEVEN = ("wrist_left", "elbow_left", "shoulder_left", "neck", "shoulder_right",
 _MHAD = ("left_wrist", "left_elbow", "left_shoulder", "neck", "right_shoulder", "right_elbow",
          "right_wrist")  # fmt: skip
 _OPENPOSE_FACE = ("Nose", "LEye", "REye", "LEar", "REar")
-_FACE = ("nose", "eye_left", "eye_right", "ear_left", "ear_right")
 _PLACE, _EVERY, _FRAMES, _STD = (0.05, -0.2, 2.5), 15, 150, 3.0
 _FEW = (0, 3, 6)  # neck and wrists
 _KINECT = (*(name.replace("wrist", "hand") for name in _SEVEN), "head")
 _FOUR = (0, 3, 6, 7)  # neck, hands and head
 _UTD, _UTD_PERSONS, _UTD_EVERY = "kinect_utd_mhad", ("s7", "s8"), 8
 _FIT = {"n_components": 10, "window_components": 48, "calibration_folds": 0}
-_ENDS = [[UPPER_BODY.index(f"{joint}_{side}") for joint in ("shoulder", "elbow", "hand")]
-         for side in ("left", "right")]  # fmt: skip
 _VISIBLE, _UNSEEN = 0.6, 0.3  # MediaPipe's visibility: of an arm that is scored, of a missing joint
 _SETTLED = 90  # frames, from where on the spread of a bone's length counts
+
+
+def arm_rows(names: Sequence[str]) -> list[list[int]]:
+    """Return the places of shoulder, elbow and wrist, or else hand, of left and right among joints."""
+    known = canonical_names(names)
+    end = "wrist" if "wrist_left" in known else "hand"
+    return [[known.index(f"{joint}_{side}") for joint in ("shoulder", "elbow", end)]
+            for side in ("left", "right")]  # fmt: skip
+
+
+_ENDS = arm_rows(UPPER_BODY)
 
 
 class View(NamedTuple):
@@ -141,7 +150,7 @@ def mhad_views(data: Path, every: int = _EVERY) -> list[View]:
         joints = joints - joints[:, [3]] + np.array(_PLACE)
         pixels = joints[..., :2] / joints[..., 2:] * 525 + np.array([319.5, 239.5])
         pixels = torch.tensor(pixels + rng.normal(0, _STD, pixels.shape))
-        truth = torch.tensor(joints)[:, [[2, 1, 0], [4, 5, 6]]]
+        truth = torch.tensor(joints)[:, arm_rows(_SEVEN)]
         views.append(
             View(pixels, torch.ones(pixels.shape[:2]), _SEVEN, camera, "mid-shoulder", truth, 30.0)
         )
@@ -160,18 +169,17 @@ def openpose_views(data: Path) -> list[View]:
             if "openpose_2d" not in file:
                 continue
             arrays = {key: file[key] for key in file.files}
-        joints = [str(name) for name in arrays["names"]]
+        ends = arm_rows(arrays["names"])
         seen = [str(name) for name in arrays["openpose_names"]]
         limbs = ("Wrist", "Elbow", "Shoulder")
         wanted = [f"L{limb}" for limb in limbs] + ["Neck"] + [f"R{limb}" for limb in limbs[::-1]]
-        ends = [[joints.index(f"{s}{limb}") for limb in limbs[::-1]] for s in "LR"]
         for k, rotation, t, found in zip(
             *(arrays[key] for key in ("K", "R", "t", "openpose_2d")), strict=True
         ):
             world = arrays["joints"].astype(float)[:, ends]
             truth = torch.tensor(world @ np.asarray(rotation, float).T + np.ravel(t))
             keypoints = torch.tensor(
-                found[:, [seen.index(name) for name in wanted + list(_OPENPOSE_FACE)]],
+                found[:, [seen.index(name) for name in (*wanted, *_OPENPOSE_FACE)]],
                 dtype=torch.float64,
             )
             sure = keypoints[..., 2].clamp(0, 1)
@@ -180,9 +188,7 @@ def openpose_views(data: Path) -> list[View]:
             )
             fps = float(arrays["fps"])
             views.append(
-                View(
-                    keypoints[..., :2], sure, (*_SEVEN, *_FACE), camera, "mid-shoulder", truth, fps
-                )
+                View(keypoints[..., :2], sure, (*_SEVEN, *FACE), camera, "mid-shoulder", truth, fps)
             )
     return views
 
@@ -203,8 +209,7 @@ def webcam_views(data: Path) -> list[View]:
             arrays = {key: file[key] for key in file.files}
         names = [str(name) for name in arrays["names"]]
         kept = [i for i, name in enumerate(names) if not name.endswith(("hip", "index"))]
-        ends = [[names.index(f"{s}_{j}") for j in ("shoulder", "elbow", "wrist")]
-                for s in ("left", "right")]  # fmt: skip
+        ends = arm_rows(names)
         sure = torch.tensor(arrays["visibility"]).double().clamp(0, 1)
         keypoints = torch.tensor(arrays["joints2d"]).double()
         truth = torch.tensor(arrays["joints3d"]).double()[:, ends]
@@ -307,11 +312,7 @@ def lifted(view: View, lengths: Float[Tensor, "2 2"], depth: float) -> Chains:
     """
     matrix = view.camera.matrix
     focal = torch.stack([matrix[0, 0], matrix[1, 1]])
-    known = canonical_names(view.names)
-    end = "wrist" if "wrist_left" in known else "hand"
-    rows = [[known.index(f"{joint}_{side}") for joint in ("shoulder", "elbow", end)]
-            for side in ("left", "right")]  # fmt: skip
-    flat = view.keypoints[:, rows] / focal * depth
+    flat = view.keypoints[:, arm_rows(view.names)] / focal * depth
     bones = flat.diff(dim=2)
     away = (lengths.square() - bones.square().sum(-1)).clamp_min(0).sqrt()
     whole = torch.cat([bones, -away[..., None]], -1)

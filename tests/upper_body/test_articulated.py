@@ -263,5 +263,5 @@ def test_shoulders_without_arms_keep_their_width_at_any_distance():
     assert float(torso.raised(depth).abs().max()) == 0.0
     width = torch.tensor([0.33], dtype=torch.float64)
     torch.testing.assert_close(
-        half_widths(torso, depth, width), torch.full((1, 3, 2), 0.165).double()
+        half_widths(width, torso.raised(depth)), torch.full((1, 3, 2), 0.165).double()
     )

@@ -68,10 +68,7 @@ def command() -> Command:
             "video": [option._replace(text=f"video: {option.text}") for option in video],
             "method_options": _method_options(names),
         },
-        parse={
-            "measurement_std": parse_stds,
-            "smoothing": parse_smoothing,
-        },
+        parse={"measurement_std": parse_stds, "smoothing": parse_smoothing},
         metavars={"frame": "camera|body", "hands": "grid|mean-shift"},
     )
 

@@ -33,6 +33,7 @@ __all__ = [
     "quaternion_vector_to_matrix",
     "rotvec_to_matrix",
     "vector_to_quaternion",
+    "within_half_turn",
     "within_unit_ball",
 ]
 
@@ -137,6 +138,11 @@ def rotvec_to_matrix(rotvec: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch
 
 def _check_order(order: str) -> None:
     check_choice("rotation order", order, ROTATION_ORDERS)
+
+
+def within_half_turn(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Return the angle between -pi and pi that is the same up to whole turns."""
+    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
 
 
 def within_unit_ball(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:

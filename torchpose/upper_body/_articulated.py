@@ -21,6 +21,7 @@ from tqdm.auto import tqdm
 from torchpose._core.module_state import derived
 from torchpose.errors import InputError
 from torchpose.filters._base import Generators
+from torchpose.math._rotations import within_half_turn
 from torchpose.priors._arms import ArmPrior, shipped_arm_prior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import upright_axes
@@ -46,7 +47,7 @@ from torchpose.upper_body._root_grid import (
     middle_of_shoulders,
     see_torso,
     shoulder_offsets,
-    torso_places,
+    spine_places,
 )
 
 __all__ = ["ArticulatedFilter", "ArticulatedState"]
@@ -287,7 +288,7 @@ class ArticulatedFilter(Estimator):
         self, frame: _LevelFrame, root: Root, middle: Tensor, width: Tensor
     ) -> Float[Tensor, "B 2 M 3"]:
         """Return both shoulders: on their rays where they are measured."""
-        half = half_widths(frame.torso, root.depth, width)
+        half = half_widths(width, frame.torso.raised(root.depth))
         offsets = shoulder_offsets(root.turn, half)
         inferred = (middle[..., None, :] + offsets).transpose(1, 2)
         ray = frame.rays[:, _SHOULDERS, None]
@@ -323,7 +324,7 @@ class ArticulatedFilter(Estimator):
         """Return the mean of the hypotheses near the likeliest turn, as the only one."""
         weight = torch.softmax(root.log_weight, 1)
         best = root.turn.gather(1, weight.argmax(1, keepdim=True))
-        off = torch.remainder(root.turn - best + math.pi, 2 * math.pi) - math.pi
+        off = within_half_turn(root.turn - best)
         near = weight * (-0.5 * (off / _MODE).square()).exp()
         near = near / near.sum(1, keepdim=True)
         depth = (near * root.depth.log()).sum(1, keepdim=True).exp()
@@ -355,8 +356,7 @@ class ArticulatedFilter(Estimator):
         bones = bones @ axes[:, None] * lengths[:, None, :2, None]
         elbow = shoulder + bones[:, :, 0]
         hand = elbow + bones[:, :, 1]
-        half = half_widths(frame.torso, root.depth, size.width)
-        torso = middle + torso_places(root.turn, half, size)[:, 0, 2:]
+        torso = middle + spine_places(size)
         joints = middle.new_zeros(len(middle), 8, 3)
         for rows, value in ((_SHOULDERS, shoulder), (_ELBOWS, elbow), (_HANDS, hand)):
             joints[:, rows] = value

@@ -10,6 +10,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchpose.math._rotations import within_half_turn
+from torchpose.upper_body._root_grid import heavy_tail
+
 __all__ = ["FACE", "FacePoints", "face_evidence", "measure_face"]
 
 FACE = ("nose", "eye_left", "eye_right", "ear_left", "ear_right")
@@ -22,13 +25,9 @@ _FORWARD = (0.11, 0.085, 0.085, 0.0, 0.0)
 _OUTWARD = (0.0, 20.0, -20.0, 90.0, -90.0)
 _HIDDEN = (-0.1, 0.0, 0.0, -0.3, -0.3)
 _SOFT = 0.15  # of that cosine
-_SEEN, _IMAGINED = (
-    0.9,
-    0.1,
-)  # probabilities that a detector gives what is visible, and what is hidden
+_SEEN, _IMAGINED = 0.9, 0.1  # probabilities that a detector gives what is visible, what is hidden
 _SURE = 0.4  # confidence from which on a keypoint counts as given
 _NOISE = 0.02  # metres: faces and detectors differ
-_FREEDOM = 4.0  # of the heavy tails
 _NECK_STD = math.radians(25.0)  # between head and shoulders
 _ANYWHERE = 0.1  # share of the heads that are turned by any angle
 
@@ -81,14 +80,14 @@ def face_evidence(
 
     A head at angle h from the camera has its points at x_i = c + left_i cos h - forward_i sin h, for an
     unknown middle c; and a detector gives those that are visible at that angle more often than others.
-    Heads are turned against shoulders by some 30 degrees, and now and then by any angle.
+    Heads are turned against shoulders by some 25 degrees, and now and then by any angle.
 
     Args:
         face: rays. std: of a pixel over the focal length. depth: of the shoulders, metres.
         turn: of the shoulders, at even steps round the circle.
     """
     at_angle = _places(face, std, depth, turn) + _visibility(face, turn)[:, None]
-    off = torch.remainder(turn[:, None] - turn + math.pi, 2 * math.pi) - math.pi
+    off = within_half_turn(turn[:, None] - turn)
     near = torch.softmax(-0.5 * (off / _NECK_STD).square(), 1)
     share = (1 - _ANYWHERE) * near + _ANYWHERE / len(turn)
     most = at_angle.amax(-1, keepdim=True)
@@ -106,7 +105,7 @@ def _places(face: FacePoints, std: Tensor, depth: Tensor, turn: Tensor) -> Float
     total = precision.sum(-1)
     mean = (precision * off).sum(-1) / total.clamp_min(1e-12)
     squared = (precision * (off - mean[..., None]).square()).sum(-1)
-    return -0.5 * (_FREEDOM + 1) * torch.log1p(squared / _FREEDOM)
+    return heavy_tail(squared)
 
 
 def _visibility(face: FacePoints, turn: Tensor) -> Float[Tensor, "B P"]:

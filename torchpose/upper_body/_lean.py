@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.upper_body._root_grid import with_axes
 
 __all__ = ["lean_angle", "rolled", "seen_lean"]
 
@@ -62,7 +63,7 @@ def rolled(
     vectors: Float[Tensor, "B *batch D"], angle: Float[Tensor, " B"]
 ) -> Float[Tensor, "B *batch D"]:
     """Return vectors, or points of the image, turned by an angle about the camera's optical axis."""
-    angle = angle[(slice(None),) + (None,) * (vectors.ndim - 2)]
+    angle = with_axes(angle, vectors.ndim - 2)
     cos, sin = angle.cos(), angle.sin()
     x, y, *rest = vectors.unbind(-1)
     return torch.stack([cos * x - sin * y, sin * x + cos * y, *rest], -1)

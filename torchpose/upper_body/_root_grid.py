@@ -18,11 +18,14 @@ __all__ = [
     "Torso",
     "TorsoLengths",
     "half_widths",
+    "heavy_tail",
     "inward_shares",
     "middle_of_shoulders",
     "see_torso",
     "shoulder_offsets",
+    "spine_places",
     "torso_places",
+    "with_axes",
 ]
 
 _TORSO = tuple(UPPER_BODY.index(n) for n in ("shoulder_left", "shoulder_right", "neck", "head"))
@@ -39,7 +42,7 @@ _LOST = 1e-4  # share of a frame's belief that starts anew
 # Standard deviation of each torso joint about its place in a stiff torso, metres: x and y.
 _STIFF = ((0.03, 0.035), (0.03, 0.035), (0.03, 0.035), (0.05, 0.035))
 # Shoulders of raised arms move in, by a share of half the width that differs from one to the next, and up.
-# As in UTD-MHAD (s1 to s6): from 0.164 m to 0.141.
+# As in UTD-MHAD (s1 to s6): from 0.165 m to 0.140.
 _INWARD, _INWARD_STD, _UPWARD_STD = 0.15, 0.2, 0.03
 _HANGING, _RAISED = -0.7, 0.2  # sines of the elevation from which, and to which, they do
 # Metres to the elbow and to the hand; the elevation does not have to be exact.
@@ -50,7 +53,7 @@ _ARMS = tuple(
     tuple(UPPER_BODY.index(f"{joint}_{side}") for joint in ("shoulder", "elbow", "hand"))
     for side in ("left", "right")
 )
-_FREEDOM = 4.0  # of the heavy tails of torso joints
+_FREEDOM = 4.0  # of the heavy tails of detectors' points
 
 
 class TorsoLengths(NamedTuple):
@@ -94,7 +97,7 @@ class Torso(NamedTuple):
 
     def raised(self, depth: Float[Tensor, "B *grid"]) -> Float[Tensor, "B *grid 2"]:
         """Return how far each arm is raised, from 0 (hanging) to 1."""
-        rise = self.rise[(slice(None),) + (None,) * (depth.ndim - 1)]
+        rise = with_axes(self.rise, depth.ndim - 1)
         return ((rise * depth[..., None] - _HANGING) / (_RAISED - _HANGING)).clamp(0.0, 1.0)
 
 
@@ -116,11 +119,10 @@ def _rise(rays: Tensor, known: Tensor, shoulder: int, elbow: int, hand: int) -> 
 
 
 def half_widths(
-    torso: Torso, depth: Float[Tensor, "B *grid"], width: Float[Tensor, " B"]
+    width: Float[Tensor, " B"], raised: Float[Tensor, "B *grid 2"]
 ) -> Float[Tensor, "B *grid 2"]:
     """Return how far left and right shoulder are from the middle, metres: less where an arm is raised."""
-    half = width[(slice(None),) + (None,) * depth.ndim] / 2
-    return half * (1 - _INWARD * torso.raised(depth))
+    return with_axes(width, raised.ndim - 1) / 2 * (1 - _INWARD * raised)
 
 
 def inward_shares(torso: Torso, depth: Float[Tensor, " B"]) -> tuple[Tensor, Tensor]:
@@ -231,16 +233,15 @@ class _Middle(NamedTuple):
 
 def _middles(torso: Torso, depth: Tensor, turn: Tensor, lengths: TorsoLengths) -> list[_Middle]:
     """Return the middle of the shoulders by x and y, given depth and turn [B, ...]."""
-    lead = (slice(None),) + (None,) * (depth.ndim - 1)
-    half = half_widths(torso, depth, lengths.width)
-    place, known = torso_places(turn, half, lengths), torso.known[lead].to(depth)
-    rays, std = torso.rays[lead], torso.std[lead]
+    rays, known, std = (with_axes(x, depth.ndim - 1) for x in torso[:3])
+    raised = torso.raised(depth)
+    place = torso_places(turn, half_widths(lengths.width, raised), lengths)
     away = depth[..., None] + place[..., 2]
-    stiff = _stiffness(lengths, torso.raised(depth))
+    stiff = _stiffness(lengths, raised)
     found = []
     for axis in (0, 1):
         value = rays[..., axis] * away - place[..., axis]
-        precision = known / (stiff[..., axis] + (std * away).square())
+        precision = known.to(depth) / (stiff[..., axis] + (std * away).square())
         mean = (precision * value).sum(-1) / precision.sum(-1).clamp_min(1e-12)
         found.append(_Middle(value, precision, mean))
     return found
@@ -250,14 +251,13 @@ def _log_likelihood(
     torso: Torso, depth: Tensor, turn: Tensor, lengths: TorsoLengths
 ) -> Float[Tensor, "B *grid"]:
     """Return the log-likelihood of the torso's joints wherever its middle is."""
-    count = torso.known.sum(-1).to(depth)[(...,) + (None,) * (depth.ndim - 1)]
+    count = with_axes(torso.known.sum(-1).to(depth), depth.ndim - 1)
     total = torch.zeros_like(depth)
     for value, precision, mean in _middles(torso, depth, turn, lengths):
         off = (precision * (value - mean[..., None]).square()).sum(-1)
         logs = torch.where(precision > 0, precision, 1.0).log().sum(-1)
-        heavy = -0.5 * (_FREEDOM + 1) * torch.log1p(off / _FREEDOM)
         mass = torch.where(count > 0, precision.sum(-1), 1.0)
-        total = total + heavy + 0.5 * (logs - mass.log())
+        total = total + heavy_tail(off) + 0.5 * (logs - mass.log())
     return total + 2 * (count - 1).clamp_min(0) * depth.log()
 
 
@@ -265,9 +265,9 @@ def _stiffness(
     lengths: TorsoLengths, raised: Float[Tensor, "B *grid 2"]
 ) -> Float[Tensor, "B *grid 4 2"]:
     """Return the variance of each torso joint about its place in x and y, metres squared."""
-    lead = (slice(None),) + (None,) * (raised.ndim - 2)
     stiff = raised.new_tensor(_STIFF).square().expand(*raised.shape[:-1], 4, 2).clone()
-    width, width_std, height_std = (x[lead] for x in (lengths.width, *lengths[2:4]))
+    sizes = (lengths.width, lengths.width_std, lengths.height_std)
+    width, width_std, height_std = (with_axes(x, raised.ndim - 2) for x in sizes)
     stiff[..., :2, 0] += (width_std / 2).square()[..., None]
     stiff[..., :2, 0] += (raised * _INWARD_STD * width[..., None] / 2).square()
     stiff[..., :2, 1] += (raised * _UPWARD_STD).square()
@@ -284,11 +284,26 @@ def torso_places(
         turn: psi. half: of the shoulders (`half_widths`). lengths: of the torso.
     """
     shoulders = shoulder_offsets(turn, half)
-    neck = torch.zeros_like(shoulders[..., 0, :])
-    neck[..., 1] = -lengths.neck
-    head = neck.clone()
-    head[..., 1] -= lengths.height[(slice(None),) + (None,) * (turn.ndim - 1)]
-    return torch.cat([shoulders, torch.stack([neck, head], -2)], -2)
+    spine = with_axes(spine_places(lengths), turn.ndim - 1).expand_as(shoulders)
+    return torch.cat([shoulders, spine], -2)
+
+
+def spine_places(lengths: TorsoLengths) -> Float[Tensor, "B 2 3"]:
+    """Return neck and head relative to the middle of the shoulders, camera axes: upright above it."""
+    neck = torch.full_like(lengths.height, -lengths.neck)
+    up = torch.stack([neck, neck - lengths.height], 1)
+    level = torch.zeros_like(up)
+    return torch.stack([level, up, level], -1)
+
+
+def with_axes(values: Float[Tensor, "B *rest"], count: int) -> Tensor:
+    """Return values with so many axes of one element after that of the batch."""
+    return values[(slice(None),) + (None,) * count]
+
+
+def heavy_tail(squared: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Return the log-density of a Student distribution, up to a constant, by the squared distance."""
+    return -0.5 * (_FREEDOM + 1) * torch.log1p(squared / _FREEDOM)
 
 
 def middle_of_shoulders(

@@ -12,7 +12,12 @@ from torchpose._core.checks import check_choice, check_finite, check_shape
 from torchpose.camera._rig import CameraRig, Cameras, as_rig
 from torchpose.errors import InputError
 from torchpose.filters._base import Generators, standard_normal, uniform
-from torchpose.math._rotations import compose, minimal_rotation, quaternion_vector_to_matrix
+from torchpose.math._rotations import (
+    compose,
+    minimal_rotation,
+    quaternion_vector_to_matrix,
+    within_half_turn,
+)
 from torchpose.whole_body._filters.annealed import anneal
 from torchpose.whole_body._filters.body_frames import silhouette_score
 from torchpose.whole_body._silhouettes.likelihood import LIKELIHOODS
@@ -282,8 +287,7 @@ def _first_particles(
     noise = standard_normal(batch, (n, 6), generator, up)
     position = place.position.to(up)[:, None] + noise[..., :3] @ factor.mT
     turn = sectors.half_width * (2 * uniform(batch, (n,), generator, up) - 1)
-    turn = turn + sectors.middle.repeat(batch // len(sectors.middle))[:, None]
-    turn = torch.remainder(turn + math.pi, 2 * math.pi) - math.pi
+    turn = within_half_turn(turn + sectors.middle.repeat(batch // len(sectors.middle))[:, None])
     upright = minimal_rotation(torch.tensor([0.0, 1.0, 0.0]).to(up), up)
     heading = compose((turn / 2).sin()[..., None] * up, upright)
     heading = compose(heading, _TILT * noise[..., 3:])
