@@ -169,7 +169,7 @@ def openpose_views(data: Path) -> list[View]:
             if "openpose_2d" not in file:
                 continue
             arrays = {key: file[key] for key in file.files}
-        ends = arm_rows(arrays["names"])
+        ends = arm_rows([str(name) for name in arrays["names"]])
         seen = [str(name) for name in arrays["openpose_names"]]
         limbs = ("Wrist", "Elbow", "Shoulder")
         wanted = [f"L{limb}" for limb in limbs] + ["Neck"] + [f"R{limb}" for limb in limbs[::-1]]

@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -296,7 +296,7 @@ def spine_places(lengths: TorsoLengths) -> Float[Tensor, "B 2 3"]:
     return torch.stack([level, up, level], -1)
 
 
-def with_axes(values: Float[Tensor, "B *rest"], count: int) -> Tensor:
+def with_axes(values: Shaped[Tensor, "B *rest"], count: int) -> Tensor:
     """Return values with so many axes of one element after that of the batch."""
     return values[(slice(None),) + (None,) * count]
 
