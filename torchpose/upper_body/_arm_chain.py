@@ -63,6 +63,12 @@ class Arms(NamedTuple):
         """Return the log of the prior predictive density of what is measured of each arm."""
         return torch.logsumexp(self.log_weight + self.log_prior, -1)
 
+    @property
+    def mean_directions(self) -> Float[Tensor, "B 2 M 6"]:
+        """Return the mean of the directions of each hypothesis of the root; not of unit length."""
+        weight = torch.softmax(self.log_weight + self.log_prior, -1)
+        return (weight[..., None] * self.directions).sum(-2)
+
 
 class ArmState(NamedTuple):
     """Belief about both arms after a frame.

@@ -59,8 +59,7 @@ _SHOULDERS, _ELBOWS, _HANDS = (
 )
 _ROOTS = 10  # hypotheses of the root that arms are weighed for
 _COARSE_ANGLES, _COARSE_AROUND = 11, 24  # of limbs, while roots are weighed
-_POWER = 0.3  # of the evidence of arms about the root: those of near frames are alike
-_SHARE = 0.2  # seconds over which frames say the same about a length
+_SHARE = 0.2  # seconds over which frames say the same about the torso and about lengths
 _MODE = math.radians(45.0)  # turns farther than that from the likeliest are another mode
 _SIDES = ((1.0, 1.0, 1.0), (-1.0, 1.0, 1.0))  # right arms are mirrored
 _TORSO_STD = 0.03  # metres: of torso joints in space
@@ -252,7 +251,8 @@ class ArticulatedFilter(Estimator):
         lengths, slack = self.lengths.metres(state.lengths), self.lengths.slack(state.lengths)
         size = self.lengths.torso(state.lengths)
         predicted = self.grid.predict(state.root)
-        believed = predicted.log() + self.grid.evidence(torso, size)
+        power = 1.0 if state.arms is None else 1 / self.stride
+        believed = predicted.log() + power * self.grid.evidence(torso, size)
         if frame.face is not None:
             std = frame.std.amin(1)
             believed = believed + face_evidence(frame.face, std, self.grid.depth, self.grid.turn)
@@ -260,9 +260,11 @@ class ArticulatedFilter(Estimator):
         middle = self._middle(state, torso, root, size)
         weighed = self._arms(frame, root, middle, lengths, slack, _COARSE_ANGLES, _COARSE_AROUND)
         seen = frame.known[:, [_ELBOWS, _HANDS]].sum((1, 2)).to(root.depth)
-        evidence = weighed.log_evidence.sum(1) + 2 * seen[:, None] * root.depth.log()
-        after = self.grid.belief(believed, root, _POWER * evidence)
-        likely = self._likely(root._replace(log_weight=root.log_weight + _POWER * evidence))
+        evidence = power * (weighed.log_evidence.sum(1) + 2 * seen[:, None] * root.depth.log())
+        after = self.grid.belief(believed, root, evidence)
+        root = root._replace(log_weight=root.log_weight + evidence)
+        near = self._near(root)
+        likely = self._mean(root, near)
         centre = self._middle(state, torso, likely, size)
         arms = self._arms(frame, likely, centre, lengths, slack)
         belief = (
@@ -272,7 +274,9 @@ class ArticulatedFilter(Estimator):
         if state.frame % self.stride == 0:
             of_lengths = partial(self._evidence_of, frame, likely, centre)
             learnt = self.lengths.learn(learnt, torso, likely, of_lengths)
-        pose = self._pose(belief, frame, likely, centre, lengths, size)
+        shoulder = self._shoulders(frame, root, middle, lengths[:, 2]) - middle[:, None]
+        others = self._covs_of_root(weighed, root, near, shoulder, lengths)
+        pose = self._pose(belief, frame, likely, centre, lengths, size, others)
         new = ArticulatedState(after, learnt, belief, centre[:, 0], state.lean, state.frame + 1)
         return new, pose
 
@@ -320,16 +324,51 @@ class ArticulatedFilter(Estimator):
         sizes = {} if angles is None or around is None else {"angles": angles, "around": around}
         return self.chain.hypotheses(arm, **sizes)
 
-    def _likely(self, root: Root) -> Root:
-        """Return the mean of the hypotheses near the likeliest turn, as the only one."""
+    @staticmethod
+    def _near(root: Root) -> Float[Tensor, "B M"]:
+        """Return the shares of the hypotheses, of those alone that are turned about as the likeliest."""
         weight = torch.softmax(root.log_weight, 1)
         best = root.turn.gather(1, weight.argmax(1, keepdim=True))
         off = within_half_turn(root.turn - best)
         near = weight * (-0.5 * (off / _MODE).square()).exp()
-        near = near / near.sum(1, keepdim=True)
+        return near / near.sum(1, keepdim=True)
+
+    @staticmethod
+    def _mean(root: Root, near: Float[Tensor, "B M"]) -> Root:
+        """Return the mean of hypotheses with these shares, as the only one."""
+        best = root.turn.gather(1, near.argmax(1, keepdim=True))
+        off = within_half_turn(root.turn - best)
         depth = (near * root.depth.log()).sum(1, keepdim=True).exp()
         turn = best + (near * off).sum(1, keepdim=True)
         return Root(depth, turn, torch.zeros_like(depth), torch.zeros_like(root.cell[:, :1]))
+
+    def _covs_of_root(
+        self, arms: Arms, root: Root, near: Tensor, shoulder: Tensor, lengths: Tensor
+    ) -> Float[Tensor, "B 4 3 3"]:
+        """Return how far both elbows, then both hands, are off where other hypotheses of the root hold.
+
+        Args:
+            arms: of each hypothesis. root: the hypotheses. near: share of each in the estimate, [B, M].
+            shoulder: relative to the middle of both, [B, 2, M, 3]. lengths: of the bones.
+        """
+        bones = self._bones(arms.mean_directions, upright_axes(root.turn)[:, None], lengths)
+        ends = shoulder[..., None, :] + bones.cumsum(-2)
+        used = (near[:, None, :, None, None] * ends).sum(2, keepdim=True)
+        off = (ends - used).permute(0, 3, 1, 2, 4).flatten(1, 2)
+        weight = torch.softmax(root.log_weight, 1)[:, None, :, None]
+        return (weight * off).mT @ off
+
+    @staticmethod
+    def _bones(directions: Tensor, axes: Tensor, lengths: Tensor) -> Float[Tensor, "B 2 N 2 3"]:
+        """Return upper arms and forearms, camera axes, of N pairs of directions in upright axes.
+
+        Args:
+            directions: of left and mirrored right arms, [B, 2, N, 6]. axes: from camera to upright axes,
+                [B, 1, N or 1, 3, 3]. lengths: of the bones, [B, 4].
+        """
+        flip = directions.new_tensor(_SIDES)[:, None, None]
+        bones = directions.unflatten(-1, (2, 3)) * flip
+        return bones @ axes * lengths[:, None, None, :2, None]
 
     def _evidence_of(
         self, frame: _LevelFrame, root: Root, middle: Tensor, lengths: Float[Tensor, "B 4"]
@@ -347,13 +386,13 @@ class ArticulatedFilter(Estimator):
         middle: Tensor,
         lengths: Tensor,
         size: TorsoLengths,
+        others: Tensor,
     ) -> FramePose:
-        """Return joints and covariances in camera axes."""
-        flip = root.depth.new_tensor(_SIDES)
+        """Return joints and covariances in camera axes; `others` are those of `_covs_of_root`."""
         axes = upright_axes(root.turn[:, 0])
         shoulder = self._shoulders(frame, root, middle, lengths[:, 2])[:, :, 0]
-        bones = self.chain.mean_directions(belief) * flip[:, None]
-        bones = bones @ axes[:, None] * lengths[:, None, :2, None]
+        mean = self.chain.mean_directions(belief).flatten(2)[:, :, None]
+        bones = self._bones(mean, axes[:, None, None], lengths)[:, :, 0]
         elbow = shoulder + bones[:, :, 0]
         hand = elbow + bones[:, :, 1]
         torso = middle + spine_places(size)
@@ -364,7 +403,8 @@ class ArticulatedFilter(Estimator):
             row = _JOINT[name]
             ray = frame.rays[:, row] / frame.rays[:, row, 2:] * torso[:, i, 2:]
             joints[:, row] = torch.where(frame.known[:, row, None], ray, torso[:, i])
-        covs = self._covs(belief, joints, axes, lengths, flip)
+        covs = self._covs(belief, joints, axes, lengths)
+        covs[:, [*_ELBOWS, *_HANDS]] += others
         weight = belief.weight.clamp_min(1e-30).log()
         seen = frame.known[:, [_ELBOWS, _HANDS]].any(1)
         count = frame.known[:, [_ELBOWS, _HANDS]].sum(1).to(root.depth)
@@ -374,12 +414,11 @@ class ArticulatedFilter(Estimator):
         return FramePose(joints, covs, turn, torch.zeros_like(turn), evidence, weight)
 
     def _covs(
-        self, belief: ArmState, joints: Tensor, axes: Tensor, lengths: Tensor, flip: Tensor
+        self, belief: ArmState, joints: Tensor, axes: Tensor, lengths: Tensor
     ) -> Float[Tensor, "B 8 3 3"]:
         """Return covariances: of the hypotheses about the estimate, of stiff torsos, and of the scale."""
         covs = torch.eye(3).to(joints).mul(_TORSO_STD**2).expand(*joints.shape, 3).clone()
-        bones = belief.directions.unflatten(-1, (2, 3)) * flip[:, None, None]
-        ends = (bones @ axes[:, None, None] * lengths[:, None, None, :2, None]).cumsum(-2)
+        ends = self._bones(belief.directions, axes[:, None, None], lengths).cumsum(-2)
         for limb, rows in ((0, _ELBOWS), (1, _HANDS)):
             off = ends[..., limb, :] - (joints[:, rows] - joints[:, _SHOULDERS])[:, :, None]
             covs[:, rows] += (belief.weight[..., None] * off).mT @ off

@@ -38,7 +38,7 @@ _NEAREST, _FARTHEST, _DEPTH_STEP = 0.4, 9.0, 0.04  # metres, and the step of log
 _TURN_STEP, _TURN_STD = 15.0, 20.0  # degrees
 _BROAD_TURN = 0.2  # share of the turns that are all alike likely
 _SPEED, _TURN_SPEED = 0.08, 60.0  # share of the depth, and degrees, after one second
-_LOST = 1e-4  # share of a frame's belief that starts anew
+_LOST = 1e-6  # share of a frame's belief that starts anew
 # Standard deviation of each torso joint about its place in a stiff torso, metres: x and y.
 _STIFF = ((0.03, 0.035), (0.03, 0.035), (0.03, 0.035), (0.05, 0.035))
 # Shoulders of raised arms move in, by a share of half the width that differs from one to the next, and up.
