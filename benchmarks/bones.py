@@ -428,7 +428,14 @@ def add_group(report: Report, group: Group, prior: UpperBodyPrior, arms: ArmPrio
         return tracked(view, prior, None, **trackers(arms)["articulated"], bone_lengths=own)
 
     table = report.table(group.seen, group.seen, COLUMNS, digits=_DIGITS)
-    found = of_trackers(None) | {"articulated, own lengths of arms": rows(measured_first)}
+    smoothed = {
+        f"{name}, smoothed": rows(
+            partial(tracked, prior=prior, chosen=None, smoothing="full", **own)
+        )
+        for name, own in trackers(arms).items()
+    }
+    own_lengths = {"articulated, own lengths of arms": rows(measured_first)}
+    found = of_trackers(None) | own_lengths | smoothed
     others = {name: rows(lift) for name, lift in lifts(arms.lengths[:2].expand(2, 2)).items()}
     for name, scored in (found | others).items():
         table.add(name, scored.nanmean(0))

@@ -142,6 +142,7 @@ def test_options_reach_the_tracker(track, files):
         track("--method", "articulated", "--bone-lengths", given)[1],
         expected(files, method="articulated", bone_lengths=lengths),
     )
+    same(track("--height", 1.6)[1], expected(files, height=1.6))
     same(track("--steady", "false")[1], expected(files, steady=False))
     same(track("--static-camera", "true")[1], expected(files, static_camera=True))
 
@@ -286,7 +287,12 @@ BAD_INPUT = {
     "bad std": ([CLIP, "--measurement-std", "wide"], "a number or five"),
     "four stds": ([CLIP, "--measurement-std", "1,2,3,4"], "one number or five"),
     "bad lengths": ([CLIP, "--bone-lengths", "long"], "must be NAME=METRES with commas"),
-    "lengths of the default": ([CLIP, "--bone-lengths", "forearm=0.2"], "it is of articulated"),
+    "lengths of single poses": (
+        [CLIP, "--method", "mkf-fixed", "--bone-lengths", "forearm=0.2"],
+        "it is of articulated",
+    ),
+    "a height in feet": ([CLIP, "--height", "5.7"], "it is in metres"),
+    "nobody's poses": ([CLIP, "--person", "{tmp}/none.npz"], "no such file"),
     "negative std": ([CLIP, "--measurement-std=-2"], "must be positive"),
     "three numbers": ([CLIP, "--camera", "1,2,3"], "fx,fy,cx,cy"),
     "no focal length": ([CLIP, "--camera", "0,0,320,240"], "positive focal lengths"),

@@ -10,9 +10,12 @@ import torch
 import torchpose
 from torchpose.errors import InputError
 from torchpose.math import euler_to_matrix
-from torchpose.priors._arms import shipped_arm_prior
+from torchpose.priors._arms import LENGTHS, shipped_arm_prior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import UpperBodyTracker
+from torchpose.upper_body._arm_chain import Arms
+from torchpose.upper_body._articulated import ArticulatedFilter
+from torchpose.upper_body._estimator import TrackerModel
 from torchpose.upper_body._root_grid import half_widths, see_torso
 
 CAMERA = torchpose.PinholeCamera(525.0, 525.0, 319.5, 239.5)
@@ -265,3 +268,111 @@ def test_shoulders_without_arms_keep_their_width_at_any_distance():
     torch.testing.assert_close(
         half_widths(width, torso.raised(depth)), torch.full((1, 3, 2), 0.165).double()
     )
+
+
+def test_lengths_are_reported_with_a_covariance_that_sharpens():
+    track = tracker()(pixels(body(90), 2.0)[None])
+    assert track.bone_names == ("upper_arm", "forearm_to_hand", "shoulder_width", "head_height")
+    usual = shipped_arm_prior()
+    rows = [LENGTHS.index(name) for name in track.bone_names]
+    torch.testing.assert_close(track.bone_lengths[0, 0], usual.lengths[rows])
+    first, last = (track.bone_covariance[0, t].diagonal().sqrt() for t in (0, -1))
+    torch.testing.assert_close(first / track.bone_lengths[0, 0], usual.spread[rows])
+    assert bool((last[1:] < 0.95 * first[1:]).all())
+    assert float(last[0]) == pytest.approx(float(first[0]))  # the scale is not to be seen
+    correlation = track.bone_covariance[0, -1, 0, 1] / (last[0] * last[1])
+    assert 0.3 < float(correlation) < 1
+
+
+def test_the_next_recording_of_a_person_begins_with_their_lengths(tmp_path):
+    uv = pixels(body(90), 2.0)[None]
+    first = tracker(bone_lengths={"upper_arm": 0.31})(uv)
+    first.save(tmp_path / "anna.npz")
+    for person in (first, tmp_path / "anna.npz"):
+        again = tracker(person=person)(uv)
+        torch.testing.assert_close(again.bone_lengths[:, 0], first.bone_lengths[:, -1])
+        torch.testing.assert_close(
+            again.bone_covariance[:, 0].diagonal(dim1=-2, dim2=-1),
+            first.bone_covariance[:, -1].diagonal(dim1=-2, dim2=-1),
+        )
+
+
+def test_forearms_to_the_wrist_are_not_taken_for_forearms_to_the_hand():
+    uv = pixels(body(30), 2.0)[None]
+    wrists = tracker(bone_lengths={"upper_arm": 0.24, "forearm": 0.10})
+    person = wrists(uv, names=[name.replace("hand", "wrist") for name in UPPER_BODY])
+    assert person.bone_names[1] == "forearm"
+    lengths = tracker(person=person)(uv).bone_lengths[0, 0]
+    assert float(lengths[0]) == pytest.approx(0.24) and float(lengths[1]) > 0.2
+
+
+def test_poses_without_lengths_are_nobody():
+    uv = pixels(body(5))[None]
+    windows = UpperBodyTracker(PRIOR, CAMERA, "mkf-fixed")(uv)
+    assert bool(windows.bone_lengths.isnan().all())
+    with pytest.raises(InputError, match="which method 'articulated' gives, got 'mkf-fixed'"):
+        tracker(person=windows)
+    with pytest.raises(InputError, match="one sequence, got 2"):
+        tracker(person=tracker()(uv.expand(2, -1, -1, -1)))
+    with pytest.raises(InputError, match="a PoseTrack or the path"):
+        tracker(person=3)
+
+
+def test_a_known_height_scales_the_body_and_its_distance():
+    uv = pixels(body(30), 2.0)[None]
+    small, usual = tracker(height=1.36)(uv), tracker(height=1.70)(uv)
+    torch.testing.assert_close(small.bone_lengths[0, 0], 0.8 * usual.bone_lengths[0, 0])
+    depth = [float(track.joints3d[0, -1, ROW["neck"], 2]) for track in (small, usual)]
+    assert depth[0] / depth[1] == pytest.approx(0.8, abs=0.04)
+    spread = small.bone_covariance[0, 0].diagonal().sqrt() / small.bone_lengths[0, 0]
+    assert bool((spread <= shipped_arm_prior().spread.max()).all())
+    for height in (17.0, 0.0):
+        with pytest.raises(InputError, match="height must lie between"):
+            tracker(height=height)
+
+
+def test_smoothing_sums_over_all_later_paths():
+    model = TrackerModel(tracker(), PRIOR, tracker().measurement_cov, 30.0)
+    chain = ArticulatedFilter(model).chain
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.randn(4, 1, 2, 3, 2, 3, generator=generator, dtype=torch.float64)
+    directions = torch.nn.functional.normalize(directions, dim=-1).flatten(-2)
+    said = torch.rand(4, 1, 2, 3, generator=generator, dtype=torch.float64)
+    prior = torch.rand(4, 1, 2, 3, generator=generator, dtype=torch.float64)
+    arms = [Arms(d[:, :, None], w.log()[:, :, None], p.log()[:, :, None])
+            for d, w, p in zip(directions, said, prior, strict=True)]  # fmt: skip
+    states = [chain.start(arms[0])]
+    for arm in arms[1:]:
+        states.append(chain.advance(states[-1], arm))
+
+    def moves(t):
+        return (1 - chain.anew) * chain._walk(
+            directions[t - 1], directions[t]
+        ) + chain.anew * prior[t, :, :, None]
+
+    def brute(first, last):
+        """Return the weights of the hypotheses of frame `first`, given all frames up to `last`."""
+        paths = states[first].weight[..., None]
+        paths = torch.diag_embed(paths[..., 0])
+        for t in range(first + 1, last + 1):
+            paths = (paths @ moves(t)) * said[t, :, :, None]
+        total = paths.sum(-1)
+        return total / total.sum(-1, keepdim=True)
+
+    for lag, lengths in ((None, None), (1, None), (2, None), (None, torch.tensor([3]))):
+        end = 3 if lengths is None else 2
+        found = chain.smoothed(states, lengths, lag)
+        for t in range(end + 1):
+            last = end if lag is None else min(end, t + lag)
+            torch.testing.assert_close(found[t].weight, brute(t, last))
+
+
+def test_smoothing_with_no_later_frame_is_filtering():
+    uv = pixels(body(20), 2.0)[None]
+    torch.testing.assert_close(tracker(smoothing=0)(uv).joints3d, tracker()(uv).joints3d)
+    assert not torch.allclose(tracker(smoothing="full")(uv).joints3d, tracker()(uv).joints3d)
+    lengths = torch.tensor([12, 20])
+    both = uv.expand(2, -1, -1, -1).clone()
+    both[0, 12:] = torch.nan
+    short = tracker(smoothing="full")(both, lengths=lengths).joints3d[0, :12]
+    torch.testing.assert_close(short, tracker(smoothing="full")(uv[:, :12]).joints3d[0])

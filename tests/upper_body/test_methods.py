@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from torchpose import load_prior
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.errors import InputError
 from torchpose.filters import MixtureKalmanFilter
@@ -58,7 +59,8 @@ def test_bones_are_the_default_where_shoulders_and_elbows_are_measured(prior):
     seen = (rays[..., :2] / rays[..., 2:])[None]
     tracker = UpperBodyTracker(prior, demo_camera())
     assert tracker.method == "window-mixture" and tracker(seen).method == "articulated"
-    assert UpperBodyTracker(prior, demo_camera(), smoothing=1)(seen).method != "articulated"
+    for options in ({"smoothing": 1}, {"height": 1.7}, {"bone_lengths": {"forearm": 0.3}}):
+        assert UpperBodyTracker(prior, demo_camera(), **options)(seen).method == "articulated"
     assert UpperBodyTracker(prior, demo_camera(), steady=False)(seen).method == "window-mixture"
     assert (
         UpperBodyTracker(prior, demo_camera(), likelihood_power=0.5)(seen).method != "articulated"
@@ -114,7 +116,7 @@ VALUES = {
     "initial_cov": 1e3 * torch.ones(21), "transition": "stationary", "gamma": 0.5, "burn_in": 20,
     "resample_threshold": 1.0, "burn_in_scale": 7.0, "likelihood_power": 0.01, "weighting": "frame",
     "reset_below": 1e6, "dtype": torch.float32, "n_particles": 30, "resampling": "multinomial",
-    "start": "prior", "bone_lengths": {"upper_arm": 0.32},
+    "start": "prior", "bone_lengths": {"upper_arm": 0.32}, "height": 1.9,
 }  # fmt: skip
 BESIDE = {
     "subspace": {"transition": "ou", "gamma": 0.5},
@@ -128,9 +130,12 @@ WALKS = ("pf-walk", "pf-walk-unscaled")
 @pytest.fixture(scope="module")
 def values(tmp_path_factory):
     """Return a value of each option that is not its default."""
+    seen = performer(8, seed=0).joints @ demo_camera().matrix.mT
+    tall = UpperBodyTracker(load_prior("kinect-upper-body-small"), demo_camera(), height=2.0)
+    person = tall((seen[..., :2] / seen[..., 2:])[None])
     shipped, file = shipped_arm_prior(), tmp_path_factory.mktemp("arms") / "long.safetensors"
     ArmPrior(shipped.directions, 1.2 * shipped.lengths, shipped.spread).save(file)
-    return VALUES | {"arms": str(file)}
+    return VALUES | {"arms": str(file), "person": person}
 
 
 @pytest.mark.parametrize("method", METHODS)

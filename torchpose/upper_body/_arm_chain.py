@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -19,10 +20,11 @@ __all__ = ["ArmChain", "ArmInput", "ArmState", "Arms", "DirectionDensity"]
 _SLACK = 0.018  # metres: joints of recordings are not the ends of stiff bones
 _ANGLES = 17  # of a bone whose end is measured
 _AROUND = 68  # directions of one whose end is not
-_STEP = math.radians(7.0)  # of a direction from frame to frame at 30 frames a second
-_ANEW = 0.3  # share of an arm's belief that starts anew in a frame at 30 frames a second
+_STEP = math.radians(10.0)  # of a direction from frame to frame at 30 frames a second
+_ANEW = 0.2  # share of an arm's belief that starts anew in a frame at 30 frames a second
 _RATE = 30.0
 _NOTHING = -60.0
+_LEAST = 1e-30  # density
 _ROWS = 2048  # directions at a time, so that what is worked out stays in the cache
 
 
@@ -76,11 +78,15 @@ class ArmState(NamedTuple):
     Attributes:
         directions: of the hypotheses, upright axes, [B, 2, N, 6]. weight: normalised, [B, 2, N].
         log_evidence: of the frame, [B, 2].
+        prior, predicted: density at each hypothesis, of the prior and as the frames before have it,
+            [B, 2, N].
     """
 
     directions: Tensor
     weight: Tensor
     log_evidence: Tensor
+    prior: Tensor
+    predicted: Tensor
 
 
 class DirectionDensity:
@@ -204,17 +210,60 @@ class ArmChain:
 
     def start(self, arms: Arms) -> ArmState:
         """Return the belief after the first frame, of arms with one hypothesis of the root each."""
-        return _belief(arms, arms.log_prior[:, :, 0].exp())
+        prior = arms.log_prior[:, :, 0].exp()
+        return _belief(arms, prior, prior)
 
     def advance(self, state: ArmState, arms: Arms) -> ArmState:
         """Return the belief after one more frame."""
-        directions, prior = arms.directions[:, :, 0], arms.log_prior[:, :, 0].exp()
-        scale = self.step**2
-        alike = state.directions @ directions.mT  # of two pairs of unit vectors: 2 where they agree
-        near = 1 / (1 + (2 - alike).clamp_min(0.0) / (2 * scale))
-        walk = 6 / (16 * math.pi**2 * scale**2) * near.square().square()
+        prior = arms.log_prior[:, :, 0].exp()
+        walk = self._walk(state.directions, arms.directions[:, :, 0])
         moved = (state.weight[..., None, :] @ walk)[..., 0, :]
-        return _belief(arms, (1 - self.anew) * moved + self.anew * prior)
+        return _belief(arms, prior, (1 - self.anew) * moved + self.anew * prior)
+
+    def smoothed(
+        self, states: Sequence[ArmState], lengths: Tensor | None, lag: int | None
+    ) -> list[ArmState]:
+        """Return the beliefs after the later frames were seen too (forward-backward algorithm).
+
+        Args:
+            states: of all frames. lengths: frames of each sequence, None for all.
+            lag: number of later frames that an estimate may use, None for all.
+        """
+        n_frames = len(states)
+        said = [torch.ones_like(state.weight) for state in states]
+        for _ in range(1 if lag is None else lag):
+            before = list(said)
+            source = said if lag is None else before
+            for t in range(n_frames - 2, -1, -1):
+                said[t] = self._said_later(states[t], states[t + 1], source[t + 1])
+                if lengths is not None:
+                    ended = (lengths.to(said[t].device) <= t + 1)[:, None, None]
+                    said[t] = torch.where(ended, 1.0, said[t])
+        weights = (state.weight * after for state, after in zip(states, said, strict=True))
+        weights = (w / w.sum(-1, keepdim=True) for w in weights)
+        return [state._replace(weight=w) for state, w in zip(states, weights, strict=True)]
+
+    def _said_later(
+        self, state: ArmState, later: ArmState, after: Tensor
+    ) -> Float[Tensor, "B 2 N"]:
+        """Return what the next frame says about the hypotheses of this one, up to a factor.
+
+        Args:
+            state: of this frame. later: of the next one. after: what the frames after that say of it.
+        """
+        ratio = later.weight / later.predicted.clamp_min(_LEAST) * after
+        walk = self._walk(state.directions, later.directions)
+        moved = (walk @ ratio[..., None])[..., 0]
+        anew = (later.prior * ratio).sum(-1, keepdim=True)
+        said = (1 - self.anew) * moved + self.anew * anew
+        return said / said.amax(-1, keepdim=True).clamp_min(_LEAST)
+
+    def _walk(self, before: Tensor, after: Tensor) -> Float[Tensor, "B 2 N M"]:
+        """Return the density t_4(x'; x, s^2) of all pairs of directions of two frames."""
+        scale = self.step**2
+        alike = before @ after.mT  # of two pairs of unit vectors: 2 where they agree
+        near = 1 / (1 + (2 - alike).clamp_min(0.0) / (2 * scale))
+        return 6 / (16 * math.pi**2 * scale**2) * near.square().square()
 
     @staticmethod
     def mean_directions(state: ArmState) -> Float[Tensor, "B 2 2 3"]:
@@ -223,11 +272,11 @@ class ArmChain:
         return normalize(mean.unflatten(-1, (2, 3)), dim=-1)
 
 
-def _belief(arms: Arms, predicted: Float[Tensor, "B 2 N"]) -> ArmState:
-    log_weight = arms.log_weight[:, :, 0] + predicted.clamp_min(1e-30).log()
+def _belief(arms: Arms, prior: Tensor, predicted: Float[Tensor, "B 2 N"]) -> ArmState:
+    log_weight = arms.log_weight[:, :, 0] + predicted.clamp_min(_LEAST).log()
     evidence = torch.logsumexp(log_weight, -1)
     weight = (log_weight - evidence[..., None]).exp()
-    return ArmState(arms.directions[:, :, 0], weight, evidence)
+    return ArmState(arms.directions[:, :, 0], weight, evidence, prior, predicted)
 
 
 def _where(here: Bool[Tensor, "B 2 1"], new: Arms, old: Arms) -> Arms:

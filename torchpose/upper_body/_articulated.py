@@ -32,12 +32,13 @@ from torchpose.upper_body._arm_chain import (
     ArmState,
     DirectionDensity,
 )
-from torchpose.upper_body._articulated_poses import FramePose, estimates_of
-from torchpose.upper_body._body_lengths import BodyLengths, Lengths
+from torchpose.upper_body._articulated_poses import SeenBody, bones_of, estimates_of, pose_of
+from torchpose.upper_body._body_lengths import BodyLengths, KnownBody, Lengths
 from torchpose.upper_body._estimator import ArmJoints, Estimates, Estimator, TrackerModel
 from torchpose.upper_body._face import FacePoints, face_evidence
 from torchpose.upper_body._lean import lean_angle, rolled, seen_lean
 from torchpose.upper_body._measurements import MeasuredJoints
+from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._root_grid import (
     Root,
     RootGrid,
@@ -57,12 +58,12 @@ _SHOULDERS, _ELBOWS, _HANDS = (
     [_JOINT[f"{joint}_{side}"] for side in ("left", "right")]
     for joint in ("shoulder", "elbow", "hand")
 )
+_SPINE = (_JOINT["neck"], _JOINT["head"])
 _ROOTS = 10  # hypotheses of the root that arms are weighed for
 _COARSE_ANGLES, _COARSE_AROUND = 11, 24  # of limbs, while roots are weighed
 _SHARE = 0.2  # seconds over which frames say the same about the torso and about lengths
 _MODE = math.radians(45.0)  # turns farther than that from the likeliest are another mode
 _SIDES = ((1.0, 1.0, 1.0), (-1.0, 1.0, 1.0))  # right arms are mirrored
-_TORSO_STD = 0.03  # metres: of torso joints in space
 
 
 class ArticulatedState(NamedTuple):
@@ -132,20 +133,24 @@ class ArticulatedFilter(Estimator):
         model: of the tracker. arms: prior over arms, or its file; by default the one that comes with
             the package. bone_lengths: of the person, metres, where they were measured: any of
             upper_arm, forearm (to the measured hand or wrist), shoulder_width and head_height (above the
-            neck). The others are expected in proportion.
+            neck). height: of the person, metres. person: poses of the same person, or the file that
+            `PoseTrack.save` wrote: their last lengths. Lengths that are not known are expected in proportion.
 
     Raises:
-        InputError: arms of another kind, no such file, or a length that nobody has. FileFormatError: a
-            file of another kind.
+        InputError: arms of another kind, no such file, a length or height that nobody has, or poses
+            without lengths. FileFormatError: a file of another kind.
     """
 
     calibration = "articulated"
+    smooths = True
 
     def __init__(
         self,
         model: TrackerModel,
         arms: ArmPrior | str | Path | None = None,
         bone_lengths: Mapping[str, float] | None = None,
+        height: float | None = None,
+        person: PoseTrack | str | Path | None = None,
     ) -> None:
         if not isinstance(arms, ArmPrior | str | Path | None):
             raise InputError(
@@ -168,7 +173,13 @@ class ArticulatedFilter(Estimator):
             owner, ("root grid", model.rate), (like,), lambda: RootGrid(model.rate, like)
         )
         info, hand = model.prior.info, model.hand or model.prior.info.hand
-        self.lengths = BodyLengths(self.prior, hand, info.neck, bone_lengths, like)
+        known = KnownBody(bone_lengths, height, person)
+        self.lengths = derived(
+            owner,
+            ("body lengths", hand, info.neck, known.key),
+            (like, self.prior.lengths, self.prior.spread),
+            lambda: BodyLengths(self.prior, hand, info.neck, known, like),
+        )
         self.matrix = info.matrix.to(like)
 
     def init(
@@ -184,8 +195,8 @@ class ArticulatedFilter(Estimator):
         self, state: ArticulatedState, measured: MeasuredJoints
     ) -> tuple[ArticulatedState, Estimates]:
         """Return the next state and the estimates of T more frames; see `Estimator`."""
-        state, poses = self._run(state, measured)
-        return state, estimates_of(poses, self.matrix)
+        state, bodies, beliefs = self._run(state, measured)
+        return state, self._estimates(bodies, beliefs)
 
     def forward(
         self,
@@ -197,18 +208,32 @@ class ArticulatedFilter(Estimator):
     ) -> Estimates:
         """Return the estimates of whole sequences; see `Estimator`."""
         state = self.init(len(measured.uv), joints, generators)
-        _, poses = self._run(state, measured, progress)
-        return estimates_of(poses, self.matrix, lengths)
+        _, bodies, beliefs = self._run(state, measured, progress)
+        smoothing = self.model.smoothing
+        if smoothing is not None:
+            lag = None if smoothing == "full" else int(smoothing)
+            beliefs = self.chain.smoothed(beliefs, lengths, lag)
+        return self._estimates(bodies, beliefs, lengths)
 
     def _run(
         self, state: ArticulatedState, measured: MeasuredJoints, progress: bool = False
-    ) -> tuple[ArticulatedState, list[FramePose]]:
-        """Return the next state, and the estimate of each frame."""
-        poses = []
+    ) -> tuple[ArticulatedState, list[SeenBody], list[ArmState]]:
+        """Return the next state, and body and belief about its arms in each frame."""
+        bodies, beliefs = [], []
         for frame in tqdm(self._frames(measured), disable=not progress, desc="frames"):
-            state, pose = self._step(state, frame)
-            poses.append(pose)
-        return state, poses
+            state, body, belief = self._step(state, frame)
+            bodies.append(body)
+            beliefs.append(belief)
+        return state, bodies, beliefs
+
+    def _estimates(
+        self, bodies: list[SeenBody], beliefs: list[ArmState], lengths: Tensor | None = None
+    ) -> Estimates:
+        """Return the estimates of bodies with such arms."""
+        poses = [
+            pose_of(body, belief, self.matrix) for body, belief in zip(bodies, beliefs, strict=True)
+        ]
+        return estimates_of(poses, self.matrix, self.lengths.names, lengths)
 
     def _frames(self, measured: MeasuredJoints) -> list[_Frame]:
         """Return the frames one by one, as rays."""
@@ -232,21 +257,21 @@ class ArticulatedFilter(Estimator):
         parts = zip(places.unbind(1), face.confidence.unbind(1), strict=True)
         return [FacePoints(*part, face.expected) for part in parts]
 
-    def _step(self, state: ArticulatedState, frame: _Frame) -> tuple[ArticulatedState, FramePose]:
-        """Return the next state and the estimate of one frame, in a camera that leans as the torso does."""
+    def _step(
+        self, state: ArticulatedState, frame: _Frame
+    ) -> tuple[ArticulatedState, SeenBody, ArmState]:
+        """Return the next state, body and arms in one frame, in a camera that leans as the torso does."""
         depth = (state.root.sum(2) @ self.grid.depth.log()).exp()
         lean = seen_lean(state.lean, frame.rays, frame.known, depth, self.model.rate)
         angle = lean_angle(lean)
         level = state._replace(middle=rolled(state.middle, -angle), lean=lean)
-        new, pose = self._level_step(level, frame.level(angle))
-        covs = rolled(rolled(pose.covs, angle).mT, angle)
-        pose = pose._replace(joints=rolled(pose.joints, angle), covs=covs, lean=angle)
-        return new._replace(middle=rolled(new.middle, angle)), pose
+        new, body, belief = self._level_step(level, frame.level(angle))
+        return new._replace(middle=rolled(new.middle, angle)), body._replace(lean=angle), belief
 
     def _level_step(
         self, state: ArticulatedState, frame: _LevelFrame
-    ) -> tuple[ArticulatedState, FramePose]:
-        """Return the next state and the estimate of one frame in which torsos are upright."""
+    ) -> tuple[ArticulatedState, SeenBody, ArmState]:
+        """Return the next state, body and arms in one frame in which torsos are upright."""
         torso = frame.torso
         lengths, slack = self.lengths.metres(state.lengths), self.lengths.slack(state.lengths)
         size = self.lengths.torso(state.lengths)
@@ -276,9 +301,9 @@ class ArticulatedFilter(Estimator):
             learnt = self.lengths.learn(learnt, torso, likely, of_lengths)
         shoulder = self._shoulders(frame, root, middle, lengths[:, 2]) - middle[:, None]
         others = self._covs_of_root(weighed, root, near, shoulder, lengths)
-        pose = self._pose(belief, frame, likely, centre, lengths, size, others)
+        body = self._body(frame, likely, centre, state.lengths)._replace(others=others)
         new = ArticulatedState(after, learnt, belief, centre[:, 0], state.lean, state.frame + 1)
-        return new, pose
+        return new, body, belief
 
     def _middle(
         self, state: ArticulatedState, torso: Torso, root: Root, size: TorsoLengths
@@ -351,24 +376,12 @@ class ArticulatedFilter(Estimator):
             arms: of each hypothesis. root: the hypotheses. near: share of each in the estimate, [B, M].
             shoulder: relative to the middle of both, [B, 2, M, 3]. lengths: of the bones.
         """
-        bones = self._bones(arms.mean_directions, upright_axes(root.turn)[:, None], lengths)
+        bones = bones_of(arms.mean_directions, upright_axes(root.turn)[:, None], lengths)
         ends = shoulder[..., None, :] + bones.cumsum(-2)
         used = (near[:, None, :, None, None] * ends).sum(2, keepdim=True)
         off = (ends - used).permute(0, 3, 1, 2, 4).flatten(1, 2)
         weight = torch.softmax(root.log_weight, 1)[:, None, :, None]
         return (weight * off).mT @ off
-
-    @staticmethod
-    def _bones(directions: Tensor, axes: Tensor, lengths: Tensor) -> Float[Tensor, "B 2 N 2 3"]:
-        """Return upper arms and forearms, camera axes, of N pairs of directions in upright axes.
-
-        Args:
-            directions: of left and mirrored right arms, [B, 2, N, 6]. axes: from camera to upright axes,
-                [B, 1, N or 1, 3, 3]. lengths: of the bones, [B, 4].
-        """
-        flip = directions.new_tensor(_SIDES)[:, None, None]
-        bones = directions.unflatten(-1, (2, 3)) * flip
-        return bones @ axes * lengths[:, None, None, :2, None]
 
     def _evidence_of(
         self, frame: _LevelFrame, root: Root, middle: Tensor, lengths: Float[Tensor, "B 4"]
@@ -378,53 +391,20 @@ class ArticulatedFilter(Estimator):
         arms = self._arms(frame, root, middle, lengths, stiff, _COARSE_ANGLES, _COARSE_AROUND)
         return arms.log_evidence.sum((1, 2))
 
-    def _pose(
-        self,
-        belief: ArmState,
-        frame: _LevelFrame,
-        root: Root,
-        middle: Tensor,
-        lengths: Tensor,
-        size: TorsoLengths,
-        others: Tensor,
-    ) -> FramePose:
-        """Return joints and covariances in camera axes; `others` are those of `_covs_of_root`."""
-        axes = upright_axes(root.turn[:, 0])
-        shoulder = self._shoulders(frame, root, middle, lengths[:, 2])[:, :, 0]
-        mean = self.chain.mean_directions(belief).flatten(2)[:, :, None]
-        bones = self._bones(mean, axes[:, None, None], lengths)[:, :, 0]
-        elbow = shoulder + bones[:, :, 0]
-        hand = elbow + bones[:, :, 1]
-        torso = middle + spine_places(size)
+    def _body(self, frame: _LevelFrame, root: Root, middle: Tensor, lengths: Lengths) -> SeenBody:
+        """Return the body but for the arms, of one hypothesis of the root."""
+        metres, bones = self.lengths.metres(lengths), self.lengths.shown(lengths)
         joints = middle.new_zeros(len(middle), 8, 3)
-        for rows, value in ((_SHOULDERS, shoulder), (_ELBOWS, elbow), (_HANDS, hand)):
-            joints[:, rows] = value
-        for i, name in enumerate(("neck", "head")):
-            row = _JOINT[name]
+        joints[:, _SHOULDERS] = self._shoulders(frame, root, middle, metres[:, 2])[:, :, 0]
+        torso = middle + spine_places(self.lengths.torso(lengths))
+        for i, row in enumerate(_SPINE):
             ray = frame.rays[:, row] / frame.rays[:, row, 2:] * torso[:, i, 2:]
             joints[:, row] = torch.where(frame.known[:, row, None], ray, torso[:, i])
-        covs = self._covs(belief, joints, axes, lengths)
-        covs[:, [*_ELBOWS, *_HANDS]] += others
-        weight = belief.weight.clamp_min(1e-30).log()
-        seen = frame.known[:, [_ELBOWS, _HANDS]].any(1)
-        count = frame.known[:, [_ELBOWS, _HANDS]].sum(1).to(root.depth)
-        area = 2 * root.depth.log() - (self.matrix[0, 0] * self.matrix[1, 1]).log()
-        evidence = torch.where(seen, belief.log_evidence + count * area, 0.0)
+        scale = self.lengths.scale.expand(len(middle))
         turn = root.turn[:, 0]
-        return FramePose(joints, covs, turn, torch.zeros_like(turn), evidence, weight)
-
-    def _covs(
-        self, belief: ArmState, joints: Tensor, axes: Tensor, lengths: Tensor
-    ) -> Float[Tensor, "B 8 3 3"]:
-        """Return covariances: of the hypotheses about the estimate, of stiff torsos, and of the scale."""
-        covs = torch.eye(3).to(joints).mul(_TORSO_STD**2).expand(*joints.shape, 3).clone()
-        ends = self._bones(belief.directions, axes[:, None, None], lengths).cumsum(-2)
-        for limb, rows in ((0, _ELBOWS), (1, _HANDS)):
-            off = ends[..., limb, :] - (joints[:, rows] - joints[:, _SHOULDERS])[:, :, None]
-            covs[:, rows] += (belief.weight[..., None] * off).mT @ off
-        apart = joints - joints[:, _JOINT["neck"], None]
-        scale = self.lengths.spread.amin().square()
-        return covs + scale * apart[..., :, None] * apart[..., None, :]
+        others = joints.new_zeros(len(middle), 4, 3, 3)
+        level = torch.zeros_like(turn)
+        return SeenBody(joints, frame.known, metres, bones, scale, others, turn, level)
 
 
 def _kept(owner: nn.Module, path: str | Path | None, like: Tensor) -> ArmPrior:

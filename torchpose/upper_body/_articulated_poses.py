@@ -13,11 +13,41 @@ from torchpose.camera._projection import project
 from torchpose.filters._outputs import FilterOutput
 from torchpose.math._rotations import euler_to_matrix
 from torchpose.skeleton._joint_sets import UPPER_BODY
-from torchpose.upper_body._estimator import Estimates, ReadOut
+from torchpose.skeleton._torso import upright_axes
+from torchpose.upper_body._arm_chain import ArmChain, ArmState
+from torchpose.upper_body._estimator import Bones, Estimates, ReadOut
+from torchpose.upper_body._lean import rolled
 
-__all__ = ["FramePose", "estimates_of"]
+__all__ = ["FramePose", "SeenBody", "bones_of", "estimates_of", "pose_of"]
 
 _NECK = UPPER_BODY.index("neck")
+_SHOULDERS, _ELBOWS, _HANDS = (
+    [UPPER_BODY.index(f"{joint}_{side}") for side in ("left", "right")]
+    for joint in ("shoulder", "elbow", "hand")
+)
+_SIDES = ((1.0, 1.0, 1.0), (-1.0, 1.0, 1.0))  # right arms are mirrored
+_STD = 0.03  # metres: of every joint in space
+
+
+class SeenBody(NamedTuple):
+    """A body in one frame but for its arms, in the axes of a camera that leans as it does.
+
+    Attributes:
+        joints: [B, 8, 3], of shoulders, neck and head. known: which of the eight are measured, [B, 8].
+        lengths: of the bones, [B, 4]. bones: the same as they are shown, with their covariances.
+        scale: deviation of the log of their common scale, [B].
+        others: covariances of both elbows, then both hands, for turns that were not chosen, [B, 4, 3, 3].
+        turn, lean: [B].
+    """
+
+    joints: Tensor
+    known: Tensor
+    lengths: Tensor
+    bones: Bones
+    scale: Tensor
+    others: Tensor
+    turn: Tensor
+    lean: Tensor
 
 
 class FramePose(NamedTuple):
@@ -26,6 +56,7 @@ class FramePose(NamedTuple):
     Attributes:
         joints: camera axes, [B, 8, 3]. covs: [B, 8, 3, 3]. turn, lean: of the shoulders, [B].
         log_evidence: of both arms, [B, 2]. log_weights: of their hypotheses, [B, 2, N].
+        bones, bone_covs: lengths of bones, [B, 4], and their covariances, [B, 4, 4].
     """
 
     joints: Tensor
@@ -34,17 +65,73 @@ class FramePose(NamedTuple):
     lean: Tensor
     log_evidence: Tensor
     log_weights: Tensor
+    bones: Tensor
+    bone_covs: Tensor
+
+
+def bones_of(
+    directions: Float[Tensor, "B 2 N 6"],
+    axes: Float[Tensor, "B 1 M 3 3"],
+    lengths: Float[Tensor, "B 4"],
+) -> Float[Tensor, "B 2 N 2 3"]:
+    """Return upper arms and forearms in camera axes, metres.
+
+    Args:
+        directions: of left and mirrored right arms, upright axes. axes: from camera to upright axes.
+        lengths: of the bones.
+    """
+    flip = directions.new_tensor(_SIDES)[:, None, None]
+    return directions.unflatten(-1, (2, 3)) * flip @ axes * lengths[:, None, None, :2, None]
+
+
+def pose_of(body: SeenBody, belief: ArmState, matrix: Float[Tensor, "3 3"]) -> FramePose:
+    """Return the estimate of a frame, in camera axes: bones point to the mean of what is believed.
+
+    Args:
+        body: but for its arms. belief: about these. matrix: K of their pixels.
+    """
+    axes = upright_axes(body.turn)[:, None, None]
+    mean = ArmChain.mean_directions(belief).flatten(2)[:, :, None]
+    joints = body.joints.clone()
+    arms = joints[:, _SHOULDERS, None] + bones_of(mean, axes, body.lengths)[:, :, 0].cumsum(-2)
+    joints[:, _ELBOWS], joints[:, _HANDS] = arms.unbind(2)
+    covs = _covs(body, belief, joints)
+    seen = body.known[:, [_ELBOWS, _HANDS]]
+    area = 2 * body.joints[:, _SHOULDERS, 2].mean(1).log() - matrix.diagonal()[:2].log().sum()
+    evidence = belief.log_evidence + seen.sum(1).to(area) * area[:, None]
+    evidence = torch.where(seen.any(1), evidence, 0.0)
+    covs = rolled(rolled(covs, body.lean).mT, body.lean)
+    weight = belief.weight.clamp_min(1e-30).log()
+    return FramePose(
+        rolled(joints, body.lean), covs, body.turn, body.lean, evidence, weight,
+        body.bones.metres, body.bones.covs,
+    )  # fmt: skip
+
+
+def _covs(body: SeenBody, belief: ArmState, joints: Tensor) -> Float[Tensor, "B 8 3 3"]:
+    """Return covariances: of the hypotheses about the estimate, of stiff torsos, and of the scale."""
+    covs = torch.eye(3).to(joints).mul(_STD**2).expand(*joints.shape, 3).clone()
+    axes = upright_axes(body.turn)[:, None, None]
+    ends = bones_of(belief.directions, axes, body.lengths).cumsum(-2)
+    for limb, rows in enumerate((_ELBOWS, _HANDS)):
+        off = ends[..., limb, :] - (joints[:, rows] - joints[:, _SHOULDERS])[:, :, None]
+        covs[:, rows] += (belief.weight[..., None] * off).mT @ off
+        covs[:, rows] += body.others[:, 2 * limb : 2 * limb + 2]
+    apart = joints - joints[:, _NECK, None]
+    scale = body.scale.square()[:, None, None, None]
+    return covs + scale * apart[..., :, None] * apart[..., None, :]
 
 
 def estimates_of(
     poses: Sequence[FramePose],
     matrix: Float[Tensor, "3 3"],
+    names: tuple[str, ...],
     lengths: Int[Tensor, " B"] | None = None,
 ) -> Estimates:
     """Return the estimates of both arms and the poses; past the lengths the last ones again.
 
     Args:
-        poses: of each frame. matrix: K of their pixels.
+        poses: of each frame. matrix: K of their pixels. names: of the bones' lengths.
         lengths: frames of each sequence, None for all.
     """
     stacked = FramePose(*(torch.stack(values, 1) for values in zip(*poses, strict=True)))
@@ -66,7 +153,9 @@ def estimates_of(
         )
         for arm in (0, 1)
     )  # fmt: skip
-    return Estimates(left, right, None, ReadOut(joints, covs, angles, neck, uv, uv_covs))
+    reading = ReadOut(joints, covs, angles, neck, uv, uv_covs)
+    bones = Bones(names, stacked.bones, stacked.bone_covs)
+    return Estimates(left, right, None, reading, bones)
 
 
 def _repeated(poses: FramePose, lengths: Int[Tensor, " B"]) -> FramePose:

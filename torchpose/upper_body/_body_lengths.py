@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -12,9 +13,11 @@ from torch import Tensor
 from torchpose._core.checks import check_choice
 from torchpose.errors import InputError
 from torchpose.priors._arms import LENGTHS, ArmPrior
+from torchpose.upper_body._estimator import Bones
+from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._root_grid import NECK_HEIGHT, Root, Torso, TorsoLengths, inward_shares
 
-__all__ = ["BODY_LENGTHS", "BodyLengths", "Lengths"]
+__all__ = ["BODY_LENGTHS", "BodyLengths", "KnownBody", "Lengths"]
 
 BODY_LENGTHS = ("upper_arm", "forearm", "shoulder_width", "head_height")
 """Lengths that may be given: shoulder to elbow, elbow to the measured hand or wrist, between the
@@ -22,17 +25,43 @@ shoulders, and from the neck up to the head."""
 
 _NUDGE = 0.03  # of a log-length, to see what a frame says about it
 _MOST = 0.1  # of a log-length that one frame may change it by
-_POWER = 0.1  # of what arms say about their lengths: frames of one pose are alike
+_POWER = 0.1  # of what a frame says about lengths: frames of one pose are alike
 _WIDTH_STD, _HEIGHT_STD = 0.05, 0.05  # metres: shoulders and heads move in their torsos
 _GIVEN = 0.02  # of the log of a length that was measured on the person
 _SHORTEST, _LONGEST = 0.05, 1.0  # metres
+_SMALLEST, _TALLEST = 0.5, 2.6  # metres
+_HEIGHT, _OF_HEIGHT = (
+    1.70,
+    0.055,
+)  # metres of grown-ups, and what it explains of the log of a length
+_SUREST = 0.01  # of the log of a length relative to others
+_LEAST = 0.04  # of the log of a length that is only known in proportion
+
+
+class KnownBody(NamedTuple):
+    """What is known of a person beforehand, all of it optional.
+
+    Attributes:
+        lengths: metres by name of `BODY_LENGTHS`, as measured on the person. height: of the person,
+            metres. person: poses of the same person, or their file.
+    """
+
+    lengths: Mapping[str, float] | None = None
+    height: float | None = None
+    person: PoseTrack | str | Path | None = None
+
+    @property
+    def key(self) -> str:
+        """Return what tells it from others, as long as the poses exist."""
+        person = id(self.person) if isinstance(self.person, PoseTrack) else self.person
+        return str((self.lengths, self.height, person))
 
 
 class Lengths(NamedTuple):
     """Gaussian over the logs of `BODY_LENGTHS` of a person, relative to what is usual.
 
     Attributes:
-        mean: [B, 4]. precision: [B, 4].
+        mean: [B, 4]. precision: [B, 4]; of the common scale for the surest of them.
     """
 
     mean: Tensor
@@ -47,33 +76,68 @@ class BodyLengths:
 
     Args:
         prior: over persons. hand: kind of the measured hands, "hand" or "wrist".
-        neck: kind of the neck. given: metres by name of `BODY_LENGTHS`, as measured on the person; the
-            others are then expected in the same proportion. like: tells dtype and device.
+        neck: kind of the neck. known: of the person. What nobody knows is expected in proportion.
+        like: tells dtype and device.
+
+    Attributes:
+        names: of the lengths, as `LENGTHS` has them.
 
     Raises:
-        InputError: an unknown name, or a length that nobody has.
+        InputError: an unknown name, a length or a height that nobody has, or poses without lengths.
     """
 
     def __init__(
-        self,
-        prior: ArmPrior,
-        hand: str | None,
-        neck: str | None,
-        given: Mapping[str, float] | None,
-        like: Tensor,
+        self, prior: ArmPrior, hand: str | None, neck: str | None, known: KnownBody, like: Tensor
     ) -> None:
         forearm = "forearm" if hand == "wrist" else "forearm_to_hand"
-        rows = [LENGTHS.index(n) for n in ("upper_arm", forearm, *BODY_LENGTHS[2:])]
+        self.names = ("upper_arm", forearm, *BODY_LENGTHS[2:])
+        rows = [LENGTHS.index(name) for name in self.names]
         self.neck = 0.0 if neck == "mid-shoulder" else NECK_HEIGHT
-        lower = like.new_tensor([0.0, 0.0, 0.0, NECK_HEIGHT - self.neck])
-        self.usual = prior.lengths[rows].to(like) + lower
+        self.lower = like.new_tensor([0.0, 0.0, 0.0, NECK_HEIGHT - self.neck])
+        self.usual = prior.lengths[rows].to(like) + self.lower
         self.spread = prior.spread[rows].to(like)
-        if given is not None:
-            self._measure(given)
+        if known.height is not None:
+            self._grow(known.height)
+        if known.person is not None:
+            self._recognise(known.person)
+        if known.lengths is not None:
+            self._measure(known.lengths)
         self.surest = int(self.spread.argmin())
 
+    def _grow(self, height: float) -> None:
+        """Expect the lengths of a person of this height."""
+        if not _SMALLEST <= height <= _TALLEST:
+            raise InputError(
+                f"height must lie between {_SMALLEST} and {_TALLEST} m, got {height!r}; it is in metres"
+            )
+        self.usual = self.usual * (height / _HEIGHT)
+        left = (self.spread.square() - _OF_HEIGHT**2).clamp_min(_LEAST**2)
+        self.spread = left.sqrt().minimum(self.spread)
+
+    def _recognise(self, person: PoseTrack | str | Path) -> None:
+        """Expect the lengths of poses of the same person."""
+        if not isinstance(person, PoseTrack | str | Path):
+            raise InputError(
+                f"person must be a PoseTrack or the path of its file, got {type(person).__name__}"
+            )
+        track = person if isinstance(person, PoseTrack) else PoseTrack.load(person)
+        if len(track) != 1:
+            raise InputError(
+                f"person must be poses of one sequence, got {len(track)}; see PoseTrack.sequence"
+            )
+        found = track.bone_lengths[0, int(track.lengths[0]) - 1].to(self.usual)
+        covs = track.bone_covariance[0, int(track.lengths[0]) - 1].to(self.usual)
+        rows = [i for i, name in enumerate(self.names) if track.bone_names[i] == name]
+        if not bool(found[rows].isfinite().all()):
+            raise InputError(
+                "person must be poses with lengths of bones, which method 'articulated' gives, got "
+                f"{track.method!r}"
+            )
+        metres = found + self.lower
+        self._expect(rows, metres[rows], covs.diagonal()[rows].sqrt() / metres[rows])
+
     def _measure(self, given: Mapping[str, float]) -> None:
-        """Expect these lengths, and the others in proportion."""
+        """Expect lengths that were measured on the person."""
         if not isinstance(given, Mapping):
             raise InputError(
                 f"bone_lengths must be a mapping of {', '.join(BODY_LENGTHS)} to metres, got "
@@ -89,18 +153,41 @@ class BodyLengths:
                 )
         rows = [BODY_LENGTHS.index(name) for name in given]
         values = self.usual.new_tensor(list(given.values()))
-        self.usual = self.usual * (values / self.usual[rows]).log().mean().exp()
-        self.usual[rows] = values
-        self.spread[rows] = self.spread[rows].clamp_max(_GIVEN)
+        self._expect(rows, values, torch.full_like(values, _GIVEN))
+
+    def _expect(self, rows: list[int], metres: Tensor, spread: Tensor) -> None:
+        """Expect these lengths, and the others in proportion."""
+        self.usual = self.usual * (metres / self.usual[rows]).log().mean().exp()
+        self.usual[rows] = metres
+        self.spread = self.spread.clone()
+        self.spread[rows] = self.spread[rows].minimum(spread)
+
+    @property
+    def scale(self) -> Tensor:
+        """Return the standard deviation of the log of the common scale."""
+        return self.spread[self.surest]
 
     def init(self, batch_size: int) -> Lengths:
         """Return what is believed before the first frame."""
-        precision = self.spread.square().reciprocal().expand(batch_size, -1)
+        own = (self.spread.square() - self.scale.square()).clamp_min(_SUREST**2)
+        own[self.surest] = self.scale.square()
+        precision = own.reciprocal().expand(batch_size, -1)
         return Lengths(torch.zeros_like(precision), precision)
 
     def metres(self, lengths: Lengths) -> Float[Tensor, "B 4"]:
         """Return the lengths."""
         return self.usual * lengths.mean.exp()
+
+    def shown(self, lengths: Lengths) -> Bones:
+        """Return the lengths as they are reported, heads above Kinect's neck.
+
+        Their covariances are those of a common scale and of each length by itself.
+        """
+        own = lengths.precision.reciprocal()
+        own[:, self.surest] = 0.0
+        logs = torch.diag_embed(own) + self.scale.square()
+        metres = self.metres(lengths)
+        return Bones(self.names, metres - self.lower, metres[:, :, None] * logs * metres[:, None])
 
     def slack(self, lengths: Lengths) -> Float[Tensor, "B 2"]:
         """Return the deviations of both bones of an arm, metres; none of the surest: it moves no pixel."""
@@ -130,8 +217,8 @@ class BodyLengths:
         """
         slope, bend = self._slopes_of_arms(lengths, evidence)
         width, height = self._slopes_of_torso(lengths, torso, root)
-        slope = torch.cat([slope, width[0], height[0]], 1)
-        bend = torch.cat([bend, width[1], height[1]], 1).clamp_min(0.0)
+        slope = _POWER * torch.cat([slope, width[0], height[0]], 1)
+        bend = _POWER * torch.cat([bend, width[1], height[1]], 1).clamp_min(0.0)
         precision = lengths.precision + bend
         mean = lengths.mean + (slope / precision).clamp(-_MOST, _MOST)
         mean = mean - mean[:, [self.surest]]
@@ -151,7 +238,7 @@ class BodyLengths:
         )
         slope = [(pairs[i] - pairs[i + 1]) / (2 * _NUDGE) for i in (0, 2)]
         bend = [(2 * at - pairs[i] - pairs[i + 1]) / _NUDGE**2 for i in (0, 2)]
-        return _POWER * torch.stack(slope, 1), _POWER * torch.stack(bend, 1)
+        return torch.stack(slope, 1), torch.stack(bend, 1)
 
     def _slopes_of_torso(
         self, lengths: Lengths, torso: Torso, root: Root

@@ -21,6 +21,7 @@ from torchpose.upper_body._measurements import MeasuredJoints
 __all__ = [
     "ARMS",
     "ArmJoints",
+    "Bones",
     "Estimates",
     "Estimator",
     "MotionRatios",
@@ -105,6 +106,19 @@ class ReadOut(NamedTuple):
     uv_covs: Tensor
 
 
+class Bones(NamedTuple):
+    """Lengths of bones.
+
+    Attributes:
+        names: of K lengths, as `torchpose.priors._arms.LENGTHS` has them.
+        metres: [..., K]. covs: metres squared, [..., K, K].
+    """
+
+    names: tuple[str, ...]
+    metres: Tensor
+    covs: Tensor
+
+
 class Estimates(NamedTuple):
     """The states of both arms in T frames.
 
@@ -113,12 +127,14 @@ class Estimates(NamedTuple):
             `torchpose.priors._arm_state`.
         view: the virtual camera in whose pixels the states are; None is the prior's camera.
         reading: the poses themselves, of estimators that do not estimate states of arms apart.
+        bones: lengths [B, T, K], of estimators that learn them.
     """
 
     left: FilterOutput
     right: FilterOutput
     view: BodyView | None = None
     reading: ReadOut | None = None
+    bones: Bones | None = None
 
 
 class MotionRatios(NamedTuple):

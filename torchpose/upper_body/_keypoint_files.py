@@ -39,12 +39,14 @@ class TrackSettings:
         measurement_std: standard deviation of a keypoint in pixels: one number, or five with commas for
             hand, elbow, shoulder, head, neck; by default what the prior learnt, else 3.
         smoothing: use this many later frames, or all of them ("full"), for each estimate; of
-            window-mixture and mkf-fixed.
+            articulated, window-mixture and mkf-fixed.
         n_particles: particles of the pf methods (default 10000).
         n_tracks: tracks of mkf-sampled and mkf-split.
         arms: file of a prior over arms, of articulated; by default the one that comes with torchpose.
         bone_lengths: of articulated, metres, as measured on the person, with commas: any of upper_arm=,
             forearm= (to the measured hand or wrist), shoulder_width= and head_height= (above the neck).
+        height: of articulated, metres: of the person, if their bones were not measured.
+        person: of articulated: the .npz of a recording of the same person, whose lengths are taken.
         frame: axes of the 3D poses: of the camera (default) or of the body.
         static_camera: let the body turn in front of a camera that stays where it is.
         window: deprecated: false stands for the method mkf-fixed, true for the default.
@@ -69,6 +71,8 @@ class TrackSettings:
     n_tracks: int | None = None
     arms: str | None = None
     bone_lengths: str | None = None
+    height: float | None = None
+    person: str | None = None
     frame: str = "camera"
     static_camera: bool = False
     window: bool | None = None
@@ -104,7 +108,8 @@ class TrackSettings:
                 options[name] = value
         if self.bone_lengths is not None:
             options["bone_lengths"] = _lengths_of(self.bone_lengths)
-        return options if self.arms is None else options | {"arms": self.arms}
+        own = {name: getattr(self, name) for name in ("arms", "height", "person")}
+        return options | {name: value for name, value in own.items() if value is not None}
 
 
 def _lengths_of(text: str) -> dict[str, float]:

@@ -46,6 +46,7 @@ class LivePose(NamedTuple):
         unseen: seconds since any joint was measured, [B]; 0 where one is.
         failed: [B], True where the filter degenerated: poses are NaN until the stream is begun anew.
         inlier_probability: that the keypoint of a joint is no outlier, [B, 8]; see `PoseTrack`.
+        bone_lengths: [B, 4], metres. bone_covariance: [B, 4, 4]; see `PoseTrack`.
     """
 
     joints2d: Tensor
@@ -58,6 +59,8 @@ class LivePose(NamedTuple):
     unseen: Tensor
     failed: Tensor
     inlier_probability: Tensor
+    bone_lengths: Tensor
+    bone_covariance: Tensor
 
 
 def live_pose(track: PoseTrack, unseen: Tensor) -> LivePose:

@@ -76,6 +76,7 @@ METHODS: dict[str, Method] = {
 }
 """Every method by its name: `UpperBodyTracker`, the command line and the benchmarks take them from here."""
 
+_BONE_OPTIONS = {"arms", "bone_lengths", "height", "person"}  # of no other method
 # Without a method these options mean single poses, as they did before windows had a name.
 _POSE_OPTIONS = {"transition", "gamma", "subspace", "initial_cov", "process_cov"}
 
@@ -209,7 +210,7 @@ def choose_method(
             f"{SINGLE_POSES!r}"
         )
     check_options(chosen.method, options)
-    return chosen._replace(free=method is None and smoothing is None and not list(options))
+    return chosen._replace(free=method is None and not list(options))
 
 
 def _find(method: str) -> Method:
@@ -228,6 +229,8 @@ def _default(
     prior: UpperBodyPrior, smoothing: int | str | None, fps: float | None, options: Iterable[str]
 ) -> Chosen:
     """Return the choice where no method was named."""
+    if _BONE_OPTIONS & set(options):
+        return Chosen(BONES, ())
     poses = sorted(_POSE_OPTIONS & set(options))
     if poses:
         warnings.warn(

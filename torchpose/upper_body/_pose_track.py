@@ -15,7 +15,10 @@ from torchpose.camera._projection import check_intrinsics
 from torchpose.errors import CameraError, FileFormatError
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
-__all__ = ["FRAME_FIELDS", "PoseTrack"]
+__all__ = ["BONE_NAMES", "FRAME_FIELDS", "PoseTrack"]
+
+BONE_NAMES = ("upper_arm", "forearm_to_hand", "shoulder_width", "head_height")
+"""Lengths of bones in the order of `PoseTrack.bone_lengths`, unless it has forearms to the wrist."""
 
 FRAME_FIELDS = (
     "joints2d",
@@ -26,10 +29,17 @@ FRAME_FIELDS = (
     "log_evidence",
     "effective_sample_size",
     "inlier_probability",
+    "bone_lengths",
+    "bone_covariance",
 )
 """What a `PoseTrack` holds for every frame."""
 
-_ADDED = ("effective_sample_size", "inlier_probability")  # files of older releases have none
+_ADDED = (
+    "effective_sample_size",
+    "inlier_probability",
+    "bone_lengths",
+    "bone_covariance",
+)  # files of older releases have none
 _FIELDS = {
     "joints2d": ("f", "T 8 2"),
     "joints3d": ("f", "T 8 3"),
@@ -39,6 +49,8 @@ _FIELDS = {
     "log_evidence_arms": ("f", "T 2"),
     "effective_sample_size": ("f", "T 2"),
     "inlier_probability": ("f", "T 8"),
+    "bone_lengths": ("f", "T 4"),
+    "bone_covariance": ("f", "T 4 4"),
     "lengths": ("i", ""),
     "failed_at": ("i", ""),
     "K": ("f", "3 3"),
@@ -73,6 +85,12 @@ class PoseTrack:
             is no estimate; one track that has it is a Gaussian, sure of its component.
         inlier_probability: that the keypoint of a joint is no outlier, [B, T, 8]; below 1/2 it was taken
             as missing. NaN where none was given or looked for, and in files of older releases.
+        bone_lengths: that were believed before each frame, in the order of `bone_names`, [B, T, 4], metres;
+            NaN of methods that learn none and in files of older releases. One camera does not tell a large
+            body from a near one, so their common scale is that of the prior or of what was given.
+        bone_covariance: of the lengths, [B, T, 4, 4], metres squared; most of it is the common scale.
+        bone_names: upper_arm, forearm (to the wrist) or forearm_to_hand, shoulder_width and head_height
+            (above Kinect's neck).
     """
 
     joints2d: Tensor
@@ -92,12 +110,20 @@ class PoseTrack:
     method: str = "unknown"
     effective_sample_size: Tensor = field(default_factory=lambda: torch.empty(0))
     inlier_probability: Tensor = field(default_factory=lambda: torch.empty(0))
+    bone_lengths: Tensor = field(default_factory=lambda: torch.empty(0))
+    bone_covariance: Tensor = field(default_factory=lambda: torch.empty(0))
+    bone_names: tuple[str, ...] = BONE_NAMES
 
     def __post_init__(self) -> None:
         if self.effective_sample_size.numel() == 0:
             self.effective_sample_size = torch.full_like(self.log_evidence, torch.nan)
         if self.inlier_probability.numel() == 0:
             self.inlier_probability = torch.full_like(self.joints2d[..., 0], torch.nan)
+        if self.bone_lengths.numel() == 0:
+            self.bone_lengths = torch.full_like(self.joints3d[..., :4, 0], torch.nan)
+        if self.bone_covariance.numel() == 0:
+            self.bone_covariance = torch.full_like(self.covariance3d[..., :4, :1, 0], torch.nan)
+            self.bone_covariance = self.bone_covariance.expand(*self.bone_lengths.shape, 4).clone()
 
     def __len__(self) -> int:
         return self.joints3d.shape[0]
@@ -128,8 +154,8 @@ class PoseTrack:
 
         `log_evidence` in the file is the score, the sum over both arms; `log_evidence_arms` has them
         apart. Keys: joints2d, joints3d, covariance2d, covariance3d, observed, log_evidence,
-        log_evidence_arms, effective_sample_size, inlier_probability, names, fps (NaN if unknown), K,
-        frame, failed_at, lengths, notes, first_frame, method.
+        log_evidence_arms, effective_sample_size, inlier_probability, bone_lengths, bone_covariance,
+        bone_names, names, fps (NaN if unknown), K, frame, failed_at, lengths, notes, first_frame, method.
 
         Raises:
             OutputError: the file cannot be written.
@@ -152,6 +178,7 @@ class PoseTrack:
         arrays["notes"] = np.array(self.notes, dtype=str)
         arrays["first_frame"] = np.array(self.first_frame)
         arrays["method"] = np.array(self.method)
+        arrays["bone_names"] = np.array(self.bone_names)
         write_npz(path, arrays)
 
     @classmethod
@@ -170,7 +197,7 @@ class PoseTrack:
             "fps",
             "notes",
         )
-        arrays = read_npz(path, required, ("first_frame", "method", *_ADDED))
+        arrays = read_npz(path, required, ("first_frame", "method", "bone_names", *_ADDED))
         fields = {key: size for key, size in _FIELDS.items() if key in arrays}
         single = arrays["joints3d"].ndim == 3
         batch = "" if single else "B "
@@ -193,6 +220,7 @@ class PoseTrack:
         track = cls(
             **tensors, names=names, frame=one_text(path, "frame", arrays["frame"]),
             method=one_text(path, "method", arrays.get("method", np.array("unknown"))),
+            bone_names=texts(path, "bone_names", arrays.get("bone_names", np.array(BONE_NAMES))),
             **frame_facts(path, arrays),
         )  # fmt: skip
         track._check(path)
@@ -216,9 +244,20 @@ class PoseTrack:
         outside = (self.inlier_probability < 0) | (self.inlier_probability > 1)
         if bool(outside.any()):
             raise FileFormatError(f"{path}: expected inlier_probability between 0 and 1, or NaN")
+        self._check_bones(path)
         failed = torch.nonzero(self.failed_at >= 0).reshape(-1)
         whole = self.joints3d[failed, self.failed_at[failed]].isfinite().flatten(1).all(-1)
         if bool(whole.any()) or bool(self.log_evidence.isposinf().any()):
             raise FileFormatError(
                 f"{path}: expected NaN in the frame of failed_at and no infinite log_evidence_arms"
             )
+
+    def _check_bones(self, path: str | Path) -> None:
+        """Raise unless the lengths of bones are lengths, or unknown."""
+        if len(self.bone_names) != len(BONE_NAMES):
+            raise FileFormatError(
+                f"{path}: expected {len(BONE_NAMES)} bone_names, got {', '.join(self.bone_names):.80}"
+            )
+        if bool((self.bone_lengths <= 0).any() or self.bone_lengths.isinf().any()):
+            raise FileFormatError(f"{path}: expected positive bone_lengths, or NaN")
+        check_estimates(path, "bone_lengths", self.bone_lengths, self.bone_covariance)

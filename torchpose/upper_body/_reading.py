@@ -1,7 +1,7 @@
 """Read a `PoseTrack` off the estimates of both arms, and note particles that have collapsed."""
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,7 +12,13 @@ from torchpose.camera._projection import map_pixel_covariance, map_pixels
 from torchpose.errors import InputError
 from torchpose.math._rotations import RotationOrder
 from torchpose.priors._upper_body import UpperBodyPrior
-from torchpose.upper_body._estimator import Estimates, Estimator, first_failure, mending_notes
+from torchpose.upper_body._estimator import (
+    Bones,
+    Estimates,
+    Estimator,
+    first_failure,
+    mending_notes,
+)
 from torchpose.upper_body._fusion import (
     MotionStage,
     MotionState,
@@ -129,6 +135,7 @@ class PoseReader(NamedTuple):
             notes=(*notes, *mending_notes(left, right)),
             method=self.method,
             inlier_probability=torch.empty(0) if probability is None else probability.to(matrix),
+            **_bone_fields(estimates.bones),
         )
 
     def _placed(
@@ -144,6 +151,17 @@ class PoseReader(NamedTuple):
             return reading
         fixed = self.prior.left.moments()[0][18:] if self.static_camera else None
         return in_camera_axes(reading, self.order, fixed)
+
+
+def _bone_fields(bones: Bones | None) -> dict[str, Any]:
+    """Return the fields of a `PoseTrack` that hold lengths of bones."""
+    if bones is None:
+        return {}
+    return {
+        "bone_lengths": bones.metres,
+        "bone_covariance": bones.covs,
+        "bone_names": bones.names,
+    }
 
 
 def check_frame(frame: str, static_camera: bool) -> None:

@@ -82,14 +82,14 @@ class UpperBodyTracker(WideModule):
         prior: from `load_prior` or `fit_upper_body_prior`.
         camera: of the keypoints. One other than the prior's is mapped to it.
         method: one of `METHODS`. By default "articulated" where both shoulders and an elbow are
-            measured and neither `smoothing`, `steady` nor an option is asked for; else "window-mixture"
-            where the prior has windows that suit, else "mkf-fixed". The attribute `method` is the one
-            for few joints, `PoseTrack.method` the one that ran.
+            measured, or an option of bones is given, and neither `steady` nor an option of another method
+            is; else "window-mixture" where the prior has windows that suit, else "mkf-fixed". The
+            attribute `method` is the one for few joints, `PoseTrack.method` the one that ran.
         measurement_std: standard deviation of a keypoint in the camera's pixels, one number or one
             for each of hand, elbow, shoulder, head, neck; by default what the prior brings, else 3.
         fps: frame rate of the keypoints; by default that of the prior. Process noise is scaled.
         smoothing: None, the number of later frames that an estimate may use, or "full"; only for
-            "window-mixture", whose windows then look a few frames ahead, and "mkf-fixed".
+            "articulated", "mkf-fixed" and "window-mixture", whose windows then look a few frames ahead.
         frame: "camera" (axes of the camera) or "body" (of the prior's recordings).
         static_camera: put the body, turned by the estimated rotation, in front of a camera that
             stays at the prior's mean place, as the authors' released demo does.
