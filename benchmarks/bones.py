@@ -197,7 +197,7 @@ def webcam_views(data: Path) -> list[View]:
     """Return clips of strangers as MediaPipe saw them, with its own 3D landmarks in place of a truth.
 
     Frames in which it is not sure of an arm have no truth. Clips without a visible arm are left out. The
-    depth is the one at which the landmarks have the size of the image.
+    depth is the one at which the shoulders have the size of the image; hands are nearer.
 
     Args:
         data: folder with video_people/ and video_asl/.
@@ -213,12 +213,13 @@ def webcam_views(data: Path) -> list[View]:
         sure = torch.tensor(arrays["visibility"]).double().clamp(0, 1)
         keypoints = torch.tensor(arrays["joints2d"]).double()
         truth = torch.tensor(arrays["joints3d"]).double()[:, ends]
+        apart = [points[:, [row[0] for row in ends], :2].diff(dim=1).norm(dim=-1)
+                 for points in (torch.tensor(arrays["joints3d"]).double(), keypoints)]  # fmt: skip
         truth[(sure[:, ends] < _VISIBLE).any(-1)] = torch.nan
         if not bool(truth.isfinite().any()):
             continue
         camera = torchpose.PinholeCamera.from_image_size(*(int(x) for x in arrays["image_size"]))
-        flat = keypoints[:, ends].diff(dim=2).norm(dim=-1) / float(camera.matrix[0, 0])
-        depth = float((truth.diff(dim=2)[..., :2].norm(dim=-1) / flat).nanmedian())
+        depth = float((apart[0] / apart[1]).nanmedian() * camera.matrix[0, 0])
         sure, fps = torch.where(sure < _UNSEEN, 0.0, sure)[:, kept], float(arrays["fps"])
         seen = [names[i] for i in kept]
         views.append(

@@ -59,6 +59,8 @@ def test_bones_are_the_default_where_shoulders_and_elbows_are_measured(prior):
     seen = (rays[..., :2] / rays[..., 2:])[None]
     tracker = UpperBodyTracker(prior, demo_camera())
     assert tracker.method == "window-mixture" and tracker(seen).method == "articulated"
+    late = UpperBodyTracker(prior, demo_camera(), smoothing=1)
+    assert late.method == "mkf-fixed" and late.notes and late(seen).notes == ()
     for options in ({"smoothing": 1}, {"height": 1.7}, {"bone_lengths": {"forearm": 0.3}}):
         assert UpperBodyTracker(prior, demo_camera(), **options)(seen).method == "articulated"
     assert UpperBodyTracker(prior, demo_camera(), steady=False)(seen).method == "window-mixture"

@@ -143,6 +143,7 @@ class ArticulatedFilter(Estimator):
 
     calibration = "articulated"
     smooths = True
+    knows_wrists = True
 
     def __init__(
         self,

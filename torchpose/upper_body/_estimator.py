@@ -158,6 +158,7 @@ class Estimator(ABC):
             by the name of the method.
         steadied_by: of the motion stage that frames need, None where they follow each other smoothly.
         ahead: number of later frames that an estimate uses by itself.
+        knows_wrists: whether wrists and hands are two joints to it (`TrackerModel.hand`).
         reads_rays: whether pixels and joints in space are two readings (`on_their_rays`).
     """
 
@@ -166,6 +167,7 @@ class Estimator(ABC):
     calibration: str | None = None
     steadied_by: MotionRatios | None = None
     ahead: int = 0
+    knows_wrists: ClassVar[bool] = False
     reads_rays: bool = False
 
     def check(self) -> None:  # noqa: B027  # most estimators have nothing to refuse

@@ -68,7 +68,8 @@ class Picked(NamedTuple):
             the middle of the shoulders.
         middle: whether the neck is to be put between that, or else the middle of the measured
             shoulders, and the head (`place_measured_neck`).
-        notes: what was assumed.
+        notes: what was assumed about the neck. of_hands: about hands of another kind than the prior's,
+            by estimators that take one kind for the other.
         hand: kind of the hands, "hand" or "wrist"; None where the names do not tell.
         face: places of nose, eyes and ears (`FACE`) among the keypoints, -1 if absent.
     """
@@ -78,6 +79,7 @@ class Picked(NamedTuple):
     notes: tuple[str, ...]
     hand: str | None = None
     face: tuple[int, ...] = (-1,) * len(FACE)
+    of_hands: tuple[str, ...] = ()
 
     @property
     def there(self) -> list[bool]:
@@ -125,11 +127,12 @@ def pick_joints(
         if not middle:
             indices[_NECK] = -1
         notes += _neck_notes(kind if other else None, wanted_neck, middle)
+    of_hands: tuple[str, ...] = ()
     if found.hand is not None and wanted_hand is not None and found.hand != wanted_hand:
-        notes.append(f"the keypoints' {found.hand}s stand for the prior's {wanted_hand}s")
+        of_hands = (f"the keypoints' {found.hand}s stand for the prior's {wanted_hand}s",)
     known = canonical_names(names)
     face = tuple(known.index(name) if name in known else -1 for name in FACE)
-    return Picked(tuple(indices), middle, tuple(notes), found.hand, face)
+    return Picked(tuple(indices), middle, tuple(notes), found.hand, face, of_hands)
 
 
 def _neck_notes(kind: str | None, wanted: str | None, middle: bool) -> list[str]:

@@ -249,7 +249,9 @@ class UpperBodyTracker(WideModule):
             estimator = self._estimator_of(method, picked.hand)
             arms = generators_of_arms(generator)
             estimates = estimator.forward(found.measured, joints, arms, lengths, progress)
-            notes = self.notes + picked.notes + outlier_notes(*found[1:], lengths)
+            notes = self._notes_of(method) + picked.notes
+            notes += () if estimator.knows_wrists else picked.of_hands
+            notes += outlier_notes(*found[1:], lengths)
             reader, seen = self._reader(method, estimator), found.measured.mask
             reading = reader.whole(estimates, lengths)
             track = reader.track(reading, estimates, seen, lengths, notes, found.probability)
@@ -359,11 +361,15 @@ class UpperBodyTracker(WideModule):
             own, estimates = estimator.advance(state.estimator, found.measured)
             reader = self._reader(method, estimator)
             motion, reading = reader.more(state.motion, estimates)
-            notes = self.notes + outlier_notes(*found[1:])
+            notes = self._notes_of(method) + outlier_notes(*found[1:])
             track = reader.track(reading, estimates, seen, None, notes, found.probability)
         unseen = unseen_frames(state.unseen, seen.any(-1))
         state = state._replace(estimator=own, motion=motion, unseen=unseen, screen=screen)
         return state, track.in_precision(self.dtype)
+
+    def _notes_of(self, method: str) -> tuple[str, ...]:
+        """Return what is to be said about the choice of a method."""
+        return self.notes if method == self.method else ()
 
     def _checked(self, keypoints: Tensor) -> Float[Tensor, "B T J 2"]:
         """Return the keypoints of whole sequences, where and as wide as the tracker's own tensors."""
