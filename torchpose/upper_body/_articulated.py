@@ -8,7 +8,7 @@ learnt on the way.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -32,7 +32,13 @@ from torchpose.upper_body._arm_chain import (
     ArmState,
     DirectionDensity,
 )
-from torchpose.upper_body._articulated_poses import SeenBody, bones_of, estimates_of, pose_of
+from torchpose.upper_body._articulated_poses import (
+    FramePose,
+    SeenBody,
+    bones_of,
+    estimates_of,
+    pose_of,
+)
 from torchpose.upper_body._body_lengths import BodyLengths, KnownBody, Lengths
 from torchpose.upper_body._estimator import ArmJoints, Estimates, Estimator, TrackerModel
 from torchpose.upper_body._face import FacePoints, face_evidence
@@ -43,7 +49,6 @@ from torchpose.upper_body._root_grid import (
     Root,
     RootGrid,
     Torso,
-    TorsoLengths,
     half_widths,
     middle_of_shoulders,
     see_torso,
@@ -117,6 +122,29 @@ class _LevelFrame(NamedTuple):
     torso: Torso
 
 
+class _Roots(NamedTuple):
+    """Hypotheses of depth and turn in a frame.
+
+    Attributes:
+        belief: over the grid, [B, Z, P]. root: the likeliest of them.
+        near: share of each in the estimate, [B, M]. arms: of each. middle: of the shoulders, [B, M, 3].
+    """
+
+    belief: Tensor
+    root: Root
+    near: Tensor
+    arms: Arms
+    middle: Tensor
+
+
+class _Step(NamedTuple):
+    """What a frame leaves: the next state, the body, and what is believed of its arms."""
+
+    state: ArticulatedState
+    body: SeenBody
+    arms: ArmState
+
+
 class ArticulatedFilter(Estimator):
     """Estimator of arms whose bones keep their lengths, from any of the eight joints.
 
@@ -127,7 +155,8 @@ class ArticulatedFilter(Estimator):
        the prior over persons and sharpens (assumed-density filter). One camera does not tell a large
        body that is far from a small one that is near, so the common scale stays the prior's.
     3. The arms: hypotheses at every angle to the image that a bone of known length may have, weighed by
-       a density over directions and tied to those of the frame before (`ArmChain`).
+       a density over directions and tied to those of the frame before (`ArmChain`), and with `smoothing`
+       to those of later frames, of which 40 kB each are kept.
 
     Args:
         model: of the tracker. arms: prior over arms, or its file; by default the one that comes with
@@ -196,8 +225,10 @@ class ArticulatedFilter(Estimator):
         self, state: ArticulatedState, measured: MeasuredJoints
     ) -> tuple[ArticulatedState, Estimates]:
         """Return the next state and the estimates of T more frames; see `Estimator`."""
-        state, bodies, beliefs = self._run(state, measured)
-        return state, self._estimates(bodies, beliefs)
+        poses, last = [], state
+        for last, body, belief in self._steps(state, measured):  # noqa: B007  # the last one is returned
+            poses.append(pose_of(body, belief, self.matrix))
+        return last, estimates_of(poses, self.matrix, self.lengths.names)
 
     def forward(
         self,
@@ -209,32 +240,29 @@ class ArticulatedFilter(Estimator):
     ) -> Estimates:
         """Return the estimates of whole sequences; see `Estimator`."""
         state = self.init(len(measured.uv), joints, generators)
-        _, bodies, beliefs = self._run(state, measured, progress)
-        smoothing = self.model.smoothing
-        if smoothing is not None:
-            lag = None if smoothing == "full" else int(smoothing)
-            beliefs = self.chain.smoothed(beliefs, lengths, lag)
-        return self._estimates(bodies, beliefs, lengths)
-
-    def _run(
-        self, state: ArticulatedState, measured: MeasuredJoints, progress: bool = False
-    ) -> tuple[ArticulatedState, list[SeenBody], list[ArmState]]:
-        """Return the next state, and body and belief about its arms in each frame."""
-        bodies, beliefs = [], []
-        for frame in tqdm(self._frames(measured), disable=not progress, desc="frames"):
-            state, body, belief = self._step(state, frame)
-            bodies.append(body)
-            beliefs.append(belief)
-        return state, bodies, beliefs
-
-    def _estimates(
-        self, bodies: list[SeenBody], beliefs: list[ArmState], lengths: Tensor | None = None
-    ) -> Estimates:
-        """Return the estimates of bodies with such arms."""
-        poses = [
-            pose_of(body, belief, self.matrix) for body, belief in zip(bodies, beliefs, strict=True)
-        ]
+        steps = self._steps(state, measured, progress)
+        if self.model.smoothing is None:
+            poses = [pose_of(body, belief, self.matrix) for _, body, belief in steps]
+        else:
+            poses = self._smoothed(list(steps), lengths)
         return estimates_of(poses, self.matrix, self.lengths.names, lengths)
+
+    def _smoothed(self, steps: list[_Step], lengths: Tensor | None) -> list[FramePose]:
+        """Return the poses after the later frames were seen too."""
+        smoothing = self.model.smoothing
+        lag = int(smoothing) if isinstance(smoothing, int) else None
+        beliefs = self.chain.smoothed([step.arms for step in steps], lengths, lag)
+        pairs = zip(steps, beliefs, strict=True)
+        return [pose_of(step.body, belief, self.matrix) for step, belief in pairs]
+
+    def _steps(
+        self, state: ArticulatedState, measured: MeasuredJoints, progress: bool = False
+    ) -> Iterator[_Step]:
+        """Yield what each frame leaves."""
+        for frame in tqdm(self._frames(measured), disable=not progress, desc="frames"):
+            step = self._step(state, frame)
+            state = step.state
+            yield step
 
     def _frames(self, measured: MeasuredJoints) -> list[_Frame]:
         """Return the frames one by one, as rays."""
@@ -258,58 +286,60 @@ class ArticulatedFilter(Estimator):
         parts = zip(places.unbind(1), face.confidence.unbind(1), strict=True)
         return [FacePoints(*part, face.expected) for part in parts]
 
-    def _step(
-        self, state: ArticulatedState, frame: _Frame
-    ) -> tuple[ArticulatedState, SeenBody, ArmState]:
-        """Return the next state, body and arms in one frame, in a camera that leans as the torso does."""
+    def _step(self, state: ArticulatedState, frame: _Frame) -> _Step:
+        """Return what a frame leaves, worked out in a camera that leans as the torso does."""
         depth = (state.root.sum(2) @ self.grid.depth.log()).exp()
         lean = seen_lean(state.lean, frame.rays, frame.known, depth, self.model.rate)
         angle = lean_angle(lean)
         level = state._replace(middle=rolled(state.middle, -angle), lean=lean)
         new, body, belief = self._level_step(level, frame.level(angle))
-        return new._replace(middle=rolled(new.middle, angle)), body._replace(lean=angle), belief
+        new = new._replace(middle=rolled(new.middle, angle))
+        return _Step(new, body._replace(lean=angle), belief)
 
-    def _level_step(
-        self, state: ArticulatedState, frame: _LevelFrame
-    ) -> tuple[ArticulatedState, SeenBody, ArmState]:
-        """Return the next state, body and arms in one frame in which torsos are upright."""
-        torso = frame.torso
+    def _level_step(self, state: ArticulatedState, frame: _LevelFrame) -> _Step:
+        """Return what a frame leaves in which torsos are upright."""
         lengths, slack = self.lengths.metres(state.lengths), self.lengths.slack(state.lengths)
-        size = self.lengths.torso(state.lengths)
-        predicted = self.grid.predict(state.root)
-        power = 1.0 if state.arms is None else 1 / self.stride
-        believed = predicted.log() + power * self.grid.evidence(torso, size)
-        if frame.face is not None:
-            std = frame.std.amin(1)
-            believed = believed + face_evidence(frame.face, std, self.grid.depth, self.grid.turn)
-        root = self.grid.best(believed, _ROOTS)
-        middle = self._middle(state, torso, root, size)
-        weighed = self._arms(frame, root, middle, lengths, slack, _COARSE_ANGLES, _COARSE_AROUND)
-        seen = frame.known[:, [_ELBOWS, _HANDS]].sum((1, 2)).to(root.depth)
-        evidence = power * (weighed.log_evidence.sum(1) + 2 * seen[:, None] * root.depth.log())
-        after = self.grid.belief(believed, root, evidence)
-        root = root._replace(log_weight=root.log_weight + evidence)
-        near = self._near(root)
-        likely = self._mean(root, near)
-        centre = self._middle(state, torso, likely, size)
-        arms = self._arms(frame, likely, centre, lengths, slack)
+        roots = self._weigh(state, frame, lengths, slack)
+        root = self._mean(roots.root, roots.near)
+        middle = self._middle(state, frame.torso, root)
+        arms = self._arms(frame, root, middle, lengths, slack)
         belief = (
             self.chain.start(arms) if state.arms is None else self.chain.advance(state.arms, arms)
         )
         learnt = state.lengths
         if state.frame % self.stride == 0:
-            of_lengths = partial(self._evidence_of, frame, likely, centre)
-            learnt = self.lengths.learn(learnt, torso, likely, of_lengths)
-        shoulder = self._shoulders(frame, root, middle, lengths[:, 2]) - middle[:, None]
-        others = self._covs_of_root(weighed, root, near, shoulder, lengths)
-        body = self._body(frame, likely, centre, state.lengths)._replace(others=others)
-        new = ArticulatedState(after, learnt, belief, centre[:, 0], state.lean, state.frame + 1)
-        return new, body, belief
+            of_lengths = partial(self._evidence_of, frame, root, middle)
+            learnt = self.lengths.learn(learnt, frame.torso, root, of_lengths)
+        others = self._covs_of_root(frame, roots, lengths)
+        body = self._body(frame, root, middle, state.lengths, others)
+        new = ArticulatedState(
+            roots.belief, learnt, belief, middle[:, 0], state.lean, state.frame + 1
+        )
+        return _Step(new, body, belief)
 
-    def _middle(
-        self, state: ArticulatedState, torso: Torso, root: Root, size: TorsoLengths
-    ) -> Float[Tensor, "B M 3"]:
+    def _weigh(
+        self, state: ArticulatedState, frame: _LevelFrame, lengths: Tensor, slack: Tensor
+    ) -> _Roots:
+        """Return depths and turns, weighed by the torso, the face and the arms."""
+        power = 1.0 if state.arms is None else 1 / self.stride
+        size = self.lengths.torso(state.lengths)
+        believed = self.grid.predict(state.root).log()
+        believed = believed + power * self.grid.evidence(frame.torso, size)
+        if frame.face is not None:
+            std = frame.std.amin(1)
+            believed = believed + face_evidence(frame.face, std, self.grid.depth, self.grid.turn)
+        root = self.grid.best(believed, _ROOTS)
+        middle = self._middle(state, frame.torso, root)
+        arms = self._arms(frame, root, middle, lengths, slack, _COARSE_ANGLES, _COARSE_AROUND)
+        seen = frame.known[:, [_ELBOWS, _HANDS]].sum((1, 2)).to(root.depth)
+        evidence = power * (arms.log_evidence.sum(1) + 2 * seen[:, None] * root.depth.log())
+        belief = self.grid.belief(believed, root, evidence)
+        root = root._replace(log_weight=root.log_weight + evidence)
+        return _Roots(belief, root, self._near(root), arms, middle)
+
+    def _middle(self, state: ArticulatedState, torso: Torso, root: Root) -> Float[Tensor, "B M 3"]:
         """Return the middle of the shoulders, where it was last if nothing of the torso is measured."""
+        size = self.lengths.torso(state.lengths)
         found = middle_of_shoulders(torso, root.depth, root.turn, size)
         before = (state.middle / state.middle[:, 2:])[:, None] * root.depth[..., None]
         return torch.where(torso.known.any(1)[:, None, None], found, before)
@@ -369,14 +399,11 @@ class ArticulatedFilter(Estimator):
         return Root(depth, turn, torch.zeros_like(depth), torch.zeros_like(root.cell[:, :1]))
 
     def _covs_of_root(
-        self, arms: Arms, root: Root, near: Tensor, shoulder: Tensor, lengths: Tensor
+        self, frame: _LevelFrame, roots: _Roots, lengths: Tensor
     ) -> Float[Tensor, "B 4 3 3"]:
-        """Return how far both elbows, then both hands, are off where other hypotheses of the root hold.
-
-        Args:
-            arms: of each hypothesis. root: the hypotheses. near: share of each in the estimate, [B, M].
-            shoulder: relative to the middle of both, [B, 2, M, 3]. lengths: of the bones.
-        """
+        """Return how far both elbows, then both hands, are off where other hypotheses of the root hold."""
+        _, root, near, arms, middle = roots
+        shoulder = self._shoulders(frame, root, middle, lengths[:, 2]) - middle[:, None]
         bones = bones_of(arms.mean_directions, upright_axes(root.turn)[:, None], lengths)
         ends = shoulder[..., None, :] + bones.cumsum(-2)
         used = (near[:, None, :, None, None] * ends).sum(2, keepdim=True)
@@ -392,8 +419,10 @@ class ArticulatedFilter(Estimator):
         arms = self._arms(frame, root, middle, lengths, stiff, _COARSE_ANGLES, _COARSE_AROUND)
         return arms.log_evidence.sum((1, 2))
 
-    def _body(self, frame: _LevelFrame, root: Root, middle: Tensor, lengths: Lengths) -> SeenBody:
-        """Return the body but for the arms, of one hypothesis of the root."""
+    def _body(
+        self, frame: _LevelFrame, root: Root, middle: Tensor, lengths: Lengths, others: Tensor
+    ) -> SeenBody:
+        """Return the body but for the arms, of one hypothesis of the root; `others` as in `SeenBody`."""
         metres, bones = self.lengths.metres(lengths), self.lengths.shown(lengths)
         joints = middle.new_zeros(len(middle), 8, 3)
         joints[:, _SHOULDERS] = self._shoulders(frame, root, middle, metres[:, 2])[:, :, 0]
@@ -403,7 +432,6 @@ class ArticulatedFilter(Estimator):
             joints[:, row] = torch.where(frame.known[:, row, None], ray, torso[:, i])
         scale = self.lengths.scale.expand(len(middle))
         turn = root.turn[:, 0]
-        others = joints.new_zeros(len(middle), 4, 3, 3)
         level = torch.zeros_like(turn)
         return SeenBody(joints, frame.known, metres, bones, scale, others, turn, level)
 
