@@ -327,7 +327,7 @@ def test_a_known_height_scales_the_body_and_its_distance():
     assert depth[0] / depth[1] == pytest.approx(0.8, abs=0.04)
     spread = small.bone_covariance[0, 0].diagonal().sqrt() / small.bone_lengths[0, 0]
     assert bool((spread <= shipped_arm_prior().spread.max()).all())
-    for height in (17.0, 0.0):
+    for height in (17.0, 0.0, float("nan"), "1.7"):
         with pytest.raises(InputError, match="height must lie between"):
             tracker(height=height)
 

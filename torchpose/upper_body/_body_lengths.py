@@ -30,10 +30,8 @@ _WIDTH_STD, _HEIGHT_STD = 0.05, 0.05  # metres: shoulders and heads move in thei
 _GIVEN = 0.02  # of the log of a length that was measured on the person
 _SHORTEST, _LONGEST = 0.05, 1.0  # metres
 _SMALLEST, _TALLEST = 0.5, 2.6  # metres
-_HEIGHT, _OF_HEIGHT = (
-    1.70,
-    0.055,
-)  # metres of grown-ups, and what it explains of the log of a length
+_HEIGHT = 1.70  # metres: of whom the prior's lengths are taken for
+_OF_HEIGHT = 0.055  # of the log of a length: what the heights of grown-ups explain
 _SUREST = 0.01  # of the log of a length relative to others
 _LEAST = 0.04  # of the log of a length that is only known in proportion
 
@@ -106,7 +104,7 @@ class BodyLengths:
 
     def _grow(self, height: float) -> None:
         """Expect the lengths of a person of this height."""
-        if not _SMALLEST <= height <= _TALLEST:
+        if not isinstance(height, int | float) or not _SMALLEST <= height <= _TALLEST:
             raise InputError(
                 f"height must lie between {_SMALLEST} and {_TALLEST} m, got {height!r}; it is in metres"
             )
