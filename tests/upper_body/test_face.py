@@ -55,6 +55,15 @@ def test_a_face_that_nobody_looks_for_says_nothing():
     torch.testing.assert_close(evidence, torch.zeros_like(evidence))
 
 
+def test_a_bad_ear_does_not_bring_a_body_near():
+    face = measured(0.3)
+    face.places[0, 3] += 0.3
+    evidence = face_evidence(face, STD, DEPTH, TURNS)
+    torch.testing.assert_close(
+        evidence.exp().mean(-1), torch.ones_like(evidence[..., 0]), rtol=1e-6, atol=1e-6
+    )
+
+
 def test_unsure_points_count_less():
     right = measured(-0.6)
     wrong = right.places.clone()

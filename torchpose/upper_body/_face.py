@@ -76,7 +76,9 @@ def face_evidence(
     depth: Float[Tensor, " Z"],
     turn: Float[Tensor, " P"],
 ) -> Float[Tensor, "B Z P"]:
-    """Return the log-likelihood of a face for each depth and turn of the shoulders.
+    """Return what a face says about the turn of the shoulders at each depth, of mean one over turns.
+
+    It says nothing about the depth itself: at a small one any face is small, and a bad ear seems to fit.
 
     A head at angle h from the camera has its points at x_i = c + left_i cos h - forward_i sin h, for an
     unknown middle c; and a detector gives those that are visible at that angle more often than others.
@@ -91,7 +93,8 @@ def face_evidence(
     near = torch.softmax(-0.5 * (off / _NECK_STD).square(), 1)
     share = (1 - _ANYWHERE) * near + _ANYWHERE / len(turn)
     most = at_angle.amax(-1, keepdim=True)
-    return ((at_angle - most).exp() @ share.mT).log() + most
+    said = ((at_angle - most).exp() @ share.mT).log() + most
+    return said - torch.logsumexp(said, -1, keepdim=True) + math.log(len(turn))
 
 
 def _places(face: FacePoints, std: Tensor, depth: Tensor, turn: Tensor) -> Float[Tensor, "B Z P"]:
