@@ -213,13 +213,14 @@ def webcam_views(data: Path) -> list[View]:
         sure = torch.tensor(arrays["visibility"]).double().clamp(0, 1)
         keypoints = torch.tensor(arrays["joints2d"]).double()
         truth = torch.tensor(arrays["joints3d"]).double()[:, ends]
-        apart = [points[:, [row[0] for row in ends], :2].diff(dim=1).norm(dim=-1)
-                 for points in (torch.tensor(arrays["joints3d"]).double(), keypoints)]  # fmt: skip
+        widths = [
+            arms[:, :, 0, :2].diff(dim=1).norm(dim=-1) for arms in (truth, keypoints[:, ends])
+        ]
         truth[(sure[:, ends] < _VISIBLE).any(-1)] = torch.nan
         if not bool(truth.isfinite().any()):
             continue
         camera = torchpose.PinholeCamera.from_image_size(*(int(x) for x in arrays["image_size"]))
-        depth = float((apart[0] / apart[1]).nanmedian() * camera.matrix[0, 0])
+        depth = float((widths[0] / widths[1]).nanmedian() * camera.matrix[0, 0])
         sure, fps = torch.where(sure < _UNSEEN, 0.0, sure)[:, kept], float(arrays["fps"])
         seen = [names[i] for i in kept]
         views.append(

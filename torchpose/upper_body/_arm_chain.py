@@ -232,8 +232,7 @@ class ArmChain:
         n_frames = len(states)
         said = [torch.ones_like(state.weight) for state in states]
         for _ in range(1 if lag is None else lag):
-            before = list(said)
-            source = said if lag is None else before
+            source = said if lag is None else list(said)  # each round looks one frame farther
             for t in range(n_frames - 2, -1, -1):
                 said[t] = self._said_later(states[t], states[t + 1], source[t + 1])
                 if lengths is not None:

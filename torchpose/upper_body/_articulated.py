@@ -33,6 +33,10 @@ from torchpose.upper_body._arm_chain import (
     DirectionDensity,
 )
 from torchpose.upper_body._articulated_poses import (
+    ELBOWS,
+    HANDS,
+    SHOULDERS,
+    SIDES,
     FramePose,
     SeenBody,
     bones_of,
@@ -58,17 +62,11 @@ from torchpose.upper_body._root_grid import (
 
 __all__ = ["ArticulatedFilter", "ArticulatedState"]
 
-_JOINT = {name: i for i, name in enumerate(UPPER_BODY)}
-_SHOULDERS, _ELBOWS, _HANDS = (
-    [_JOINT[f"{joint}_{side}"] for side in ("left", "right")]
-    for joint in ("shoulder", "elbow", "hand")
-)
-_SPINE = (_JOINT["neck"], _JOINT["head"])
+_SPINE = (UPPER_BODY.index("neck"), UPPER_BODY.index("head"))
 _ROOTS = 10  # hypotheses of the root that arms are weighed for
 _COARSE_ANGLES, _COARSE_AROUND = 11, 24  # of limbs, while roots are weighed
 _SHARE = 0.2  # seconds over which frames say the same about the torso and about lengths
 _MODE = math.radians(45.0)  # turns farther than that from the likeliest are another mode
-_SIDES = ((1.0, 1.0, 1.0), (-1.0, 1.0, 1.0))  # right arms are mirrored
 
 
 class ArticulatedState(NamedTuple):
@@ -331,7 +329,7 @@ class ArticulatedFilter(Estimator):
         root = self.grid.best(believed, _ROOTS)
         middle = self._middle(state, frame.torso, root)
         arms = self._arms(frame, root, middle, lengths, slack, _COARSE_ANGLES, _COARSE_AROUND)
-        seen = frame.known[:, [_ELBOWS, _HANDS]].sum((1, 2)).to(root.depth)
+        seen = frame.known[:, [ELBOWS, HANDS]].sum((1, 2)).to(root.depth)
         evidence = power * (arms.log_evidence.sum(1) + 2 * seen[:, None] * root.depth.log())
         belief = self.grid.belief(believed, root, evidence)
         root = root._replace(log_weight=root.log_weight + evidence)
@@ -351,9 +349,9 @@ class ArticulatedFilter(Estimator):
         half = half_widths(width, frame.torso.raised(root.depth))
         offsets = shoulder_offsets(root.turn, half)
         inferred = (middle[..., None, :] + offsets).transpose(1, 2)
-        ray = frame.rays[:, _SHOULDERS, None]
+        ray = frame.rays[:, SHOULDERS, None]
         on_ray = ray / ray[..., 2:] * inferred[..., 2:]
-        return torch.where(frame.known[:, _SHOULDERS, None, None], on_ray, inferred)
+        return torch.where(frame.known[:, SHOULDERS, None, None], on_ray, inferred)
 
     def _arms(
         self,
@@ -366,13 +364,13 @@ class ArticulatedFilter(Estimator):
         around: int | None = None,
     ) -> Arms:
         """Return the hypotheses about both arms for each hypothesis of the root."""
-        flip = root.depth.new_tensor(_SIDES)
+        flip = root.depth.new_tensor(SIDES)
         shoulder = self._shoulders(frame, root, middle, lengths[:, 2]) * flip[:, None]
-        rays = torch.stack([frame.rays[:, _ELBOWS], frame.rays[:, _HANDS]], 2) * flip[:, None]
-        noise = frame.std[:, [_SHOULDERS, _ELBOWS, _HANDS]].square()
-        noise = torch.where(frame.known[:, [_SHOULDERS, _ELBOWS, _HANDS]], noise, 0.0)
+        rays = torch.stack([frame.rays[:, ELBOWS], frame.rays[:, HANDS]], 2) * flip[:, None]
+        noise = frame.std[:, [SHOULDERS, ELBOWS, HANDS]].square()
+        noise = torch.where(frame.known[:, [SHOULDERS, ELBOWS, HANDS]], noise, 0.0)
         std = torch.stack([noise[:, 0] + noise[:, 1], noise[:, 1] + noise[:, 2]], -1).sqrt()
-        known = torch.stack([frame.known[:, _ELBOWS], frame.known[:, _HANDS]], -1)
+        known = torch.stack([frame.known[:, ELBOWS], frame.known[:, HANDS]], -1)
         axes = upright_axes(root.turn)
         axes = torch.stack([axes, flip[1, :, None] * axes * flip[1]], 1)
         bones = lengths[:, None, None, :2].expand(*shoulder.shape[:3], 2)
@@ -425,7 +423,7 @@ class ArticulatedFilter(Estimator):
         """Return the body but for the arms, of one hypothesis of the root; `others` as in `SeenBody`."""
         metres, bones = self.lengths.metres(lengths), self.lengths.shown(lengths)
         joints = middle.new_zeros(len(middle), 8, 3)
-        joints[:, _SHOULDERS] = self._shoulders(frame, root, middle, metres[:, 2])[:, :, 0]
+        joints[:, SHOULDERS] = self._shoulders(frame, root, middle, metres[:, 2])[:, :, 0]
         torso = middle + spine_places(self.lengths.torso(lengths))
         for i, row in enumerate(_SPINE):
             ray = frame.rays[:, row] / frame.rays[:, row, 2:] * torso[:, i, 2:]

@@ -18,14 +18,25 @@ from torchpose.upper_body._arm_chain import ArmChain, ArmState
 from torchpose.upper_body._estimator import Bones, Estimates, ReadOut
 from torchpose.upper_body._lean import rolled
 
-__all__ = ["FramePose", "SeenBody", "bones_of", "estimates_of", "pose_of"]
+__all__ = [
+    "ELBOWS",
+    "HANDS",
+    "SHOULDERS",
+    "SIDES",
+    "FramePose",
+    "SeenBody",
+    "bones_of",
+    "estimates_of",
+    "pose_of",
+]
 
 _NECK = UPPER_BODY.index("neck")
-_SHOULDERS, _ELBOWS, _HANDS = (
+SHOULDERS, ELBOWS, HANDS = (
     [UPPER_BODY.index(f"{joint}_{side}") for side in ("left", "right")]
     for joint in ("shoulder", "elbow", "hand")
 )
-_SIDES = ((1.0, 1.0, 1.0), (-1.0, 1.0, 1.0))  # right arms are mirrored
+SIDES = ((1.0, 1.0, 1.0), (-1.0, 1.0, 1.0))
+"""Signs of the axes by which right arms are mirrored."""
 _STD = 0.03  # metres: of every joint in space
 
 
@@ -80,7 +91,7 @@ def bones_of(
         directions: of left and mirrored right arms, upright axes. axes: from camera to upright axes.
         lengths: of the bones.
     """
-    flip = directions.new_tensor(_SIDES)[:, None, None]
+    flip = directions.new_tensor(SIDES)[:, None, None]
     return directions.unflatten(-1, (2, 3)) * flip @ axes * lengths[:, None, None, :2, None]
 
 
@@ -93,11 +104,11 @@ def pose_of(body: SeenBody, belief: ArmState, matrix: Float[Tensor, "3 3"]) -> F
     axes = upright_axes(body.turn)[:, None, None]
     mean = ArmChain.mean_directions(belief).flatten(2)[:, :, None]
     joints = body.joints.clone()
-    arms = joints[:, _SHOULDERS, None] + bones_of(mean, axes, body.lengths)[:, :, 0].cumsum(-2)
-    joints[:, _ELBOWS], joints[:, _HANDS] = arms.unbind(2)
+    arms = joints[:, SHOULDERS, None] + bones_of(mean, axes, body.lengths)[:, :, 0].cumsum(-2)
+    joints[:, ELBOWS], joints[:, HANDS] = arms.unbind(2)
     covs = _covs(body, belief, joints)
-    seen = body.known[:, [_ELBOWS, _HANDS]]
-    area = 2 * body.joints[:, _SHOULDERS, 2].mean(1).log() - matrix.diagonal()[:2].log().sum()
+    seen = body.known[:, [ELBOWS, HANDS]]
+    area = 2 * body.joints[:, SHOULDERS, 2].mean(1).log() - matrix.diagonal()[:2].log().sum()
     evidence = belief.log_evidence + seen.sum(1).to(area) * area[:, None]
     evidence = torch.where(seen.any(1), evidence, 0.0)
     covs = rolled(rolled(covs, body.lean).mT, body.lean)
@@ -113,8 +124,8 @@ def _covs(body: SeenBody, belief: ArmState, joints: Tensor) -> Float[Tensor, "B 
     covs = torch.eye(3).to(joints).mul(_STD**2).expand(*joints.shape, 3).clone()
     axes = upright_axes(body.turn)[:, None, None]
     ends = bones_of(belief.directions, axes, body.lengths).cumsum(-2)
-    for limb, rows in enumerate((_ELBOWS, _HANDS)):
-        off = ends[..., limb, :] - (joints[:, rows] - joints[:, _SHOULDERS])[:, :, None]
+    for limb, rows in enumerate((ELBOWS, HANDS)):
+        off = ends[..., limb, :] - (joints[:, rows] - joints[:, SHOULDERS])[:, :, None]
         covs[:, rows] += (belief.weight[..., None] * off).mT @ off
         covs[:, rows] += body.others[:, 2 * limb : 2 * limb + 2]
     apart = joints - joints[:, _NECK, None]

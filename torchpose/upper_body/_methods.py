@@ -76,7 +76,6 @@ METHODS: dict[str, Method] = {
 }
 """Every method by its name: `UpperBodyTracker`, the command line and the benchmarks take them from here."""
 
-_BONE_OPTIONS = {"arms", "bone_lengths", "height", "person"}  # of no other method
 # Without a method these options mean single poses, as they did before windows had a name.
 _POSE_OPTIONS = {"transition", "gamma", "subspace", "initial_cov", "process_cov"}
 
@@ -229,7 +228,7 @@ def _default(
     prior: UpperBodyPrior, smoothing: int | str | None, fps: float | None, options: Iterable[str]
 ) -> Chosen:
     """Return the choice where no method was named."""
-    if _BONE_OPTIONS & set(options):
+    if set(method_options(BONES)) & set(options):  # of no other method
         return Chosen(BONES, ())
     poses = sorted(_POSE_OPTIONS & set(options))
     if poses:

@@ -122,8 +122,8 @@ class PoseTrack:
         if self.bone_lengths.numel() == 0:
             self.bone_lengths = torch.full_like(self.joints3d[..., :4, 0], torch.nan)
         if self.bone_covariance.numel() == 0:
-            self.bone_covariance = torch.full_like(self.covariance3d[..., :4, :1, 0], torch.nan)
-            self.bone_covariance = self.bone_covariance.expand(*self.bone_lengths.shape, 4).clone()
+            lengths = self.bone_lengths
+            self.bone_covariance = lengths.new_full((*lengths.shape, lengths.shape[-1]), torch.nan)
 
     def __len__(self) -> int:
         return self.joints3d.shape[0]
