@@ -1,11 +1,14 @@
 """Writing whole files or none, and refusing what is no plain .npz."""
 
+import gc
 import os
 import stat
+import sys
 
 import numpy as np
 import pytest
 
+from torchpose._core import files
 from torchpose._core.files import atomic_path, check_output_folder, write_npz
 from torchpose._core.reading import read_npz, require_file
 from torchpose.errors import FileFormatError, InputError, OutputError
@@ -33,6 +36,46 @@ def test_nothing_is_left_when_the_block_fails(tmp_path):
         raise KeyError("stopped")
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def _interrupt_at(step):
+    """A tracer that raises KeyboardInterrupt before instruction number `step` of the module of files."""
+    left = [step]
+
+    def trace(frame, event, argument):
+        if frame.f_code.co_filename != files.__file__:
+            return None
+        frame.f_trace_opcodes = True
+        if event == "opcode":
+            left[0] -= 1
+            if left[0] == 0:
+                raise KeyboardInterrupt
+        return trace
+
+    return trace
+
+
+def test_an_interruption_at_any_instruction_leaves_nothing(tmp_path):
+    """A signal may come between making the file and writing it; what stood there is whole after it."""
+    path = tmp_path / "poses.csv"
+    path.write_text("old")
+    before = sys.gettrace()
+    interrupted = 0
+    for step in range(1, 1000):
+        sys.settrace(_interrupt_at(step))
+        try:
+            with atomic_path(path) as temporary:
+                temporary.write_text("new")
+        except KeyboardInterrupt:
+            interrupted += 1
+        finally:
+            sys.settrace(before)
+        gc.collect(0)
+        assert [p.name for p in tmp_path.iterdir()] == ["poses.csv"], step
+        assert path.read_text() in ("old", "new")
+        if interrupted < step:
+            break
+    assert 100 < interrupted < 999
 
 
 def test_what_cannot_be_written_to(tmp_path):

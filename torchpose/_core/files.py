@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import secrets
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +18,6 @@ __all__ = [
     "check_output_folder",
     "clear_leftovers",
     "hold",
-    "make_temporary_file",
     "read_npz",
     "require_file",
     "write_npz",
@@ -52,22 +52,6 @@ def hold(handle: int, wait: bool = False) -> bool | None:
     except OSError:  # a file system without locks
         return None
     return True
-
-
-def make_temporary_file(folder: Path, suffix: str) -> tuple[int, Path]:
-    """Make a file that `clear_leftovers` leaves alone until its descriptor is closed.
-
-    Returns:
-        The descriptor and the path.
-
-    Raises:
-        OSError: it cannot be made.
-    """
-    while True:
-        handle, name = tempfile.mkstemp(dir=folder, prefix=_PREFIX, suffix=suffix)
-        if hold(handle) is not False and os.path.exists(name):
-            return handle, Path(name)
-        os.close(handle)  # taken for a leftover before it was locked
 
 
 def clear_leftovers(folder: str | Path) -> None:
@@ -112,26 +96,40 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     if path.is_dir():
         raise OutputError(f"{path}: is a folder; give the name of a file")
+    # Named before it is made, and made inside the `try`: a signal between the two leaves nothing.
+    temporary = path.with_name(f"{_PREFIX}{secrets.token_hex(8)}{path.suffix}")
+    handle = None
     try:
-        handle, temporary = make_temporary_file(path.parent, path.suffix)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot write here ({error.strerror or error})") from error
-    if os.name == "nt":  # an open file cannot be renamed there
-        os.close(handle)
-    try:
+        handle = _make(temporary, path)
+        if os.name == "nt":  # an open file cannot be renamed there
+            os.close(handle)
         yield temporary
         umask = os.umask(0)
         os.umask(umask)
-        temporary.chmod(0o666 & ~umask)  # mkstemp makes files that only their owner can read
+        temporary.chmod(0o666 & ~umask)  # only its owner could read it so far
         temporary.replace(path)
     except OSError as error:
         if isinstance(error, OutputError):
             raise
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
     finally:
-        temporary.unlink(missing_ok=True)
-        if os.name != "nt":
+        with contextlib.suppress(OSError):  # never made, or renamed
+            temporary.unlink()
+        if handle is not None and os.name != "nt":
             os.close(handle)
+
+
+def _make(temporary: Path, path: Path) -> int:
+    """Make a file that `clear_leftovers` leaves alone until its descriptor is closed; return that."""
+    while True:
+        try:
+            handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+        except OSError as error:
+            raise OutputError(f"{path}: cannot write here ({error.strerror or error})") from error
+        hold(handle, wait=True)
+        if temporary.exists():
+            return handle
+        os.close(handle)  # another process took it for a leftover before it was locked
 
 
 def check_output_folder(folder: str | Path) -> Path:
