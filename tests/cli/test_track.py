@@ -123,7 +123,7 @@ def test_without_matplotlib_it_says_how_to_get_pictures(torchpose, files, tmp_pa
 def test_methods(track, files, method):
     options = ("--n-particles", 50) if method.startswith("pf-") else ()
     more = {"n_particles": 50} if options else {}
-    if method == "window-mixture":
+    if method in ("window-mixture", "multiple-model"):
         options, more = ("--prior", SMALL), {"prior": load_prior(SMALL)}
     done, poses = track("--method", method, *options)
     same(poses, expected(files, method=method, **more))

@@ -377,3 +377,32 @@ def test_smoothing_with_no_later_frame_is_filtering():
     both[0, 12:] = torch.nan
     short = tracker(smoothing="full")(both, lengths=lengths).joints3d[0, :12]
     torch.testing.assert_close(short, tracker(smoothing="full")(uv[:, :12]).joints3d[0])
+
+
+def test_a_middle_of_the_shoulders_alone_is_seen_where_it_is():
+    joints = body(40, depth=1.4)
+    middle = joints[:, [ROW["shoulder_left"], ROW["shoulder_right"]]].mean(1, keepdim=True)
+    seen = torch.cat([middle, joints[:, [ROW["hand_left"], ROW["hand_right"]]]], 1)
+    names = ["neck", "left_hand", "right_hand"]
+    track = tracker(neck="mid-shoulder")(pixels(seen)[None], names=names)
+    shoulders = track.joints2d[0][:, [ROW["shoulder_left"], ROW["shoulder_right"]]].mean(1)
+    torch.testing.assert_close(shoulders, pixels(middle)[:, 0], atol=4.0, rtol=0)
+    found = track.joints3d[0]
+    share = (found[:, ROW["neck"]] - found[:, ROW["head"]]).norm(dim=-1)
+    whole = found[:, [ROW["shoulder_left"], ROW["shoulder_right"]]].mean(1) - found[:, ROW["head"]]
+    torch.testing.assert_close(
+        share / whole.norm(dim=-1), torch.full_like(share, 0.63), atol=0.02, rtol=0
+    )
+
+
+def test_limbs_that_nobody_sees_are_expected_nearer_than_their_lengths():
+    keypoints = pixels(body(30), 2.0)[None]
+    whole = tracker()(keypoints, names=list(UPPER_BODY))
+    keypoints[:, 20:, ROW["elbow_left"]] = torch.nan
+    track = tracker()(keypoints, names=list(UPPER_BODY))
+    lengths = [
+        torch.linalg.vector_norm(bones(x.joints3d[0], "left")[0], dim=-1) for x in (whole, track)
+    ]
+    torch.testing.assert_close(lengths[0], whole.bone_lengths[0, :, 0], atol=1e-6, rtol=0)
+    torch.testing.assert_close(lengths[0][:20], lengths[1][:20])
+    assert bool((lengths[1][20:] < track.bone_lengths[0, 20:, 0] - 1e-4).all())

@@ -9,7 +9,7 @@ import torchpose
 from tests.upper_body.test_articulated import CAMERA, PRIOR, ROW, body, pixels
 from torchpose.math import euler_to_matrix
 from torchpose.skeleton import UPPER_BODY
-from torchpose.upper_body._face import FACE, FacePoints, face_evidence
+from torchpose.upper_body._face import FACE, FacePoints, face_evidence, head_in_face
 
 TURNS = torch.deg2rad(torch.arange(-180.0, 180.0, 15.0, dtype=torch.float64))
 DEPTH = torch.tensor([1.5, 2.5], dtype=torch.float64)
@@ -111,3 +111,33 @@ def test_a_stream_with_a_face_gives_the_numbers_of_the_whole_recording():
         torch.testing.assert_close(pose.joints3d, whole.joints3d[:, t], rtol=0, atol=1e-9)
     without = tracker(seen[:, :, :8], names=UPPER_BODY)
     assert float((whole.joints3d - without.joints3d).abs().max()) > 1e-3
+
+
+@pytest.mark.parametrize("degrees", [-60, -20, 0, 35])
+def test_the_head_is_above_the_middle_of_the_ears(degrees):
+    turn = math.radians(degrees)
+    face, depth = measured(turn), torch.tensor([2.5], dtype=torch.float64)
+    found, told = head_in_face(face, STD, depth, torch.tensor([turn]).double(), TURNS)
+    assert bool(told)
+    assert found[0].tolist() == pytest.approx([0.0, -0.03, 2.5], abs=0.02)
+
+
+def test_no_face_tells_of_no_head():
+    nothing = FacePoints(torch.zeros(1, 5, 2), torch.zeros(1, 5), torch.zeros(5, dtype=torch.bool))
+    depth = torch.tensor([2.5])
+    found, told = head_in_face(nothing, STD.float(), depth, torch.zeros(1), TURNS.float())
+    assert not bool(told) and bool(found.isfinite().all())
+
+
+def test_a_bent_head_is_seen_by_its_face():
+    joints = body(40)
+    aside = torch.tensor([0.10, 0.02, 0.0], dtype=torch.float64)
+    head = joints[:, ROW["head"]] + aside
+    points = head[:, None] + HEAD + torch.tensor([0.0, 0.03, 0.0])
+    names = [name for name in UPPER_BODY if name != "head"]
+    seen = torch.cat([joints[:, [ROW[name] for name in names]], points], 1)
+    tracker = torchpose.UpperBodyTracker(PRIOR, CAMERA, "articulated", fps=30.0)
+    found = tracker(pixels(seen, 1.0)[None], names=[*names, *FACE]).joints3d[0]
+    apart = (found[:, ROW["head"]] - found[:, ROW["neck"]]) - (head - joints[:, ROW["neck"]])
+    assert float(apart[10:, :2].norm(dim=-1).mean()) < 0.04
+    assert float(aside.norm()) > 0.1

@@ -71,6 +71,10 @@ def test_bones_are_the_default_where_shoulders_and_elbows_are_measured(prior):
     hidden = seen.clone()
     hidden[:, :, elbows] = torch.nan
     assert tracker(hidden).method == "window-mixture"
+    wrists = [UPPER_BODY.index(f"hand_{side}") for side in ("left", "right")]
+    chosen = {"neck": UPPER_BODY.index("neck"), "left_wrist": wrists[0], "right_wrist": wrists[1]}
+    few = tracker(seen[:, :, list(chosen.values())], names=list(chosen))
+    assert few.method == "articulated"
     _, track = tracker.advance(tracker.init(1), seen)
     assert track.method == "articulated"
     torch.testing.assert_close(track.joints3d, tracker(seen).joints3d, rtol=0, atol=1e-9)

@@ -235,3 +235,15 @@ def test_files_hold_the_probabilities_and_older_ones_are_read_without(tracker, k
     np.savez(tmp_path / "wrong.npz", **older)
     with pytest.raises(FileFormatError, match="inlier_probability"):
         PoseTrack.load(tmp_path / "wrong.npz")
+
+
+@pytest.mark.parametrize(("sure", "kept"), [(1.0, True), (0.5, True), (0.1, False)])
+def test_an_unsure_keypoint_is_believed_only_where_it_is_expected(tracker, keypoints, sure, kept):
+    confidence = torch.ones(keypoints.shape[:3])
+    confidence[:, FRAME, 2] = sure
+    there = tracker(keypoints, confidence, NAMES).inlier_probability[:, FRAME, ROWS[2]]
+    moved_away = keypoints.clone()
+    moved_away[:, FRAME, 2] += 60.0
+    aside = tracker(moved_away, confidence, NAMES).inlier_probability[:, FRAME, ROWS[2]]
+    assert bool((there > 0.5).all())
+    assert bool((aside > 0.5).all()) is kept

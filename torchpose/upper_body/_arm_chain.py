@@ -19,7 +19,8 @@ __all__ = ["ArmChain", "ArmInput", "ArmState", "Arms", "DirectionDensity"]
 
 _SLACK = 0.018  # metres: joints of recordings are not the ends of stiff bones
 _ANGLES = 17  # of a bone whose end is measured
-_AROUND = 68  # directions of one whose end is not
+_AROUND = 150  # directions of one whose end is not
+_BOTH = 68  # of each of two such bones
 _STEP = math.radians(10.0)  # of a direction from frame to frame at 30 frames a second
 _ANEW = 0.2  # share of an arm's belief that starts anew in a frame at 30 frames a second
 _RATE = 30.0
@@ -149,6 +150,9 @@ class ArmChain:
             around: number of directions of one whose end is not.
         """
         count = angles * angles
+        both = min(around, _BOTH)
+        sizes = {(True, True): (angles, angles), (True, False): (angles, around),
+                 (False, True): (around, angles), (False, False): (both, both)}  # fmt: skip
         known = arm.known[..., None, :]
         patterns = {
             (upper, lower): (known[..., 0] == upper) & (known[..., 1] == lower)
@@ -157,9 +161,7 @@ class ArmChain:
         }
         there = {ends: here for ends, here in patterns.items() if bool(here.any())}
         found = {
-            (upper, lower): self._weighed(
-                arm, upper, lower, (angles if upper else around, angles if lower else around), count
-            )
+            (upper, lower): self._weighed(arm, upper, lower, sizes[upper, lower], count)
             for upper, lower in there
         }
         first, *others = found
@@ -265,10 +267,14 @@ class ArmChain:
         return 6 / (16 * math.pi**2 * scale**2) * near.square().square()
 
     @staticmethod
-    def mean_directions(state: ArmState) -> Float[Tensor, "B 2 2 3"]:
-        """Return the mean direction of each bone, upright axes."""
-        mean = (state.weight[..., None] * state.directions).sum(-2)
-        return normalize(mean.unflatten(-1, (2, 3)), dim=-1)
+    def mean_directions(state: ArmState, seen: Bool[Tensor, "B 2"]) -> Float[Tensor, "B 2 2 3"]:
+        """Return the mean direction of each bone, upright axes.
+
+        Args:
+            state: belief. seen: whether elbow and hand are measured; if so means are given unit length.
+        """
+        mean = (state.weight[..., None] * state.directions).sum(-2).unflatten(-1, (2, 3))
+        return torch.where(seen[..., None, None], normalize(mean, dim=-1), mean)
 
 
 def _belief(arms: Arms, prior: Tensor, predicted: Float[Tensor, "B 2 N"]) -> ArmState:

@@ -24,7 +24,7 @@ from torchpose.filters._base import Generators
 from torchpose.math._rotations import within_half_turn
 from torchpose.priors._arms import ArmPrior, shipped_arm_prior
 from torchpose.skeleton._joint_sets import UPPER_BODY
-from torchpose.skeleton._torso import upright_axes
+from torchpose.skeleton._torso import KINECT_NECK, upright_axes
 from torchpose.upper_body._arm_chain import (
     ArmChain,
     ArmInput,
@@ -45,7 +45,7 @@ from torchpose.upper_body._articulated_poses import (
 )
 from torchpose.upper_body._body_lengths import BodyLengths, KnownBody, Lengths
 from torchpose.upper_body._estimator import ArmJoints, Estimates, Estimator, TrackerModel
-from torchpose.upper_body._face import FacePoints, face_evidence
+from torchpose.upper_body._face import FacePoints, face_evidence, head_in_face
 from torchpose.upper_body._lean import lean_angle, rolled, seen_lean
 from torchpose.upper_body._measurements import MeasuredJoints
 from torchpose.upper_body._pose_track import PoseTrack
@@ -62,7 +62,8 @@ from torchpose.upper_body._root_grid import (
 
 __all__ = ["ArticulatedFilter", "ArticulatedState"]
 
-_SPINE = (UPPER_BODY.index("neck"), UPPER_BODY.index("head"))
+_NECK = UPPER_BODY.index("neck")
+_SPINE = [_NECK, UPPER_BODY.index("head")]
 _ROOTS = 10  # hypotheses of the root that arms are weighed for
 _COARSE_ANGLES, _COARSE_AROUND = 11, 24  # of limbs, while roots are weighed
 _SHARE = 0.2  # seconds over which frames say the same about the torso and about lengths
@@ -200,13 +201,15 @@ class ArticulatedFilter(Estimator):
         self.grid = derived(
             owner, ("root grid", model.rate), (like,), lambda: RootGrid(model.rate, like)
         )
-        info, hand = model.prior.info, model.hand or model.prior.info.hand
+        info, (self.neck_between, self.middle_alone) = model.prior.info, model.middle
+        hand = model.hand or info.hand
+        neck = "mid-shoulder" if self.middle_alone else info.neck
         known = KnownBody(bone_lengths, height, person)
         self.lengths = derived(
             owner,
-            ("body lengths", hand, info.neck, known.key),
+            ("body lengths", hand, neck, known.key),
             (like, self.prior.lengths, self.prior.spread),
-            lambda: BodyLengths(self.prior, hand, info.neck, known, like),
+            lambda: BodyLengths(self.prior, hand, neck, known, like),
         )
         self.matrix = info.matrix.to(like)
 
@@ -265,6 +268,8 @@ class ArticulatedFilter(Estimator):
     def _frames(self, measured: MeasuredJoints) -> list[_Frame]:
         """Return the frames one by one, as rays."""
         focal = (self.matrix[0, 0] * self.matrix[1, 1]).sqrt()
+        if self.middle_alone:
+            measured = _with_middle(measured)
         uv = measured.uv
         ones = torch.ones_like(uv[..., :1])
         rays = torch.cat([uv, ones], -1) @ torch.linalg.inv(self.matrix).mT
@@ -422,16 +427,42 @@ class ArticulatedFilter(Estimator):
     ) -> SeenBody:
         """Return the body but for the arms, of one hypothesis of the root; `others` as in `SeenBody`."""
         metres, bones = self.lengths.metres(lengths), self.lengths.shown(lengths)
+        shoulders = self._shoulders(frame, root, middle, metres[:, 2])[:, :, 0]
         joints = middle.new_zeros(len(middle), 8, 3)
-        joints[:, SHOULDERS] = self._shoulders(frame, root, middle, metres[:, 2])[:, :, 0]
-        torso = middle + spine_places(self.lengths.torso(lengths))
-        for i, row in enumerate(_SPINE):
-            ray = frame.rays[:, row] / frame.rays[:, row, 2:] * torso[:, i, 2:]
-            joints[:, row] = torch.where(frame.known[:, row, None], ray, torso[:, i])
+        joints[:, SHOULDERS] = shoulders
+        joints[:, _SPINE] = self._spine(frame, root, middle, shoulders, lengths)
         scale = self.lengths.scale.expand(len(middle))
         turn = root.turn[:, 0]
         level = torch.zeros_like(turn)
         return SeenBody(joints, frame.known, metres, bones, scale, others, turn, level)
+
+    def _spine(
+        self, frame: _LevelFrame, root: Root, middle: Tensor, shoulders: Tensor, lengths: Lengths
+    ) -> Float[Tensor, "B 2 3"]:
+        """Return neck and head: on their rays where they are measured, the head by its face too."""
+        upright = middle + spine_places(self.lengths.torso(lengths))
+        ray = frame.rays[:, _SPINE]
+        on_ray = ray / ray[..., 2:] * upright[..., 2:]
+        known = frame.known[:, _SPINE, None]
+        neck, head = torch.where(known, on_ray, upright).unbind(1)
+        if frame.face is not None:
+            std, depth, turn = frame.std.amin(1), upright[:, 1, 2], root.turn[:, 0]
+            found, told = head_in_face(frame.face, std, depth, turn, self.grid.turn)
+            head = torch.where(told[:, None] & ~known[:, 1], found, head)
+        if self.neck_between:
+            neck = shoulders.mean(1).lerp(head, KINECT_NECK.fraction)
+        return torch.stack([neck, head], 1)
+
+
+def _with_middle(measured: MeasuredJoints) -> MeasuredJoints:
+    """Return the joints with the middle of the shoulders for a neck, as it was measured."""
+    middle = measured.middle
+    if middle is None:
+        return measured
+    uv, mask, cov = (x.clone() for x in measured[:3])
+    uv[..., _NECK, :], mask[..., _NECK] = middle.uv, middle.mask & mask[..., _NECK]
+    cov[..., _NECK, :, :] = middle.cov
+    return measured._replace(uv=uv, mask=mask, cov=cov)
 
 
 def _kept(owner: nn.Module, path: str | Path | None, like: Tensor) -> ArmPrior:

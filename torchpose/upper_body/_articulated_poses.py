@@ -98,19 +98,22 @@ def bones_of(
 def pose_of(body: SeenBody, belief: ArmState, matrix: Float[Tensor, "3 3"]) -> FramePose:
     """Return the estimate of a frame, in camera axes: bones point to the mean of what is believed.
 
+    They keep their lengths where elbow and hand are measured. Where not, joints are where they are expected,
+    which is nearer to the shoulder: the error of an unsure direction is least so.
+
     Args:
         body: but for its arms. belief: about these. matrix: K of their pixels.
     """
     axes = upright_axes(body.turn)[:, None, None]
-    mean = ArmChain.mean_directions(belief).flatten(2)[:, :, None]
+    known = body.known[:, [ELBOWS, HANDS]]
+    mean = ArmChain.mean_directions(belief, known.all(1)).flatten(2)[:, :, None]
     joints = body.joints.clone()
     arms = joints[:, SHOULDERS, None] + bones_of(mean, axes, body.lengths)[:, :, 0].cumsum(-2)
     joints[:, ELBOWS], joints[:, HANDS] = arms.unbind(2)
     covs = _covs(body, belief, joints)
-    seen = body.known[:, [ELBOWS, HANDS]]
     area = 2 * body.joints[:, SHOULDERS, 2].mean(1).log() - matrix.diagonal()[:2].log().sum()
-    evidence = belief.log_evidence + seen.sum(1).to(area) * area[:, None]
-    evidence = torch.where(seen.any(1), evidence, 0.0)
+    evidence = belief.log_evidence + known.sum(1).to(area) * area[:, None]
+    evidence = torch.where(known.any(1), evidence, 0.0)
     covs = rolled(rolled(covs, body.lean).mT, body.lean)
     weight = belief.weight.clamp_min(1e-30).log()
     return FramePose(

@@ -50,6 +50,9 @@ class TrackerModel(NamedTuple):
         fps: frame rate, or None. smoothing: None, the number of later frames that an estimate may
             use, or "full".
         hand: kind of the measured hands, "hand" or "wrist"; None is the prior's.
+        middle: whether the middle of the shoulders is measured in place of the neck, and whether that is all
+            that is measured of them.
+        calibrated: whether covariances are recalibrated as the prior says.
     """
 
     owner: nn.Module
@@ -58,6 +61,8 @@ class TrackerModel(NamedTuple):
     fps: float | None
     smoothing: int | str | None = None
     hand: str | None = None
+    middle: tuple[bool, bool] = (False, False)
+    calibrated: bool = True
 
     @property
     def rate(self) -> float:

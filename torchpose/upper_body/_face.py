@@ -1,4 +1,4 @@
-"""Tell from nose, eyes and ears which way a head faces."""
+"""Tell from nose, eyes and ears which way a head faces, and where it is."""
 
 from __future__ import annotations
 
@@ -13,21 +13,23 @@ from torch import Tensor
 from torchpose.math._rotations import within_half_turn
 from torchpose.upper_body._root_grid import heavy_tail
 
-__all__ = ["FACE", "FacePoints", "face_evidence", "measure_face"]
+__all__ = ["FACE", "FacePoints", "face_evidence", "head_in_face", "measure_face"]
 
 FACE = ("nose", "eye_left", "eye_right", "ear_left", "ear_right")
 """Keypoints that tell where a head faces."""
 
-# Of each of `FACE`: metres to the left of the middle of the ears and before it, the direction in which
-# it looks out of the head (degrees to the left), and the cosine to the camera from which on it is seen.
+# Of each of `FACE`: metres to the left of the middle of the ears, before it and below it, the direction in
+# which it looks out of the head (degrees to the left), and the cosine to the camera from which on it is seen.
 _LEFT = (0.0, 0.032, -0.032, 0.075, -0.075)
 _FORWARD = (0.11, 0.085, 0.085, 0.0, 0.0)
+_BELOW = (0.02, -0.015, -0.015, 0.0, 0.0)
 _OUTWARD = (0.0, 20.0, -20.0, 90.0, -90.0)
 _HIDDEN = (-0.1, 0.0, 0.0, -0.3, -0.3)
 _SOFT = 0.15  # of that cosine
 _SEEN, _IMAGINED = 0.9, 0.1  # probabilities that a detector gives what is visible, what is hidden
 _SURE = 0.4  # confidence from which on a keypoint counts as given
 _NOISE = 0.02  # metres: faces and detectors differ
+_HEAD_ABOVE = 0.03  # metres from the middle of the ears to Kinect's head, 0.1 below the crown
 _NECK_STD = math.radians(25.0)  # between head and shoulders
 _ANYWHERE = 0.1  # share of the heads that are turned by any angle
 
@@ -88,27 +90,72 @@ def face_evidence(
         face: rays. std: of a pixel over the focal length. depth: of the shoulders, metres.
         turn: of the shoulders, at even steps round the circle.
     """
-    at_angle = _places(face, std, depth, turn) + _visibility(face, turn)[:, None]
-    off = within_half_turn(turn[:, None] - turn)
-    near = torch.softmax(-0.5 * (off / _NECK_STD).square(), 1)
-    share = (1 - _ANYWHERE) * near + _ANYWHERE / len(turn)
+    places = _horizontal(face, std, depth.expand(len(face.places), -1), turn)
+    at_angle = heavy_tail(places.squared) + _visibility(face, turn)[:, None]
     most = at_angle.amax(-1, keepdim=True)
-    said = ((at_angle - most).exp() @ share.mT).log() + most
+    said = ((at_angle - most).exp() @ _turned_necks(turn, turn).mT).log() + most
     return said - torch.logsumexp(said, -1, keepdim=True) + math.log(len(turn))
 
 
-def _places(face: FacePoints, std: Tensor, depth: Tensor, turn: Tensor) -> Float[Tensor, "B Z P"]:
-    """Return the log-likelihood of where the points of a face are to each other."""
-    left, forward = (turn.new_tensor(x) for x in (_LEFT, _FORWARD))
-    expected = left * turn.cos()[:, None] - forward * turn.sin()[:, None]
-    seen = face.places[..., None, None, :, 0] * depth[:, None, None]
+def head_in_face(
+    face: FacePoints,
+    std: Float[Tensor, " B"],
+    depth: Float[Tensor, " B"],
+    turn: Float[Tensor, " B"],
+    angles: Float[Tensor, " P"],
+) -> tuple[Float[Tensor, "B 3"], Bool[Tensor, " B"]]:
+    """Return where Kinect's head is above the middle of the ears, camera axes, and whether a face tells.
+
+    It is the mean over the angles h of the head, weighed by all points (`face_evidence`).
+
+    Args:
+        face: rays. std: of a pixel over the focal length. depth, turn: of the shoulders.
+        angles: of heads that are tried, at even steps round the circle.
+    """
+    places = _horizontal(face, std, depth[:, None], angles)
+    said = heavy_tail(places.squared)[:, 0] + _visibility(face, angles)
+    weight = torch.softmax(said + _turned_necks(turn, angles).log(), -1)
+    across = (weight * places.middle[:, 0]).sum(-1)
+    sure = face.confidence
+    below = face.places[..., 1] * depth[:, None] - depth.new_tensor(_BELOW)
+    down = (sure * below).sum(-1) / sure.sum(-1).clamp_min(1e-12)
+    return torch.stack([across, down - _HEAD_ABOVE, depth], -1), sure.sum(-1) > _SURE
+
+
+class _Horizontal(NamedTuple):
+    """Points of a face along the image, for heads at angles, [B, Z, P] each.
+
+    Attributes:
+        middle: of the ears, metres. squared: distance of all points from where they would be.
+    """
+
+    middle: Tensor
+    squared: Tensor
+
+
+def _turned_necks(
+    shoulders: Float[Tensor, " S"], heads: Float[Tensor, " P"]
+) -> Float[Tensor, "S P"]:
+    """Return how likely heads are turned so, by the turn of the shoulders."""
+    off = within_half_turn(shoulders[:, None] - heads)
+    near = torch.softmax(-0.5 * (off / _NECK_STD).square(), 1)
+    return (1 - _ANYWHERE) * near + _ANYWHERE / len(heads)
+
+
+def _horizontal(
+    face: FacePoints, std: Tensor, depth: Float[Tensor, "B Z"], angles: Float[Tensor, " P"]
+) -> _Horizontal:
+    """Return where the points of a face are to each other."""
+    left, forward = (angles.new_tensor(x) for x in (_LEFT, _FORWARD))
+    expected = left * angles.cos()[:, None] - forward * angles.sin()[:, None]
+    seen = face.places[..., None, None, :, 0] * depth[..., None, None]
     off = seen - expected
     noise = _NOISE**2 + (std[:, None] * depth).square()[..., None, None]
     precision = face.confidence[:, None, None] / noise
     total = precision.sum(-1)
     mean = (precision * off).sum(-1) / total.clamp_min(1e-12)
     squared = (precision * (off - mean[..., None]).square()).sum(-1)
-    return heavy_tail(squared)
+    return _Horizontal(mean, squared)
 
 
 def _visibility(face: FacePoints, turn: Tensor) -> Float[Tensor, "B P"]:

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.module_state import derived
 from torchpose.camera._projection import (
     arm_in_body_frame,
     join_arms,
@@ -25,16 +26,18 @@ from torchpose.math._rotations import RotationOrder, euler_to_matrix, matrix_to_
 from torchpose.priors._arm_state import STATE_DIM
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import onto_torso
-from torchpose.upper_body._estimator import Estimates, ReadOut, require_cov
+from torchpose.upper_body._estimator import Estimates, MotionRatios, ReadOut, require_cov
 
 __all__ = [
     "MotionStage",
     "MotionState",
     "calibration_mode",
     "in_camera_axes",
+    "kept_stage",
     "on_their_rays",
     "read_out",
     "recalibrated",
+    "stage_lag",
 ]
 
 _LIMB_ENDS = tuple(
@@ -227,6 +230,28 @@ class MotionStage(nn.Module):
 
     def _filters(self) -> tuple[ConstantVelocityFilter, ...]:
         return self.joints, self.pixels, self.placement
+
+
+def kept_stage(owner: nn.Module, ratios: MotionRatios, fps: float, like: Tensor) -> MotionStage:
+    """Return the stage of these ratios; made once for each owner.
+
+    Args:
+        owner: with which it is kept. fps: frames per second. like: tells the device.
+    """
+    return derived(
+        owner, ("stage", *ratios), (like,), lambda: MotionStage(*ratios, fps).to(like.device)
+    )
+
+
+def stage_lag(smoothing: int | str | None, ahead: int) -> int | None:
+    """Return the number of later frames that a stage may use, None for all.
+
+    Args:
+        smoothing: as in `TrackerModel`. ahead: later frames that the estimates use already.
+    """
+    if smoothing is None:
+        return 0
+    return None if smoothing == "full" else int(smoothing) - ahead
 
 
 def _numbers(reading: ReadOut) -> tuple[Tensor, Tensor, Tensor]:

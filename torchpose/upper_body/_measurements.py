@@ -45,6 +45,18 @@ _LEFT, _HEAD, _NECK, _RIGHT = (
 )
 
 
+class MiddlePoint(NamedTuple):
+    """Measured middle of the shoulders, which some detectors call the neck.
+
+    Attributes:
+        uv: [B, T, 2], zero where missing. mask: [B, T]. cov: R, [2, 2] or [B, T, 2, 2].
+    """
+
+    uv: Tensor
+    mask: Tensor
+    cov: Tensor
+
+
 class MeasuredJoints(NamedTuple):
     """Measurements of the eight joints of `UPPER_BODY`.
 
@@ -52,12 +64,16 @@ class MeasuredJoints(NamedTuple):
         uv: [B, T, 8, 2], zero where missing. mask: [B, T, 8], True where measured.
         cov: R of each joint, [8, 2, 2], or [B, T, 8, 2, 2] if it changes.
         face: pixels of nose, eyes and ears, None if none is among the keypoints.
+        middle: what the neck was put by (`place_measured_neck`); None where it was measured itself.
+        confidence: in the keypoints, [B, T, 8], 1 where missing; None where a detector gives none.
     """
 
     uv: Tensor
     mask: Tensor
     cov: Tensor
     face: FacePoints | None = None
+    middle: MiddlePoint | None = None
+    confidence: Tensor | None = None
 
 
 class Picked(NamedTuple):
@@ -80,6 +96,16 @@ class Picked(NamedTuple):
     hand: str | None = None
     face: tuple[int, ...] = (-1,) * len(FACE)
     of_hands: tuple[str, ...] = ()
+
+    @property
+    def wrists_for_hands(self) -> bool:
+        """Return whether wrists are measured where the prior has hands."""
+        return self.hand == "wrist" and bool(self.of_hands)
+
+    @property
+    def middle_alone(self) -> bool:
+        """Return whether the middle of the shoulders is all that is measured of them."""
+        return self.middle and min(self.indices[_LEFT], self.indices[_RIGHT]) < 0
 
     @property
     def there(self) -> list[bool]:
@@ -176,6 +202,9 @@ def place_measured_neck(
         neck: f and s.
     """
     uv, mask, cov = (x.clone() for x in measured[:3])
+    point = MiddlePoint(
+        *(x.clone() for x in (uv[..., _NECK, :], mask[..., _NECK], cov[..., _NECK, :, :]))
+    )
     both = mask[..., _LEFT] & mask[..., _RIGHT] & ~mask[..., _NECK]
     middle = torch.where(
         both[..., None], (uv[..., _LEFT, :] + uv[..., _RIGHT, :]) / 2, uv[..., _NECK, :]
@@ -200,7 +229,7 @@ def place_measured_neck(
         cov = cov.expand(*uv.shape[:-2], *cov.shape[-3:]).clone()
         with_head = torch.where(head[..., None, None], with_head, alone)
     cov[..., _NECK, :, :] = with_head
-    return measured._replace(uv=uv, mask=mask, cov=cov)
+    return measured._replace(uv=uv, mask=mask, cov=cov, middle=point)
 
 
 def known_covariances(
@@ -257,6 +286,7 @@ def measure_joints(
         weight = torch.where(measured, weight, torch.ones_like(weight))
         if bool((weight < 1).any()):
             cov = cov / weight[..., None, None]
+            return MeasuredJoints(uv, measured, cov, confidence=weight)
     return MeasuredJoints(uv, measured, cov)
 
 

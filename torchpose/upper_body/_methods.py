@@ -18,6 +18,7 @@ from torchpose.priors._upper_body import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._articulated import ArticulatedFilter
 from torchpose.upper_body._estimator import Estimator
+from torchpose.upper_body._multiple_models import MultipleModelFilter
 from torchpose.upper_body._single_poses import PoseFilter, ProcessNoise
 from torchpose.upper_body._windows import WindowMixture, suitable_window
 
@@ -47,6 +48,8 @@ SINGLE_POSES = "mkf-fixed"
 BONES = "articulated"
 """Arms of bones that keep their lengths."""
 
+_BOTH = "multiple-model"
+
 Method = type[Estimator] | PoseFilter
 """What makes an estimator from a `TrackerModel` and, by name, the options in its signature."""
 
@@ -67,6 +70,7 @@ def _particles(proposal: str, noise: ProcessNoise) -> PoseFilter:
 METHODS: dict[str, Method] = {
     WINDOWS: WindowMixture,
     BONES: ArticulatedFilter,
+    _BOTH: MultipleModelFilter,
     SINGLE_POSES: _kalman_bank(FixedTrackFilter, 100.0, ("transition", "gamma", "uniform_weight")),
     "mkf-sampled": _kalman_bank(SampledTrackFilter, 10.0, ("transition", "gamma")),
     "mkf-split": _kalman_bank(SplitTrackFilter, 10.0, ("transition", "gamma")),
@@ -167,16 +171,19 @@ class Chosen(NamedTuple):
     notes: tuple[str, ...]
     free: bool = False
 
-    def with_joints(self, there: Sequence[bool]) -> str:
-        """Return the method for these joints: one with bones where shoulders and elbows are measured.
+    def with_joints(self, there: Sequence[bool], wrists: bool) -> str:
+        """Return the method for these joints: one with bones where both shoulders and an elbow are measured.
+
+        So it is where wrists stand for the prior's hands: other methods do not tell the two apart.
 
         Args:
-            there: whether each of `UPPER_BODY` is measured.
+            there: whether each of `UPPER_BODY` is measured. wrists: whether they stand for the prior's
+                hands.
         """
         seen = {name for name, known in zip(UPPER_BODY, there, strict=True) if known}
         whole = {"shoulder_left", "shoulder_right"} <= seen
         bent = not seen.isdisjoint({"elbow_left", "elbow_right"})
-        return BONES if self.free and whole and bent else self.method
+        return BONES if self.free and (wrists or (whole and bent)) else self.method
 
 
 def choose_method(
@@ -203,9 +210,9 @@ def choose_method(
     if smoothing is not None and not _find(chosen.method).smooths:
         able = [repr(name) for name, other in METHODS.items() if other.smooths]
         raise InputError(f"smoothing needs method {' or '.join(able)}, got {chosen.method!r}")
-    if method == WINDOWS and suitable_window(prior, smoothing, fps or 30.0) is None:
+    if method in (WINDOWS, _BOTH) and suitable_window(prior, smoothing, fps or 30.0) is None:
         raise InputError(
-            f"method {WINDOWS!r} cannot be used: {_missing(prior, smoothing, fps)}; use method "
+            f"method {method!r} cannot be used: {_missing(prior, smoothing, fps)}; use method "
             f"{SINGLE_POSES!r}"
         )
     check_options(chosen.method, options)

@@ -18,6 +18,7 @@ from torchpose.upper_body._screen_model import (
     APART,
     BRISK,
     CERTAIN,
+    OUTLIERS,
     SLACK,
     TAKEOVER,
     ScreenModel,
@@ -34,6 +35,9 @@ __all__ = [
 _LEFT, _RIGHT = UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")
 _TRACKS = ("position", "velocity", "cov", "evidence")
 _DOUBTFUL = 3.0  # of log phi: below that, a place does not go with the other joints
+# Of OpenPose's wrists and elbows, beside the truth: the confidence at which every second is an outlier,
+# and the step of confidence in which odds change by e.
+_EVEN, _STEEP = 0.25, 0.06
 _MOST = 30.0  # log-odds beyond which a joint tells the others no more
 
 
@@ -136,7 +140,7 @@ def _run(
     known = measured.mask & ((uv >= model.low) & (uv <= model.high)).all(-1)
     noise = _largest_variance(measured.cov.to(model.low)).expand(known.shape)
     ways = model.exchanges
-    frames = (uv[:, :, ways], known[:, :, ways], noise[:, :, ways])
+    frames = (uv[:, :, ways], known[:, :, ways], noise[:, :, ways], _doubt(measured)[:, :, ways])
     probabilities, chosen = [], []
     for t in range(uv.shape[1]):
         state, probability, way = _step(model, state, *(x[:, t] for x in frames))
@@ -151,6 +155,7 @@ def _step(
     uv: Float[Tensor, "B X 8 2"],
     known: Bool[Tensor, "B X 8"],
     noise: Float[Tensor, "B X 8"],
+    doubt: Float[Tensor, "B X 8"],
 ) -> tuple[ScreenState, Float[Tensor, "B 8"], Int[Tensor, " B"]]:
     """Return the next state, the inlier probabilities of a frame, and the way of exchange."""
     scale = model.scale * (state.scales.exp() @ model.log_scales).exp()
@@ -158,16 +163,18 @@ def _step(
     state = _predict(model, state, square)
     noise, jump = noise + SLACK**2 * square, square * model.jump
     if len(model.exchanges) > 1:
-        odds = _log_odds(model, state.position[:, :1], state.cov[:, :1], uv, known, noise, jump)
+        track = state.position[:, :1], state.cov[:, :1]
+        odds = _log_odds(model, *track, uv, known, noise, doubt, jump)
         hands = state.position[:, 0, _LEFT] - state.position[:, 0, _RIGHT]
         state, way = _exchange(model, state, odds, hands.norm(dim=-1) > APART * scale)
     else:
         way = torch.zeros(len(uv), dtype=torch.long, device=uv.device)
     rows = torch.arange(len(way), device=way.device)
-    z, known, noise = uv[rows, way], known[rows, way], noise[rows, way]
+    z, known, noise, doubt = (x[rows, way] for x in (uv, known, noise, doubt))
     both = _log_odds(
-        model, state.position, state.cov, z[:, None], known[:, None], noise[:, None], jump
-    )
+        model, state.position, state.cov, z[:, None], known[:, None], noise[:, None],
+        doubt[:, None], jump,
+    )  # fmt: skip
     change = both.brisk * jump
     changed = torch.stack([change, change / model.dt, change / model.dt**2], -1)
     body, scales = _beside_others(model, both.total[:, 0], z, known, noise, state.scales)
@@ -200,13 +207,15 @@ def _log_odds(
     uv: Float[Tensor, "B #N 8 2"],
     known: Bool[Tensor, "B #N 8"],
     noise: Float[Tensor, "B #N 8"],
+    doubt: Float[Tensor, "B #N 8"],
     jump: Float[Tensor, "B 1 8"],
 ) -> _Odds:
     """Return log ((1 - o) f(z) / (o u)), 0 where nothing is measured; see `advance_screen`."""
+    start = model.start - doubt
     half, calm = (uv - position).square().sum(-1) / 2, cov[..., 0] + noise
     brisk = calm + jump
-    usual = model.start + math.log1p(-BRISK) - calm.log() - half / calm
-    other = model.start + math.log(BRISK) - brisk.log() - half / brisk
+    usual = start + math.log1p(-BRISK) - calm.log() - half / calm
+    other = start + math.log(BRISK) - brisk.log() - half / brisk
     total = torch.logaddexp(usual, other)
     return _Odds(total * known, (other - total).exp() * (known & (total > 0)))
 
@@ -352,6 +361,17 @@ def _started(
 def _in_order(value: Tensor, order: Int[Tensor, "B #N 8"], dim: int) -> Tensor:
     """Return tracks [B, 2, 8, ...] in another order: of track and candidate (1), or of the joints (2)."""
     return value.gather(dim, order.reshape(*order.shape, *[1] * (value.ndim - 3)).expand_as(value))
+
+
+def _doubt(measured: MeasuredJoints) -> Float[Tensor, "B T 8"]:
+    """Return by how much the log-odds of an inlier are lower than usual for want of confidence c.
+
+    Those of a keypoint that a detector is unsure of are (c - 0.25) / 0.06.
+    """
+    if measured.confidence is None:
+        return torch.zeros_like(measured.uv[..., 0])
+    usual = math.log((1 - OUTLIERS) / OUTLIERS)
+    return (usual - (measured.confidence - _EVEN) / _STEEP).clamp_min(0.0)
 
 
 def _largest_variance(cov: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch"]:

@@ -28,7 +28,7 @@ from torchpose.upper_body._estimator import (
     check_model,
     generators_of_arms,
 )
-from torchpose.upper_body._fusion import MotionStage
+from torchpose.upper_body._fusion import kept_stage, stage_lag
 from torchpose.upper_body._live import LivePose, StreamState, live_pose, unseen_frames
 from torchpose.upper_body._measurements import (
     MeasuredJoints,
@@ -68,6 +68,8 @@ class UpperBodyTracker(WideModule):
       beside the views that the prior was fitted to.
     - ``articulated``: arms of bones that keep their lengths, under a prior over directions that knows
       no camera and no size; for all joints measured, of anybody.
+    - ``multiple-model``: both of these, averaged by what they predicted of elbows and hands; for strangers of
+      whom few joints are measured.
     - ``mkf-fixed``, ``mkf-sampled``, ``mkf-split``: banks of Kalman filters over single poses (BL
       section 3.4), see `MixtureKalmanFilter`.
     - ``pf-mixture``, ``pf-walk``, ``pf-walk-unscaled``: particles over single poses (BL section 3.3),
@@ -82,9 +84,10 @@ class UpperBodyTracker(WideModule):
         prior: from `load_prior` or `fit_upper_body_prior`.
         camera: of the keypoints. One other than the prior's is mapped to it.
         method: one of `METHODS`. By default "articulated" where both shoulders and an elbow are
-            measured, or an option of bones is given, and neither `steady` nor an option of another method
-            is; else "window-mixture" where the prior has windows that suit, else "mkf-fixed". The
-            attribute `method` is the one for few joints, `PoseTrack.method` the one that ran.
+            measured, wrists stand for the prior's hands, or an option of bones is given, and neither
+            `steady` nor an option of another method is; else "window-mixture" where the prior has
+            windows that suit, else "mkf-fixed". The attribute `method` is the one for few joints,
+            `PoseTrack.method` the one that ran.
         measurement_std: standard deviation of a keypoint in the camera's pixels, one number or one
             for each of hand, elbow, shoulder, head, neck; by default what the prior brings, else 3.
         fps: frame rate of the keypoints; by default that of the prior. Process noise is scaled.
@@ -196,12 +199,17 @@ class UpperBodyTracker(WideModule):
     @property
     def estimator(self) -> Estimator:
         """Return the estimator of the method, on prior, noise and options as they are now."""
-        return self._estimator_of(self.method, None)
+        return self._estimator_of(self.method)
 
-    def _estimator_of(self, method: str, hand: str | None) -> Estimator:
-        """Return the estimator of a method for measured hands of a kind; None is that of the prior."""
+    def _estimator_of(self, method: str, picked: Picked | None = None) -> Estimator:
+        """Return the estimator of a method for these keypoints; without any for the prior's joints."""
         make: Callable[..., Estimator] = METHODS[method]
-        model = TrackerModel(self, self.prior, self.measurement_cov, self.fps, self.smoothing, hand)
+        model = TrackerModel(
+            self, self.prior, self.measurement_cov, self.fps, self.smoothing,
+            calibrated=self.calibrated,
+        )  # fmt: skip
+        if picked is not None:
+            model = model._replace(hand=picked.hand, middle=(picked.middle, picked.middle_alone))
         return make(model, **self.given_options)
 
     def forward(
@@ -244,9 +252,10 @@ class UpperBodyTracker(WideModule):
             given = self._measure(keypoints, confidence, mask, covariance, picked)
             check_gaps(given.mask, lengths, self.max_gap, self.fps or 30.0)
             there = given.mask.flatten(0, 1).any(0).tolist()
-            joints, method = arm_joints(there), self._chosen.with_joints(there)
+            joints = arm_joints(there)
+            method = self._chosen.with_joints(there, picked.wrists_for_hands)
             _, found = screen_joints(self._screen(picked), None, given)
-            estimator = self._estimator_of(method, picked.hand)
+            estimator = self._estimator_of(method, picked)
             arms = generators_of_arms(generator)
             estimates = estimator.forward(found.measured, joints, arms, lengths, progress)
             notes = self._notes_of(method) + picked.notes
@@ -288,9 +297,9 @@ class UpperBodyTracker(WideModule):
         n_keypoints = len(UPPER_BODY) if names is None else len(names)
         picked = self._pick(n_keypoints, names)
         joints = arm_joints(picked.there)
-        method = self._chosen.with_joints(picked.there)
+        method = self._chosen.with_joints(picked.there, picked.wrists_for_hands)
         with one_run(self.measurement_cov.device):
-            estimator = self._estimator_of(method, picked.hand)
+            estimator = self._estimator_of(method, picked)
             state = estimator.init(batch_size, joints, generators_of_arms(generator))
         unseen = torch.zeros(batch_size, dtype=torch.long, device=self.measurement_cov.device)
         return StreamState(state, None, unseen, n_keypoints, picked)
@@ -355,8 +364,8 @@ class UpperBodyTracker(WideModule):
             keypoints = keypoints.to(self.measurement_cov)
             given = self._measure(keypoints, confidence, mask, covariance, state.picked)
             screen, found = screen_joints(self._screen(state.picked), state.screen, given)
-            method = self._chosen.with_joints(state.picked.there)
-            estimator = self._estimator_of(method, state.picked.hand)
+            method = self._chosen.with_joints(state.picked.there, state.picked.wrists_for_hands)
+            estimator = self._estimator_of(method, state.picked)
             seen = found.measured.mask
             own, estimates = estimator.advance(state.estimator, found.measured)
             reader = self._reader(method, estimator)
@@ -407,15 +416,8 @@ class UpperBodyTracker(WideModule):
         """Return what makes poses of the estimates, as the settings ask for."""
         stage, ratios, cov = None, estimator.steadied_by, self.measurement_cov
         if self.steady and ratios is not None:
-            stage = derived(
-                self,
-                ("stage", *ratios),
-                (cov,),
-                lambda: MotionStage(*ratios, self.fps or 30.0).to(cov.device),
-            )
-        lag: int | None = 0
-        if self.smoothing is not None:
-            lag = None if self.smoothing == "full" else int(self.smoothing) - estimator.ahead
+            stage = kept_stage(self, ratios, self.fps or 30.0, cov)
+        lag = stage_lag(self.smoothing, estimator.ahead)
         return PoseReader(
             self.prior, self.camera, method, estimator, stage, lag, self.frame,
             self.static_camera, self.calibrated, self.fps,

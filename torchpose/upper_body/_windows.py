@@ -50,6 +50,7 @@ from torchpose.upper_body._measurements import (
 
 __all__ = ["SeenInView", "WindowMixture", "WindowState", "see_in_view", "suitable_window"]
 
+_N_LIMB = 2  # hand and elbow are the first of an arm
 _BIMODAL = 2  # hand and elbow, which may be before or behind the body
 _HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
 _HANDS = [UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")]
@@ -168,12 +169,16 @@ class WindowMixture(Estimator):
         likelihood_power: exponent of the likelihood in the weights; by default that of the window.
         dtype: of means and measurements; covariances are always float64.
 
+    Attributes:
+        of_limbs: whether `FilterOutput.log_evidence` is that of elbow and hand alone, given the torso.
+
     Raises:
         InputError: no window suits.
     """
 
     smooths = True
     reads_rays = True
+    of_limbs = False
 
     def __init__(
         self,
@@ -261,9 +266,20 @@ class WindowMixture(Estimator):
             )
             model = self._filter(side, joints[side])
             out = model(*both, noise, lengths, return_cov=True, progress=progress)
-            context = self._filter(side, ())(*hands, None, lengths)
-            arms[side] = _pose_of_window(in_double(out), context, seen, arm, self.window.layout)
+            if self.of_limbs:
+                context, told = self._torso(seen, side, joints[side], lengths), arm[:_N_LIMB]
+            else:
+                context, told = self._filter(side, ())(*hands, None, lengths), arm
+            arms[side] = _pose_of_window(in_double(out), context, seen, told, self.window.layout)
         return Estimates(arms["left"], arms["right"], seen.view)
+
+    def _torso(
+        self, seen: SeenInView, side: str, joints: tuple[str, ...], lengths: Tensor | None
+    ) -> FilterOutput:
+        """Return the estimates of an arm from its torso and the hands of the window alone."""
+        torso = tuple(joint for joint in joints if joint not in ARM_JOINTS[:_N_LIMB])
+        both, noise, _ = _window_inputs(seen, self.window, side, torso, self.model.measurement_cov)
+        return self._filter(side, torso)(*both, noise, lengths)
 
     def _filter(self, side: str, joints: tuple[str, ...]) -> MixtureKalmanFilter:
         """Return the filter of an arm; the same one as long as it holds."""

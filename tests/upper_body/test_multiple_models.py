@@ -1,0 +1,186 @@
+"""Windows and arms of bones averaged by their evidence."""
+
+import copy
+
+import pytest
+import torch
+
+from tests.upper_body.test_articulated import CAMERA, ROW, body, pixels
+from torchpose import PinholeCamera
+from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
+from torchpose.errors import InputError
+from torchpose.math import euler_to_matrix
+from torchpose.priors import UpperBodyPrior
+from torchpose.skeleton import UPPER_BODY
+from torchpose.upper_body import UpperBodyTracker
+from torchpose.upper_body._fusion import ReadOut, in_camera_axes
+from torchpose.upper_body._multiple_models import _averaged
+
+BOTH = ("window-mixture", "articulated")
+FEW = ("head", "neck", "hand_left", "hand_right")
+
+
+@pytest.fixture(scope="module")
+def prior(small_windows_file):
+    return UpperBodyPrior.load(small_windows_file)
+
+
+@pytest.fixture(scope="module")
+def of_performer():
+    return noisy_keypoints(performer(40, seed=0).joints, std_px=3.0)[None]
+
+
+def of_stranger(n_frames=40):
+    return pixels(body(n_frames), 2.0)[None][:, :, [ROW[name] for name in FEW]]
+
+
+def tracked(prior, keypoints, method, names=FEW, camera=CAMERA, **options):
+    tracker = UpperBodyTracker(prior, camera, method, fps=30.0, **options)
+    return tracker(keypoints, names=list(names))
+
+
+def shares(prior, keypoints, names=FEW, camera=CAMERA, **options):
+    """Return the weight of windows in each frame [T], and how far joints are from that average."""
+    args = prior, keypoints
+    mixed = tracked(*args, "multiple-model", names, camera, **options).joints3d[0].flatten(1)
+    windows, bones = (
+        tracked(*args, m, names, camera, **options).joints3d[0].flatten(1) for m in BOTH
+    )
+    apart = windows - bones
+    share = ((mixed - bones) * apart).sum(1) / apart.square().sum(1)
+    return share, (bones + share[:, None] * apart - mixed).abs().max()
+
+
+@pytest.mark.parametrize("smoothing", [None, 20, "full"])
+def test_poses_are_the_average_of_both_methods(prior, smoothing):
+    share, off = shares(prior, of_stranger(), smoothing=smoothing)
+    assert float(off) < 1e-9
+    assert bool(((share > 0) & (share < 1)).all())
+
+
+def test_the_body_that_windows_do_not_know_has_less_of_them(prior, of_performer):
+    stranger, _ = shares(prior, of_stranger())
+    known, _ = shares(prior, of_performer, KEYPOINT_NAMES, demo_camera())
+    assert float(known[-1]) > float(stranger[-1]) + 0.1
+
+
+def test_the_odds_begin_alike_and_rest_on_the_frames_before(prior):
+    keypoints = of_stranger()
+    changed = keypoints.clone()
+    changed[:, 25:, 2:] += 40.0
+    share, _ = shares(prior, keypoints)
+    other, _ = shares(prior, changed, outliers=False)
+    same, _ = shares(prior, keypoints, outliers=False)
+    torch.testing.assert_close(other[:25], same[:25])
+    assert not torch.allclose(other[25:], same[25:])
+    assert len(share) == 40
+
+
+@pytest.mark.parametrize("size", [1, 7])
+def test_a_stream_gives_the_numbers_of_the_whole_recording(prior, size):
+    keypoints = of_stranger(21)
+    tracker = UpperBodyTracker(prior, CAMERA, "multiple-model", fps=30.0)
+    whole = tracker(keypoints, names=list(FEW))
+    state = tracker.init(1, names=list(FEW))
+    parts = []
+    for part in keypoints.split(size, 1):
+        state, track = tracker.advance(state, part)
+        parts.append(track)
+    for name in ("joints3d", "covariance3d", "joints2d", "log_evidence"):
+        together = torch.cat([getattr(part, name) for part in parts], 1)
+        torch.testing.assert_close(together, getattr(whole, name), atol=1e-8, rtol=1e-6)
+
+
+def test_sequences_of_a_batch_do_not_know_of_each_other(prior):
+    keypoints = torch.cat([of_stranger(30), of_stranger(30) + 15.0])
+    keypoints[0, 20:] = 0.0
+    lengths = torch.tensor([20, 30])
+    tracker = UpperBodyTracker(prior, CAMERA, "multiple-model", fps=30.0, smoothing="full")
+    both = tracker(keypoints, names=list(FEW), lengths=lengths)
+    alone = tracker(keypoints[:1, :20], names=list(FEW))
+    torch.testing.assert_close(both.joints3d[:1, :20], alone.joints3d, atol=1e-8, rtol=1e-6)
+
+
+def test_frames_without_arms_leave_the_odds(prior):
+    keypoints = of_stranger(30)
+    keypoints[:, 10:, 2:] = torch.nan
+    share, off = shares(prior, keypoints)
+    assert float(off) < 1e-9
+    torch.testing.assert_close(share[10:], share[9].expand(20), atol=1e-8, rtol=1e-6)
+
+
+def reading(seed):
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    covs, uv_covs = (x @ x.mT for x in (draw(1, 1, 8, 3, 3), draw(1, 1, 8, 2, 2)))
+    angles, place = 0.3 * draw(1, 1, 3), draw(1, 1, 3)
+    return ReadOut(draw(1, 1, 8, 3), covs, angles, place, draw(1, 1, 8, 2), uv_covs)
+
+
+@pytest.mark.parametrize(("share", "which"), [(1.0, 0), (0.0, 1)])
+def test_all_the_weight_is_one_of_the_two(share, which):
+    two = reading(0), reading(1)
+    mixed = _averaged(torch.tensor([[share]], dtype=torch.float64), *two, "zxy")
+    for found, wanted in zip(mixed, two[which], strict=True):
+        torch.testing.assert_close(found, wanted)
+
+
+def test_covariances_are_those_of_a_mixture():
+    two, share = (reading(0), reading(1)), 0.3
+    mixed = _averaged(torch.tensor([[share]], dtype=torch.float64), *two, "zxy")
+    seen = [in_camera_axes(x, "zxy") for x in (*two, mixed)]
+    generator = torch.Generator().manual_seed(2)
+    n = 400_000
+    first = torch.rand(n, generator=generator) < share
+    draws = []
+    for part in seen[:2]:
+        factor = torch.linalg.cholesky(part.covs[0, 0, ROW["head"]])
+        noise = torch.randn(n, 3, generator=generator, dtype=torch.float64)
+        draws.append(part.joints[0, 0, ROW["head"]] + noise @ factor.mT)
+    drawn = torch.where(first[:, None], *draws)
+    head = seen[2].joints[0, 0, ROW["head"]], seen[2].covs[0, 0, ROW["head"]]
+    torch.testing.assert_close(head[0], drawn.mean(0), atol=0.02, rtol=0)
+    torch.testing.assert_close(head[1], drawn.mT.cov(), atol=0.05, rtol=0.02)
+
+
+def test_the_mean_rotation_is_half_way():
+    zero, turned = (
+        reading(0)._replace(angles=torch.tensor([[[0.0, 0.0, x]]]).double()) for x in (0.0, 0.8)
+    )
+    mixed = _averaged(torch.tensor([[0.5]], dtype=torch.float64), zero, turned, "zxy")
+    wanted = euler_to_matrix(torch.tensor([0.0, 0.0, 0.4], dtype=torch.float64), "zxy")
+    torch.testing.assert_close(euler_to_matrix(mixed.angles[0, 0], "zxy"), wanted)
+
+
+def test_covariances_of_windows_are_recalibrated_before(prior):
+    with_noise = copy.deepcopy(prior)
+    with_noise.set_noise("calibration_scale_causal", torch.full((8,), 4.0))
+    with_noise.set_noise("calibration_floor_causal", torch.zeros(8))
+    found = [
+        tracked(with_noise, of_stranger(), "multiple-model", calibrated=c).covariance3d
+        for c in (True, False)
+    ]
+    variances = [x.diagonal(dim1=-2, dim2=-1) for x in found]
+    assert bool((variances[0] > variances[1]).all())
+
+
+def test_a_prior_without_windows_is_refused(prior):
+    bare = UpperBodyPrior(prior.left, prior.right, prior.info, prior.noise)
+    with pytest.raises(InputError, match=r"multiple-model.*no mixtures over windows"):
+        UpperBodyTracker(bare, PinholeCamera(525.0, 525.0, 319.5, 239.5), "multiple-model")
+
+
+def test_all_joints_may_be_measured(prior):
+    keypoints = pixels(body(10), 2.0)[None]
+    track = tracked(prior, keypoints, "multiple-model", UPPER_BODY)
+    assert bool(track.joints3d.isfinite().all()) and bool(track.bone_lengths.isfinite().all())
+
+
+def test_gradients_are_finite(prior):
+    keypoints = of_stranger(4).requires_grad_()
+    track = tracked(prior, keypoints, "multiple-model")
+    (slope,) = torch.autograd.grad(track.joints3d.square().sum(), keypoints)
+    assert bool(slope.isfinite().all()) and bool((slope != 0).any())

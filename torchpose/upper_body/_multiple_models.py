@@ -1,0 +1,240 @@
+"""Weigh two models of the same body by what each has predicted, and mix what they estimate."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.filters._base import Generators
+from torchpose.math._rotations import (
+    RotationOrder,
+    euler_to_matrix,
+    matrix_to_euler,
+    matrix_to_quaternion_vector,
+    mean_rotation,
+    quaternion_vector_to_matrix,
+)
+from torchpose.priors._arms import ArmPrior
+from torchpose.upper_body._articulated import ArticulatedFilter, ArticulatedState
+from torchpose.upper_body._articulated_poses import ELBOWS, HANDS
+from torchpose.upper_body._estimator import (
+    ArmJoints,
+    Estimates,
+    Estimator,
+    ReadOut,
+    TrackerModel,
+)
+from torchpose.upper_body._fusion import (
+    MotionStage,
+    MotionState,
+    in_camera_axes,
+    kept_stage,
+    on_their_rays,
+    read_out,
+    recalibrated,
+    stage_lag,
+)
+from torchpose.upper_body._measurements import MeasuredJoints
+from torchpose.upper_body._windows import WindowMixture, WindowState
+
+__all__ = ["MultipleModelFilter", "MultipleModelState"]
+
+_LIMBS = [*ELBOWS, *HANDS]
+_MEMORY = 4.0  # seconds after which evidence counts for 1/e
+_SHARE = 0.5  # of the mean evidence of a frame that counts: frames are alike, so many are as few
+_FIRST = 0.5  # log-odds of windows before the first frame
+
+
+class MultipleModelState(NamedTuple):
+    """State of `MultipleModelFilter` between two frames.
+
+    Attributes:
+        windows, articulated: of both models. motion: of the stage that steadies windows.
+        said: sum of what frames said for windows, and of their weights, [B, 2].
+    """
+
+    windows: WindowState
+    articulated: ArticulatedState
+    motion: MotionState | None
+    said: Tensor
+
+
+class MultipleModelFilter(Estimator):
+    """Estimator that averages "window-mixture" and "articulated" by their evidence.
+
+    Windows know the persons and the motions of their prior well and others badly; arms of bones are the
+    other way round. Both say how likely elbow and hand of each arm are, given the torso. The log-odds l
+    of windows are these, averaged over the last seconds, since frames of one motion err alike (dynamic
+    model averaging, Raftery et al. 2010, with a tempered likelihood):
+
+        d_s = sum_arms log p_windows(z_s | ...) - log p_articulated(z_s | ...)
+        l_t = l_0 + c sum_s a^(t-s) d_s / sum_s a^(t-s),   a = e^(-1 / (4 s f)),   c = 1/2
+
+    Joints are averaged in camera axes with weights sigma(l_t) and 1 - sigma(l_t), and covariances
+    include how far the two are apart. So lengths of bones change where both have weight; `bone_lengths` are
+    those of "articulated".
+
+    Args:
+        model: of the tracker; its prior has a window that suits. arms: as in `ArticulatedFilter`.
+
+    Raises:
+        InputError: no window suits; as `ArticulatedFilter`.
+    """
+
+    calibration = "articulated"
+    smooths = True
+
+    def __init__(self, model: TrackerModel, arms: ArmPrior | str | Path | None = None) -> None:
+        self.model = model
+        self.windows = WindowMixture(model)
+        self.windows.of_limbs = True
+        self.articulated = ArticulatedFilter(model, arms)
+        self.forget = math.exp(-1 / (_MEMORY * model.rate))
+        self.matrix = model.prior.info.matrix.to(model.measurement_cov)
+        self.order: RotationOrder = model.prior.info.rotation_order  # type: ignore[assignment]
+
+    def init(
+        self, batch_size: int, joints: ArmJoints, generators: dict[str, Generators]
+    ) -> MultipleModelState:
+        """Return the state before the first frame; see `Estimator`."""
+        return MultipleModelState(
+            self.windows.init(batch_size, joints, generators),
+            self.articulated.init(batch_size, joints, generators),
+            None,
+            self.matrix.new_zeros(batch_size, 2),
+        )
+
+    def advance(
+        self, state: MultipleModelState, measured: MeasuredJoints
+    ) -> tuple[MultipleModelState, Estimates]:
+        """Return the next state and the estimates of T more frames; see `Estimator`."""
+        windows, seen = self.windows.advance(state.windows, measured)
+        articulated, bodies = self.articulated.advance(state.articulated, measured)
+        reading, motion = read_out(seen, self.matrix, self.order), state.motion
+        if self._stage is not None:
+            motion, reading = self._stage.advance(motion or self._stage.init(reading), reading)
+        sums = self._sums(state.said, _said(seen, bodies, measured))
+        mixed = self._mixed(sums, reading, seen, bodies, measured)
+        return MultipleModelState(windows, articulated, motion, sums[:, -1]), mixed
+
+    def forward(
+        self,
+        measured: MeasuredJoints,
+        joints: ArmJoints,
+        generators: dict[str, Generators],
+        lengths: Tensor | None = None,
+        progress: bool = False,
+    ) -> Estimates:
+        """Return the estimates of whole sequences; see `Estimator`.
+
+        With smoothing "full" the log-odds are those of the frames before and after.
+        """
+        seen = self.windows.forward(measured, joints, generators, lengths)
+        bodies = self.articulated.forward(measured, joints, generators, lengths, progress)
+        reading = read_out(seen, self.matrix, self.order)
+        if self._stage is not None:
+            lag = stage_lag(self.model.smoothing, self.windows.ahead)
+            reading = self._stage(reading, lengths, lag)
+        said = _said(seen, bodies, measured)
+        if lengths is not None:
+            frames = torch.arange(said.shape[1], device=said.device)
+            said = said * (frames < lengths.to(said.device)[:, None])[..., None]
+        none = said.new_zeros(len(said), 2)
+        sums = self._sums(none, said)
+        if self.model.smoothing == "full":
+            sums = sums + self._sums(none, said.flip(1)).flip(1) - said
+        return self._mixed(sums, reading, seen, bodies, measured)
+
+    @property
+    def _stage(self) -> MotionStage | None:
+        """Return what steadies windows, None if their prior does not say how brisk motions are."""
+        ratios, model = self.windows.steadied_by, self.model
+        if ratios is None:
+            return None
+        return kept_stage(model.owner, ratios, model.rate, model.measurement_cov)
+
+    def _sums(
+        self, before: Float[Tensor, "B 2"], said: Float[Tensor, "B T 2"]
+    ) -> Float[Tensor, "B T 2"]:
+        """Return the sums of what frames said and of their weights after each frame."""
+        sums = []
+        for now in said.unbind(1):
+            before = self.forget * before + now
+            sums.append(before)
+        return torch.stack(sums, 1)
+
+    def _mixed(
+        self,
+        sums: Float[Tensor, "B T 2"],
+        reading: ReadOut,
+        seen: Estimates,
+        bodies: Estimates,
+        measured: MeasuredJoints,
+    ) -> Estimates:
+        """Return the average of both models, with the evidence of the mixture.
+
+        Args:
+            sums: of what frames said and of their weights. reading: of windows, steadied.
+            seen, bodies: what the two estimated. measured: the joints.
+        """
+        if bodies.reading is None:
+            raise RuntimeError("an articulated filter reads its poses itself")
+        reading = on_their_rays(reading, self.matrix, self.order, measured.mask)
+        if self.model.calibrated:
+            noise, mode = self.model.prior.noise, str(self.windows.calibration)
+            reading = reading._replace(covs=recalibrated(reading.covs, noise, mode))
+        mean_said = sums[..., 0] / sums[..., 1].clamp_min(1e-12)
+        share = torch.sigmoid(_FIRST + _SHARE * mean_said)
+        mixed = _averaged(share, reading, bodies.reading, self.order)
+        logs = torch.stack([share.log(), torch.log1p(-share)], -1)
+        arms = []
+        for ours, theirs in ((seen.left, bodies.left), (seen.right, bodies.right)):
+            both = torch.stack([ours.log_evidence, theirs.log_evidence], -1)
+            arms.append(theirs._replace(log_evidence=torch.logsumexp(logs + both, -1)))
+        return Estimates(arms[0], arms[1], None, mixed, bodies.bones)
+
+
+def _said(seen: Estimates, bodies: Estimates, measured: MeasuredJoints) -> Float[Tensor, "B T 2"]:
+    """Return by how much windows gave both arms a higher log-density, and one where any was measured."""
+    ours, theirs = (x.left.log_evidence + x.right.log_evidence for x in (seen, bodies))
+    some = measured.mask[..., _LIMBS].any(-1)
+    apart = torch.where(some, (ours - theirs).nan_to_num(0.0), 0.0)
+    return torch.stack([apart, some.to(apart)], -1)
+
+
+def _averaged(
+    share: Float[Tensor, "B T"], ours: ReadOut, theirs: ReadOut, order: RotationOrder
+) -> ReadOut:
+    """Return two readings averaged in camera axes, with the moments of a mixture.
+
+    Args:
+        share: of the first. order: of their angles.
+    """
+    turns = [euler_to_matrix(reading.angles, order) for reading in (ours, theirs)]
+    vectors = matrix_to_quaternion_vector(torch.stack(turns, -3))
+    seen = [in_camera_axes(reading, order) for reading in (ours, theirs)]
+    mean = mean_rotation(vectors, torch.stack([share, 1 - share], -1))
+    rotation = quaternion_vector_to_matrix(mean)
+    place = theirs.place.lerp(ours.place, share[..., None])
+    back = rotation.mT[..., None, :, :]
+    joints, covs = _moments(share, *((reading.joints, reading.covs) for reading in seen))
+    uv, uv_covs = _moments(share, *((reading.uv, reading.uv_covs) for reading in (ours, theirs)))
+    joints = (back @ (joints - place[..., None, :])[..., None])[..., 0]
+    angles = matrix_to_euler(rotation, order)
+    return ReadOut(joints, back @ covs @ back.mT, angles, place, uv, uv_covs)
+
+
+def _moments(
+    share: Float[Tensor, "B T"], ours: tuple[Tensor, Tensor], theirs: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Return mean and covariance of a mixture of two, given theirs."""
+    weight = share[..., None, None]
+    mean = theirs[0].lerp(ours[0], weight)
+    apart = ours[0] - theirs[0]
+    spread = (weight * (1 - weight))[..., None] * apart[..., :, None] * apart[..., None, :]
+    return mean, theirs[1].lerp(ours[1], weight[..., None]) + spread
