@@ -14,7 +14,7 @@ The prior over arms is fitted without the set that is scored, for UTD-MHAD witho
 other methods have the prior that comes with torchpose, which knows none of these persons; for UTD-MHAD one
 that is fitted to s1 to s6 as in UB-people.
 
-    python -m benchmarks.bones --data DIR [--out FILE]
+    python -m benchmarks.bones --data DIR [--out FILE] [--pictures FOLDER]
     python -m benchmarks.bones --data DIR --fit FILE.safetensors
 
 The second line fits the prior over arms that comes with torchpose, to all sets.
@@ -39,6 +39,7 @@ from torch import Tensor
 
 import torchpose
 from benchmarks._table_file import table_file
+from torchpose._core.files import check_output_folder
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import CAMERA, centred_on_neck, make_test_set
 from torchpose.io import Recording, read_recordings
@@ -76,11 +77,12 @@ _MHAD = ("left_wrist", "left_elbow", "left_shoulder", "neck", "right_shoulder", 
          "right_wrist")  # fmt: skip
 _OPENPOSE_FACE = ("Nose", "LEye", "REye", "LEar", "REar")
 _PLACE, _EVERY, _FRAMES, _STD = (0.05, -0.2, 2.5), 15, 150, 3.0
-_FEW = (0, 3, 6)  # neck and wrists
+FEW = (0, 3, 6)  # neck and wrists
 _KINECT = (*(name.replace("wrist", "hand") for name in _SEVEN), "head")
-_FOUR = (0, 3, 6, 7)  # neck, hands and head
+FOUR = (0, 3, 6, 7)  # neck, hands and head
 _UTD, _UTD_PERSONS, _UTD_EVERY = "kinect_utd_mhad", ("s7", "s8"), 8
-_FIT = {"n_components": 10, "window_components": 48, "calibration_folds": 0}
+FIT = {"n_components": 10, "window_components": 48, "calibration_folds": 0}
+_NAMES = ("mhad", "openpose", "webcam", "utd-mhad")  # of groups, for pictures
 _VISIBLE, _UNSEEN = 0.6, 0.3  # MediaPipe's visibility: of an arm that is scored, of a missing joint
 _SETTLED = 90  # frames, from where on the spread of a bone's length counts
 
@@ -93,7 +95,7 @@ def arm_rows(names: Sequence[str]) -> list[list[int]]:
             for side in ("left", "right")]  # fmt: skip
 
 
-_ENDS = arm_rows(UPPER_BODY)
+ENDS = arm_rows(UPPER_BODY)
 
 
 class View(NamedTuple):
@@ -230,7 +232,7 @@ def webcam_views(data: Path) -> list[View]:
 
 
 @cache
-def _recordings(folder: Path) -> list[Recording]:
+def recordings(folder: Path) -> list[Recording]:
     """Return the recordings of a set, read once."""
     return read_recordings(folder)
 
@@ -241,15 +243,24 @@ def kinect_views(data: Path, every: int = _UTD_EVERY) -> list[View]:
     Args:
         data: folder with kinect_utd_mhad/. every: one sequence in so many.
     """
-    chosen = [r for r in _recordings(data / _UTD) if r.person in _UTD_PERSONS][::every]
-    poses = [centred_on_neck(r.upper_body().joints.double()) for r in chosen]
+    chosen = [r for r in recordings(data / _UTD) if r.person in _UTD_PERSONS][::every]
+    return seen_by_camera([r.upper_body().joints.double() for r in chosen])
+
+
+def seen_by_camera(joints: Sequence[Float[Tensor, "T 8 3"]]) -> list[View]:
+    """Return recordings in the test camera of UB-people, 3 px of noise.
+
+    Args:
+        joints: of each, at 30 frames a second.
+    """
+    poses = [centred_on_neck(x) for x in joints]
     test = make_test_set(poses, CAMERA, 30.0, noise_std=_STD, names=_KINECT)
     views = []
     for keypoints, truth, n in zip(
         test.keypoints, test.truth3d, test.lengths.tolist(), strict=True
     ):
         sure = torch.ones(n, len(_KINECT))
-        views.append(View(keypoints[:n], sure, _KINECT, CAMERA, "neck", truth[:n][:, _ENDS], 30.0))
+        views.append(View(keypoints[:n], sure, _KINECT, CAMERA, "neck", truth[:n][:, ENDS], 30.0))
     return views
 
 
@@ -261,8 +272,8 @@ def fit_without(data: Path, left_out: str | None, persons: Sequence[str] = ()) -
             sets.
     """
     kept = {name: share for name, share in SETS.items() if name != left_out}
-    recordings = [[r for r in _recordings(data / name) if r.person not in persons] for name in kept]
-    return fit_arm_prior(recordings, shares=list(kept.values()))
+    found = [[r for r in recordings(data / name) if r.person not in persons] for name in kept]
+    return fit_arm_prior(found, shares=list(kept.values()))
 
 
 def fit_shipped(data: Path, path: Path) -> None:
@@ -288,22 +299,29 @@ def tracked(
         view: what is seen. prior: of the tracker. chosen: keypoints that are measured, None for all.
         options: of the tracker.
     """
+    poses = poses_of(view, prior, chosen, **options)
+    ends = poses.joints3d[0][:, ENDS]
+    covariance = poses.covariance3d[0][:, ENDS]
+    found, true = (x - x[:, :, :1].mean(1, keepdim=True) for x in (ends, view.truth))
+    parts = (x[:, :, 1:].flatten(1, 2) for x in (found, covariance, true))
+    bones = ends.diff(dim=2)
+    return Chains(bones[:, :, 0], bones[:, :, 1], coverage(*parts).overall.tolist())
+
+
+def poses_of(
+    view: View, prior: UpperBodyPrior, chosen: Sequence[int] | None, **options: object
+) -> torchpose.PoseTrack:
+    """Return the poses of a tracker; see `tracked`."""
     rows = list(range(len(view.names))) if chosen is None else list(chosen)
     tracker = torchpose.UpperBodyTracker(
         prior, view.camera, neck=view.neck, fps=view.fps, max_gap=None, **options
     )  # type: ignore[arg-type]
     with torch.inference_mode():
-        poses = tracker(
+        return tracker(
             view.keypoints[None, :, rows],
             view.confidence[None, :, rows].double(),
             names=[view.names[i] for i in rows],
         )
-    ends = poses.joints3d[0][:, _ENDS]
-    covariance = poses.covariance3d[0][:, _ENDS]
-    found, true = (x - x[:, :, :1].mean(1, keepdim=True) for x in (ends, view.truth))
-    parts = (x[:, :, 1:].flatten(1, 2) for x in (found, covariance, true))
-    bones = ends.diff(dim=2)
-    return Chains(bones[:, :, 0], bones[:, :, 1], coverage(*parts).overall.tolist())
 
 
 def lifted(view: View, lengths: Float[Tensor, "2 2"], depth: float) -> Chains:
@@ -343,7 +361,8 @@ def true_lengths(view: View) -> Float[Tensor, "2 2"]:
 
 def trackers(arms: ArmPrior) -> dict[str, dict[str, object]]:
     """Return the options of the trackers that are compared, by the method's name."""
-    own = {"window-mixture": {}, "articulated": {"arms": arms}, "mkf-fixed": {}}
+    own = {"window-mixture": {}, "articulated": {"arms": arms}, "multiple-model": {"arms": arms},
+           "mkf-fixed": {}}  # fmt: skip
     return {name: {"method": name, **options} for name, options in own.items()}
 
 
@@ -390,14 +409,14 @@ def groups(data: Path, quick: bool) -> Iterator[Group]:
     """Yield what is scored, set by set."""
     every = 150 if quick else _EVERY
     yield Group("MHAD, seven joints", mhad_views(data, every), "mocap_berkeley_mhad",
-                few=_FEW, few_seen="MHAD, neck and wrists")  # fmt: skip
+                few=FEW, few_seen="MHAD, neck and wrists")  # fmt: skip
     yield Group("OpenPose, upper body and face, one of four views",
                 openpose_views(data)[: 1 if quick else None], each=True)  # fmt: skip
     yield Group("Webcams, MediaPipe's 2D against its own 3D landmarks",
                 webcam_views(data)[: 1 if quick else None])  # fmt: skip
     every = 200 if quick else _UTD_EVERY
     yield Group("UTD-MHAD, eight joints", kinect_views(data, every), persons=_UTD_PERSONS,
-                few=_FOUR, few_seen="UTD-MHAD, head, neck and hands")  # fmt: skip
+                few=FOUR, few_seen="UTD-MHAD, head, neck and hands")  # fmt: skip
 
 
 def priors_of(group: Group, data: Path, quick: bool) -> tuple[UpperBodyPrior, ArmPrior]:
@@ -408,8 +427,8 @@ def priors_of(group: Group, data: Path, quick: bool) -> tuple[UpperBodyPrior, Ar
     arms = fit_without(data, group.left_out, group.persons) if known else shipped_arm_prior()
     if not group.persons:
         return torchpose.load_prior("kinect-upper-body"), arms
-    others = [r for r in _recordings(data / _UTD) if r.person not in group.persons]
-    return fit_kinect_prior(others, seed=0, **_FIT), arms
+    others = [r for r in recordings(data / _UTD) if r.person not in group.persons]
+    return fit_kinect_prior(others, seed=0, **FIT), arms
 
 
 def add_group(report: Report, group: Group, prior: UpperBodyPrior, arms: ArmPrior) -> None:
@@ -450,6 +469,28 @@ def add_group(report: Report, group: Group, prior: UpperBodyPrior, arms: ArmPrio
             table.add(name, scored.nanmean(0))
 
 
+def draw(group: Group, prior: UpperBodyPrior, arms: ArmPrior, folder: Path, name: str) -> None:
+    """Write strips of the last view of a group: windows and bones, with the truth in grey.
+
+    The truth is moved so that the middles of the shoulders meet.
+    """
+    from torchpose import viz
+
+    view = group.views[-1]
+    for method in ("window-mixture", "articulated"):
+        poses = poses_of(view, prior, None, **trackers(arms)[method])
+        joints = poses.joints3d[0]
+        truth = torch.full_like(joints, torch.nan)
+        truth[:, ENDS] = view.truth
+        middles = (x[:, ENDS][:, :, 0].mean(1, keepdim=True) for x in (joints, truth))
+        found, true = middles
+        figure = viz.plot_pose_strip(
+            joints, truth=truth + found - true, fps=view.fps, observed=poses.observed[0],
+            title=f"{group.seen}: {method}",
+        )  # fmt: skip
+        viz.save_figure(figure, folder / f"{name}-{method}.png", dpi=110)
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -457,6 +498,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2, help="cores")
     parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
     parser.add_argument("--quick", action="store_true", help="few recordings, to see that it works")
+    parser.add_argument("--pictures", type=Path, help="folder for strips of poses")
     parser.add_argument(
         "--fit", type=Path, help="file for a prior over arms, in place of the table"
     )
@@ -465,9 +507,14 @@ def main() -> None:
     if args.fit is not None:
         fit_shipped(args.data, args.fit)
         return
+    if args.pictures is not None:
+        check_output_folder(args.pictures)
     report = Report("Arms of strangers")
-    for group in groups(args.data, args.quick):
-        add_group(report, group, *priors_of(group, args.data, args.quick))
+    for group, name in zip(groups(args.data, args.quick), _NAMES, strict=True):
+        priors = priors_of(group, args.data, args.quick)
+        if args.pictures is not None:
+            draw(group, *priors, args.pictures, name)
+        add_group(report, group, *priors)
     tables = [table.to_markdown() for table in report.values()]
     print("\n\n".join(tables))
     if args.out is not None:
