@@ -19,7 +19,6 @@ from torchpose.learning._samplers import (
     TensorSource,
     WindowSource,
     all_samples,
-    block_sizes,
     cached,
     derived_seed,
 )
@@ -56,7 +55,8 @@ def test_blocks_hold_every_sample_once(n):
     source = arm_source(n)
     assert isinstance(source, SampleSource)
     sizes = [len(source.block(i).states) for i in range(source.n_blocks)]
-    assert sizes == block_sizes(n) and sum(sizes) == source.n_samples == n
+    full, rest = divmod(n, BLOCK)
+    assert sizes == [BLOCK] * full + ([rest] if rest else []) and source.n_samples == n
     with pytest.raises(InputError, match="block must lie in 0"):
         source.block(source.n_blocks)
 

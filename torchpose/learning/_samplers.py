@@ -31,7 +31,6 @@ __all__ = [
     "TensorSource",
     "WindowSource",
     "all_samples",
-    "block_sizes",
     "cached",
     "derived_seed",
     "join_samples",
@@ -81,11 +80,6 @@ class SampleSource(Protocol):
     def block(self, index: int, epoch: int = 0) -> Samples:
         """Return the states of a block; the epoch matters only where each draws fresh ones."""
         ...
-
-
-def block_sizes(n_samples: int) -> list[int]:
-    """Return the number of states in each block."""
-    return [min(BLOCK, n_samples - start) for start in range(0, n_samples, BLOCK)]
 
 
 def all_samples(source: SampleSource, epoch: int = 0) -> Samples:

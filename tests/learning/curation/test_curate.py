@@ -11,7 +11,7 @@ from tests.learning.curation.bodies import moving, recording
 from torchpose.errors import InputError, OverlapError, PriorError
 from torchpose.io import read_recordings
 from torchpose.io._recordings import find_recordings
-from torchpose.learning._curation import CurationSettings, complete_runs, curate
+from torchpose.learning._curation import CurationSettings, curate
 from torchpose.skeleton import UPPER_BODY
 
 WRISTS = tuple(name.replace("hand", "wrist") for name in UPPER_BODY)
@@ -142,20 +142,6 @@ def test_notes_are_counted_and_folders_of_one_name_are_said(tmp_path):
     notes = curate(same).report.notes
     assert "taken for millimetres (2 recordings)" in notes
     assert any("2 folders count as the one person ann#" in note for note in notes)
-
-
-def test_complete_runs():
-    joints = moving(100)
-    joints[30, 0] = math.nan
-    joints[50:60, 4] = math.nan
-    joints[95, 1] = math.nan
-    weights = torch.ones(100, 8).double()
-    runs = complete_runs(recording(joints=joints, weights=weights, first_frame=5))
-    assert [(r.first_frame, len(r)) for r in runs] == [(5, 30), (36, 19), (65, 35)]
-    assert all(r.joints.isfinite().all() and r.weights.shape == (len(r), 8) for r in runs)
-    assert complete_runs(recording(joints=joints), least=40) == []
-    headless = torch.where(torch.arange(8)[:, None] == 3, math.nan, moving(50))
-    assert [len(r) for r in complete_runs(recording(joints=headless))] == [50]
 
 
 @pytest.mark.data

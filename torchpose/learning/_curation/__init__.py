@@ -10,7 +10,7 @@ from torchpose.learning._curation.bones import (
     person_bones,
     torso_rotation,
 )
-from torchpose.learning._curation.curate import Curated, CurationSettings, complete_runs, curate
+from torchpose.learning._curation.curate import Curated, CurationSettings, curate
 from torchpose.learning._curation.joints import JUMP_SPEEDS, find_jumps
 from torchpose.learning._curation.report import CurationReport, Drop
 from torchpose.learning._curation.splits import (
@@ -36,7 +36,6 @@ __all__ = [
     "PersonSplit",
     "bone_lengths",
     "check_kinds",
-    "complete_runs",
     "curate",
     "face_camera",
     "find_duplicates",

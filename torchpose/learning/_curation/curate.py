@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -24,7 +23,6 @@ from torchpose.learning._curation.joints import (
     find_jumps,
     label,
     measured,
-    runs,
     with_missing,
 )
 from torchpose.learning._curation.report import CurationReport, Drop, Size, drop_frames
@@ -37,7 +35,7 @@ from torchpose.learning._curation.splits import (
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM
 
-__all__ = ["Curated", "CurationSettings", "complete_runs", "curate"]
+__all__ = ["Curated", "CurationSettings", "curate"]
 
 _RATE = 30.0  # of recordings that do not say: a Kinect's
 _LEFT, _RIGHT = UPPER_BODY.index("shoulder_left"), UPPER_BODY.index("shoulder_right")
@@ -124,31 +122,6 @@ def curate(recordings: Sequence[Recording], settings: CurationSettings = DEFAULT
         _size(recordings), after, tuple(drops), _notes(recordings, settings), settings._asdict()
     )
     return Curated(kept, report)
-
-
-def complete_runs(recording: Recording, least: int = 15) -> list[Recording]:
-    """Cut a recording at the frames in which one of the eight joints is missing.
-
-    For what needs whole sequences. Joints that the joint set lacks do not count.
-
-    Args:
-        recording: to be cut. least: frames that a piece needs.
-
-    Returns:
-        Pieces without a missing joint, with their `first_frame`.
-    """
-    joints = recording.upper_body().joints
-    there = measured(joints)
-    whole = (there | ~there.any(0)).all(1) & there.any()
-    return [
-        replace(
-            recording,
-            joints=recording.joints[frames],
-            weights=None if recording.weights is None else recording.weights[frames],
-            first_frame=recording.first_frame + frames.start,
-        )
-        for frames in runs(whole, least)
-    ]
 
 
 # --- the steps ------------------------------------------------------------------------------------
