@@ -137,6 +137,7 @@ def test_a_neck_of_another_kind_is_converted_here_too(prior, few):
     state, poses = stream(tracker, few)
     check_equal(poses, track)
     assert state.picked.notes == track.notes != ()
+    assert tracker.advance(tracker.init(len(few), NAMES), few[:, :2])[1].notes == track.notes
 
 
 def test_a_stream_goes_on_while_nothing_is_seen_and_says_for_how_long(prior, keypoints):

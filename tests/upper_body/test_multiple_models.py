@@ -58,6 +58,18 @@ def test_poses_are_the_average_of_both_methods(prior, smoothing):
     assert bool(((share > 0) & (share < 1)).all())
 
 
+def test_windows_inside_are_not_steadied_where_nobody_wants_that(prior, of_performer):
+    """Whole and live; each frame of windows stands by itself then, and joints shake more."""
+    args = prior, of_performer, "multiple-model", KEYPOINT_NAMES, demo_camera()
+    steady, plain = tracked(*args), tracked(*args, steady=False)
+    shaking = [track.joints3d[0].diff(n=2, dim=0).norm(dim=-1).mean() for track in (steady, plain)]
+    assert float(shaking[1]) > 1.1 * float(shaking[0])
+    tracker = UpperBodyTracker(prior, demo_camera(), "multiple-model", fps=30.0, steady=False)
+    state = tracker.init(1, names=list(KEYPOINT_NAMES))
+    _, live = tracker.advance(state, of_performer)
+    torch.testing.assert_close(live.joints3d, plain.joints3d)
+
+
 def test_the_body_that_windows_do_not_know_has_less_of_them(prior, of_performer):
     stranger, _ = shares(prior, of_stranger())
     known, _ = shares(prior, of_performer, KEYPOINT_NAMES, demo_camera())

@@ -53,6 +53,7 @@ class TrackerModel(NamedTuple):
         middle: whether the middle of the shoulders is measured in place of the neck, and whether that is all
             that is measured of them.
         calibrated: whether covariances are recalibrated as the prior says.
+        steadied: whether what windows give is passed through filters of constant velocity.
     """
 
     owner: nn.Module
@@ -63,6 +64,7 @@ class TrackerModel(NamedTuple):
     hand: str | None = None
     middle: tuple[bool, bool] = (False, False)
     calibrated: bool = True
+    steadied: bool = True
 
     @property
     def rate(self) -> float:

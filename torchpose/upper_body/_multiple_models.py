@@ -152,9 +152,9 @@ class MultipleModelFilter(Estimator):
 
     @property
     def _stage(self) -> MotionStage | None:
-        """Return what steadies windows, None if their prior does not say how brisk motions are."""
+        """Return what steadies windows, None if nothing shall or their prior brings no ratios."""
         ratios, model = self.windows.steadied_by, self.model
-        if ratios is None:
+        if ratios is None or not model.steadied:
             return None
         return kept_stage(model.owner, ratios, model.rate, model.measurement_cov)
 

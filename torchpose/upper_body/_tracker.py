@@ -98,7 +98,8 @@ class UpperBodyTracker(WideModule):
             stays at the prior's mean place, as the authors' released demo does.
         window: deprecated; False stands for method "mkf-fixed", True for the default.
         steady: pass what windows give through filters of constant velocity (`MotionStage`), which take
-            the jitter out; smoothers if `smoothing` is asked for. By default where there are windows.
+            the jitter out; smoothers if `smoothing` is asked for. By default where there are windows;
+            False leaves it out, in "multiple-model" too.
         calibrated: recalibrate `covariance3d` as the prior's training persons showed, if it says how.
         neck: kind of neck of the keypoints, where their names do not tell it (see
             `torchpose.skeleton.NECK_KINDS`). A neck of another kind than the prior's is put where the
@@ -163,6 +164,7 @@ class UpperBodyTracker(WideModule):
         self.dtype = working_precision("dtype", options.get("dtype", torch.float64))
         register_given(self, "measurement_std", wide_or_parameter(measurement_std))
         self.options = options
+        self._unsteady = steady is False
         for name, value in options.items():
             if isinstance(value, Tensor):
                 register_given(self, name, wide_or_parameter(value))
@@ -206,7 +208,7 @@ class UpperBodyTracker(WideModule):
         make: Callable[..., Estimator] = METHODS[method]
         model = TrackerModel(
             self, self.prior, self.measurement_cov, self.fps, self.smoothing,
-            calibrated=self.calibrated,
+            calibrated=self.calibrated, steadied=not self._unsteady,
         )  # fmt: skip
         if picked is not None:
             model = model._replace(hand=picked.hand, middle=(picked.middle, picked.middle_alone))
@@ -258,9 +260,7 @@ class UpperBodyTracker(WideModule):
             estimator = self._estimator_of(method, picked)
             arms = generators_of_arms(generator)
             estimates = estimator.forward(found.measured, joints, arms, lengths, progress)
-            notes = self._notes_of(method) + picked.notes
-            notes += () if estimator.knows_wrists else picked.of_hands
-            notes += outlier_notes(*found[1:], lengths)
+            notes = self._notes_of(method, estimator, picked) + outlier_notes(*found[1:], lengths)
             reader, seen = self._reader(method, estimator), found.measured.mask
             reading = reader.whole(estimates, lengths)
             track = reader.track(reading, estimates, seen, lengths, notes, found.probability)
@@ -370,15 +370,16 @@ class UpperBodyTracker(WideModule):
             own, estimates = estimator.advance(state.estimator, found.measured)
             reader = self._reader(method, estimator)
             motion, reading = reader.more(state.motion, estimates)
-            notes = self._notes_of(method) + outlier_notes(*found[1:])
+            notes = self._notes_of(method, estimator, state.picked) + outlier_notes(*found[1:])
             track = reader.track(reading, estimates, seen, None, notes, found.probability)
         unseen = unseen_frames(state.unseen, seen.any(-1))
         state = state._replace(estimator=own, motion=motion, unseen=unseen, screen=screen)
         return state, track.in_precision(self.dtype)
 
-    def _notes_of(self, method: str) -> tuple[str, ...]:
-        """Return what is to be said about the choice of a method."""
-        return self.notes if method == self.method else ()
+    def _notes_of(self, method: str, estimator: Estimator, picked: Picked) -> tuple[str, ...]:
+        """Return what is to be said about the choice of a method, and about the keypoints' joints."""
+        chosen = self.notes if method == self.method else ()
+        return chosen + picked.notes + (() if estimator.knows_wrists else picked.of_hands)
 
     def _checked(self, keypoints: Tensor) -> Float[Tensor, "B T J 2"]:
         """Return the keypoints of whole sequences, where and as wide as the tracker's own tensors."""
