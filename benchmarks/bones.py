@@ -286,8 +286,11 @@ def fit_shipped(data: Path, path: Path) -> None:
         licence="MIT; see the card for the recordings",
         command=f"python -m benchmarks.bones --data DIR --fit {path.name}",
     )
-    lengths, spread = fitted.lengths, fitted.spread
-    ArmPrior(fitted.directions.rounded(), lengths, spread, fitted.broad, info).save(path)
+    fitted = ArmPrior(
+        fitted.directions.rounded(), fitted.lengths, fitted.spread, fitted.broad, info,
+        fitted.together.float(),
+    )  # fmt: skip
+    fitted.save(path)
 
 
 def tracked(

@@ -57,6 +57,38 @@ def test_lengths_are_those_of_the_persons_and_poses_the_likelier(joints):
     torch.testing.assert_close(again.directions.means, prior.directions.means, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize(("alike", "least", "most"), [(True, 0.3, 0.7), (False, 0.0, 0.05)])
+def test_arms_that_go_together_are_known_to(alike, least, most):
+    """Arms hang or reach out to the side: both the same, or each as it likes; in nats per frame."""
+    generator = torch.Generator().manual_seed(0)
+    out = torch.randint(2, (2, 400), generator=generator).bool()
+    if alike:
+        out[1] = out[0]
+    poses = torch.zeros(400, len(UPPER_BODY), 3, dtype=torch.float64)
+    for side, away, reach in (("left", 1.0, out[0]), ("right", -1.0, out[1])):
+        bone = torch.where(
+            reach[:, None], torch.tensor([away, 0.1, 0.0]), torch.tensor([0.0, 1, 0])
+        )
+        place = torch.tensor([0.17 * away, 0.0, 2.5], dtype=torch.float64).expand(400, 3)
+        for joint in ("shoulder", "elbow", "hand"):
+            poses[:, UPPER_BODY.index(f"{joint}_{side}")] = place
+            place = place + 0.28 * bone
+    prior = fit_arm_prior([[recording(poses, "p")]], n_components=2, n_samples=4000)
+    together, weights = prior.together, prior.directions.weights
+    torch.testing.assert_close(together.sum(1), weights, rtol=0, atol=1e-6)
+    torch.testing.assert_close(together, together.mT)
+    said = (together * (together / (weights[:, None] * weights)).log()).sum()
+    assert least <= float(said) <= most
+
+
+def test_one_arm_that_is_never_known_leaves_arms_apart(joints):
+    joints = joints.clone()
+    joints[:, UPPER_BODY.index("hand_right")] = torch.nan
+    prior = fit_arm_prior([[recording(joints, "p")]], n_components=4, n_samples=1000)
+    weights = prior.directions.weights
+    torch.testing.assert_close(prior.together, weights[:, None] * weights)
+
+
 def test_sets_without_arms_are_refused(joints):
     with pytest.raises(InputError, match="at least one recording"):
         fit_arm_prior([[]])

@@ -5,10 +5,12 @@ import math
 import pytest
 import torch
 
+from torchpose._core.tensor_file import read_tensors, write_tensors
 from torchpose.errors import FileFormatError, InputError, PriorError, ShapeError
 from torchpose.priors import GaussianMixture
-from torchpose.priors._arms import LENGTHS, ArmPrior, shipped_arm_prior
-from torchpose.upper_body._arm_chain import DirectionDensity
+from torchpose.priors._arms import _KIND, LENGTHS, ArmPrior, shipped_arm_prior
+from torchpose.priors._gaussian_mixture import component_log_density
+from torchpose.upper_body._arm_chain import ArmChain, Arms, DirectionDensity
 from torchpose.upper_body._limb_nodes import nodes_on_ray, sphere_points
 
 DOUBLE = torch.float64
@@ -49,6 +51,7 @@ def test_it_is_read_as_it_was_written(prior, tmp_path):
     points = pairs(50)
     torch.testing.assert_close(again.log_prob(points), prior.log_prob(points), rtol=0, atol=0)
     torch.testing.assert_close(again.lengths, prior.lengths, rtol=0, atol=0)
+    torch.testing.assert_close(again.together, prior.together, rtol=0, atol=0)
     (tmp_path / "cut.safetensors").write_bytes((tmp_path / "arms.safetensors").read_bytes()[:-100])
     with pytest.raises(FileFormatError):
         ArmPrior.load(tmp_path / "cut.safetensors")
@@ -64,9 +67,55 @@ def test_what_cannot_be_is_refused(prior):
         ArmPrior(prior.directions, prior.lengths[:2], prior.spread)
     with pytest.raises(InputError, match="broad"):
         ArmPrior(prior.directions, prior.lengths, prior.spread, broad=0.0)
+    weights = prior.directions.weights
+    uneven = torch.diag(weights).roll(1, 0)
+    for together in (uneven, torch.diag(2 * weights), 2 * torch.diag(weights) - prior.together):
+        with pytest.raises(PriorError, match="together must be symmetric"):
+            ArmPrior(prior.directions, prior.lengths, prior.spread, together=together)
+    with pytest.raises(ShapeError):
+        ArmPrior(prior.directions, prior.lengths, prior.spread, together=torch.eye(3))
     with pytest.raises(ShapeError):
         prior.log_prob(torch.zeros(3, 5))
     assert len(prior.lengths) == len(LENGTHS)
+
+
+def test_files_of_arms_apart_are_read(prior, tmp_path):
+    """Files that were written before components were tied have no shares of pairs."""
+    path = tmp_path / "arms.safetensors"
+    prior.save(path)
+    info, tensors = read_tensors(path, _KIND)
+    del tensors["together"]
+    write_tensors(path, _KIND, info, tensors)
+    found = ArmPrior.load(path)
+    weights = found.directions.weights
+    torch.testing.assert_close(found.together, weights[:, None] * weights)
+
+
+def test_the_evidence_of_both_arms_is_the_sum_over_all_pairs(prior):
+    """Of hypotheses of left and right arm, with the components of each, the broad one apart."""
+    n = 6
+    generator = torch.Generator().manual_seed(1)
+    mixture = prior.directions
+    near = mixture.means[torch.randint(mixture.n_components, (2 * n,), generator=generator)]
+    directions = torch.nn.functional.normalize(near.unflatten(-1, (2, 3)), dim=-1).view(
+        1, 2, 1, n, 6
+    )
+    weight = torch.rand(1, 2, 1, n, generator=generator, dtype=DOUBLE)
+    arms = Arms(directions, weight.log(), prior.log_prob(directions))
+    chain = ArmChain(DirectionDensity(prior), 30.0)
+    parts = component_log_density(
+        directions, mixture.means, torch.linalg.cholesky(mixture.covariances)
+    )
+    parts = (parts - prior.log_mass).exp() * (1 - prior.broad)
+    broad = torch.full_like(parts[..., :1], 1 / (4 * math.pi) ** 2)
+    left, right = (weight[..., None, :] @ torch.cat([parts, broad], -1))[0, :, 0, 0]
+    pairs = torch.zeros(len(left), len(left), dtype=DOUBLE)
+    pairs[:-1, :-1] = prior.together
+    pairs[-1, :-1] = pairs[:-1, -1] = prior.broad * mixture.weights
+    pairs[-1, -1] = prior.broad**2
+    found = chain.evidence_of_both(arms)
+    assert float(found) == pytest.approx(float((left @ pairs @ right).log()), abs=1e-3)
+    assert abs(float(found - arms.log_evidence.sum())) > 0.05  # it differs from arms apart
 
 
 def test_nodes_integrate_a_pixels_likelihood_over_the_sphere():

@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 from torchpose.errors import InputError
 from torchpose.io import Recording
 from torchpose.priors._arms import ArmPrior, ArmPriorInfo
-from torchpose.priors._gaussian_mixture import GaussianMixture
+from torchpose.priors._gaussian_mixture import GaussianMixture, component_log_density
 from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
 from torchpose.skeleton._torso import upright_axes
 from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM, UpperBody
@@ -28,6 +28,7 @@ _DEFAULT_SPREAD = torch.tensor([0.07, 0.07, 0.09, 0.12, 0.10], dtype=torch.float
 _DEFAULT_LENGTHS = torch.tensor([0.27, 0.24, 0.30, 0.32, 0.19], dtype=torch.float64)
 _FLOOR = 0.01  # variance added to each coordinate of a direction: a tenth of a radian
 _TILT = 8.0  # degrees by which cameras stand askew to what they look at
+_APART = 0.1  # share of frames in which what one arm does says nothing of the other
 _RATE = 30.0
 _ARMS = (LEFT_ARM, RIGHT_ARM)
 _SHOULDERS = tuple(UPPER_BODY.index(f"shoulder_{side}") for side in ("left", "right"))
@@ -52,7 +53,11 @@ def arm_directions(joints: Float[Tensor, "N 8 3"]) -> Float[Tensor, "N 2 6"]:
 
 
 class _Person(NamedTuple):
-    """What the recordings of a person say: directions [N, 6], and the medians of lengths [5]."""
+    """What the recordings of a person say.
+
+    Attributes:
+        directions: of both arms, [N, 2, 6], NaN of an arm that is not known. lengths: medians, [5].
+    """
 
     directions: Tensor
     lengths: Tensor
@@ -88,23 +93,65 @@ def fit_arm_prior(
     samples, lengths, persons, trust = [], [], [], []
     for of_set, share in zip(recordings, shares, strict=True):
         by_person = _persons(of_set)
-        directions = torch.cat([person.directions for person in by_person.values()])
-        if not len(directions):
+        pairs = torch.cat([person.directions for person in by_person.values()])
+        if not len(pairs):
             raise InputError("a set of recordings has no frame with an arm and both shoulders")
         count = round(n_samples * share / sum(shares))
-        rows = torch.randint(len(directions), (count,), generator=generator)
-        samples.append(directions[rows])
+        rows = torch.randint(len(pairs), (count,), generator=generator)
+        samples.append(pairs[rows])
         lengths += [person.lengths for person in by_person.values()]
         persons += list(by_person)
         trust += [share / sum(shares) / len(by_person)] * len(by_person)
-    points = _tilted(torch.cat(samples), generator)
+    both = _tilted(torch.cat(samples), generator)
+    points = _one_of(both, generator)
     mixture = GaussianMixture.fit(
         points, n_components=n_components, seed=seed, max_iter=60, covariance_floor=_FLOOR
     )
+    whole = both[both.isfinite().flatten(1).all(1)]
+    together = _together(mixture, whole) if len(whole) else None
     medians, spread = _length_statistics(
         torch.stack(lengths), torch.tensor(trust, dtype=torch.float64)
     )
-    return ArmPrior(mixture, medians, spread, broad, ArmPriorInfo(persons=tuple(persons)))
+    info = ArmPriorInfo(persons=tuple(persons))
+    return ArmPrior(mixture, medians, spread, broad, info, together)
+
+
+def _one_of(pairs: Float[Tensor, "N 2 6"], generator: torch.Generator) -> Float[Tensor, "N 6"]:
+    """Return one arm of each pair at random, the known one where the other is not."""
+    known = pairs.isfinite().all(-1)
+    left = torch.rand(len(pairs), generator=generator) < 0.5
+    return torch.where(((left & known[:, 0]) | ~known[:, 1])[:, None], pairs[:, 0], pairs[:, 1])
+
+
+def _together(
+    mixture: GaussianMixture, pairs: Float[Tensor, "N 2 6"], rounds: int = 100
+) -> Float[Tensor, "K K"]:
+    """Return how often one arm is of one component and the other, mirrored, of another (EM).
+
+    Args:
+        mixture: over one arm, which stays. pairs: of arms, both known.
+    """
+    weights = mixture.weights
+    parts = component_log_density(pairs, mixture.means, torch.linalg.cholesky(mixture.covariances))
+    ratio = torch.softmax(parts + weights.log(), -1) / weights
+    ratio = torch.cat([ratio, ratio.flip(1)])  # what left arms do, right ones may do
+    left, right = ratio.unbind(1)
+    found = weights[:, None] * weights
+    for _ in range(rounds):
+        density = ((left @ found) * right).sum(-1, keepdim=True)
+        found = found * ((left / density).mT @ right) / len(left)
+    found = (1 - _APART) * found + _APART * weights[:, None] * weights
+    return _with_sums(found, weights)
+
+
+def _with_sums(
+    shares: Float[Tensor, "K K"], sums: Float[Tensor, " K"], rounds: int = 200
+) -> Float[Tensor, "K K"]:
+    """Return a symmetric matrix with its rows and columns scaled to these sums (Sinkhorn)."""
+    scale = torch.ones_like(sums)
+    for _ in range(rounds):
+        scale = (scale * sums / (shares @ scale)).sqrt()
+    return scale[:, None] * shares * scale
 
 
 def _persons(recordings: Sequence[Recording]) -> dict[str, _Person]:
@@ -115,9 +162,9 @@ def _persons(recordings: Sequence[Recording]) -> dict[str, _Person]:
         body = recording.upper_body()
         step = max(1, round(float(recording.fps or _RATE) / _RATE))
         joints = body.joints.double()[::step]
-        arms = arm_directions(joints).flatten(0, 1)
+        arms = arm_directions(joints)
         person = recording.person_id
-        directions.setdefault(person, []).append(arms[arms.isfinite().all(-1)])
+        directions.setdefault(person, []).append(arms[arms.isfinite().all(-1).any(-1)])
         lengths.setdefault(person, []).append(_lengths(recording, joints, body, step))
     return {
         person: _Person(torch.cat(found), torch.cat(lengths[person]).nanmedian(0).values)
@@ -157,16 +204,16 @@ def _wrists(recording: Recording, step: int) -> Tensor | None:
     return recording.joints.double()[::step, columns]
 
 
-def _tilted(directions: Float[Tensor, "N 6"], generator: torch.Generator) -> Float[Tensor, "N 6"]:
+def _tilted(pairs: Float[Tensor, "N 2 6"], generator: torch.Generator) -> Float[Tensor, "N 2 6"]:
     """Return the directions as level cameras would see them that are tilted and turned at random."""
-    angles = torch.randn(2, len(directions), generator=generator, dtype=torch.float64)
+    angles = torch.randn(2, len(pairs), generator=generator, dtype=torch.float64)
     (c, d), (s, r) = (f(angles * math.radians(_TILT)) for f in (torch.cos, torch.sin))
-    bones = directions.unflatten(-1, (2, 3))
-    x, y, z = bones.unbind(-1)
-    c, d, s, r = (value[:, None] for value in (c, d, s, r))
+    x, y, z = pairs.unflatten(-1, (2, 3)).unbind(-1)
+    c, d, s, r = (value[:, None, None] for value in (c, d, s, r))
+    r = r * r.new_tensor([1.0, -1.0])[:, None]  # right arms are mirrored
     y, z = c * y - s * z, s * y + c * z
     x, z = d * x + r * z, -r * x + d * z
-    return torch.stack([x, y, z], -1).flatten(1)
+    return torch.stack([x, y, z], -1).flatten(2)
 
 
 def _length_statistics(

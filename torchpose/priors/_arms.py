@@ -63,13 +63,17 @@ class ArmPrior(nn.Module):
     shoulders: x to the person's left along the level part of the line between the shoulders, y down,
     z to the back. The right arm is the mirror image. Z is the mixture's mass on pairs of unit vectors,
     so that the density is one over S^2 x S^2; b is the share of the broad part, which expects nothing.
+    What both arms do goes together by the components alone: a left arm is of j and a mirrored right one of
+    k in a share A_jk of the frames.
 
     Args:
         directions: mixture over R^6. lengths: medians of `LENGTHS` [5], metres. spread: standard
             deviations of their logs over persons [5]. broad: b. info: what it was fitted on.
+        together: A, symmetric, of which each row sums to pi_j; pi_j pi_k (arms apart) by default.
 
     Raises:
-        PriorError: a mixture of another size, or lengths and spreads that are not positive.
+        PriorError: a mixture of another size, lengths and spreads that are not positive, or pairs of
+            components whose shares do not sum to the weights.
 
     >>> prior = shipped_arm_prior()
     >>> hanging = torch.tensor([0.0, 1.0, 0.0, 0.0, 1.0, 0.0], dtype=torch.float64)
@@ -79,6 +83,7 @@ class ArmPrior(nn.Module):
 
     lengths: Tensor
     spread: Tensor
+    together: Tensor
     log_mass: Tensor
 
     def __init__(
@@ -88,6 +93,7 @@ class ArmPrior(nn.Module):
         spread: Float[Tensor, " 5"],
         broad: float = 0.1,
         info: ArmPriorInfo | None = None,
+        together: Float[Tensor, "K K"] | None = None,
     ) -> None:
         super().__init__()
         if directions.dim != 6:
@@ -104,6 +110,7 @@ class ArmPrior(nn.Module):
         register_given(self, "lengths", lengths)
         register_given(self, "spread", spread)
         self.info = info or ArmPriorInfo()
+        register_given(self, "together", _checked(together, directions.weights))
         self.register_buffer("log_mass", _log_mass(directions))
 
     def log_prob(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
@@ -130,6 +137,7 @@ class ArmPrior(nn.Module):
         tensors = {part: getattr(self.directions, part) for part in _PARTS}
         broad = torch.tensor([self.broad], dtype=torch.float64)
         tensors |= {"lengths": self.lengths, "spread": self.spread, "broad": broad}
+        tensors["together"] = self.together
         write_tensors(path, _KIND, self.info, {k: v.detach().cpu() for k, v in tensors.items()})
 
     @classmethod
@@ -145,13 +153,37 @@ class ArmPrior(nn.Module):
                 name: require_tensor(path, tensors, name).double()
                 for name in (*_PARTS, "lengths", "spread", "broad")
             }
-            mixture = GaussianMixture(*(named[part] for part in _PARTS))
-            return cls(mixture, named["lengths"], named["spread"], float(named["broad"]), info)
+            together = tensors.get("together")  # earlier files have none
+            return cls(
+                GaussianMixture(*(named[part] for part in _PARTS)), named["lengths"], named["spread"],
+                float(named["broad"]), info, None if together is None else together.double(),
+            )  # fmt: skip
 
 
 def shipped_arm_prior() -> ArmPrior:
     """Return the prior over arms that comes with the package."""
     return ArmPrior.load(_SHIPPED)
+
+
+def _checked(
+    together: Float[Tensor, "K K"] | None, weights: Float[Tensor, " K"]
+) -> Float[Tensor, "K K"]:
+    """Return the shares of pairs of components: those of arms apart unless they are given.
+
+    Raises:
+        ShapeError, PriorError: shares that are none.
+    """
+    if together is None:
+        return weights[:, None] * weights
+    check_shape("together", together, [len(weights)] * 2)
+    alike = torch.allclose(together, together.mT, atol=1e-6)
+    sums = torch.allclose(together.sum(1).to(weights), weights, atol=1e-4)
+    if not (alike and sums and bool((together >= 0).all())):
+        raise PriorError(
+            "together must be symmetric, not negative, and sum to the weights of the directions; got "
+            f"sums {together.sum(1).tolist()}"
+        )
+    return together
 
 
 def _log_mass(mixture: GaussianMixture, n_points: int = 20_000) -> Tensor:

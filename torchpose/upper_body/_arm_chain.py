@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, pad
 
 from torchpose.priors._arms import ArmPrior
 from torchpose.priors._gaussian_mixture import LOG_2PI
@@ -26,6 +26,7 @@ _ANEW = 0.2  # share of an arm's belief that starts anew in a frame at 30 frames
 _RATE = 30.0
 _NOTHING = -60.0
 _LEAST = 1e-30  # density
+_LIKELIEST = 32  # hypotheses of an arm that are compared with the other arm's
 _ROWS = 2048  # directions at a time, so that what is worked out stays in the cache
 
 
@@ -107,6 +108,9 @@ class DirectionDensity:
         self.constant = (constant + math.log1p(-prior.broad)).float()
         self.broad = math.log(prior.broad) - 2 * math.log(4 * math.pi)
         self.size = dim, k
+        apart = (weights[:, None] * weights).clamp_min(_LEAST)
+        tied = prior.together.to(device).double() / apart
+        self.together = pad(tied, (0, 1, 0, 1), value=1.0)  # the broad part is tied to nothing
 
     def __call__(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
         """Return log p(d_u, d_f), worked out in float32: unit vectors and a tenth of a radian."""
@@ -115,11 +119,21 @@ class DirectionDensity:
         known = torch.cat(parts).to(directions.dtype)
         return torch.logaddexp(known, known.new_tensor(self.broad)).view(directions.shape[:-1])
 
-    def _known(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, " N"]:
-        """Return the log density of the mixture."""
+    def shares(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch K"]:
+        """Return the posterior of each component, the broad one last."""
+        logs = self._logs(directions.reshape(-1, 6).float())
+        logs = pad(logs, (0, 1), value=self.broad)
+        return torch.softmax(logs, -1).to(directions.dtype).view(*directions.shape[:-1], -1)
+
+    def _logs(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, "N K"]:
+        """Return the log density of each component of the mixture, times its weight."""
         off = torch.addmm(self.shift, rows, self.rows, beta=-1).square()
         squared = off.view(len(rows), *self.size).sum(1)
-        logs = self.constant - 0.5 * squared
+        return self.constant - 0.5 * squared
+
+    def _known(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, " N"]:
+        """Return the log density of the mixture."""
+        logs = self._logs(rows)
         most = logs.amax(-1, keepdim=True).detach()
         # exp of what is far below is slow where it is denormal, and adds nothing
         return (logs - most).clamp_min(_NOTHING).exp().sum(-1).log() + most[:, 0]
@@ -209,6 +223,24 @@ class ArmChain:
         depth = arm.shoulder[..., 2:].clamp_min(0.1)
         slack = arm.slack.square()[:, None, None] + _SLACK**2
         return ((arm.std[:, :, None] * depth).square() + slack).sqrt()
+
+    def evidence_of_both(self, arms: Arms) -> Float[Tensor, "B M"]:
+        """Return the log of the prior predictive density of what is measured of both arms together.
+
+        Given the torso each arm's likelihood is its own, and `ArmPrior.together` ties components:
+
+            log p(z_l, z_r) = log p(z_l) + log p(z_r) + log sum_jk E_l[r_j] C_jk E_r[r_k]
+
+        with the shares r of the components in each hypothesis, their means E over the likeliest
+        hypotheses of an arm, and C_jk = A_jk / (pi_j pi_k).
+        """
+        logs = arms.log_weight + arms.log_prior
+        logs, rows = logs.topk(min(_LIKELIEST, logs.shape[-1]), -1)
+        chosen = arms.directions.gather(-2, rows[..., None].expand(*rows.shape, 6))
+        weight = torch.softmax(logs, -1)[..., None, :]
+        left, right = (weight @ self.density.shares(chosen))[..., 0, :].unbind(1)
+        tied = ((left @ self.density.together) * right).sum(-1)
+        return arms.log_evidence.sum(1) + tied.log()
 
     def start(self, arms: Arms) -> ArmState:
         """Return the belief after the first frame, of arms with one hypothesis of the root each."""

@@ -149,7 +149,7 @@ class ArticulatedFilter(Estimator):
 
     0. The lean of the torso to a side, by which the frame is turned about the optical axis (`seen_lean`).
     1. The torso: depth and turn of the shoulders on a grid, weighed by what torso joints, the face and
-       the arms say (`RootGrid`, `face_evidence`).
+       both arms together say (`RootGrid`, `face_evidence`, `ArmChain.evidence_of_both`).
     2. The lengths of upper arm, forearm, shoulders and head, a Gaussian over their logs that starts as
        the prior over persons and sharpens (assumed-density filter). One camera does not tell a large
        body that is far from a small one that is near, so the common scale stays the prior's.
@@ -189,7 +189,8 @@ class ArticulatedFilter(Estimator):
         owner = model.owner
         like = model.measurement_cov
         self.prior = arms if isinstance(arms, ArmPrior) else _kept(owner, arms, like)
-        sources = (*self.prior.directions.parameters_tuple(), self.prior.log_mass)
+        prior = self.prior
+        sources = (*prior.directions.parameters_tuple(), prior.log_mass, prior.together)
         density = derived(
             owner,
             ("arm density", self.prior.broad, like.device),
@@ -335,7 +336,9 @@ class ArticulatedFilter(Estimator):
         middle = self._middle(state, frame.torso, root)
         arms = self._arms(frame, root, middle, lengths, slack, _COARSE_ANGLES, _COARSE_AROUND)
         seen = frame.known[:, [ELBOWS, HANDS]].sum((1, 2)).to(root.depth)
-        evidence = power * (arms.log_evidence.sum(1) + 2 * seen[:, None] * root.depth.log())
+        evidence = power * (
+            self.chain.evidence_of_both(arms) + 2 * seen[:, None] * root.depth.log()
+        )
         belief = self.grid.belief(believed, root, evidence)
         root = root._replace(log_weight=root.log_weight + evidence)
         return _Roots(belief, root, self._near(root), arms, middle)
