@@ -324,7 +324,7 @@ def test_a_known_height_scales_the_body_and_its_distance():
     small, usual = tracker(height=1.36)(uv), tracker(height=1.70)(uv)
     torch.testing.assert_close(small.bone_lengths[0, 0], 0.8 * usual.bone_lengths[0, 0])
     depth = [float(track.joints3d[0, -1, ROW["neck"], 2]) for track in (small, usual)]
-    assert depth[0] / depth[1] == pytest.approx(0.8, abs=0.04)
+    assert depth[0] / depth[1] == pytest.approx(0.8, abs=0.06)  # both are drawn to 2.6 m
     spread = small.bone_covariance[0, 0].diagonal().sqrt() / small.bone_lengths[0, 0]
     assert bool((spread <= shipped_arm_prior().spread.max()).all())
     for height in (17.0, 0.0, float("nan"), "1.7"):
