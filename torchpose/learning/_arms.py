@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 from torchpose.errors import InputError
 from torchpose.io import Recording
 from torchpose.priors._arms import ArmPrior, ArmPriorInfo
-from torchpose.priors._gaussian_mixture import GaussianMixture, component_log_density
+from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
 from torchpose.skeleton._torso import upright_axes
 from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM, UpperBody
@@ -132,8 +132,7 @@ def _together(
         mixture: over one arm, which stays. pairs: of arms, both known.
     """
     weights = mixture.weights
-    parts = component_log_density(pairs, mixture.means, torch.linalg.cholesky(mixture.covariances))
-    ratio = torch.softmax(parts + weights.log(), -1) / weights
+    ratio = torch.softmax(mixture.component_log_prob(pairs), -1) / weights
     ratio = torch.cat([ratio, ratio.flip(1)])  # what left arms do, right ones may do
     left, right = ratio.unbind(1)
     found = weights[:, None] * weights

@@ -16,7 +16,7 @@ from torchpose._core.module_state import register_given
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import FileKind, read_tensors, require_tensor, write_tensors
 from torchpose.errors import InputError, PriorError
-from torchpose.priors._gaussian_mixture import GaussianMixture, component_log_density
+from torchpose.priors._gaussian_mixture import GaussianMixture
 
 __all__ = ["LENGTHS", "ArmPrior", "ArmPriorInfo", "shipped_arm_prior"]
 
@@ -120,11 +120,7 @@ class ArmPrior(nn.Module):
             directions: upper arm and forearm of a left arm, or of a mirrored right one.
         """
         check_shape("directions", directions, ("...", 6))
-        mixture = self.directions
-        parts = component_log_density(
-            directions, mixture.means, torch.linalg.cholesky(mixture.covariances)
-        )
-        known = torch.logsumexp(parts + mixture.weights.log(), -1) - self.log_mass
+        known = self.directions.log_prob(directions) - self.log_mass
         broad = torch.full_like(known, math.log(self.broad) - _SPHERES)
         return torch.logaddexp(known + math.log1p(-self.broad), broad)
 
@@ -191,7 +187,6 @@ def _log_mass(mixture: GaussianMixture, n_points: int = 20_000) -> Tensor:
     generator = torch.Generator().manual_seed(0)
     points = torch.randn(n_points, 2, 3, generator=generator, dtype=torch.float64)
     points = torch.nn.functional.normalize(points, dim=-1).flatten(1)
-    means, covs = (x.detach().cpu().double() for x in (mixture.means, mixture.covariances))
-    parts = component_log_density(points, means, torch.linalg.cholesky(covs))
-    density = torch.logsumexp(parts + mixture.weights.detach().cpu().double().log(), -1)
+    with torch.no_grad():
+        density = mixture.log_prob(points.to(mixture.means.device))
     return torch.logsumexp(density, 0) - math.log(n_points) + _SPHERES

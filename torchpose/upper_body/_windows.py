@@ -50,8 +50,7 @@ from torchpose.upper_body._measurements import (
 
 __all__ = ["SeenInView", "WindowMixture", "WindowState", "see_in_view", "suitable_window"]
 
-_N_LIMB = 2  # hand and elbow are the first of an arm
-_BIMODAL = 2  # hand and elbow, which may be before or behind the body
+_N_LIMB = 2  # hand and elbow, the first of an arm, which may be before or behind the body
 _HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
 _HANDS = [UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")]
 
@@ -330,7 +329,7 @@ def _window_filter(
         transition="ou",
         gamma=0.0,
         weighting="frame",
-        medians=layout.in_torso[: 3 * _BIMODAL : 3] if joints else (),
+        medians=layout.in_torso[: 3 * _N_LIMB : 3] if joints else (),
         likelihood_power=likelihood_power,
         dtype=dtype,
     )
