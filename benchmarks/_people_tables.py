@@ -13,6 +13,7 @@ from torchpose.metrics._poses import share_below
 from torchpose.priors import UpperBodyPrior
 
 MAIN, LAGGED, SMOOTHED = "MKF filtered", "MKF fixed lag", "MKF smoothed"
+DEFAULT = "windows and bones"
 UNCALIBRATED = "MKF filtered, uncalibrated"
 BASELINE = "MKF paper, hand-set noise"
 MEAN_POSE, NEIGHBOUR = "mean pose", "nearest neighbour"
@@ -128,7 +129,7 @@ def add_findings(report: Report) -> None:
         f"{float(moved[SMOOTHED, 'mean']):.2f} cm smoothed."
     )
     table = report["coverage"]
-    for name in (MAIN, UNCALIBRATED, BASELINE):
+    for name in (MAIN, f"{DEFAULT}, filtered", UNCALIBRATED, BASELINE):
         rows = [row for row in table.rows if row in (f"{name}, 50 %", f"{name}, 90 %")]
         if not rows:
             continue
@@ -152,7 +153,8 @@ def add_pictures(report: Report, out: Path, scores: dict[str, Scores]) -> None:
     """Add bars of the errors, curves of correct limbs, reliability."""
     from torchpose import viz
 
-    shown = [n for n in (MAIN, SMOOTHED, BASELINE, NEIGHBOUR, MEAN_POSE) if n in scores]
+    usual = (f"{DEFAULT}, filtered", f"{DEFAULT}, smoothed")
+    shown = [n for n in (*usual, MAIN, SMOOTHED, BASELINE, NEIGHBOUR, MEAN_POSE) if n in scores]
     bars = viz.plot_error_bars(
         {n: scores[n].errors3d for n in shown}, title="3D error on persons never seen"
     )
@@ -164,7 +166,9 @@ def add_pictures(report: Report, out: Path, scores: dict[str, Scores]) -> None:
     curves = viz.plot_pcp({n: scores[n].limbs for n in shown}, by_limb=True, title="Correct limbs")
     add_picture(report, out, "pcp.png", curves)
     held = {
-        n: scores[n].reliability for n in (MAIN, SMOOTHED, UNCALIBRATED, BASELINE) if n in scores
+        n: scores[n].reliability
+        for n in (usual[0], MAIN, SMOOTHED, UNCALIBRATED, BASELINE)
+        if n in scores
     }
     known = {n: curve for n, curve in held.items() if curve is not None}
     diagram = viz.plot_reliability(known, title="Calibration of the 3D covariances")

@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import Module
 
+from benchmarks import bones
 from benchmarks.engine import Experiment
 from torchpose.camera import PinholeCamera, project, sample_viewpoints
 from torchpose.errors import InputError
@@ -57,7 +59,10 @@ def tracker_facts(test: Trials, tracker: Tracker) -> list[Any]:
     """Return what a run of a tracker on a test set depends on, beside its seed."""
     prior, options = tracker
     numbers = [value for value in options.values() if isinstance(value, Tensor)]
-    words = {name: v for name, v in options.items() if not isinstance(v, Tensor)}
+    numbers += [
+        t for v in options.values() if isinstance(v, Module) for t in v.state_dict().values()
+    ]
+    words = {name: v for name, v in options.items() if not isinstance(v, Tensor | Module)}
     facts = [words, *numbers, prior.info.transition, *prior.state_dict().values()]
     return [*facts, test.keypoints, test.lengths, test.fps, test.names]
 
@@ -77,6 +82,20 @@ def _track(test: Trials, tracker: Tracker, seeds: Sequence[int]) -> list[Estimat
 
 TRACKING = Experiment(Estimate, _track, tracker_facts, (*MADE_WITH, "benchmarks/_upper_body.py"))
 """Estimates of a `Tracker` on a test set."""
+
+
+def with_bones(data: Path, persons: Sequence[str]) -> dict[str, Any] | None:
+    """Return the options of the tracker's default, with a prior over arms that does not know these persons.
+
+    The prior over arms that comes with the package was fitted to all sets, the test persons included.
+
+    Args:
+        data: folder with all sets, `bones.SETS`; None is returned where one is missing. persons: who is
+            tracked.
+    """
+    if not all((data / name).exists() for name in bones.SETS):
+        return None
+    return {"method": "multiple-model", "arms": bones.fit_without(data, None, persons)}
 
 
 def data_folder(data: str | Path, name: str) -> Path:

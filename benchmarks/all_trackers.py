@@ -27,15 +27,17 @@ from benchmarks._upper_body import (
     score,
     tracker_facts,
     trials_of,
+    with_bones,
 )
 from benchmarks.engine import Experiment, Grid
 from benchmarks.ub_one import split_recording
-from benchmarks.ub_people import mean_pose, people
+from benchmarks.ub_people import TEST_PERSONS, mean_pose, people
 from torchpose._core.files import check_output_folder
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import CAMERA, MEASURED, Estimate, Trials, cached_prior
 from torchpose.io import Recording
 from torchpose.learning import fit_kinect_prior
+from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import METHODS, UpperBodyTracker, method_options
 
 RECIPES: dict[str, dict[str, Any]] = {
@@ -79,10 +81,23 @@ TRACKING = Experiment(
 )
 
 
-def options_of(method: str, particles: int) -> dict[str, Any]:
-    """Return the options of a method, with the particles if it draws any."""
-    drawn = "n_particles" in method_options(method)
-    return {"method": method, "n_particles": particles} if drawn else {"method": method}
+def can_run(method: str, prior: UpperBodyPrior, bones: dict[str, Any] | None) -> bool:
+    """Return whether the prior has windows and there is a prior over arms, where the method needs them."""
+    of_windows = method in (WINDOWS, "multiple-model")
+    return (bool(prior.windows) or not of_windows) and (
+        bones is not None or "arms" not in method_options(method)
+    )
+
+
+def options_of(method: str, particles: int, bones: dict[str, Any] | None) -> dict[str, Any]:
+    """Return the options of a method, with the particles if it draws any, and its prior over arms.
+
+    Args:
+        method: whose. particles: number of them. bones: of `with_bones`.
+    """
+    known = method_options(method)
+    given = (bones or {}) | {"n_particles": particles}
+    return {name: value for name, value in given.items() if name in known} | {"method": method}
 
 
 def ub_people(arguments: argparse.Namespace) -> tuple[list[Recording], Trials]:
@@ -105,6 +120,8 @@ def compare(
     name: str, recordings: list[Recording], test: Trials, report: Report, arguments: Any
 ) -> None:
     """Add a table for each recipe: error, coverage and sample size of every method."""
+    unseen = TEST_PERSONS if name == "UB-people" else [r.person for r in recordings]
+    bones = with_bones(arguments.data, unseen)
     still = mean_pose(test, *projected_training_poses(recordings, CAMERA, 20_000))
     for recipe in arguments.recipes:
         settings = RECIPES[recipe]
@@ -128,8 +145,8 @@ def compare(
              "lost frames"],
             digits=(2, 1, 0, 0, 1, 0, 0),
         )  # fmt: skip
-        methods = [m for m in METHODS if m != WINDOWS or prior.windows]
-        trackers = {m: Tracker(prior, options_of(m, arguments.particles)) for m in methods}
+        methods = [m for m in METHODS if can_run(m, prior, bones)]
+        trackers = {m: Tracker(prior, options_of(m, arguments.particles, bones)) for m in methods}
         grid = Grid({name: test}, trackers)
         runs = TRACKING.run(
             {recipe: grid}, (0,), arguments.out, progress=arguments.progress, title=name

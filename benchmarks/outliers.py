@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from benchmarks._upper_body import data_folder, score, trials_of
+from benchmarks._upper_body import Tracker, data_folder, score, trials_of, with_bones
 from benchmarks.ub_people import TEST_PERSONS, TRAIN_PERSONS
 from torchpose._core.files import check_output_folder
 from torchpose.evaluation import Report
@@ -26,11 +26,9 @@ from torchpose.evaluation.common import CAMERA, Estimate, Trials, cached_prior
 from torchpose.evaluation.unseen import QUICK
 from torchpose.io import read_recordings
 from torchpose.learning import fit_kinect_prior
-from torchpose.priors import UpperBodyPrior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack, UpperBodyTracker
 
-METHODS = ("window-mixture", "mkf-fixed")
 SIZES = (1e2, 3e2, 1e3, 1e4, 1e6)
 JOINTS = ("head", "neck", "hand_left")
 IMAGE = (640.0, 480.0)
@@ -104,27 +102,34 @@ def median_of_frames(keypoints: Float[Tensor, "B T M 2"], width: int = 5) -> Ten
     return torch.where(keypoints.isfinite(), middle, keypoints)
 
 
-def track(prior: UpperBodyPrior, test: Trials, method: str, outliers: bool) -> PoseTrack:
+def track(how: Tracker, test: Trials, outliers: bool) -> PoseTrack:
     """Return the poses of a test set."""
+    prior, options = how
     tracker = UpperBodyTracker(
-        prior, CAMERA, method, fps=test.fps, neck=prior.info.neck, max_gap=None, outliers=outliers
+        prior,
+        CAMERA,
+        fps=test.fps,
+        neck=prior.info.neck,
+        max_gap=None,
+        outliers=outliers,
+        **options,
     )
     with torch.inference_mode():
         return tracker(test.keypoints, names=test.names, lengths=test.lengths)
 
 
-Way = Callable[[UpperBodyPrior, Trials, str], PoseTrack]
+Way = Callable[[Tracker, Trials], PoseTrack]
 
 WAYS: Mapping[str, Way] = {
-    "as they are": lambda prior, test, method: track(prior, test, method, False),
-    "median of 5 frames": lambda prior, test, method: track(
-        prior, test._replace(keypoints=median_of_frames(test.keypoints)), method, False
+    "as they are": lambda how, test: track(how, test, False),
+    "median of 5 frames": lambda how, test: track(
+        how, test._replace(keypoints=median_of_frames(test.keypoints)), False
     ),
-    "outliers left out": lambda prior, test, method: track(prior, test, method, True),
+    "outliers left out": lambda how, test: track(how, test, True),
 }
 
 
-def add_many(report: Report, prior: UpperBodyPrior, test: Trials, wild: Wild) -> None:
+def add_many(report: Report, trackers: Mapping[str, Tracker], test: Trials, wild: Wild) -> None:
     """Add errors and coverage on keypoints as they come and on those that went wrong."""
     table = report.table(
         "many",
@@ -134,17 +139,17 @@ def add_many(report: Report, prior: UpperBodyPrior, test: Trials, wild: Wild) ->
          "with outliers, inside 50 %", "90 %"],
         digits=(3, 3, 3, 0, 0, 0, 0),
     )  # fmt: skip
-    for method in METHODS:
+    for method, how in trackers.items():
         numbers = {}
         for name, way in WAYS.items():
             row: list[float] = []
             for subject in (test, wild.test):
-                row += _error_and_coverage(way(prior, subject, method), test)
+                row += _error_and_coverage(way(how, subject), test)
             numbers[name] = row
         known = test._replace(
             keypoints=torch.where(wild.outliers[..., None], torch.nan, test.keypoints)
         )
-        floor = _error_and_coverage(track(prior, known, method, False), test)
+        floor = _error_and_coverage(track(how, known, False), test)
         numbers["outliers known"] = [*numbers["as they are"][:3], *floor]
         best = min(row[0] for row in numbers.values())
         for name, row in numbers.items():
@@ -165,7 +170,7 @@ def _error_and_coverage(poses: PoseTrack, test: Trials) -> list[float]:
     ]
 
 
-def add_found(report: Report, prior: UpperBodyPrior, test: Trials, wild: Wild) -> None:
+def add_found(report: Report, how: Tracker, test: Trials, wild: Wild) -> None:
     """Add which keypoints were left out."""
     rows = [UPPER_BODY.index(name) for name in test.names]
     table = report.table(
@@ -175,8 +180,8 @@ def add_found(report: Report, prior: UpperBodyPrior, test: Trials, wild: Wild) -
         digits=(3, 3, 1, 1),
         note="Frames with exchanged hands do not count for hands. A metre is what it is at the neck.",
     )
-    clean = track(prior, test, METHODS[0], True)
-    poses = track(prior, wild.test, METHODS[0], True)
+    clean = track(how, test, True)
+    poses = track(how, wild.test, True)
     inside = test.inside[..., None]
     distance = (wild.test.keypoints - test.truth2d[:, :, rows]).norm(dim=-1)
     metre = CAMERA.matrix[0, 0] / test.truth3d[..., UPPER_BODY.index("neck"), 2]
@@ -194,7 +199,7 @@ def add_found(report: Report, prior: UpperBodyPrior, test: Trials, wild: Wild) -
         table.add(name, [100 * float(kind.double().mean()) for kind in kinds])
 
 
-def add_single(report: Report, prior: UpperBodyPrior, test: Trials, seed: int) -> None:
+def add_single(report: Report, trackers: Mapping[str, Tracker], test: Trials, seed: int) -> None:
     """Add what one outlier of each size at each joint adds to the error."""
     table = report.table(
         "single",
@@ -203,15 +208,15 @@ def add_single(report: Report, prior: UpperBodyPrior, test: Trials, seed: int) -
         digits=(2, 1, 2, 1, 1, 1),
         note="Mean over eight joints; 'worst' over outliers.",
     )
-    for method in METHODS:
-        base = {found: _errors(track(prior, test, method, found), test) for found in (True, False)}
+    for method, how in trackers.items():
+        base = {found: _errors(track(how, test, found), test) for found in (True, False)}
         everything: dict[bool, list[Tensor]] = {True: [], False: []}
         for joint in JOINTS:
             for size in SIZES:
                 wild, at = one_outlier(test, joint, size, seed)
                 numbers = {}
                 for found, clean in base.items():
-                    added = _errors(track(prior, wild, method, found), test) - clean
+                    added = _errors(track(how, wild, found), test) - clean
                     later = added[:, _LATER:][at[:, :-_LATER] & test.inside[:, _LATER:]]
                     numbers[found] = (added[at], later)
                     everything[found].append(torch.stack([added[at].mean(), later.nanmean()]))
@@ -282,9 +287,15 @@ def run(arguments: argparse.Namespace) -> Report:
     facts = {"every": arguments.every, "persons": arguments.persons, "seed": arguments.seed}
     facts |= {"sequences": len(test.lengths), "frames": int(test.lengths.sum()), **small}
     report = Report("Outliers", facts)
-    add_many(report, prior, test, wild)
-    add_found(report, prior, test, wild)
-    add_single(report, prior, test, arguments.seed)
+    bones = with_bones(arguments.data, arguments.persons)
+    trackers = {"multiple-model": Tracker(prior, bones)} if bones else {}
+    trackers |= {
+        "window-mixture": Tracker(prior, {"method": "window-mixture"}),
+        "mkf-fixed": Tracker(prior, {"method": "mkf-fixed"}),
+    }
+    add_many(report, trackers, test, wild)
+    add_found(report, next(iter(trackers.values())), test, wild)
+    add_single(report, trackers, test, arguments.seed)
     report.findings.append(
         "A keypoint that is left out costs what a missing one does: the numbers of sizes that are all found "
         "are alike."

@@ -21,6 +21,7 @@ from tqdm.auto import tqdm
 from benchmarks._gaps import add_gap_tables
 from benchmarks._people_tables import (
     BASELINE,
+    DEFAULT,
     LAGGED,
     MAIN,
     MEAN_POSE,
@@ -41,6 +42,7 @@ from benchmarks._upper_body import (
     plain_prior,
     projected_training_poses,
     score,
+    with_bones,
 )
 from benchmarks.engine import Grid
 from torchpose._core.files import check_output_folder
@@ -84,7 +86,8 @@ def run(
     instead of made again.
 
     Args:
-        data: folder kinect_utd_mhad, or the one it is in. out: folder for the results.
+        data: folder kinect_utd_mhad, or the one it is in; the tracker's default is scored too if all
+            other sets are there. out: folder for the results.
         seed: of prior and noise. progress: whether to show bars.
         quick: a small prior, a few sequences and no fixed lag, to see that all of it works.
         n_components: Gaussians per arm; what the recipe has by default if None.
@@ -113,9 +116,10 @@ def run(
     report = Report("UB-people", _settings(train, tested, still, prior, settings, quick))
     lag = 0 if quick else lag
     projected = projected_training_poses(train, CAMERA, 2_000 if quick else _N_PROJECTED, seed)
-    trackers = _variants(prior, lag)
+    bones = None if quick else with_bones(Path(data), TEST_PERSONS)
+    trackers = _usual(prior, bones) | _variants(prior, lag)
     scores = _all_methods(trackers, still, projected, out, progress)
-    some = {name: trackers[name] for name in (MAIN, SMOOTHED, BASELINE)}
+    some = {n: t for n, t in trackers.items() if n in (MAIN, SMOOTHED, BASELINE) or DEFAULT in n}
     moved = _all_methods(some, moving, projected, out, progress, "moving: trackers")
     add_error_tables(report, scores, moved, still, moving)
     add_pcp_table(report, scores)
@@ -180,8 +184,18 @@ def _settings(
     }
 
 
+def _usual(prior: UpperBodyPrior, options: dict[str, Any] | None) -> dict[str, Tracker]:
+    """Return the tracker as it comes, filtered and smoothed, where it has both of its priors."""
+    if not prior.windows or options is None:
+        return {}
+    return {
+        f"{DEFAULT}, filtered": Tracker(prior, options),
+        f"{DEFAULT}, smoothed": Tracker(prior, options | {"smoothing": "full"}),
+    }
+
+
 def _variants(prior: UpperBodyPrior, lag: int) -> dict[str, Tracker]:
-    """Return the trackers of the table: prior with noise, and options."""
+    """Return the other trackers of the table, of the prior alone: prior with noise, and options."""
     plain = plain_prior(prior)
     smooth: dict[str, Any] = {"smoothing": "full"}
     variants = {MAIN: Tracker(prior, {}), SMOOTHED: Tracker(prior, smooth)}

@@ -149,7 +149,7 @@ def test_options_reach_the_tracker(track, files):
 
 def test_the_summary_says_what_ran_where_no_method_was_given(track):
     done, poses = track("--prior", SMALL)
-    assert poses.method == "window-mixture" and "method   window-mixture, filtered" in done.out
+    assert poses.method == "multiple-model" and "method   multiple-model, filtered" in done.out
     done, poses = track()
     assert poses.method == "mkf-fixed" and "method   mkf-fixed, filtered" in done.out
     assert "note" not in done.out

@@ -46,11 +46,17 @@ def without_windows(prior):
     return UpperBodyPrior(prior.left, prior.right, prior.info, prior.noise)
 
 
-def test_windows_are_the_default_where_the_prior_has_them(prior, keypoints):
+def test_windows_and_bones_are_the_default_where_the_prior_has_windows(prior, keypoints):
     track = poses(UpperBodyTracker(prior, demo_camera()), keypoints)
-    assert track.method == "window-mixture" and track.notes == ()
-    named = poses(UpperBodyTracker(prior, demo_camera(), "window-mixture"), keypoints)
+    assert track.method == "multiple-model" and track.notes == ()
+    named = poses(UpperBodyTracker(prior, demo_camera(), "multiple-model"), keypoints)
     assert torch.equal(track.joints3d, named.joints3d)
+
+
+@pytest.mark.parametrize("asked", [{"steady": True}, {"likelihood_power": 0.5}, {"window": True}])
+@pytest.mark.filterwarnings("ignore:window=True is deprecated")
+def test_what_is_asked_of_windows_alone_chooses_windows(prior, asked):
+    assert UpperBodyTracker(prior, demo_camera(), **asked).method == "window-mixture"
 
 
 def test_bones_are_the_default_where_shoulders_and_elbows_are_measured(prior):
@@ -58,7 +64,7 @@ def test_bones_are_the_default_where_shoulders_and_elbows_are_measured(prior):
     rays = joints @ demo_camera().matrix.mT
     seen = (rays[..., :2] / rays[..., 2:])[None]
     tracker = UpperBodyTracker(prior, demo_camera())
-    assert tracker.method == "window-mixture" and tracker(seen).method == "articulated"
+    assert tracker.method == "multiple-model" and tracker(seen).method == "articulated"
     late = UpperBodyTracker(prior, demo_camera(), smoothing=1)
     assert late.method == "mkf-fixed" and late.notes and late(seen).notes == ()
     for options in ({"smoothing": 1}, {"height": 1.7}, {"bone_lengths": {"forearm": 0.3}}):
@@ -70,7 +76,7 @@ def test_bones_are_the_default_where_shoulders_and_elbows_are_measured(prior):
     elbows = [UPPER_BODY.index(f"elbow_{side}") for side in ("left", "right")]
     hidden = seen.clone()
     hidden[:, :, elbows] = torch.nan
-    assert tracker(hidden).method == "window-mixture"
+    assert tracker(hidden).method == "multiple-model"
     wrists = [UPPER_BODY.index(f"hand_{side}") for side in ("left", "right")]
     chosen = {"neck": UPPER_BODY.index("neck"), "left_wrist": wrists[0], "right_wrist": wrists[1]}
     few = tracker(seen[:, :, list(chosen.values())], names=list(chosen))
@@ -96,7 +102,7 @@ def test_single_poses_are_the_default_without_windows(prior, keypoints, smoothin
 def test_a_prior_without_the_window_that_is_needed_says_so(prior, keypoints):
     causal = {"causal": prior.windows["causal"]}
     own = UpperBodyPrior(prior.left, prior.right, prior.info, prior.noise, causal)
-    assert UpperBodyTracker(own, demo_camera()).method == "window-mixture"
+    assert UpperBodyTracker(own, demo_camera()).method == "multiple-model"
     track = poses(UpperBodyTracker(own, demo_camera(), smoothing="full"), keypoints)
     assert track.method == "mkf-fixed"
     assert "brings no mixtures over windows for smoothing" in track.notes[0]
@@ -104,7 +110,7 @@ def test_a_prior_without_the_window_that_is_needed_says_so(prior, keypoints):
 
 def test_a_lag_that_ends_before_the_window_does_leaves_single_poses(prior, keypoints):
     ahead = prior.windows["full"].layout.at_rate(30.0).ahead
-    for lag, method in ((ahead - 1, "mkf-fixed"), (ahead, "window-mixture")):
+    for lag, method in ((ahead - 1, "mkf-fixed"), (ahead, "multiple-model")):
         track = poses(UpperBodyTracker(prior, demo_camera(), smoothing=lag), keypoints)
         assert track.method == method
         assert any(f"look {ahead} frames ahead" in n for n in track.notes) == (lag < ahead)

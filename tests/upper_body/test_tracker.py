@@ -239,7 +239,7 @@ def test_results_are_saved_and_loaded(prior, scene, tmp_path):
     for name in ("joints2d", "joints3d", "covariance3d", "observed", "log_evidence", "lengths"):
         torch.testing.assert_close(getattr(back, name), getattr(single, name))
     assert back.names == UPPER_BODY and back.fps == single.fps and back.notes == single.notes
-    assert back.method == single.method == "window-mixture"
+    assert back.method == single.method == "multiple-model"
     double = tracker(
         keypoints[None].expand(2, -1, -1, -1), names=NAMES, lengths=torch.tensor([150, 90])
     )

@@ -16,7 +16,7 @@ from torchpose.priors._window import WindowPrior
 
 NAMES = ["head", "neck", "hand_left", "hand_right"]
 METHODS = {
-    "windows": {},
+    "windows": {"method": "window-mixture"},
     "poses": {"method": "mkf-fixed"},
     "sampled": {"method": "mkf-sampled"},
     "particles": {"method": "pf-mixture", "n_particles": 100},

@@ -28,6 +28,7 @@ from torchpose.io._results import replace_own
 from torchpose.math._rotations import euler_to_matrix
 from torchpose.priors._upper_body import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.upper_body._methods import choose_method
 from torchpose.upper_body._tracker import UpperBodyTracker
 
 __all__ = [
@@ -45,6 +46,7 @@ __all__ = [
     "draw_picture",
     "keep",
     "make_test_set",
+    "own_method",
     "read_kept",
     "settings_hash",
     "track",
@@ -206,6 +208,13 @@ class Estimate(NamedTuple):
     covariance3d: Tensor | None = None
 
 
+def own_method(
+    prior: UpperBodyPrior, fps: float | None = None, smoothing: int | str | None = None
+) -> str:
+    """Return the method that a prior has by itself: windows where they suit, else single poses."""
+    return choose_method(prior, None, smoothing, fps, (), windows=True).method
+
+
 def track(
     prior: UpperBodyPrior,
     camera: PinholeCamera,
@@ -216,6 +225,7 @@ def track(
     progress: bool = False,
     label: str = "",
     generator: Generators = None,
+    method: str | None = None,
     **options: Any,
 ) -> Estimate:
     """Run `UpperBodyTracker` over a test set, some sequences at a time.
@@ -223,10 +233,13 @@ def track(
     Args:
         prior: of the tracker. camera: of the test. mask: [B, T, M], False = hidden.
         chunk: sequences at a time. progress, label: of the bar. generator: for methods that draw.
+        method: of the tracker; without one `own_method`, since the prior over arms that comes with the
+            package was fitted to many a person who is scored.
         options: of the tracker.
     """
+    method = method or own_method(prior, test.fps, options.get("smoothing"))
     tracker = UpperBodyTracker(
-        prior, camera, fps=test.fps, neck=prior.info.neck, max_gap=None, **options
+        prior, camera, method, fps=test.fps, neck=prior.info.neck, max_gap=None, **options
     )
     parts = []
     starts = range(0, len(test.lengths), chunk)

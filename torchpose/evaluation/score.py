@@ -5,7 +5,7 @@ and tracked. Errors are 3D distances after fixed-scale Procrustes on head, neck 
 whom the prior was fitted on are refused: on them it looks better than on anybody else.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -17,7 +17,7 @@ from tqdm.auto import tqdm
 
 from torchpose._core.checks import check_count
 from torchpose._core.files import check_output_folder
-from torchpose.errors import InputError
+from torchpose.errors import InputError, OverlapError
 from torchpose.evaluation.common import CAMERA, MEASURED, Trials, draw_picture, make_test_set, track
 from torchpose.evaluation.person_tables import (
     add_persons,
@@ -37,9 +37,10 @@ from torchpose.evaluation.unseen import (
 )
 from torchpose.io._recordings import Recording, read_recordings
 from torchpose.metrics._poses import ALIGN_JOINTS, align, joint_errors
+from torchpose.priors._arms import shipped_arm_prior
 from torchpose.priors._upper_body import UpperBodyPrior, load_prior
 from torchpose.skeleton._joint_sets import UPPER_BODY
-from torchpose.upper_body._methods import METHODS
+from torchpose.upper_body._methods import METHODS, choose_method, method_options
 
 __all__ = ["run"]
 
@@ -77,23 +78,27 @@ def run(
         method: of the tracker (default that of torchpose track).
         joints: what the tracker is given: head, neck and hands, or all eight.
         noise_std: of a keypoint, pixels (default 3). every: only each n-th recording of a person.
-        seen: score also persons whom the prior was fitted on; the report says so.
+        seen: score also persons whom the prior, or the prior over arms that comes with the package, was
+            fitted on; the report says so.
 
     Returns:
         The report, with the tables `joints`, `persons` and `pose_classes`.
 
     Raises:
-        InputError: no recordings, or settings out of range. OverlapError: the prior was fitted on one
-            of the persons. PriorError: another kind of hand than the prior's. OutputError: `out`
-            cannot be written.
+        InputError: no recordings, or settings out of range. OverlapError: the prior, or the one over
+            arms if the method takes it, was fitted on one of the persons. PriorError: another kind of
+            hand than the prior's. OutputError: `out` cannot be written.
     """
     _check(method, joints, noise_std, every)
     out = check_output_folder(out)
     prior = load_prior("kinect-upper-body") if prior is None else prior
     recordings = read_recordings(data)
-    known = sorted({r.person_id for r in recordings} & set(prior.info.persons))
+    scored = {r.person_id for r in recordings}
+    in_arms = _known_to_arms(scored, method or _usual(prior, _SEEN[joints]))
+    known = sorted(scored & {*prior.info.persons, *in_arms})
     if not seen:
-        prior.check_unseen({r.person_id for r in recordings})
+        prior.check_unseen(scored)
+        _check_arms(in_arms)
     persons = {name: group[::every] for name, group in by_person(recordings).items()}
     found = {}
     for name, group in tqdm(persons.items(), disable=not progress, unit="person", desc="score"):
@@ -104,12 +109,12 @@ def run(
         "persons": {name: f"{len(group)} recordings" for name, group in persons.items()},
     })  # fmt: skip
     _add_joints(report, found)
-    scored = {name: scores.scored for name, scores in found.items()}
-    add_persons(report, scored)
-    add_pose_classes(report, {"all": pooled(list(scored.values()))})
+    by_name = {name: scores.scored for name, scores in found.items()}
+    add_persons(report, by_name)
+    add_pose_classes(report, {"all": pooled(list(by_name.values()))})
     _add_findings(report, found, known)
     title = f"3D error of each person under {prior.info.name or 'the prior'}"
-    draw_picture(report, out, "persons.png", lambda: plot_persons(scored, title))
+    draw_picture(report, out, "persons.png", lambda: plot_persons(by_name, title))
     report.save(out)
     return report
 
@@ -122,6 +127,34 @@ def _check(method: str | None, joints: str, noise_std: float, every: int) -> Non
     if not 0 < noise_std < float("inf"):
         raise InputError(f"noise_std must be positive, got {noise_std:g}")
     check_count("every", every)
+
+
+def _usual(
+    prior: UpperBodyPrior,
+    names: Sequence[str],
+    fps: float | None = None,
+    smoothing: str | None = None,
+) -> str:
+    """Return the method that the tracker takes by itself for these joints."""
+    there = [joint in names for joint in UPPER_BODY]
+    return choose_method(prior, None, smoothing, fps, ()).with_joints(there, wrists=False)
+
+
+def _known_to_arms(persons: Set[str], method: str) -> list[str]:
+    """Return those of the persons whom the prior over arms knows, if the method takes it."""
+    if "arms" not in method_options(method):
+        return []
+    return sorted(persons & set(shipped_arm_prior().info.persons))
+
+
+def _check_arms(known: Sequence[str]) -> None:
+    """Raise `OverlapError` if there are persons whom the prior over arms knows."""
+    if known:
+        raise OverlapError(
+            f"the prior over arms that comes with the package was fitted on {', '.join(known)}; score "
+            "other persons, pass seen=True, or take method 'window-mixture' or 'mkf-fixed', which do "
+            "without it"
+        )
 
 
 def _score(
@@ -169,6 +202,7 @@ def _tracked(
 ) -> tuple[Tensor, Tensor]:
     """Return errors [N, 8] and whether the truth is inside the ellipsoids [N, L, 8]."""
     generator = torch.Generator().manual_seed(seed)
+    method = method or _usual(prior, test.names, test.fps, options.get("smoothing"))
     estimate = track(prior, CAMERA, test, method=method, generator=generator, **options)
     return compare(estimate, test, counted)
 

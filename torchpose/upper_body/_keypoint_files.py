@@ -32,7 +32,7 @@ class TrackSettings:
     Args:
         prior: a prior that comes with torchpose, or a .safetensors file.
         method: name of the estimator; by default articulated if both shoulders and an elbow are measured,
-            else window-mixture if the prior brings windows that suit, else mkf-fixed.
+            else multiple-model if the prior brings windows that suit, else mkf-fixed.
         camera: TOML file or four numbers fx,fy,cx,cy in pixels; without it K or the image size of the
             input.
         camera_name: which camera of a file with several.
@@ -49,7 +49,8 @@ class TrackSettings:
         person: of articulated: the .npz of a recording of the same person, whose lengths are taken.
         frame: axes of the 3D poses: of the camera (default) or of the body.
         static_camera: let the body turn in front of a camera that stays where it is.
-        window: deprecated: false stands for the method mkf-fixed, true for the default.
+        window: deprecated: false stands for the method mkf-fixed, true for window-mixture if the prior
+            brings windows that suit.
         steady: take the jitter out of what windows give, by filters of constant velocity (default
             true for window-mixture).
         neck: kind of the keypoints' neck if their names do not tell: neck, low-neck, mid-shoulder.
@@ -101,6 +102,8 @@ class TrackSettings:
         names = ("smoothing", "frame", "static_camera", "outliers")
         options = {name: getattr(self, name) for name in names}
         options |= {"method": method, "steady": steady}
+        if self.window and method is None:
+            options["window"] = True  # windows, which were the default
         for name in ("n_particles", "n_tracks"):
             value = getattr(self, name)
             if value is not None:

@@ -192,12 +192,14 @@ def choose_method(
     smoothing: int | str | None,
     fps: float | None,
     options: Iterable[str],
+    windows: bool = False,
 ) -> Chosen:
-    """Return the method that was named, else windows where the prior's suit, else single poses.
+    """Return the method that was named, else one with windows where the prior's suit, else single poses.
 
     Args:
         prior: with its windows. method: one of `METHODS`, or None. smoothing, fps: as in
             `suitable_window`. options: names of those that were given to the filter.
+        windows: whether something was asked for that is of windows alone.
 
     Raises:
         InputError: no such method, one that cannot do what was asked for, an option that it does not
@@ -206,7 +208,8 @@ def choose_method(
     wrong_lag = isinstance(smoothing, int) and smoothing < 0
     if wrong_lag or (isinstance(smoothing, str) and smoothing != "full"):
         raise InputError(f"smoothing must be None, a number of frames or 'full', got {smoothing!r}")
-    chosen = _default(prior, smoothing, fps, options) if method is None else Chosen(method, ())
+    free = method is None and not windows and not list(options)
+    chosen = Chosen(method, ()) if method else _default(prior, smoothing, fps, options, free)
     if smoothing is not None and not _find(chosen.method).smooths:
         able = [repr(name) for name, other in METHODS.items() if other.smooths]
         raise InputError(f"smoothing needs method {' or '.join(able)}, got {chosen.method!r}")
@@ -216,7 +219,7 @@ def choose_method(
             f"{SINGLE_POSES!r}"
         )
     check_options(chosen.method, options)
-    return chosen._replace(free=method is None and not list(options))
+    return chosen._replace(free=free)
 
 
 def _find(method: str) -> Method:
@@ -232,7 +235,11 @@ def _find_filter(method: str) -> PoseFilter:
 
 
 def _default(
-    prior: UpperBodyPrior, smoothing: int | str | None, fps: float | None, options: Iterable[str]
+    prior: UpperBodyPrior,
+    smoothing: int | str | None,
+    fps: float | None,
+    options: Iterable[str],
+    free: bool,
 ) -> Chosen:
     """Return the choice where no method was named."""
     if set(method_options(BONES)) & set(options):  # of no other method
@@ -247,7 +254,7 @@ def _default(
         )
         return Chosen(SINGLE_POSES, ())
     if suitable_window(prior, smoothing, fps or 30.0) is not None:
-        return Chosen(WINDOWS, ())
+        return Chosen(_BOTH if free else WINDOWS, ())
     if not prior.windows:
         return Chosen(SINGLE_POSES, ())
     reason = _missing(prior, smoothing, fps)

@@ -85,9 +85,10 @@ class UpperBodyTracker(WideModule):
         camera: of the keypoints. One other than the prior's is mapped to it.
         method: one of `METHODS`. By default "articulated" where both shoulders and an elbow are
             measured, wrists stand for the prior's hands, or an option of bones is given, and neither
-            `steady` nor an option of another method is; else "window-mixture" where the prior has
-            windows that suit, else "mkf-fixed". The attribute `method` is the one for few joints,
-            `PoseTrack.method` the one that ran.
+            `steady` nor an option of another method is; else "multiple-model" where the prior has
+            windows that suit, or "window-mixture" if `steady` or an option of windows is given; else
+            "mkf-fixed". The attribute `method` is the one for few joints, `PoseTrack.method` the one
+            that ran.
         measurement_std: standard deviation of a keypoint in the camera's pixels, one number or one
             for each of hand, elbow, shoulder, head, neck; by default what the prior brings, else 3.
         fps: frame rate of the keypoints; by default that of the prior. Process noise is scaled.
@@ -96,7 +97,8 @@ class UpperBodyTracker(WideModule):
         frame: "camera" (axes of the camera) or "body" (of the prior's recordings).
         static_camera: put the body, turned by the estimated rotation, in front of a camera that
             stays at the prior's mean place, as the authors' released demo does.
-        window: deprecated; False stands for method "mkf-fixed", True for the default.
+        window: deprecated; False stands for method "mkf-fixed", True for "window-mixture" where the prior
+            has windows that suit.
         steady: pass what windows give through filters of constant velocity (`MotionStage`), which take
             the jitter out; smoothers if `smoothing` is asked for. By default where there are windows;
             False leaves it out, in "multiple-model" too.
@@ -151,9 +153,9 @@ class UpperBodyTracker(WideModule):
             method, steady = options_of_window(method, window, steady)
         self.prior = prior
         self.fps = fps or prior.info.fps
-        chosen = choose_method(prior, method, smoothing, self.fps, options)
-        self._chosen = chosen._replace(free=chosen.free and steady is None and window is None)
-        self.method, self.notes = chosen.method, chosen.notes
+        of_windows = steady is not None or window is not None
+        self._chosen = choose_method(prior, method, smoothing, self.fps, options, of_windows)
+        self.method, self.notes = self._chosen.method, self._chosen.notes
         self.smoothing = smoothing
         self.calibrated = calibrated
         self.frame = frame
