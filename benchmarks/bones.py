@@ -84,6 +84,7 @@ _UTD, _UTD_PERSONS, _UTD_EVERY = "kinect_utd_mhad", ("s7", "s8"), 8
 FIT = {"n_components": 10, "window_components": 48, "calibration_folds": 0}
 _NAMES = ("mhad", "openpose", "webcam", "utd-mhad")  # of groups, for pictures
 _VISIBLE, _UNSEEN = 0.6, 0.3  # MediaPipe's visibility: of an arm that is scored, of a missing joint
+_QUICK_FRAMES = 40  # of a view of a quick run
 _SETTLED = 90  # frames, from where on the spread of a bone's length counts
 
 
@@ -409,7 +410,20 @@ class Group(NamedTuple):
 
 
 def groups(data: Path, quick: bool) -> Iterator[Group]:
-    """Yield what is scored, set by set."""
+    """Yield what is scored, set by set: little of each in a quick run."""
+    for group in _groups(data, quick):
+        views = [begun(view) for view in group.views] if quick else group.views
+        yield group._replace(views=views)
+
+
+def begun(view: View, frames: int = _QUICK_FRAMES) -> View:
+    """Return the first frames of a view."""
+    seen = (view.keypoints, view.confidence, view.truth)
+    keypoints, confidence, truth = (values[:frames] for values in seen)
+    return view._replace(keypoints=keypoints, confidence=confidence, truth=truth)
+
+
+def _groups(data: Path, quick: bool) -> Iterator[Group]:
     every = 150 if quick else _EVERY
     yield Group("MHAD, seven joints", mhad_views(data, every), "mocap_berkeley_mhad",
                 few=FEW, few_seen="MHAD, neck and wrists")  # fmt: skip

@@ -355,7 +355,7 @@ def main() -> None:
     jitter_tables(bench, report, tracks)
     gap_table(bench, report, *((60, GAPS[:1]) if args.quick else (10,)))
     inferred_table(bench, report)
-    some = slice(2 if args.quick else None)
+    some = slice(1 if args.quick else None)
     place_table(bench, report, HEADS[some], NECKS[some])
     by_clip_table(bench, report, tracks)
     space_table(bench, report, tracks)

@@ -4,7 +4,7 @@ from torchpose.upper_body import method_options
 
 prior = torchpose.load_prior("kinect-upper-body-small")
 print(torchpose.UpperBodyTracker(prior, prior.camera).method)
-# > window-mixture
+# > multiple-model
 print(method_options("window-mixture"))
 # > ('likelihood_power', 'dtype')
 try:

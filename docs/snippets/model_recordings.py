@@ -9,7 +9,7 @@ clip = noisy_keypoints(performer(300, seed=0).joints, std_px=3.0)
 recordings = [clip[i : i + 20 + i % 40] for i in range(200)]
 
 prior = torchpose.load_prior("kinect-upper-body-small")
-tracker = torchpose.UpperBodyTracker(prior, camera=demo_camera())
+tracker = torchpose.UpperBodyTracker(prior, camera=demo_camera(), method="window-mixture")
 
 poses: dict[int, torch.Tensor] = {}
 order = sorted(range(len(recordings)), key=lambda i: len(recordings[i]))
