@@ -29,12 +29,15 @@ from torchpose.evaluation import Report
 from torchpose.learning import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
 from torchpose.priors._arms import ArmPrior
-from torchpose.skeleton._joint_sets import canonical_names
+from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
+from torchpose.skeleton._torso import KINECT_NECK
 
 _MHAD = "mocap_berkeley_mhad"
 _KINECT = {"kinect_utd_mhad": 24, "burke_kinect/kinect_joints.npz": 1, "kinect_laban": 1}
 """Kinect sets, and one recording of so many that is scored."""
 _ONE = "burke_kinect/kinect_joints.npz"  # that lifters of a quick run know
+_HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
+_SHOULDERS = [UPPER_BODY.index(f"shoulder_{side}") for side in ("left", "right")]
 _LONGEST, _SHORTEST = 600, 30  # frames of a recording
 _RATE = 30.0
 _LIFT, _HANGING = "lift, others' lengths, own depth", "hanging arms"
@@ -89,9 +92,16 @@ def _kinect_views(path: Path, every: int) -> list[bones.View]:
 
 
 def _at_rate(recording: torchpose.io.Recording) -> Tensor:
-    """Return the eight joints at 30 frames a second, [T, 8, 3]."""
+    """Return the eight joints at 30 frames a second, with Kinect's neck where that is known, [T, 8, 3]."""
     step = max(1, round(float(recording.fps or _RATE) / _RATE))
-    return recording.upper_body().joints.double()[::step]
+    body = recording.upper_body()
+    joints = body.joints.double()[::step]
+    if body.neck == "mid-shoulder":
+        joints = joints.clone()
+        joints[:, _NECK] = (
+            joints[:, _SHOULDERS].mean(1).lerp(joints[:, _HEAD], KINECT_NECK.fraction)
+        )
+    return joints
 
 
 def _joints(found: Sequence[torchpose.io.Recording]) -> list[Tensor]:

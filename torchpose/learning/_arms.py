@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -21,10 +21,11 @@ from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM, UpperBody
 
 __all__ = ["arm_directions", "fit_arm_prior"]
 
-_LEAST_SPREAD = 0.04  # of the log of a length over persons: fewer persons know no less
+_LEAST_SPREAD = 0.04  # of the log of a length over persons, however alike those are
 _OUTLYING = 0.25  # log of a length beyond which a joint means something else
-_FEW = 4.0  # persons whose weight a default spread has
-_DEFAULT_SPREAD = torch.tensor([0.07, 0.07, 0.09, 0.12, 0.10], dtype=torch.float64)
+_FOREIGN = 0.5  # the same relative to the upper arm: a neck or a wrist that is none of Kinect's
+_FEW = 4.0  # sets whose weight a default spread has
+_DEFAULT_SPREAD = torch.tensor([0.07, 0.07, 0.09, 0.12, 0.16], dtype=torch.float64)
 _DEFAULT_LENGTHS = torch.tensor([0.27, 0.24, 0.30, 0.32, 0.19], dtype=torch.float64)
 _FLOOR = 0.01  # variance added to each coordinate of a direction: a tenth of a radian
 _TILT = 8.0  # degrees by which cameras stand askew to what they look at
@@ -90,7 +91,7 @@ def fit_arm_prior(
         raise InputError("a prior over arms needs sets of at least one recording, got none")
     shares = [1 / len(recordings)] * len(recordings) if shares is None else list(shares)
     generator = torch.Generator().manual_seed(seed)
-    samples, lengths, persons, trust = [], [], [], []
+    samples, lengths, persons, trust, of = [], [], [], [], []
     for of_set, share in zip(recordings, shares, strict=True):
         by_person = _persons(of_set)
         pairs = torch.cat([person.directions for person in by_person.values()])
@@ -102,6 +103,7 @@ def fit_arm_prior(
         lengths += [person.lengths for person in by_person.values()]
         persons += list(by_person)
         trust += [share / sum(shares) / len(by_person)] * len(by_person)
+        of += [len(samples)] * len(by_person)
     both = _tilted(torch.cat(samples), generator)
     points = _one_of(both, generator)
     mixture = GaussianMixture.fit(
@@ -110,7 +112,7 @@ def fit_arm_prior(
     whole = both[both.isfinite().flatten(1).all(1)]
     together = _together(mixture, whole) if len(whole) else None
     medians, spread = _length_statistics(
-        torch.stack(lengths), torch.tensor(trust, dtype=torch.float64)
+        torch.stack(lengths), torch.tensor(trust, dtype=torch.float64), torch.tensor(of)
     )
     info = ArmPriorInfo(persons=tuple(persons))
     return ArmPrior(mixture, medians, spread, broad, info, together)
@@ -216,17 +218,21 @@ def _tilted(pairs: Float[Tensor, "N 2 6"], generator: torch.Generator) -> Float[
 
 
 def _length_statistics(
-    lengths: Float[Tensor, "P 5"], trust: Float[Tensor, " P"]
+    lengths: Float[Tensor, "P 5"], trust: Float[Tensor, " P"], of: Int[Tensor, " P"]
 ) -> tuple[Tensor, Tensor]:
     """Return the weighted median of each length, and the spread of its log, shrunk to what is usual.
 
+    The persons of a set were measured alike: a set counts as one, however many persons it has.
+
     Args:
         lengths: of each person, NaN where not known. trust: weight of each person, of sum one.
+        of: number of each person's set.
     """
     logs = lengths.log()
-    known = logs.isfinite()
+    in_proportion = logs - logs[:, :1] - (_DEFAULT_LENGTHS / _DEFAULT_LENGTHS[0]).log()
+    known = logs.isfinite() & ~(in_proportion.abs() > _FOREIGN)
     weight = torch.where(known, trust[:, None], 0.0)
-    count = known.sum(0)
+    count = torch.stack([known[of == i].any(0) for i in of.unique()]).sum(0)
     order = logs.where(known, math.inf).argsort(0)
     passed = weight.gather(0, order).cumsum(0) >= weight.sum(0) / 2
     middle = logs.gather(0, order).gather(0, passed.to(torch.uint8).argmax(0, keepdim=True))[0]

@@ -44,7 +44,7 @@ from torchpose.upper_body._articulated_poses import (
     pose_of,
 )
 from torchpose.upper_body._body_lengths import BodyLengths, KnownBody, Lengths
-from torchpose.upper_body._estimator import ArmJoints, Estimates, Estimator, TrackerModel
+from torchpose.upper_body._estimator import ArmJoints, Bones, Estimates, Estimator, TrackerModel
 from torchpose.upper_body._face import FacePoints, face_evidence, head_in_face
 from torchpose.upper_body._lean import lean_angle, rolled, seen_lean
 from torchpose.upper_body._measurements import MeasuredJoints
@@ -74,7 +74,7 @@ class ArticulatedState(NamedTuple):
     """State of `ArticulatedFilter` between two frames.
 
     Attributes:
-        root: belief over depth and turn, [B, Z, P]. lengths: of the bones.
+        root: belief over size, depth and turn of the torso, [B, S, Z, P]. lengths: of the bones.
         arms: belief over the arms; None before the first frame.
         middle: of the shoulders, camera axes, [B, 3]; on the axis before any of the torso was seen.
         lean: moments of the line between the shoulders (`seen_lean`), [B, 2].
@@ -125,7 +125,7 @@ class _Roots(NamedTuple):
     """Hypotheses of depth and turn in a frame.
 
     Attributes:
-        belief: over the grid, [B, Z, P]. root: the likeliest of them.
+        belief: over the grid, [B, S, Z, P]. root: the likeliest of them.
         near: share of each in the estimate, [B, M]. arms: of each. middle: of the shoulders, [B, M, 3].
     """
 
@@ -148,8 +148,9 @@ class ArticulatedFilter(Estimator):
     """Estimator of arms whose bones keep their lengths, from any of the eight joints.
 
     0. The lean of the torso to a side, by which the frame is turned about the optical axis (`seen_lean`).
-    1. The torso: depth and turn of the shoulders on a grid, weighed by what torso joints, the face and
-       both arms together say (`RootGrid`, `face_evidence`, `ArmChain.evidence_of_both`).
+    1. The torso: its depth, its size, which stays, and the turn of the shoulders on a grid, weighed by
+       what torso joints, the face and both arms together say (`RootGrid`, `face_evidence`,
+       `ArmChain.evidence_of_both`).
     2. The lengths of upper arm, forearm, shoulders and head, a Gaussian over their logs that starts as
        the prior over persons and sharpens (assumed-density filter). One camera does not tell a large
        body that is far from a small one that is near, so the common scale stays the prior's.
@@ -218,10 +219,11 @@ class ArticulatedFilter(Estimator):
         self, batch_size: int, joints: ArmJoints, generators: dict[str, Generators]
     ) -> ArticulatedState:
         """Return the state before the first frame; see `Estimator`."""
-        root = self.grid.init(batch_size)
+        root = self.grid.init(batch_size, self.lengths.size_spread)
+        lengths = self.lengths.init(batch_size, self.grid.moments(root).of_size)
         middle = root.new_tensor([0.0, 0.0, 1.0]).expand(batch_size, -1)
         lean = root.new_zeros(batch_size, 2)
-        return ArticulatedState(root, self.lengths.init(batch_size), None, middle, lean, 0)
+        return ArticulatedState(root, lengths, None, middle, lean, 0)
 
     def advance(
         self, state: ArticulatedState, measured: MeasuredJoints
@@ -229,7 +231,7 @@ class ArticulatedFilter(Estimator):
         """Return the next state and the estimates of T more frames; see `Estimator`."""
         poses, last = [], state
         for last, body, belief in self._steps(state, measured):  # noqa: B007  # the last one is returned
-            poses.append(pose_of(body, belief, self.matrix))
+            poses.append(self._pose(body, belief))
         return last, estimates_of(poses, self.matrix, self.lengths.names)
 
     def forward(
@@ -244,7 +246,7 @@ class ArticulatedFilter(Estimator):
         state = self.init(len(measured.uv), joints, generators)
         steps = self._steps(state, measured, progress)
         if self.model.smoothing is None:
-            poses = [pose_of(body, belief, self.matrix) for _, body, belief in steps]
+            poses = [self._pose(body, belief) for _, body, belief in steps]
         else:
             poses = self._smoothed(list(steps), lengths)
         return estimates_of(poses, self.matrix, self.lengths.names, lengths)
@@ -255,7 +257,11 @@ class ArticulatedFilter(Estimator):
         lag = int(smoothing) if isinstance(smoothing, int) else None
         beliefs = self.chain.smoothed([step.arms for step in steps], lengths, lag)
         pairs = zip(steps, beliefs, strict=True)
-        return [pose_of(step.body, belief, self.matrix) for step, belief in pairs]
+        return [self._pose(step.body, belief) for step, belief in pairs]
+
+    def _pose(self, body: SeenBody, belief: ArmState) -> FramePose:
+        """Return the estimate of a frame."""
+        return pose_of(body, belief, self.matrix, self.model.calibrated)
 
     def _steps(
         self, state: ArticulatedState, measured: MeasuredJoints, progress: bool = False
@@ -292,7 +298,7 @@ class ArticulatedFilter(Estimator):
 
     def _step(self, state: ArticulatedState, frame: _Frame) -> _Step:
         """Return what a frame leaves, worked out in a camera that leans as the torso does."""
-        depth = (state.root.sum(2) @ self.grid.depth.log()).exp()
+        depth = self.grid.moments(state.root).depth
         lean = seen_lean(state.lean, frame.rays, frame.known, depth, self.model.rate)
         angle = lean_angle(lean)
         level = state._replace(middle=rolled(state.middle, -angle), lean=lean)
@@ -315,7 +321,11 @@ class ArticulatedFilter(Estimator):
             of_lengths = partial(self._evidence_of, frame, root, middle)
             learnt = self.lengths.learn(learnt, frame.torso, root, of_lengths)
         others = self._covs_of_root(frame, roots, lengths)
-        body = self._body(frame, root, middle, state.lengths, others)
+        before = self.grid.moments(state.root)
+        bones = self.lengths.shown(state.lengths, before.size, before.of_size)
+        body = self._body(frame, root, middle, state.lengths, bones)
+        far = self.grid.moments(roots.belief).of_depth
+        body = body._replace(others=others, far=far)
         new = ArticulatedState(
             roots.belief, learnt, belief, middle[:, 0], state.lean, state.frame + 1
         )
@@ -331,7 +341,8 @@ class ArticulatedFilter(Estimator):
         believed = believed + power * self.grid.evidence(frame.torso, size)
         if frame.face is not None:
             std = frame.std.amin(1)
-            believed = believed + face_evidence(frame.face, std, self.grid.depth, self.grid.turn)
+            said = face_evidence(frame.face, std, self.grid.depth, self.grid.turn)
+            believed = believed + said[:, None]
         root = self.grid.best(believed, _ROOTS)
         middle = self._middle(state, frame.torso, root)
         arms = self._arms(frame, root, middle, lengths, slack, _COARSE_ANGLES, _COARSE_AROUND)
@@ -346,7 +357,7 @@ class ArticulatedFilter(Estimator):
     def _middle(self, state: ArticulatedState, torso: Torso, root: Root) -> Float[Tensor, "B M 3"]:
         """Return the middle of the shoulders, where it was last if nothing of the torso is measured."""
         size = self.lengths.torso(state.lengths)
-        found = middle_of_shoulders(torso, root.depth, root.turn, size)
+        found = middle_of_shoulders(torso, root, size)
         before = (state.middle / state.middle[:, 2:])[:, None] * root.depth[..., None]
         return torch.where(torso.known.any(1)[:, None, None], found, before)
 
@@ -354,7 +365,7 @@ class ArticulatedFilter(Estimator):
         self, frame: _LevelFrame, root: Root, middle: Tensor, width: Tensor
     ) -> Float[Tensor, "B 2 M 3"]:
         """Return both shoulders: on their rays where they are measured."""
-        half = half_widths(width, frame.torso.raised(root.depth))
+        half = half_widths(width, frame.torso.raised(root.depth)) * root.size[..., None]
         offsets = shoulder_offsets(root.turn, half)
         inferred = (middle[..., None, :] + offsets).transpose(1, 2)
         ray = frame.rays[:, SHOULDERS, None]
@@ -401,8 +412,9 @@ class ArticulatedFilter(Estimator):
         best = root.turn.gather(1, near.argmax(1, keepdim=True))
         off = within_half_turn(root.turn - best)
         depth = (near * root.depth.log()).sum(1, keepdim=True).exp()
+        size = (near * root.size.log()).sum(1, keepdim=True).exp()
         turn = best + (near * off).sum(1, keepdim=True)
-        return Root(depth, turn, torch.zeros_like(depth), torch.zeros_like(root.cell[:, :1]))
+        return Root(depth, turn, size, torch.zeros_like(depth), torch.zeros_like(root.cell[:, :1]))
 
     def _covs_of_root(
         self, frame: _LevelFrame, roots: _Roots, lengths: Tensor
@@ -426,24 +438,24 @@ class ArticulatedFilter(Estimator):
         return arms.log_evidence.sum((1, 2))
 
     def _body(
-        self, frame: _LevelFrame, root: Root, middle: Tensor, lengths: Lengths, others: Tensor
+        self, frame: _LevelFrame, root: Root, middle: Tensor, lengths: Lengths, bones: Bones
     ) -> SeenBody:
-        """Return the body but for the arms, of one hypothesis of the root; `others` as in `SeenBody`."""
-        metres, bones = self.lengths.metres(lengths), self.lengths.shown(lengths)
+        """Return the body but for the arms, of one hypothesis of the root that is right."""
+        metres = self.lengths.metres(lengths)
         shoulders = self._shoulders(frame, root, middle, metres[:, 2])[:, :, 0]
         joints = middle.new_zeros(len(middle), 8, 3)
         joints[:, SHOULDERS] = shoulders
         joints[:, _SPINE] = self._spine(frame, root, middle, shoulders, lengths)
         scale = self.lengths.scale.expand(len(middle))
         turn = root.turn[:, 0]
-        level = torch.zeros_like(turn)
-        return SeenBody(joints, frame.known, metres, bones, scale, others, turn, level)
+        level, sure = torch.zeros_like(turn), middle.new_zeros(len(middle), 4, 3, 3)
+        return SeenBody(joints, frame.known, metres, bones, scale, sure, level, turn, level)
 
     def _spine(
         self, frame: _LevelFrame, root: Root, middle: Tensor, shoulders: Tensor, lengths: Lengths
     ) -> Float[Tensor, "B 2 3"]:
         """Return neck and head: on their rays where they are measured, the head by its face too."""
-        upright = middle + spine_places(self.lengths.torso(lengths))
+        upright = middle + spine_places(self.lengths.torso(lengths)) * root.size[..., None]
         ray = frame.rays[:, _SPINE]
         on_ray = ray / ray[..., 2:] * upright[..., 2:]
         known = frame.known[:, _SPINE, None]

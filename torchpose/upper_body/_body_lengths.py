@@ -33,6 +33,7 @@ _SMALLEST, _TALLEST = 0.5, 2.6  # metres
 _HEIGHT = 1.70  # metres: of whom the prior's lengths are taken for
 _OF_HEIGHT = 0.055  # of the log of a length: what the heights of grown-ups explain
 _SUREST = 0.01  # of the log of a length relative to others
+_TOGETHER = 0.72  # of the variance of a torso's lengths relative to arms: one size explains it
 _LEAST = 0.04  # of the log of a length that is only known in proportion
 
 
@@ -165,26 +166,46 @@ class BodyLengths:
         """Return the standard deviation of the log of the common scale."""
         return self.spread[self.surest]
 
-    def init(self, batch_size: int) -> Lengths:
-        """Return what is believed before the first frame."""
-        own = (self.spread.square() - self.scale.square()).clamp_min(_SUREST**2)
-        own[self.surest] = self.scale.square()
-        precision = own.reciprocal().expand(batch_size, -1)
+    @property
+    def size_spread(self) -> Tensor:
+        """Return the standard deviation of the log of a torso's size relative to arms (`RootGrid`)."""
+        own = self.spread.square() - self.scale.square()
+        return (_TOGETHER * own[2:].amin()).clamp_min(0.0).sqrt()
+
+    def init(self, batch_size: int, of_size: Float[Tensor, " B"]) -> Lengths:
+        """Return what is believed before the first frame, given the size of the torso.
+
+        Args:
+            batch_size: B. of_size: variance of the log of that size.
+        """
+        own = (self.spread.square() - self.scale.square()).repeat(batch_size, 1)
+        own[:, 2:] -= of_size[:, None]
+        own = own.clamp_min(_SUREST**2)
+        own[:, self.surest] = self.scale.square()
+        precision = own.reciprocal()
         return Lengths(torch.zeros_like(precision), precision)
 
     def metres(self, lengths: Lengths) -> Float[Tensor, "B 4"]:
         """Return the lengths."""
         return self.usual * lengths.mean.exp()
 
-    def shown(self, lengths: Lengths) -> Bones:
+    def shown(
+        self, lengths: Lengths, size: Float[Tensor, " B"], unsure: Float[Tensor, " B"]
+    ) -> Bones:
         """Return the lengths as they are reported, heads above Kinect's neck.
 
-        Their covariances are those of a common scale and of each length by itself.
+        Their covariances are those of a common scale, of the size of the torso, and of each length by
+        itself.
+
+        Args:
+            lengths: given the size. size: of the torso. unsure: variance of its log.
         """
         own = lengths.precision.reciprocal()
         own[:, self.surest] = 0.0
+        torso = own.new_tensor([0.0, 0.0, 1.0, 1.0])
         logs = torch.diag_embed(own) + self.scale.square()
-        metres = self.metres(lengths)
+        logs = logs + unsure[:, None, None] * torso[:, None] * torso
+        metres = self.metres(lengths) * size[:, None] ** torso
         return Bones(self.names, metres - self.lower, metres[:, :, None] * logs * metres[:, None])
 
     def slack(self, lengths: Lengths) -> Float[Tensor, "B 2"]:
@@ -242,7 +263,7 @@ class BodyLengths:
         self, lengths: Lengths, torso: Torso, root: Root
     ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
         """Return slope and bend of the evidence over the log-width and the log-height, [B, 1] each."""
-        size = self.metres(lengths)
+        size = self.metres(lengths) * root.size
         inward, wavering = (x[:, None] for x in inward_shares(torso, root.depth[:, 0]))
         width, height = size[:, 2:3], size[:, 3:]
         across = width * (1 - inward) * root.turn.cos()

@@ -1,4 +1,4 @@
-"""Follow how far away a torso is, and how far its shoulders are turned, on a grid."""
+"""Follow how far away a torso is, how large, and how far its shoulders are turned, on a grid."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 
 __all__ = [
     "NECK_HEIGHT",
+    "Moments",
     "Root",
     "RootGrid",
     "Torso",
@@ -35,6 +36,7 @@ NECK_HEIGHT = 0.105
 # Metres, as the Kinect recordings have it, and of its log: others sit at webcams, or stand in halls.
 _DEPTH, _DEPTH_STD = 2.6, 0.6
 _NEAREST, _FARTHEST, _DEPTH_STEP = 0.4, 9.0, 0.04  # metres, and the step of log depth
+_SIZES, _CELLS = 11, 2  # of torsos, and steps of log depth from one to the next
 _TURN_STEP, _TURN_STD = 15.0, 20.0  # degrees
 _BROAD_TURN = 0.2  # share of the turns that are all alike likely
 _SPEED, _TURN_SPEED = 0.08, 60.0  # share of the depth, and degrees, after one second
@@ -73,12 +75,31 @@ class TorsoLengths(NamedTuple):
 
 
 class Root(NamedTuple):
-    """Hypotheses about the torso: depth, turn psi, log-weight and place in the flat grid, [B, M] each."""
+    """Hypotheses about the torso, [B, M] each.
+
+    Attributes:
+        depth: metres. turn: psi. size: of the torso, over what `TorsoLengths` say. log_weight: of each.
+        cell: place in the flat grid of depths and turns.
+    """
 
     depth: Tensor
     turn: Tensor
+    size: Tensor
     log_weight: Tensor
     cell: Tensor
+
+
+class Moments(NamedTuple):
+    """What is believed about a torso, [B] each.
+
+    Attributes:
+        depth: metres. size: over what `TorsoLengths` say. of_depth, of_size: variances of their logs.
+    """
+
+    depth: Tensor
+    size: Tensor
+    of_depth: Tensor
+    of_size: Tensor
 
 
 class Torso(NamedTuple):
@@ -145,11 +166,13 @@ def shoulder_offsets(turn: Float[Tensor, "*batch"], half: Float[Tensor, "*batch 
 
 
 class RootGrid:
-    """Point-mass filter over log depth and the turn of the shoulders about the vertical.
+    """Point-mass filter over log depth z, the turn of the shoulders psi and the size s of the torso.
 
     The middle of the shoulders may be anywhere in the image. Given depth and turn, every measured
     joint of the torso says where it is, up to how stiff torsos are; what they disagree about is the
-    evidence, with heavy tails (Student, 4 degrees of freedom).
+    evidence, with heavy tails (Student, 4 degrees of freedom). A torso that is s times as large looks like
+    one at z / s, and stays as large: so a usual size at every frame is no evidence for it, and what arms
+    say about the depth adds up.
 
     Args:
         fps: frames per second. like: tells dtype and device.
@@ -157,8 +180,11 @@ class RootGrid:
 
     def __init__(self, fps: float, like: Tensor) -> None:
         n_depths = 1 + math.ceil(math.log(_FARTHEST / _NEAREST) / _DEPTH_STEP)
-        steps = torch.arange(n_depths, dtype=like.dtype, device=like.device)
-        self.depth = _NEAREST * (_DEPTH_STEP * steps).exp()
+        beyond = _CELLS * (_SIZES // 2)
+        steps = torch.arange(-beyond, n_depths + beyond, dtype=like.dtype, device=like.device)
+        self._relative = _NEAREST * (_DEPTH_STEP * steps).exp()
+        self.depth = self._relative[beyond:-beyond]
+        self.log_size = _CELLS * _DEPTH_STEP * (steps[:_SIZES] - steps[_SIZES // 2])
         n_turns = round(360.0 / _TURN_STEP)
         degrees = _TURN_STEP * (torch.arange(n_turns, dtype=like.dtype) - n_turns // 2)
         self.turn = torch.deg2rad(degrees).to(like.device)
@@ -172,40 +198,52 @@ class RootGrid:
             _share_that_moves(_TURN_SPEED / math.sqrt(fps), _TURN_STEP),
         )
 
-    def init(self, batch_size: int) -> Float[Tensor, "B Z P"]:
-        """Return what is believed before the first frame."""
-        return self.prior.expand(batch_size, len(self.depth), -1)
+    def init(self, batch_size: int, spread: Float[Tensor, ""]) -> Float[Tensor, "B S Z P"]:
+        """Return what is believed before the first frame.
 
-    def predict(self, belief: Float[Tensor, "B Z P"]) -> Float[Tensor, "B Z P"]:
+        Args:
+            batch_size: B. spread: standard deviation of the log of the size.
+        """
+        sizes = torch.softmax(-0.5 * (self.log_size / spread.clamp_min(1e-3)).square(), 0)
+        belief = sizes[:, None, None] * self.prior
+        return belief.expand(batch_size, *belief.shape)
+
+    def predict(self, belief: Float[Tensor, "B S Z P"]) -> Float[Tensor, "B S Z P"]:
         """Return what is believed of the next frame: a random walk, and a little that starts anew."""
         along, round_ = self._spread
         moved = _diffused(belief, along)
-        moved = moved + round_ * (moved.roll(1, 2) + moved.roll(-1, 2) - 2 * moved)
-        return (1 - _LOST) * moved + _LOST * self.prior
+        moved = moved + round_ * (moved.roll(1, -1) + moved.roll(-1, -1) - 2 * moved)
+        anew = belief.sum((-2, -1), keepdim=True) * self.prior
+        return (1 - _LOST) * moved + _LOST * anew
 
-    def evidence(self, torso: Torso, lengths: TorsoLengths) -> Float[Tensor, "B Z P"]:
-        """Return the log-likelihood of the torso's joints for every depth and turn."""
-        shape = (len(torso.rays), len(self.depth), len(self.turn))
-        depth = self.depth[:, None].expand(shape)
-        return _log_likelihood(torso, depth, self.turn.expand(shape), lengths)
+    def evidence(self, torso: Torso, lengths: TorsoLengths) -> Float[Tensor, "B S Z P"]:
+        """Return the log-likelihood of the torso's joints for every size, depth and turn."""
+        shape = (len(torso.rays), len(self._relative), len(self.turn))
+        relative = self._relative[:, None].expand(shape)
+        found = _log_likelihood(torso, relative, self.turn.expand(shape), lengths)
+        return found.unfold(1, len(self.depth), _CELLS).flip(1).mT
 
-    def best(self, log_belief: Float[Tensor, "B Z P"], count: int) -> Root:
-        """Return the likeliest hypotheses, half of them turned to either side.
+    def best(self, log_belief: Float[Tensor, "B S Z P"], count: int) -> Root:
+        """Return the likeliest depths and turns, half of them turned to either side.
 
         A turn and its mirror image look alike, so that the wrong one may be the likelier for a while.
         """
         n_turns, half = len(self.turn), len(self.turn) // 2
+        whole = torch.logsumexp(log_belief, 1)
         sides = []
         for first in (0, half):
-            index = log_belief[:, :, first : first + half].flatten(1).topk(count // 2, 1).indices
+            index = whole[:, :, first : first + half].flatten(1).topk(count // 2, 1).indices
             sides.append(index // half * n_turns + index % half + first)
         index = torch.cat(sides, 1)
-        values = log_belief.flatten(1).gather(1, index)
-        return Root(self.depth[index // n_turns], self.turn[index % n_turns], values, index)
+        values = whole.flatten(1).gather(1, index)
+        of_sizes = index[:, None].expand(-1, len(self.log_size), -1)
+        share = torch.softmax(log_belief.flatten(2).gather(2, of_sizes), 1)
+        size = (share.mT @ self.log_size).exp()
+        return Root(self.depth[index // n_turns], self.turn[index % n_turns], size, values, index)
 
     def belief(
-        self, log_belief: Float[Tensor, "B Z P"], root: Root, said: Float[Tensor, "B M"]
-    ) -> Float[Tensor, "B Z P"]:
+        self, log_belief: Float[Tensor, "B S Z P"], root: Root, said: Float[Tensor, "B M"]
+    ) -> Float[Tensor, "B S Z P"]:
         """Return the belief over the grid after hypotheses were weighed.
 
         Of the others is believed that they would have been as likely as these on average.
@@ -215,8 +253,24 @@ class RootGrid:
         """
         share = torch.log_softmax(root.log_weight, 1)
         usual = torch.logsumexp(share + said, 1, keepdim=True)
-        flat = log_belief.flatten(1).scatter_add(1, root.cell, said - usual)
-        return torch.softmax(flat, 1).view_as(log_belief)
+        flat = log_belief.flatten(2)
+        more = torch.zeros_like(flat[:, 0]).scatter_add(1, root.cell, said - usual)
+        weighed = (flat + more[:, None]).flatten(1)
+        return torch.softmax(weighed, 1).view_as(log_belief)
+
+    def moments(self, belief: Float[Tensor, "B S Z P"]) -> Moments:
+        """Return what is believed about depth and size."""
+        depth, of_depth = _mean_and_variance(belief.sum((1, 3)), self.depth.log())
+        size, of_size = _mean_and_variance(belief.sum((2, 3)), self.log_size)
+        return Moments(depth.exp(), size.exp(), of_depth, of_size)
+
+
+def _mean_and_variance(
+    share: Float[Tensor, "B N"], values: Float[Tensor, " N"]
+) -> tuple[Tensor, Tensor]:
+    """Return both moments of values, [B] each."""
+    mean = share @ values
+    return mean, (share @ values.square() - mean.square()).clamp_min(0.0)
 
 
 class _Middle(NamedTuple):
@@ -306,12 +360,11 @@ def heavy_tail(squared: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return -0.5 * (_FREEDOM + 1) * torch.log1p(squared / _FREEDOM)
 
 
-def middle_of_shoulders(
-    torso: Torso, depth: Float[Tensor, "B M"], turn: Float[Tensor, "B M"], lengths: TorsoLengths
-) -> Float[Tensor, "B M 3"]:
-    """Return where the middle of the shoulders is, given depth and turn; on the axis if nothing is known."""
-    u, v = _middles(torso, depth, turn, lengths)
-    return torch.stack([u.mean, v.mean, depth], -1)
+def middle_of_shoulders(torso: Torso, root: Root, lengths: TorsoLengths) -> Float[Tensor, "B M 3"]:
+    """Return where the middle of the shoulders is, given depth, turn and size; on the axis if unknown."""
+    depth = root.depth / root.size  # what is larger is as if nearer
+    u, v = _middles(torso, depth, root.turn, lengths)
+    return torch.stack([u.mean, v.mean, depth], -1) * root.size[..., None]
 
 
 def _share_that_moves(std: float, step: float) -> float:
@@ -319,10 +372,10 @@ def _share_that_moves(std: float, step: float) -> float:
     return min(0.5 * (std / step) ** 2, 1 / 3)
 
 
-def _diffused(belief: Float[Tensor, "B Z P"], share: float) -> Float[Tensor, "B Z P"]:
+def _diffused(belief: Float[Tensor, "B S Z P"], share: float) -> Float[Tensor, "B S Z P"]:
     """Return the belief after a share of each depth went to either neighbour; the ends keep theirs."""
-    flow = share * belief.diff(dim=1)
+    flow = share * belief.diff(dim=-2)
     moved = belief.clone()
-    moved[:, :-1] += flow
-    moved[:, 1:] -= flow
+    moved[..., :-1, :] += flow
+    moved[..., 1:, :] -= flow
     return moved
