@@ -57,6 +57,26 @@ def test_lengths_are_those_of_the_persons_and_poses_the_likelier(joints):
     torch.testing.assert_close(again.directions.means, prior.directions.means, rtol=0, atol=0)
 
 
+def test_necks_that_are_none_of_kinects_tell_no_height_of_heads(joints):
+    neck, head = UPPER_BODY.index("neck"), UPPER_BODY.index("head")
+    near = joints.clone()
+    near[:, head] = near[:, neck].lerp(near[:, head], 0.45)  # as motion capture puts them
+    own, other = [recording(joints, "a")], [recording(near, f"m{i}") for i in range(9)]
+    few = {"n_components": 2, "n_samples": 500}
+    prior = fit_arm_prior([own, other], shares=[0.1, 0.9], **few)
+    alone = fit_arm_prior([own], **few)
+    torch.testing.assert_close(prior.lengths[4], alone.lengths[4])
+    torch.testing.assert_close(prior.spread[4], alone.spread[4])
+    torch.testing.assert_close(prior.lengths[0], alone.lengths[0])
+
+
+def test_persons_of_one_set_are_one_measurement_of_lengths(joints):
+    few = {"n_components": 2, "n_samples": 500}
+    one = fit_arm_prior([[recording(joints, "a")]], **few)
+    many = fit_arm_prior([[recording(joints, f"p{i}") for i in range(9)]], **few)
+    torch.testing.assert_close(one.spread, many.spread)
+
+
 @pytest.mark.parametrize(("alike", "least", "most"), [(True, 0.3, 0.7), (False, 0.0, 0.05)])
 def test_arms_that_go_together_are_known_to(alike, least, most):
     """Arms hang or reach out to the side: both the same, or each as it likes; in nats per frame."""

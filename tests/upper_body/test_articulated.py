@@ -285,6 +285,19 @@ def test_lengths_are_reported_with_a_covariance_that_sharpens():
     assert 0.3 < float(correlation) < 1
 
 
+def test_covariances_of_arms_that_are_measured_whole_are_calibrated():
+    uv = pixels(body(4), 2.0)[None]
+    own, as_they_are = (tracker(calibrated=c)(uv).covariance3d[0, -1] for c in (True, False))
+    arms = [ROW[f"{joint}_{side}"] for joint in ("elbow", "hand") for side in ("left", "right")]
+    ratio = own.diagonal(dim1=-2, dim2=-1) / as_they_are.diagonal(dim1=-2, dim2=-1)
+    assert ratio[arms].std() < 1e-9 and 0.4 < float(ratio[arms].mean()) < 0.7
+    others = [i for i in range(len(ratio)) if i not in arms]
+    torch.testing.assert_close(ratio[others], torch.ones_like(ratio[others]))
+    uv[:, :, [ROW["elbow_left"], ROW["elbow_right"]]] = torch.nan
+    own, as_they_are = (tracker(calibrated=c)(uv).covariance3d for c in (True, False))
+    torch.testing.assert_close(own, as_they_are)
+
+
 def test_the_next_recording_of_a_person_begins_with_their_lengths(tmp_path):
     uv = pixels(body(90), 2.0)[None]
     first = tracker(bone_lengths={"upper_arm": 0.31})(uv)

@@ -350,7 +350,7 @@ class ArticulatedFilter(Estimator):
         evidence = power * (
             self.chain.evidence_of_both(arms) + 2 * seen[:, None] * root.depth.log()
         )
-        belief = self.grid.belief(believed, root, evidence)
+        belief = self.grid.belief(believed, root, evidence, frame.torso)
         root = root._replace(log_weight=root.log_weight + evidence)
         return _Roots(belief, root, self._near(root), arms, middle)
 

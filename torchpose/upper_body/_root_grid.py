@@ -40,6 +40,7 @@ _SIZES, _CELLS = 11, 2  # of torsos, and steps of log depth from one to the next
 _TURN_STEP, _TURN_STD = 15.0, 20.0  # degrees
 _BROAD_TURN = 0.2  # share of the turns that are all alike likely
 _SPEED, _TURN_SPEED = 0.08, 60.0  # share of the depth, and degrees, after one second
+_MOST_SAID = 1.0  # nats that are believed of depths at which nothing was weighed
 _LOST = 1e-6  # share of a frame's belief that starts anew
 # Standard deviation of each torso joint about its place in a stiff torso, metres: x and y.
 _STIFF = ((0.03, 0.035), (0.03, 0.035), (0.03, 0.035), (0.05, 0.035))
@@ -242,21 +243,40 @@ class RootGrid:
         return Root(self.depth[index // n_turns], self.turn[index % n_turns], size, values, index)
 
     def belief(
-        self, log_belief: Float[Tensor, "B S Z P"], root: Root, said: Float[Tensor, "B M"]
+        self,
+        log_belief: Float[Tensor, "B S Z P"],
+        root: Root,
+        said: Float[Tensor, "B M"],
+        torso: Torso,
     ) -> Float[Tensor, "B S Z P"]:
         """Return the belief over the grid after hypotheses were weighed.
 
-        Of the others is believed that they would have been as likely as these on average.
+        Of the others is believed that they would have been as likely as these on average. Where the torso
+        has a size in the image they are believed to be more or less likely the farther they are, as these
+        are: hypotheses lie close together. Where it has none, arms alone are a poor witness of that.
 
         Args:
-            log_belief: before. root: hypotheses, before. said: log-evidence about them.
+            log_belief: before. root: hypotheses, before. said: log-evidence about them. torso: as seen.
         """
         share = torch.log_softmax(root.log_weight, 1)
         usual = torch.logsumexp(share + said, 1, keepdim=True)
-        flat = log_belief.flatten(2)
-        more = torch.zeros_like(flat[:, 0]).scatter_add(1, root.cell, said - usual)
-        weighed = (flat + more[:, None]).flatten(1)
+        sized = (torso.known.sum(1) > 1)[:, None].to(said)
+        more = sized * self._trend(root, share.exp(), said)
+        more = more[..., None].expand(-1, -1, len(self.turn))
+        more = more.flatten(1).scatter(1, root.cell, said - usual)
+        weighed = (log_belief.flatten(2) + more[:, None]).flatten(1)
         return torch.softmax(weighed, 1).view_as(log_belief)
+
+    def _trend(
+        self, root: Root, share: Float[Tensor, "B M"], said: Float[Tensor, "B M"]
+    ) -> Float[Tensor, "B Z"]:
+        """Return what evidence gains with the depth, nats relative to that of the hypotheses' mean."""
+        logs = root.depth.log()
+        mean = (share * logs).sum(1, keepdim=True)
+        off = share * (logs - mean)
+        slope = (off * said).sum(1) / ((off * (logs - mean)).sum(1) + _DEPTH_STEP**2)
+        along = slope[:, None] * (self.depth.log() - mean)
+        return along.clamp(-_MOST_SAID, _MOST_SAID)
 
     def moments(self, belief: Float[Tensor, "B S Z P"]) -> Moments:
         """Return what is believed about depth and size."""
