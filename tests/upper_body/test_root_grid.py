@@ -58,7 +58,7 @@ def test_what_else_tells_the_depth_adds_up_against_the_usual_size(grid):
         believed = grid.predict(belief).log() + grid.evidence(torso, lengths())
         root = grid.best(believed, 10)
         said = -0.5 * ((root.depth / true).log() / 0.2).square()
-        belief = grid.belief(believed, root, said, torso)
+        belief = grid.belief(believed, root, said, torch.tensor([True]))
     found = grid.moments(belief)
     assert float(found.depth) == pytest.approx(true, rel=0.04)
     assert float(found.size) == pytest.approx(true / 2.0, rel=0.06)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
@@ -94,12 +94,14 @@ class _Frame(NamedTuple):
 
     Attributes:
         rays: [B, 8, 3]. known: [B, 8]. std: of their pixels over the focal length, [B, 8].
+        exact: whether nobody doubts any of them, [B].
         face: rays of nose, eyes and ears, None if there are none.
     """
 
     rays: Tensor
     known: Tensor
     std: Tensor
+    exact: Tensor
     face: FacePoints | None
 
     def level(self, lean: Float[Tensor, " B"]) -> _LevelFrame:
@@ -108,7 +110,7 @@ class _Frame(NamedTuple):
         if face is not None:
             face = face._replace(places=rolled(face.places, -lean))
         torso = see_torso(rays, self.known, self.std)
-        return _LevelFrame(rays, self.known, self.std, face, torso)
+        return _LevelFrame(rays, self.known, self.std, self.exact, face, torso)
 
 
 class _LevelFrame(NamedTuple):
@@ -117,6 +119,7 @@ class _LevelFrame(NamedTuple):
     rays: Tensor
     known: Tensor
     std: Tensor
+    exact: Tensor
     face: FacePoints | None
     torso: Torso
 
@@ -282,7 +285,10 @@ class ArticulatedFilter(Estimator):
         rays = torch.cat([uv, ones], -1) @ torch.linalg.inv(self.matrix).mT
         variance = measured.cov.diagonal(dim1=-2, dim2=-1).mean(-1)
         std = (variance.sqrt() / focal).expand(uv.shape[:3])
-        parts = zip(rays.unbind(1), measured.mask.unbind(1), std.unbind(1), strict=True)
+        sure = measured.confidence
+        exact = measured.mask.any(-1) if sure is None else (sure >= 1).all(-1)
+        values = (rays, measured.mask, std, exact)
+        parts = zip(*(x.unbind(1) for x in values), strict=True)
         faces = self._faces(measured)
         return [_Frame(*part, face) for part, face in zip(parts, faces, strict=True)]
 
@@ -350,7 +356,7 @@ class ArticulatedFilter(Estimator):
         evidence = power * (
             self.chain.evidence_of_both(arms) + 2 * seen[:, None] * root.depth.log()
         )
-        belief = self.grid.belief(believed, root, evidence, frame.torso)
+        belief = self.grid.belief(believed, root, evidence, _told_by_hands(frame))
         root = root._replace(log_weight=root.log_weight + evidence)
         return _Roots(belief, root, self._near(root), arms, middle)
 
@@ -449,7 +455,9 @@ class ArticulatedFilter(Estimator):
         scale = self.lengths.scale.expand(len(middle))
         turn = root.turn[:, 0]
         level, sure = torch.zeros_like(turn), middle.new_zeros(len(middle), 4, 3, 3)
-        return SeenBody(joints, frame.known, metres, bones, scale, sure, level, turn, level)
+        return SeenBody(
+            joints, frame.known, frame.exact, metres, bones, scale, sure, level, turn, level
+        )
 
     def _spine(
         self, frame: _LevelFrame, root: Root, middle: Tensor, shoulders: Tensor, lengths: Lengths
@@ -467,6 +475,14 @@ class ArticulatedFilter(Estimator):
         if self.neck_between:
             neck = shoulders.mean(1).lerp(head, KINECT_NECK.fraction)
         return torch.stack([neck, head], 1)
+
+
+def _told_by_hands(frame: _LevelFrame) -> Bool[Tensor, " B"]:
+    """Return whether hands say what lies beyond the hypotheses: elbows are sharper than a trend.
+
+    A torso of one joint has no size in the image, and arms alone are a poor witness of how far it is.
+    """
+    return (frame.torso.known.sum(1) > 1) & ~frame.known[:, ELBOWS].any(1)
 
 
 def _with_middle(measured: MeasuredJoints) -> MeasuredJoints:

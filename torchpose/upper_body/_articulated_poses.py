@@ -38,8 +38,8 @@ SHOULDERS, ELBOWS, HANDS = (
 SIDES = ((1.0, 1.0, 1.0), (-1.0, 1.0, 1.0))
 """Signs of the axes by which right arms are mirrored."""
 _STD = 0.03  # metres: of every joint in space
-# Of the covariances of arms of which both ends are measured: what each of four sets needed that was in no fit
-# (0.50 to 0.67 at the median). Others hold as they are.
+# Of the covariances of arms of which both ends are measured and nobody doubts: what each of four sets needed that
+# was in no fit (0.50 to 0.67 at the median). Others hold as they are, with detectors' errors too.
 _CALIBRATION = 0.55
 
 
@@ -48,6 +48,7 @@ class SeenBody(NamedTuple):
 
     Attributes:
         joints: [B, 8, 3], of shoulders, neck and head. known: which of the eight are measured, [B, 8].
+        exact: whether nobody doubts any of them, [B].
         lengths: of the bones, [B, 4]. bones: the same as they are shown, with their covariances.
         scale: deviation of the log of their common scale, [B].
         others: covariances of both elbows, then both hands, for turns that were not chosen, [B, 4, 3, 3].
@@ -57,6 +58,7 @@ class SeenBody(NamedTuple):
 
     joints: Tensor
     known: Tensor
+    exact: Tensor
     lengths: Tensor
     bones: Bones
     scale: Tensor
@@ -120,7 +122,8 @@ def pose_of(
     joints[:, ELBOWS], joints[:, HANDS] = arms.unbind(2)
     covs = _covs(body, belief, joints)
     if calibrated:
-        trust = torch.where(known.all(1), _CALIBRATION, 1.0).to(covs)[..., None, None]
+        whole = known.all(1) & body.exact[:, None]
+        trust = torch.where(whole, _CALIBRATION, 1.0).to(covs)[..., None, None]
         covs[:, ELBOWS], covs[:, HANDS] = trust * covs[:, ELBOWS], trust * covs[:, HANDS]
     area = 2 * body.joints[:, SHOULDERS, 2].mean(1).log() - matrix.diagonal()[:2].log().sum()
     evidence = belief.log_evidence + known.sum(1).to(area) * area[:, None]

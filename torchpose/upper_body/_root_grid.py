@@ -247,21 +247,20 @@ class RootGrid:
         log_belief: Float[Tensor, "B S Z P"],
         root: Root,
         said: Float[Tensor, "B M"],
-        torso: Torso,
+        trend: Bool[Tensor, " B"],
     ) -> Float[Tensor, "B S Z P"]:
         """Return the belief over the grid after hypotheses were weighed.
 
-        Of the others is believed that they would have been as likely as these on average. Where the torso
-        has a size in the image they are believed to be more or less likely the farther they are, as these
-        are: hypotheses lie close together. Where it has none, arms alone are a poor witness of that.
+        Of the others is believed that they would have been as likely as these on average, or, with a trend,
+        the more or less likely the farther they are, as these are: hypotheses lie close together.
 
         Args:
-            log_belief: before. root: hypotheses, before. said: log-evidence about them. torso: as seen.
+            log_belief: before. root: hypotheses, before. said: log-evidence about them. trend: whether
+                there is one.
         """
         share = torch.log_softmax(root.log_weight, 1)
         usual = torch.logsumexp(share + said, 1, keepdim=True)
-        sized = (torso.known.sum(1) > 1)[:, None].to(said)
-        more = sized * self._trend(root, share.exp(), said)
+        more = trend[:, None].to(said) * self._trend(root, share.exp(), said)
         more = more[..., None].expand(-1, -1, len(self.turn))
         more = more.flatten(1).scatter(1, root.cell, said - usual)
         weighed = (log_belief.flatten(2) + more[:, None]).flatten(1)
