@@ -38,8 +38,8 @@ SHOULDERS, ELBOWS, HANDS = (
 SIDES = ((1.0, 1.0, 1.0), (-1.0, 1.0, 1.0))
 """Signs of the axes by which right arms are mirrored."""
 _STD = 0.03  # metres: of every joint in space
-# Of the covariances of arms of which both ends are measured and nobody doubts: what each of four sets needed that
-# was in no fit (0.50 to 0.67 at the median). Others hold as they are, with detectors' errors too.
+# Of the covariances of arms of which both ends are measured and nobody doubts: what each of four sets needed
+# that was in no fit (0.50 to 0.67 at the median). Others hold as they are, with detectors' errors too.
 _CALIBRATION = 0.55
 
 
