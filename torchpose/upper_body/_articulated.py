@@ -287,8 +287,9 @@ class ArticulatedFilter(Estimator):
         std = (variance.sqrt() / focal).expand(uv.shape[:3])
         sure = measured.confidence
         exact = measured.mask.any(-1) if sure is None else (sure >= 1).all(-1)
-        values = (rays, measured.mask, std, exact)
-        parts = zip(*(x.unbind(1) for x in values), strict=True)
+        parts = zip(
+            rays.unbind(1), measured.mask.unbind(1), std.unbind(1), exact.unbind(1), strict=True
+        )
         faces = self._faces(measured)
         return [_Frame(*part, face) for part, face in zip(parts, faces, strict=True)]
 
