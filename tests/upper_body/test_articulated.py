@@ -15,6 +15,7 @@ from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import UpperBodyTracker
 from torchpose.upper_body._arm_chain import Arms
 from torchpose.upper_body._articulated import ArticulatedFilter
+from torchpose.upper_body._articulated_poses import _trust
 from torchpose.upper_body._estimator import TrackerModel
 from torchpose.upper_body._root_grid import half_widths, see_torso
 
@@ -293,9 +294,23 @@ def test_covariances_of_arms_that_are_measured_whole_are_calibrated():
     assert ratio[arms].std() < 1e-9 and 0.4 < float(ratio[arms].mean()) < 0.7
     others = [i for i in range(len(ratio)) if i not in arms]
     torch.testing.assert_close(ratio[others], torch.ones_like(ratio[others]))
-    uv[:, :, [ROW["elbow_left"], ROW["elbow_right"]]] = torch.nan
-    own, as_they_are = (tracker(calibrated=c)(uv).covariance3d for c in (True, False))
-    torch.testing.assert_close(own, as_they_are)
+
+
+def test_covariances_are_calibrated_by_what_is_measured_of_an_arm():
+    everything = torch.ones(2, 8, dtype=torch.bool)
+    exact = torch.tensor([True, False])
+
+    def trust(*missing):
+        known = everything.clone()
+        known[:, [ROW[name] for name in missing]] = False
+        return _trust(known, exact)
+
+    whole, alone = float(trust()[0, 0]), float(trust("elbow_left")[0, 0])
+    assert 0.4 < whole < alone < 1.0
+    of_left = ("elbow_left",), ("shoulder_left",), ("hand_left",), ("elbow_left", "hand_left")
+    for missing, wanted in zip(of_left, (alone, 1.0, 1.0, 1.0), strict=True):
+        found = trust(*missing)
+        torch.testing.assert_close(found, torch.tensor([[wanted, whole], [1.0, 1.0]]))
 
 
 def test_the_next_recording_of_a_person_begins_with_their_lengths(tmp_path):

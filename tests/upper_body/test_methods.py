@@ -59,31 +59,43 @@ def test_what_is_asked_of_windows_alone_chooses_windows(prior, asked):
     assert UpperBodyTracker(prior, demo_camera(), **asked).method == "window-mixture"
 
 
-def test_bones_are_the_default_where_shoulders_and_elbows_are_measured(prior):
-    joints = performer(8, seed=0).joints
-    rays = joints @ demo_camera().matrix.mT
-    seen = (rays[..., :2] / rays[..., 2:])[None]
+@pytest.fixture(scope="module")
+def seen():
+    """All eight joints of the performer, [1, 8, 8, 2]."""
+    rays = performer(8, seed=0).joints @ demo_camera().matrix.mT
+    return (rays[..., :2] / rays[..., 2:])[None]
+
+
+def test_bones_are_the_default_where_wrists_are_measured(prior, seen):
     tracker = UpperBodyTracker(prior, demo_camera())
-    assert tracker.method == "multiple-model" and tracker(seen).method == "articulated"
-    late = UpperBodyTracker(prior, demo_camera(), smoothing=1)
-    assert late.method == "mkf-fixed" and late.notes and late(seen).notes == ()
-    for options in ({"smoothing": 1}, {"height": 1.7}, {"bone_lengths": {"forearm": 0.3}}):
-        assert UpperBodyTracker(prior, demo_camera(), **options)(seen).method == "articulated"
-    assert UpperBodyTracker(prior, demo_camera(), steady=False)(seen).method == "window-mixture"
-    assert (
-        UpperBodyTracker(prior, demo_camera(), likelihood_power=0.5)(seen).method != "articulated"
-    )
-    elbows = [UPPER_BODY.index(f"elbow_{side}") for side in ("left", "right")]
-    hidden = seen.clone()
-    hidden[:, :, elbows] = torch.nan
-    assert tracker(hidden).method == "multiple-model"
-    wrists = [UPPER_BODY.index(f"hand_{side}") for side in ("left", "right")]
-    chosen = {"neck": UPPER_BODY.index("neck"), "left_wrist": wrists[0], "right_wrist": wrists[1]}
-    few = tracker(seen[:, :, list(chosen.values())], names=list(chosen))
-    assert few.method == "articulated"
-    _, track = tracker.advance(tracker.init(1), seen)
+    assert tracker.method == "multiple-model" and tracker(seen).method == "multiple-model"
+    names = [name.replace("hand", "wrist") for name in UPPER_BODY]
+    whole = tracker(seen, names=names)
+    assert whole.method == "articulated"
+    rows = [UPPER_BODY.index(name) for name in ("hand_left", "neck", "hand_right")]
+    assert tracker(seen[:, :, rows], names=[names[i] for i in rows]).method == "articulated"
+    _, track = tracker.advance(tracker.init(1, names), seen)
     assert track.method == "articulated"
-    torch.testing.assert_close(track.joints3d, tracker(seen).joints3d, rtol=0, atol=1e-9)
+    torch.testing.assert_close(track.joints3d, whole.joints3d, rtol=0, atol=1e-9)
+
+
+def test_bones_are_the_default_where_they_are_known_and_no_other_method_is_asked_for(prior, seen):
+    names = [name.replace("hand", "wrist") for name in UPPER_BODY]
+    for options in ({"height": 1.7}, {"bone_lengths": {"forearm": 0.3}}):
+        assert UpperBodyTracker(prior, demo_camera(), **options)(seen).method == "articulated"
+    for options in ({"steady": False}, {"likelihood_power": 0.5}):
+        tracker = UpperBodyTracker(prior, demo_camera(), **options)
+        assert tracker(seen, names=names).method == "window-mixture"
+
+
+def test_bones_are_the_default_of_all_joints_where_no_window_suits(prior, seen):
+    late = UpperBodyTracker(prior, demo_camera(), smoothing=1)
+    assert late.method == "mkf-fixed" and late.notes
+    track = late(seen)
+    assert track.method == "articulated" and track.notes == ()
+    hidden = seen.clone()
+    hidden[:, :, [UPPER_BODY.index(f"elbow_{side}") for side in ("left", "right")]] = torch.nan
+    assert late(hidden).method == "mkf-fixed"
 
 
 @pytest.mark.parametrize("smoothing", [None, 3, "full"])

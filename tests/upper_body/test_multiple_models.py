@@ -172,11 +172,19 @@ def test_covariances_of_windows_are_recalibrated_before(prior):
     with_noise.set_noise("calibration_scale_causal", torch.full((8,), 4.0))
     with_noise.set_noise("calibration_floor_causal", torch.zeros(8))
     found = [
-        tracked(with_noise, of_stranger(), "multiple-model", calibrated=c).covariance3d
-        for c in (True, False)
+        tracked(own, of_stranger(), "multiple-model").covariance3d for own in (with_noise, prior)
     ]
     variances = [x.diagonal(dim1=-2, dim2=-1) for x in found]
     assert bool((variances[0] > variances[1]).all())
+
+
+def test_covariances_are_narrower_where_both_models_have_weight(prior):
+    found = [
+        tracked(prior, of_stranger(), "multiple-model", calibrated=c).covariance3d
+        for c in (True, False)
+    ]
+    shrunk = found[0].diagonal(dim1=-2, dim2=-1).sum() / found[1].diagonal(dim1=-2, dim2=-1).sum()
+    assert 0.25 < float(shrunk) < 1.0
 
 
 def test_a_prior_without_windows_is_refused(prior):

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.camera._projection import project
@@ -38,9 +38,10 @@ SHOULDERS, ELBOWS, HANDS = (
 SIDES = ((1.0, 1.0, 1.0), (-1.0, 1.0, 1.0))
 """Signs of the axes by which right arms are mirrored."""
 _STD = 0.03  # metres: of every joint in space
-# Of the covariances of arms of which both ends are measured and nobody doubts: what each of four sets needed
-# that was in no fit (0.50 to 0.67 at the median). Others hold as they are, with detectors' errors too.
-_CALIBRATION = 0.55
+# Of the covariances of arms that are seen whole, and of those of which the hand is seen alone, where
+# nobody doubts it: what four sets needed that were in no fit (at the median 0.45 to 0.51 and 0.31 to
+# 0.74). Others hold as they are, with detectors' errors too.
+_WHOLE, _HAND_ALONE = 0.55, 0.75
 
 
 class SeenBody(NamedTuple):
@@ -122,8 +123,7 @@ def pose_of(
     joints[:, ELBOWS], joints[:, HANDS] = arms.unbind(2)
     covs = _covs(body, belief, joints)
     if calibrated:
-        whole = known.all(1) & body.exact[:, None]
-        trust = torch.where(whole, _CALIBRATION, 1.0).to(covs)[..., None, None]
+        trust = _trust(body.known, body.exact).to(covs)[..., None, None]
         covs[:, ELBOWS], covs[:, HANDS] = trust * covs[:, ELBOWS], trust * covs[:, HANDS]
     area = 2 * body.joints[:, SHOULDERS, 2].mean(1).log() - matrix.diagonal()[:2].log().sum()
     evidence = belief.log_evidence + known.sum(1).to(area) * area[:, None]
@@ -134,6 +134,15 @@ def pose_of(
         rolled(joints, body.lean), covs, body.turn, body.lean, evidence, weight,
         body.bones.metres, body.bones.covs,
     )  # fmt: skip
+
+
+def _trust(known: Bool[Tensor, "B 8"], exact: Bool[Tensor, " B"]) -> Float[Tensor, "B 2"]:
+    """Return what covariances of both arms are multiplied by, for what is measured of each."""
+    shoulder, elbow, hand = (known[:, rows] for rows in (SHOULDERS, ELBOWS, HANDS))
+    one = torch.ones(elbow.shape, device=known.device)
+    trust = torch.where(hand & ~elbow, _HAND_ALONE, one)
+    trust = torch.where(shoulder & elbow & hand, _WHOLE, trust)
+    return torch.where(exact[:, None], trust, one)
 
 
 def _covs(body: SeenBody, belief: ArmState, joints: Tensor) -> Float[Tensor, "B 8 3 3"]:

@@ -31,8 +31,8 @@ class TrackSettings:
 
     Args:
         prior: a prior that comes with torchpose, or a .safetensors file.
-        method: name of the estimator; by default articulated if both shoulders and an elbow are measured,
-            else multiple-model if the prior brings windows that suit, else mkf-fixed.
+        method: name of the estimator; by default articulated if wrists are measured and the prior has hands,
+            else multiple-model if it brings windows that suit, else articulated or mkf-fixed.
         camera: TOML file or four numbers fx,fy,cx,cy in pixels; without it K or the image size of the
             input.
         camera_name: which camera of a file with several.

@@ -172,9 +172,10 @@ class Chosen(NamedTuple):
     free: bool = False
 
     def with_joints(self, there: Sequence[bool], wrists: bool) -> str:
-        """Return the method for these joints: one with bones where both shoulders and an elbow are measured.
+        """Return the method for these joints: that of bones where wrists stand for the prior's hands.
 
-        So it is where wrists stand for the prior's hands: other methods do not tell the two apart.
+        Other methods do not tell the two apart. So it is where both shoulders and an elbow are measured, and
+        the prior has no windows that suit.
 
         Args:
             there: whether each of `UPPER_BODY` is measured. wrists: whether they stand for the prior's
@@ -183,7 +184,8 @@ class Chosen(NamedTuple):
         seen = {name for name, known in zip(UPPER_BODY, there, strict=True) if known}
         whole = {"shoulder_left", "shoulder_right"} <= seen
         bent = not seen.isdisjoint({"elbow_left", "elbow_right"})
-        return BONES if self.free and (wrists or (whole and bent)) else self.method
+        bones = wrists or (self.method != _BOTH and whole and bent)
+        return BONES if self.free and bones else self.method
 
 
 def choose_method(

@@ -83,11 +83,11 @@ class UpperBodyTracker(WideModule):
     Args:
         prior: from `load_prior` or `fit_upper_body_prior`.
         camera: of the keypoints. One other than the prior's is mapped to it.
-        method: one of `METHODS`. By default "articulated" where both shoulders and an elbow are
-            measured, wrists stand for the prior's hands, or an option of bones is given, and neither
-            `steady` nor an option of another method is; else "multiple-model" where the prior has
-            windows that suit, or "window-mixture" if `steady` or an option of windows is given; else
-            "mkf-fixed". The attribute `method` is the one for few joints, `PoseTrack.method` the one
+        method: one of `METHODS`. By default "articulated" where wrists stand for the prior's hands, or an
+            option of bones is given, and neither `steady` nor an option of another method is; else
+            "multiple-model" where the prior has windows that suit, or "window-mixture" if `steady` or an
+            option of windows is given; else "articulated" where both shoulders and an elbow are measured,
+            and "mkf-fixed". The attribute `method` is the one for few joints, `PoseTrack.method` the one
             that ran.
         measurement_std: standard deviation of a keypoint in the camera's pixels, one number or one
             for each of hand, elbow, shoulder, head, neck; by default what the prior brings, else 3.
