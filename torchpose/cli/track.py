@@ -69,7 +69,7 @@ def command() -> Command:
             "method_options": _method_options(names),
         },
         parse={"measurement_std": parse_stds, "smoothing": parse_smoothing},
-        metavars={"frame": "camera|body", "hands": "grid|mean-shift"},
+        metavars={"frame": "camera|body", "hands": "learnt|grid|mean-shift"},
     )
 
 

@@ -171,6 +171,10 @@ class HandSettings:
         covariance_scale, covariance_floor: the reported covariance is the belief's times the scale,
             plus the floor (a standard deviation).
         least_mass, least_skin: below these a hand is not `seen`.
+        beside_network: weight of all other cues beside a network's.
+        gone_weight: share of a frame's log-odds that a hand is gone that counts; frames are alike.
+        gone_stay: probability that it is still gone, or still there, in the next frame.
+        most_gone: from that probability on a hand is not `seen`.
         stray, rescale: see `follow_faces`.
         face_follow: weight of a face's new size in the average; face_change: ratio of sizes from
             which the new size replaces the average.
@@ -216,6 +220,10 @@ class HandSettings:
     covariance_floor: float = 0.05
     least_mass: float = 0.3
     least_skin: float = 0.15
+    beside_network: float = 0.5
+    gone_weight: float = 0.5
+    gone_stay: float = 0.97
+    most_gone: float = 0.5
     stray: float = 0.5
     rescale: float = 1.15
     face_follow: float = 0.05

@@ -36,6 +36,7 @@ from torchpose.measure._hand_likelihood import (
     check_frame,
     no_hands,
 )
+from torchpose.measure._hand_network import HandNetwork, HandPlaces
 from torchpose.measure._hand_prior import HandPrior
 from torchpose.measure._head import FaceMemory, FaceMemoryState, head_part
 from torchpose.measure._persons import match_states, take_rows
@@ -46,6 +47,7 @@ __all__ = ["HandState", "HandTracker"]
 _REACH = -5.2  # log density per B squared above which a hand may be in a place
 _FACE = (0.7, 0.9)  # half the width and height of a face with its surroundings, in B
 _NEAR = 4  # cells about a hand that belong to it
+_UNKNOWN, _SUREST = 0.5, 1e-3  # probability that a hand is gone: at first, and at the least
 
 
 class HandState(NamedTuple):
@@ -54,7 +56,8 @@ class HandState(NamedTuple):
     Attributes:
         identity: number of each person. anchors: of the windows (x, y, B), pixels.
         skin, memory, motion: of the parts.
-        belief: probability of each hand in each cell, sums to one [N, 2, 80, 96].
+        belief: probability of each hand in each cell, if it is seen; sums to one [N, 2, 80, 96].
+        gone: probability that each hand is not to be seen [N, 2].
         size: B, slowly averaged, pixels.
         place: of the hands in the last frame, pixels. speed: pixels per frame.
         frames: seen so far.
@@ -66,6 +69,7 @@ class HandState(NamedTuple):
     memory: FaceMemoryState
     motion: MotionState
     belief: Float[Tensor, "N 2 h w"]
+    gone: Float[Tensor, "N 2"]
     size: Float[Tensor, " N"]
     place: Float[Tensor, "N 2 2"]
     speed: Float[Tensor, "N 2 2"]
@@ -75,44 +79,54 @@ class HandState(NamedTuple):
 class HandTracker(nn.Module):
     """Tracks both hands of every person by a histogram filter in a window about the face.
 
-    The likelihood of a hand comes from skin (against clothes and background), motion and the shape
-    of a hand at the end of its forearm (`HandLikelihood`). Its prior is that over poses, given the face
-    (`HandPrior`). The face is removed from the skin unless it changes (`FaceMemory`). The belief is
-    predicted by optical flow, by its own velocity and by diffusion, and the two hands exclude each
-    other (`predict`, `exclude`). A frame without motion has little weight. The hands of a frame are
-    returned with that frame, without delay.
+        The likelihood of a hand comes from skin (against clothes and background), motion and the shape
+        of a hand at the end of its forearm (`HandLikelihood`). Its prior is that over poses, given the face
+        (`HandPrior`). The face is removed from the skin unless it changes (`FaceMemory`). The belief is
+        predicted by optical flow, by its own velocity and by diffusion, and the two hands exclude each
+        other (`predict`, `exclude`). A frame without motion has little weight. The hands of a frame are
+        returned with that frame, without delay.
 
-    Args:
-        prior: of hands given the face.
-        settings: constants. fps: frames per second of the video.
+        With a network the log-likelihood is a sum of two, and a hand may be gone: hidden, or outside of the
+        image. That is a state of its own, beside the places, with a probability that is filtered over time.
 
-    Raises:
-        InputError: a frame rate that is not positive.
+        Args:
+            prior: of hands given the face.
+            settings: constants. fps: frames per second of the video.
+            network: that tells hands from what looks alike; None leaves it to colours, motion and shape, and
+                takes every hand to be somewhere.
 
-    Reference:
-        Burke & Lasenby, section 5.2, for the task and the skin; the filter goes beyond it.
+        Raises:
+            InputError: a frame rate that is not positive.
 
-    Example:
-        >>> import numpy as np, torch, torchpose
-        >>> from torchpose.measure import HandTracker
-        >>> from torchpose.measure._hand_prior import HandPrior
-        >>> tracker = HandTracker(HandPrior.from_prior(torchpose.load_prior("kinect-upper-body")))
-        >>> frame = np.full((120, 160, 3), 90, np.uint8)
-        >>> face, number = torch.tensor([[80.0, 30.0, 20.0]]), torch.tensor([0])
-        >>> state, hands = tracker.step(tracker.init(), frame, face, number)
-        >>> hands.points.shape
-        torch.Size([1, 2, 2])
+        Reference:
+            Burke & Lasenby, section 5.2, for the task and the skin; the filter goes beyond it.
+
+        Example:
+            >>> import numpy as np, torch, torchpose
+            >>> from torchpose.measure import HandTracker
+            >>> from torchpose.measure._hand_network import HandNetwork, HandPlaces
+    from torchpose.measure._hand_prior import HandPrior
+            >>> tracker = HandTracker(HandPrior.from_prior(torchpose.load_prior("kinect-upper-body")))
+            >>> frame = np.full((120, 160, 3), 90, np.uint8)
+            >>> face, number = torch.tensor([[80.0, 30.0, 20.0]]), torch.tensor([0])
+            >>> state, hands = tracker.step(tracker.init(), frame, face, number)
+            >>> hands.points.shape
+            torch.Size([1, 2, 2])
     """
 
     def __init__(
-        self, prior: HandPrior, settings: HandSettings | None = None, fps: float = 30.0
+        self,
+        prior: HandPrior,
+        settings: HandSettings | None = None,
+        fps: float = 30.0,
+        network: HandNetwork | None = None,
     ) -> None:
         super().__init__()
         if not (math.isfinite(fps) and fps > 0):
             raise InputError(f"fps must be positive, got {fps}")
         self.prior, self.settings, self.fps = prior, settings or HandSettings(), fps
         s, rate = self.settings, 30.0 / fps
-        self.rate = rate
+        self.rate, self.network = rate, network
         self.skin = SkinModel(
             s.skin_slope, s.skin_bias, s.skin_decay**rate, s.skin_floor, s.clothes_share
         )
@@ -164,9 +178,12 @@ class HandTracker(nn.Module):
         state, faces = self._steady(state, faces)
         state = self._follow(state, faces)
         inside = inside_image(state.anchors, frame.shape[1], frame.shape[0], EVIDENCE)
-        state, means, flow = self._evidence(state, frame, faces, inside, foreground)
+        state, means, flow, found = self._evidence(state, frame, faces, inside, foreground)
         log_prior, elbow = self._prior(faces, state.anchors)
         log_likelihood = self.likelihood(means, elbow) + self.settings.prior * log_prior
+        if found is not None:
+            log_likelihood = self.settings.beside_network * log_likelihood + found.log_prob
+            state = state._replace(gone=self._gone(state.gone, found.gone))
         rebirth = self._rebirth(log_prior, faces, state.anchors, expected)
         belief = torch.where(new[:, None, None, None], rebirth, state.belief)
         reach = log_prior.amax(1) > _REACH
@@ -203,7 +220,8 @@ class HandTracker(nn.Module):
         even = torch.full((n, 2, *CELLS), 1 / math.prod(CELLS))
         return HandState(
             number, anchors.double(), self.skin.init(n), self.memory.init(n), self.motion.init(n),
-            even, anchors[:, 2].double(), nowhere, torch.zeros_like(nowhere), number.clone(),
+            even, torch.full((n, 2), _UNKNOWN if self.network else 0.0), anchors[:, 2].double(),
+            nowhere, torch.zeros_like(nowhere), number.clone(),
         )  # fmt: skip
 
     def _follow(self, state: HandState, faces: Tensor) -> HandState:
@@ -225,8 +243,8 @@ class HandTracker(nn.Module):
         faces: Tensor,
         inside: Tensor,
         foreground: Image | None,
-    ) -> tuple[HandState, Tensor, Tensor]:
-        """Return the next state, the means of the likelihood in every cell, and the optical flow."""
+    ) -> tuple[HandState, Tensor, Tensor, HandPlaces | None]:
+        """Return the next state, the likelihood's means in every cell, the flow, and the network's places."""
         lab, smooth, head = cut_colours(frame, state.anchors, head_part(COLOURS))
         hands = _hands_near(state.belief) * (state.frames > 0)[:, None, None]
         bins = self.skin.byte_bins(lab)
@@ -249,7 +267,19 @@ class HandTracker(nn.Module):
             maps = maps * inside[:, None]
             maps[:, 0] += self.likelihood.unknown * (1 - inside)
         means = self.likelihood.means(maps)
-        return state._replace(skin=learnt, memory=memory, motion=motion), means, flow
+        found = None
+        if self.network is not None:
+            found = self.network.find(lab, maps, inside, faces_in_window(faces, state.anchors))
+        return state._replace(skin=learnt, memory=memory, motion=motion), means, flow, found
+
+    def _gone(
+        self, before: Float[Tensor, "N 2"], log_odds: Float[Tensor, "N 2"]
+    ) -> Float[Tensor, "N 2"]:
+        """Return the probability that hands are gone: a chain of two states, and a tempered likelihood."""
+        kept = (2 * self.settings.gone_stay - 1) ** self.rate
+        predicted = 0.5 + kept * (before - 0.5)
+        odds = torch.logit(predicted) + self.settings.gone_weight * log_odds
+        return torch.sigmoid(odds).clamp(_SUREST, 1 - _SUREST)
 
     def _prior(self, faces: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor]:
         """Return log density [N, 2, r, c] and expected elbow [N, 2, 2, r, c], in B from the anchor."""
@@ -319,6 +349,8 @@ class HandTracker(nn.Module):
         cell = found.mode[..., 1] * CELLS[1] + found.mode[..., 0]
         here = skin.flatten(1).gather(1, cell)
         seen = there & (found.mass >= s.least_mass) & (here >= s.least_skin)
+        seen = seen & (state.gone < s.most_gone)
+        covariance = covariance / (1 - state.gone)[..., None, None]
         step = points - state.place
         most = 5 * CELL * anchors[:, 2, None, None] * self.rate
         step = torch.minimum(torch.maximum(step, -most), most).nan_to_num_(0.0)  # none at first

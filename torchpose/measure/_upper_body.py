@@ -15,6 +15,7 @@ from torchpose.errors import InputError
 from torchpose.measure._background import BackgroundModel
 from torchpose.measure._face import FaceDetector, FaceTracker, FaceTracks
 from torchpose.measure._hand_likelihood import HandMeasurements
+from torchpose.measure._hand_network import shipped_hand_network
 from torchpose.measure._hand_prior import HandPrior
 from torchpose.measure._hands import HandTracker
 from torchpose.measure._head import HeadNeck
@@ -37,7 +38,7 @@ __all__ = [
 MEASURED = ("head", "neck", "hand_left", "hand_right")
 """Names and order of the measured joints; elbows follow if they are measured."""
 _ELBOWS = ("elbow_left", "elbow_right")
-HAND_TRACKERS = ("grid", "mean-shift")
+HAND_TRACKERS = ("learnt", "grid", "mean-shift")
 
 _LARGEST_SIDE = 960  # of the image in which faces are detected, pixels
 _UNSEEN = 1.0  # seconds over which a face that is not detected counts as measured
@@ -87,7 +88,8 @@ class UpperBodyMeasurer(nn.Module):
     Args:
         prior: of poses; gives the density of hands relative to the face.
         fps: frames per second.
-        hands: "grid" (`HandTracker`) or "mean-shift" (`MeanShiftHandTracker`, the paper's recipe).
+        hands: "learnt" (`HandTracker` with the network that comes along), "grid" (without it) or
+            "mean-shift" (`MeanShiftHandTracker`, the paper's recipe).
         background: whether to detect the foreground, for a static camera.
         elbows: whether to measure elbows, where the torso with its sleeves is widest.
         face_detector: by default Haar's. max_persons: the largest faces are taken.
@@ -104,7 +106,7 @@ class UpperBodyMeasurer(nn.Module):
         self,
         prior: UpperBodyPrior,
         fps: float = 30.0,
-        hands: str = "grid",
+        hands: str = "learnt",
         background: bool = False,
         elbows: bool = False,
         face_detector: FaceDetector | None = None,
@@ -124,8 +126,9 @@ class UpperBodyMeasurer(nn.Module):
         self.head_neck = HeadNeck() if head_neck is None else head_neck
         self.register = PersonRegister(within=round(30 * fps))
         self.hand_tracker: HandTracker | MeanShiftHandTracker
-        if hands == "grid":
-            self.hand_tracker = HandTracker(HandPrior.from_prior(prior), fps=fps)
+        if hands != "mean-shift":
+            network = shipped_hand_network() if hands == "learnt" else None
+            self.hand_tracker = HandTracker(HandPrior.from_prior(prior), fps=fps, network=network)
         else:
             self.hand_tracker = MeanShiftHandTracker()
         self.background = BackgroundModel() if background else None
@@ -164,7 +167,7 @@ class UpperBodyMeasurer(nn.Module):
         Args:
             state: from `init` or the step before. image: RGB, uint8 [H, W, 3].
             tracks: faces of this frame by `follow_faces`, if that has been called already.
-            candidates: hands of these persons by a pose filter; only for "grid".
+            candidates: hands of these persons by a pose filter; not for "mean-shift".
 
         Raises:
             InputError: another kind of image; candidates for a tracker that takes none.
@@ -184,7 +187,7 @@ class UpperBodyMeasurer(nn.Module):
             expected = _expected(candidates, number, faces[:, 2])
             hand_state, hands = self.hand_tracker.step(*arguments, expected)
         else:
-            raise InputError("candidates need hands='grid': mean shift takes none")
+            raise InputError("candidates need hands='learnt' or 'grid': mean shift takes none")
         parts = [self.head_neck(faces, face_cov), (_where_seen(hands), hands.covariance)]
         if len(self.names) > len(MEASURED):
             found = self._elbows(image, faces, hand_state.skin)

@@ -70,7 +70,8 @@ class VideoTracker(nn.Module):
         prior: from `load_prior` or `fit_upper_body_prior`.
         camera: of the video.
         fps: frames per second. All frames are taken to be equally far apart.
-        hands: the hand tracker: "grid" (default) or "mean-shift", the paper's method.
+        hands: the hand tracker: "learnt" (default), "grid" (without its network) or "mean-shift", the
+            paper's method.
         background: detect the foreground, for a static camera.
         elbows: measure elbows, where the torso with its sleeves is widest.
         edges: correct swapped hands by the edges of the arms (`HandAssociation`); takes about twice
@@ -102,7 +103,7 @@ class VideoTracker(nn.Module):
         camera: PinholeCamera | None = None,
         *,
         fps: float = 30.0,
-        hands: str = "grid",
+        hands: str = "learnt",
         background: bool = False,
         elbows: bool = False,
         edges: bool = False,
@@ -120,8 +121,8 @@ class VideoTracker(nn.Module):
         self.measurer = UpperBodyMeasurer(
             prior, fps, hands, background, elbows, face_detector, max_persons, head_neck
         )
-        if candidates and hands != "grid":
-            raise InputError(f"candidates need hands='grid', got {hands!r}")
+        if candidates and hands == "mean-shift":
+            raise InputError(f"candidates need hands='learnt' or 'grid', got {hands!r}")
         self.candidates = candidates
         smoothing = options.pop("smoothing", None)
         tracker = UpperBodyTracker(prior, camera, fps=fps, max_gap=None, **options)

