@@ -84,7 +84,7 @@ _UTD, _UTD_PERSONS, _UTD_EVERY = "kinect_utd_mhad", ("s7", "s8"), 8
 FIT = {"n_components": 10, "window_components": 48, "calibration_folds": 0}
 _NAMES = ("mhad", "openpose", "webcam", "utd-mhad")  # of groups, for pictures
 _VISIBLE, _UNSEEN = 0.6, 0.3  # MediaPipe's visibility: of an arm that is scored, of a missing joint
-_QUICK_FRAMES = 40  # of a view of a quick run
+_QUICK_FRAMES = 20  # of a view of a quick run
 _SETTLED = 90  # frames, from where on the spread of a bone's length counts
 
 

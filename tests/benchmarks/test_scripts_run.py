@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from benchmarks._table_file import table_file
-from tests.data import data_dir_or_skip
+from tests.data import few_recordings
 
 SCRIPTS = (
     "speed.mixture_kalman_filter",
@@ -49,10 +49,8 @@ def test_a_table_goes_to_a_file_or_into_a_folder(tmp_path, monkeypatch):
 
 
 def test_levers_run_without_the_test_persons_and_go_on_where_they_stopped(run_here, tmp_path):
-    recordings = tmp_path / "kinect_utd_mhad"
-    recordings.mkdir()
-    for path in data_dir_or_skip("kinect_utd_mhad").glob("s0[1-6]_*.npz"):
-        (recordings / path.name).symlink_to(path)
+    persons = tuple(f"s0{i}" for i in range(1, 7))
+    recordings = few_recordings("kinect_utd_mhad", tmp_path, 12, persons)
     out = tmp_path / "levers"
     arguments = ("--quick", "--data", str(recordings), "--out", str(out), "--only")
     first = run_here("ub_people_levers", *arguments, "single")

@@ -40,7 +40,7 @@ def test_poses(torchpose, files, tmp_path):
     assert torchpose("track", files / "keypoints.npz", *line).code == 0
     done = torchpose("info", tmp_path / "poses.npz")
     assert done.code == 0
-    assert "90 (3.0 s at 30 fps)" in done.out
+    assert "45 (1.5 s at 30 fps)" in done.out
     row = next(line for line in done.out.splitlines() if line.startswith("hand_right"))
     assert row.split()[1] == "88.9"
 

@@ -20,12 +20,12 @@ PAGES = sorted((ROOT / "docs").rglob("*.md"))
 
 @pytest.fixture(scope="session")
 def clip(tmp_path_factory):
-    """Two seconds of a rendered performer."""
+    """One second of a rendered performer."""
     from torchpose.demo import demo_camera, performer
     from torchpose.demo._rendering import render_video
 
     path = tmp_path_factory.mktemp("clip") / "clip.mp4"
-    render_video(path, performer(60, 30.0, 0), demo_camera())
+    render_video(path, performer(30, 30.0, 0), demo_camera())
     return path
 
 

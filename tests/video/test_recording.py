@@ -1,5 +1,7 @@
 """Persons of a recording: who comes, goes and returns, from scripted measurements."""
 
+import functools
+
 import pytest
 import torch
 
@@ -25,6 +27,18 @@ def tracker(small_windows_file):
 def keypoints():
     order = [KEYPOINT_NAMES.index(name) for name in MEASURED]
     return noisy_keypoints(performer(120).joints, std_px=2.0)[:, order]
+
+
+@pytest.fixture(scope="module")
+def tracked_alone(tracker, keypoints):
+    """What the tracker says of some frames by themselves: tracked_alone(first, last)."""
+
+    @functools.cache
+    def track(first, last):
+        cov = COV.double().expand(1, last - first, -1, -1, -1)
+        return tracker(keypoints[None, first:last], names=MEASURED, covariance=cov)
+
+    return track
 
 
 COV = torch.full((4,), 9.0, dtype=torch.float64)[:, None, None] * torch.eye(2)
@@ -58,13 +72,11 @@ def record(tracker, found, size, smoother=None):
 
 
 @pytest.mark.parametrize("size", [1, 7, 32, 200])
-def test_one_person_is_tracked_as_from_keypoints(tracker, keypoints, size):
-    found = frames(keypoints, [[0]] * 60)
+def test_one_person_is_tracked_as_from_keypoints(tracker, keypoints, tracked_alone, size):
+    found = frames(keypoints, [[0]] * 45)
     (person,) = record(tracker, found, size)
-    assert (person.number, person.first_frame, len(person)) == (0, 0, 60)
-    whole = tracker(
-        keypoints[None, :60], names=MEASURED, covariance=COV.double().expand(1, 60, -1, -1, -1)
-    )
+    assert (person.number, person.first_frame, len(person)) == (0, 0, 45)
+    whole = tracked_alone(0, 45)
     for name in FIELDS:
         torch.testing.assert_close(
             getattr(person.track, name), getattr(whole, name), rtol=1e-9, atol=1e-9
@@ -72,16 +84,16 @@ def test_one_person_is_tracked_as_from_keypoints(tracker, keypoints, size):
 
 
 @pytest.mark.parametrize("size", [1, 9, 32])
-def test_poses_end_when_somebody_is_away_for_too_long_and_begin_anew(tracker, keypoints, size):
+def test_poses_end_when_somebody_is_away_for_too_long_and_begin_anew(
+    tracker, keypoints, tracked_alone, size
+):
     present = [[]] * 5 + [[0]] * 30 + [[]] * 35 + [[0]] * 20 + [[]] * 30
     (person,) = record(tracker, frames(keypoints, present), size)
     assert (person.first_frame, len(person)) == (5, 85)
     there = person.track.joints3d[0].isfinite().all(-1).all(-1)
     assert torch.nonzero(~there).flatten().tolist() == list(range(30 + GAP, 65))
     assert not person.track.observed[0, 30:65].any() and person.track.observed[0, 65:, 3:5].all()
-    anew = tracker(
-        keypoints[None, 70:90], names=MEASURED, covariance=COV.double().expand(1, 20, -1, -1, -1)
-    )
+    anew = tracked_alone(70, 90)
     torch.testing.assert_close(
         person.track.joints3d[0, 65:], anew.joints3d[0], rtol=1e-9, atol=1e-9
     )
@@ -89,24 +101,24 @@ def test_poses_end_when_somebody_is_away_for_too_long_and_begin_anew(tracker, ke
 
 
 def test_persons_do_not_mix_and_the_one_seen_longest_is_first(tracker, keypoints):
-    present = [[0, 1]] * 25 + [[1, 2]] * 10 + [[1]] * 20
+    present = [[0, 1]] * 15 + [[1, 2]] * 8 + [[1]] * 10
     people = record(tracker, frames(keypoints, present), 16)
-    assert [(p.number, p.first_frame, len(p)) for p in people] == [(1, 0, 55), (0, 0, 25)]
-    alone = record(tracker, frames(keypoints, [[1]] * 55), 16)[0]
+    assert [(p.number, p.first_frame, len(p)) for p in people] == [(1, 0, 33), (0, 0, 15)]
+    alone = record(tracker, frames(keypoints, [[1]] * 33), 16)[0]
     torch.testing.assert_close(people[0].track.joints3d, alone.track.joints3d)
     assert torch.equal(people[0].keypoints, alone.keypoints)
 
 
 def test_smoothed_poses_respect_long_gaps_too(tracker, keypoints):
-    present = [[0]] * 30 + [[]] * 30 + [[0]] * 20
+    present = [[0]] * 15 + [[]] * 30 + [[0]] * 15
     smoother = UpperBodyTracker(
         tracker.prior, demo_camera(), fps=30.0, max_gap=None, smoothing="full"
     )
     (person,) = record(tracker, frames(keypoints, present), 32, smoother)
     there = person.track.joints3d[0].isfinite().all(-1).all(-1)
-    assert torch.nonzero(~there).flatten().tolist() == list(range(30 + GAP, 60))
+    assert torch.nonzero(~there).flatten().tolist() == list(range(15 + GAP, 45))
     (filtered,) = record(tracker, frames(keypoints, present), 32)
-    assert not torch.allclose(person.track.joints3d[0, :30], filtered.track.joints3d[0, :30])
+    assert not torch.allclose(person.track.joints3d[0, :15], filtered.track.joints3d[0, :15])
 
 
 def test_covariances_are_rounded_to_few_levels_of_the_same_size():
