@@ -175,18 +175,15 @@ def render_clips(folder: Path) -> list[Clip]:
     return clips
 
 
-def measure(
-    clip: Clip, tracker: HandTracker | None = None
-) -> Iterator[tuple[int, HandMeasurements, Tensor]]:
+def measure(clip: Clip, tracker: HandTracker) -> Iterator[tuple[int, HandMeasurements, Tensor]]:
     """Yield the frames in which the labelled person is found: number, hands, and the window's anchor.
 
     Args:
-        clip: with its labels. tracker: of hands; by default that of the package.
+        clip: with its labels. tracker: of hands.
     """
     with open_video(clip.path) as video:
-        measurer = UpperBodyMeasurer(load_prior("kinect-upper-body"), video.fps)
-        if tracker is not None:
-            measurer.hand_tracker = tracker
+        measurer = UpperBodyMeasurer(load_prior("kinect-upper-body"), video.fps, "grid")
+        measurer.hand_tracker = tracker
         state = measurer.init()
         for t, frame in zip(range(len(clip.labels.nose)), video, strict=False):
             state, found = measurer.step(state, frame.image)
