@@ -18,7 +18,7 @@ from torchpose.demo._rendering import render_video
 from torchpose.measure import HandTracker, UpperBodyMeasurer
 from torchpose.measure._body_window import CELLS, pixels_to_cells
 from torchpose.measure._hand_likelihood import HandMeasurements, HandSettings
-from torchpose.measure._hand_network import HandPlaces
+from torchpose.measure._hand_network import HandNetwork, HandPlaces
 from torchpose.measure._hand_prior import HandPrior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.video import open_video
@@ -98,7 +98,7 @@ class Windows(NamedTuple):
     seen: Tensor
 
 
-class _Recorder(nn.Module):
+class _Recorder(HandNetwork):
     """Keeps what a network is asked, and says nothing."""
 
     def find(self, lab: Tensor, maps: Tensor, inside: Tensor, faces: Tensor) -> HandPlaces:
@@ -210,7 +210,7 @@ def windows_of(clip: Clip) -> Windows:
     with open_video(clip.path) as video:
         fps = video.fps
     prior = HandPrior.from_prior(load_prior("kinect-upper-body"))
-    tracker = HandTracker(prior, HandSettings(beside_network=1.0), fps, recorder)  # type: ignore[arg-type]
+    tracker = HandTracker(prior, HandSettings(beside_network=1.0), fps, recorder)
     rows: list[tuple[Tensor, ...]] = []
     for t, _, anchor in measure(clip, tracker):
         lab, maps, faces = (x[:1] for x in recorder.asked)

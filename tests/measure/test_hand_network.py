@@ -1,0 +1,141 @@
+"""The network that tells hands in a window, and hands that are gone."""
+
+import pytest
+import torch
+
+import torchpose
+from tests.measure.test_hands import follow, scene
+from torchpose.errors import FileFormatError
+from torchpose.measure import HandTracker
+from torchpose.measure._body_window import CELLS, cell_centres
+from torchpose.measure._hand_network import (
+    HandNetwork,
+    HandNetworkInfo,
+    HandPlaces,
+    relative_colours,
+    shipped_hand_network,
+)
+from torchpose.measure._hand_prior import HandPrior
+
+FACE = torch.tensor([[0.1, -0.05, 1.02]])
+PERSON = [(320.0, 120.0, 76.0)]
+
+
+def windows(count=1, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    lab = torch.randint(0, 255, (count, 3, 160, 192), dtype=torch.uint8, generator=generator)
+    maps = torch.rand(count, 3, 160, 192, generator=generator)
+    return lab, maps, torch.ones(count, 160, 192), FACE.expand(count, -1)
+
+
+class Says(HandNetwork):
+    """Stands for a network that says the same log-odds in every frame, of places nothing."""
+
+    def __init__(self, *gone):
+        super().__init__()
+        self.said = iter(gone)
+
+    def find(self, lab, maps, inside, faces):
+        return HandPlaces(
+            maps.new_zeros(len(maps), 2, *CELLS), torch.full((len(maps), 2), next(self.said))
+        )
+
+
+def tracked(network, fps=30.0, frames=12):
+    prior = HandPrior.from_prior(torchpose.load_prior("kinect-upper-body"))
+    tracker = HandTracker(prior, fps=fps, network=network)
+    return tracker, follow(tracker, [scene(t) for t in range(frames)], PERSON)
+
+
+@torch.inference_mode()
+def test_places_and_absence_are_one_distribution():
+    network = shipped_hand_network()
+    lab, maps, inside, faces = windows(2)
+    found = network.find(lab, maps, inside, faces)
+    assert found.log_prob.shape == (2, 2, *CELLS) and found.gone.shape == (2, 2)
+    mass = found.log_prob.exp().sum((2, 3))
+    torch.testing.assert_close(mass, torch.ones_like(mass), atol=0.05, rtol=0)  # of resized maps
+    every = torch.nn.functional.avg_pool2d(torch.cat([maps, inside[:, None]], 1), 4)
+    share = torch.softmax(network(relative_colours(lab, faces), every, faces), -1)[..., -1]
+    torch.testing.assert_close(torch.sigmoid(found.gone), share, atol=1e-5, rtol=1e-5)
+
+
+@torch.inference_mode()
+def test_persons_do_not_depend_on_each_other():
+    network = shipped_hand_network()
+    both = network.find(*windows(2))
+    alone = network.find(*(x[1:] for x in windows(2)))
+    torch.testing.assert_close(both.log_prob[1:], alone.log_prob, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(both.gone[1:], alone.gone, atol=1e-4, rtol=1e-4)
+
+
+def test_colours_are_relative_to_the_face():
+    lab = windows()[0].clamp(30, 200)
+    brighter = lab + torch.tensor([20, 7, 3], dtype=torch.uint8)[:, None, None]
+    plain = relative_colours(lab, FACE)
+    torch.testing.assert_close(relative_colours(brighter, FACE), plain, atol=1e-4, rtol=0)
+    away = (cell_centres(2) - FACE[0, :2]) / FACE[0, 2]
+    face = (away / torch.tensor([0.35, 0.4])).square().sum(-1) < 1
+    lab[0, :, face] = torch.tensor([120, 140, 150], dtype=torch.uint8)[:, None]
+    inside = relative_colours(lab, FACE)[0, :, face]
+    torch.testing.assert_close(inside, torch.zeros_like(inside), atol=1e-4, rtol=0)
+
+
+@torch.inference_mode()
+def test_a_file_gives_the_same_network(tmp_path):
+    info = HandNetworkInfo("own", ("a", "b"), ("anna",), "MIT", "fit")
+    network = HandNetwork(info).eval()
+    network.save(tmp_path / "own.safetensors")
+    again = HandNetwork.load(tmp_path / "own.safetensors")
+    assert again.info == info and not again.training
+    torch.testing.assert_close(
+        again.find(*windows()).log_prob, network.find(*windows()).log_prob, rtol=0, atol=0
+    )
+    (tmp_path / "own.safetensors").write_bytes(b"nothing")
+    with pytest.raises(FileFormatError):
+        HandNetwork.load(tmp_path / "own.safetensors")
+
+
+def test_the_network_that_comes_along_says_what_it_knows():
+    info = shipped_hand_network().info
+    assert (
+        info.name == "hands" and {"P02", "P40", "A"} <= set(info.persons) and "MIT" in info.licence
+    )
+
+
+def test_hands_that_are_gone_are_not_seen_and_come_back():
+    _, (state, out) = tracked(Says(*[-3.0] * 5, *[3.0] * 8, *[-3.0] * 8), frames=21)
+    seen = [bool(hands.seen.all()) for hands in out]
+    assert all(seen[3:5]) and not any(seen[8:13]) and all(seen[16:])
+    assert 0 < float(state.gone.amax()) < 0.05
+
+
+def test_how_long_a_hand_stays_gone_does_not_depend_on_the_frame_rate():
+    found = []
+    for fps, frames in ((30.0, 8), (15.0, 4)):
+        tracker, _ = tracked(None, fps, 1)
+        gone = torch.full((1, 2), 0.9)
+        for _ in range(frames):
+            gone = tracker._gone(gone, torch.zeros(1, 2))
+        found.append(gone)
+    torch.testing.assert_close(found[0], found[1])
+    assert 0.5 < float(found[0][0, 0]) < 0.9
+
+
+def test_what_is_unsure_of_being_there_has_a_larger_covariance():
+    sure, unsure = (tracked(Says(*[odds] * 6), frames=6)[1][1][-1] for odds in (-4.0, -0.1))
+    ratio = unsure.covariance.diagonal(dim1=-2, dim2=-1) / sure.covariance.diagonal(
+        dim1=-2, dim2=-1
+    )
+    assert bool((ratio > 1.2).all())
+
+
+def test_without_a_network_no_hand_is_gone():
+    _, (state, _) = tracked(None, frames=2)
+    assert not bool(state.gone.any())
+
+
+def test_an_even_network_leaves_places_to_the_other_cues():
+    _, (_, plain) = tracked(None, frames=6)
+    _, (_, even) = tracked(Says(*[-5.0] * 6), frames=6)
+    assert float((plain[-1].points - even[-1].points).norm(dim=-1).amax()) < 0.3 * PERSON[0][2]
