@@ -125,7 +125,7 @@ class KeypointMeasurer:
             InputError: another kind of image, or a detector that returns something else than it says.
         """
         check_rgb("a frame", image)
-        found = self._sure(self._detect(state.tracks, image))
+        found = self._sure(self._detect(state.tracks, image), image)
         found = _rows(found, without_doubles(found, self._scale(found.keypoints)[1], self._upper))
         before = self._scale(state.tracks.keypoints)[1]
         tracks, owner = associate(state.tracks, found.keypoints, before, self._upper)
@@ -157,10 +157,11 @@ class KeypointMeasurer:
     def _scale(self, keypoints: Tensor) -> tuple[Tensor, Tensor]:
         return person_scale(keypoints, self.names)
 
-    def _sure(self, found: Detections) -> Detections:
-        """Return the persons with enough keypoints, without those that are unsure."""
+    def _sure(self, found: Detections, image: Image) -> Detections:
+        """Return the persons with enough keypoints, without those that are unsure or not in the image."""
         sure = (found.confidence >= self.min_confidence) & (found.confidence > 0)
-        sure &= found.keypoints.isfinite().all(-1)
+        size = found.keypoints.new_tensor([image.shape[1], image.shape[0]])
+        sure &= ((found.keypoints >= 0) & (found.keypoints < size)).all(-1)
         keypoints = torch.where(sure[..., None], found.keypoints, torch.nan)
         least = min(_LEAST_KEYPOINTS, len(self._upper))
         there = sure[:, self._upper].sum(1) >= least

@@ -87,9 +87,9 @@ class VideoTracker(nn.Module):
         face_detector: by default Haar's.
         max_persons: track only the N largest faces, or persons of a detector.
         head_neck: offsets of head and neck from the face.
-        detector: keypoints of a detector in place of faces, skin and hands: a model file (.onnx, or .task of
-            MediaPipe), package:factory in Python, or in Python an object with the attribute `names` that is called
-            with an image [H, W, 3] and returns keypoints [N, J, 2] and confidence [N, J].
+        detector: of keypoints, in place of faces, skin and hands: a model file (.onnx, or .task of
+            MediaPipe), package:factory in Python, or in Python an object with the attribute `names` that
+            is called with an image [H, W, 3] and returns keypoints [N, J, 2] and confidence [N, J].
         min_confidence: with a detector, of a keypoint, below which it is missing.
         max_gap: seconds without measurements after which a person has no pose; None is never.
         seed: of methods that draw; every person has a generator.

@@ -127,8 +127,11 @@ def _rtmo(outputs: _Outputs, names: tuple[str, ...]) -> Layout | None:
 
 def _heatmaps(outputs: _Outputs, names: tuple[str, ...]) -> Layout | None:
     """Fit one output [1, J, h, w] whose sides are those of the input over one number."""
-    (shape, *others), (width, height) = outputs.shapes, outputs.size
-    if others or len(shape) != 4 or shape[3] * height != shape[2] * width:
+    shapes, (width, height) = outputs.shapes, outputs.size
+    if [len(shape) for shape in shapes] != [4]:
+        return None
+    shape = shapes[0]
+    if shape[3] * height != shape[2] * width:
         return None
     joints = joint_set(shape[1], outputs.model)
     return Layout("heatmaps", joints, True, _imagenet, _read_heatmaps)
@@ -136,9 +139,9 @@ def _heatmaps(outputs: _Outputs, names: tuple[str, ...]) -> Layout | None:
 
 def _yolo(outputs: _Outputs, names: tuple[str, ...]) -> Layout | None:
     """Fit one output [1, C, N] or [1, N, C], C = 5 + 3 J; where both could be, the smaller side is C."""
-    (shape, *others) = outputs.shapes
-    if others or len(shape) != 3:
+    if [len(shape) for shape in outputs.shapes] != [3]:
         return None
+    shape = outputs.shapes[0]
     columns = sorted(side for side in shape[1:] if side > 5 and (side - 5) % 3 == 0)
     if not columns:
         return None

@@ -4,7 +4,7 @@ import importlib
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -20,6 +20,7 @@ _FREE = {
 _EXTRA = "pip install 'torchpose[onnx]'"
 
 
+@runtime_checkable
 class Network(Protocol):
     """Runs a model: an array in, arrays out.
 
