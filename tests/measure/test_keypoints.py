@@ -180,5 +180,7 @@ def test_bad_settings_and_detectors_are_refused():
         InputError, match=r"mine must return keypoints \[N, 17, 2\].*got \[1, 3, 2\]"
     ):
         run(Wrong([]), 1, name="mine")
+    with pytest.raises(InputError, match=r"mine failed on an image \[480, 640, 3\]: IndexError"):
+        run(Scripted([]), 1, name="mine")
     with pytest.raises(InputError, match="a frame must be RGB"):
         run(Scripted([[]]), 1, [np.zeros((4, 4), np.uint8)])

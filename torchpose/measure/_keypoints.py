@@ -1,6 +1,6 @@
 """Measure the keypoints of all persons in a video by a detector, frame by frame."""
 
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from jaxtyping import Float, Int
@@ -8,11 +8,12 @@ from torch import Tensor
 
 from torchpose._core.checks import check_count, check_rgb
 from torchpose._core.images import Image
-from torchpose.errors import InputError
+from torchpose.errors import InputError, TorchposeError
 from torchpose.measure._detectors.associate import (
     PersonTracks,
     associate,
     crop_boxes,
+    least_seen,
     no_tracks,
     person_scale,
     pseudo_faces,
@@ -30,7 +31,6 @@ from torchpose.skeleton._mediapipe_landmarks import derive_joints, lacks_joints
 
 __all__ = ["FrameKeypoints", "KeypointMeasurer", "KeypointState"]
 
-_LEAST_KEYPOINTS = 3  # of the upper body, which somebody has to have
 _KNOWN_FOR = 30.0  # seconds for which somebody who has left is remembered
 _PRESENT = 1.0  # seconds for which somebody who is not detected counts as there
 _CROPPED = 0.2  # seconds without a detection after which the whole image is searched
@@ -141,11 +141,22 @@ class KeypointMeasurer:
         if isinstance(detector, CroppingDetector):
             found = detector.detect_in(image, self._boxes(tracks))
         else:
-            found = checked_detections(detector(image), len(self._given), self._name)
+            found = checked_detections(self._call(image), len(self._given), self._name)
         if not self._derives:
             return found
         points, confidence, _ = derive_joints(*found, self._given)
         return Detections(points, cast(Tensor, confidence))
+
+    def _call(self, image: Image) -> Any:
+        """Return what the detector returns for a frame; its own errors name it."""
+        try:
+            return self.detector(image)
+        except TorchposeError:
+            raise
+        except Exception as error:
+            raise InputError(
+                f"{self._name} failed on an image {list(image.shape)}: {type(error).__name__}: {error}"
+            ) from error
 
     def _boxes(self, tracks: PersonTracks) -> Float[Tensor, "N 4"] | None:
         """Return boxes about the persons of the last frames, None for the whole image."""
@@ -163,8 +174,7 @@ class KeypointMeasurer:
         size = found.keypoints.new_tensor([image.shape[1], image.shape[0]])
         sure &= ((found.keypoints >= 0) & (found.keypoints < size)).all(-1)
         keypoints = torch.where(sure[..., None], found.keypoints, torch.nan)
-        least = min(_LEAST_KEYPOINTS, len(self._upper))
-        there = sure[:, self._upper].sum(1) >= least
+        there = sure[:, self._upper].sum(1) >= least_seen(len(self._upper))
         confidence = torch.where(sure, found.confidence, 0.0)
         return Detections(keypoints[there], confidence[there])
 

@@ -15,6 +15,7 @@ __all__ = [
     "PersonTracks",
     "associate",
     "crop_boxes",
+    "least_seen",
     "no_tracks",
     "person_scale",
     "pseudo_faces",
@@ -28,7 +29,7 @@ _GATE = (
 _DRIFT = 0.05  # of the gate, per frame in which the person was not detected
 _WIDEST = 1.5  # gate
 _DOUBLE = 0.15  # mean distance in scales, within which two detections are of one person
-_LEAST_SHARED = 3  # keypoints that both have
+_LEAST_SHARED = 3  # keypoints that both have, or half of a smaller set
 _MEMORY = 30  # most detections that count; a track loses a third of one in every frame without
 _LEAST_HITS = 3  # detections before a person counts
 
@@ -114,7 +115,12 @@ def _distances(
     apart = (first[:, None] - second).norm(dim=-1)
     shared = apart.isfinite()
     mean = apart.nan_to_num(0.0).sum(-1) / shared.sum(-1).clamp_min(1) / scale
-    return torch.where(shared.sum(-1) >= _LEAST_SHARED, mean, torch.inf)
+    return torch.where(shared.sum(-1) >= least_seen(first.shape[1]), mean, torch.inf)
+
+
+def least_seen(n_keypoints: int) -> int:
+    """Return how many keypoints tell somebody: three, or half of a set of fewer than five."""
+    return min(_LEAST_SHARED, (n_keypoints + 1) // 2)
 
 
 def without_doubles(
