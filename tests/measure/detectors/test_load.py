@@ -101,7 +101,7 @@ def test_files_that_are_missing_or_of_another_kind(tmp_path):
 def test_without_mediapipe_it_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mediapipe", None)
     (tmp_path / "pose.task").write_bytes(b"model")
-    with pytest.raises(MissingDependencyError, match=r"pip install .*mediapipe"):
+    with pytest.raises(MissingDependencyError, match=r"pip install 'torchpose.mediapipe.'"):
         load_detector(tmp_path / "pose.task")
 
 
