@@ -66,7 +66,9 @@ class VideoTracker(nn.Module):
     """Tracks all persons in a video: `UpperBodyMeasurer`, then an `UpperBodyTracker` for each person.
 
     With `detector` the keypoints of that take the place of what `UpperBodyMeasurer` measures; each person's
-    are tracked with their confidences, as keypoints in files are.
+    are tracked with their confidences, as keypoints in files are. A detector may also be an object with the
+    attribute `names`, of J keypoints, that is called with an RGB image [H, W, 3] and returns keypoints
+    [N, J, 2], pixels, and confidence [N, J], 0 to 1, of N persons.
 
     `forward` tracks a recording, `init` and `step` a camera. A frame passes three stages, each of which
     takes and returns values: the measurer gives `FrameMeasurements`, the streams of the persons
@@ -87,9 +89,8 @@ class VideoTracker(nn.Module):
         face_detector: by default Haar's.
         max_persons: track only the N largest faces, or persons of a detector.
         head_neck: offsets of head and neck from the face.
-        detector: of keypoints, in place of faces, skin and hands: a model file (.onnx, or .task of
-            MediaPipe), package:factory in Python, or in Python an object with the attribute `names` that
-            is called with an image [H, W, 3] and returns keypoints [N, J, 2] and confidence [N, J].
+        detector: of keypoints, in place of faces, skin and hands: a model in ONNX (.onnx), a pose
+            landmarker of MediaPipe (.task), or package:factory, which Python imports and calls.
         min_confidence: with a detector, of a keypoint, below which it is missing.
         max_gap: seconds without measurements after which a person has no pose; None is never.
         seed: of methods that draw; every person has a generator.

@@ -8,6 +8,7 @@ from torchpose.measure._detectors.bottom_up import (
     decode_movenet_multi,
     decode_rtmo,
     decode_yolo,
+    decode_yolo_suppressed,
     suppress_overlaps,
 )
 from torchpose.measure._detectors.joint_sets import joint_set, select_joints
@@ -86,6 +87,9 @@ def test_yolo_gives_boxes_by_their_middle():
     rows = torch.cat([middle, sides, torch.tensor([[0.4], [0.8]]), people.flatten(1)], 1)
     found = decode_yolo(rows.float())
     torch.testing.assert_close(found.keypoints, people[[1, 0], :, :2], atol=1e-4, rtol=0)
+    of_corners = torch.cat([corners, rows[:, 4:5], torch.zeros(2, 1), people.flatten(1)], 1)
+    again = decode_yolo_suppressed(of_corners)
+    torch.testing.assert_close(again.keypoints, people[[1, 0], :, :2])
 
 
 def test_movenet_multi_pose_has_boxes_behind_the_keypoints():

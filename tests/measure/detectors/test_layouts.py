@@ -21,6 +21,7 @@ KNOWN = {
         ([(1, 56, 8400)], SQUARE),
         ([(1, 8400, 56)], SQUARE),
         ([(1, 104, 2100)], (320, 320)),  # of 33 keypoints
+        ([(1, 300, 57)], SQUARE),  # of its own suppression
     ],
 }
 CASES = [(title, *case) for title, cases in KNOWN.items() for case in cases]

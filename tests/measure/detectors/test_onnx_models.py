@@ -131,6 +131,19 @@ def test_the_header_says_what_the_package_onnx_says(shape, kind, tmp_path):
     assert found.shape == tuple(d.dim_value or None for d in given)
 
 
+def test_a_damaged_header_is_refused_as_such(tmp_path):
+    path = tiny.constant(tmp_path / "m.onnx", [1, 3, 8, 8], {"out": np.zeros((1, 6))})
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    for _ in range(300):
+        data = bytearray(whole[: rng.integers(1, len(whole) + 1)])
+        for place in rng.integers(0, len(data), 3):
+            data[place] = rng.integers(256)
+        try:
+            read_inputs(bytes(data), "m")
+        except FileFormatError as error:
+            assert "expected an ONNX model" in str(error)
+
+
 def test_damaged_and_other_files_are_refused(runtime, tmp_path):
     path = tmp_path / "m.onnx"
     whole = tiny.heatmaps(path).read_bytes()

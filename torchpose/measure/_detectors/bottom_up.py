@@ -13,6 +13,7 @@ __all__ = [
     "decode_movenet_multi",
     "decode_rtmo",
     "decode_yolo",
+    "decode_yolo_suppressed",
     "suppress_overlaps",
 ]
 
@@ -53,6 +54,16 @@ def decode_yolo(rows: Float[Tensor, "N C"]) -> Detections:
     middle, half = rows[:, :2], rows[:, 2:4] / 2
     boxes = torch.cat([middle - half, middle + half], 1)
     return _persons(Scored(boxes, rows[:, 4], rows[:, 5:].unflatten(1, (-1, 3))))
+
+
+def decode_yolo_suppressed(rows: Float[Tensor, "N C"]) -> Detections:
+    """Return the persons of YOLO-pose with its own suppression of overlaps.
+
+    Args:
+        rows: box (left, top, right, bottom), score, class, and u, v and confidence of each keypoint,
+            C = 6 + 3 J, pixels of the model's input.
+    """
+    return _persons(Scored(rows[:, :4], rows[:, 4], rows[:, 6:].unflatten(1, (-1, 3))))
 
 
 def decode_movenet_multi(out: Float[Tensor, "1 N C"], size: tuple[int, int]) -> Detections:

@@ -8,7 +8,7 @@ from torchpose.errors import InputError
 from torchpose.measure._detectors.protocol import Detections
 from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
 
-__all__ = ["COUNTS", "JointSet", "joint_set", "select_joints"]
+__all__ = ["COUNTS", "KNOWN", "JointSet", "joint_set", "select_joints"]
 
 COCO = (
     "nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder",
@@ -40,6 +40,8 @@ _SETS = {
     33: JointSet("MediaPipe", LANDMARKS),
     133: JointSet("COCO-WholeBody", (*COCO, "hand_left", "hand_right"), hands=True),
 }
+KNOWN = frozenset(_SETS)
+"""Numbers of keypoints that tell a set."""
 COUNTS = ", ".join(f"{count} ({joints.title})" for count, joints in _SETS.items())
 """The known sets, for messages."""
 

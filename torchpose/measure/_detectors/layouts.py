@@ -9,8 +9,13 @@ from torch import Tensor
 
 from torchpose._core.images import Image
 from torchpose.errors import InputError
-from torchpose.measure._detectors.bottom_up import decode_movenet_multi, decode_rtmo, decode_yolo
-from torchpose.measure._detectors.joint_sets import JointSet, joint_set
+from torchpose.measure._detectors.bottom_up import (
+    decode_movenet_multi,
+    decode_rtmo,
+    decode_yolo,
+    decode_yolo_suppressed,
+)
+from torchpose.measure._detectors.joint_sets import KNOWN, JointSet, joint_set
 from torchpose.measure._detectors.protocol import Detections
 from torchpose.measure._detectors.top_down import (
     decode_heatmaps,
@@ -79,9 +84,9 @@ def find_layout(
     raise InputError(
         f"{model}: its outputs {came} (input {order}, {size[0]} x {size[1]}) are of no known layout; "
         "expected simcc_x [1, J, W] and simcc_y [1, J, H] (RTMPose), heatmaps [1, J, h, w], dets [1, N, 5] "
-        "and keypoints [1, N, J, 3] (RTMO), [1, 5 + 3 J, N] or [1, N, 5 + 3 J] (YOLO-pose) of an input "
-        "[1, 3, h, w], or [1, 1, 17, 3] or [1, 6, 56] (MoveNet) of an input [1, h, w, 3]; wrap other "
-        "models in Python (package:factory)"
+        "and keypoints [1, N, J, 3] (RTMO), [1, 5 + 3 J, N], [1, N, 5 + 3 J] or [1, N, 6 + 3 J] (YOLO-pose) "
+        "of an input [1, 3, h, w], or [1, 1, 17, 3] or [1, 6, 56] (MoveNet) of an input [1, h, w, 3]; wrap "
+        "other models in Python (package:factory)"
     )
 
 
@@ -138,16 +143,22 @@ def _heatmaps(outputs: _Outputs, names: tuple[str, ...]) -> Layout | None:
 
 
 def _yolo(outputs: _Outputs, names: tuple[str, ...]) -> Layout | None:
-    """Fit one output [1, C, N] or [1, N, C], C = 5 + 3 J; where both could be, the smaller side is C."""
+    """Fit one output [1, C, N] or [1, N, C], C = 5 + 3 J, or [1, N, 6 + 3 J] of a model that suppresses."""
     if [len(shape) for shape in outputs.shapes] != [3]:
         return None
-    shape = outputs.shapes[0]
-    columns = sorted(side for side in shape[1:] if side > 5 and (side - 5) % 3 == 0)
-    if not columns:
+    first, last = outputs.shapes[0][1:]
+    fitting = [
+        (side - before, read)
+        for side, before, read in (
+            (first, 5, _read_yolo_columns), (last, 5, _read_yolo), (last, 6, _read_yolo_suppressed),
+        )
+        if side > before and (side - before) % 3 == 0
+    ]  # fmt: skip
+    if not fitting:
         return None
-    by_column = shape[2] != columns[0]
-    joints = joint_set((columns[0] - 5) // 3, outputs.model)
-    read = _read_yolo_columns if by_column else _read_yolo
+    known = [(values, read) for values, read in fitting if values // 3 in KNOWN]
+    values, read = known[0] if known else min(fitting, key=lambda one: one[0])
+    joints = joint_set(values // 3, outputs.model)
     return Layout("YOLO-pose", joints, False, _unit, read, _GREY)
 
 
@@ -177,6 +188,10 @@ def _read_yolo(out: Sequence[Tensor], size: Size) -> Detections:
 
 def _read_yolo_columns(out: Sequence[Tensor], size: Size) -> Detections:
     return decode_yolo(out[0][0].T)
+
+
+def _read_yolo_suppressed(out: Sequence[Tensor], size: Size) -> Detections:
+    return decode_yolo_suppressed(out[0][0])
 
 
 def _read_movenet_single(out: Sequence[Tensor], size: Size) -> Detections:

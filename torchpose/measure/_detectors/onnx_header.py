@@ -42,7 +42,7 @@ def read_inputs(data: bytes, model: str) -> list[TensorInfo]:
             elif field == _INITIALIZER:
                 names = (v for f, v in _fields(_bytes(value)) if f == _TENSOR_NAME)
                 weights.add(_text(next(names, b"")))
-    except (StopIteration, IndexError, ValueError) as error:
+    except (StopIteration, LookupError, TypeError, ValueError) as error:
         raise FileFormatError(f"{model}: expected an ONNX model, got another file") from error
     return [one for one in inputs if one.name not in weights]
 
