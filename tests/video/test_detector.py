@@ -112,6 +112,8 @@ def test_what_a_detector_replaces_is_refused(prior):
             VideoTracker(prior, CAMERA, detector=detector, **option)
     with pytest.raises(InputError, match="min_confidence must be in 0 to 1"):
         VideoTracker(prior, CAMERA, detector=detector, min_confidence=2.0)
+    with pytest.raises(InputError, match="min_confidence is of keypoints"):
+        VideoTracker(prior, CAMERA, min_confidence=0.5)
     with pytest.raises(InputError, match=r"expected a detector.*got object"):
         VideoTracker(prior, CAMERA, detector=object())
     with pytest.raises(InputError, match=r"model\.pt: a detector must be an ONNX model"):

@@ -29,8 +29,10 @@ from torchpose.measure._detectors.protocol import (
 from torchpose.measure._persons import PersonRegister, Persons
 from torchpose.skeleton._mediapipe_landmarks import derive_joints, lacks_joints
 
-__all__ = ["FrameKeypoints", "KeypointMeasurer", "KeypointState"]
+__all__ = ["LEAST_CONFIDENCE", "FrameKeypoints", "KeypointMeasurer", "KeypointState"]
 
+LEAST_CONFIDENCE = 0.3
+"""Of a keypoint, below which it counts as missing unless something else is asked for."""
 _KNOWN_FOR = 30.0  # seconds for which somebody who has left is remembered
 _PRESENT = 1.0  # seconds for which somebody who is not detected counts as there
 _CROPPED = 0.2  # seconds without a detection after which the whole image is searched
@@ -90,7 +92,7 @@ class KeypointMeasurer:
         detector: KeypointDetector,
         fps: float = 30.0,
         max_persons: int | None = None,
-        min_confidence: float = 0.3,
+        min_confidence: float = LEAST_CONFIDENCE,
         name: str = "the detector",
     ) -> None:
         if not 0 <= min_confidence <= 1:
@@ -139,7 +141,7 @@ class KeypointMeasurer:
         """Return all keypoints of a frame."""
         detector = self.detector
         if isinstance(detector, CroppingDetector):
-            found = detector.detect_in(image, self._boxes(tracks))
+            found = detector.detect_in(image, self._boxes(tracks, image))
         else:
             found = checked_detections(self._call(image), len(self._given), self._name)
         if not self._derives:
@@ -158,12 +160,12 @@ class KeypointMeasurer:
                 f"{self._name} failed on an image {list(image.shape)}: {type(error).__name__}: {error}"
             ) from error
 
-    def _boxes(self, tracks: PersonTracks) -> Float[Tensor, "N 4"] | None:
+    def _boxes(self, tracks: PersonTracks, image: Image) -> Float[Tensor, "N 4"] | None:
         """Return boxes about the persons of the last frames, None for the whole image."""
         recent = tracks.keypoints[tracks.unseen <= _CROPPED * self.fps]
         if not len(recent):
             return None
-        return crop_boxes(recent, *self._scale(recent))
+        return crop_boxes(recent, *self._scale(recent), (image.shape[1], image.shape[0]))
 
     def _scale(self, keypoints: Tensor) -> tuple[Tensor, Tensor]:
         return person_scale(keypoints, self.names)

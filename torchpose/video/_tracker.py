@@ -21,7 +21,12 @@ from torchpose.measure._detectors.load import check_detector, load_detector
 from torchpose.measure._detectors.protocol import KeypointDetector
 from torchpose.measure._face import FaceDetector, FaceTracks
 from torchpose.measure._head import HeadNeck
-from torchpose.measure._keypoints import FrameKeypoints, KeypointMeasurer, KeypointState
+from torchpose.measure._keypoints import (
+    LEAST_CONFIDENCE,
+    FrameKeypoints,
+    KeypointMeasurer,
+    KeypointState,
+)
 from torchpose.measure._upper_body import (
     Candidates,
     FrameMeasurements,
@@ -91,7 +96,7 @@ class VideoTracker(nn.Module):
         head_neck: offsets of head and neck from the face.
         detector: of keypoints, in place of faces, skin and hands: a model in ONNX (.onnx), a pose
             landmarker of MediaPipe (.task), or package:factory, which Python imports and calls.
-        min_confidence: with a detector, of a keypoint, below which it is missing.
+        min_confidence: with a detector, of a keypoint, below which it is missing (default 0.3).
         max_gap: seconds without measurements after which a person has no pose; None is never.
         seed: of methods that draw; every person has a generator.
         options: to `UpperBodyTracker`, such as method, smoothing or frame.
@@ -123,7 +128,7 @@ class VideoTracker(nn.Module):
         max_persons: int | None = None,
         head_neck: HeadNeck | None = None,
         detector: str | Path | KeypointDetector | None = None,
-        min_confidence: float = 0.3,
+        min_confidence: float | None = None,
         max_gap: float | None = 5.0,
         seed: int = 0,
         **options: Any,
@@ -135,6 +140,8 @@ class VideoTracker(nn.Module):
             raise InputError(f"candidates need hands='grid', got {hands!r}")
         self.measurer: UpperBodyMeasurer | KeypointMeasurer
         if detector is None:
+            if min_confidence is not None:
+                raise InputError("min_confidence is of keypoints: give a detector, or leave it out")
             self.measurer = UpperBodyMeasurer(
                 prior, fps, hands, background, elbows, face_detector, max_persons, head_neck
             )
@@ -289,7 +296,7 @@ def _keypoint_measurer(
     detector: str | Path | KeypointDetector,
     fps: float,
     max_persons: int | None,
-    min_confidence: float,
+    min_confidence: float | None,
 ) -> KeypointMeasurer:
     """Return what measures by a detector, which is loaded if it is a file or the name of a factory."""
     if isinstance(detector, str | Path):
@@ -297,7 +304,8 @@ def _keypoint_measurer(
     else:
         name = type(detector).__name__
         loaded = check_detector(detector, name)
-    return KeypointMeasurer(loaded, fps, max_persons, min_confidence, name)
+    least = LEAST_CONFIDENCE if min_confidence is None else min_confidence
+    return KeypointMeasurer(loaded, fps, max_persons, least, name)
 
 
 def _refuse_measurer(**given: bool) -> None:

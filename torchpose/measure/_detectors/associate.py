@@ -180,15 +180,21 @@ def pseudo_faces(middle: Float[Tensor, "N 2"], scale: Float[Tensor, " N"]) -> Fl
 
 
 def crop_boxes(
-    keypoints: Float[Tensor, "N J 2"], middle: Float[Tensor, "N 2"], scale: Float[Tensor, " N"]
+    keypoints: Float[Tensor, "N J 2"],
+    middle: Float[Tensor, "N 2"],
+    scale: Float[Tensor, " N"],
+    size: tuple[int, int],
 ) -> Float[Tensor, "N 4"]:
     """Return boxes about persons: left, top, right, bottom.
 
-    They hold the box of the keypoints, a quarter larger, and what arms reach.
+    They hold the box of the keypoints, a quarter larger, and of what arms reach the part in the image.
+
+    Args:
+        keypoints: of the persons. middle, scale: by `person_scale`. size: (w, h) of the image.
     """
     low, high = _extent(keypoints)
     centre, half = (low + high) / 2, _MARGIN * (high - low) / 2
-    reach = _REACH * scale[:, None]
-    first = torch.minimum(centre - half, middle - reach)
-    last = torch.maximum(centre + half, middle + reach)
+    reach, border = _REACH * scale[:, None], keypoints.new_tensor(size)
+    first = torch.minimum(centre - half, (middle - reach).clamp_min(0.0))
+    last = torch.maximum(centre + half, torch.minimum(middle + reach, border))
     return torch.cat([first, last], 1)

@@ -94,8 +94,10 @@ class _Runtime:
         available = runtime.get_available_providers()
         wanted = ("CUDAExecutionProvider", "CPUExecutionProvider")
         providers = [name for name in wanted if name in available]
+        options = runtime.SessionOptions()
+        options.log_severity_level = 3  # errors, which are raised as well
         try:
-            session = runtime.InferenceSession(str(path), providers=providers)
+            session = runtime.InferenceSession(str(path), options, providers=providers)
         except Exception as error:  # of many types, none of which the package names
             raise FileFormatError(
                 f"{path}: expected an ONNX model that ONNX Runtime reads; it says: {_first_line(error)}"
