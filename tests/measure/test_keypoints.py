@@ -110,6 +110,22 @@ def test_what_is_unsure_or_outside_of_the_image_is_missing():
     assert run(detector, 5, min_confidence=0.5)[-1].person.tolist() == []
 
 
+def test_a_head_may_be_above_the_image():
+    class Heads(Scripted):
+        def reset(self):
+            pass
+
+        names = ("head", "neck", "left_shoulder", "right_shoulder", "left_wrist")
+
+        def __call__(self, image):
+            return np.array([[[300, -20], [300, -2], [250, 30], [350, 30], [360, -5]]]), np.ones(
+                (1, 5)
+            )
+
+    (person,) = run(Heads([]), 4)[-1].keypoints
+    assert person.isnan().any(-1).tolist() == [False, False, False, False, True]
+
+
 def test_the_largest_are_taken():
     frames = [[at(120.0), at(320.0, scale=1.3), at(520.0)]] * 5
     (measured,) = run(Scripted(frames), 5, max_persons=1)[-1:]

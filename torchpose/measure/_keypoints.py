@@ -27,12 +27,14 @@ from torchpose.measure._detectors.protocol import (
     checked_detections,
 )
 from torchpose.measure._persons import PersonRegister, Persons
+from torchpose.skeleton._joint_sets import canonical_names
 from torchpose.skeleton._mediapipe_landmarks import derive_joints, lacks_joints
 
 __all__ = ["LEAST_CONFIDENCE", "FrameKeypoints", "KeypointMeasurer", "KeypointState"]
 
 LEAST_CONFIDENCE = 0.3
 """Of a keypoint, below which it counts as missing unless something else is asked for."""
+_ANYWHERE = ("head", "neck")  # may lie above the image: they follow from face and shoulders
 _KNOWN_FOR = 30.0  # seconds for which somebody who has left is remembered
 _PRESENT = 1.0  # seconds for which somebody who is not detected counts as there
 _CROPPED = 0.2  # seconds without a detection after which the whole image is searched
@@ -108,6 +110,7 @@ class KeypointMeasurer:
             self.names = derive_joints(torch.zeros(1, len(self.names), 2), None, self.names)[2]
         self.neck: str | None = "neck" if self._derives else getattr(detector, "neck", None)
         self._upper = upper_rows(self.names)
+        self._anywhere = torch.tensor([one in _ANYWHERE for one in canonical_names(self.names)])
         self.register = PersonRegister(within=round(_KNOWN_FOR * fps))
 
     def init(self) -> KeypointState:
@@ -174,7 +177,8 @@ class KeypointMeasurer:
         """Return the persons with enough keypoints, without those that are unsure or not in the image."""
         sure = (found.confidence >= self.min_confidence) & (found.confidence > 0)
         size = found.keypoints.new_tensor([image.shape[1], image.shape[0]])
-        sure &= ((found.keypoints >= 0) & (found.keypoints < size)).all(-1)
+        inside = ((found.keypoints >= 0) & (found.keypoints < size)).all(-1)
+        sure &= inside | (self._anywhere & found.keypoints.isfinite().all(-1))
         keypoints = torch.where(sure[..., None], found.keypoints, torch.nan)
         there = sure[:, self._upper].sum(1) >= least_seen(len(self._upper))
         confidence = torch.where(sure, found.confidence, 0.0)
