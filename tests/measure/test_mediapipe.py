@@ -210,7 +210,9 @@ def test_the_first_person_is_what_a_tracker_takes(stand, model):
 @pytest.mark.parametrize("adapter", [MediaPipeFaceDetector, MediaPipePose])
 def test_without_the_package_it_says_what_to_install(adapter, model, monkeypatch):
     monkeypatch.setitem(sys.modules, "mediapipe", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install mediapipe.*model file"):
+    with pytest.raises(
+        MissingDependencyError, match=r"pip install 'torchpose.mediapipe.'.*model file"
+    ):
         adapter(model)
 
 

@@ -24,6 +24,8 @@ from torchpose.errors import InputError
 _EXAMPLES = """
 torchpose track clip.mp4 --out result
 torchpose track 0 --out result
+torchpose track clip.mp4 --out result --detector pose_landmarker_full.task
+torchpose track clip.mp4 --out result --detector rtmo.onnx --max-persons 2
 torchpose track frames/ --out result --fps 25 --background true
 torchpose track keypoints.npz --out result
 torchpose track openpose_json/ --out result --camera 525,525,319.5,239.5 --nose-as-head true
@@ -101,7 +103,8 @@ def run(
 
     A video may be a folder of images or the picture of a camera; keypoints are those of head, neck and
     hands, or any others of the upper body, gaps and all. Writes poses.npz, poses.csv, poses.bvh and
-    pictures into a folder, of video also overlay.mp4 and report.html.
+    pictures into a folder, of video also overlay.mp4 and report.html. With --detector the keypoints of
+    video are those of a model in ONNX, of MediaPipe, or of a Python object.
 
     Args:
         input: a video file, a folder of images, or the number of a camera; or keypoints: .npz, .csv or a

@@ -45,7 +45,7 @@ def track_video(job: Job, options: dict[str, Any], face_model: str | None, overl
     from torchpose.priors._upper_body import load_prior
 
     settings = job.settings
-    _refuse_keypoint_options(job)
+    _refuse_options(job, options["detector"], face_model)
     share_cores()
     prior = load_prior(settings.prior)
     pictures = pictures_possible(job.pictures)
@@ -64,13 +64,13 @@ def track_video(job: Job, options: dict[str, Any], face_model: str | None, overl
             seconds = time.perf_counter() - start
             notes += tuple(source.notes)
         if not people:
-            return _nobody(job.input, n_frames, notes, results.folder)
+            return _nobody(job.input, n_frames, notes, results.folder, options["detector"])
         facts = {
             "video": f"{job.input}, {source.size[0]} x {source.size[1]}, {source.fps:g} fps",
             "prior": prior.info.name or settings.prior,
             "camera": camera_text(camera),
             "method": people[0].track.method
-            + f"{smoothing_text(settings.smoothing)}, hands by {options['hands']}",
+            + f"{smoothing_text(settings.smoothing)}, {_measured_by(options)}",
             "speed": f"{n_frames / max(seconds, 1e-9):.0f} frames a second, without drawing",
         }
         people = [replace(p, track=replace(p.track, notes=notes + p.track.notes)) for p in people]
@@ -98,16 +98,21 @@ def _open(where: str, fps: float | None) -> "VideoSource":
         raise FileFormatError(f"{error}; {_KEYPOINTS}") from error
 
 
-def _refuse_keypoint_options(job: Job) -> None:
-    """Raise `InputError` for options that only mean something for keypoints."""
-    given = {
-        "--nose-as-head": job.settings.nose_as_head,
-        "--neck": job.settings.neck is not None,
-        "--measurement-std": job.settings.measurement_std is not None,
-    }
+def _refuse_options(job: Job, detector: str | None, face_model: str | None) -> None:
+    """Raise `InputError` for options that mean nothing for what is measured."""
+    given = {"--nose-as-head": job.settings.nose_as_head}
+    if detector is None:
+        given |= {
+            "--neck": job.settings.neck is not None,
+            "--measurement-std": job.settings.measurement_std is not None,
+        }
     for option, used in given.items():
         if used:
             raise InputError(f"{option} is for keypoints; {job.input} is taken for a video")
+    if detector is not None and face_model is not None:
+        raise InputError(
+            "--face-model is for faces, whose place --detector takes; give one of them"
+        )
 
 
 def _tracker(
@@ -121,10 +126,13 @@ def _tracker(
     from torchpose.measure._mediapipe import MediaPipeFaceDetector
     from torchpose.video._tracker import VideoTracker
 
-    detector = None if face_model is None else MediaPipeFaceDetector(face_model)
+    faces = None if face_model is None else MediaPipeFaceDetector(face_model)
+    of_keypoints = {name: getattr(job.settings, name) for name in ("neck", "measurement_std")}
+    of_keypoints = {name: value for name, value in of_keypoints.items() if value is not None}
     return VideoTracker(
-        prior, camera, fps=fps, face_detector=detector, max_gap=job.settings.max_gap,
-        seed=job.settings.seed, **options, **job.settings.tracker_options(), **job.options,
+        prior, camera, fps=fps, face_detector=faces, max_gap=job.settings.max_gap,
+        seed=job.settings.seed, **options, **job.settings.tracker_options(), **of_keypoints,
+        **job.options,
     )  # fmt: skip
 
 
@@ -258,16 +266,32 @@ def _write_report(
     return [*written, out / "report.html"]
 
 
-def _nobody(where: str, n_frames: int, notes: tuple[str, ...], out: Path) -> int:
+def _measured_by(options: dict[str, Any]) -> str:
+    """Return in words what measures."""
+    if options["detector"] is not None:
+        return f"keypoints by {options['detector']}"
+    return f"hands by {options['hands']}"
+
+
+def _nobody(
+    where: str, n_frames: int, notes: tuple[str, ...], out: Path, detector: str | None
+) -> int:
     """Say that there is no pose, and why; return the exit code."""
     if (out / "poses.npz").exists():
         notes += (f"{out / 'poses.npz'} is of an earlier run",)
     for note in notes:
         print(f"note     {note}")
+    what, wants = "face", (
+        "The detector wants faces from the front, upright and at least 40 pixels high; keypoints of "
+        "another detector can be tracked instead (--detector)"
+    )  # fmt: skip
+    if detector is not None:
+        what, wants = "person", (
+            f"{detector} has to give three keypoints of the upper body; --min-confidence says how sure"
+        )  # fmt: skip
     print(
-        f"torchpose: no face was seen for long enough in the {n_frames} frames of {where}, so "
-        "there are no poses. The detector wants faces from the front, upright and at least 40 "
-        "pixels high; keypoints of another detector can be tracked instead",
+        f"torchpose: no {what} was seen for long enough in the {n_frames} frames of {where}, so "
+        f"there are no poses. {wants}",
         file=sys.stderr,
     )
     return 1

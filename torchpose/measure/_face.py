@@ -23,6 +23,7 @@ __all__ = [
     "HaarFaceDetector",
     "Region",
     "check_faces",
+    "nearest_pairs",
 ]
 
 _ROI = 1.1  # half the side of the region searched about a known face, in its sizes
@@ -340,13 +341,24 @@ def _region(face: list[float], shape: tuple[int, ...]) -> Region:
 
 def _nearest(faces: Tensor, found: Tensor, gate: float) -> Int[Tensor, " n"]:
     """Return the track of each detection, -1 for none, associating the nearest pairs first."""
-    owner = torch.full((len(found),), -1)
     distance = torch.cdist(found, faces)
-    distance = torch.where(distance <= gate * faces[:, 2], distance, torch.inf)
+    return nearest_pairs(torch.where(distance <= gate * faces[:, 2], distance, torch.inf))
+
+
+def nearest_pairs(distance: Float[Tensor, "n N"]) -> Int[Tensor, " n"]:
+    """Return the column of each row, -1 for none, associating the nearest pairs first.
+
+    Args:
+        distance: infinite where a row and a column cannot be a pair.
+
+    >>> nearest_pairs(torch.tensor([[1.0, 3.0], [2.0, torch.inf], [0.5, 4.0]])).tolist()
+    [1, -1, 0]
+    """
+    owner, distance = torch.full((len(distance),), -1), distance.clone()
     while distance.numel() and bool(torch.isfinite(distance.min())):
-        detection, track = divmod(int(distance.argmin()), distance.shape[1])
-        owner[detection] = track
-        distance[detection], distance[:, track] = torch.inf, torch.inf
+        row, column = divmod(int(distance.argmin()), distance.shape[1])
+        owner[row] = column
+        distance[row], distance[:, column] = torch.inf, torch.inf
     return owner
 
 

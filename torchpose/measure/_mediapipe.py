@@ -278,8 +278,8 @@ def _require_mediapipe() -> ModuleType:
     except ImportError as error:
         raise MissingDependencyError(
             "this needs the package mediapipe, which is not installed; run "
-            '`pip install mediapipe "opencv-contrib-python>=4.10,<5"` (a later OpenCV has no Haar '
-            "cascade) and name a model file, which MediaPipe's models page describes"
+            "`pip install 'torchpose[mediapipe]'` and name a model file, which MediaPipe's models page "
+            "describes"
         ) from error
     if not hasattr(mediapipe, "tasks"):
         raise MissingDependencyError(

@@ -39,6 +39,7 @@ MEASURED = ("head", "neck", "hand_left", "hand_right")
 """Names and order of the measured joints; elbows follow if they are measured."""
 _ELBOWS = ("elbow_left", "elbow_right")
 HAND_TRACKERS = ("learnt", "grid", "mean-shift")
+"""Names of the hand trackers, the default first."""
 
 _LARGEST_SIDE = 960  # of the image in which faces are detected, pixels
 _UNSEEN = 1.0  # seconds over which a face that is not detected counts as measured

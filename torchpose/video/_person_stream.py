@@ -10,7 +10,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose._core.images import Image
+from torchpose.errors import InputError
 from torchpose.measure._association import AssociationState, HandAssociation
+from torchpose.measure._keypoints import FrameKeypoints
 from torchpose.measure._upper_body import FrameMeasurements
 from torchpose.upper_body._live import StreamState
 from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
@@ -31,13 +33,16 @@ class Measured(NamedTuple):
     """Holds the measurements of one person in T frames.
 
     Attributes:
-        keypoints: pixels, NaN where missing [T, J, 2]. covariance: [T, J, 2, 2].
-        size: of the face, NaN where there is none [T].
+        keypoints: pixels, NaN where missing [T, J, 2].
+        covariance: [T, J, 2, 2]; None of a detector of keypoints.
+        size: of the face, of a detector about the width of the shoulders, NaN where there is none [T].
+        confidence: of a detector of keypoints, 0 to 1 [T, J], 0 where missing; else None.
     """
 
     keypoints: Float[Tensor, "T J 2"]
-    covariance: Float[Tensor, "T J 2 2"]
+    covariance: Float[Tensor, "T J 2 2"] | None
     size: Float[Tensor, " T"]
+    confidence: Float[Tensor, "T J"] | None = None
 
     @property
     def seen(self) -> Bool[Tensor, " T"]:
@@ -46,27 +51,44 @@ class Measured(NamedTuple):
 
     def frames(self, rows: slice) -> "Measured":
         """Return some of the frames."""
-        return Measured(*(x[rows] for x in self))
+        return Measured(*(None if x is None else x[rows] for x in self))  # type: ignore[arg-type]
 
 
-def measured_of(block: Sequence[FrameMeasurements], number: int, n_joints: int) -> Measured:
-    """Return the measurements of one person in each frame of a block."""
-    keypoints, cov, size = found = unmeasured(len(block), n_joints)
+def measured_of(
+    block: Sequence[FrameMeasurements | FrameKeypoints], number: int, n_joints: int
+) -> Measured:
+    """Return the measurements of one person in each frame of a block, all of one kind."""
+    detected = any(isinstance(frame, FrameKeypoints) for frame in block)
+    found = unmeasured(len(block), n_joints, detected)
     for t, frame in enumerate(block):
-        row = torch.nonzero(frame.person == number).flatten()
-        if len(row):
-            keypoints[t], cov[t] = frame.keypoints[row[0]], frame.covariance[row[0]]
-            size[t] = frame.faces[row[0], 2]
+        for row in torch.nonzero(frame.person == number).flatten()[:1]:
+            found.keypoints[t] = frame.keypoints[row]
+            if isinstance(frame, FrameKeypoints):
+                _given(found.confidence)[t], found.size[t] = frame.confidence[row], frame.sizes[row]
+            else:
+                _given(found.covariance)[t] = frame.covariance[row]
+                found.size[t] = frame.faces[row, 2]
     return found
 
 
-def unmeasured(n_frames: int, n_joints: int) -> Measured:
-    """Return frames without measurements."""
-    return Measured(
-        torch.full((n_frames, n_joints, 2), torch.nan, dtype=torch.float64),
-        torch.eye(2, dtype=torch.float64).repeat(n_frames, n_joints, 1, 1),
-        torch.full((n_frames,), torch.nan, dtype=torch.float64),
-    )
+def unmeasured(n_frames: int, n_joints: int, detected: bool = False) -> Measured:
+    """Return frames without measurements.
+
+    Args:
+        detected: by a detector of keypoints, which gives confidences in place of covariances.
+    """
+    points = torch.full((n_frames, n_joints, 2), torch.nan, dtype=torch.float64)
+    size = torch.full((n_frames,), torch.nan, dtype=torch.float64)
+    if detected:
+        return Measured(points, None, size, torch.zeros(n_frames, n_joints, dtype=torch.float64))
+    eye = torch.eye(2, dtype=torch.float64)
+    return Measured(points, eye.repeat(n_frames, n_joints, 1, 1), size)
+
+
+def _given(values: Tensor | None) -> Tensor:
+    if values is None:
+        raise InputError("expected measurements with covariances, got keypoints of a detector")
+    return values
 
 
 class PersonStreamState(NamedTuple):
@@ -118,8 +140,10 @@ class PersonStream(nn.Module):
         super().__init__()
         self.tracker, self.association = tracker, association
         self.names, self.seed = tuple(names), seed
-        self.hands = [self.names.index(name) for name in ("hand_left", "hand_right")]
-        self.exchanged = [self.names.index(_other_side(name)) for name in self.names]
+        self.hands, self.exchanged = [], []
+        if association is not None:
+            self.hands = [self.names.index(name) for name in ("hand_left", "hand_right")]
+            self.exchanged = [self.names.index(_other_side(name)) for name in self.names]
 
     def init(self, number: int) -> PersonStreamState:
         """Return the state before the first frame of the person of this number."""
@@ -145,15 +169,19 @@ class PersonStream(nn.Module):
         """
         if self.association is None or state.votes is None:
             stream, poses = self.tracker.advance(
-                state.stream, measured.keypoints[None], covariance=measured.covariance[None]
+                state.stream,
+                measured.keypoints[None],
+                _batch(measured.confidence),
+                covariance=_batch(measured.covariance),
             )
             return state._replace(stream=stream), poses, measured
         swapped = Measured(
             measured.keypoints[:, self.exchanged],
-            measured.covariance[:, self.exchanged],
+            _given(measured.covariance)[:, self.exchanged],
             measured.size,
         )
-        both = [torch.stack(pair) for pair in zip(measured[:2], swapped[:2], strict=True)]
+        pairs = zip(measured[:2], swapped[:2], strict=True)
+        both = [torch.stack([_given(one), _given(other)]) for one, other in pairs]
         stream, poses = self.tracker.advance(state.stream, both[0], covariance=both[1])
         votes, which = _vote(self.association, state.votes, poses, measured, images, self.hands)
         keypoints, cov = (hypotheses[which, torch.arange(len(which))] for hypotheses in both)
@@ -163,7 +191,7 @@ class PersonStream(nn.Module):
     def advance_all(
         self,
         states: Mapping[int, PersonStreamState],
-        block: Sequence[FrameMeasurements],
+        block: Sequence[FrameMeasurements | FrameKeypoints],
         images: Sequence[Image],
         gap: int,
     ) -> tuple[dict[int, PersonStreamState], dict[int, TrackedBlock]]:
@@ -189,6 +217,10 @@ class PersonStream(nn.Module):
             if state.unseen <= gap:
                 following[number] = state
         return following, tracked
+
+
+def _batch(values: Tensor | None) -> Tensor | None:
+    return None if values is None else values[None]
 
 
 def _vote(

@@ -121,14 +121,17 @@ class TrackedPerson:
         number: in the order of appearance. first_frame: of the video, that of the first pose.
         track: poses as a batch of one; NaN where the person was absent for longer than `max_gap`.
         keypoints: measured [T, J, 2], pixels, NaN where missing, in the order of the
-            measurer's `names`. covariance: of these [T, J, 2, 2].
+            measurer's `names`.
+        covariance: of these [T, J, 2, 2]; None of a detector of keypoints.
+        confidence: of a detector of keypoints [T, J], 0 to 1; else None.
     """
 
     number: int
     first_frame: int
     track: PoseTrack
     keypoints: Tensor
-    covariance: Tensor
+    covariance: Tensor | None
+    confidence: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -188,7 +191,8 @@ class TrackedRecording:
         place = frame - person.first_frame
         absent = place - len(person.poses)
         if absent:
-            person.measured.append(unmeasured(absent, len(self.names)))
+            detected = part.measured.confidence is not None
+            person.measured.append(unmeasured(absent, len(self.names), detected))
             person.poses.append(_nobody(absent, self.tracker))
         person.measured.append(part.measured)
         person.poses.append(part.poses)
@@ -211,11 +215,14 @@ class TrackedRecording:
     def _finish(self, person: _Person, smoother: UpperBodyTracker | None) -> TrackedPerson:
         """Return the poses until the person was last seen."""
         count = person.last_seen + 1
-        keypoints = torch.cat([part.keypoints for part in person.measured])[:count]
-        cov = torch.cat([part.covariance for part in person.measured])[:count]
+        fields = (_joined(parts, count) for parts in zip(*person.measured, strict=True))
+        measured = Measured(*fields)  # type: ignore[arg-type]
         track = person.poses.track(count)
         track = replace(track, first_frame=person.first_frame)
-        found = TrackedPerson(person.number, person.first_frame, track, keypoints, cov)
+        found = TrackedPerson(
+            person.number, person.first_frame, track, measured.keypoints, measured.covariance,
+            measured.confidence,
+        )  # fmt: skip
         if smoother is None:
             return found
         return replace(found, track=smoothed(found, smoother, self.names, self.gap))
@@ -230,10 +237,20 @@ def smoothed(
         names: of the measured joints. gap: frames after which there is no pose.
     """
     with torch.no_grad():
-        track = smoother(person.keypoints[None], names=names, covariance=person.covariance[None])
+        confidence, cov = (
+            None if values is None else values[None]
+            for values in (person.confidence, person.covariance)
+        )
+        track = smoother(person.keypoints[None], confidence, names, covariance=cov)
     seen = person.keypoints.isfinite().flatten(1).any(1)
     track = without_long_gaps(track, seen, 0, gap)
     return replace(track, first_frame=person.first_frame)
+
+
+def _joined(parts: Sequence[Tensor | None], count: int) -> Tensor | None:
+    """Return the first frames of some parts, None if these are not measured."""
+    there = [part for part in parts if part is not None]
+    return torch.cat(there)[:count] if there else None
 
 
 def _nobody(n_frames: int, tracker: UpperBodyTracker) -> PoseTrack:

@@ -17,9 +17,18 @@ from torchpose._core.module_state import derived
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.errors import InputError
 from torchpose.measure._association import HandAssociation
+from torchpose.measure._detectors.load import check_detector, load_detector
+from torchpose.measure._detectors.protocol import KeypointDetector
 from torchpose.measure._face import FaceDetector, FaceTracks
 from torchpose.measure._head import HeadNeck
+from torchpose.measure._keypoints import (
+    LEAST_CONFIDENCE,
+    FrameKeypoints,
+    KeypointMeasurer,
+    KeypointState,
+)
 from torchpose.measure._upper_body import (
+    HAND_TRACKERS,
     Candidates,
     FrameMeasurements,
     MeasurerState,
@@ -35,7 +44,8 @@ from torchpose.video._recording import TrackedPerson, TrackedRecording
 
 __all__ = ["LivePerson", "TrackedPerson", "VideoState", "VideoTracker", "Watcher"]
 
-Watcher = Callable[[Image, FrameMeasurements, dict[int, PoseTrack]], None]
+Found = FrameMeasurements | FrameKeypoints
+Watcher = Callable[[Image, Found, dict[int, PoseTrack]], None]
 """Is called with a frame, its measurements, and the poses of the persons in it by number."""
 
 _HANDS = [UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")]
@@ -45,7 +55,7 @@ _BLOCK = 32  # frames of a recording that are filtered together
 class VideoState(NamedTuple):
     """Holds the state of `VideoTracker.step`: of the measurer, of all streams, and the last poses."""
 
-    measurer: MeasurerState
+    measurer: MeasurerState | KeypointState
     streams: dict[int, PersonStreamState]
     poses: dict[int, PoseTrack]
 
@@ -60,6 +70,11 @@ class LivePerson(NamedTuple):
 
 class VideoTracker(nn.Module):
     """Tracks all persons in a video: `UpperBodyMeasurer`, then an `UpperBodyTracker` for each person.
+
+    With `detector` the keypoints of that take the place of what `UpperBodyMeasurer` measures; each person's
+    are tracked with their confidences, as keypoints in files are. A detector may also be an object with the
+    attribute `names`, of J keypoints, that is called with an RGB image [H, W, 3] and returns keypoints
+    [N, J, 2], pixels, and confidence [N, J], 0 to 1, of N persons.
 
     `forward` tracks a recording, `init` and `step` a camera. A frame passes three stages, each of which
     takes and returns values: the measurer gives `FrameMeasurements`, the streams of the persons
@@ -79,8 +94,11 @@ class VideoTracker(nn.Module):
         candidates: also reinitialise the hand tracker at the hands of the last pose; frames are then
             measured and filtered in turn, which is slower.
         face_detector: by default Haar's.
-        max_persons: track only the N largest faces.
+        max_persons: track only the N largest faces, or persons of a detector.
         head_neck: offsets of head and neck from the face.
+        detector: of keypoints, in place of faces, skin and hands: a model in ONNX (.onnx), a pose
+            landmarker of MediaPipe (.task), or package:factory, which Python imports and calls.
+        min_confidence: with a detector, of a keypoint, below which it is missing (default 0.3).
         max_gap: seconds without measurements after which a person has no pose; None is never.
         seed: of methods that draw; every person has a generator.
         options: to `UpperBodyTracker`, such as method, smoothing or frame.
@@ -111,6 +129,8 @@ class VideoTracker(nn.Module):
         face_detector: FaceDetector | None = None,
         max_persons: int | None = None,
         head_neck: HeadNeck | None = None,
+        detector: str | Path | KeypointDetector | None = None,
+        min_confidence: float | None = None,
         max_gap: float | None = 5.0,
         seed: int = 0,
         **options: Any,
@@ -118,11 +138,23 @@ class VideoTracker(nn.Module):
         super().__init__()
         if max_gap is not None and not max_gap > 0:
             raise InputError(f"max_gap must be positive, got {max_gap}")
-        self.measurer = UpperBodyMeasurer(
-            prior, fps, hands, background, elbows, face_detector, max_persons, head_neck
-        )
         if candidates and hands == "mean-shift":
             raise InputError(f"candidates need hands='learnt' or 'grid', got {hands!r}")
+        self.measurer: UpperBodyMeasurer | KeypointMeasurer
+        if detector is None:
+            if min_confidence is not None:
+                raise InputError("min_confidence is of keypoints: give a detector, or leave it out")
+            self.measurer = UpperBodyMeasurer(
+                prior, fps, hands, background, elbows, face_detector, max_persons, head_neck
+            )
+        else:
+            _refuse_measurer(
+                hands=hands != HAND_TRACKERS[0], background=background, elbows=elbows, edges=edges,
+                candidates=candidates, face_detector=face_detector is not None,
+                head_neck=head_neck is not None,
+            )  # fmt: skip
+            self.measurer = _keypoint_measurer(detector, fps, max_persons, min_confidence)
+            options.setdefault("neck", self.measurer.neck)
         self.candidates = candidates
         smoothing = options.pop("smoothing", None)
         tracker = UpperBodyTracker(prior, camera, fps=fps, max_gap=None, **options)
@@ -173,7 +205,7 @@ class VideoTracker(nn.Module):
             raise InputError("a camera is tracked frame by frame: expected smoothing=None")
         image = as_image(image)
         candidates = _candidates(state.poses) if self.candidates else None
-        measurer, measured = self.measurer.step(state.measurer, image, None, candidates)
+        measurer, measured = self._measure_frame(state.measurer, image, None, candidates)
         streams, tracked = self.stream.advance_all(state.streams, [measured], [image], self.gap)
         people = [LivePerson(n, tracked[n].poses, tracked[n].measured) for n in streams]
         return VideoState(measurer, streams, {p.number: p.pose for p in people}), people
@@ -221,27 +253,70 @@ class VideoTracker(nn.Module):
 
     def _measure(
         self, frames: Iterable[Any] | Tensor, last: dict[int, PoseTrack]
-    ) -> Iterator[tuple[Image, FrameMeasurements]]:
+    ) -> Iterator[tuple[Image, Found]]:
         """Yield frames and what is measured in them; faces are found ahead, in another thread.
 
         `last` holds the poses of the frame before, for candidates.
         """
         state = self.measurer.init()
-        for image, tracks in prefetch(self._follow_faces(frames, state.faces)):
+        for image, tracks in prefetch(self._follow_faces(frames, state)):
             with torch.no_grad():
                 candidates = _candidates(last) if self.candidates else None
-                state, measured = self.measurer.step(state, image, tracks, candidates)
+                state, measured = self._measure_frame(state, image, tracks, candidates)
             yield image, measured
 
+    def _measure_frame(
+        self,
+        state: MeasurerState | KeypointState,
+        image: Image,
+        tracks: FaceTracks | None,
+        candidates: dict[int, Candidates] | None,
+    ) -> tuple[MeasurerState | KeypointState, Found]:
+        """Return the next state of the measurer, and what is measured in a frame."""
+        if isinstance(self.measurer, UpperBodyMeasurer) and isinstance(state, MeasurerState):
+            return self.measurer.step(state, image, tracks, candidates)
+        if isinstance(self.measurer, KeypointMeasurer) and isinstance(state, KeypointState):
+            return self.measurer.step(state, image)
+        raise InputError(
+            "expected a state of this tracker's init or step, got one of another tracker"
+        )
+
     def _follow_faces(
-        self, frames: Iterable[Any] | Tensor, tracks: FaceTracks
-    ) -> Iterator[tuple[Image, FaceTracks]]:
-        """Yield frames and the faces in them."""
+        self, frames: Iterable[Any] | Tensor, state: MeasurerState | KeypointState
+    ) -> Iterator[tuple[Image, FaceTracks | None]]:
+        """Yield frames and the faces in them, None with a detector of keypoints."""
+        tracks = state.faces if isinstance(state, MeasurerState) else None
         for frame in frames:
             image = as_image(getattr(frame, "image", frame))
-            with torch.no_grad():
-                tracks = self.measurer.follow_faces(tracks, image)
+            if isinstance(self.measurer, UpperBodyMeasurer) and tracks is not None:
+                with torch.no_grad():
+                    tracks = self.measurer.follow_faces(tracks, image)
             yield image, tracks
+
+
+def _keypoint_measurer(
+    detector: str | Path | KeypointDetector,
+    fps: float,
+    max_persons: int | None,
+    min_confidence: float | None,
+) -> KeypointMeasurer:
+    """Return what measures by a detector, which is loaded if it is a file or the name of a factory."""
+    if isinstance(detector, str | Path):
+        name, loaded = str(detector), load_detector(detector, fps, max_persons)
+    else:
+        name = type(detector).__name__
+        loaded = check_detector(detector, name)
+    least = LEAST_CONFIDENCE if min_confidence is None else min_confidence
+    return KeypointMeasurer(loaded, fps, max_persons, least, name)
+
+
+def _refuse_measurer(**given: bool) -> None:
+    """Raise `InputError` for options of `UpperBodyMeasurer`, which a detector replaces."""
+    for option, used in given.items():
+        if used:
+            raise InputError(
+                f"{option} is of the measurer of faces and hands, whose place a detector takes; leave it out"
+            )
 
 
 def as_image(image: Any) -> Image:

@@ -1,0 +1,147 @@
+"""What a detector's keypoints become in video of strangers: hands found and invented, elbows, shoulders.
+
+The clips of `video_people`: webcams, phones, studios. The reference is MediaPipe's landmarks beside each clip
+(`*_mediapipe_pose1.npz`), so for MediaPipe itself the table says what association, filter and prior leave
+of a detector, and not how good that is. A hand is 0.7 of the way from the wrist to the index finger. It is
+visible with a visibility of both above 0.6 inside the image, and found within a quarter of the shoulders'
+width; it is not there with one below 0.15 or below the image, and invented if it counts as measured then.
+
+    python -m benchmarks.video_detector --data DIR --detector pose_landmarker_full.task
+"""
+
+import argparse
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from benchmarks._table_file import table_file
+from torchpose import VideoTracker
+from torchpose.camera import PinholeCamera
+from torchpose.evaluation import Report
+from torchpose.io import read_keypoints
+from torchpose.priors import UpperBodyPrior, load_prior
+from torchpose.skeleton import UPPER_BODY
+from torchpose.skeleton._joint_sets import canonical_names
+from torchpose.video import open_video
+
+BURN_IN, SEEN, GONE, NEAR = 15, 0.6, 0.15, 0.25
+LOWEST, BELOW = (
+    0.985,
+    1.05,
+)  # of the height: to where a hand is visible, from where on it is not there
+COLUMNS = ["hands found", "invented", "elbows", "shoulders", "frames with a pose"]
+
+
+class Scores(NamedTuple):
+    """Of one clip: visible hands and those found, absent hands and those invented, shares, medians."""
+
+    visible: int
+    found: int
+    absent: int
+    invented: int
+    elbows: float
+    shoulders: float
+    posed: float
+
+    def cells(self) -> list[float]:
+        """Return a row of the table."""
+        share = self.found / self.visible if self.visible else torch.nan
+        invented = self.invented / self.absent if self.absent else torch.nan
+        return [share, invented, self.elbows, self.shoulders, self.posed]
+
+
+def tracked(
+    path: Path, prior: UpperBodyPrior, detector: str | None
+) -> tuple[Tensor, Tensor, tuple[int, int]]:
+    """Return joints [T, 8, 2] of the person seen longest, what was measured [T, 8], and the image's size."""
+    with open_video(path) as video:
+        camera = PinholeCamera.from_image_size(*video.size)
+        people = VideoTracker(prior, camera, fps=video.fps, detector=detector)(video)
+        size = video.size
+    if not people:
+        return torch.zeros(0, 8, 2), torch.zeros(0, 8, dtype=torch.bool), size
+    first = people[0]
+    absent = torch.full((first.first_frame, 8, 2), torch.nan, dtype=torch.float64)
+    joints = torch.cat([absent, first.track.joints2d[0]])
+    measured = torch.cat([absent[..., 0] > 0, first.track.observed[0]])
+    return joints, measured, size
+
+
+def score(path: Path, reference: Path, prior: UpperBodyPrior, detector: str | None) -> Scores:
+    """Return the scores of one clip."""
+    landmarks = read_keypoints(reference)
+    names, points, sure = (
+        canonical_names(landmarks.names),
+        landmarks.keypoints,
+        landmarks.confidence,
+    )
+    if sure is None:
+        raise SystemExit(f"{reference}: expected a visibility of the landmarks")
+    joints, measured, (_, height) = tracked(path, prior, detector)
+    n = min(len(points), len(joints))
+    points, sure, joints, measured = points[:n], sure[:n], joints[:n], measured[:n]
+    late = torch.arange(n)[:, None] > BURN_IN
+
+    def of(part: str) -> tuple[Tensor, Tensor, Tensor]:
+        rows = [names.index(f"{part}_{side}") for side in ("left", "right")]
+        own = [UPPER_BODY.index(f"{part}_{side}") for side in ("left", "right")]
+        gap = (joints[:, own] - points[:, rows]).norm(dim=-1)
+        return points[:, rows], sure[:, rows], gap
+
+    shoulders, _, _ = of("shoulder")
+    width = float((shoulders[:, 0] - shoulders[:, 1]).norm(dim=-1).nanmedian())
+    hands, hand_sure, hand_gap = of("hand")
+    v = hands[..., 1]
+    visible = late & (hand_sure > SEEN) & (v > 0) & (v < LOWEST * height)
+    absent = late & ((hand_sure < GONE) | (v > BELOW * height))
+    own = [UPPER_BODY.index(f"hand_{side}") for side in ("left", "right")]
+
+    def median(part: str) -> float:
+        place, confidence, gap = of(part)
+        return float(gap[late & (confidence > SEEN) & (place[..., 1] < height)].nanmedian()) / width
+
+    return Scores(
+        int(visible.sum()), int((visible & (hand_gap < NEAR * width)).sum()),
+        int(absent.sum()), int((absent & measured[:, own]).sum()),
+        median("elbow"), median("shoulder"),
+        float(joints[BURN_IN + 1 :, UPPER_BODY.index("head"), 0].isfinite().double().mean()),
+    )  # fmt: skip
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--data", type=Path, required=True, help="folder with video_people/")
+    parser.add_argument("--detector", help="as of torchpose track; without it torchpose measures")
+    parser.add_argument("--prior", default="kinect-upper-body", help="name or file")
+    parser.add_argument("--threads", type=int, default=2, help="cores")
+    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
+    parser.add_argument("--quick", action="store_true", help="one clip, to see that it works")
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    folder = args.data / "video_people" if (args.data / "video_people").is_dir() else args.data
+    references = sorted(folder.glob("*_mediapipe_pose1.npz"))[: 1 if args.quick else None]
+    prior = load_prior(args.prior)
+    report = Report("Keypoints of a detector in video of strangers")
+    table = report.table("clips", "By clip: shares, and medians in widths of the shoulders", COLUMNS,
+                         digits=(2, 2, 2, 2, 2))  # fmt: skip
+    scores = []
+    for reference in references:
+        name = reference.name.removesuffix("_mediapipe_pose1.npz")
+        scores.append(score(folder / f"{name}.mp4", reference, prior, args.detector))
+        table.add(name, scores[-1].cells())
+    rows = torch.tensor([one.cells() for one in scores], dtype=torch.float64)
+    invented = sum(one.invented for one in scores) / max(1, sum(one.absent for one in scores))
+    mean, middle = rows.nanmean(0).tolist(), rows.nanmedian(0).values.tolist()
+    table.add("all (means of shares, medians of medians; invented pooled)",
+              [mean[0], invented, *middle[2:4], mean[4]])  # fmt: skip
+    report.settings = {"detector": args.detector or "none", "prior": prior.info.name}
+    print(report.summary())
+    if args.out:
+        args.out.write_text(report.to_markdown(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""`torchpose track --detector`: poses of everybody, and what is refused."""
+
+import numpy as np
+import pytest
+
+from torchpose import demo
+from torchpose.skeleton import UPPER_BODY
+from torchpose.upper_body import PoseTrack
+from torchpose.video import VideoWriter
+
+N = 36
+DETECTOR = """
+import numpy as np
+
+NAMES = {names}
+POINTS = np.load({points!r})
+
+
+class two:
+    names = NAMES
+
+    def __init__(self):
+        self.at = 0
+
+    def __call__(self, image):
+        one = POINTS[self.at]
+        self.at += 1
+        return np.stack([one - [90, 0], one + [110, 10]]), np.full((2, len(NAMES)), 0.8)
+
+
+class nobody(two):
+    def __call__(self, image):
+        return np.zeros((0, len(NAMES), 2)), np.zeros((0, len(NAMES)))
+
+
+class wrong(two):
+    def __call__(self, image):
+        return np.zeros((1, 2)), np.zeros(1)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A grey clip, and a module with detectors in the working directory."""
+    points = demo.demo_camera()(demo.performer(N).joints)[..., :2]
+    np.save(tmp_path / "points.npy", points.numpy())
+    text = DETECTOR.format(names=UPPER_BODY, points=str(tmp_path / "points.npy"))
+    (tmp_path / "some_detectors.py").write_text(text)
+    with VideoWriter(tmp_path / "clip.mp4", 30.0, (640, 480)) as writer:
+        for _ in range(N):
+            writer.write(np.full((480, 640, 3), 90, np.uint8))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def track(torchpose, files, folder):
+    prior = files / "prior.safetensors"
+
+    def run(*options):
+        given = ("--out", folder / "out", "--prior", prior, "--pictures", "false", *options)
+        return torchpose("track", folder / "clip.mp4", *given)
+
+    return run
+
+
+def test_everybody_whom_a_detector_finds_has_poses(track, folder):
+    done = track("--detector", "some_detectors:two", "--measurement-std", 2)
+    assert done.code == 0, done.err
+    names = {path.name for path in (folder / "out").iterdir()}
+    assert {"poses.npz", "poses_p02.npz", "overlay.mp4", "report.html"} <= names
+    assert "keypoints by some_detectors:two" in done.out
+    first, second = (PoseTrack.load(folder / "out" / f"poses{s}.npz") for s in ("", "_p02"))
+    assert bool(first.observed.all()) and first.joints2d.shape[1] == N - 2
+    apart = (second.joints2d - first.joints2d).median(1).values[0, UPPER_BODY.index("neck")]
+    assert apart.tolist() == pytest.approx([200.0, 10.0], abs=6)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--detector", "model.pt"), "a detector must be an ONNX model"),
+        (
+            ("--detector", "absent.onnx"),
+            "absent.onnx: expected a model file, there is no such file",
+        ),
+        (("--detector", "some_detectors:none"), "expected package:factory"),
+        (("--detector", "some_detectors:wrong"), "must return keypoints [N, 8, 2]"),
+        (("--detector", "some_detectors:two", "--hands", "mean-shift"), "hands is of the measurer"),
+        (("--detector", "some_detectors:two", "--face-model", "f.tflite"), "give one of them"),
+        (("--detector", "some_detectors:two", "--nose-as-head", "true"), "is for keypoints"),
+    ],
+)
+def test_refusals(track, options, said):
+    done = track(*options)
+    assert done.code == 2 and said in done.err, done.err
+    assert len(done.err.splitlines()) == 1
+
+
+def test_nobody_is_said(track):
+    done = track("--detector", "some_detectors:nobody")
+    assert done.code == 1
+    assert f"no person was seen for long enough in the {N} frames" in done.err

@@ -1,0 +1,82 @@
+"""Name the keypoints of models by how many there are, and make those that the tracker takes of them."""
+
+from typing import NamedTuple
+
+import torch
+
+from torchpose.errors import InputError
+from torchpose.measure._detectors.protocol import Detections
+from torchpose.skeleton._mediapipe_landmarks import LANDMARKS
+
+__all__ = ["COUNTS", "KNOWN", "JointSet", "joint_set", "select_joints"]
+
+COCO = (
+    "nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder",
+    "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hip", "right_hip",
+    "left_knee", "right_knee", "left_ankle", "right_ankle",
+)  # fmt: skip
+"""The 17 keypoints of COCO, with which Halpe's 26 and the 133 of COCO-WholeBody begin."""
+
+_HAND = 0.7  # of the way from the wrist to the knuckle of the middle finger, as with MediaPipe's index finger
+_WRISTS, _KNUCKLES = [9, 10], [100, 121]  # of COCO-WholeBody, left and right
+
+
+class JointSet(NamedTuple):
+    """Holds what is taken of the keypoints of a model.
+
+    Attributes:
+        title: of the set. names: of what is taken, of which the first keypoints of the model are the first.
+        hands: whether hands follow, made of wrists and knuckles.
+    """
+
+    title: str
+    names: tuple[str, ...]
+    hands: bool = False
+
+
+_SETS = {
+    17: JointSet("COCO", COCO),
+    26: JointSet("Halpe", COCO),  # its head is the crown and its neck lies between the shoulders
+    33: JointSet("MediaPipe", LANDMARKS),
+    133: JointSet("COCO-WholeBody", (*COCO, "hand_left", "hand_right"), hands=True),
+}
+KNOWN = frozenset(_SETS)
+"""Numbers of keypoints that tell a set."""
+COUNTS = ", ".join(f"{count} ({joints.title})" for count, joints in _SETS.items())
+"""The known sets, for messages."""
+
+
+def joint_set(n_keypoints: int, model: str) -> JointSet:
+    """Return the joint set with this many keypoints.
+
+    Args:
+        n_keypoints: J. model: what it is called in messages.
+
+    Raises:
+        InputError: no known set has as many.
+    """
+    if n_keypoints not in _SETS:
+        raise InputError(
+            f"{model}: expected as many keypoints as a known joint set has, {COUNTS}, got {n_keypoints}; "
+            "wrap the model in Python (package:factory), where its keypoints can be named"
+        )
+    return _SETS[n_keypoints]
+
+
+def select_joints(found: Detections, joints: JointSet) -> Detections:
+    """Return the keypoints that are taken of those of a model.
+
+        hand = wrist + 0.7 (knuckle of the middle finger - wrist)
+
+    Args:
+        found: all keypoints of the model.
+    """
+    points, confidence = found
+    n_first = len(joints.names) - (2 if joints.hands else 0)
+    first = Detections(points[:, :n_first], confidence[:, :n_first])
+    if not joints.hands:
+        return first
+    wrists = points[:, _WRISTS]
+    hands = wrists + _HAND * (points[:, _KNUCKLES] - wrists)
+    sure = torch.minimum(confidence[:, _WRISTS], confidence[:, _KNUCKLES])
+    return Detections(*(torch.cat(pair, 1) for pair in zip(first, (hands, sure), strict=True)))

@@ -1,0 +1,211 @@
+"""Measure the keypoints of all persons in a video by a detector, frame by frame."""
+
+from typing import Any, NamedTuple, cast
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchpose._core.checks import check_count, check_rgb
+from torchpose._core.images import Image
+from torchpose.errors import InputError, TorchposeError
+from torchpose.measure._detectors.associate import (
+    PersonTracks,
+    associate,
+    crop_boxes,
+    least_seen,
+    no_tracks,
+    person_scale,
+    pseudo_faces,
+    upper_rows,
+    without_doubles,
+)
+from torchpose.measure._detectors.protocol import (
+    CroppingDetector,
+    Detections,
+    KeypointDetector,
+    checked_detections,
+)
+from torchpose.measure._persons import PersonRegister, Persons
+from torchpose.skeleton._joint_sets import canonical_names
+from torchpose.skeleton._mediapipe_landmarks import derive_joints, lacks_joints
+
+__all__ = ["LEAST_CONFIDENCE", "FrameKeypoints", "KeypointMeasurer", "KeypointState"]
+
+LEAST_CONFIDENCE = 0.3
+"""Of a keypoint, below which it counts as missing unless something else is asked for."""
+_ANYWHERE = ("head", "neck")  # may lie above the image: they follow from face and shoulders
+_KNOWN_FOR = 30.0  # seconds for which somebody who has left is remembered
+_PRESENT = 1.0  # seconds for which somebody who is not detected counts as there
+_CROPPED = 0.2  # seconds without a detection after which the whole image is searched
+
+
+class FrameKeypoints(NamedTuple):
+    """Holds the keypoints of N persons in a frame.
+
+    Attributes:
+        person: their numbers, in the order of appearance [N].
+        keypoints: of the measurer's `names` [N, J, 2], pixels, NaN where missing.
+        confidence: 0 to 1 [N, J]. sizes: about the widths of the shoulders, pixels [N].
+    """
+
+    person: Int[Tensor, " N"]
+    keypoints: Float[Tensor, "N J 2"]
+    confidence: Float[Tensor, "N J"]
+    sizes: Float[Tensor, " N"]
+
+    @property
+    def faces(self) -> None:
+        """Return None: keypoints come without faces."""
+        return None
+
+
+class KeypointState(NamedTuple):
+    """Holds the tracks of the persons, who they are, and the number of frames before."""
+
+    tracks: PersonTracks
+    persons: Persons
+    frame: int
+
+
+class KeypointMeasurer:
+    """Measures the keypoints of all persons in a video by a detector, and tells the persons apart.
+
+    A frame passes four stages: detection, of crops about the persons where the detector wants one person;
+    removal of what is unsure or there twice; association with the persons of the frames before, by the
+    distances of the keypoints; and recognition of who returns, by the colours of the clothes.
+
+    Args:
+        detector: of keypoints. fps: frames per second.
+        max_persons: the largest are taken; None takes all.
+        min_confidence: of a keypoint, below which it counts as missing.
+        name: of the detector, in messages.
+
+    Attributes:
+        names: of the keypoints; head, neck and hands follow the landmarks of MediaPipe.
+        neck: kind of neck, if the detector or its landmarks tell.
+
+    Raises:
+        InputError: settings out of range.
+    """
+
+    def __init__(
+        self,
+        detector: KeypointDetector,
+        fps: float = 30.0,
+        max_persons: int | None = None,
+        min_confidence: float = LEAST_CONFIDENCE,
+        name: str = "the detector",
+    ) -> None:
+        if not 0 <= min_confidence <= 1:
+            raise InputError(f"min_confidence must be in 0 to 1, got {min_confidence}")
+        if max_persons is not None:
+            check_count("max_persons", max_persons)
+        self.detector, self.fps, self.max_persons = detector, float(fps), max_persons
+        self.min_confidence, self._name = min_confidence, name
+        self._given = tuple(str(one) for one in detector.names)
+        self._derives = lacks_joints(self._given)
+        self.names = self._given
+        if self._derives:
+            self.names = derive_joints(torch.zeros(1, len(self.names), 2), None, self.names)[2]
+        self.neck: str | None = "neck" if self._derives else getattr(detector, "neck", None)
+        self._upper = upper_rows(self.names)
+        self._anywhere = torch.tensor([one in _ANYWHERE for one in canonical_names(self.names)])
+        self.register = PersonRegister(within=round(_KNOWN_FOR * fps))
+
+    def init(self) -> KeypointState:
+        """Return the state before the first frame, and reset the detector."""
+        reset = getattr(self.detector, "reset", None)
+        if callable(reset):
+            reset()
+        return KeypointState(no_tracks(len(self.names)), self.register.init(), 0)
+
+    def step(self, state: KeypointState, image: Image) -> tuple[KeypointState, FrameKeypoints]:
+        """Return the next state and the keypoints of the next frame.
+
+        Args:
+            state: from `init` or the step before. image: RGB, uint8 [H, W, 3].
+
+        Raises:
+            InputError: another kind of image, or a detector that returns something else than it says.
+        """
+        check_rgb("a frame", image)
+        found = self._sure(self._detect(state.tracks, image), image)
+        found = _rows(found, without_doubles(found, self._scale(found.keypoints)[1], self._upper))
+        before = self._scale(state.tracks.keypoints)[1]
+        tracks, owner = associate(state.tracks, found.keypoints, before, self._upper)
+        persons, number = self._number(state, tracks, image)
+        chosen = self._chosen(number[owner], found)
+        found, number = _rows(found, chosen), number[owner][chosen]
+        measured = FrameKeypoints(number, *found, self._scale(found.keypoints)[1])
+        return KeypointState(tracks, persons, state.frame + 1), measured
+
+    def _detect(self, tracks: PersonTracks, image: Image) -> Detections:
+        """Return all keypoints of a frame."""
+        detector = self.detector
+        if isinstance(detector, CroppingDetector):
+            found = detector.detect_in(image, self._boxes(tracks, image))
+        else:
+            found = checked_detections(self._call(image), len(self._given), self._name)
+        if not self._derives:
+            return found
+        points, confidence, _ = derive_joints(*found, self._given)
+        return Detections(points, cast(Tensor, confidence))
+
+    def _call(self, image: Image) -> Any:
+        """Return what the detector returns for a frame; its own errors name it."""
+        try:
+            return self.detector(image)
+        except TorchposeError:
+            raise
+        except Exception as error:
+            raise InputError(
+                f"{self._name} failed on an image {list(image.shape)}: {type(error).__name__}: {error}"
+            ) from error
+
+    def _boxes(self, tracks: PersonTracks, image: Image) -> Float[Tensor, "N 4"] | None:
+        """Return boxes about the persons of the last frames, None for the whole image."""
+        recent = tracks.keypoints[tracks.unseen <= _CROPPED * self.fps]
+        if not len(recent):
+            return None
+        return crop_boxes(recent, *self._scale(recent), (image.shape[1], image.shape[0]))
+
+    def _scale(self, keypoints: Tensor) -> tuple[Tensor, Tensor]:
+        return person_scale(keypoints, self.names)
+
+    def _sure(self, found: Detections, image: Image) -> Detections:
+        """Return the persons with enough keypoints, without those that are unsure or not in the image."""
+        sure = (found.confidence >= self.min_confidence) & (found.confidence > 0)
+        size = found.keypoints.new_tensor([image.shape[1], image.shape[0]])
+        inside = ((found.keypoints >= 0) & (found.keypoints < size)).all(-1)
+        sure &= inside | (self._anywhere & found.keypoints.isfinite().all(-1))
+        keypoints = torch.where(sure[..., None], found.keypoints, torch.nan)
+        there = sure[:, self._upper].sum(1) >= least_seen(len(self._upper))
+        confidence = torch.where(sure, found.confidence, 0.0)
+        return Detections(keypoints[there], confidence[there])
+
+    def _number(
+        self, state: KeypointState, tracks: PersonTracks, image: Image
+    ) -> tuple[Persons, Int[Tensor, " P"]]:
+        """Return who the followed persons are: the next register, and numbers, -1 of who does not count."""
+        present = tracks.usable & (tracks.unseen <= _PRESENT * self.fps)
+        faces = pseudo_faces(*self._scale(tracks.keypoints[present]))
+        persons, number = self.register.step(
+            state.persons, image, faces, tracks.identity[present], state.frame,
+            tracks.unseen[present] == 0,
+        )  # fmt: skip
+        numbers = torch.full_like(tracks.identity, -1)
+        numbers[present] = number
+        return persons, numbers
+
+    def _chosen(self, number: Int[Tensor, " N"], found: Detections) -> Int[Tensor, " n"]:
+        """Return the rows of the persons who count, the largest if there are too many."""
+        rows = torch.nonzero(number >= 0).flatten()
+        if self.max_persons is None or len(rows) <= self.max_persons:
+            return rows
+        size = self._scale(found.keypoints[rows])[1]
+        return rows[size.argsort(descending=True)[: self.max_persons].sort().values]
+
+
+def _rows(found: Detections, rows: Int[Tensor, " n"]) -> Detections:
+    return Detections(*(values[rows] for values in found))
