@@ -154,12 +154,12 @@ class HandNetwork(nn.Module):
         return HandPlaces(fine, gone - torch.logsumexp(places, -1))
 
     def save(self, path: str | Path) -> None:
-        """Write the network as safetensors; the file appears whole or not at all.
+        """Write the network as safetensors, in half precision; the file appears whole or not at all.
 
         Raises:
             OutputError: the file cannot be written.
         """
-        tensors = {k: v.detach().cpu() for k, v in self.state_dict().items() if v.ndim}
+        tensors = {k: v.detach().cpu().half() for k, v in self.state_dict().items() if v.ndim}
         write_tensors(path, _KIND, self.info, tensors)
 
     @classmethod
