@@ -43,10 +43,11 @@ FPS = 30.0
 HANDS = [UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")]
 SHOULDERS = [UPPER_BODY.index("shoulder_left"), UPPER_BODY.index("shoulder_right")]
 TRACKERS: dict[str, dict[str, Any]] = {
-    "histogram filter": {},
-    "histogram filter, background": {"background": True},
-    "histogram filter, edges": {"edges": True},
-    "histogram filter, candidates": {"candidates": True},
+    "with the network": {},
+    "histogram filter": {"hands": "grid"},
+    "histogram filter, background": {"hands": "grid", "background": True},
+    "histogram filter, edges": {"hands": "grid", "edges": True},
+    "histogram filter, candidates": {"hands": "grid", "candidates": True},
     "mean shift": {"hands": "mean-shift"},
     "mean shift, background": {"hands": "mean-shift", "background": True},
     "mean shift, edges": {"hands": "mean-shift", "edges": True},

@@ -40,7 +40,7 @@ _SIZES, _CELLS = 11, 2  # of torsos, and steps of log depth from one to the next
 _TURN_STEP, _TURN_STD = 15.0, 20.0  # degrees
 _BROAD_TURN = 0.2  # share of the turns that are all alike likely
 _SPEED, _TURN_SPEED = 0.08, 60.0  # share of the depth, and degrees, after one second
-_MOST_SAID = 0.3  # nats that are believed of depths at which nothing was weighed
+_MOST_SAID = 0.1  # nats that are believed of depths at which nothing was weighed
 _LOST = 1e-6  # share of a frame's belief that starts anew
 # Standard deviation of each torso joint about its place in a stiff torso, metres: x and y.
 _STIFF = ((0.03, 0.035), (0.03, 0.035), (0.03, 0.035), (0.05, 0.035))
