@@ -107,9 +107,8 @@ def test_settings_are_the_options_of_track() -> None:
     theirs = vars(track_command().parser().get_defaults())
     assert {name: theirs[name] for name in own} == own
     of_video = {"hands", "background", "edges", "candidates", "elbows", "face_model", "overlay"}
-    assert (
-        set(theirs) - set(own) == {"config", "input", "out", "pictures", "max_persons"} | of_video
-    )
+    of_video |= {"max_persons", "detector", "min_confidence"}
+    assert set(theirs) - set(own) == {"config", "input", "out", "pictures"} | of_video
 
 
 def test_bad_recordings_are_listed_and_do_not_stop_the_others(data, prior_file, tmp_path, capsys):

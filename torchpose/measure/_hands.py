@@ -79,39 +79,38 @@ class HandState(NamedTuple):
 class HandTracker(nn.Module):
     """Tracks both hands of every person by a histogram filter in a window about the face.
 
-        The likelihood of a hand comes from skin (against clothes and background), motion and the shape
-        of a hand at the end of its forearm (`HandLikelihood`). Its prior is that over poses, given the face
-        (`HandPrior`). The face is removed from the skin unless it changes (`FaceMemory`). The belief is
-        predicted by optical flow, by its own velocity and by diffusion, and the two hands exclude each
-        other (`predict`, `exclude`). A frame without motion has little weight. The hands of a frame are
-        returned with that frame, without delay.
+    The likelihood of a hand comes from skin (against clothes and background), motion and the shape
+    of a hand at the end of its forearm (`HandLikelihood`). Its prior is that over poses, given the face
+    (`HandPrior`). The face is removed from the skin unless it changes (`FaceMemory`). The belief is
+    predicted by optical flow, by its own velocity and by diffusion, and the two hands exclude each
+    other (`predict`, `exclude`). A frame without motion has little weight. The hands of a frame are
+    returned with that frame, without delay.
 
-        With a network the log-likelihood is a sum of two, and a hand may be gone: hidden, or outside of the
-        image. That is a state of its own, beside the places, with a probability that is filtered over time.
+    With a network the log-likelihood is a sum of two, and a hand may be gone: hidden, or outside of the
+    image. That is a state of its own, beside the places, with a probability that is filtered over time.
 
-        Args:
-            prior: of hands given the face.
-            settings: constants. fps: frames per second of the video.
-            network: that tells hands from what looks alike; None leaves it to colours, motion and shape, and
-                takes every hand to be somewhere.
+    Args:
+        prior: of hands given the face.
+        settings: constants. fps: frames per second of the video.
+        network: that tells hands from what looks alike; None leaves it to colours, motion and shape, and
+            takes every hand to be somewhere.
 
-        Raises:
-            InputError: a frame rate that is not positive.
+    Raises:
+        InputError: a frame rate that is not positive.
 
-        Reference:
-            Burke & Lasenby, section 5.2, for the task and the skin; the filter goes beyond it.
+    Reference:
+        Burke & Lasenby, section 5.2, for the task and the skin; the filter goes beyond it.
 
-        Example:
-            >>> import numpy as np, torch, torchpose
-            >>> from torchpose.measure import HandTracker
-            >>> from torchpose.measure._hand_network import HandNetwork, HandPlaces
-    from torchpose.measure._hand_prior import HandPrior
-            >>> tracker = HandTracker(HandPrior.from_prior(torchpose.load_prior("kinect-upper-body")))
-            >>> frame = np.full((120, 160, 3), 90, np.uint8)
-            >>> face, number = torch.tensor([[80.0, 30.0, 20.0]]), torch.tensor([0])
-            >>> state, hands = tracker.step(tracker.init(), frame, face, number)
-            >>> hands.points.shape
-            torch.Size([1, 2, 2])
+    Example:
+        >>> import numpy as np, torch, torchpose
+        >>> from torchpose.measure import HandTracker
+        >>> from torchpose.measure._hand_prior import HandPrior
+        >>> tracker = HandTracker(HandPrior.from_prior(torchpose.load_prior("kinect-upper-body")))
+        >>> frame = np.full((120, 160, 3), 90, np.uint8)
+        >>> face, number = torch.tensor([[80.0, 30.0, 20.0]]), torch.tensor([0])
+        >>> state, hands = tracker.step(tracker.init(), frame, face, number)
+        >>> hands.points.shape
+        torch.Size([1, 2, 2])
     """
 
     def __init__(
