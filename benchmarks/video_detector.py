@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from benchmarks._table_file import table_file
+from benchmarks.hand_network.clips import BELOW, BURN_IN, LOWEST, SEEN, UNSEEN
 from torchpose import VideoTracker
 from torchpose.camera import PinholeCamera
 from torchpose.evaluation import Report
@@ -26,11 +27,7 @@ from torchpose.skeleton import UPPER_BODY
 from torchpose.skeleton._joint_sets import canonical_names
 from torchpose.video import open_video
 
-BURN_IN, SEEN, GONE, NEAR = 15, 0.6, 0.15, 0.25
-LOWEST, BELOW = (
-    0.985,
-    1.05,
-)  # of the height: to where a hand is visible, from where on it is not there
+NEAR = 0.25  # widths of the shoulders
 COLUMNS = ["hands found", "invented", "elbows", "shoulders", "frames with a pose"]
 
 
@@ -95,7 +92,7 @@ def score(path: Path, reference: Path, prior: UpperBodyPrior, detector: str | No
     hands, hand_sure, hand_gap = of("hand")
     v = hands[..., 1]
     visible = late & (hand_sure > SEEN) & (v > 0) & (v < LOWEST * height)
-    absent = late & ((hand_sure < GONE) | (v > BELOW * height))
+    absent = late & ((hand_sure < UNSEEN) | (v > BELOW * height))
     own = [UPPER_BODY.index(f"hand_{side}") for side in ("left", "right")]
 
     def median(part: str) -> float:

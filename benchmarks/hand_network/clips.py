@@ -55,7 +55,10 @@ _FIRST_SEED, _RENDERED_FRAMES, _DISTANCE = (
     1.6,
 )  # no benchmark of video renders these seeds
 SEEN, UNSEEN = 0.6, 0.15  # MediaPipe's visibility of a hand that is seen, and of one that is not
-_LOWEST, _BELOW = 0.985, 1.05  # of the image's height
+LOWEST, BELOW = (
+    0.985,
+    1.05,
+)  # of its height: to where a hand is in the image, from where on below it
 BURN_IN = 15  # frames that are not scored
 
 
@@ -146,8 +149,8 @@ def _by_mediapipe(landmarks: Path, video: Path) -> Labels:
 def _seen(centres: Tensor, sure: Tensor, size: tuple[int, int]) -> Tensor:
     """Return whether hands are seen, not to be seen, or neither is sure."""
     x, y = centres.unbind(-1)
-    inside = (x > 0) & (y > 0) & (x < size[0]) & (y < _LOWEST * size[1])
-    gone = (sure < UNSEEN) | (y > _BELOW * size[1])
+    inside = (x > 0) & (y > 0) & (x < size[0]) & (y < LOWEST * size[1])
+    gone = (sure < UNSEEN) | (y > BELOW * size[1])
     return torch.where((sure > SEEN) & inside, 1, torch.where(gone, 0, -1))
 
 

@@ -22,7 +22,7 @@ def test_a_dot_is_where_the_view_says(centred, box, size):
     assert seen.pixels.shape == (size[1], size[0], 3)
     bright = np.argwhere(seen.pixels[..., 0] > 200)
     found = torch.from_numpy(bright.mean(0)[::-1].copy())
-    expected = seen.to_model(torch.tensor([70.0, 60.0]).double())
+    expected = torch.tensor([70.0, 60.0]).double() * seen.scale + torch.tensor(seen.offset).double()
     torch.testing.assert_close(found, expected, atol=1.0, rtol=0)
     torch.testing.assert_close(seen.to_image(expected), torch.tensor([70.0, 60.0]).double())
 

@@ -30,10 +30,6 @@ class View(NamedTuple):
         """Return points of the image for points of the model's input."""
         return (points - points.new_tensor(self.offset)) / self.scale
 
-    def to_model(self, points: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
-        """Return points of the model's input for points of the image."""
-        return points * self.scale + points.new_tensor(self.offset)
-
 
 def whole(image: Image) -> Float[Tensor, " 4"]:
     """Return the box of an image: left, top, right, bottom."""
