@@ -228,7 +228,7 @@ def time_step(tracker: Tracker, test: Trials, n_steps: int = 20) -> float:
     generator = torch.Generator().manual_seed(0)
     seconds: Sequence[float] = []
     with torch.inference_mode():
-        state = model.init(1, generator)
+        state = model.init(1, generator=generator)
         n_warm = min(BURN_IN + 3, z.shape[1])
         for t in range(n_warm + n_steps):
             start = time.perf_counter()

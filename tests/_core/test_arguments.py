@@ -105,13 +105,13 @@ def filters():
 @pytest.mark.parametrize("name", filters())
 def test_a_state_of_another_batch_or_filter(name):
     model, generator = filters()[name], torch.Generator().manual_seed(0)
-    state = model.init(3, generator)
+    state = model.init(3, generator=generator)
     with pytest.raises(ShapeError, match=r"2 elements of z.*init\(2\)"):
         model.step(state, draw(2, 2), generator=generator)
     other = filters()["particles" if name in ("fixed", "sampled", "split") else "fixed"]
     with pytest.raises(InputError, match="state must be a"):
-        model.step(other.init(2, generator), draw(2, 2), generator=generator)
-    state, _ = model.step(model.init(2, generator), draw(2, 2), generator=generator)
+        model.step(other.init(2, generator=generator), draw(2, 2), generator=generator)
+    state, _ = model.step(model.init(2, generator=generator), draw(2, 2), generator=generator)
     model.step(state, draw(2, 2), generator=generator)  # its own are taken
 
 

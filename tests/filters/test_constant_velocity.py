@@ -56,7 +56,9 @@ def test_smoother_is_the_conditional_mean(noisy: torch.Tensor, lag: int | None) 
     upto = [min(t + reach, length - 1) for t in range(length)]
     expected = dense_estimates(noisy[2, :length, 1], upto)
     lengths = torch.tensor([40, 12, length])
-    found = ConstantVelocityFilter(RATIO, FPS).smooth(noisy, lengths, lag)[2, :length, 1]
+    found = ConstantVelocityFilter(RATIO, FPS).smooth(noisy, lengths=lengths, lag=lag)[
+        2, :length, 1
+    ]
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
 
 
@@ -73,7 +75,7 @@ def test_what_comes_after_a_sequence_changes_nothing(noisy: torch.Tensor) -> Non
     model, lengths = ConstantVelocityFilter(RATIO, FPS), torch.tensor([40, 12, 31])
     spoilt = noisy.clone()
     spoilt[1, 12:] = 1e6
-    found = model.smooth(spoilt, lengths)[1, :12]
+    found = model.smooth(spoilt, lengths=lengths)[1, :12]
     torch.testing.assert_close(found, model.smooth(noisy[1:2, :12])[0])
 
 

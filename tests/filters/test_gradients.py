@@ -30,9 +30,9 @@ def outputs(model, p, smooth=False, noise=None, **options):
 
     def run(z):
         if smooth:
-            return model.smooth(z, mask, noise, LENGTHS, return_cov=True, **options)[:4]
+            return model.smooth(z, mask, noise, lengths=LENGTHS, return_cov=True, **options)[:4]
         generator = torch.Generator().manual_seed(0)
-        return model(z, mask, noise, LENGTHS, generator, return_cov=True)[:4]
+        return model(z, mask, noise, lengths=LENGTHS, generator=generator, return_cov=True)[:4]
 
     return run
 
@@ -120,7 +120,7 @@ def test_constant_velocity(lag):
     if lag == "filter":
         assert_differentiable(lambda z: [model(z)], z)
     else:
-        assert_differentiable(lambda z: [model.smooth(z, lengths, lag)], z)
+        assert_differentiable(lambda z: [model.smooth(z, lengths=lengths, lag=lag)], z)
 
 
 MODELS = [

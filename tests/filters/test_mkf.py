@@ -35,7 +35,7 @@ DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
 
 def online(model, z, mask, **options):
     """Step by step, as in a live system."""
-    state, steps = model.init(len(z), options.get("generator")), []
+    state, steps = model.init(len(z), generator=options.get("generator")), []
     for t in range(z.shape[1]):
         state, out = model.step(state, z[:, t], mask[:, t], return_cov=True, **options)
         steps.append(out)
@@ -140,7 +140,7 @@ def test_some_more_frames_are_those_of_steps(tracks):
     z, mask, model = tensor(p.z), torch.tensor(p.mask), p.filter(tracks=tracks)
     steps = online(model, z, mask, generator=torch.Generator().manual_seed(0))
     draws, parts = torch.Generator().manual_seed(0), []
-    state = model.init(3, draws)
+    state = model.init(3, generator=draws)
     for rows in (slice(0, 1), slice(1, 12), slice(12, 20)):
         options = {"generator": draws, "return_cov": True}
         state, out = model.advance(state, z[:, rows], mask[:, rows], **options)

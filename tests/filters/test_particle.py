@@ -148,7 +148,7 @@ def test_a_measured_start_draws_from_the_posterior_of_each_element():
     tracker = BootstrapParticleFilter(
         prior, torch.ones(3), tensor(noise), [2, 0], n_particles=40_000, start="measured"
     )
-    state = tracker.init(3, generator())
+    state = tracker.init(3, generator=generator())
     state, out = tracker.step(state, tensor(z), seen, generator=generator(), return_cov=True)
     assert torch.allclose(out.log_weights.exp(), torch.full_like(out.log_weights, 1 / 40_000))
     points = np.random.default_rng(0).multivariate_normal(np.zeros(3), np.eye(3), 400_000)
@@ -388,7 +388,7 @@ def test_online_equals_offline(proposal, start):
     z, mask = signal(3, 6, 1), torch.rand(3, 6, 1, generator=generator(1)) > 0.2
     offline = tracker(z, mask, generator=generator(2), return_cov=True)
     g = generator(2)
-    state = tracker.init(3, g)
+    state = tracker.init(3, generator=g)
     for t in range(6):
         state, out = tracker.step(state, z[:, t], mask[:, t], generator=g, return_cov=True)
         assert torch.equal(out.mean, offline.mean[:, t])
@@ -402,7 +402,7 @@ def test_the_estimate_is_the_weighted_mean_of_the_particles_before_resampling():
     tracker = BootstrapParticleFilter(
         small_mixture(dim=2), torch.full((2,), 0.2), torch.ones(1), [1], n_particles=500, dtype=WIDE
     )
-    state, out = tracker.step(tracker.init(2, generator(0)), signal(2, 1, 1)[:, 0])
+    state, out = tracker.step(tracker.init(2, generator=generator(0)), signal(2, 1, 1)[:, 0])
     particles, weights = tracker.particles(state), state.log_weights.exp()
     torch.testing.assert_close(out.mean, (weights[..., None] * particles).sum(1))
     assert torch.equal(out.log_weights, state.log_weights)

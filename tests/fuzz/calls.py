@@ -58,19 +58,19 @@ def _tracker() -> UpperBodyTracker:
 def _step(which: str, z: Tensor, mask: Tensor, cov: Tensor, states: int) -> Any:
     model = _filters()[which]
     generator = torch.Generator().manual_seed(0)
-    state = model.init(states, generator)
-    return model.step(state, z, mask, cov, generator, True)
+    state = model.init(states, generator=generator)
+    return model.step(state, z, mask, cov, generator=generator, return_cov=True)
 
 
 def _foreign_state(which: str, other: str, z: Tensor) -> Any:
     generator = torch.Generator().manual_seed(0)
-    state = _filters()[other].init(len(z) if z.ndim else 1, generator)
-    return _filters()[which].step(state, z, None, None, generator, True)
+    state = _filters()[other].init(len(z) if z.ndim else 1, generator=generator)
+    return _filters()[which].step(state, z, None, None, generator=generator, return_cov=True)
 
 
 def _run(which: str, z: Tensor, mask: Tensor, cov: Tensor, lengths: Tensor) -> Any:
     generator = torch.Generator().manual_seed(0)
-    return _filters()[which](z, mask, cov, lengths, generator, True)
+    return _filters()[which](z, mask, cov, lengths=lengths, generator=generator, return_cov=True)
 
 
 def _track(keypoints: Tensor, confidence: Tensor, mask: Tensor) -> Any:

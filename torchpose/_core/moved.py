@@ -1,6 +1,6 @@
-"""Import modules by their old paths, for one release, with a `DeprecationWarning`.
+"""Keep old names working for one release, with a `DeprecationWarning`: modules, names, arguments.
 
-`MODULES` and `NAMES` are the whole table. Both are to go in version 0.3.0.
+`MODULES`, `NAMES` and `ARGUMENTS` are the whole table. All are to go in version 0.3.0.
 """
 
 import sys
@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 __all__ = [
+    "ARGUMENTS",
     "MODULES",
     "NAMES",
     "install",
@@ -368,6 +369,27 @@ NAMES: dict[str, dict[str, str]] = {
 """Names that a package or module had: present home (without `torchpose.`) to the names in it.
 
 A name that has changed is OLD=NEW.
+"""
+
+ARGUMENTS = {
+    "BootstrapParticleFilter.init": "generator",
+    "BodyTracker.forward": "generator progress",
+    "BodyTracker.init": "generator",
+    "ConstantVelocityFilter.smooth": "lengths lag",
+    "MixtureKalmanFilter.init": "generator",
+    "RecursiveFilter.advance": "generator return_cov",
+    "RecursiveFilter.forward": "lengths generator return_cov progress",
+    "RecursiveFilter.smooth": "lengths lag return_cov",
+    "RecursiveFilter.step": "generator return_cov",
+    "SampledTrackFilter.init": "generator",
+    "SilhouetteParticleFilter.forward": "generator lengths progress initial_std=initial_cov",
+    "SilhouetteParticleFilter.init": "generator initial_std=initial_cov",
+    "SilhouetteParticleFilter.step": "generator",
+    "track_body": "generator +initial_std=initial_cov",
+}
+"""Functions to the arguments that they took by position, in this order, and take by name alone now.
+
+One whose name has changed is OLD=NEW; one behind a + was taken by name before, too.
 """
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchpose._core.checks import check_shape
+from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.module_state import (
     WideModule,
     derived,
@@ -35,6 +36,7 @@ from torchpose.filters._outputs import FilterOutput, StepOutput, collect
 __all__ = [
     "Generators",
     "RecursiveFilter",
+    "check_lag",
     "require_state",
     "standard_normal",
     "uniform",
@@ -69,6 +71,14 @@ def uniform(
     return torch.stack([torch.rand(*shape, generator=g, **kind) for g in generator])
 
 
+def check_lag(lag: int | None) -> None:
+    """Raise `InputError` for a negative number of later frames."""
+    if lag is not None and lag < 0:
+        raise InputError(
+            f"lag must be at least 0 frames, or None for the whole sequence, got {lag}"
+        )
+
+
 def require_state(state: Any, kind: type, field: str, shape: Sequence[int | None]) -> None:
     """Raise unless a state is of this type, with a tensor of this shape; for `check_state`.
 
@@ -94,10 +104,11 @@ class RecursiveFilter(WideModule, ABC):
     """A recursive Bayesian filter over batches of sequences.
 
     `forward` filters whole sequences; `init`, then `step` (one frame) or `advance` (some more frames)
-    give the same numbers online. Randomness, masks and noise have the same arguments in all of them.
+    give the same numbers online. `smooth` uses later frames too, where a filter can. Randomness, masks
+    and noise have the same arguments in all of them.
 
-    A filter implements `init` and `filter_frame`, which get checked arguments; it may override
-    `filter_frames`, the loop over time, where it knows a faster way.
+    A filter implements `init` and `filter_frame`, which get checked arguments. It may override
+    `filter_frames`, the loop over time, where it knows a faster way, and `smooth_frames`.
 
     Args:
         measurement_cov: R, [Z, Z] or its diagonal [Z].
@@ -143,7 +154,7 @@ class RecursiveFilter(WideModule, ABC):
             del cls.advance
 
     @abstractmethod
-    def init(self, batch_size: int, generator: Generators = None) -> Any:
+    def init(self, batch_size: int, *, generator: Generators = None) -> Any:
         """Return the state before the first measurement; the first step predicts, then updates."""
 
     @abstractmethod
@@ -155,12 +166,14 @@ class RecursiveFilter(WideModule, ABC):
     def check_state(self, state: Any, batch: int) -> None:
         """Raise unless a state is one of this filter's with so many elements; may be left out."""
 
+    @takes_former_arguments
     def step(
         self,
         state: Any,
         z: Float[Tensor, "B Z"],
         mask: Bool[Tensor, "B Z"] | None = None,
         measurement_cov: Tensor | None = None,
+        *,
         generator: Generators = None,
         return_cov: bool = False,
     ) -> tuple[Any, StepOutput]:
@@ -187,12 +200,14 @@ class RecursiveFilter(WideModule, ABC):
             frames = self.check(z[:, None], mask, measurement_cov, None, generator)
             return self.filter_frame(state, frames.frame(0), generator, return_cov)
 
+    @takes_former_arguments
     def advance(
         self,
         state: Any,
         z: Float[Tensor, "B T Z"],
         mask: Bool[Tensor, "B T Z"] | None = None,
         measurement_cov: Tensor | None = None,
+        *,
         generator: Generators = None,
         return_cov: bool = False,
     ) -> tuple[Any, FilterOutput]:
@@ -214,13 +229,15 @@ class RecursiveFilter(WideModule, ABC):
             frames = self.check(z, mask, measurement_cov, None, generator)
             return self.continue_frames(state, frames, generator, return_cov)
 
+    @takes_former_arguments
     def forward(
         self,
         z: Float[Tensor, "B T Z"],
         mask: Bool[Tensor, "B T Z"] | None = None,
         measurement_cov: Tensor | None = None,
-        lengths: Int[Tensor, " B"] | None = None,
+        *,
         generator: Generators = None,
+        lengths: Int[Tensor, " B"] | None = None,
         return_cov: bool = False,
         progress: bool = False,
     ) -> FilterOutput:
@@ -229,9 +246,10 @@ class RecursiveFilter(WideModule, ABC):
         Args:
             z: measurements [B, T, Z] in the units of the state (pixels). mask: [B, T, Z], True where
                 measured; what z holds elsewhere is ignored. measurement_cov: R [Z, Z] or
-                [B, T, Z, Z], overrides the filter's own. lengths: [B], frames of each sequence.
+                [B, T, Z, Z], overrides the filter's own.
             generator: for filters that draw; a generator, or a list of B generators, one for each
                 element, which makes an element's numbers independent of its batch.
+            lengths: [B], frames of each sequence; past them its last estimate is repeated.
             return_cov: whether to return covariances. progress: whether to show a progress bar.
 
         Returns:
@@ -245,11 +263,53 @@ class RecursiveFilter(WideModule, ABC):
             frames = self.check(z, mask, measurement_cov, lengths, generator)
             return self.filter_frames(frames, generator, return_cov, progress)
 
+    @takes_former_arguments
+    def smooth(
+        self,
+        z: Float[Tensor, "B T Z"],
+        mask: Bool[Tensor, "B T Z"] | None = None,
+        measurement_cov: Tensor | None = None,
+        *,
+        lengths: Int[Tensor, " B"] | None = None,
+        lag: int | None = None,
+        return_cov: bool = False,
+    ) -> FilterOutput:
+        """Return estimates that use later measurements too, of filters that can: `FixedTrackFilter`.
+
+        Args:
+            z, mask, measurement_cov, lengths, return_cov: as `forward`.
+            lag: number of later frames that each estimate may use; None is the whole sequence.
+
+        Returns:
+            `FilterOutput` with smoothed mean, weights and covariance, and the filter's log-evidence.
+
+        Raises:
+            InputError: the filter cannot smooth, or not with its options (`smooth_frames`), or lag is
+            negative; else as `forward`.
+        """
+        check_lag(lag)
+        with one_run(self.observed.device):
+            frames = self.check(z, mask, measurement_cov, lengths, None)
+            return self.smooth_frames(frames, lag, return_cov)
+
+    def smooth_frames(
+        self, frames: Measurements, lag: int | None, return_cov: bool
+    ) -> FilterOutput:
+        """Return smoothed estimates of whole sequences, given checked measurements.
+
+        Raises:
+            InputError: the filter cannot smooth, as here.
+        """
+        raise InputError(
+            f"{type(self).__name__} cannot smooth: that needs tracks='fixed' (FixedTrackFilter), whose "
+            "tracks have a past each"
+        )
+
     def filter_frames(
         self, frames: Measurements, generator: Generators, return_cov: bool, progress: bool
     ) -> FilterOutput:
         """Return the estimates of whole sequences, given checked measurements."""
-        state = self.init(len(frames.z), generator)
+        state = self.init(len(frames.z), generator=generator)
         return self.continue_frames(state, frames, generator, return_cov, progress)[1]
 
     def continue_frames(

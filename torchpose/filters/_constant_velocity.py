@@ -7,8 +7,10 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchpose._core.checks import check_positive, check_shape
+from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.module_state import derived
-from torchpose.errors import InputError
+from torchpose.filters._base import check_lag
+from torchpose.filters._measurements import check_lengths
 from torchpose.math._gaussian import kalman_gain, safe_cholesky, symmetrise
 
 __all__ = ["ConstantVelocityFilter", "ConstantVelocityState"]
@@ -111,10 +113,22 @@ class ConstantVelocityFilter(nn.Module):
         correction = gain[:, None] * (z - predicted[:, 0])[:, None]
         return ConstantVelocityState(predicted + correction, state.time + 1), correction
 
-    def forward(self, z: Float[Tensor, "B T N"]) -> Float[Tensor, "B T N"]:
-        """Return filtered numbers: each uses its own frame and those before."""
+    def forward(
+        self, z: Float[Tensor, "B T N"], *, lengths: Int[Tensor, " B"] | None = None
+    ) -> Float[Tensor, "B T N"]:
+        """Return filtered numbers: each uses its own frame and those before.
+
+        Args:
+            z: [B, T, N]. lengths: frames of each sequence [B]; past them its last number is repeated.
+
+        Raises:
+            ShapeError, InputError: wrong shapes, or lengths outside 1..T.
+        """
         check_shape("z", z, ["B", "T", "N"])
-        return self.advance(self.init(z[:, 0]), z)[1]
+        found = self.advance(self.init(z[:, 0]), z)[1]
+        if lengths is None:
+            return found
+        return _held(found, check_lengths(lengths, len(z), z.shape[1], z.device))
 
     def _run(
         self, state: ConstantVelocityState, z: Tensor
@@ -127,24 +141,34 @@ class ConstantVelocityFilter(nn.Module):
             corrections.append(correction)
         return state, torch.stack(means, 1), torch.stack(corrections, 1)
 
+    @takes_former_arguments
     def smooth(
         self,
         z: Float[Tensor, "B T N"],
+        *,
         lengths: Int[Tensor, " B"] | None = None,
         lag: int | None = None,
     ) -> Float[Tensor, "B T N"]:
         """Return numbers that use later frames too.
 
         Args:
-            z: [B, T, N]. lengths: frames of each sequence [B]; those after are not used.
+            z: [B, T, N]. lengths: frames of each sequence [B]; those after are not used, and its last
+                number is repeated.
             lag: number of later frames that each may use; None is all.
 
         Raises:
-            ShapeError, InputError: wrong shapes, or a negative lag.
+            ShapeError, InputError: wrong shapes, lengths outside 1..T, or a negative lag.
         """
         check_shape("z", z, ["B", "T", "N"])
-        if lag is not None and lag < 0:
-            raise InputError(f"lag must be at least 0 frames, or None for all, got {lag}")
+        check_lag(lag)
+        inside = check_lengths(lengths, len(z), z.shape[1], z.device)
+        found = self.smooth_frames(z, inside, lag)
+        return found if lengths is None else _held(found, inside)
+
+    def smooth_frames(
+        self, z: Float[Tensor, "B T N"], lengths: Int[Tensor, " B"] | None, lag: int | None
+    ) -> Float[Tensor, "B T N"]:
+        """Return smoothed numbers, given checked arguments; past its length a sequence is filtered alone."""
         _, means, corrections = self._run(self.init(z[:, 0]), z)
         n_frames = z.shape[1]
         frames = torch.arange(n_frames, device=z.device)
@@ -169,6 +193,13 @@ class ConstantVelocityFilter(nn.Module):
     def extra_repr(self) -> str:
         """Return the settings, for printing."""
         return f"ratio={float(self.ratio):g}, fps={float(self.fps):g}"
+
+
+def _held(numbers: Float[Tensor, "B T N"], lengths: Int[Tensor, " B"]) -> Float[Tensor, "B T N"]:
+    """Return numbers with the last one of each sequence repeated past its length."""
+    batch, n_frames = numbers.shape[:2]
+    held = torch.minimum(torch.arange(n_frames, device=numbers.device), lengths[:, None] - 1)
+    return numbers[torch.arange(batch, device=numbers.device)[:, None], held]
 
 
 def _riccati(matrix: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -115,6 +116,13 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
         return self._weighs_frames_alone and still
 
     @property
+    def _way(self) -> Literal["traced", "alone", "tracked"]:
+        """Return how frames are filtered: alone, along tracks, or both while no value may be seen."""
+        if not values_visible():
+            return "traced"
+        return "alone" if self.is_memoryless else "tracked"
+
+    @property
     def _weighs_frames_alone(self) -> bool:
         """Return whether neither weights nor, at a rate of 0, states depend on earlier frames."""
         return self.weighting == "frame" and self.transition_kind == "ou"
@@ -123,10 +131,10 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
         self, state: MKFState, frame: Measurements, generator: Generators, return_cov: bool
     ) -> tuple[MKFState, StepOutput]:
         """Return the next state and the estimate, given checked measurements of one frame."""
-        rule = self.weight_rule
-        if not values_visible():
+        rule, way = self.weight_rule, self._way
+        if way == "traced":
             return self._filter_unseen(rule, state, frame, return_cov)
-        if self.is_memoryless:
+        if way == "alone":
             return step_memoryless(self, rule, self.medians, state, frame, return_cov)
         return self._filter_tracks(rule, state, frame, return_cov)
 
@@ -169,7 +177,7 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
         The plain recursion is left to noise that changes in each frame, to burn-in, and to gradients of
         model or noise.
         """
-        if not values_visible() or self.is_memoryless:
+        if self._way != "tracked":
             return super().filter_frames(frames, generator, return_cov, progress)
         rule, given = self.weight_rule, (frames, return_cov, progress)
         model_learns = wants_gradient(frames.cov, *self.sources)
@@ -195,7 +203,7 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
         progress: bool = False,
     ) -> tuple[MKFState, FilterOutput]:
         """Return the state after some frames, and their estimates; without memory, all at once."""
-        if not values_visible() or not self.is_memoryless:
+        if self._way != "alone":
             return super().continue_frames(state, frames, generator, return_cov, progress)
         rule, n_frames = self.weight_rule, frames.z.shape[1]
         out = run_memoryless(self, rule, self.medians, frames, return_cov, progress)
@@ -208,17 +216,23 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
 
         Filters whose frames do not depend on each other have nothing to smooth: their estimates are
         those of `forward`.
+
+        Raises:
+            InputError: weights may be reset (`reset_below`).
+
+        Reference:
+            H. Rauch, F. Tung, C. Striebel (1965); see `smooth_fixed_tracks`.
         """
         if self.reset_below is not None:
             raise InputError(
                 "smoothing goes back along the weights, which a reset cuts off, got "
                 f"reset_below={self.reset_below}; leave it out"
             )
-        rule = self.weight_rule
-        if values_visible() and self.is_memoryless:
+        rule, way = self.weight_rule, self._way
+        if way == "alone":
             return run_memoryless(self, rule, self.medians, frames, return_cov)
         smoothed = smooth_fixed_tracks(self, rule, frames, lag, return_cov)
-        if values_visible() or not self._may_have_medians:
+        if way == "tracked" or not self._may_have_medians:
             return smoothed
         alone = run_memoryless(self, rule, self.medians, frames, return_cov)
         return FilterOutput(*self._choose_unseen(alone, smoothed))  # type: ignore[arg-type]

@@ -19,6 +19,7 @@ from torchpose.errors import InputError, ShapeError
 __all__ = [
     "Measurements",
     "as_covariance",
+    "check_lengths",
     "check_noise",
     "check_values",
     "given_covariance",
@@ -68,7 +69,7 @@ def check_values(
     if batch == 0 or n_frames == 0:
         raise InputError(f"z must hold at least one sequence of one frame, got {list(z.shape)}")
     z = z.to(like)
-    lengths = _check_lengths(lengths, batch, n_frames, z.device)
+    lengths = check_lengths(lengths, batch, n_frames, z.device)
     inside = torch.arange(n_frames, device=z.device) < lengths[:, None]
     if mask is None:
         mask = inside[..., None].expand(z.shape)
@@ -81,9 +82,14 @@ def check_values(
     return torch.where(mask, z, torch.zeros_like(z)), mask, lengths
 
 
-def _check_lengths(
+def check_lengths(
     lengths: Tensor | None, batch: int, n_frames: int, device: torch.device
-) -> Tensor:
+) -> Int[Tensor, " B"]:
+    """Return the frames of each sequence [B] on a device; all of them for None.
+
+    Raises:
+        ShapeError: not [B]. InputError: not whole numbers from 1 to T.
+    """
     if lengths is None:
         return torch.full((batch,), n_frames, device=device)
     lengths = torch.as_tensor(lengths, device=device)

@@ -9,11 +9,12 @@ from functools import cache
 from typing import Any, ClassVar, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose._core.checks import check_choice, check_count
-from torchpose._core.module_state import derived, one_run, register_given, wide_or_parameter
+from torchpose._core.former_arguments import takes_former_arguments
+from torchpose._core.module_state import derived, register_given, wide_or_parameter
 from torchpose.errors import InputError
 from torchpose.filters._base import Generators, RecursiveFilter, require_state
 from torchpose.filters._measurements import (
@@ -22,7 +23,7 @@ from torchpose.filters._measurements import (
     given_covariance,
     given_initial_cov,
 )
-from torchpose.filters._outputs import FilterOutput, StepOutput
+from torchpose.filters._outputs import StepOutput
 from torchpose.filters._transition import (
     BURN_IN_SCALE,
     Transition,
@@ -245,7 +246,8 @@ class MixtureKalmanFilter(RecursiveFilter):
             self.subspace,
         )
 
-    def init(self, batch_size: int, generator: Generators = None) -> MKFState:
+    @takes_former_arguments
+    def init(self, batch_size: int, *, generator: Generators = None) -> MKFState:
         """Return the state before the first frame: tracks at the component means, weighted by pi.
 
         Args:
@@ -272,47 +274,6 @@ class MixtureKalmanFilter(RecursiveFilter):
     ) -> tuple[MKFState, StepOutput]:
         """Return the next state and the estimate, given checked measurements of one frame."""
         raise NotImplementedError(f"{type(self).__name__} has no tracks")
-
-    def smooth(
-        self,
-        z: Float[Tensor, "B T Z"],
-        mask: Bool[Tensor, "B T Z"] | None = None,
-        measurement_cov: Tensor | None = None,
-        lengths: Int[Tensor, " B"] | None = None,
-        lag: int | None = None,
-        return_cov: bool = False,
-    ) -> FilterOutput:
-        """Return estimates that use later measurements too; fixed tracks only.
-
-        Args:
-            z, mask, measurement_cov, lengths, return_cov: as `forward`.
-            lag: number of later frames that each estimate may use; None is the whole sequence.
-
-        Returns:
-            `FilterOutput` with smoothed mean, weights and covariance, and the filter's log-evidence.
-
-        Raises:
-            InputError: tracks are not fixed, their weights may be reset (`reset_below`), or lag is
-            negative; else as `forward`.
-
-        Reference:
-            H. Rauch, F. Tung, C. Striebel (1965); see `smooth_fixed_tracks`.
-        """
-        if lag is not None and lag < 0:
-            raise InputError(
-                f"lag must be at least 0 frames, or None for the whole sequence, got {lag}"
-            )
-        with one_run(self.observed.device):
-            frames = self.check(z, mask, measurement_cov, lengths, None)
-            return self.smooth_frames(frames, lag, return_cov)
-
-    def smooth_frames(
-        self, frames: Measurements, lag: int | None, return_cov: bool
-    ) -> FilterOutput:
-        """Return smoothed estimates of whole sequences, given checked measurements."""
-        raise InputError(
-            f"smoothing needs tracks='fixed', whose tracks have a past each, got {self.tracks!r}"
-        )
 
     def extra_repr(self) -> str:
         """Return the main settings, for printing."""

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchpose._core.checks import check_count
+from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.module_state import derived, register_given, wide_or_parameter
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
@@ -220,7 +221,8 @@ class BootstrapParticleFilter(RecursiveFilter):
         return inflation(time, self.burn_in, self.burn_in_scale)
 
     @torch.no_grad()
-    def init(self, batch_size: int, generator: Generators = None) -> ParticleState:
+    @takes_former_arguments
+    def init(self, batch_size: int, *, generator: Generators = None) -> ParticleState:
         """Return the state before the first frame, with particles drawn from the prior.
 
         Args:

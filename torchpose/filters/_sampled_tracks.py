@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchpose._core.checks import check_count
+from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
 from torchpose.filters._base import Generators, uniform
@@ -68,7 +69,8 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
         )  # fmt: skip
         self.resample_threshold = threshold
 
-    def init(self, batch_size: int, generator: Generators = None) -> MKFState:
+    @takes_former_arguments
+    def init(self, batch_size: int, *, generator: Generators = None) -> MKFState:
         """Return the state before the first frame: M tracks at the means of components drawn from pi.
 
         Args:

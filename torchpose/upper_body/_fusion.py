@@ -213,7 +213,7 @@ class MotionStage(nn.Module):
         if lag == 0:
             return _with_numbers(reading, *(model(values) for model, values in pairs))
         return _with_numbers(
-            reading, *(model.smooth(values, lengths, lag) for model, values in pairs)
+            reading, *(model.smooth_frames(values, lengths, lag) for model, values in pairs)
         )
 
     def init(self, reading: ReadOut) -> MotionState:

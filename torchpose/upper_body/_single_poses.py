@@ -272,7 +272,7 @@ class SinglePoses(Estimator):
     ) -> PoseState:
         """Return the state before the first frame; see `Estimator`."""
         filters = {
-            side: self.filter(side, joints[side]).init(batch_size, generators[side])
+            side: self.filter(side, joints[side]).init(batch_size, generator=generators[side])
             for side in ARMS
         }
         return PoseState(filters, joints, generators)
@@ -286,7 +286,12 @@ class SinglePoses(Estimator):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DegenerateFilterWarning)  # told by `failed`
                 filters[side], out = model.advance(
-                    state.filters[side], z, mask, cov, state.generators[side], return_cov=True
+                    state.filters[side],
+                    z,
+                    mask,
+                    cov,
+                    generator=state.generators[side],
+                    return_cov=True,
                 )
             arms[side] = _wide(out)
         return state._replace(filters=filters), Estimates(arms["left"], arms["right"])
@@ -307,11 +312,12 @@ class SinglePoses(Estimator):
             if lag is not None:
                 later = None if lag == "full" else int(lag)
                 smooth = cast(MixtureKalmanFilter, model).smooth  # or another filter that smooths
-                out = smooth(z, mask, cov, lengths, lag=later, return_cov=True)
+                out = smooth(z, mask, cov, lengths=lengths, lag=later, return_cov=True)
             else:
                 out = model(
-                    z, mask, cov, lengths, generators[side], return_cov=True, progress=progress
-                )
+                    z, mask, cov, generator=generators[side], lengths=lengths, return_cov=True,
+                    progress=progress,
+                )  # fmt: skip
             arms[side] = in_double(out)
         return Estimates(arms["left"], arms["right"])
 

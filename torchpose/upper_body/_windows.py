@@ -264,11 +264,11 @@ class WindowMixture(Estimator):
                 seen, self.window, side, joints[side], self.model.measurement_cov
             )
             model = self._filter(side, joints[side])
-            out = model(*both, noise, lengths, return_cov=True, progress=progress)
+            out = model(*both, noise, lengths=lengths, return_cov=True, progress=progress)
             if self.of_limbs:
                 context, told = self._torso(seen, side, joints[side], lengths), arm[:_N_LIMB]
             else:
-                context, told = self._filter(side, ())(*hands, None, lengths), arm
+                context, told = self._filter(side, ())(*hands, None, lengths=lengths), arm
             arms[side] = _pose_of_window(in_double(out), context, seen, told, self.window.layout)
         return Estimates(arms["left"], arms["right"], seen.view)
 
@@ -278,7 +278,7 @@ class WindowMixture(Estimator):
         """Return the estimates of an arm from its torso and the hands of the window alone."""
         torso = tuple(joint for joint in joints if joint not in ARM_JOINTS[:_N_LIMB])
         both, noise, _ = _window_inputs(seen, self.window, side, torso, self.model.measurement_cov)
-        return self._filter(side, torso)(*both, noise, lengths)
+        return self._filter(side, torso)(*both, noise, lengths=lengths)
 
     def _filter(self, side: str, joints: tuple[str, ...]) -> MixtureKalmanFilter:
         """Return the filter of an arm; the same one as long as it holds."""
