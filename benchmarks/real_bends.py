@@ -90,7 +90,9 @@ def track(person: Person, dimensions: int | None, setting: Setting, n: int, seed
     )  # fmt: skip
     with warnings.catch_warnings():  # frames in which all were clamped are counted
         warnings.simplefilter("ignore", DegenerateFilterWarning)
-        out = tracker(person.data.silhouettes, person.data.rig, person.states[0], seeded(seed))
+        out = tracker(
+            person.data.silhouettes, person.data.rig, person.states[0], generator=seeded(seed)
+        )
     shares = [float(out.details[name].mean()) for name in ("acceptance", "clamped")]
     return Found(out.mean, *shares)
 

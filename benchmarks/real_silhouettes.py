@@ -110,12 +110,16 @@ def report_four(report: Report, folder: Path, seeds: int, out: Path) -> None:
         given = fit_state(body, data.joints[:1])[0]
         for name, make in plain_filters(body, None).items():
             found = [
-                body.joints(make(100.0)(data.silhouettes, data.rig, given, seeded(seed)).mean)
+                body.joints(
+                    make(100.0)(data.silhouettes, data.rig, given, generator=seeded(seed)).mean
+                )
                 for seed in range(seeds)
             ]
             table.add(f"{name}, {shape}", mean_of(found, data.joints, False))
     given = fit_state(average, data.joints[:1])[0]
-    track = plain_filters(average, None)["APF"](100.0)(data.silhouettes, data.rig, given, seeded(0))
+    track = plain_filters(average, None)["APF"](100.0)(
+        data.silhouettes, data.rig, given, generator=seeded(0)
+    )
     draw(report, data, average, track.mean, out, f"{PICTURES}/four-cameras.png")
     tracks = []
     for seed in range(seeds):
@@ -124,7 +128,9 @@ def report_four(report: Report, folder: Path, seeds: int, out: Path) -> None:
             average, data.silhouettes[0], data.rig, None, generator, facing=facing(data.joints[0])
         )
         tracker = plain_filters(average, None)["APF"](100.0)
-        tracks.append(average.joints(tracker(data.silhouettes, data.rig, start, generator).mean))
+        tracks.append(
+            average.joints(tracker(data.silhouettes, data.rig, start, generator=generator).mean)
+        )
     table.add("APF, average body, first pose found", mean_of(tracks, data.joints, False))
 
 
@@ -196,7 +202,7 @@ def filters_of(person: Person) -> dict[str, Make]:
 def run(person: Person, make: Make, sharpness: float, data: Filmed, seed: int) -> Tensor:
     """Joints of the estimates [T, 15, 3]."""
     start = fit_state(person.body, data.joints[:1])[0]
-    track = make(sharpness)(data.silhouettes, data.rig, start, seeded(seed))
+    track = make(sharpness)(data.silhouettes, data.rig, start, generator=seeded(seed))
     return person.body.joints(track.mean)
 
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from torchpose.upper_body._pose_track import PoseTrack as PoseTrack
     from torchpose.upper_body._tracker import UpperBodyTracker as UpperBodyTracker
     from torchpose.video._tracker import VideoTracker as VideoTracker
-    from torchpose.whole_body._poses import BodyPoses as BodyPoses
+    from torchpose.whole_body._poses import BodyTrack as BodyTrack
     from torchpose.whole_body._tracker import BodyTracker as BodyTracker
 
     __version__: str
@@ -67,7 +67,7 @@ _PACKAGES = frozenset(
     ]
 )
 _HOMES = {
-    "BodyPoses": "whole_body._poses",
+    "BodyTrack": "whole_body._poses",
     "BodyTracker": "whole_body._tracker",
     "GaussianMixture": "priors._gaussian_mixture",
     "PinholeCamera": "camera._pinhole",
@@ -84,7 +84,7 @@ _HOMES = {
 }
 
 __all__ = [
-    "BodyPoses",
+    "BodyTrack",
     "BodyTracker",
     "GaussianMixture",
     "PinholeCamera",
@@ -114,7 +114,7 @@ if not TYPE_CHECKING:  # which would take every name for an object
         elif name in _PACKAGES or _moved.present_module(f"torchpose.{name}"):
             value = _import_module(f"torchpose.{name}")
         else:
-            raise AttributeError(f"module 'torchpose' has no attribute {name!r}")
+            return _moved.moved_names("torchpose")(name)  # or raises
         globals()[name] = value
         return value
 

@@ -71,11 +71,11 @@ def predictions(
         seed: of the filter and of the choice.
     """
     generator = torch.Generator().manual_seed(seed)
-    state = tracker.init(view.initial_state[None], generator)
+    state = tracker.init(view.initial_state[None], generator=generator)
     with warnings.catch_warnings():  # of frames in which every particle was clamped
         warnings.simplefilter("ignore", DegenerateFilterWarning)
         for t in range(frame + 1):
-            state, _ = tracker.step(state, view.silhouettes[t][None], view.rig, generator)
+            state, _ = tracker.step(state, view.silhouettes[t][None], view.rig, generator=generator)
     chosen = torch.randperm(tracker.n_particles, generator=generator)[:count]
     body: Any = tracker.body
     joints: Tensor = body.joints(state.particles[0, chosen]).double()

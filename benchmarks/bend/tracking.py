@@ -23,7 +23,7 @@ from benchmarks.engine import Experiment, Grid, Setting, Tuning, choose_setting
 from benchmarks.engine.tuning import SCALES
 from torchpose.errors import DegenerateFilterWarning
 from torchpose.priors import state_postures
-from torchpose.whole_body import BodyTrack
+from torchpose.whole_body import BodyFilterOutput
 
 _VALIDATION_SEED = 1000
 
@@ -76,7 +76,7 @@ def _track(subject: Subject[BendTrackee], how: Filter, seeds: Sequence[int]) -> 
     began = perf_counter()
     with warnings.catch_warnings():  # frames in which every particle was clamped are counted
         warnings.simplefilter("ignore", DegenerateFilterWarning)
-        out: BodyTrack = tracker(view.silhouettes, view.rig, start, generator=generators)
+        out: BodyFilterOutput = tracker(view.silhouettes, view.rig, start, generator=generators)
     seconds = (perf_counter() - began) / len(view.clip) / len(seeds)
     mean = out.mean.double()
     errors = view_errors(body, view, mean)

@@ -11,7 +11,7 @@ from torch import Tensor
 from benchmarks.bodies.views import Subject, View
 from benchmarks.engine import Row
 from torchpose.body import BODY_15, Body
-from torchpose.whole_body import BodyTrack, SilhouetteParticleFilter
+from torchpose.whole_body import BodyFilterOutput, SilhouetteParticleFilter
 
 LAYERS = 5
 """Of the annealed particle filter."""
@@ -59,7 +59,7 @@ class Run(NamedTuple):
     Attributes:
         errors: distance of every joint [T, 15], mm, NaN where the truth is unknown (MR 31).
         mean: estimated states [T, D]. std: of the particles [T, D].
-        coasting, respread: [T], as `BodyTrack`. seconds: [1], per frame, of the batch it ran in.
+        coasting, respread: [T], as `BodyFilterOutput`. seconds: [1], per frame, of the batch it ran in.
     """
 
     errors: Tensor
@@ -84,7 +84,7 @@ def track_view(
 ) -> list[Run]:
     """Return one run for each generator, made as one batch, each from its own initial state."""
     began = perf_counter()
-    out: BodyTrack = tracker(view.silhouettes, view.rig, start, generator=generators)
+    out: BodyFilterOutput = tracker(view.silhouettes, view.rig, start, generator=generators)
     seconds = (perf_counter() - began) / len(view.clip) / len(generators)
     errors = view_errors(body, view, out.mean)
     return [

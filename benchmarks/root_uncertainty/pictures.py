@@ -87,9 +87,11 @@ def add_pictures(
 def follow(tracker: SilhouetteParticleFilter, view: View, n_frames: int) -> Sample:
     """Return a filter after the first frames of a clip, and one more."""
     generators = generators_of([0])
-    state = tracker.init(view.initial_state[None], generators)
+    state = tracker.init(view.initial_state[None], generator=generators)
     for t in range(n_frames + 1):
-        state, out = tracker.step(state, view.silhouettes[t : t + 1], view.rig, generators)
+        state, out = tracker.step(
+            state, view.silhouettes[t : t + 1], view.rig, generator=generators
+        )
     return Sample(tracker.body, state, out.mean[0])  # type: ignore[arg-type]
 
 

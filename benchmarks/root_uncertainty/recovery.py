@@ -127,14 +127,14 @@ def _after(
     """Return errors from the frame `at` on, before which every particle is moved by the same step."""
     generators = generators_of(seeds)
     shift, turn = _steps(displacement, view.clip.up, seeds)
-    state = tracker.init(view.initial_state.expand(len(seeds), -1), generators)
+    state = tracker.init(view.initial_state.expand(len(seeds), -1), generator=generators)
     estimates = []
     for t in range(min(at + n_frames, len(view.clip))):
         if t == at:
             moved = displaced(state.particles, shift[:, None], turn[:, None])
             state = state._replace(particles=moved, mean=displaced(state.mean, shift, turn))
         frame = view.silhouettes[t].expand(len(seeds), *view.silhouettes.shape[1:])
-        state, out = tracker.step(state, frame, view.rig, generators)
+        state, out = tracker.step(state, frame, view.rig, generator=generators)
         estimates.append(out.mean)
     errors = view_errors(body, _cut(view, len(estimates)), torch.stack(estimates, 1))
     return errors[:, at:].nanmean(-1)

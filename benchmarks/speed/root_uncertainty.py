@@ -82,7 +82,9 @@ def check(scene: Scene, report: Report) -> bool:
     """Counts of a few hypotheses against images of every part at each of its places."""
     spread = torch.full((scene.body.dim,), 0.05, dtype=torch.float64)
     one = tracker(scene, 3)
-    states = one.init(scene.state[None], torch.Generator().manual_seed(1), spread).particles[0]
+    states = one.init(
+        scene.state[None], generator=torch.Generator().manual_seed(1), initial_cov=spread.square()
+    ).particles[0]
     mean = states[..., 6:].unflatten(-1, (-1, 3))
     points = sigma_points(mean, one.first_memory(states[None])[0], centre=True)
     prepared = prepare_silhouettes(scene.silhouettes[0])
@@ -162,7 +164,9 @@ def where(scene: Scene, n: int, runs: int, report: Report) -> None:
     """The steps of a frame one by one, on the same hypotheses."""
     one, (height, width) = tracker(scene, n), scene.silhouettes.shape[-2:]
     spread = torch.full((scene.body.dim,), 0.02, dtype=torch.float64)
-    state = one.init(scene.state[None], torch.Generator().manual_seed(0), spread)
+    state = one.init(
+        scene.state[None], generator=torch.Generator().manual_seed(0), initial_cov=spread.square()
+    )
     prepared = prepare_silhouettes(scene.silhouettes)
     mean = state.particles[..., 6:].unflatten(-1, (-1, 3))
     memory = one.first_memory(state.particles)
@@ -202,8 +206,8 @@ def tracker(scene: Scene, n: int) -> RootUncertaintyTracker:
 def one_frame(one: SilhouetteParticleFilter, scene: Scene) -> Callable[[], object]:
     generator = torch.Generator().manual_seed(0)
     spread = torch.full((scene.body.dim,), 0.02, dtype=torch.float64)
-    state = one.init(scene.state[None], generator, spread)
-    return lambda: one.step(state, scene.silhouettes, scene.rig, generator)
+    state = one.init(scene.state[None], generator=generator, initial_cov=spread.square())
+    return lambda: one.step(state, scene.silhouettes, scene.rig, generator=generator)
 
 
 if __name__ == "__main__":

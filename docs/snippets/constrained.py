@@ -33,5 +33,5 @@ tracker = ConstrainedParticleFilter(
     body, action, 200, likelihood="overlap", sharpness=30.0,
     process_cov=constant_velocity_std(body, recorded, floor=0.005).square(),
 )  # fmt: skip
-track = tracker(silhouettes, camera, states[0], torch.Generator().manual_seed(0))
+track = tracker(silhouettes, camera, states[0], generator=torch.Generator().manual_seed(0))
 print(track.mean.shape, track.details["acceptance"])  # [T, D], share of first draws accepted

@@ -32,5 +32,5 @@ camera = PinholeCamera(80, 80, 39.5, 29.5, 80, 60, rotation=(torch.pi, 0, 0), tr
 silhouettes = render(body, standing.expand(4, -1), camera, 60, 80)  # bool [T, 1, H, W]
 
 tracker = BodyTracker(camera, "swinging", body=body, n_particles=100, fps=30.0, leg_swap=0.1)
-poses = tracker(silhouettes, standing, torch.Generator().manual_seed(0))
+poses = tracker(silhouettes, standing, generator=torch.Generator().manual_seed(0))
 print(poses.method, poses.joints3d.shape, poses.coasting.tolist())

@@ -121,7 +121,7 @@ def body_filter(kind, model=None, person=walker):
 
 def follow(tracker):
     states = walk(walker(), 1) if tracker.body.dim == walker().dim else points(3, 1, BODY.dim)
-    return tracker(torch.zeros(3, 1), None, 0.1 * states[0], G().manual_seed(0)).mean
+    return tracker(torch.zeros(3, 1), None, 0.1 * states[0], generator=G().manual_seed(0)).mean
 
 
 def root_tracker(seed):
@@ -151,7 +151,7 @@ def body_tracker(seed):
 def follow_body(tracker):
     seen = whole_body.render(walker(), walk(walker(), 3), rig(2), HEIGHT, WIDTH)
     start = walker().convert(walk(walker(), 1)[0], tracker.body)
-    poses = tracker(seen, start, G().manual_seed(0))
+    poses = tracker(seen, start, generator=G().manual_seed(0))
     return poses.state, poses.covariance3d, tracker.upright.joints(walk(walker(), 2))
 
 

@@ -14,7 +14,7 @@ from torchpose.learning import fit_action_space, fit_gplvm, fit_limb_conditional
 from torchpose.priors import ActionBank, ManifoldInfo
 from torchpose.priors._actions.file import ActionInfo
 from torchpose.priors._limb_conditionals import in_body_frame
-from torchpose.whole_body import BodyPoses
+from torchpose.whole_body import BodyTrack
 
 
 def test_installation(torchpose):
@@ -101,7 +101,7 @@ def test_poses_of_a_whole_body(torchpose, tmp_path):
     body = Body.of_height(BODY_15, 1.7, "body")
     states = torch.zeros(4, body.dim, dtype=torch.float64)
     nothing = torch.zeros(4)
-    BodyPoses(
+    BodyTrack(
         body, states, states, body.joints(states), 0.01 * torch.eye(3).expand(4, 15, 3, 3),
         nothing, nothing, nothing > 0, nothing > 0, 25.0, ("a note",), 3,
         {"actions": torch.eye(2)[[0, 0, 0, 1]]}, ("bend", "none"),

@@ -14,7 +14,7 @@ from torchpose.priors import ActionBank, ManifoldInfo
 from torchpose.priors._actions.postures import state_postures
 from torchpose.priors._limb_conditionals import in_body_frame
 from torchpose.video import VideoWriter
-from torchpose.whole_body import BodyPoses, BodyTracker, render
+from torchpose.whole_body import BodyTrack, BodyTracker, render
 
 HEIGHT, WIDTH, N = 120, 160, 8
 
@@ -68,7 +68,7 @@ def recorded(tmp_path_factory):
                 frame = empty.copy()
                 frame[mask] = (30, 20, 160)
                 writer.write(frame)
-    start = BodyPoses(
+    start = BodyTrack(
         body, states[:1], torch.zeros(1, body.dim), body.joints(states[:1]),
         torch.zeros(1, 15, 3, 3), *(torch.zeros(1) for _ in range(2)),
         *(torch.zeros(1, dtype=torch.bool) for _ in range(2)),
@@ -92,7 +92,7 @@ def test_poses_from_videos(recorded, tmp_path, capsys):
     assert main(arguments(folder, tmp_path / "a", *given)) == 0
     said = capsys.readouterr().out
     assert "apf" in said
-    poses = BodyPoses.load(tmp_path / "a" / "body.npz")
+    poses = BodyTrack.load(tmp_path / "a" / "body.npz")
     assert len(poses) == N
     assert poses.fps == 60
     errors = (poses.joints3d - body.joints(states)).norm(dim=-1)
@@ -108,7 +108,7 @@ def test_poses_from_videos(recorded, tmp_path, capsys):
     assert picture.shape[0] == 3 * 324
     again = [*given, "--overlay", "false", "--pictures", "false"]
     assert main(arguments(folder, tmp_path / "b", *again)) == 0
-    assert torch.equal(BodyPoses.load(tmp_path / "b" / "body.npz").state, poses.state)
+    assert torch.equal(BodyTrack.load(tmp_path / "b" / "body.npz").state, poses.state)
 
 
 def test_nobody_there_is_said(recorded, tmp_path, capsys):
@@ -177,7 +177,7 @@ def test_a_manifold_of_the_motion(recorded, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(arguments(folder, out, *given, str(tmp_path / "arms.safetensors"))) == 0
     assert "mrpf" in capsys.readouterr().out
-    poses = BodyPoses.load(out / "body.npz")
+    poses = BodyTrack.load(out / "body.npz")
     errors = (poses.joints3d - body.joints(states)).norm(dim=-1)
     assert float(errors.mean()) < 0.08
     assert main(arguments(folder, out, *given, str(tmp_path / "slow.safetensors"))) == 0
@@ -250,7 +250,7 @@ def test_hypotheses_of_the_root(recorded, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "root, 140 particles\n" in said
     assert "learnt at 30 frames per second and rescaled to 60" in said
-    poses = BodyPoses.load(tmp_path / "out" / "body.npz")
+    poses = BodyTrack.load(tmp_path / "out" / "body.npz")
     assert poses.body.frame == "body"
     assert torch.equal(poses.body.centres, conditionals.centres)
     torch.testing.assert_close(poses.body.joints(poses.state), poses.joints3d)
@@ -274,7 +274,7 @@ def test_the_constraint_of_actions_is_reported(recorded, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "constrained, 300 particles, sharpness 30" in said
     assert "rescaled to 60" in said and "of the first draws through" in said
-    poses = BodyPoses.load(tmp_path / "out" / "body.npz")
+    poses = BodyTrack.load(tmp_path / "out" / "body.npz")
     assert poses.body.frame == "parent"
     assert poses.action_names == ("rise", "swing", "none")
     assert poses.details["actions"].shape == (N, 3)
@@ -288,7 +288,7 @@ def test_the_constraint_of_actions_is_reported(recorded, tmp_path, capsys):
 
 def test_the_likeliest_actions_are_told_by_frames():
     states, T = torch.zeros(6, 36).double(), 6
-    poses = BodyPoses(
+    poses = BodyTrack(
         Body.of_height(BODY_15, 1.7), states, states, *(torch.zeros(T) for _ in range(6)),
         first_frame=10, action_names=("bend", "wave", "none"),
         details={"actions": torch.eye(3).double()[[0, 0, 1, 1, 1, 2]]},

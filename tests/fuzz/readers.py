@@ -19,7 +19,7 @@ from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack
 from torchpose.video import open_video
-from torchpose.whole_body import BodyPoses
+from torchpose.whole_body import BodyTrack
 
 __all__ = ["READERS", "SilentError", "info"]
 
@@ -100,7 +100,7 @@ def _poses(path: Path) -> None:
 
 
 def _body_poses(path: Path) -> None:
-    poses = BodyPoses.load(path)
+    poses = BodyTrack.load(path)
     frames, dim = len(poses), poses.body.dim
     _need(frames > 0, "empty")
     for name, sizes in {

@@ -32,7 +32,7 @@ from torchpose.priors._prior_file import PriorInfo
 from torchpose.skeleton import SKELETONS, UPPER_BODY
 from torchpose.upper_body import PoseTrack
 from torchpose.upper_body._pose_files import write_bvh
-from torchpose.whole_body import BodyPoses
+from torchpose.whole_body import BodyTrack
 
 __all__ = ["SAMPLES", "Content"]
 
@@ -66,14 +66,14 @@ def pose_track(batch: int = 1) -> PoseTrack:
     )
 
 
-def body_poses() -> BodyPoses:
+def body_poses() -> BodyTrack:
     """Poses of a whole body with details of a bank of actions."""
     g = torch.Generator().manual_seed(1)
     body = Body.of_height(BODY_15, 1.7)
     states = 0.2 * torch.randn(_FRAMES, body.dim, generator=g, dtype=torch.float64)
     body = body.altered(centres=centres_of(body, states))
     factor = 0.05 * torch.randn(_FRAMES, 15, 3, 3, generator=g, dtype=torch.float64)
-    return BodyPoses(
+    return BodyTrack(
         body, states, states.abs(), body.joints(states), factor @ factor.mT,
         torch.randn(_FRAMES, generator=g, dtype=torch.float64),
         1 + torch.rand(_FRAMES, generator=g, dtype=torch.float64),

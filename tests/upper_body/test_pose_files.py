@@ -10,7 +10,7 @@ from tests.fuzz.samples import body_poses, pose_track
 from torchpose.cli import main
 from torchpose.errors import TorchposeError
 from torchpose.upper_body import PoseTrack
-from torchpose.whole_body import BodyPoses
+from torchpose.whole_body import BodyTrack
 
 
 def put(key, at, value):
@@ -109,7 +109,7 @@ def test_bodies_that_do_not_agree(tmp_path, capsys, what):
         arrays = dict(file)
     BODIES[what](arrays)
     np.savez(tmp_path / "body.npz", **arrays)
-    refused(BodyPoses, tmp_path / "body.npz", capsys)
+    refused(BodyTrack, tmp_path / "body.npz", capsys)
 
 
 @pytest.mark.parametrize("batch", [1, 2])

@@ -42,9 +42,14 @@ def scene():
 def test_frame_by_frame_gives_what_all_frames_give(scene, kind):
     body, rig, states, silhouettes = scene
     model = kind(body, 60)
-    together = model(silhouettes, rig, states[0], torch.Generator().manual_seed(3))
+    together = model(silhouettes, rig, states[0], generator=torch.Generator().manual_seed(3))
     found = track_body(
-        model, iter(silhouettes), rig, states[0], torch.Generator().manual_seed(3), fps=60.0
+        model,
+        iter(silhouettes),
+        rig,
+        states[0],
+        generator=torch.Generator().manual_seed(3),
+        fps=60.0,
     )
     assert torch.equal(found.state, together.mean)
     assert torch.equal(found.state_std, together.std)
@@ -138,7 +143,7 @@ def test_the_root_tracker_tells_the_covariance_of_both(scene, monkeypatch):
 
     def covariance():
         seed = torch.Generator().manual_seed(1)
-        return track_body(model, iter(silhouettes[:2]), rig, start, seed).covariance3d
+        return track_body(model, iter(silhouettes[:2]), rig, start, generator=seed).covariance3d
 
     both = covariance()
     monkeypatch.setattr(

@@ -5,7 +5,7 @@ import torch
 from torchpose.body import BODY_15, Body, centres_of
 from torchpose.camera import PinholeCamera
 from torchpose.errors import FileFormatError, InputError, SkeletonError
-from torchpose.whole_body import BodyPoses, load_body
+from torchpose.whole_body import BodyTrack, load_body
 
 FIELDS = ("state", "state_std", "joints3d", "covariance3d", "log_evidence",
           "effective_sample_size", "coasting", "respread")  # fmt: skip
@@ -18,7 +18,7 @@ def poses(frames=4, frame="parent", seed=0):
     states = 0.2 * torch.randn(frames, body.dim, generator=g, dtype=torch.float64)
     body = body.altered(radii=1.1 * body.radii, centres=centres_of(body, states))
     factor = torch.randn(frames, 15, 3, 3, generator=g, dtype=torch.float64)
-    return BodyPoses(
+    return BodyTrack(
         body, states, states.abs(), body.joints(states), factor @ factor.mT,
         torch.randn(frames, generator=g), torch.rand(frames, generator=g),
         torch.tensor([i == 1 for i in range(frames)]), torch.zeros(frames, dtype=torch.bool),
@@ -30,7 +30,7 @@ def poses(frames=4, frame="parent", seed=0):
 def test_what_is_saved_is_loaded(tmp_path, frame):
     before = poses(frame=frame)
     before.save(tmp_path / "body.npz")
-    after = BodyPoses.load(tmp_path / "body.npz")
+    after = BodyTrack.load(tmp_path / "body.npz")
     for name in FIELDS:
         assert torch.equal(getattr(after, name), getattr(before, name)), name
     assert (after.fps, after.notes, after.first_frame) == (50.0, ("a note",), 7)
@@ -50,18 +50,18 @@ def test_details_are_saved_by_their_names(tmp_path):
     with np.load(tmp_path / "body.npz") as file:
         assert file["detail_released"].tolist() == [True, False, True, False]
         arrays = dict(file)
-    after = BodyPoses.load(tmp_path / "body.npz")
+    after = BodyTrack.load(tmp_path / "body.npz")
     assert after.action_names == before.action_names
     assert after.details.keys() == before.details.keys()
     for name, value in before.details.items():
         assert torch.equal(after.details[name], value)
     np.savez(tmp_path / "short.npz", **(arrays | {"detail_released": np.zeros(3, dtype=bool)}))
     with pytest.raises(FileFormatError, match="detail_released of 4 frames"):
-        BodyPoses.load(tmp_path / "short.npz")
+        BodyTrack.load(tmp_path / "short.npz")
     # files of before there were details
     old = {k: v for k, v in arrays.items() if not k.startswith(("detail_", "action_names"))}
     np.savez(tmp_path / "old.npz", **old)
-    assert BodyPoses.load(tmp_path / "old.npz").details == {}
+    assert BodyTrack.load(tmp_path / "old.npz").details == {}
 
 
 def test_joints_in_the_axes_of_a_camera():
@@ -85,10 +85,10 @@ def test_joints_in_the_axes_of_a_camera():
 
 def test_other_files_are_refused(tmp_path):
     with pytest.raises(InputError):
-        BodyPoses.load(tmp_path / "none.npz")
+        BodyTrack.load(tmp_path / "none.npz")
     np.savez(tmp_path / "other.npz", joints=np.zeros((2, 15, 3)))
     with pytest.raises(FileFormatError, match="state"):
-        BodyPoses.load(tmp_path / "other.npz")
+        BodyTrack.load(tmp_path / "other.npz")
     poses().save(tmp_path / "body.npz")
     with np.load(tmp_path / "body.npz") as z:
         arrays = dict(z)

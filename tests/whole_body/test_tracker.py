@@ -13,7 +13,7 @@ from torchpose.priors._limb_conditionals import in_body_frame
 from torchpose.whole_body import (
     METHODS,
     AnnealedParticleFilter,
-    BodyPoses,
+    BodyTrack,
     BodyTracker,
     SilhouetteParticleFilter,
     SIRParticleFilter,
@@ -25,8 +25,8 @@ from torchpose.whole_body import (
     track_body,
 )
 from torchpose.whole_body._filters.body_particles import BodyFilterOptions
-from torchpose.whole_body._methods import choose_method, method_options
-from torchpose.whole_body._tracker import all_see
+from torchpose.whole_body._following import all_see
+from torchpose.whole_body._methods import BodyTrackerOptions, choose_method, method_options
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,9 @@ def test_it_does_what_the_stages_do_by_hand(scene):
     start = find_first_pose(walker(), silhouettes[:6], rig(), None, g, fps=12.0).state
     step = default_step_std(walker()) * math.sqrt(60 / 12)
     model = AnnealedParticleFilter(walker(), 20, process_cov=step.square(), sharpness=100.0)
-    by_hand = track_body(model, silhouettes, rig(), start, g, initial_std=2 * step)
+    by_hand = track_body(
+        model, silhouettes, rig(), start, generator=g, initial_cov=(2 * step).square()
+    )
     assert_same(poses, by_hand)
     assert (poses.first_frame, poses.method, poses.fps) == (2, "apf", 12.0)
     assert "first 2 frames" in poses.notes[-1]
@@ -77,7 +79,7 @@ def test_it_does_what_the_stages_do_by_hand(scene):
 def test_live_gives_what_a_whole_run_gives(scene, method):
     states, silhouettes = scene
     tracker = BodyTracker(rig(), method, body=walker(), n_particles=60)
-    whole = tracker(iter(silhouettes), states[0], seeded())
+    whole = tracker(iter(silhouettes), states[0], generator=seeded())
     state = tracker.init(initial_state=states[0], generator=seeded())
     parts = []
     for frame in silhouettes[:3]:
@@ -99,10 +101,10 @@ def test_covariances_are_those_of_the_filter(scene):
         initial_cov=4 * variances,
     )  # fmt: skip
     torch.testing.assert_close(by_cov.process_cov, variances)
-    torch.testing.assert_close(by_cov.initial_std, 2 * variances.sqrt())
+    torch.testing.assert_close(by_cov.initial_cov, 4 * variances)
     with pytest.warns(DeprecationWarning, match="square as process_cov"):
         by_std = BodyTracker(rig(), "sir", body=walker(), n_particles=60, step_std=variances.sqrt())
-    a, b = (t(silhouettes, states[0], seeded()) for t in (by_cov, by_std))
+    a, b = (t(silhouettes, states[0], generator=seeded()) for t in (by_cov, by_std))
     torch.testing.assert_close(a.state, b.state)
     full = torch.diag(variances) + 1e-6
     for bad, said in ((full, "must be diagonal"), (-variances, "must not be negative")):
@@ -130,7 +132,7 @@ def test_models_put_the_body_into_their_frame(scene):
         "the limbs' diffusion was learnt at 30 frames per second and rescaled to 60",
     )
     start = walker().convert(states[0], tracker.body)
-    poses = tracker(silhouettes, start, seeded())
+    poses = tracker(silhouettes, start, generator=seeded())
     torch.testing.assert_close(poses.body.joints(poses.state), poses.joints3d)
     bodies = [m for m in tracker.modules() if isinstance(m, Body)]
     assert len(bodies) == 2
@@ -141,11 +143,11 @@ def test_models_put_the_body_into_their_frame(scene):
 def test_results_keep_their_method_in_a_file(scene, tmp_path):
     states, silhouettes = scene
     tracker = BodyTracker(rig(), "sir", body=walker(), n_particles=30)
-    poses = tracker(silhouettes, states[0], seeded())
+    poses = tracker(silhouettes, states[0], generator=seeded())
     assert not poses.joints3d.requires_grad
     assert poses.failed_at == -1
     poses.save(tmp_path / "a.npz")
-    found = BodyPoses.load(tmp_path / "a.npz")
+    found = BodyTrack.load(tmp_path / "a.npz")
     assert found.method == "sir"
     assert_same(found, poses)
     again = BodyTracker(rig(), body=tmp_path / "a.npz", n_particles=20)
@@ -201,7 +203,7 @@ def test_a_filter_of_ones_own_is_registered_in_one_line(scene):
         assert method_options("still")[0] == "gain"
         tracker = BodyTracker(rig(), "still", body=walker(), n_particles=12, gain=2.0)
         assert (tracker.filter.gain, tracker.filter.n_particles) == (2.0, 12)
-        assert tracker(silhouettes, states[0], seeded()).method == "still"
+        assert tracker(silhouettes, states[0], generator=seeded()).method == "still"
         with pytest.raises(InputError, match="choose another name"):
             register_body_filter("still", SIRParticleFilter)
     finally:
@@ -236,17 +238,61 @@ def test_past_its_length_a_sequence_holds_its_last_estimate(scene):
     model = SIRParticleFilter(walker(), 40, sharpness=100.0)
     both = torch.stack([silhouettes[:5], silhouettes[2:7]])
     starts = torch.stack([states[0], states[2]])
-    cut = model(both, rig(), starts, [seeded(1), seeded(2)], torch.tensor([3, 5]))
-    alone = model(silhouettes[:3], rig(), states[0], seeded(1))
-    whole = model(both[1], rig(), states[2], seeded(2))
+    cut = model(both, rig(), starts, generator=[seeded(1), seeded(2)], lengths=torch.tensor([3, 5]))
+    alone = model(silhouettes[:3], rig(), states[0], generator=seeded(1))
+    whole = model(both[1], rig(), states[2], generator=seeded(2))
     torch.testing.assert_close(cut.mean[0, :3], alone.mean)
     torch.testing.assert_close(cut.mean[0, 3:], alone.mean[2].expand(2, -1))
     assert bool((cut.log_evidence[0, 3:] == 0).all())
     torch.testing.assert_close(cut.element(1).mean, whole.mean)
     torch.testing.assert_close(cut.element(1).log_evidence, whole.log_evidence)
-    assert cut.failed_at.tolist() == [-1, -1]
+    assert cut.failed_at.tolist() == [-1, -1] and not cut.failed.any()
     with pytest.raises(InputError, match="from 1 to 5"):
         model(both, rig(), starts, lengths=torch.tensor([3, 6]))
+
+
+def test_a_tracker_repeats_its_last_pose_past_the_length(scene):
+    states, silhouettes = scene
+    tracker = BodyTracker(rig(), "sir", body=walker(), n_particles=60)
+    late = torch.cat([torch.zeros_like(silhouettes[:1]), silhouettes])
+    alone = tracker(silhouettes[:3], states[0], generator=seeded())
+    for given in (late, iter(late)):
+        cut = tracker(given, states[0], generator=seeded(), lengths=torch.tensor([4]))
+        assert (len(cut), cut.first_frame, cut.failed) == (8, 1, False)
+        for name, value in tensors(cut).items():
+            torch.testing.assert_close(value[:3], tensors(alone)[name], rtol=0, atol=0)
+        assert (cut.joints3d[3:] == cut.joints3d[2]).all() and (cut.log_evidence[3:] == 0).all()
+    for wrong in (0, 10):
+        with pytest.raises(InputError, match="lengths must be"):
+            tracker(late, states[0], generator=seeded(), lengths=torch.tensor([wrong]))
+
+
+def test_former_arguments_give_the_same_poses(scene):
+    states, silhouettes = scene
+    tracker = BodyTracker(rig(), "sir", body=walker(), n_particles=60)
+    now = tracker(silhouettes, states[0], generator=seeded())
+    with pytest.warns(DeprecationWarning, match="generator, progress by name"):
+        assert_same(tracker(silhouettes, states[0], seeded(), False), now)
+    with pytest.warns(DeprecationWarning, match="root of initial_cov"):
+        std = tracker.initial_std
+    torch.testing.assert_close(std, tracker.initial_cov.sqrt())
+    given = (tracker.filter, silhouettes, rig(), states[0])
+    with pytest.warns(DeprecationWarning, match="initial_std of track_body is initial_cov"):
+        assert_same(track_body(*given, generator=seeded(), initial_std=std), now)
+    with pytest.warns(DeprecationWarning) as said:
+        before = tracker.filter(silhouettes, rig(), states[0], seeded(), None, False, std)
+    assert ["by name" in str(w.message) for w in said] == [True]
+    torch.testing.assert_close(before.mean, now.state, rtol=0, atol=0)
+    state = tracker.filter.init(states[:1])
+    _, one = tracker.filter.step(state, silhouettes[:1], rig(), generator=seeded())
+    with pytest.warns(DeprecationWarning, match="filter_frame of one"):
+        _, same = tracker.filter.advance(state, silhouettes[:1], rig(), generator=seeded())
+    torch.testing.assert_close(same.mean, one.mean, rtol=0, atol=0)
+
+
+def test_options_of_the_tracker_are_those_of_the_filters():
+    listed = set(BodyTrackerOptions.__annotations__) | {"process_cov"}
+    assert listed - {"step_std"} == {o for name in METHODS for o in method_options(name)}
 
 
 def test_the_average_body_has_the_height_that_was_given():

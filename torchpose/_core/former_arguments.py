@@ -1,19 +1,16 @@
-"""Take the arguments of methods as they were given one release ago, with a `DeprecationWarning`."""
+"""Take arguments and methods as they were one release ago, with a `DeprecationWarning`."""
 
 import functools
 import inspect
-import sys
-import warnings
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import torch
 
-from torchpose._core.moved import ARGUMENTS
+from torchpose._core.moved import ARGUMENTS, warn_of_former
 
-__all__ = ["takes_former_arguments", "variances"]
+__all__ = ["rename_former_hook", "takes_former_arguments", "variances"]
 
-_WITHIN = ("torch.", "torchpose.")  # modules between a program and a warning
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
@@ -40,17 +37,31 @@ def takes_former_arguments(function: _Function) -> _Function:
         if len(beyond) > len(positions) or not options.keys().isdisjoint(names):
             return function(*args, *beyond, **options)  # raises what Python says of it
         if names:
-            _warn(f"{function.__qualname__} takes {', '.join(names)} by name now, not by position")
+            warn_of_former(
+                f"{function.__qualname__} takes {', '.join(names)} by name now; positions go"
+            )
         options |= zip(names, beyond, strict=True)
         for old in renamed.keys() & options.keys():
             new, value = renamed[old], options.pop(old)
             if old not in names:
-                _warn(f"{old} of {function.__qualname__} is {new} now")
+                warn_of_former(f"{old} of {function.__qualname__} is {new} now; the old name goes")
             squared = old.endswith("_std") and new.endswith("_cov")
             options[new] = variances(value) if squared and value is not None else value
         return function(*args, **options)
 
     return cast(_Function, call)
+
+
+def rename_former_hook(cls: type, old: str, new: str) -> None:
+    """Rename what a subclass implements by a former name, which has another meaning now, and warn.
+
+    Args:
+        cls: of a program. old, new: names of the method.
+    """
+    if old in vars(cls) and new not in vars(cls):
+        warn_of_former(f"{cls.__name__}.{old} is to be called {new}; the old name goes")
+        setattr(cls, new, vars(cls)[old])
+        delattr(cls, old)
 
 
 def variances(std: Any) -> torch.Tensor:
@@ -69,13 +80,3 @@ def _former(qualified: str) -> tuple[tuple[str, ...], dict[str, str]]:
         if new:
             renamed[name] = new
     return tuple(positions), renamed
-
-
-def _warn(said: str) -> None:
-    """Warn where the program calls: a module's `forward` is called by PyTorch."""
-    level, frame = 1, sys._getframe()
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(_WITHIN):
-        level, frame = level + 1, frame.f_back
-    warnings.warn(
-        f"{said}; the former way goes with version 0.3.0", DeprecationWarning, stacklevel=level
-    )

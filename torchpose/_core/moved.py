@@ -21,9 +21,11 @@ __all__ = [
     "moved_function",
     "moved_names",
     "present_module",
+    "warn_of_former",
 ]
 
 _PACKAGE = Path(__file__).parents[1]
+_BETWEEN = {"torchpose", "torch", "importlib"}  # packages between a program and a warning
 
 MODULES = {
     "arm_filters": "upper_body._single_poses",
@@ -224,6 +226,9 @@ LABORATORY = frozenset(
 """Modules that belong to the benchmarks of a checkout now, and are no part of the package."""
 
 NAMES: dict[str, dict[str, str]] = {
+    "torchpose": {
+        "whole_body._poses": "BodyPoses=BodyTrack",
+    },
     "torchpose.body": {
         "body._fitting": "joint_errors",
         "body._kinematics": "FRAMES",
@@ -254,9 +259,10 @@ NAMES: dict[str, dict[str, str]] = {
         "filters._mkf": "MKFState",
         "filters._particle": "ParticleState",
         "whole_body": (
-            "AnnealedParticleFilter BodyTrack ConstrainedParticleFilter ManifoldParticleFilter "
-            "RootUncertaintyTracker SIRParticleFilter SilhouetteParticleFilter constant_velocity_std "
-            "default_step_std find_first_pose find_pose fit_sharpness motion_std"
+            "AnnealedParticleFilter BodyTrack=BodyFilterOutput ConstrainedParticleFilter "
+            "ManifoldParticleFilter RootUncertaintyTracker SIRParticleFilter "
+            "SilhouetteParticleFilter constant_velocity_std default_step_std find_first_pose find_pose "
+            "fit_sharpness motion_std"
         ),
         "whole_body._filters.body_particles": "BodyFilterState",
         "whole_body._first_pose": "FirstPose",
@@ -356,6 +362,7 @@ NAMES: dict[str, dict[str, str]] = {
         "viz._prior_pictures": "plot_log_likelihood plot_prior_components plot_prior_samples",
     },
     "torchpose.whole_body": {
+        "whole_body": "BodyPoses=BodyTrack",
         "whole_body._filters.body_particles": "BodyFilterState joint_covariance",
         "whole_body._first_pose": "FirstPose",
         "whole_body._sharpness": "ValidationSequence",
@@ -365,6 +372,15 @@ NAMES: dict[str, dict[str, str]] = {
         ),
         "whole_body._silhouettes.shape": "fit_radii",
     },
+    "torchpose.whole_body._filters.body_particles": {
+        "whole_body._filters.body_particles": "BodyTrack=BodyFilterOutput",
+    },
+    "torchpose.whole_body._poses": {
+        "whole_body._poses": "BodyPoses=BodyTrack",
+    },
+    "torchpose.whole_body._tracker": {
+        "whole_body._following": "track_body",
+    },
 }
 """Names that a package or module had: present home (without `torchpose.`) to the names in it.
 
@@ -372,9 +388,9 @@ A name that has changed is OLD=NEW.
 """
 
 ARGUMENTS = {
-    "BootstrapParticleFilter.init": "generator",
     "BodyTracker.forward": "generator progress",
     "BodyTracker.init": "generator",
+    "BootstrapParticleFilter.init": "generator",
     "ConstantVelocityFilter.smooth": "lengths lag",
     "MixtureKalmanFilter.init": "generator",
     "RecursiveFilter.advance": "generator return_cov",
@@ -382,6 +398,7 @@ ARGUMENTS = {
     "RecursiveFilter.smooth": "lengths lag return_cov",
     "RecursiveFilter.step": "generator return_cov",
     "SampledTrackFilter.init": "generator",
+    "SilhouetteParticleFilter.advance": "generator",
     "SilhouetteParticleFilter.forward": "generator lengths progress initial_std=initial_cov",
     "SilhouetteParticleFilter.init": "generator initial_std=initial_cov",
     "SilhouetteParticleFilter.step": "generator",
@@ -443,13 +460,23 @@ def install() -> None:
         sys.meta_path.insert(0, _OldNames())
 
 
+def warn_of_former(said: str) -> None:
+    """Warn of what goes with version 0.3.0, where the program stands that uses it.
+
+    Frames of torchpose do not count, nor those of PyTorch, which calls `forward`, and of imports.
+    """
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and _package_of(frame.f_globals) in _BETWEEN:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(f"{said} with version 0.3.0", DeprecationWarning, stacklevel=level)
+
+
+def _package_of(names: dict[str, Any]) -> str:
+    return str(names.get("__name__", "")).partition(".")[0]
+
+
 def _warn(old: str, new: str) -> None:
-    """Warn where the caller of the caller stands; frames of the import machinery do not count."""
-    warnings.warn(
-        f"{old} is {new} now; the old one goes with version 0.3.0",
-        DeprecationWarning,
-        stacklevel=3,
-    )
+    warn_of_former(f"{old} is {new} now; the old one goes")
 
 
 class _OldNames:

@@ -30,7 +30,7 @@ def demo_walk(folder: str, seconds: float, seed: int, pictures: bool) -> int:
     """Render, track by `torchpose track-body`, score; return exit code 1 if standing still is not beaten."""
     from torchpose.cli import track_body
     from torchpose.demo._rendering.walk import walk
-    from torchpose.whole_body._poses import BodyPoses
+    from torchpose.whole_body._poses import BodyTrack
 
     print(_SAID.format(height=_HEIGHT))
     walker, out = walk(seconds, _FPS, _HEIGHT, seed), Path(folder)
@@ -48,7 +48,7 @@ def demo_walk(folder: str, seconds: float, seed: int, pictures: bool) -> int:
         print("torchpose: the demo failed: the walker was not tracked", file=sys.stderr)
         return 1
     elapsed = time.process_time() - started
-    poses = BodyPoses.load(out / "body.npz")
+    poses = BodyTrack.load(out / "body.npz")
     truth = walker.joints[poses.first_frame :][: len(poses)]
     scores = {"tracked": _errors(poses.joints3d, truth), "standing still": _still(truth)}
     print(

@@ -122,9 +122,9 @@ DESCRIBED: dict[str, Callable[[Path], Facts]] = {
 def describe_body_poses(path: Path) -> Facts:
     """Return what poses of a whole body are, from `torchpose track-body`."""
     from torchpose.cli.track_body_output import action_text
-    from torchpose.whole_body._poses import BodyPoses
+    from torchpose.whole_body._poses import BodyTrack
 
-    poses = BodyPoses.load(path)
+    poses = BodyTrack.load(path)
     spread = poses.covariance3d.diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(0).sqrt().mean(0)
     stds = zip(poses.names, (100 * spread).tolist(), strict=True)
     rate = (

@@ -25,7 +25,7 @@ from torchpose.errors import CameraError, DegenerateFilterWarning, InputError, N
 
 if TYPE_CHECKING:
     from torchpose.camera._pinhole import PinholeCamera
-    from torchpose.whole_body._poses import BodyPoses
+    from torchpose.whole_body._poses import BodyTrack
     from torchpose.whole_body._tracker import BodyTracker
 
 _EXAMPLES = """
@@ -234,17 +234,17 @@ def _track(
     initial_pose: str | None,
     facing: list[float] | None,
     seed: int,
-) -> "BodyPoses | None":
+) -> "BodyTrack | None":
     """Find the person, then track; return None if there is nobody."""
     import torch
 
     from torchpose.body._fitting import fit_state
-    from torchpose.whole_body._poses import BodyPoses
+    from torchpose.whole_body._poses import BodyTrack
 
     start = None
     frames = recordings.silhouettes()
     if initial_pose:
-        recorded = BodyPoses.load(initial_pose)
+        recorded = BodyTrack.load(initial_pose)
         start = fit_state(tracker.body, recorded.joints3d[:1])[0]
     else:
         print("finding the pose of the first frame ...", flush=True)
@@ -255,8 +255,8 @@ def _track(
         warnings.filterwarnings("ignore", "the gate rejected", DegenerateFilterWarning)
         try:
             poses = tracker(
-                frames, start, generator, show_progress(), facing=direction,
-                n_frames=recordings.n_frames,
+                frames, start, generator=generator, facing=direction, n_frames=recordings.n_frames,
+                progress=show_progress(),
             )  # fmt: skip
         except NobodySeenError:
             return None

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from torchpose.io._results import ResultsFolder
     from torchpose.video._base import VideoSource
     from torchpose.video._silhouettes import SilhouetteMeasurer, SilhouetteView
-    from torchpose.whole_body._poses import BodyPoses
+    from torchpose.whole_body._poses import BodyTrack
     from torchpose.whole_body._tracker import BodyTracker
 
 __all__ = [
@@ -190,7 +190,7 @@ def _overlay_name(camera: str) -> str:
     return f"overlay_{camera}.mp4"
 
 
-def write_poses(out: Path, poses: "BodyPoses") -> list[Path]:
+def write_poses(out: Path, poses: "BodyTrack") -> list[Path]:
     """Write the poses as an .npz and as a table."""
     written = [out / name for name in _POSES]
     poses.save(written[0])
@@ -198,7 +198,7 @@ def write_poses(out: Path, poses: "BodyPoses") -> list[Path]:
     return written
 
 
-def _write_csv(path: Path, poses: "BodyPoses") -> None:
+def _write_csv(path: Path, poses: "BodyTrack") -> None:
     """Write one row per frame: x, y, z of every joint in metres, and its standard deviation."""
     from torchpose._core.files import atomic_path
 
@@ -215,7 +215,7 @@ def _write_csv(path: Path, poses: "BodyPoses") -> None:
 
 
 def draw(
-    recordings: "Recordings", poses: "BodyPoses", out: Path, videos: bool, picture: bool
+    recordings: "Recordings", poses: "BodyTrack", out: Path, videos: bool, picture: bool
 ) -> list[Path]:
     """Draw the body into the frames of every camera: videos, and some frames as one picture."""
     from contextlib import ExitStack
@@ -247,7 +247,7 @@ def draw(
 
 
 def _drawn(
-    recordings: "Recordings", poses: "BodyPoses", t: int, images: Iterable[Any]
+    recordings: "Recordings", poses: "BodyTrack", t: int, images: Iterable[Any]
 ) -> list[Any]:
     from torchpose.video._overlay import draw_body
     from torchpose.whole_body._silhouettes.rendering import render
@@ -314,7 +314,7 @@ def facts_of(
     given: "Given",
     tracker: "BodyTracker",
     recordings: "Recordings",
-    poses: "BodyPoses",
+    poses: "BodyTrack",
     seconds: float,
 ) -> dict[str, str]:
     """Return what was tracked, and how, by the name of each fact."""
@@ -335,7 +335,7 @@ def facts_of(
     return {name: fact for name, fact in facts.items() if fact}
 
 
-def action_text(poses: "BodyPoses") -> str:
+def action_text(poses: "BodyTrack") -> str:
     """Return the likeliest action frame by frame, as runs of frames, or as shares if there are many runs."""
     import torch
 
@@ -356,7 +356,7 @@ def action_text(poses: "BodyPoses") -> str:
 
 
 def write_page(
-    recordings: "Recordings", poses: "BodyPoses", facts: dict[str, str], out: Path
+    recordings: "Recordings", poses: "BodyTrack", facts: dict[str, str], out: Path
 ) -> list[Path]:
     """Write the page with the first camera's overlay, the skeleton and curves."""
     from torchpose.viz._report.page import write_report
@@ -373,7 +373,7 @@ def write_page(
 
 
 def summary(
-    poses: "BodyPoses", facts: dict[str, str], written: Sequence[Path], notes: Sequence[str] = ()
+    poses: "BodyTrack", facts: dict[str, str], written: Sequence[Path], notes: Sequence[str] = ()
 ) -> int:
     """Print what was found; return 1 if the person was lost in more than half of the frames, else 0."""
     for name, fact in facts.items():

@@ -4,7 +4,6 @@ A filter is a fixed model (buffers) and pure steps over a state, which is a Name
 implements `init` and `filter_frame`; shapes, masks, lengths and failures are handled here.
 """
 
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any
@@ -15,7 +14,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchpose._core.checks import check_shape
-from torchpose._core.former_arguments import takes_former_arguments
+from torchpose._core.former_arguments import rename_former_hook, takes_former_arguments
 from torchpose._core.module_state import (
     WideModule,
     derived,
@@ -36,6 +35,7 @@ from torchpose.filters._outputs import FilterOutput, StepOutput, collect
 __all__ = [
     "Generators",
     "RecursiveFilter",
+    "check_generators",
     "check_lag",
     "require_state",
     "standard_normal",
@@ -69,6 +69,15 @@ def uniform(
     if isinstance(generator, torch.Generator) or generator is None:
         return torch.rand(batch, *shape, generator=generator, **kind)
     return torch.stack([torch.rand(*shape, generator=g, **kind) for g in generator])
+
+
+def check_generators(generator: Generators, batch: int) -> None:
+    """Raise `InputError` for a list that does not hold one generator for each sequence."""
+    if isinstance(generator, Sequence) and len(generator) != batch:
+        raise InputError(
+            f"a list of generators must hold one for each of the {batch} sequences, "
+            f"got {len(generator)}"
+        )
 
 
 def check_lag(lag: int | None) -> None:
@@ -143,15 +152,7 @@ class RecursiveFilter(WideModule, ABC):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        if "advance" in vars(cls) and "filter_frame" not in vars(cls):
-            warnings.warn(
-                f"{cls.__name__}.advance is to be called filter_frame; the old name goes with version "
-                "0.3.0",
-                DeprecationWarning,
-                stacklevel=2,
-            )
-            cls.filter_frame = vars(cls)["advance"]  # type: ignore[method-assign]
-            del cls.advance
+        rename_former_hook(cls, "advance", "filter_frame")
 
     @abstractmethod
     def init(self, batch_size: int, *, generator: Generators = None) -> Any:
@@ -341,11 +342,7 @@ class RecursiveFilter(WideModule, ABC):
         like = torch.empty(0, dtype=self.dtype, device=self.observed.device)
         z, mask, lengths = check_values(z, mask, lengths, like, self.observed.numel())
         cov = self._own_noise() if measurement_cov is None else check_noise(measurement_cov, z)
-        if isinstance(generator, Sequence) and len(generator) != len(z):
-            raise InputError(
-                f"a list of generators must hold one for each of the {len(z)} sequences, "
-                f"got {len(generator)}"
-            )
+        check_generators(generator, len(z))
         return Measurements(z, mask, cov, lengths)
 
     def _own_noise(self) -> Float[Tensor, "Z Z"]:

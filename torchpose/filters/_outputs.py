@@ -66,6 +66,11 @@ class FilterOutput(NamedTuple):
     jitter: Tensor | None = None
 
     @property
+    def failed(self) -> Tensor:
+        """Return whether the filter degenerated, [B]."""
+        return self.failed_at >= 0
+
+    @property
     def effective_sample_size(self) -> Tensor:
         """Return 1 / sum_j w_j^2 (BL 25), [B, T]."""
         return effective_sample_size(self.log_weights)

@@ -109,7 +109,8 @@ def find_first_pose(
         process_cov=(default_step_std(body) * math.sqrt(stride * _RATE / fps)).square(),
     )  # fmt: skip
     many = frames.expand(len(states), *frames.shape)
-    track = model(many, rig, states, generator, initial_std=2 * model.step_std).mean
+    spread = (2 * model.step_std).square()
+    track = model(many, rig, states, generator=generator, initial_cov=spread).mean
     fit = _mean_log_likelihood(body, track, frames, rig, likelihood)
     evidence = facing_evidence(body, track, up)
     score = _SHARPNESS * fit + evidence

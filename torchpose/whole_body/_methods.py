@@ -5,11 +5,12 @@
 """
 
 import inspect
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from torchpose._core.checks import check_choice, refuse_unused
 from torchpose.body._kinematics import Body
@@ -18,7 +19,7 @@ from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 from torchpose.priors._shipped import load_action, load_limb_conditionals, load_manifold
 from torchpose.whole_body._filters.annealed import AnnealedParticleFilter
-from torchpose.whole_body._filters.body_particles import BodyFilterOptions
+from torchpose.whole_body._filters.body_particles import BodyFilterOptions, WeightingOptions
 from torchpose.whole_body._filters.constrained import ConstrainedParticleFilter
 from torchpose.whole_body._filters.manifold import ManifoldParticleFilter
 from torchpose.whole_body._filters.root_uncertainty import RootUncertaintyTracker
@@ -29,6 +30,7 @@ __all__ = [
     "LEARNT",
     "METHODS",
     "BodyMethod",
+    "BodyTrackerOptions",
     "LearntKind",
     "check_options",
     "choose_method",
@@ -40,6 +42,29 @@ __all__ = [
 
 _DEFAULT = "apf"  # needs nothing
 _DEPRECATED = {"step_std"}  # options that still work and are not listed
+
+
+class BodyTrackerOptions(WeightingOptions, total=False):
+    """The options of the filters of `METHODS` but for `process_cov`; each has some (`method_options`)."""
+
+    step_std: Tensor | float | None
+    survival_rate: float | None
+    n_layers: int
+    schedule: Sequence[float] | None
+    noise_decay: float | None
+    weights: str
+    proposal: str
+    survival_per_second: float | None
+    normalisation: str
+    camera_rule: str
+    observation_sharpness: float
+    least_std: float
+    first_std: float
+    weighting: str
+    velocity_rate: float | None
+    max_redraws: int
+    gate_width: float
+    posture_body: Body | None
 
 
 class BodyMethod(NamedTuple):

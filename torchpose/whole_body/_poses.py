@@ -1,6 +1,6 @@
 """Hold the poses of a tracked whole body with their uncertainty, and read and write their file."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpose._core.estimates import check_estimates, frame_facts, to_tensor
+from torchpose._core.facade import set_up_facade
 from torchpose._core.files import write_npz
 from torchpose._core.reading import check_arrays, npz_keys, one_text, read_npz, texts
 from torchpose.body._kinematics import Body
@@ -17,7 +18,7 @@ from torchpose.camera._pinhole import PinholeCamera
 from torchpose.errors import FileFormatError, InputError, ShapeError, SkeletonError
 from torchpose.whole_body._filters.body_particles import first_true
 
-__all__ = ["BodyPoses", "load_body"]
+__all__ = ["BodyTrack", "load_body", "repeat_last"]
 
 _FRAMES = {
     "state": "f T 36",
@@ -42,8 +43,12 @@ _HEIGHTS = (0.3, 5.0)  # metres; between them is everybody, and what is no perso
 
 
 @dataclass
-class BodyPoses:
+class BodyTrack:
     """Poses of one person in T frames; J joints and states of D numbers, as their body has.
+
+    Named as in `torchpose.PoseTrack`, without the dimension of a batch. A filter over bodies that fails goes
+    on with particles drawn anew, so there is a pose in every frame: `respread` tells the frames in which
+    that happened, `failed_at` the first of them.
 
     Attributes:
         body: whose states they are.
@@ -55,7 +60,7 @@ class BodyPoses:
         respread: [T], True where all particles had died and were spread about the last estimate.
         fps: frames per second, or None. notes: what was assumed, in plain words.
         first_frame: of the videos, that of the first pose.
-        details: what only some filters report, by name, [T, ...] each (`BodyTrack.details`): of
+        details: what only some filters report, by name, [T, ...] each (`BodyFilterOutput.details`): of
             `ConstrainedParticleFilter` "acceptance", "clamped", "actions" and so on.
         action_names: of the columns of ``details["actions"]``.
         method: the filter that ran, one of `torchpose.whole_body.METHODS`; "unknown" in files of older
@@ -90,6 +95,11 @@ class BodyPoses:
     def failed_at(self) -> int:
         """Return the first frame in which all particles had died, -1 if there is none."""
         return int(first_true(self.respread))
+
+    @property
+    def failed(self) -> bool:
+        """Return whether the filter failed, in any frame."""
+        return bool(self.respread.any())
 
     def save(self, path: str | Path) -> None:
         """Write an .npz: what holds for each frame, `names`, `fps` (NaN if unknown), `notes`,
@@ -191,6 +201,20 @@ class BodyPoses:
         )
 
 
+def repeat_last(track: BodyTrack, count: int) -> BodyTrack:
+    """Return a track with its last pose repeated, as past the length of a sequence."""
+    if count == 0:
+        return track
+    held = torch.arange(len(track) + count).clamp(max=len(track) - 1)
+    inside = torch.arange(len(held)) < len(track)
+    fields = {name: getattr(track, name)[held] for name in _FRAMES}
+    evidence, respread = fields["log_evidence"], fields["respread"]
+    fields["log_evidence"] = torch.where(inside.to(evidence.device), evidence, 0.0)
+    fields["respread"] = respread & inside.to(respread.device)
+    details = {name: value[held] for name, value in track.details.items()}
+    return replace(track, **fields, details=details)
+
+
 @dataclass
 class CameraPoses:
     """Poses in the axes of a camera; see `torchpose.viz._report.packing.ReportedTrack`."""
@@ -242,3 +266,6 @@ def load_body(path: str | Path) -> Body:
             f"of up to {largest:.3g} m"
         )
     return body
+
+
+set_up_facade(__name__)

@@ -3,35 +3,43 @@
 from collections.abc import Iterable
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from torchpose._core.checks import check_rate, check_shape
+from torchpose._core.facade import set_up_facade
+from torchpose._core.former_arguments import takes_former_arguments
+from torchpose._core.moved import warn_of_former
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
 from torchpose.camera._rig import CameraRig, Cameras, as_rig
 from torchpose.errors import InputError, NobodySeenError
-from torchpose.filters._base import Generators
+from torchpose.filters._measurements import check_lengths
 from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.space import ActionSpace
 from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
-from torchpose.whole_body._filters.body_frames import check_frame
-from torchpose.whole_body._filters.body_particles import BodyFilterState, stack_tracks
+from torchpose.whole_body._filters.body_particles import BodyFilterState
 from torchpose.whole_body._filters.motion import std_of_covariance
-from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
 from torchpose.whole_body._first_pose import find_first_pose
-from torchpose.whole_body._methods import LEARNT, METHODS, choose_method, make_filter, rebased
-from torchpose.whole_body._poses import BodyPoses, load_body
+from torchpose.whole_body._following import all_see, follow
+from torchpose.whole_body._methods import (
+    LEARNT,
+    METHODS,
+    BodyTrackerOptions,
+    choose_method,
+    make_filter,
+    rebased,
+)
+from torchpose.whole_body._poses import BodyTrack, load_body, repeat_last
 
-__all__ = ["BodyStream", "BodyTracker", "all_see", "track_body"]
+__all__ = ["BodyStream", "BodyTracker"]
 
 _LOOK_AHEAD = 0.5  # seconds that decide where the person looks at first
-_SEEN = 0.002  # of the image: fewer pixels are nobody
 
 
 class BodyStream(NamedTuple):
@@ -66,7 +74,7 @@ class BodyTracker(nn.Module):
     Args:
         cameras: of the silhouettes, undistorted: a `CameraRig`, or what makes one.
         method: a name of `torchpose.whole_body.METHODS`; by default that of the model given, else "apf".
-        body: the person's body, or a body.npz (`BodyPoses`) whose bone lengths and shape the person has;
+        body: the person's body, or a body.npz (`BodyTrack`) whose bone lengths and shape the person has;
             then the height is not used.
         height: height of the person, metres.
         manifold: poses of an action, by a name that `torchpose info` lists, or a file; in Python also the
@@ -121,7 +129,7 @@ class BodyTracker(nn.Module):
         fps: float = 60.0,
         process_cov: Tensor | None = None,
         initial_cov: Tensor | None = None,
-        **options: Any,
+        **options: Unpack[BodyTrackerOptions],
     ) -> None:
         super().__init__()
         check_rate("fps", fps)
@@ -137,9 +145,10 @@ class BodyTracker(nn.Module):
         if needs is not None:
             learnt = models[needs][0]
             tracked = upright if needs == "manifold" else LEARNT[needs].body(person, learnt)
-        if process_cov is not None:
-            options["process_cov"] = process_cov
-        self.filter = make_filter(self.method, tracked, learnt, fps, n_particles, options)
+        noise = {} if process_cov is None else {"process_cov": process_cov}
+        self.filter = make_filter(
+            self.method, tracked, learnt, fps, n_particles, {**options, **noise}
+        )
         self.cameras, self.fps, self.n_particles = as_rig(cameras), float(fps), n_particles
         self.notes = tuple(filter(None, (note for _, note in models.values())))
         # of the filter where these are the same, so that its tensors are in the state once
@@ -172,39 +181,52 @@ class BodyTracker(nn.Module):
         return self.filter.process_cov
 
     @property
-    def initial_std(self) -> Float[Tensor, " D"]:
-        """Return the standard deviation of the particles about the first pose."""
-        return self.filter.start_std() if self._initial_std is None else self._initial_std
+    def initial_cov(self) -> Float[Tensor, " D"]:
+        """Return the variances of the particles about the first pose."""
+        std = self.filter.start_std() if self._initial_std is None else self._initial_std
+        return std.square()
 
+    @property
+    def initial_std(self) -> Float[Tensor, " D"]:
+        """Return the square root of `initial_cov`; deprecated."""
+        warn_of_former("BodyTracker.initial_std is the root of initial_cov; it goes")
+        return self.initial_cov.sqrt()
+
+    @takes_former_arguments
     @torch.no_grad()
     def forward(
         self,
         silhouettes: Iterable[Bool[Tensor, "C H W"]],
         initial_state: Float[Tensor, " D"] | None = None,
-        generator: torch.Generator | None = None,
-        progress: bool = False,
         *,
+        generator: torch.Generator | None = None,
+        lengths: Int[Tensor, "1"] | None = None,
         facing: Float[Tensor, "3"] | None = None,
         n_frames: int | None = None,
-    ) -> BodyPoses:
+        progress: bool = False,
+    ) -> BodyTrack:
         """Track one person from the first frame in which all cameras see somebody.
 
         Args:
             silhouettes: bool [T, C, H, W], or frames [C, H, W] one after the other, of which memory then
                 holds those that the first pose is found in, and one more.
             initial_state: the pose before that frame [D], of `body`; found in half a second of frames
-                (`find_first_pose`) if None. generator: for what is drawn.
-            progress: whether to show a bar. facing: [3], the world direction that the person looks in at
-                first, if it is known. n_frames: how many frames to expect, for the bar.
+                (`find_first_pose`) if None.
+            generator: for what is drawn. lengths: [1], frames of the sequence, if they are fewer; past them
+                the last pose is repeated.
+            facing: [3], the world direction that the person looks in at first, if it is known.
+            n_frames: how many frames to expect, for the bar. progress: whether to show one.
 
         Returns:
-            `BodyPoses`, from frame `first_frame`.
+            `BodyTrack`, from frame `first_frame`.
 
         Raises:
-            NobodySeenError: by all cameras in any frame. InputError: silhouettes that are not bool.
+            NobodySeenError: by all cameras in any frame. InputError: silhouettes that are not bool, or
+            lengths outside 1..T.
             ShapeError, CameraError: of other sizes than the cameras' images.
         """
-        frames = iter(silhouettes)
+        source = iter(silhouettes)
+        frames = source if lengths is None else islice(source, _whole(lengths))
         seen = next(((t, masks) for t, masks in enumerate(frames) if all_see(masks)), None)
         if seen is None:
             raise NobodySeenError(
@@ -214,24 +236,29 @@ class BodyTracker(nn.Module):
         begun, first = seen
         looked_at = 1 if initial_state is not None else max(1, round(_LOOK_AHEAD * self.fps))
         begin = [first, *islice(frames, looked_at - 1)]
-        state = self.init(torch.stack(begin), initial_state, generator, facing=facing)
+        state = self.init(torch.stack(begin), initial_state, generator=generator, facing=facing)
         state = state._replace(frame=begun)
         expected = None if n_frames is None else max(1, n_frames - begun)
         bar = tqdm(chain(begin, frames), total=expected, disable=not progress, unit="frame")
         poses = self.advance(state, iter(bar))[1]
+        if lengths is not None:
+            there, later = begun + len(poses), sum(1 for _ in source)
+            check_lengths(lengths, 1, there + later, lengths.device)
+            poses = repeat_last(poses, later)
         if begun:
             poses.notes += (
                 f"the first {begun} frames, in which not all cameras saw somebody, have no pose",
             )
         return poses
 
+    @takes_former_arguments
     @torch.no_grad()
     def init(
         self,
         silhouettes: Bool[Tensor, "T C H W"] | None = None,
         initial_state: Float[Tensor, " D"] | None = None,
-        generator: torch.Generator | None = None,
         *,
+        generator: torch.Generator | None = None,
         facing: Float[Tensor, "3"] | None = None,
     ) -> BodyStream:
         """Begin to track a live stream, whose first frame is the first of these, or the one after a pose.
@@ -258,13 +285,15 @@ class BodyTracker(nn.Module):
                 found if self._upright is None else self.upright.convert(found, self.body)
             )
         check_shape("initial_state", initial_state, [self.body.dim])
-        state = self.filter.init(initial_state[None], generator, self.initial_std)
+        state = self.filter.init(
+            initial_state[None], generator=generator, initial_cov=self.initial_cov
+        )
         return BodyStream(state, 0, generator)
 
     @torch.no_grad()
     def step(
         self, state: BodyStream, silhouettes: Bool[Tensor, "C H W"]
-    ) -> tuple[BodyStream, BodyPoses]:
+    ) -> tuple[BodyStream, BodyTrack]:
         """Track one more frame: the same numbers as that frame of `forward`.
 
         Args:
@@ -272,7 +301,7 @@ class BodyTracker(nn.Module):
             silhouettes: of one frame, bool [C, H, W].
 
         Returns:
-            The next state, and the `BodyPoses` of this one frame.
+            The next state, and the `BodyTrack` of this one frame.
 
         Raises:
             ShapeError, InputError, CameraError: as `forward`.
@@ -282,19 +311,19 @@ class BodyTracker(nn.Module):
     @torch.no_grad()
     def advance(
         self, state: BodyStream, silhouettes: Iterable[Bool[Tensor, "C H W"]]
-    ) -> tuple[BodyStream, BodyPoses]:
+    ) -> tuple[BodyStream, BodyTrack]:
         """Track some more frames: the same numbers as `step` for one after the other.
 
         Args:
             state: as in `step`. silhouettes: bool [T, C, H, W], or one frame [C, H, W] after the other.
 
         Returns:
-            The next state, and the `BodyPoses` of these frames.
+            The next state, and the `BodyTrack` of these frames.
 
         Raises:
             ShapeError, InputError, CameraError: as `forward`.
         """
-        after, poses = _follow(
+        after, poses = follow(
             self.filter, state.filter, silhouettes, self.cameras, state.generator, state.frame
         )
         poses.fps, poses.method = self.fps, self.method
@@ -309,87 +338,24 @@ class BodyTracker(nn.Module):
         return getattr(self.filter, "manifold", None) if self._search is None else self._search
 
 
-def all_see(silhouettes: Bool[Tensor, "C H W"]) -> bool:
-    """Tell whether every camera sees somebody in a frame: more than 0.2 % of its pixels."""
-    return bool((silhouettes.double().mean((-2, -1)) > _SEEN).all())
-
-
-@torch.no_grad()
-def track_body(
-    model: SilhouetteParticleFilter,
-    frames: Iterable[Bool[Tensor, "C H W"]],
-    cameras: Cameras,
-    initial_state: Float[Tensor, " D"],
-    generator: Generators = None,
-    *,
-    initial_std: Float[Tensor, " D"] | None = None,
-    fps: float | None = None,
-    n_frames: int | None = None,
-    progress: bool = False,
-) -> BodyPoses:
-    """Track one person with any filter; memory holds the poses and a single frame.
-
-    Args:
-        model: a filter over silhouettes, whose body is a `torchpose.body.Body`.
-        frames: silhouettes of the C cameras, frame after frame. cameras: theirs.
-        initial_state: the pose before the first frame [D], recorded or from `find_first_pose`.
-        generator: for what is drawn. initial_std: spread of the first particles [D]; none if None.
-        fps: of the frames, for the result. n_frames: how many to expect, for the progress bar.
-        progress: whether to show it.
-
-    Returns:
-        `BodyPoses` of as many frames as came, with the covariances that the filter gives their joints
-        (`SilhouetteParticleFilter.joint_covariance`).
-
-    Raises:
-        InputError: no frame, or a filter without a body. CameraError, ShapeError: as the filter.
-    """
-    if not isinstance(model.body, Body):
-        raise InputError(f"the filter must track a Body, got {type(model.body).__name__}")
-    state = model.init(initial_state[None], generator, initial_std)
-    bar = tqdm(frames, total=n_frames, disable=not progress, unit="frame")
-    poses = _follow(model, state, iter(bar), cameras, generator)[1]
-    poses.fps = fps
-    return poses
-
-
-def _follow(
-    model: SilhouetteParticleFilter,
-    state: BodyFilterState,
-    frames: Iterable[Tensor],
-    cameras: Cameras,
-    generator: Generators,
-    first_frame: int = 0,
-) -> tuple[BodyFilterState, BodyPoses]:
-    """Return the state after some frames, and their poses."""
-    steps, covs = [], []
-    body: Any = model.body
-    for silhouettes in frames:
-        check_frame(silhouettes[None], 1, plain=not callable(model.likelihood))
-        state, out = model.advance(state, silhouettes[None], cameras, generator)
-        steps.append(out)
-        covs.append(model.joint_covariance(state, out.mean)[0])
-    if not steps:
-        raise InputError("there must be at least one frame of silhouettes, got none")
-    batch = stack_tracks(steps)
-    model.warn(batch)
-    track = batch.element(0)
-    poses = BodyPoses(
-        body, track.mean, track.std, body.joints(track.mean), torch.stack(covs), track.log_evidence,
-        track.effective_sample_size, track.coasting, track.respread,
-        notes=model.notes(track, first_frame), first_frame=first_frame, details=track.details,
-        action_names=model.action_names,
-    )  # fmt: skip
-    return state, poses
-
-
 def _person(body: Body | str | Path | None, height: float) -> Body:
     if isinstance(body, Body):
         return body
     return Body.of_height(BODY_15, height) if body is None else load_body(body)
 
 
+def _whole(lengths: Int[Tensor, "1"]) -> int:
+    """Return how many frames of a sequence are tracked; `check_lengths` follows when all are counted."""
+    check_shape("lengths", lengths, [1])
+    if int(lengths) < 1:
+        raise InputError(f"lengths must be integers of 1 or more, got {lengths.tolist()}")
+    return int(lengths)
+
+
 def _model(kind: str, value: Any, fps: float) -> tuple[Any, str]:
     """Return a model with its noise for a frame rate, and what is to be said of that."""
     model = LEARNT[kind].load(value) if isinstance(value, str | Path) else value
     return LEARNT[kind].at_rate(model, fps), LEARNT[kind].rescaled(model, fps)
+
+
+set_up_facade(__name__)

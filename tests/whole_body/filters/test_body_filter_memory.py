@@ -55,10 +55,14 @@ def generators(count):
 def test_memory_follows_its_particles_through_resampling():
     model = tracker()
     z = torch.randn(2, 5, 2, dtype=WIDE, generator=torch.Generator().manual_seed(1))
-    state = model.init(torch.zeros(2, 2, dtype=WIDE), generators(2), torch.ones(2, dtype=WIDE))
+    state = model.init(
+        torch.zeros(2, 2, dtype=WIDE),
+        generator=generators(2),
+        initial_cov=torch.ones(2, dtype=WIDE),
+    )
     streams = generators(2)
     for t in range(5):
-        state, out = model.step(state, z[:, t], None, streams)
+        state, out = model.step(state, z[:, t], None, generator=streams)
         # a particle has moved by 0.25 a frame from what it was at first, whoever its neighbours were
         moved = state.particles - state.memory
         torch.testing.assert_close(moved, torch.full_like(moved, 0.25 * (t + 1)))
@@ -71,16 +75,16 @@ def test_a_trend_holds_what_was_before_and_details_are_reported_for_every_frame(
     model = tracker()
     z = torch.randn(3, 4, 2, dtype=WIDE, generator=torch.Generator().manual_seed(2))
     start = torch.zeros(3, 2, dtype=WIDE)
-    out = model(z, None, start, generators(3))
+    out = model(z, None, start, generator=generators(3))
     assert out.details["age"].shape == (3, 4)
     state, streams = model.init(start), generators(3)
     means = [start]
     for t in range(4):
-        state, one = model.step(state, z[:, t], None, streams)
+        state, one = model.step(state, z[:, t], None, generator=streams)
         torch.testing.assert_close(out.details["age"][:, t], one.details["age"])
         torch.testing.assert_close(state.trend, torch.stack(means[-2:] if t else [start] * 2, 1))
         means.append(one.mean)
-    alone = model(z[1], None, start[1], generators(2)[1])
+    alone = model(z[1], None, start[1], generator=generators(2)[1])
     torch.testing.assert_close(alone.details["age"], out.details["age"][1])
 
 
@@ -92,9 +96,9 @@ def test_particles_that_died_start_with_a_memory_of_their_own():
     z = torch.zeros(2, 3, 2, dtype=WIDE)
     z[1, 1] = 9.0
     state, streams = model.init(torch.zeros(2, 2, dtype=WIDE)), generators(2)
-    state, _ = model.step(state, z[:, 0], None, streams)
+    state, _ = model.step(state, z[:, 0], None, generator=streams)
     with pytest.warns(DegenerateFilterWarning, match="element 1"):
-        state, out = model.step(state, z[:, 1], None, streams)
+        state, out = model.step(state, z[:, 1], None, generator=streams)
     assert out.respread.tolist() == [False, True]
     torch.testing.assert_close(state.memory[1], state.particles[1])
     torch.testing.assert_close(state.memory[0], state.particles[0] - 0.5)
@@ -128,7 +132,7 @@ def test_every_filter_finds_legs_that_had_been_taken_for_each_other(kind):
     error = []
     for rate in (0.0, 0.5):
         model = kind(body, 100, process_cov=0.005**2, likelihood=likelihood, leg_swap=rate)
-        out = model(frames, None, start, torch.Generator().manual_seed(0))
+        out = model(frames, None, start, generator=torch.Generator().manual_seed(0))
         error.append(float((body.joints(out.mean[-1]) - joints).norm(dim=-1).mean()))
     assert error[0] > 0.05, "without a swap the legs stay where they were"
     assert error[1] < 0.02
@@ -144,9 +148,9 @@ def test_memory_hears_of_swapped_legs():
     spread = torch.zeros(model.body.dim, dtype=WIDE)
     spread[0] = 0.01
     generator = torch.Generator().manual_seed(0)
-    state = model.init(start, generator, spread)
+    state = model.init(start, generator=generator, initial_cov=spread**2)
     for _ in range(2):  # the second frame begins with the resampling by the weights of the first
-        state, _ = model.step(state, torch.zeros(1, 1, dtype=WIDE), None, generator)
+        state, _ = model.step(state, torch.zeros(1, 1, dtype=WIDE), None, generator=generator)
     legs = state.particles[0, :, 3:]
     turned = (state.memory[0, :, 3:] == -start[0, 3:]).all(-1)
     swapped = ~torch.isclose(legs, start[0, 3:]).all(-1)
@@ -181,5 +185,5 @@ def test_limits_that_discard_hold_for_the_estimate_of_the_largest_weight():
             limit_mode=mode,
             estimate="map",
         )
-        out = model(frames, None, start, torch.Generator().manual_seed(0))
+        out = model(frames, None, start, generator=torch.Generator().manual_seed(0))
         assert not out.respread.any() and limits.inside(out.mean).all()

@@ -112,11 +112,11 @@ def test_one_frame_is_the_model_sampled_by_brute_force(brute_force, weights):
     copies = ancestors.repeat_interleave(80, 0)
     means, gates = [], []
     for seed in range(4):
-        state = tracker.init(before, generator(seed))
+        state = tracker.init(before, generator=generator(seed))
         state = state._replace(particles=copies[None])
         if state.memory is not None:  # eighty copies of each
             state = state._replace(memory=torch.arange(1280)[None] // 80)
-        _, out = tracker.step(state, FRAME, None, generator(seed))
+        _, out = tracker.step(state, FRAME, None, generator=generator(seed))
         means.append(out.mean[0, 6:])
         gates.append(out.details["acceptance"][0])
         assert out.details["clamped"] < 0.01
@@ -127,13 +127,12 @@ def test_one_frame_is_the_model_sampled_by_brute_force(brute_force, weights):
 def test_the_weights_differ_between_the_two_forms():
     """The same draws, so that only Z is between them."""
     start, ahead = performance("bend", 3)[12], performance("bend", 3)[14]
-    options = {"process_cov": STD**2, "likelihood": near(ahead), "initial_std": STD}
-    spread = options.pop("initial_std")
+    options = {"process_cov": STD**2, "likelihood": near(ahead)}
     means = []
     for weights in ("published", "normalised"):
         tracker = ConstrainedParticleFilter(BODY, BEND, 200, weights=weights, **options)
-        state = tracker.init(start, generator(), spread)
-        _, out = tracker.step(state, FRAME, None, generator(1))
+        state = tracker.init(start, generator=generator(), initial_cov=STD**2)
+        _, out = tracker.step(state, FRAME, None, generator=generator(1))
         means.append(out.mean)
     assert (means[0] - means[1]).abs().max() > 1e-4
 
@@ -143,7 +142,7 @@ def test_every_particle_belongs_to_the_action():
     tracker = ConstrainedParticleFilter(
         BODY, BEND, 200, process_cov=(2 * STD) ** 2, likelihood=flat, max_redraws=100
     )
-    state, out = tracker.step(tracker.init(start), FRAME, None, generator())
+    state, out = tracker.step(tracker.init(start), FRAME, None, generator=generator())
     assert out.details["clamped"] < 0.02 and 0 < out.details["acceptance"] < 0.7
     z = BEND.project(state_postures(BODY, state.particles[0]))
     off = (z[:, None] - BEND.performance).abs() - 2 * BEND.std
@@ -160,8 +159,10 @@ def test_without_an_action_and_velocity_it_is_sir():
     silhouettes = render(BODY, states[1:6], RIG, HEIGHT, WIDTH)
     options = {"process_cov": STD**2, "sharpness": 30.0, "likelihood": "overlap"}
     ours = ConstrainedParticleFilter(BODY, None, 50, velocity_rate=None, **options)
-    out = ours(silhouettes, RIG, states[0], generator())
-    expected = SIRParticleFilter(BODY, 50, **options)(silhouettes, RIG, states[0], generator())
+    out = ours(silhouettes, RIG, states[0], generator=generator())
+    expected = SIRParticleFilter(BODY, 50, **options)(
+        silhouettes, RIG, states[0], generator=generator()
+    )
     assert torch.equal(out.mean, expected.mean)
     assert (out.details["acceptance"] == 1).all() and not out.details["clamped"].any()
 
@@ -201,7 +202,7 @@ def test_a_bend_is_tracked_better_than_without_the_action(sequence):
     errors = []
     for action in (BEND, None):
         tracker = ConstrainedParticleFilter(BODY, action, 150, max_redraws=20, **options)
-        out = tracker(silhouettes.expand(2, -1, -1, -1, -1), RIG, states[0], generator())
+        out = tracker(silhouettes.expand(2, -1, -1, -1, -1), RIG, states[0], generator=generator())
         errors.append(error(BODY, out.mean, states[1:].expand(2, -1, -1)))
     still = error(BODY, states[:1].expand(17, -1), states[1:])
     assert errors[0] < errors[1] and errors[0] < 0.4 * still
@@ -222,15 +223,15 @@ def test_frame_by_frame_and_alone_it_is_the_same(sequence):
         )
         both = torch.stack([silhouettes[:3], silhouettes[4:7]])
         start = torch.stack([states[0], states[4]])
-        track = tracker(both, RIG, start, [generator(1), generator(2)])
-        alone = tracker(both[1], RIG, start[1], [generator(2)])
+        track = tracker(both, RIG, start, generator=[generator(1), generator(2)])
+        alone = tracker(both[1], RIG, start[1], generator=[generator(2)])
         assert torch.allclose(track.mean[1], alone.mean)
         for name, value in alone.details.items():
             assert torch.allclose(track.details[name][1].double(), value.double())
         state = tracker.init(start[1])
         g = [generator(2)]
         for t in range(3):
-            state, out = tracker.step(state, both[1, t][None], RIG, g)
+            state, out = tracker.step(state, both[1, t][None], RIG, generator=g)
             assert torch.allclose(out.mean[0], alone.mean[t])
 
 
@@ -239,7 +240,7 @@ def test_coasting_stays_in_the_action(sequence):
     gone = silhouettes[:8].clone()
     gone[2:] = False
     tracker = ConstrainedParticleFilter(BODY, BEND, 100, process_cov=STD**2, likelihood="overlap")
-    out = tracker(gone, RIG, states[0], generator())
+    out = tracker(gone, RIG, states[0], generator=generator())
     assert out.coasting.tolist() == [False] * 2 + [True] * 6
     z = BEND.project(state_postures(BODY, out.mean))
     assert ((z[:, None] - BEND.performance).abs() < 2 * BEND.std).all(-1).any(-1).all()
@@ -259,7 +260,7 @@ def test_joint_limits_hold_too(sequence):
             max_redraws=10,
         )
         state = tracker.init(states[0])
-        state, _ = tracker.step(state, silhouettes[:1], RIG, generator())
+        state, _ = tracker.step(state, silhouettes[:1], RIG, generator=generator())
         kept = state.particles[0][state.log_weights[0] > -torch.inf]
         assert len(kept) and limits.inside(kept).all()
 
@@ -279,10 +280,10 @@ def follow(action, states, n_particles, n_seeds):
         max_redraws=10,
     )  # fmt: skip
     generators = [generator(seed) for seed in range(n_seeds)]
-    state, details = tracker.init(states[0].expand(n_seeds, -1), generators), []
+    state, details = tracker.init(states[0].expand(n_seeds, -1), generator=generators), []
     for seen_now in states[1:]:
         seen.append(seen_now)
-        state, out = tracker.step(state, FRAME.expand(n_seeds, 1), None, generators)
+        state, out = tracker.step(state, FRAME.expand(n_seeds, 1), None, generator=generators)
         details.append(out.details)
     return {name: torch.stack([d[name] for d in details], 1) for name in details[0]}
 
@@ -336,7 +337,7 @@ def test_a_gate_that_rejects_everything_is_reported():
         BODY, BEND, 30, process_cov=(0.1 * STD) ** 2, likelihood=flat, max_redraws=3
     )
     with pytest.warns(DegenerateFilterWarning, match="all particles 1 times .element 0 at frame 0"):
-        state, out = tracker.step(tracker.init(start), FRAME, None, generator())
+        state, out = tracker.step(tracker.init(start), FRAME, None, generator=generator())
     assert out.details["clamped"] == 1 and out.details["acceptance"] == 0
     assert out.details["redraws"] == 3
     z = BEND.project(state_postures(BODY, state.particles[0]))
@@ -352,7 +353,7 @@ def test_a_gate_that_rejects_everything_is_reported():
         weights="normalised",
     )
     with pytest.warns(DegenerateFilterWarning):
-        _, out = normalised.step(normalised.init(start), FRAME, None, generator())
+        _, out = normalised.step(normalised.init(start), FRAME, None, generator=generator())
     assert not out.respread.any()  # all alike
 
 

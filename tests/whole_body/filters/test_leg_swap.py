@@ -126,9 +126,9 @@ def resampled(resampling="systematic", threshold=1.0):
     state = state._replace(memory=torch.zeros(2, 200, dtype=torch.long))
     frames = torch.tensor([[0.0], [3.0]], dtype=torch.float64)
     generators = [torch.Generator().manual_seed(i) for i in range(2)]
-    state, _ = model.step(state, frames, None, generators)
+    state, _ = model.step(state, frames, None, generator=generators)
     assert not bool(state.memory.any()), "nothing has been resampled before the first weights"
-    state, _ = model.step(state, frames, None, generators)
+    state, _ = model.step(state, frames, None, generator=generators)
     return body, before, state
 
 

@@ -65,7 +65,7 @@ def test_steps_and_batches_give_the_numbers_of_sequences_alone():
     state = filter_.init(starts[1:])
     generator = seeded(4)
     for t in range(4):
-        state, out = filter_.step(state, both[1:, t], rig(), generator)
+        state, out = filter_.step(state, both[1:, t], rig(), generator=generator)
         torch.testing.assert_close(out.mean[0], track.mean[1, t], rtol=0, atol=1e-9)
         torch.testing.assert_close(out.std[0], track.std[1, t], rtol=0, atol=1e-9)
     assert state.memory.shape == (1, 10, 10, 3, 3)
@@ -76,7 +76,7 @@ def test_roots_alone_are_drawn_and_parts_grow_by_the_learnt_diffusion():
     filter_ = tracker(10)
     state = filter_.init(truth[:1])
     empty = torch.zeros_like(silhouettes[:1])
-    after, out = filter_.step(state, empty, rig(), seeded(0))
+    after, out = filter_.step(state, empty, rig(), generator=seeded(0))
     assert bool(out.coasting) and float(out.log_evidence) == 0
     assert torch.equal(after.particles[..., 6:], state.particles[..., 6:])
     moved = after.particles[..., :6] - state.particles[..., :6]
@@ -84,7 +84,7 @@ def test_roots_alone_are_drawn_and_parts_grow_by_the_learnt_diffusion():
     mean = truth[0, 6:].view(-1, 3)
     grown = conditionals.diffuse(mean, state.memory[0, 0])[1]
     torch.testing.assert_close(after.memory[0], grown.expand_as(after.memory[0]))
-    again, later = filter_.step(after, empty, rig(), seeded(1))
+    again, later = filter_.step(after, empty, rig(), generator=seeded(1))
     assert bool((later.std > out.std).all())
     assert torch.equal(again.log_weights, state.log_weights)
 
@@ -95,7 +95,7 @@ def test_an_element_that_nobody_sees_coasts_beside_one_that_is_seen():
     state = filter_.init(truth[:2])
     frame = silhouettes[:2].clone()
     frame[1] = False
-    after, out = filter_.step(state, frame, rig(), seeded(0, 1))
+    after, out = filter_.step(state, frame, rig(), generator=seeded(0, 1))
     assert out.coasting.tolist() == [False, True]
     assert torch.equal(after.particles[1, :, 6:], state.particles[1, :, 6:])
     torch.testing.assert_close(after.log_weights[1], state.log_weights[1])
@@ -105,7 +105,7 @@ def test_an_element_that_nobody_sees_coasts_beside_one_that_is_seen():
 def test_hypotheses_weigh_as_the_product_over_parts_of_sums_over_places():
     body, _, truth, silhouettes = scene()
     filter_ = tracker(12, normalisation="published", camera_rule="sum")
-    after, _ = filter_.step(filter_.init(truth[:1]), silhouettes[:1], rig(), seeded(5))
+    after, _ = filter_.step(filter_.init(truth[:1]), silhouettes[:1], rig(), generator=seeded(5))
     mean = truth[0, 6:].view(-1, 3).expand(12, -1, -1)
     covariance = filter_.conditionals.diffuse(mean, filter_.first_memory(after.particles)[0])[1]
     points = sigma_points(mean, covariance, centre=True)
@@ -168,7 +168,7 @@ def test_hypotheses_that_all_die_are_spread_anew():
     elsewhere[..., :2, :2] = True  # a corner, far from every part
     filter_ = tracker(10, weighting="parts")
     with pytest.warns(DegenerateFilterWarning, match="all particles died"):
-        after, out = filter_.step(filter_.init(truth[:1]), elsewhere, rig(), seeded(0))
+        after, out = filter_.step(filter_.init(truth[:1]), elsewhere, rig(), generator=seeded(0))
     assert bool(out.respread) and torch.equal(out.mean, truth[:1])
     torch.testing.assert_close(after.memory, filter_.first_memory(after.particles))
 
@@ -178,9 +178,9 @@ def test_hypotheses_outside_the_limits_are_discarded():
     tight = JointLimits(truth[0, 6:] - 1e-4, truth[0, 6:] + 1e-4, torch.full((30,), 0.01).double())
     filter_ = tracker(5, limits=tight)
     with pytest.warns(DegenerateFilterWarning):
-        filter_.step(filter_.init(truth[:1]), silhouettes[:1], rig(), seeded(0))
+        filter_.step(filter_.init(truth[:1]), silhouettes[:1], rig(), generator=seeded(0))
     free = tracker(5, limits=JointLimits.fit(truth, margin=10.0))
-    _, out = free.step(free.init(truth[:1]), silhouettes[:1], rig(), seeded(0))
+    _, out = free.step(free.init(truth[:1]), silhouettes[:1], rig(), generator=seeded(0))
     assert not bool(out.respread)
 
 
@@ -201,7 +201,7 @@ def test_by_default_several_hypotheses_survive_at_every_frame_rate(fps):
     for n in (3, 20, 114):
         filter_ = tracker(n, fps=fps, survival_rate=None)
         assert filter_.survival_rate * n >= 2 - 1e-9
-    after, out = filter_.step(filter_.init(truth[:1]), silhouettes[:1], rig(), seeded(0))
+    after, out = filter_.step(filter_.init(truth[:1]), silhouettes[:1], rig(), generator=seeded(0))
     weights = after.log_weights[0].exp()
     left = float(weights.sum() ** 2 / weights.square().sum())
     assert left == pytest.approx(114 * filter_.survival_rate, rel=1e-6) and left > 10

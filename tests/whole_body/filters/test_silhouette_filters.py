@@ -17,7 +17,7 @@ from tests.filters.linear_poses import (
 from torchpose.errors import DegenerateFilterWarning, InputError, PriorError, ShapeError
 from torchpose.whole_body import (
     AnnealedParticleFilter,
-    BodyTrack,
+    BodyFilterOutput,
     ManifoldParticleFilter,
     SIRParticleFilter,
     default_step_std,
@@ -67,10 +67,12 @@ def kalman(z, noise=R):
     return [torch.stack(part) for part in zip(*out, strict=True)]
 
 
-def run(tracker, z, runs=RUNS, seed=0, initial_std=START_STD):
+def run(tracker, z, runs=RUNS, seed=0, initial_cov=START_STD**2):
     """The same sequence filtered `runs` times, as a batch."""
     frames = z.expand(runs, *z.shape)
-    return tracker(frames, None, START.expand(runs, -1), generator(seed), initial_std=initial_std)
+    return tracker(
+        frames, None, START.expand(runs, -1), generator=generator(seed), initial_cov=initial_cov
+    )
 
 
 def sir(n=3000, **options):
@@ -106,7 +108,7 @@ def test_sharpness_is_an_exponent_of_the_likelihood():
 def test_the_map_estimate_is_the_particle_of_the_largest_weight():
     z, tracker = observations(1, missing=()), sir(50, estimate="map")
     state = tracker.init(START[None])
-    state, out = tracker.step(state, z[:1], None, generator(3))
+    state, out = tracker.step(state, z[:1], None, generator=generator(3))
     assert (out.mean[0] == state.particles[0, state.log_weights[0].argmax()]).all()
 
 
@@ -152,15 +154,24 @@ def test_steps_are_the_run_and_elements_are_independent(name):
     tracker = filters()[name]
     z = torch.stack([observations(seed=s, missing=m) for s, m in ((1, ()), (2, (0, 4)), (3, (1,)))])
     start = START + torch.arange(3, dtype=WIDE)[:, None] / 10
-    out = tracker(z, None, start, generators(3))
+    out = tracker(z, None, start, generator=generators(3))
     assert out.mean.shape == (3, 6, 3) and out.coasting.shape == (3, 6)
     state, streams = tracker.init(start), generators(3)
     for t in range(6):
-        state, one = tracker.step(state, z[:, t], None, streams)
+        state, one = tracker.step(state, z[:, t], None, generator=streams)
         assert not out.details and not one.details
         for whole, part in zip(out[:-1], one[:-1], strict=True):
             torch.testing.assert_close(whole[:, t], part, rtol=0, atol=0, equal_nan=True)
-    alone = tracker(z[1], None, start[1], generator(1))
+    state, streams = tracker.init(start), generators(3)
+    for frames in (slice(0, 2), slice(2, 6)):
+        state, some = tracker.advance(state, z[:, frames], None, generator=streams)
+        for whole, part in zip(out[:-1], some[:-1], strict=True):
+            torch.testing.assert_close(whole[:, frames], part, rtol=0, atol=0, equal_nan=True)
+    with pytest.raises(ShapeError, match="one frame or more for each of the 3"):
+        tracker.advance(state, z[:, :0], None, generator=streams)
+    with pytest.raises(InputError, match="one for each of the 3"):
+        tracker.advance(state, z, None, generator=streams[:2])
+    alone = tracker(z[1], None, start[1], generator=generator(1))
     assert alone.mean.shape == (6, 3)
     for whole, part in zip(out[:-1], alone[:-1], strict=True):
         torch.testing.assert_close(whole[1], part, equal_nan=True)
@@ -171,7 +182,7 @@ def test_single_precision(name):
     tracker = filters()[name].float()
     likelihood = tracker.likelihood
     tracker.likelihood = lambda states, frame: likelihood(states.double(), frame)
-    out = tracker(observations(), None, START, generator())
+    out = tracker(observations(), None, START, generator=generator())
     assert out.mean.dtype == torch.float32 and out.log_evidence.dtype == WIDE
     assert out.mean.isfinite().all()
 
@@ -206,7 +217,7 @@ def test_particles_that_all_die_are_spread_about_the_last_mean(kind, value):
     healthy = observations(missing=())
     both, starts = torch.stack([healthy, z]), START.expand(2, -1)
     with pytest.warns(DegenerateFilterWarning, match=r"2 times \(element 1 at frame 2, element 1"):
-        out = tracker(both, None, starts, generators(2))
+        out = tracker(both, None, starts, generator=generators(2))
     expected = torch.zeros(2, 6, dtype=torch.bool)
     expected[1, 2:4] = True
     assert (out.respread == expected).all()
@@ -222,7 +233,9 @@ def test_particles_that_all_die_are_spread_about_the_last_mean(kind, value):
         assert (out.log_evidence[1, 2:4] == -math.inf).all()
         assert out.log_evidence[0].isfinite().all()
     # the other element saw nothing of it
-    torch.testing.assert_close(out.mean[0], tracker(healthy, None, START, generator(0)).mean)
+    torch.testing.assert_close(
+        out.mean[0], tracker(healthy, None, START, generator=generator(0)).mean
+    )
     assert out.effective_sample_size[1, 2:4] == pytest.approx(4000)
 
 
@@ -230,7 +243,7 @@ def test_a_step_warns_as_well():
     likelihood, z = killing([0])
     tracker = sir(10, likelihood=likelihood)
     with pytest.warns(DegenerateFilterWarning, match="1 times"):
-        tracker.step(tracker.init(START[None]), z[:1], None, generator())
+        tracker.step(tracker.init(START[None]), z[:1], None, generator=generator())
 
 
 # --- limits
@@ -239,10 +252,10 @@ def test_a_step_warns_as_well():
 def test_limits_clamp_or_discard():
     z = observations(missing=())
     clamped = sir(500, limits=BoxLimits(0.4))
-    state, out = clamped.step(clamped.init(START[None]), z[:1], None, generator())
+    state, out = clamped.step(clamped.init(START[None]), z[:1], None, generator=generator())
     assert (state.particles.abs() <= 0.4).all() and state.particles.abs().max() == 0.4
     discarding = sir(4000, limits=BoxLimits(0.4), limit_mode="discard")
-    state, out = discarding.step(discarding.init(START[None]), z[:1], None, generator())
+    state, out = discarding.step(discarding.init(START[None]), z[:1], None, generator=generator())
     inside = (state.particles.abs() <= 0.4).all(-1)
     assert inside.any() and not inside.all()
     assert (state.log_weights[~inside] == -math.inf).all()
@@ -253,7 +266,7 @@ def test_limits_clamp_or_discard():
     assert float(out.log_evidence) == pytest.approx(float(exact), abs=0.05)
     with pytest.warns(DegenerateFilterWarning):
         nothing = sir(10, limits=BoxLimits(-1.0), limit_mode="discard")
-        nothing(z, None, START, generator())
+        nothing(z, None, START, generator=generator())
 
 
 # --- the annealed filter
@@ -285,7 +298,7 @@ def test_the_noise_of_a_layer_shrinks_with_the_survival_rate():
         LinearBody(3), 20_000, n_layers=4, survival_rate=0.5, process_cov=STEP**2, likelihood=flat
     )
     z = observations(2, missing=(1,))
-    out = tracker(z, None, START, generator())
+    out = tracker(z, None, START, generator=generator())
     total = (1 + 0.5 + 0.25 + 0.125) ** 0.5
     torch.testing.assert_close(out.std[0], total * STEP, rtol=0.03, atol=0)
     # what nobody sees moves once
@@ -299,7 +312,7 @@ def test_the_estimate_is_that_of_the_last_layer():
     tracker = AnnealedParticleFilter(
         LinearBody(3), 200, process_cov=STEP**2, likelihood=gaussian_likelihood(H, R)
     )
-    state, out = tracker.step(tracker.init(START[None]), z, None, generator(4))
+    state, out = tracker.step(tracker.init(START[None]), z, None, generator=generator(4))
     expected = torch.einsum("bn,bnd->bd", state.log_weights.exp(), state.particles)
     torch.testing.assert_close(out.mean, expected)
     assert float(out.effective_sample_size) == pytest.approx(100)
@@ -323,8 +336,8 @@ def test_annealing_finds_a_narrow_peak_that_sir_misses():
     options = {"process_cov": 1.0, "likelihood": likelihood}
     annealed = AnnealedParticleFilter(LinearBody(4), 100, n_layers=10, **options)
     plain = SIRParticleFilter(LinearBody(4), 1000, **options)
-    near = (annealed(frames, None, start, generator()).mean - peak).norm(dim=-1)
-    far = (plain(frames, None, start, generator()).mean - peak).norm(dim=-1)
+    near = (annealed(frames, None, start, generator=generator()).mean - peak).norm(dim=-1)
+    far = (plain(frames, None, start, generator=generator()).mean - peak).norm(dim=-1)
     assert near.mean() < 0.5 * far.mean()
 
 
@@ -410,7 +423,7 @@ def test_how_far_particles_stray_without_evidence(weights):
     tracker = ManifoldParticleFilter(
         LinearBody(1), point, 4000, weights=weights, process_cov=0.1**2, likelihood=flat
     )
-    out = tracker(torch.ones(150, 1), None, tensor([0.0]), generator())
+    out = tracker(torch.ones(150, 1), None, tensor([0.0]), generator=generator())
     if weights == "published":  # P = (1 / (P + q) + 1 / s)^-1
         exact = (-q + (q * q + 4 * q * s) ** 0.5) / 2
     else:  # x <- (1 - k) x + N(0, k s), k = q / (q + s)
@@ -446,7 +459,7 @@ def test_columns_that_never_move_do_no_harm():
                 LinearBody(9, n_root=6), still, 50, weights=weights, proposal=proposal,
                 likelihood=flat,
             )  # fmt: skip
-            out = tracker(torch.ones(3, 1), None, torch.zeros(9, dtype=WIDE), generator())
+            out = tracker(torch.ones(3, 1), None, torch.zeros(9, dtype=WIDE), generator=generator())
             assert out.mean.isfinite().all()
             assert (out.std[:, 7] == 0).all() and (out.std[:, 6] > 0).all()
 
@@ -595,7 +608,7 @@ def test_inputs_that_are_refused():
     with pytest.raises(ShapeError, match="at least one"):
         tracker(masks[:0], None, torch.zeros(3))
     with pytest.raises(InputError, match="list of generators"):
-        tracker(masks, None, torch.zeros(3), generators(2))
+        tracker(masks, None, torch.zeros(3), generator=generators(2))
     with pytest.raises(ShapeError, match="one frame for each"):
         tracker.step(tracker.init(torch.zeros(2, 3)), masks, None)
-    assert BodyTrack._fields[:2] == ("mean", "log_evidence")
+    assert BodyFilterOutput._fields[:2] == ("mean", "log_evidence")

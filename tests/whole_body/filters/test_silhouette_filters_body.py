@@ -58,7 +58,7 @@ def make(kind, process_cov, manifold, **options):
 def test_a_walk_is_tracked(kind, sequence, process_cov, manifold):
     start, states, silhouettes = sequence
     tracker = make(kind, process_cov, manifold)
-    out = tracker(silhouettes, RIG, start, generator())
+    out = tracker(silhouettes, RIG, start, generator=generator())
     error = mean_joint_error(BODY, out.mean, BODY.joints(states))
     still = mean_joint_error(BODY, start.expand_as(states), BODY.joints(states))
     assert float(error) < 0.1 < 0.5 * float(still)
@@ -76,7 +76,7 @@ def test_empty_silhouettes_let_the_filter_coast(kind, sequence, process_cov, man
     one_blind = silhouettes[:12].clone()
     one_blind[:, 0] = False
     both = torch.stack([gone, one_blind])
-    out = make(kind, process_cov, manifold)(both, RIG, start, generator())
+    out = make(kind, process_cov, manifold)(both, RIG, start, generator=generator())
     expected = torch.zeros(2, 12, dtype=torch.bool)
     expected[0, 4:10] = True
     assert (out.coasting == expected).all()
@@ -93,7 +93,7 @@ def test_overlap_limits_and_single_precision(sequence, process_cov):
         walker().float(), 100, process_cov=process_cov, likelihood="overlap", sharpness=30.0,
         limits=limits.float(),
     )  # fmt: skip
-    out = tracker(silhouettes[:6], RIG, start, generator())
+    out = tracker(silhouettes[:6], RIG, start, generator=generator())
     assert out.mean.dtype == torch.float32
     # the mean of what lies in a box lies in it
     low, high = limits.lower - 1e-5, limits.upper + 1e-5
@@ -107,7 +107,7 @@ def test_a_body_that_no_camera_has_in_view_is_no_error(sequence, process_cov):
     behind = start.clone()
     behind[0] += 50.0
     out = SIRParticleFilter(BODY, 20, process_cov=process_cov)(
-        silhouettes[:2], RIG, behind, generator()
+        silhouettes[:2], RIG, behind, generator=generator()
     )
     # model and silhouette share nothing: both terms are 1 in every camera (MR 12)
     assert out.log_evidence.tolist() == pytest.approx([-2.0, -2.0])
@@ -154,7 +154,7 @@ def test_the_manifold_keeps_what_no_camera_shows_near_it(weights, sequence, proc
     }.items():
         state, seeds = tracker.init(start[None]), [generator(1)]
         for frame in frames:
-            state, _ = tracker.step(state, frame[None], None, seeds)
+            state, _ = tracker.step(state, frame[None], None, generator=seeds)
         relative = BODY.relative(state.particles)
         gap = (relative - manifold.reconstruct(relative)) / manifold.std_pose.clamp_min(1e-3)
         distance[name] = float(gap.square().mean().sqrt())

@@ -1,15 +1,15 @@
 """Check frames of silhouettes, and score how well states explain them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool
 from torch import Tensor
 
 from torchpose._core.checks import check_shape
 from torchpose.errors import InputError, ShapeError
-from torchpose.filters._base import Generators
+from torchpose.filters._base import Generators, check_generators
 from torchpose.whole_body._silhouettes.likelihood import silhouette_log_likelihood
 from torchpose.whole_body._silhouettes.rendering import (
     PreparedSilhouettes,
@@ -22,7 +22,7 @@ __all__ = [
     "Likelihood",
     "Score",
     "check_frame",
-    "check_lengths",
+    "check_frames",
     "check_sequences",
     "is_seen",
     "see_frame",
@@ -158,29 +158,9 @@ def check_sequences(
             f"of one frame; got {list(observed.shape)} and {list(initial_state.shape)}"
         )
     batch = max(len(frames), len(start))
-    if isinstance(generator, Sequence) and len(generator) != batch:
-        raise InputError(
-            f"a list of generators must hold one for each of the {batch} sequences, "
-            f"got {len(generator)}"
-        )
+    check_generators(generator, batch)
     frames, start = frames.expand(batch, *frames.shape[1:]), start.expand(batch, -1)
     return frames, start, batched or several
-
-
-def check_lengths(lengths: Tensor | None, batch: int, n_frames: int) -> Int[Tensor, " B"] | None:
-    """Return the frames of each sequence, None where all have as many.
-
-    Raises:
-        ShapeError: not [B]. InputError: not whole numbers from 1 to T.
-    """
-    if lengths is None:
-        return None
-    lengths = torch.as_tensor(lengths)
-    check_shape("lengths", lengths, [batch])
-    whole = not (lengths.dtype.is_floating_point or lengths.is_complex())
-    if not whole or bool(((lengths < 1) | (lengths > n_frames)).any()):
-        raise InputError(f"lengths must be integers from 1 to {n_frames}, got {lengths.tolist()}")
-    return lengths.long()
 
 
 def check_frame(observed: Tensor, batch: int, *, plain: bool) -> None:
@@ -197,6 +177,23 @@ def check_frame(observed: Tensor, batch: int, *, plain: bool) -> None:
     if plain:
         check_shape("silhouettes", observed, ["B", "C", "H", "W"])
         _check_silhouettes(observed)
+
+
+def check_frames(observed: Tensor, batch: int, generator: Generators, *, plain: bool) -> None:
+    """Raise unless these are one frame or more [B, T, ...] of B sequences, and generators suit.
+
+    Raises:
+        ShapeError, InputError: as `SilhouetteParticleFilter.advance`.
+    """
+    if plain:
+        check_shape("silhouettes", observed, ["B", "T", "C", "H", "W"])
+        _check_silhouettes(observed)
+    if observed.ndim < 2 or len(observed) != batch or observed.shape[1] == 0:
+        raise ShapeError(
+            f"silhouettes must hold one frame or more for each of the {batch} elements of the state, "
+            f"[B, T, C, H, W]; got {list(observed.shape)}"
+        )
+    check_generators(generator, batch)
 
 
 def _check_silhouettes(silhouettes: Tensor) -> None:

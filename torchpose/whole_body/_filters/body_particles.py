@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
+from torchpose._core.facade import set_up_facade
 from torchpose.body._kinematics import Body
 from torchpose.errors import DegenerateFilterWarning
 from torchpose.filters._base import Generators
@@ -18,17 +19,18 @@ from torchpose.whole_body._filters.body_frames import Likelihood
 
 __all__ = [
     "BodyFilterOptions",
+    "BodyFilterOutput",
     "BodyFilterState",
-    "BodyTrack",
     "PoseSpace",
     "WeightedParticles",
+    "WeightingOptions",
     "best_particle",
     "first_true",
     "joint_covariance",
     "particle_std",
     "resample_state",
     "reweight",
-    "stack_tracks",
+    "stack_outputs",
     "take_particles",
     "warn_of_frames",
 ]
@@ -55,11 +57,9 @@ class PoseSpace(Protocol):
     def mean(self, states: Tensor, log_weights: Tensor) -> Tensor: ...
 
 
-class BodyFilterOptions(TypedDict, total=False):
-    """The options of `SilhouetteParticleFilter`, which every filter over body poses has."""
+class WeightingOptions(TypedDict, total=False):
+    """The options of `SilhouetteParticleFilter` but for its noise."""
 
-    process_cov: Tensor | float | None
-    step_std: Tensor | float | None
     likelihood: str | Likelihood
     sharpness: float
     limits: Any | None
@@ -72,8 +72,17 @@ class BodyFilterOptions(TypedDict, total=False):
     respread_scale: float
 
 
-class BodyTrack(NamedTuple):
+class BodyFilterOptions(WeightingOptions, total=False):
+    """The options of `SilhouetteParticleFilter`, which every filter over body poses has."""
+
+    process_cov: Tensor | float | None
+    step_std: Tensor | float | None
+
+
+class BodyFilterOutput(NamedTuple):
     """Estimates of a sequence; [T, ...] from one sequence, [B, T, ...] from a batch, [B, ...] of a step.
+
+    A filter over bodies that fails goes on: in the frames of `respread` its particles are drawn anew.
 
     Past the length of a sequence its last estimate is repeated, with log-evidence 0.
 
@@ -99,13 +108,20 @@ class BodyTrack(NamedTuple):
 
     @property
     def failed_at(self) -> Int[Tensor, "*batch"]:
-        """Return the first frame in which all particles died, -1 where there is none."""
+        """Return the first frame in which all particles died, -1 where there is none; of sequences."""
         return first_true(self.respread)
 
-    def element(self, index: int) -> "BodyTrack":
+    @property
+    def failed(self) -> Bool[Tensor, "*batch"]:
+        """Return whether the filter failed, in any frame; of sequences."""
+        return self.respread.any(-1)
+
+    def element(self, index: int) -> "BodyFilterOutput":
         """Return the track of one element of a batch."""
         parts: dict[str, Any] = {name: getattr(self, name)[index] for name in self._fields[:-1]}
-        return BodyTrack(**parts, details={n: value[index] for n, value in self.details.items()})
+        return BodyFilterOutput(
+            **parts, details={n: value[index] for n, value in self.details.items()}
+        )
 
 
 class BodyFilterState(NamedTuple):
@@ -132,7 +148,7 @@ class WeightedParticles(NamedTuple):
     Attributes:
         particles: [B, N, D]. log_weights: normalised [B, N], float64; NaN in an element whose particles
             all died. log_evidence: of the frame, [B]; it counts where somebody is seen.
-        memory, trend: as in the state, of the new frame. details: as in `BodyTrack`, [B, ...].
+        memory, trend: as in the state, of the new frame. details: as in `BodyFilterOutput`, [B, ...].
     """
 
     particles: Tensor
@@ -148,7 +164,9 @@ def first_true(flags: Bool[Tensor, "*batch T"]) -> Int[Tensor, "*batch"]:
     return torch.where(flags.any(-1), flags.int().argmax(-1), -1)
 
 
-def stack_tracks(steps: Sequence[BodyTrack], lengths: Int[Tensor, " B"] | None = None) -> BodyTrack:
+def stack_outputs(
+    steps: Sequence[BodyFilterOutput], lengths: Int[Tensor, " B"] | None = None
+) -> BodyFilterOutput:
     """Put the steps [B, ...] of a run together as one track [B, T, ...].
 
     Args:
@@ -156,12 +174,12 @@ def stack_tracks(steps: Sequence[BodyTrack], lengths: Int[Tensor, " B"] | None =
     """
     parts: dict[str, Any] = {
         name: torch.stack([getattr(step, name) for step in steps], 1)
-        for name in BodyTrack._fields[:-1]
+        for name in BodyFilterOutput._fields[:-1]
     }
     names = steps[0].details
     details = {name: torch.stack([step.details[name] for step in steps], 1) for name in names}
     if lengths is None:
-        return BodyTrack(**parts, details=details)
+        return BodyFilterOutput(**parts, details=details)
     frames = torch.arange(len(steps), device=lengths.device)
     rows = torch.arange(len(lengths), device=lengths.device)[:, None]
     held = torch.minimum(frames, lengths[:, None] - 1)
@@ -169,7 +187,9 @@ def stack_tracks(steps: Sequence[BodyTrack], lengths: Int[Tensor, " B"] | None =
     parts = {name: value[rows, held] for name, value in parts.items()}
     parts["log_evidence"] = torch.where(inside, parts["log_evidence"], 0.0)
     parts["respread"] = parts["respread"] & inside
-    return BodyTrack(**parts, details={name: value[rows, held] for name, value in details.items()})
+    return BodyFilterOutput(
+        **parts, details={name: value[rows, held] for name, value in details.items()}
+    )
 
 
 def reweight(
@@ -270,3 +290,6 @@ def warn_of_frames(failed: Bool[Tensor, "B T"], text: str) -> None:
         DegenerateFilterWarning,
         stacklevel=4,
     )
+
+
+set_up_facade(__name__)

@@ -18,8 +18,8 @@ from torchpose.priors._actions.space import ActionSpace
 from torchpose.whole_body._filters.body_frames import Frame
 from torchpose.whole_body._filters.body_particles import (
     BodyFilterOptions,
+    BodyFilterOutput,
     BodyFilterState,
-    BodyTrack,
     PoseSpace,
     WeightedParticles,
     reweight,
@@ -76,9 +76,9 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
     hardly tells actions apart. The sums of weights are a posterior over actions, p(A_t | I_1:t); where
     none of them has the most, the motion is free, which `details["released"]` says.
 
-    Reported per frame in `BodyTrack.details`: "acceptance", the share of first draws that were accepted;
-    "redraws", how many more were drawn per particle; "clamped", a share; with a bank "actions" [A + 1],
-    none last, and "released".
+    Reported per frame in `BodyFilterOutput.details`: "acceptance", the share of first draws that were
+    accepted; "redraws", how many more were drawn per particle; "clamped", a share; with a bank "actions"
+    [A + 1], none last, and "released".
 
     Args:
         body: a `Body` of the joints of `BODY_15`.
@@ -177,7 +177,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         details = self._details(found, moved.log_weights, actions)
         return moved._replace(memory=memory, trend=trend, details=details)
 
-    def warn(self, track: BodyTrack) -> None:
+    def warn(self, track: BodyFilterOutput) -> None:
         """Warn of the frames in which all particles died, or the gate rejected every draw."""
         super().warn(track)
         warn_of_frames(track.details["clamped"] == 1, _REJECTED)
@@ -187,7 +187,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         """Return the names of the bank's actions, none last; empty without a bank."""
         return () if self.gate is None or not self.gate.several else tuple(self.gate.action.names)
 
-    def notes(self, track: BodyTrack, first_frame: int = 0) -> tuple[str, ...]:
+    def notes(self, track: BodyFilterOutput, first_frame: int = 0) -> tuple[str, ...]:
         """Return what the gate let through, and when it was released, in plain words."""
         if self.gate is None:
             return ()

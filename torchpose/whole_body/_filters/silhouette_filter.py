@@ -5,13 +5,12 @@ next. Batches, empty silhouettes, dead particles and the loop over time are hand
 """
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from jaxtyping import Float, Int
+from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchpose._core.checks import (
@@ -21,51 +20,46 @@ from torchpose._core.checks import (
     check_positive,
     check_shape,
 )
+from torchpose._core.former_arguments import rename_former_hook, takes_former_arguments
+from torchpose._core.moved import warn_of_former
 from torchpose.errors import InputError
 from torchpose.filters._base import Generators, standard_normal
+from torchpose.filters._measurements import check_lengths
 from torchpose.filters._outputs import effective_sample_size
 from torchpose.filters._resampling import RESAMPLING
 from torchpose.whole_body._filters.body_frames import (
-    Frame,
     Likelihood,
     check_frame,
-    check_lengths,
+    check_frames,
     check_sequences,
     see_frame,
     seen_until,
 )
 from torchpose.whole_body._filters.body_particles import (
+    BodyFilterOutput,
     BodyFilterState,
-    BodyTrack,
     PoseSpace,
     WeightedParticles,
     best_particle,
-    joint_covariance,
-    particle_std,
     resample_state,
-    stack_tracks,
-    warn_of_frames,
+    stack_outputs,
 )
+from torchpose.whole_body._filters.hooks import BodyFilterHooks
 from torchpose.whole_body._filters.legs import check_leg_swap, extra_copies, swap_legs
-from torchpose.whole_body._filters.motion import default_step_std, diffusion_std
+from torchpose.whole_body._filters.motion import diffusion_std, std_of_covariance
 from torchpose.whole_body._silhouettes.likelihood import LIKELIHOODS
 from torchpose.whole_body._silhouettes.outlines import check_limb_shape
 
 __all__ = ["SilhouetteParticleFilter"]
 
 _MOST_SPREAD = 10  # frames over which the noise of a filter that stays lost keeps growing
-_SHARPNESS = 100.0  # exponent of a likelihood in [-2, 0] that tells poses apart
-_DIED = (
-    "all particles died {times} times ({frames}) and were spread about the last mean; use more "
-    "particles, a larger process_cov, a smaller sharpness or wider joint limits"
-)
 
 
-class SilhouetteParticleFilter(nn.Module, ABC):
+class SilhouetteParticleFilter(BodyFilterHooks):
     """Base of the particle filters over body poses; a subclass implements `move`.
 
-    `forward` tracks whole sequences, `init` and `step` frame by frame, with the same numbers. Estimates have
-    no gradients: nothing runs through particles.
+    `forward` tracks whole sequences; `init`, then `step` (one frame) or `advance` (some more frames) give the
+    same numbers online. Estimates have no gradients: nothing runs through particles.
 
     Args:
         body: whose poses are tracked; anything with the methods of `PoseSpace`.
@@ -93,10 +87,6 @@ class SilhouetteParticleFilter(nn.Module, ABC):
     Raises:
         InputError, ShapeError: an argument is not as described.
     """
-
-    least_particles: ClassVar[int] = 1  # of a layer if there are several: two or more survive
-    unused: ClassVar[frozenset[str]] = frozenset()  # options that make no difference
-    step_std: Tensor
 
     def __init__(
         self,
@@ -136,98 +126,30 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         self.leg_swap, self.respread_scale = leg_swap, respread_scale
         self.register_buffer("step_std", diffusion_std(body, process_cov, step_std))
 
-    # --- what a subclass adds
-
-    @abstractmethod
-    def move(
-        self, state: BodyFilterState, frame: Frame, generator: Generators
-    ) -> WeightedParticles:
-        """Return weighted particles of the next frame from those of the last.
-
-        Args:
-            state: of the last frame, its particles resampled if that was due, with what was remembered
-                of them. frame: what is seen. generator: for what is drawn.
-        """
-
-    def first_memory(self, particles: Float[Tensor, "B N D"]) -> Tensor | None:
-        """Return what is remembered of new particles, [B, N, ...]; nothing by default."""
-        return None
-
-    def first_trend(self, mean: Float[Tensor, "B D"]) -> Tensor | None:
-        """Return what is remembered of an element before its first frame, [B, ...]; nothing by default."""
-        return None
-
-    def swap_memory(self, memory: Tensor, swapped: Bool[Tensor, "B N"]) -> Tensor:
-        """Return the memory of particles of which some have exchanged their legs; the same by default."""
-        return memory
-
-    def spread(
-        self,
-        particles: Float[Tensor, "B N D"],
-        log_weights: Float[Tensor, "B N"],
-        mean: Float[Tensor, "B D"],
-        memory: Tensor | None,
-    ) -> Float[Tensor, "B D"]:
-        """Return the standard deviation about the estimate, in the units of a step."""
-        return particle_std(self.body, particles, log_weights, mean)
-
-    def joint_covariance(
-        self, state: BodyFilterState, mean: Float[Tensor, "B D"]
-    ) -> Float[Tensor, "B J 3 3"]:
-        """Return the second moment of the joints of a `Body` about those of an estimate, metres squared."""
-        return joint_covariance(self.body, state, mean)  # type: ignore[arg-type]
-
-    def warn(self, track: BodyTrack) -> None:
-        """Warn of the frames of a track [B, T] in which the filter degenerated."""
-        warn_of_frames(track.respread, _DIED)
-
-    # --- how `BodyTracker` sets a filter up; a subclass may say otherwise
-
-    @classmethod
-    def likelihoods_per_particle(cls, options: Mapping[str, Any]) -> int:
-        """Return how many likelihoods of whole bodies one particle costs in a frame."""
-        return 1
-
-    @classmethod
-    def tracking_options(cls, body: Any, fps: float, learnt: Any = None) -> dict[str, Any]:
-        """Return the options that `BodyTracker` gives the filter where it is given none itself.
-
-        Args:
-            body: that is tracked. fps: frames per second. learnt: what the filter needs, if anything.
-        """
-        return {"process_cov": default_step_std(body, fps).square(), "sharpness": _SHARPNESS}
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        rename_former_hook(cls, "advance", "filter_frame")
 
     @property
-    def process_cov(self) -> Float[Tensor, " D"]:
-        """Return the variances of the diffusion per frame."""
-        return self.step_std.square()
-
-    def start_std(self) -> Float[Tensor, " D"]:
-        """Return the spread of particles about a first pose that was found in images."""
-        return 2 * self.step_std
-
-    @property
-    def action_names(self) -> tuple[str, ...]:
-        """Return the names of the columns of ``details["actions"]``; empty by default."""
-        return ()
-
-    def notes(self, track: BodyTrack, first_frame: int = 0) -> tuple[str, ...]:
-        """Return what is to be said of a track [T], whose first frame has this number."""
-        return ()
+    def _plain(self) -> bool:
+        """Return whether observations are silhouettes, and not what a callable takes."""
+        return not callable(self.likelihood)
 
     # --- running
 
+    @takes_former_arguments
     @torch.no_grad()
     def forward(
         self,
         silhouettes: Tensor,
         cameras: Any,
         initial_state: Tensor,
+        *,
         generator: Generators = None,
         lengths: Tensor | None = None,
+        initial_cov: Tensor | float | None = None,
         progress: bool = False,
-        initial_std: Tensor | None = None,
-    ) -> BodyTrack:
+    ) -> BodyFilterOutput:
         """Track one person through a sequence, or several through a batch of sequences.
 
         Args:
@@ -238,81 +160,134 @@ class SilhouetteParticleFilter(nn.Module, ABC):
             generator: one generator, or a list of one for each sequence, which makes a sequence's
                 numbers independent of its batch.
             lengths: [B], frames of each sequence; past them its last estimate is repeated.
+            initial_cov: variances of the first particles, as `process_cov`; none if None, as published.
             progress: whether to show a progress bar.
-            initial_std: [D], spread of the first particles; none if None, as published.
 
         Returns:
-            `BodyTrack`, with the dimension of the batch if there was one.
+            `BodyFilterOutput`, with the dimension of the batch if there was one.
 
         Raises:
             ShapeError: sizes that do not match. InputError: no frames, values that are not finite,
             silhouettes that are not bool, lengths outside 1..T. CameraError: as the likelihood.
         """
         frames, start, batched = check_sequences(
-            silhouettes,
-            initial_state,
-            generator,
-            self.body.dim,
-            plain=not callable(self.likelihood),
+            silhouettes, initial_state, generator, self.body.dim, plain=self._plain
         )
-        lengths = check_lengths(lengths, *frames.shape[:2])
-        state = self.init(start, generator, initial_std)
-        steps = []
-        for t in tqdm(range(frames.shape[1]), disable=not progress, unit="frame"):
-            shown = frames[:, t] if lengths is None else seen_until(lengths > t, frames[:, t])
-            state, out = self.advance(state, shown, cameras, generator)
-            steps.append(out)
-        track = stack_tracks(steps, lengths)
-        self.warn(track)
+        if lengths is not None:
+            lengths = check_lengths(lengths, len(frames), frames.shape[1], self.step_std.device)
+        state = self.init(start, generator=generator, initial_cov=initial_cov)
+        track = self._run(state, frames, cameras, generator, lengths, progress)[1]
         return track if batched else track.element(0)
 
+    @takes_former_arguments
     @torch.no_grad()
     def init(
         self,
         initial_state: Float[Tensor, "*B D"],
+        *,
         generator: Generators = None,
-        initial_std: Tensor | None = None,
+        initial_cov: Tensor | float | None = None,
     ) -> BodyFilterState:
-        """Return N copies of the initial state, spread if `initial_std` [D] is given (step 1, MR)."""
+        """Return N copies of the initial state, spread if `initial_cov` is given (step 1, MR).
+
+        Args:
+            initial_state: the pose before the first frame, [D] or [B, D]. generator, initial_cov: as in
+                `forward`.
+
+        Raises:
+            ShapeError, InputError: as `forward`.
+        """
         start = initial_state.to(self.step_std).reshape(-1, initial_state.shape[-1])
         check_shape("initial_state", start, ["B", self.body.dim])
         check_finite("initial_state", start)
         particles = start[:, None].expand(-1, self.n_particles, -1).contiguous()
-        if initial_std is not None:
-            spread = torch.as_tensor(initial_std).to(self.step_std)
-            particles = self.diffuse(particles, spread, generator)
+        if initial_cov is not None:
+            spread = std_of_covariance("initial_cov", initial_cov, self.body.dim)
+            particles = self.diffuse(particles, spread.to(self.step_std), generator)
         uniform = torch.full(particles.shape[:2], -math.log(self.n_particles))
         uniform = uniform.to(start.device, torch.float64)
         lost = torch.zeros(len(start), dtype=torch.long, device=start.device)
         memory, trend = self.first_memory(particles), self.first_trend(start)
         return BodyFilterState(particles, uniform, start, lost, memory, trend)
 
+    @takes_former_arguments
     @torch.no_grad()
     def step(
         self,
         state: BodyFilterState,
         silhouettes: Tensor,
         cameras: Any,
+        *,
         generator: Generators = None,
-    ) -> tuple[BodyFilterState, BodyTrack]:
+    ) -> tuple[BodyFilterState, BodyFilterOutput]:
         """Track one more frame: the same numbers as the same frame of `forward`.
 
         Args:
-            state: from `init` or the step before. silhouettes: [B, C, H, W], bool.
+            state: from `init`, `step` or `advance`. silhouettes: [B, C, H, W], bool.
             cameras, generator: as in `forward`.
 
         Returns:
-            The next state, and a `BodyTrack` without the dimension of time.
+            The next state, and a `BodyFilterOutput` without the dimension of time.
+
+        Raises:
+            ShapeError, InputError, CameraError: as `forward`.
         """
-        check_frame(silhouettes, len(state.mean), plain=not callable(self.likelihood))
-        state, out = self.advance(state, silhouettes, cameras, generator)
-        self.warn(stack_tracks([out]))
+        check_frame(silhouettes, len(state.mean), plain=self._plain)
+        state, out = self.filter_frame(state, silhouettes, cameras, generator)
+        self.warn(stack_outputs([out]))
         return state, out
 
+    @takes_former_arguments
+    @torch.no_grad()
     def advance(
+        self,
+        state: BodyFilterState,
+        silhouettes: Tensor,
+        cameras: Any,
+        *,
+        generator: Generators = None,
+    ) -> tuple[BodyFilterState, BodyFilterOutput]:
+        """Track some more frames: the same numbers as `step` for one after the other.
+
+        Args:
+            state: from `init`, `step` or `advance`. silhouettes: [B, T, C, H, W], bool.
+            cameras, generator: as in `forward`.
+
+        Returns:
+            The next state, and a `BodyFilterOutput` [B, T].
+
+        Raises:
+            ShapeError, InputError, CameraError: as `forward`.
+        """
+        if self._plain and silhouettes.ndim == 4:
+            warn_of_former("advance is of several frames now, filter_frame of one; one frame goes")
+            return self.filter_frame(state, silhouettes, cameras, generator)
+        check_frames(silhouettes, len(state.mean), generator, plain=self._plain)
+        return self._run(state, silhouettes, cameras, generator)
+
+    def _run(
+        self,
+        state: BodyFilterState,
+        frames: Tensor,
+        cameras: Any,
+        generator: Generators,
+        lengths: Int[Tensor, " B"] | None = None,
+        progress: bool = False,
+    ) -> tuple[BodyFilterState, BodyFilterOutput]:
+        """Return the state after some frames [B, T, ...], and their estimates: the one loop over time."""
+        steps = []
+        for t in tqdm(range(frames.shape[1]), disable=not progress, unit="frame"):
+            shown = frames[:, t] if lengths is None else seen_until(lengths > t, frames[:, t])
+            state, out = self.filter_frame(state, shown, cameras, generator)
+            steps.append(out)
+        track = stack_outputs(steps, lengths)
+        self.warn(track)
+        return state, track
+
+    def filter_frame(
         self, state: BodyFilterState, silhouettes: Tensor, cameras: Any, generator: Generators
-    ) -> tuple[BodyFilterState, BodyTrack]:
-        """Track one more frame, as `step`, of silhouettes that were checked; without warnings."""
+    ) -> tuple[BodyFilterState, BodyFilterOutput]:
+        """Return the next state and the estimate, given a checked frame [B, C, H, W]; without warnings."""
         frame = see_frame(
             self.body, silhouettes.to(self.step_std.device), cameras, self.likelihood,
             self.sharpness, self.limb_shape,
@@ -326,7 +301,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         mean = self._estimate(particles, log_weights)
         mean = torch.where(dead[:, None], state.mean, mean)
         evidence = torch.where(frame.seen, moved.log_evidence, 0.0)  # exactly: without rounding
-        out = BodyTrack(
+        out = BodyFilterOutput(
             mean, torch.where(dead & ~evidence.isnan(), -torch.inf, evidence),
             self.spread(particles, log_weights, mean, moved.memory),
             effective_sample_size(log_weights), ~frame.seen, dead, moved.details or {},

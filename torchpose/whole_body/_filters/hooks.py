@@ -1,0 +1,121 @@
+"""Define what a filter over body poses says for itself; all but `move` has a usual form here."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from torchpose.filters._base import Generators
+from torchpose.whole_body._filters.body_frames import Frame
+from torchpose.whole_body._filters.body_particles import (
+    BodyFilterOutput,
+    BodyFilterState,
+    PoseSpace,
+    WeightedParticles,
+    joint_covariance,
+    particle_std,
+    warn_of_frames,
+)
+from torchpose.whole_body._filters.motion import default_step_std
+
+__all__ = ["BodyFilterHooks"]
+
+_SHARPNESS = 100.0  # exponent of a likelihood in [-2, 0] that tells poses apart
+_DIED = (
+    "all particles died {times} times ({frames}) and were spread about the last mean; use more "
+    "particles, a larger process_cov, a smaller sharpness or wider joint limits"
+)
+
+
+class BodyFilterHooks(nn.Module, ABC):
+    """What `SilhouetteParticleFilter` and `BodyTracker` ask of a filter.
+
+    Attributes:
+        body: whose poses are tracked. step_std: standard deviations of the diffusion per frame [D].
+    """
+
+    least_particles: ClassVar[int] = 1  # of a layer if there are several: two or more survive
+    unused: ClassVar[frozenset[str]] = frozenset()  # options that make no difference
+    body: PoseSpace
+    step_std: Tensor
+
+    # --- what a subclass adds
+
+    @abstractmethod
+    def move(
+        self, state: BodyFilterState, frame: Frame, generator: Generators
+    ) -> WeightedParticles:
+        """Return weighted particles of the next frame from those of the last.
+
+        Args:
+            state: of the last frame, its particles resampled if that was due, with what was remembered
+                of them. frame: what is seen. generator: for what is drawn.
+        """
+
+    def first_memory(self, particles: Float[Tensor, "B N D"]) -> Tensor | None:
+        """Return what is remembered of new particles, [B, N, ...]; nothing by default."""
+        return None
+
+    def first_trend(self, mean: Float[Tensor, "B D"]) -> Tensor | None:
+        """Return what is remembered of an element before its first frame, [B, ...]; nothing by default."""
+        return None
+
+    def swap_memory(self, memory: Tensor, swapped: Bool[Tensor, "B N"]) -> Tensor:
+        """Return the memory of particles of which some have exchanged their legs; the same by default."""
+        return memory
+
+    def spread(
+        self,
+        particles: Float[Tensor, "B N D"],
+        log_weights: Float[Tensor, "B N"],
+        mean: Float[Tensor, "B D"],
+        memory: Tensor | None,
+    ) -> Float[Tensor, "B D"]:
+        """Return the standard deviation about the estimate, in the units of a step."""
+        return particle_std(self.body, particles, log_weights, mean)
+
+    def joint_covariance(
+        self, state: BodyFilterState, mean: Float[Tensor, "B D"]
+    ) -> Float[Tensor, "B J 3 3"]:
+        """Return the second moment of the joints of a `Body` about those of an estimate, metres squared."""
+        return joint_covariance(self.body, state, mean)  # type: ignore[arg-type]
+
+    def warn(self, track: BodyFilterOutput) -> None:
+        """Warn of the frames of a track [B, T] in which the filter degenerated."""
+        warn_of_frames(track.respread, _DIED)
+
+    # --- how `BodyTracker` sets a filter up; a subclass may say otherwise
+
+    @classmethod
+    def likelihoods_per_particle(cls, options: Mapping[str, Any]) -> int:
+        """Return how many likelihoods of whole bodies one particle costs in a frame."""
+        return 1
+
+    @classmethod
+    def tracking_options(cls, body: Any, fps: float, learnt: Any = None) -> dict[str, Any]:
+        """Return the options that `BodyTracker` gives the filter where it is given none itself.
+
+        Args:
+            body: that is tracked. fps: frames per second. learnt: what the filter needs, if anything.
+        """
+        return {"process_cov": default_step_std(body, fps).square(), "sharpness": _SHARPNESS}
+
+    @property
+    def process_cov(self) -> Float[Tensor, " D"]:
+        """Return the variances of the diffusion per frame."""
+        return self.step_std.square()
+
+    def start_std(self) -> Float[Tensor, " D"]:
+        """Return the spread of particles about a first pose that was found in images."""
+        return 2 * self.step_std
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """Return the names of the columns of ``details["actions"]``; empty by default."""
+        return ()
+
+    def notes(self, track: BodyFilterOutput, first_frame: int = 0) -> tuple[str, ...]:
+        """Return what is to be said of a track [T], whose first frame has this number."""
+        return ()
