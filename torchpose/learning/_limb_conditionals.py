@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Unpack
 
 import torch
 from jaxtyping import Float, Int
@@ -15,7 +15,9 @@ from torchpose.errors import InputError
 from torchpose.math._rotation_gaussians import fit_gaussian, safe_centre
 from torchpose.math._rotations import compose, conjugate
 from torchpose.math._unscented import floor_eigenvalues
+from torchpose.priors._facts import FitFacts
 from torchpose.priors._limb_conditionals import (
+    LEAST_STD,
     PART_TREE,
     LimbConditionals,
     LimbInfo,
@@ -24,7 +26,6 @@ from torchpose.priors._limb_conditionals import (
 
 __all__ = ["edge_rotations", "fit_limb_conditionals", "frame_rotations", "part_rotations"]
 
-_LEAST_STD = 0.01  # of a vector: 1.1 degrees, about what joints tell of a rotation
 _MOST_CANDIDATES = 2000  # training rotations that a centre is looked for among
 _STRIDES = (2, 3, 4)  # frames, over which the growth of diffusion is looked at
 
@@ -35,8 +36,8 @@ def fit_limb_conditionals(
     fps: float,
     *,
     edges: Sequence[tuple[str, str]] = PART_TREE,
-    least_std: float = _LEAST_STD,
-    **facts: Any,
+    least_std: float = LEAST_STD,
+    **facts: Unpack[FitFacts],
 ) -> LimbConditionals:
     """Fit limb conditionals and diffusion to recorded states.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple, Unpack
 
 import torch
 from jaxtyping import Float
@@ -13,7 +13,7 @@ from torch import Tensor
 from torchpose.errors import InputError
 from torchpose.learning._blocks import ALONE, Share, usable_samples
 from torchpose.learning._samplers import SampleSource
-from torchpose.learning._streamed_em import StreamedEM, run_streamed
+from torchpose.learning._streamed_em import StartOptions, StreamedEM, run_streamed
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
 __all__ = ["RULES", "Candidate", "Selection", "held_out_scores", "select_n_components"]
@@ -84,7 +84,7 @@ def select_n_components(
     tol: float = 1e-3,
     share: Share = ALONE,
     progress: bool = False,
-    **options: Any,
+    **options: Unpack[StartOptions],
 ) -> Selection:
     """Fit a mixture for each number of components and compare them on held-out states.
 

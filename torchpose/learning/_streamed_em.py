@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import torch
 from torch import Tensor
@@ -39,6 +39,7 @@ __all__ = [
     "START_SAMPLES",
     "ColumnsSource",
     "MixtureTask",
+    "StartOptions",
     "StreamedEM",
     "complete_mixture",
     "fit_streamed",
@@ -167,6 +168,15 @@ class StreamedEM(MixtureFit):
         return mixture
 
 
+class StartOptions(TypedDict, total=False):
+    """The options of `StreamedEM.start`."""
+
+    start_samples: int
+    covariance_floor: float
+    init: str | MixtureParameters
+    dtype: torch.dtype
+
+
 def fit_streamed(
     source: SampleSource,
     n_components: int,
@@ -176,7 +186,7 @@ def fit_streamed(
     tol: float = 1e-4,
     share: Share = ALONE,
     progress: bool = False,
-    **options: Any,
+    **options: Unpack[StartOptions],
 ) -> GaussianMixture:
     """Fit a mixture to a source that may be larger than memory, by one process or by many.
 

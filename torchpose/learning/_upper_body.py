@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import torch
 from jaxtyping import Float
@@ -45,6 +45,17 @@ KINECT_CAMERA = (525.0, 525.0, 319.5, 239.5)
 """fx, fy, cx, cy of a Kinect's camera at 640 x 480, pixels."""
 
 
+class MixtureFitOptions(TypedDict, total=False):
+    """The options of `GaussianMixture.fit` that `fit_upper_body_prior` does not set itself."""
+
+    n_init: int
+    max_iter: int
+    tol: float
+    covariance_floor: float
+    init: str
+    dtype: torch.dtype
+
+
 def fit_upper_body_prior(
     recordings: Sequence[RecordingLike],
     n_components: int = 30,
@@ -63,7 +74,7 @@ def fit_upper_body_prior(
     licence: str = "",
     command: str = "",
     progress: bool = False,
-    **fit_options: Any,
+    **fit_options: Unpack[MixtureFitOptions],
 ) -> UpperBodyPrior:
     """Fit a prior to recorded 3D poses seen from random viewpoints (BL section 3.1).
 
@@ -96,8 +107,8 @@ def fit_upper_body_prior(
     sources = arm_sources(
         poses, camera.matrix, seed, views, rotation_order, mirror, n_samples, views_per_pose
     )
-    options: dict[str, Any] = {"n_components": n_components, "seed": seed}
-    options |= {"progress": progress} | fit_options
+    options: dict[str, Any] = {"n_components": n_components, "seed": seed, "progress": progress}
+    options |= fit_options
     left = _fit_arm(sources.left, options)
     right = None if sources.right is None else _fit_arm(sources.right, options)
     info = PriorInfo(

@@ -8,7 +8,7 @@ are what `torchpose.math._tree_messages` passes messages with.
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import torch
 from jaxtyping import Float, Int
@@ -31,8 +31,16 @@ from torchpose.math._rotation_gaussians import (
 from torchpose.math._rotations import compose, conjugate, vector_to_quaternion
 from torchpose.math._tree_messages import message_tree
 from torchpose.math._unscented import Directions
+from torchpose.priors._facts import FitFacts
 
-__all__ = ["PART_TREE", "LimbConditionals", "LimbInfo", "check_body_frame", "in_body_frame"]
+__all__ = [
+    "LEAST_STD",
+    "PART_TREE",
+    "LimbConditionals",
+    "LimbInfo",
+    "check_body_frame",
+    "in_body_frame",
+]
 
 _SIDES = ("left", "right")
 PART_TREE: tuple[tuple[str, str], ...] = (
@@ -73,6 +81,9 @@ class LimbInfo:
     command: str = ""
     extra: dict[str, Any] = field(default_factory=dict)
 
+
+LEAST_STD = 0.01
+"""Least deviation of a fitted limb: 1.1 degrees, about what joints tell of a rotation."""
 
 _KIND = FileKind(
     "torchpose-limb-conditionals",
@@ -177,11 +188,23 @@ class LimbConditionals(nn.Module):
             register_given(self, name, value)
 
     @classmethod
-    def fit(cls, *args: Any, **options: Any) -> "LimbConditionals":
+    def fit(
+        cls,
+        body: Body,
+        sequences: Tensor | Sequence[Tensor],
+        fps: float,
+        *,
+        edges: Sequence[tuple[str, str]] = PART_TREE,
+        least_std: float = LEAST_STD,
+        **facts: Unpack[FitFacts],
+    ) -> "LimbConditionals":
         """Fit limbs. Deprecated: `torchpose.learning.fit_limb_conditionals`, with the same arguments."""
         # learning is a layer above: until this goes, it is looked up by its name
         name = "torchpose.learning.fit_limb_conditionals"
-        limbs: LimbConditionals = moved_function("LimbConditionals.fit", name)(*args, **options)
+        fit = moved_function("LimbConditionals.fit", name)
+        limbs: LimbConditionals = fit(
+            body, sequences, fps, edges=edges, least_std=least_std, **facts
+        )
         return limbs
 
     # --- messages -----------------------------------------------------------------------------

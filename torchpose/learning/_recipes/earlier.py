@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Unpack
 
 from torchpose.camera._viewpoints import ViewRange
 from torchpose.errors import InputError
+from torchpose.learning._recipes.settings import RecipeSettings
 from torchpose.learning._recipes.upper_body import VERSION, UpperBodyRecipe, fit_kinect_prior
 from torchpose.learning._training import RecordingLike
 from torchpose.priors._upper_body import UpperBodyPrior
@@ -14,19 +15,22 @@ from torchpose.priors._window import WindowLayout
 __all__ = ["fit_recipe_2", "renew_noise"]
 
 
-def fit_recipe_2(recordings: Sequence[RecordingLike], **settings: Any) -> UpperBodyPrior:
+def fit_recipe_2(
+    recordings: Sequence[RecordingLike], **settings: Unpack[RecipeSettings]
+) -> UpperBodyPrior:
     """Fit the recipe of the first shipped prior: windows without torso axes, bodies of less variety.
 
     Args:
         recordings: in camera axes. settings: to `fit_kinect_prior`.
     """
-    layouts = {
+    usual: RecipeSettings = {
+        "body_size": 0.15,
+        "bone_lengths": 0.10,
         "causal": WindowLayout((4, 10, 20), (0, 10)),
         "full": WindowLayout((4, 8, 16, -4, -8, -16), (0, 8, -8)),
     }
-    return fit_kinect_prior(
-        recordings, **({"body_size": 0.15, "bone_lengths": 0.10} | layouts | settings)
-    )
+    usual.update(settings)
+    return fit_kinect_prior(recordings, **usual)
 
 
 def renew_noise(

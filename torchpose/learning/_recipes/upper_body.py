@@ -7,7 +7,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from torch import Tensor
@@ -24,6 +24,7 @@ from torchpose.learning._recipes.calibration import (
     folds,
     track_held_out,
 )
+from torchpose.learning._recipes.settings import RecipeSettings
 from torchpose.learning._samplers import SampleSource, WindowSource, derived_seed
 from torchpose.learning._streamed_em import ColumnsSource, MixtureTask
 from torchpose.learning._training import (
@@ -369,7 +370,7 @@ def fit_kinect_prior(
     licence: str = "",
     command: str = "",
     progress: bool = False,
-    **settings: Any,
+    **settings: Unpack[RecipeSettings],
 ) -> UpperBodyPrior:
     """Fit the recipe of the shipped prior to recorded 3D poses: `UpperBodyRecipe.fit`.
 

@@ -117,20 +117,46 @@ class ActionSpace(nn.Module):
             self.register_buffer(name, value)
 
     @classmethod
-    def fit(cls, *args: Any, **options: Any) -> "ActionSpace":
+    def fit(
+        cls,
+        performances: Sequence[Float[Tensor, "_ 36"]],
+        n_dimensions: int = 13,
+        *,
+        name: str = "",
+        fps: float | None = None,
+        n_postures: int | None = None,
+        prominence: float = 0.15,
+        info: ActionInfo | None = None,
+    ) -> "ActionSpace":
         """Fit an action. Deprecated: `torchpose.learning.fit_action_space` takes the same arguments."""
         # learning is a layer above: until this goes, it is looked up by its name
         fit = moved_function("ActionSpace.fit", "torchpose.learning.fit_action_space")
-        space: ActionSpace = fit(*args, **options)
+        space: ActionSpace = fit(
+            performances, n_dimensions, name=name, fps=fps, n_postures=n_postures,
+            prominence=prominence, info=info,
+        )  # fmt: skip
         return space
 
     @classmethod
-    def fit_synchronised(cls, *args: Any, **options: Any) -> tuple["ActionSpace", Any]:
+    def fit_synchronised(
+        cls,
+        performances: Sequence[Float[Tensor, "_ 36"]],
+        n_dimensions: int = 13,
+        *,
+        name: str = "",
+        fps: float | None = None,
+        n_postures: int | None = None,
+        prominence: float = 0.15,
+        info: ActionInfo | None = None,
+    ) -> tuple["ActionSpace", Any]:
         """Fit an action. Deprecated: `torchpose.learning._action_spaces.fit_synchronised`."""
         # as in `fit`
-        name = "torchpose.learning._action_spaces.fit_synchronised"
-        fit = moved_function("ActionSpace.fit_synchronised", name)
-        found: tuple[ActionSpace, Any] = fit(*args, **options)
+        home = "torchpose.learning._action_spaces.fit_synchronised"
+        fit = moved_function("ActionSpace.fit_synchronised", home)
+        found: tuple[ActionSpace, Any] = fit(
+            performances, n_dimensions, name=name, fps=fps, n_postures=n_postures,
+            prominence=prominence, info=info,
+        )  # fmt: skip
         return found
 
     # --- sizes ------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from torch import Tensor
 
@@ -18,6 +18,7 @@ from torchpose._core.tensor_file import (
     write_tensors,
 )
 from torchpose.errors import PriorError
+from torchpose.priors._facts import ManifoldFacts
 
 __all__ = ["TENSORS", "ManifoldInfo", "read_manifold", "write_manifold"]
 
@@ -58,7 +59,7 @@ class ManifoldInfo:
     extra: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def of_body(cls, body: Any, **facts: Any) -> ManifoldInfo:
+    def of_body(cls, body: Any, **facts: Unpack[ManifoldFacts]) -> ManifoldInfo:
         """Return info with the skeleton, columns, frame and centres of a body, and other facts as given."""
         return cls(
             skeleton=tuple(body.skeleton.names),

@@ -1,0 +1,24 @@
+"""Name the facts about a fit that only whoever fits knows."""
+
+from typing import Any, TypedDict
+
+__all__ = ["FitFacts", "ManifoldFacts"]
+
+
+class FitFacts(TypedDict, total=False):
+    """The fields of `LimbInfo` that do not follow from body and states."""
+
+    name: str
+    persons: tuple[str, ...]
+    actions: tuple[str, ...]
+    sources: tuple[str, ...]
+    licence: str
+    command: str
+    extra: dict[str, Any]
+
+
+class ManifoldFacts(FitFacts, total=False):
+    """The fields of `ManifoldInfo` that do not follow from the body."""
+
+    fps: float | None
+    sequences: tuple[str, ...]
