@@ -10,7 +10,6 @@ import torch
 from tests.priors.performances import performances
 from torchpose.errors import FileFormatError, InputError, ShapeError
 from torchpose.learning import fit_action_space
-from torchpose.learning._action_spaces import Performed, recognition_of_unseen
 from torchpose.priors import ActionBank, ActionSpace
 from torchpose.priors._actions.gate import match_postures
 
@@ -157,30 +156,6 @@ def test_actions_are_recognised_in_turn(bank):
     for i, action in enumerate((1, 0, bank.none)):
         part = told[i * third + 30 : (i + 1) * third - 10]
         assert float((part == action).double().mean()) > 0.8, action
-
-
-def test_unseen_persons_are_told_apart():
-    def recorded(actions, seed):
-        return [
-            Performed(f"p{p}", f"action {i}", posture)
-            for i in actions
-            for p in range(4)
-            for posture in performances(4, i, 24, seed=seed + 10 * p + i)
-        ]
-
-    found = recognition_of_unseen(
-        recorded((0, 1), 0), recorded((0, 1, 7), 500), 30.0, n_dimensions=4
-    )
-    assert found.truth == ("action 0", "action 1", "action 7")
-    assert found.columns == ("action 0", "action 1", "none")
-    assert found.n_recordings.tolist() == [16, 16, 16]
-    assert float(found.correct().min()) > 0.8
-    torch.testing.assert_close(found.frames.sum(-1), torch.ones(3).double())
-    with pytest.raises(InputError, match="without p0 there are 0 performances of action 0"):
-        one = [p for p in recorded((0,), 0) if p.person == "p0"]
-        recognition_of_unseen(one, one, 30.0)
-    with pytest.raises(InputError, match="got none"):
-        recognition_of_unseen([], [], 30.0)
 
 
 def test_files(bank, spaces, tmp_path):

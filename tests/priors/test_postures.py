@@ -8,7 +8,7 @@ import torch
 from torchpose.body import BODY_15, Body, BodySkeleton
 from torchpose.errors import InputError, ShapeError, SkeletonError
 from torchpose.math._rotations import rotvec_to_matrix
-from torchpose.priors._actions.polar_limbs import ANGLE_NAMES, LIMBS_12, check_limbs
+from torchpose.priors._actions.polar_limbs import LIMBS_12, check_limbs
 from torchpose.priors._actions.postures import (
     normalise_postures,
     posture_angles,
@@ -20,8 +20,8 @@ from torchpose.priors._actions.postures import (
 
 
 def angle(postures, limb):
-    at = [ANGLE_NAMES.index(f"{limb} {axis}") for axis in "xyz"]
-    return postures[..., at]
+    first = 3 * [one.name for one in LIMBS_12].index(limb)
+    return postures[..., first : first + 3]
 
 
 def random_states(body, count=200, seed=0, size=0.6):

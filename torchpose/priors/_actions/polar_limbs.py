@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from torchpose.errors import SkeletonError
 
-__all__ = ["ANGLE_NAMES", "LIMBS_12", "LIMB_PARENTS", "POSTURE_DIM", "PolarLimb", "check_limbs"]
+__all__ = ["LIMBS_12", "LIMB_PARENTS", "POSTURE_DIM", "PolarLimb", "check_limbs"]
 
 Axis = tuple[float, float, float]
 
@@ -60,9 +60,6 @@ LIMB_PARENTS = tuple(_NAMES.index(limb.parent) if limb.parent else -1 for limb i
 
 POSTURE_DIM = 3 * len(LIMBS_12)
 """36 angles: those of a limb stand together, about x (left), y (up), z (forward)."""
-
-ANGLE_NAMES = tuple(f"{name} {axis}" for name in _NAMES for axis in "xyz")
-"""Names of the 36 angles."""
 
 
 def check_limbs(names: Sequence[str]) -> None:

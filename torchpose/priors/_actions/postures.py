@@ -59,7 +59,7 @@ def posture_angles(joints: Float[Tensor, "*batch 15 3"]) -> Float[Tensor, "*batc
             it are at rest (arm hanging, head up, elbow and knee straight).
 
     Returns:
-        [..., 36] in the order of `ANGLE_NAMES`, each from -90 to 90.
+        [..., 36], three for each of `LIMBS_12` in turn, each from -90 to 90.
 
     Raises:
         ShapeError: not fifteen joints. InputError: a joint is missing in some frames only; hips,
