@@ -1,6 +1,8 @@
 """The structure of the package: what its rooms show, and no circles of imports."""
 
 import re
+import subprocess
+import sys
 import warnings
 from importlib import import_module
 from pathlib import Path
@@ -93,6 +95,27 @@ def test_a_name_that_left_a_room_is_found_with_a_warning(room, name, home):
         present = getattr(import_module(f"torchpose.{module}"), present_name)
     with pytest.warns(DeprecationWarning, match=rf"{room}\.{name} "):
         assert getattr(import_module(room), name) is present
+
+
+def test_every_module_that_moved_is_imported_with_a_warning():
+    """In a process of its own, since an import leaves its module behind."""
+    code = """
+import sys, warnings
+from importlib import import_module
+from torchpose._core.moved import MODULES
+for old, home in MODULES.items():
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        module = import_module(f"torchpose.{old}")
+    if module is not import_module(f"torchpose.{home}"):
+        print(old, "is not", home)
+    if not any(str(w.message).startswith(f"torchpose.{old} is torchpose.{home} now") for w in said):
+        print(old, "without a warning")
+"""
+    found = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert (found.returncode, found.stdout) == (0, ""), found.stderr
 
 
 def test_a_name_that_no_room_had_is_refused():

@@ -22,7 +22,7 @@ from torchpose._core.terminal import one_line, show_progress
 from torchpose.errors import InputError, OutputError, TorchposeError
 from torchpose.upper_body._keypoint_files import TrackSettings
 from train.predict_claims import Claim, Claims, Run
-from train.predict_recordings import Recording, find_keypoints, share
+from train.predict_recordings import KeypointRecording, find_keypoints, share
 from train.predict_summary import Outcome, check_summary, count_outcomes, write_summary
 from train.predict_tracking import (
     BatchTracker,
@@ -146,7 +146,7 @@ def predict(
         batch = Batch(tracker, out, run, rank, retry_failed)
         outcomes: dict[str, Outcome] = {}
 
-        def settle(recording: Recording, claim: Claim) -> None:
+        def settle(recording: KeypointRecording, claim: Claim) -> None:
             outcomes[recording.name] = batch.settle(recording, claim)
             bar.update(1)
 
@@ -156,7 +156,9 @@ def predict(
 
 
 def _visit(
-    claims: Claims, recordings: Sequence[Recording], settle: Callable[[Recording, Claim], None]
+    claims: Claims,
+    recordings: Sequence[KeypointRecording],
+    settle: Callable[[KeypointRecording, Claim], None],
 ) -> None:
     """Settle every recording; wait at the end for those that other processes work on."""
     others = []
@@ -181,7 +183,7 @@ class Batch(NamedTuple):
     rank: int = 0
     retry_failed: bool = False
 
-    def settle(self, recording: Recording, claim: Claim) -> Outcome:
+    def settle(self, recording: KeypointRecording, claim: Claim) -> Outcome:
         """Track a recording, unless it is done already or has failed before.
 
         Raises:

@@ -1,6 +1,5 @@
 """Find recordings of 2D keypoints, name their results and count their frames."""
 
-import hashlib
 import zipfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -8,17 +7,17 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
+from torchpose._core.digests import digest_of_files
 from torchpose.errors import InputError
 
-__all__ = ["Recording", "content_of", "find_keypoints", "share"]
+__all__ = ["KeypointRecording", "content_of", "find_keypoints", "share"]
 
 _SUFFIXES = (".npz", ".csv")
 _POINTS = ("keypoints.npy", "joints2d.npy")
 _OPENPOSE = "*_keypoints.json"
-_BLOCK = 1 << 20
 
 
-class Recording(NamedTuple):
+class KeypointRecording(NamedTuple):
     """A file or folder of keypoints, the name of its result (without suffix), and its length."""
 
     name: str
@@ -28,7 +27,7 @@ class Recording(NamedTuple):
 
 def find_keypoints(
     paths: Sequence[str | Path], leave_out: str | Path | None = None
-) -> list[Recording]:
+) -> list[KeypointRecording]:
     """Find recordings of keypoints among files and folders, the longest first.
 
     Folders are searched with their subfolders; files of other content are passed over there, but
@@ -56,11 +55,13 @@ def find_keypoints(
             f"expected recordings of 2D keypoints ({', '.join(_SUFFIXES)} or folders of {_OPENPOSE}), "
             f"found none in {', '.join(map(str, paths)) or 'no paths at all'}"
         )
-    recordings = [Recording(name, path, _length(path)) for name, path in found.items()]
+    recordings = [KeypointRecording(name, path, _length(path)) for name, path in found.items()]
     return sorted(recordings, key=lambda r: (-r.n_frames, r.name))
 
 
-def share(recordings: Sequence[Recording], rank: int, world: int) -> list[Recording]:
+def share(
+    recordings: Sequence[KeypointRecording], rank: int, world: int
+) -> list[KeypointRecording]:
     """Return the recordings of one process, rank, rank + world, ..., and then those of the others.
 
     Args:
@@ -73,14 +74,11 @@ def share(recordings: Sequence[Recording], rank: int, world: int) -> list[Record
 
 def content_of(path: Path) -> str:
     """Return SHA-256 of a file, or of the names and contents of the files in a folder of OpenPose's."""
-    digest = hashlib.sha256()
-    for file in sorted(path.glob(_OPENPOSE)) if path.is_dir() else [path]:
-        if path.is_dir():
-            digest.update(f"{file.name}\0{file.stat().st_size}\0".encode())
-        with file.open("rb") as stream:
-            while block := stream.read(_BLOCK):
-                digest.update(block)
-    return digest.hexdigest()
+    if not path.is_dir():
+        return digest_of_files([path])
+    files = sorted(path.glob(_OPENPOSE))
+    named = ((f"{file.name}\0{file.stat().st_size}\0", file) for file in files)
+    return digest_of_files(part for pair in named for part in pair)
 
 
 def _recordings_in(given: Path, leave_out: Path | None) -> Iterable[tuple[str, Path]]:

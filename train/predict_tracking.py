@@ -1,6 +1,5 @@
 """Track one recording of a batch as `torchpose track` does, and store the origin of its result."""
 
-import hashlib
 import json
 import time
 import zipfile
@@ -12,16 +11,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 import torchpose
 from torchpose._core.checks import check_positive
+from torchpose._core.digests import digest_of
 from torchpose._core.files import atomic_path
 from torchpose.errors import InputError, OutputError
 from torchpose.io import read_keypoints
 from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import PoseTrack
 from torchpose.upper_body._keypoint_files import KeypointFileTracker, TrackSettings
-from train.predict_recordings import Recording, content_of
+from train.predict_recordings import KeypointRecording, content_of
 
 __all__ = [
     "BatchTracker",
@@ -52,7 +53,7 @@ class BatchTracker:
         self._tracker = KeypointFileTracker(settings, device)
         self._tracker.check()
 
-    def origin(self, recording: Recording) -> dict[str, str]:
+    def origin(self, recording: KeypointRecording) -> dict[str, str]:
         """Return what a result is made from: digests of the input, the prior and the settings.
 
         Two results with the same origin hold the same poses; where they were computed, and where the
@@ -71,10 +72,10 @@ class BatchTracker:
             "format": str(_FORMAT),
             "torchpose": torchpose.__version__,
             "prior": digest_of_prior(tracker.prior),
-            "settings": _digest(json.dumps(settings, sort_keys=True)),
+            "settings": digest_of([json.dumps(settings, sort_keys=True)]),
         }
 
-    def __call__(self, recording: Recording) -> PoseTrack:
+    def __call__(self, recording: KeypointRecording) -> PoseTrack:
         """Return the poses of a recording.
 
         Raises:
@@ -149,14 +150,9 @@ def facts_of(track: PoseTrack, started: float) -> dict[str, Any]:
     }
 
 
-def _digest(text: str | bytes) -> str:
-    return hashlib.sha256(text.encode() if isinstance(text, str) else text).hexdigest()
-
-
 def digest_of_prior(prior: UpperBodyPrior) -> str:
     """Return SHA-256 of everything in a prior: numbers, and what its file says about them."""
-    digest = hashlib.sha256(prior.info.to_json().encode())
+    parts: list[str | Tensor] = [prior.info.to_json()]
     for name, value in sorted(prior.state_dict().items()):
-        digest.update(f"{name}{tuple(value.shape)}{value.dtype}".encode())
-        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
+        parts += f"{name}{tuple(value.shape)}{value.dtype}", value
+    return digest_of(parts)

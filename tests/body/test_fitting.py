@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from tests.body.test_kinematics import random_centres, random_states, some_body
 from tests.data import data_dir_or_skip
 from torchpose.body import BODY_15, Body, body_joints, fit_body, fit_state
-from torchpose.body._fitting import joint_errors
+from torchpose.body._fitting import fit_errors
 from torchpose.errors import InputError, ShapeError
 
 
@@ -31,7 +31,7 @@ def test_joints_of_a_body_are_met_exactly(frame, centred):
     body = someone(frame, random_centres() if centred else None)
     joints = body.joints(random_states(body, 60, scale=0.3))
     found = fit_state(body, joints)
-    assert float(joint_errors(body, found, joints).max()) < 1e-4
+    assert float(fit_errors(body, found, joints).max()) < 1e-4
 
 
 @pytest.mark.parametrize("centred", [False, True])
@@ -66,7 +66,7 @@ def test_pelvis_near_the_line_of_the_hips_tilts_with_the_torso(lever, largest, e
     spine = torch.nn.functional.normalize(body.offsets[1], dim=-1)
     tilt = (pelvis[:, :, 2] * (torso @ spine)).sum(-1)  # how far the spine leans along its z
     assert float(tilt.abs().max()) < largest
-    assert float(joint_errors(body, found, body.joints(states)).max()) < error
+    assert float(fit_errors(body, found, body.joints(states)).max()) < error
 
 
 def test_gauss_newton_finds_the_least_squares():
@@ -77,7 +77,7 @@ def test_gauss_newton_finds_the_least_squares():
     noise[:, [j for j, part in enumerate(BODY_15.part_of) if part == 0]] = 0  # hips tell the tilt
     joints = joints + noise
     closed, found = fit_state(body, joints, steps=0), fit_state(body, joints, steps=20)
-    squared = [joint_errors(body, x, joints).square().sum(-1) for x in (closed, found)]
+    squared = [fit_errors(body, x, joints).square().sum(-1) for x in (closed, found)]
     assert bool((squared[1] < squared[0]).all())
     for t in range(3):
 
@@ -96,7 +96,7 @@ def test_body_of_recorded_joints():
     torch.testing.assert_close(found.bone_lengths, body.bone_lengths, rtol=0, atol=2e-4)
     assert found.height == pytest.approx(1.7)
     assert torch.equal(found.radii, BODY_15.standard_radii(found.height))
-    assert float(joint_errors(found, fit_state(found, joints), joints).max()) < 0.5
+    assert float(fit_errors(found, fit_state(found, joints), joints).max()) < 0.5
     radii = 1.1 * body.radii
     assert torch.equal(fit_body(joints, radii).radii, radii)
     other = fit_body(joints, centres=random_centres(), frame="body")
@@ -112,7 +112,7 @@ def test_joints_that_a_set_lacks_leave_their_part_at_rest():
     for name in ("head", "left_upper_arm", "left_forearm"):
         part = BODY_15.part(name)
         assert float(found[:, 3 + 3 * part : 6 + 3 * part].abs().max()) < 1e-7
-    errors = joint_errors(body, found, joints)
+    errors = fit_errors(body, found, joints)
     known = [j for j, n in enumerate(BODY_15.names) if "left_" not in n and n != "head"]
     assert float(errors[:, known].max()) < 1e-4 and bool(torch.isnan(errors[:, 2]).all())
     built = fit_body(joints)
@@ -149,7 +149,7 @@ def test_any_dtype(dtype):
     body = some_body(dtype=dtype)
     joints = body.joints(random_states(body, 5, scale=0.2))
     found = fit_state(body, joints)
-    assert found.dtype == dtype and float(joint_errors(body, found, joints).max()) < 0.1
+    assert found.dtype == dtype and float(fit_errors(body, found, joints).max()) < 0.1
     assert fit_body(joints).offsets.dtype == torch.float64
 
 
@@ -193,6 +193,6 @@ def test_error_left_on_recordings(folder, pattern, limit):
         names = [str(n) for n in file["names"]]
         joints = body_joints(torch.tensor(file["joints"][:400], dtype=torch.float64), names)
     body = fit_body(joints)
-    errors = joint_errors(body, fit_state(body, joints), joints)
+    errors = fit_errors(body, fit_state(body, joints), joints)
     assert float(errors.nanmean()) < limit
     assert 1.4 < body.height < 2.0

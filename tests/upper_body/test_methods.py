@@ -219,6 +219,7 @@ def test_a_method_is_registered_under_a_new_name_only(monkeypatch):
     monkeypatch.setattr("torchpose.upper_body.METHODS", dict(METHODS))
     with pytest.raises(InputError, match="'mkf-fixed' exists"):
         register_method("mkf-fixed", METHODS["mkf-split"])
+    register_method("mkf-fixed", METHODS["mkf-fixed"])  # itself once more
 
 
 @pytest.mark.parametrize("smoothing", [None, 2])

@@ -230,7 +230,7 @@ NAMES: dict[str, dict[str, str]] = {
         "whole_body._poses": "BodyPoses=BodyTrack",
     },
     "torchpose.body": {
-        "body._fitting": "joint_errors",
+        "body._fitting": "joint_errors=fit_errors",
         "body._kinematics": "FRAMES",
         "whole_body": "bidirectional count_pixels render",
         "whole_body._silhouettes.likelihood": "intersection_over_union",
@@ -238,6 +238,9 @@ NAMES: dict[str, dict[str, str]] = {
             "PreparedSilhouettes SilhouetteCounts prepare_silhouettes render_limbs"
         ),
         "whole_body._silhouettes.shape": "fit_radii",
+    },
+    "torchpose.body._fitting": {
+        "body._fitting": "joint_errors=fit_errors",
     },
     "torchpose.camera": {
         "camera._projection": (

@@ -19,12 +19,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose._core.checks import check_shape
+from torchpose._core.facade import set_up_facade
 from torchpose.body._kinematics import Body, Frame
 from torchpose.body._skeleton import BODY_15, BodySkeleton
 from torchpose.errors import InputError, SkeletonError
 from torchpose.math._rotations import cross_matrix, minimal_rotation, quaternion_vector_to_matrix
 
-__all__ = ["fit_body", "fit_state", "joint_errors", "swing_parts"]
+__all__ = ["fit_body", "fit_errors", "fit_state", "swing_parts"]
 
 _TILT = 0.5  # radians, standard deviation between the tilts of pelvis and torso
 _LEVER = 0.04  # metres, least distance of the pelvis joint from the hips that tells the tilt
@@ -140,7 +141,7 @@ def fit_state(body: Body, joints: Float[Tensor, "T J 3"], steps: int = 4) -> Flo
     return torch.cat([_fit_chunk(body, chunk, known, own, steps) for chunk, own in fits])
 
 
-def joint_errors(
+def fit_errors(
     body: Body, state: Float[Tensor, "*batch D"], joints: Float[Tensor, "*batch J 3"]
 ) -> Float[Tensor, "*batch J"]:
     """Return the distance of every joint from where it was recorded, millimetres, NaN where it was not."""
@@ -394,3 +395,6 @@ def _known_joints(skeleton: BodySkeleton, joints: Tensor) -> Bool[Tensor, " J"]:
 
 def _unit(vector: Tensor) -> Tensor:
     return torch.nn.functional.normalize(vector, dim=-1)
+
+
+set_up_facade(__name__)

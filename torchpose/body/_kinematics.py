@@ -40,9 +40,7 @@ __all__ = ["FRAMES", "Body", "Frame", "centres_of"]
 Frame = Literal["parent", "body"]
 FRAMES: tuple[Frame, ...] = ("parent", "body")
 
-_ROOT = slice(0, 3)
-_HEADING = slice(3, 6)
-_RELATIVE = slice(6, None)
+_ROOT, _HEADING, _RELATIVE = slice(0, 3), slice(3, 6), slice(6, None)
 
 
 class _Geometry(NamedTuple):

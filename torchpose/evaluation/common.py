@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -15,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from torchpose._core.digests import digest_of
 from torchpose._core.facade import package_version
 from torchpose._core.files import write_npz
 from torchpose._core.reading import read_npz
@@ -98,13 +98,11 @@ def cached_prior(
 
 def settings_hash(facts: Sequence[Any]) -> str:
     """Return sixteen letters that change with any of these values; tensors count with all their numbers."""
-    digest = hashlib.sha256()
-    for fact in facts:
-        if isinstance(fact, Tensor):
-            digest.update(fact.detach().cpu().contiguous().numpy().tobytes())
-        else:
-            digest.update(json.dumps(fact, sort_keys=True, default=str).encode())
-    return digest.hexdigest()[:16]
+    parts = (
+        fact if isinstance(fact, Tensor) else json.dumps(fact, sort_keys=True, default=str)
+        for fact in facts
+    )
+    return digest_of(parts)[:16]
 
 
 def read_kept(path: Path, kind: Callable[..., Any], fields: tuple[str, ...]) -> Any:

@@ -17,7 +17,7 @@ from torchpose.body._skeleton import body_joints
 from torchpose.errors import InputError
 from torchpose.io._recordings import Recording, read_recordings
 
-__all__ = ["MocapClip", "read_mocap", "resample", "select_persons"]
+__all__ = ["MocapClip", "read_mocap", "resample_frames", "select_persons"]
 
 _UNNAMED = "unnamed"
 
@@ -110,7 +110,7 @@ def select_persons(
     return found
 
 
-def resample(
+def resample_frames(
     points: Float[Tensor, "T *rest"], fps: float, target: float
 ) -> Float[Tensor, "S *rest"]:
     """Return the points at another rate: every n-th frame where that is enough, else cubic Hermite pieces.
@@ -124,7 +124,7 @@ def resample(
     Returns:
         [S, ...], from the first frame on, as many as lie within the sequence.
 
-    >>> resample(torch.arange(9.0), 120.0, 60.0)
+    >>> resample_frames(torch.arange(9.0), 120.0, 60.0)
     tensor([0., 2., 4., 6., 8.])
     """
     if not (fps > 0 and target > 0):
@@ -163,7 +163,7 @@ def _clip(recording: Recording, fps: float | None) -> MocapClip:
     rate = float(recording.fps or 0.0) if fps is None else fps
     recorded = recording.joints.double() @ recording.rotation  # back to the axes of the file
     if fps is not None and recording.fps is not None:
-        recorded = resample(recorded, recording.fps, fps)
+        recorded = resample_frames(recorded, recording.fps, fps)
     down = recording.rotation[1]  # y of camera axes, in those of the file
     words = recording.person.split()
     return MocapClip(

@@ -1,7 +1,6 @@
 """Write the results of a run to a folder all at once, and keep files that the user put there."""
 
 import contextlib
-import hashlib
 import json
 import os
 import re
@@ -11,13 +10,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+from torchpose._core.digests import digest_of_files
 from torchpose._core.files import atomic_path, check_output_folder, hold
 from torchpose._core.reading import npz_keys
 from torchpose.errors import OutputError, TorchposeError
 
 __all__ = ["ResultsFolder", "holds_arrays", "refuse_stranger", "replace_own"]
 
-_BLOCK = 2**20
 _LISTED = 5
 
 
@@ -257,11 +256,7 @@ def _list_path(folder: Path, kind: str) -> Path:
 
 
 def _facts(path: Path) -> dict[str, Any]:
-    digest = hashlib.sha256()
-    with path.open("rb") as stream:
-        while block := stream.read(_BLOCK):
-            digest.update(block)
-    return {"size": path.stat().st_size, "sha256": digest.hexdigest()}
+    return {"size": path.stat().st_size, "sha256": digest_of_files([path])}
 
 
 def _is_listed(path: Path, listed: dict[str, Any]) -> bool:

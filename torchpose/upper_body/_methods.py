@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from torchpose._core.checks import check_choice, refuse_unused
+from torchpose._core.registry import add_method
 from torchpose.errors import InputError
 from torchpose.filters._fixed_tracks import FixedTrackFilter
 from torchpose.filters._mkf import MixtureKalmanFilter
@@ -92,11 +93,9 @@ def register_method(name: str, method: Method) -> None:
             `PoseFilter`; its options are those of its signature.
 
     Raises:
-        InputError: there is a method of that name.
+        InputError: another method has this name.
     """
-    if name in METHODS:
-        raise InputError(f"method {name!r} exists; take another name")
-    METHODS[name] = method
+    add_method(METHODS, name, method)
 
 
 def method_options(method: str) -> tuple[str, ...]:

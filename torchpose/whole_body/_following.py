@@ -13,7 +13,7 @@ from torchpose.body._kinematics import Body
 from torchpose.camera._rig import Cameras
 from torchpose.errors import InputError
 from torchpose.filters._base import Generators
-from torchpose.whole_body._filters.body_frames import check_frame
+from torchpose.whole_body._filters.body_frames import check_observation
 from torchpose.whole_body._filters.body_particles import BodyFilterState, stack_outputs
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
 from torchpose.whole_body._poses import BodyTrack
@@ -81,7 +81,7 @@ def follow(
     steps, covs = [], []
     body: Any = model.body
     for silhouettes in frames:
-        check_frame(silhouettes[None], 1, plain=not callable(model.likelihood))
+        check_observation(silhouettes[None], 1, plain=not callable(model.likelihood))
         state, out = model.filter_frame(state, silhouettes[None], cameras, generator)
         steps.append(out)
         covs.append(model.joint_covariance(state, out.mean)[0])

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchpose._core.checks import check_choice, refuse_unused
+from torchpose._core.registry import add_method
 from torchpose.body._kinematics import Body
 from torchpose.errors import InputError, PriorError
 from torchpose.priors._limb_conditionals import LimbConditionals
@@ -108,11 +109,9 @@ def register_body_filter(
         raise InputError(
             f"expected a subclass of SilhouetteParticleFilter, got {filter_class!r:.80}"
         )
-    if name in METHODS and METHODS[name].filter is not filter_class:
-        raise InputError(f"method {name!r} is {METHODS[name].filter.__name__}; choose another name")
     if needs is not None and needs not in LEARNT:
         raise InputError(f"needs must be one of {', '.join(LEARNT)} or None, got {needs!r}")
-    METHODS[name] = BodyMethod(filter_class, needs)
+    add_method(METHODS, name, BodyMethod(filter_class, needs))
 
 
 # --- what filters have learnt ---------------------------------------------------------------------

@@ -3,7 +3,6 @@
 The fits of manifolds, limbs and actions do so alike, from `torchpose fit` and from the training loop.
 """
 
-import hashlib
 import os
 import re
 from collections.abc import Sequence
@@ -12,12 +11,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchpose._core.digests import digest_of
 from torchpose.body._fitting import fit_body, fit_state
 from torchpose.body._kinematics import Body, Frame
 from torchpose.body._skeleton import BODY_15, body_joints
 from torchpose.errors import InputError
 from torchpose.io._formats.axes import Axes
-from torchpose.io._mocap import resample
+from torchpose.io._mocap import resample_frames
 from torchpose.io._recordings import Recording, find_recordings, read_recordings
 from torchpose.learning._curation.splits import pick_persons, refuse_shared_recordings
 
@@ -116,7 +116,7 @@ def recorded_joints(recording: Recording, fps: float) -> Tensor:
             f"{name}: {BODY_15.names[joint]} is missing in frame {frame}; end the recording there, or "
             "fill the gap"
         )
-    return resample(joints, recording.fps, fps)
+    return resample_frames(joints, recording.fps, fps)
 
 
 def body_of_each(
@@ -184,16 +184,12 @@ def fingerprint(recordings: Sequence[Recording]) -> dict[str, Any]:
         "count": len(recordings),
         "frames": sum(len(r) for r in recordings),
         "persons": sorted({r.person_id for r in recordings}),
-        "sha256": _digest(recordings),
+        "sha256": digest_of(part for recording in recordings for part in _contents(recording)),
     }
 
 
-def _digest(recordings: Sequence[Recording]) -> str:
-    digest = hashlib.sha256()
-    for recording in recordings:
-        facts = (recording.person_id, recording.fps, recording.names, recording.joints.shape)
-        digest.update(repr(facts).encode())
-        digest.update(recording.joints.numpy().tobytes())
-        if recording.weights is not None:
-            digest.update(recording.weights.numpy().tobytes())
-    return digest.hexdigest()
+def _contents(recording: Recording) -> list[str | Tensor]:
+    """Return what a recording is told from others by."""
+    facts = (recording.person_id, recording.fps, recording.names, recording.joints.shape)
+    parts: list[str | Tensor] = [repr(facts), recording.joints]
+    return parts if recording.weights is None else [*parts, recording.weights]

@@ -4,7 +4,6 @@ After each step of ten iterations the held-out poses are mapped to the manifold 
 the lowest error is kept, and its standard deviations are measured on the held-out poses.
 """
 
-import hashlib
 import math
 import os
 import pickle
@@ -17,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
+from torchpose._core.digests import digest_of
 from torchpose._core.files import atomic_path
 from torchpose.body._kinematics import Body
 from torchpose.errors import InputError, OutputError
@@ -153,7 +153,7 @@ class ManifoldPoses:
         """Return frame rate and digests of poses and recordings, equal for equal fits."""
         return {
             "fps": self.fps,
-            "poses": _digest(self.train),
+            "poses": digest_of(part.numpy().round(9).tobytes() for part in self.train),
             "recordings": fingerprint(self.fitted),
             "held-out recordings": fingerprint(self.held_out),
         }
@@ -323,10 +323,3 @@ def _bodies(
     """Return a body for each person, from their recordings among the first `n_fitted` if any."""
     of_watched = body_of_each(recordings[n_fitted:], joints[n_fitted:])
     return of_watched | body_of_each(recordings[:n_fitted], joints[:n_fitted])
-
-
-def _digest(poses: Sequence[Tensor]) -> str:
-    digest = hashlib.sha256()
-    for part in poses:
-        digest.update(part.numpy().round(9).tobytes())
-    return digest.hexdigest()

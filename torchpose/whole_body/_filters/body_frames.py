@@ -21,8 +21,8 @@ __all__ = [
     "Frame",
     "Likelihood",
     "Score",
-    "check_frame",
-    "check_frames",
+    "check_observation",
+    "check_observations",
     "check_sequences",
     "is_seen",
     "see_frame",
@@ -163,7 +163,7 @@ def check_sequences(
     return frames, start, batched or several
 
 
-def check_frame(observed: Tensor, batch: int, *, plain: bool) -> None:
+def check_observation(observed: Tensor, batch: int, *, plain: bool) -> None:
     """Raise unless this is one frame [B, ...] of B sequences.
 
     Raises:
@@ -179,7 +179,7 @@ def check_frame(observed: Tensor, batch: int, *, plain: bool) -> None:
         _check_silhouettes(observed)
 
 
-def check_frames(observed: Tensor, batch: int, generator: Generators, *, plain: bool) -> None:
+def check_observations(observed: Tensor, batch: int, generator: Generators, *, plain: bool) -> None:
     """Raise unless these are one frame or more [B, T, ...] of B sequences, and generators suit.
 
     Raises:

@@ -29,8 +29,8 @@ from torchpose.filters._outputs import effective_sample_size
 from torchpose.filters._resampling import RESAMPLING
 from torchpose.whole_body._filters.body_frames import (
     Likelihood,
-    check_frame,
-    check_frames,
+    check_observation,
+    check_observations,
     check_sequences,
     see_frame,
     seen_until,
@@ -232,7 +232,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         Raises:
             ShapeError, InputError, CameraError: as `forward`.
         """
-        check_frame(silhouettes, len(state.mean), plain=self._plain)
+        check_observation(silhouettes, len(state.mean), plain=self._plain)
         state, out = self.filter_frame(state, silhouettes, cameras, generator)
         self.warn(stack_outputs([out]))
         return state, out
@@ -262,7 +262,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         if self._plain and silhouettes.ndim == 4:
             warn_of_former("advance is of several frames now, filter_frame of one; one frame goes")
             return self.filter_frame(state, silhouettes, cameras, generator)
-        check_frames(silhouettes, len(state.mean), generator, plain=self._plain)
+        check_observations(silhouettes, len(state.mean), generator, plain=self._plain)
         return self._run(state, silhouettes, cameras, generator)
 
     def _run(
