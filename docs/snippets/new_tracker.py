@@ -30,7 +30,7 @@ class OneGaussianFilter(RecursiveFilter):
         self.register_buffer("offset", offset[0])
         self.register_buffer("noise", noise[0])
 
-    def init(self, batch_size, generator=None):
+    def init(self, batch_size, *, generator=None):
         dim = self.dim
         return OneGaussianState(
             self.prior_mean.expand(batch_size, dim), self.prior_cov.expand(batch_size, dim, dim)

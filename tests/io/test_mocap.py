@@ -7,7 +7,7 @@ import torch
 from tests.data import data_dir_or_skip
 from torchpose.body import BODY_15
 from torchpose.errors import InputError
-from torchpose.io._mocap import read_mocap, resample, select_persons
+from torchpose.io._mocap import read_mocap, resample_frames, select_persons
 from torchpose.skeleton import SKELETONS
 from torchpose.skeleton._joint_sets import canonical_names
 
@@ -88,7 +88,7 @@ def test_resampled_curves_stay_on_the_curve(rates):
         return torch.stack([torch.sin(4 * t), t**2, 1 - t], -1)
 
     t = torch.arange(200, dtype=torch.float64) / fps
-    found = resample(curve(t), fps, target)
+    found = resample_frames(curve(t), fps, target)
     expected = curve(torch.arange(len(found), dtype=torch.float64) / target)
     assert len(found) == int(199 * target / fps + 1e-6) + 1
     torch.testing.assert_close(found[1:-1], expected[1:-1], atol=2e-4, rtol=0)
@@ -97,7 +97,7 @@ def test_resampled_curves_stay_on_the_curve(rates):
 def test_gaps_stay_gaps():
     values = torch.arange(10.0, dtype=torch.float64)
     values[4] = torch.nan
-    found = resample(values, 30.0, 60.0)
+    found = resample_frames(values, 30.0, 60.0)
     assert bool(found[8].isnan()) and bool(found[:4].isfinite().all())
     assert bool(found[13:].isfinite().all())
 
@@ -125,7 +125,7 @@ def test_refusals(tmp_path):
     with pytest.raises(InputError, match="states no frame rate"):
         read_mocap(tmp_path)
     with pytest.raises(InputError, match="positive"):
-        resample(torch.zeros(3), 0.0, 60.0)
+        resample_frames(torch.zeros(3), 0.0, 60.0)
 
 
 @pytest.mark.data
