@@ -25,6 +25,9 @@ def without_value_checks() -> Iterator[None]:
 
     `torch.compile` and `torch.export` see the step so without it.
 
+    Returns:
+        Context manager; checks are off inside its ``with`` block, in this thread.
+
     Example:
         >>> import torch, torchpose
         >>> from torchpose._core.checks import check_finite

@@ -63,6 +63,9 @@ def fit_body(
             "crown" goes: 0.11 where the joint is the head's centre (Kinect), 0 where it is its top
             (pose2sim). By default the top lies a fifth of the height above the shoulders.
 
+    Returns:
+        `Body` in float64, on the device of `joints`, with the person's bone lengths, directions and tips.
+
     Raises:
         InputError: a joint is missing in some frames only, a bone has no length, no joint of the
             pelvis or torso. ShapeError: another number of joints.

@@ -24,7 +24,7 @@ __all__ = [
 
 
 class Limbs(NamedTuple):
-    """Tapered cylinders with round ends, L for each body.
+    """Holds the tapered cylinders with round ends of a body's L limbs.
 
     Attributes:
         start, end: [..., L, 3], the middles of both ends, metres, world axes.
@@ -37,7 +37,14 @@ class Limbs(NamedTuple):
     radii: Float[Tensor, "*radii L 2"]
 
     def select(self, index: Tensor) -> "Limbs":
-        """Return the limbs at `index` (indices [l], or bool [L])."""
+        """Return some of the limbs.
+
+        Args:
+            index: indices [l], or bool [L].
+
+        Returns:
+            `Limbs` with l limbs, in the order of `index`.
+        """
         return Limbs(self.start[..., index, :], self.end[..., index, :], self.radii[..., index, :])
 
 

@@ -32,7 +32,7 @@ class RigView(NamedTuple):
 
 
 class CameraRig(nn.Module):
-    """C calibrated cameras with poses in one room.
+    """Holds C calibrated cameras with poses in one room.
 
     x_camera = rotation x_world + translation, pixels by the matrix K (BL 3). Camera axes: x right,
     y down, z forward. Distortions are not applied by `forward`: images are undistorted when they
@@ -84,6 +84,12 @@ class CameraRig(nn.Module):
     def load(cls, path: str | Path) -> "CameraRig":
         """Read all cameras of a TOML file, in its order.
 
+        Args:
+            path: of the file, see `load_cameras`.
+
+        Returns:
+            Rig of all cameras; those without a name are called as their tables.
+
         Raises:
             InputError: no such file. FileFormatError: not such a file. CameraError: bad values.
         """
@@ -118,6 +124,12 @@ class CameraRig(nn.Module):
     def select(self, index: Sequence[int]) -> "CameraRig":
         """Return the rig of some of the cameras, in the given order.
 
+        Args:
+            index: indices of cameras; negative ones count from the end.
+
+        Returns:
+            Rig with as many cameras as there are indices.
+
         Raises:
             CameraError: no index, or one that no camera has.
         """
@@ -135,6 +147,12 @@ class CameraRig(nn.Module):
 
         Pixel centres are at whole numbers, so u' + 1/2 = (u + 1/2) width / old width, and the same
         for v. Distortions do not depend on the size.
+
+        Args:
+            height, width: of the other images, pixels.
+
+        Returns:
+            Rig with the same poses.
 
         Raises:
             CameraError: the size of a camera is not known. InputError: a side is not positive.
@@ -183,7 +201,15 @@ class CameraRig(nn.Module):
         return torch.from_numpy(out).to(images.device) if isinstance(images, Tensor) else out
 
     def check_images(self, name: str, shape: Sequence[int]) -> None:
-        """Raise `CameraError` unless a shape [..., C, H, W] is that of this rig's images."""
+        """Check that images have the number and the size of this rig's cameras.
+
+        Args:
+            name: of the images, for the message.
+            shape: [..., C, H, W].
+
+        Raises:
+            CameraError: another number of cameras, another size, or fewer than three dimensions.
+        """
         if len(shape) < 3:
             raise CameraError(f"{name} must have shape [..., C, H, W], got {list(shape)}")
         count, height, width = shape[-3:]

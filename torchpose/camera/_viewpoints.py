@@ -49,7 +49,14 @@ class ViewRange:
                 )
 
     def scaled(self, factor: float) -> "ViewRange":
-        """Return the limits of another width about the same middle; 1 changes nothing."""
+        """Return limits of another width about the same middle.
+
+        Args:
+            factor: of the width, 0 or more; 1 changes nothing.
+
+        Returns:
+            `ViewRange`, radians and metres.
+        """
 
         def about_middle(limits: tuple[float, float]) -> tuple[float, float]:
             low, high = limits
@@ -85,6 +92,9 @@ def sample_viewpoints(
 
     Returns:
         `Viewpoints` with angles [n, 3] and translation [n, 3].
+
+    Raises:
+        InputError: n is negative.
 
     Reference: Burke & Lasenby, section 3.1 (angles up to 30 degrees, translations up to 0.5 m).
     """

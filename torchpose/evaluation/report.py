@@ -114,7 +114,15 @@ class Report(Mapping[str, Table]):
         return len(self.tables)
 
     def table(self, key: str, title: str, columns: Sequence[str], **options: Any) -> Table:
-        """Add a new table, and return it."""
+        """Add an empty table to the report, and return it.
+
+        Args:
+            key: of the table in ``report.json``. title: above the table. columns: names of the columns.
+            **options: other fields of `Table`.
+
+        Returns:
+            The `Table`, to be filled with rows.
+        """
         self.tables[key] = Table(title, tuple(columns), **options)
         return self.tables[key]
 
@@ -160,6 +168,9 @@ class Report(Mapping[str, Table]):
         """Write ``report.json`` and ``report.md``, each whole or not at all.
 
         Files of these names that are of something else are moved to a folder ``earlier-1``.
+
+        Args:
+            out: folder, which is made if it is missing.
 
         Raises:
             OutputError: a file cannot be written.

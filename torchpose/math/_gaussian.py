@@ -239,6 +239,9 @@ def kalman_predict(
     Args:
         mean: [..., D]. cov: [..., D, D]. transition: F [..., D, D]. offset: b [..., D].
         noise: N [..., D, D]. Batch dimensions broadcast.
+
+    Returns:
+        Mean [..., D] and covariance [..., D, D] of the prediction.
     """
     dim = cov.shape[-1]
     right = _multiply(cov, pad(transition, (0, 0, 0, _spare(dim))).mT)
@@ -353,8 +356,14 @@ def kalman_update(
 ) -> tuple[Float[Tensor, "... D"], Float[Tensor, "... D D"], Float[Tensor, "..."]]:
     """Update a Gaussian by a measurement of some of its dimensions (BL 38-41).
 
+    Args:
+        mean: [..., D]. cov: [..., D, D]. z: measurements [..., Z], in the units of the state.
+        measurement_cov: R [..., Z, Z]. observed: [Z], indices of the measured dimensions (the rows of H).
+        mask: [..., Z], True where measured; None is everywhere. Batch dimensions broadcast.
+
     Returns:
-        Mean, covariance and log-likelihood log N(z | H x, H P H^T + R) of what was measured.
+        Mean [..., D], covariance [..., D, D] and log-likelihood log N(z | H x, H P H^T + R) [...] of what
+        was measured.
     """
     mean, cov, log_likelihood, _ = mended_update(mean, cov, z, measurement_cov, observed, mask)
     return mean, cov, log_likelihood

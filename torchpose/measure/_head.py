@@ -97,6 +97,12 @@ class HeadNeck(nn.Module):
 
         Args:
             faces: centre (x, y) and size B, pixels. face_cov: their covariance.
+
+        Returns:
+            Head and neck [N, 2, 2], pixels, and their covariances [N, 2, 2, 2], squared pixels.
+
+        Raises:
+            ShapeError: faces of another shape.
         """
         check_shape("faces", faces, ["N", 3])
         faces = faces.to(self.offset)

@@ -170,6 +170,9 @@ class MeanShiftHandTracker(nn.Module):
             faces: centre (x, y) and size of the faces, pixels. identity: their numbers.
             foreground: [H, W], 0 where there is background; None is foreground everywhere.
 
+        Returns:
+            The next state, and `HandMeasurements` of N persons, pixels.
+
         Raises:
             ShapeError, InputError: frames, faces or masks of another kind.
         """

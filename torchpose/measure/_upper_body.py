@@ -146,6 +146,15 @@ class UpperBodyMeasurer(nn.Module):
         """Return the faces of the next frame, in pixels of a smaller image where the frame is large.
 
         They depend on the images alone, so this part of `step` may run ahead in another thread.
+
+        Args:
+            tracks: of the frame before. image: RGB, uint8 [H, W, 3].
+
+        Returns:
+            `FaceTracks` in this frame.
+
+        Raises:
+            InputError: another kind of image.
         """
         import cv2
 
@@ -169,6 +178,9 @@ class UpperBodyMeasurer(nn.Module):
             state: from `init` or the step before. image: RGB, uint8 [H, W, 3].
             tracks: faces of this frame by `follow_faces`, if that has been called already.
             candidates: hands of these persons by a pose filter; not for "mean-shift".
+
+        Returns:
+            The next state, and `FrameMeasurements` of all persons, pixels.
 
         Raises:
             InputError: another kind of image; candidates for a tracker that takes none.

@@ -146,12 +146,32 @@ def reliability(
     levels: Sequence[float] = RELIABILITY_LEVELS,
     mask: Bool[Tensor, "*batch J"] | None = None,
 ) -> Coverage:
-    """Return `coverage` over a grid of levels, 5 to 95 %: the curve of a reliability diagram."""
+    """Return `coverage` over a grid of levels, 5 to 95 %: the curve of a reliability diagram.
+
+    Args:
+        estimate, truth: [*batch, J, D], D = 3 (metres) or 2 (pixels).
+        covariance: [*batch, J, D, D], of the estimate, in squares of that unit.
+        levels: [L], nominal probabilities.
+        mask: [*batch, J], True = count this joint.
+
+    Returns:
+        `Coverage` at the L levels.
+
+    Raises:
+        ShapeError, InputError, CovarianceError: as `coverage`.
+    """
     return coverage(estimate, covariance, truth, levels, mask)
 
 
 def calibration_error(curve: Coverage) -> Float[Tensor, " J"]:
-    """Return the largest gap |share - nominal| over the levels, per joint (0.05 = 5 points)."""
+    """Return the largest gap |share - nominal| over the levels, per joint (0.05 = 5 points).
+
+    Args:
+        curve: from `reliability` or `coverage`, L levels and J joints.
+
+    Returns:
+        [J], 0 to 1 (0.05 = 5 points); NaN for a joint without counts.
+    """
     return (curve.per_joint - curve.levels[:, None]).abs().amax(0)
 
 

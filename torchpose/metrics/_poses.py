@@ -77,6 +77,9 @@ def align(
     Returns:
         `Alignment`; NaN for a frame in which fewer than three of `joints` are there.
 
+    Raises:
+        InputError: fewer than three indices, or one that no joint has. ShapeError: other sizes.
+
     Reference: Burke & Lasenby, section 6 ("aligning the head, neck and shoulders using fixed scale
     Procrustes analysis").
     """
@@ -141,7 +144,18 @@ def joint_errors_2d(
     truth: Float[Tensor, "*batch J 2"],
     mask: Bool[Tensor, "*batch J"] | None = None,
 ) -> Float[Tensor, "*batch J"]:
-    """Return the distance in pixels (BL Figure 3), see `joint_errors`."""
+    """Return the distance of every estimated joint from the true one in the image (BL Figure 3).
+
+    Args:
+        estimate, truth: [*batch, J, 2], pixels.
+        mask: [*batch, J], True = count this joint.
+
+    Returns:
+        [*batch, J], pixels; NaN where masked or where either side is NaN.
+
+    Raises:
+        ShapeError: other sizes.
+    """
     check_shape("estimate", estimate, ["...", None, 2])
     return joint_errors(estimate, truth, mask)
 
@@ -160,6 +174,12 @@ def joint_errors_3d(
         mask: [*batch, J], True = count the joint, and use it to align.
         joints: what each frame is aligned on; None = all joints.
         procrustes: False = no alignment at all.
+
+    Returns:
+        [*batch, J], metres; NaN where masked, where either side is NaN, and in frames without a motion.
+
+    Raises:
+        ShapeError: other sizes. InputError: as `align`.
     """
     check_shape("estimate", estimate, ["...", None, 3])
     if procrustes:
@@ -168,7 +188,17 @@ def joint_errors_3d(
 
 
 def summarise_errors(errors: Float[Tensor, "*batch J"]) -> ErrorSummary:
-    """Return the mean of all errors pooled and per joint, NaN left out (and NaN where nothing is left)."""
+    """Return mean, deviation and median of joint errors, pooled and per joint; NaN are left out.
+
+    Args:
+        errors: [*batch, J], from `joint_errors`, in any unit.
+
+    Returns:
+        `ErrorSummary` in the same unit; NaN where nothing is left.
+
+    Raises:
+        ShapeError: fewer than one dimension.
+    """
     errors = as_values("errors", errors, ["...", None])
     flat = errors.reshape(-1, errors.shape[-1])
     flat = flat if len(flat) else flat.new_full((1, errors.shape[-1]), math.nan)

@@ -33,9 +33,14 @@ SAMPLE_CHUNK = 4096  # draws per product, which gathers a factor [D, D] for each
 
 
 class ConditionedMixture(NamedTuple):
-    """Mixture over the hidden dimensions, given values of the others.
+    """Holds a Gaussian mixture over the hidden dimensions, given values of the others.
 
     The covariances do not depend on the values, so they carry no batch dimensions.
+
+    Attributes:
+        log_weights: [..., K], normalised.
+        means: [..., K, H], in the units of the hidden dimensions.
+        covariances: [K, H, H].
     """
 
     log_weights: Float[Tensor, "*batch K"]
