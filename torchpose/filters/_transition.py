@@ -111,6 +111,9 @@ def make_transition(
         gamma: [K] or [], in [0, 1); only for "ou".
         subspace: number of principal directions, only for "ou".
 
+    Returns:
+        `Transition` with F [K, D, D], b [K, D] and N [K, D, D], symmetric.
+
     Raises:
         InputError: unknown kind, or gamma missing or outside [0, 1).
     """

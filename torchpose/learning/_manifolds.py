@@ -81,6 +81,9 @@ def fit_gplvm(
         patience: see there.
         info: what the poses are of. progress: show a bar for every start.
 
+    Returns:
+        `BackConstrainedGPLVM` without noise, see `fit_gplvm_noise`.
+
     Raises:
         InputError: fewer than 10 frames, NaN (frame and column are named), no motion, bad
             settings. ShapeError: not [T, Q], or sequences with different columns.
@@ -167,7 +170,7 @@ def fit_gplvm_noise(
     poses: Float[Tensor, "T Q"] | Sequence[Float[Tensor, "_ Q"]],
     fps: float,
 ) -> BackConstrainedGPLVM:
-    """Set the three standard deviations from validation poses; returns the manifold itmanifold.
+    """Set the three standard deviations of a manifold from validation poses.
 
     sigma x->z: root mean square of g(x_t) - g(x_t-1) (MR 27); sigma z->x: of x_t - f(g(x_t))
     (MR 30); sigma x->x: of x_t - x_t-1 (MR 29), each dimension apart; see `motion_noise`.
@@ -176,6 +179,9 @@ def fit_gplvm_noise(
         manifold: that is changed.
         poses: one sequence or several that were not fitted to; on those that were, sigma z->x
             comes out too small. fps: their frame rate, which all three are for.
+
+    Returns:
+        The same manifold, changed.
 
     Raises:
         InputError: fewer than 10 frames, NaN, a frame rate that is not positive, or frames that

@@ -180,6 +180,9 @@ def split_persons(recordings: Sequence[Recording], test_persons: Iterable[str]) 
         recordings: all of them.
         test_persons: ids (`Recording.person_id`).
 
+    Returns:
+        `PersonSplit` with the recordings to train on and to test on.
+
     Raises:
         InputError: a person without a recording, or nobody left on one side. OverlapError: one
             recording, or part of it, on both sides under different persons.
@@ -208,6 +211,12 @@ def _split(recordings: Sequence[Recording], wanted: list[str]) -> PersonSplit:
 
 def leave_one_person_out(recordings: Sequence[Recording]) -> Iterator[PersonSplit]:
     """Return one split per person, in the order of their ids, with that person as the test.
+
+    Args:
+        recordings: of two persons or more.
+
+    Returns:
+        Iterator over `PersonSplit`, as many as there are persons.
 
     Raises:
         InputError: fewer than two persons. OverlapError: as `split_persons`.

@@ -45,7 +45,7 @@ COMMON_HEIGHT = 1.75
 
 @dataclass(frozen=True)
 class ActionRecipe:
-    """Settings of the fit of an action space, or of a bank.
+    """Holds the settings of the fit of an action space, or of a bank.
 
     Args:
         n_dimensions: D, of the principal axes of the postures.
@@ -230,6 +230,13 @@ class FittedActions:
 
 def fit_actions(performances: Performances, recipe: ActionRecipe) -> FittedActions:
     """Fit every action, and test its gate on held-out persons.
+
+    Args:
+        performances: of each action, and of held-out persons.
+        recipe: settings of the fits.
+
+    Returns:
+        `FittedActions` with an action space for each action, in degrees.
 
     Raises:
         InputError: as `fit_action_space`.

@@ -122,7 +122,10 @@ def fit_limbs(
         states: to fit to.
         least_std: least deviation of a limb in any direction, sine of half an angle
             (`fit_limb_conditionals`).
-        facts: name, licence, command; those that are empty are left out.
+        **facts: name, licence, command; those that are empty are left out.
+
+    Returns:
+        The limb conditionals, and the spread of held-out persons, None without any.
 
     Raises:
         InputError: `least_std` is negative, and as `fit_limb_conditionals`.

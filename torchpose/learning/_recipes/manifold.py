@@ -49,7 +49,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class ManifoldRecipe:
-    """Settings of the fit of a manifold.
+    """Holds the settings of the fit of a manifold.
 
     Args:
         latent_dim: dimensions d of the latent space.
