@@ -84,6 +84,9 @@ def find_first_pose(
         facing: [3], the world direction that the person faces to within 60 degrees, if it is known;
             then nothing is turned round.
 
+    Returns:
+        `FirstPose` with the state [D] and the K candidates [K, D].
+
     Raises:
         InputError: no frame, nobody seen in the first one, or a bad setting. Others: as
             `find_candidates`.

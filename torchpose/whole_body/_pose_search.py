@@ -160,8 +160,17 @@ def find_pose(
     come out turned by half a turn. `find_first_pose` lets several frames decide.
 
     Args:
-        silhouettes: bool [C, H, W], or [B, C, H, W] for several persons' frames.
-        All others: as `find_candidates`.
+        body: a `torchpose.body.Body`.
+        silhouettes: bool [C, H, W], or [B, C, H, W] for a frame of each of B persons.
+        cameras: the C cameras.
+        prior: poses to start from, as `find_candidates`; None is the rest pose.
+        generator: one generator, or a list of one for each of B.
+        n_particles: N, of all sectors together. n_layers: M; the search evaluates M N likelihoods.
+        n_headings: sectors of the circle. survival_rate: of a layer, above 0 to below 1.
+        likelihood: "bidirectional" or "overlap".
+        limits: joint limits with `clamp(states)`, or None.
+        up: [3], direction of the world's vertical; by `upward_direction` if None.
+        facing: [3], the world direction that the person faces to within 60 degrees, if it is known.
 
     Returns:
         State [D] or [B, D].

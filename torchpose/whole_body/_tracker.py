@@ -35,7 +35,7 @@ _SEEN = 0.002  # of the image: fewer pixels are nobody
 
 
 class BodyStream(NamedTuple):
-    """State of `BodyTracker.step` between two frames.
+    """Holds the state of `BodyTracker.step` between two frames.
 
     Attributes:
         filter: state of the filter. frame: number of the next frame. generator: for what is drawn.
@@ -47,7 +47,7 @@ class BodyStream(NamedTuple):
 
 
 class BodyTracker(nn.Module):
-    """Tracker of one person's whole body through the silhouettes of calibrated cameras, in 3D.
+    """Tracks one person's whole body through the silhouettes of calibrated cameras, in 3D.
 
     `forward` tracks a whole sequence and finds the first pose by itself; `init` and `step` track live,
     `advance` some frames at a time, with the same numbers.
@@ -79,7 +79,7 @@ class BodyTracker(nn.Module):
             in squares of metres for the root and of sines of half angles for rotations; by default what
             suits the method.
         initial_cov: the same of the particles about the first pose; by default four times `process_cov`.
-        options: of the method's filter (`torchpose.whole_body._methods.method_options`), such as sharpness,
+        **options: of the method's filter (`torchpose.whole_body._methods.method_options`), such as sharpness,
             limits, leg_swap or n_layers.
 
     Attributes:
@@ -240,6 +240,9 @@ class BodyTracker(nn.Module):
             silhouettes: bool, half a second in which the first pose is found; they are to be tracked
                 afterwards, with `step` or `advance`. initial_state: the pose before the first frame [D], of
                 `body`, instead. generator: for what is drawn; the state holds it. facing: as in `forward`.
+
+        Returns:
+            `BodyStream` before the first frame.
 
         Raises:
             InputError: neither silhouettes nor a pose, nobody seen in the first frame. ShapeError,
