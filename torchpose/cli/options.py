@@ -171,9 +171,10 @@ def documented(source: Callable[..., Any]) -> dict[str, str]:
     if not section or not names:
         return {}
     text = " ".join(section[1].split())
-    parts = re.split(rf"(?:^|(?<=[.;,?] ))((?:(?:{names}), )*(?:{names})): ", text)
+    name = rf"\*{{0,2}}(?:{names})"
+    parts = re.split(rf"(?:^|(?<=[.;,?] ))((?:{name}, )*{name}): ", text)
     return {
-        name: words.strip().rstrip(".,;")
+        name.lstrip("*"): words.strip().rstrip(".,;")
         for several, words in zip(parts[1::2], parts[2::2], strict=True)
         for name in several.split(", ")
     }

@@ -38,7 +38,7 @@ def known_models(kind: str) -> list[str]:
     """Return the names of the models of a kind that come with the package.
 
     Args:
-        kind: "actions", "conditionals", "manifolds" and so on, see `KINDS`.
+        kind: "manifolds", "conditionals", "actions" or another folder of models.
 
     Returns:
         Names in alphabetical order; none for an unknown kind.
