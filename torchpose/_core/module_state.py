@@ -58,7 +58,7 @@ def wide_or_parameter(value: Tensor | float | Sequence[float] | None) -> Tensor 
 
 
 class _Mark(NamedTuple):
-    """Identity and version of a tensor when something was derived from it; any change of values shows."""
+    """Holds the identity and version of a tensor, by which a later change of its values is noticed."""
 
     tensor: Tensor
     version: int
@@ -78,7 +78,7 @@ class _Mark(NamedTuple):
 
 
 class _Entry(NamedTuple):
-    """Value that was derived, with the marks of the tensors that it came from."""
+    """Holds a derived value with the marks of the tensors that it was derived from."""
 
     marks: tuple[_Mark, ...]
     value: Any
@@ -89,7 +89,7 @@ _KEPT: "WeakKeyDictionary[nn.Module, dict[Hashable, _Entry]]" = WeakKeyDictionar
 
 
 class _Graphs(threading.local):
-    """Values derived with a graph while a run goes on in this thread."""
+    """Holds the values derived with a graph while a run goes on in this thread."""
 
     def __init__(self) -> None:
         self.depth = 0
@@ -199,7 +199,7 @@ def _is_opaque(tensor: Tensor) -> bool:
 
 
 class WideModule(nn.Module):
-    """A module whose tensors keep their precision, whatever `.float()` or `.to(dtype)` ask for.
+    """Keeps the precision of its tensors, whatever `.float()` or `.to(dtype)` ask for.
 
     Covariances whose scales span ten orders of magnitude do not survive single precision. What such a
     call changes is `dtype`, the precision of what goes in and comes out; `.to(device)` moves

@@ -431,7 +431,7 @@ def _warn(old: str, new: str) -> None:
 
 
 class _OldNames:
-    """Finder of modules by their old names, which loads the present ones.
+    """Finds modules by their old names, and loads the present ones.
 
     A finder as `sys.meta_path` has them. The base classes of `importlib.abc` are not needed for that, and
     take as long to import as half of torchpose.
@@ -455,7 +455,7 @@ class _OldNames:
 
 
 class _Alias:
-    """Loader that returns the present module unchanged."""
+    """Returns the present module unchanged."""
 
     def __init__(self, present: str) -> None:
         self.present = present

@@ -42,7 +42,7 @@ Info = TypeVar("Info")
 
 @dataclass(frozen=True)
 class FileKind(Generic[Info]):
-    """A kind of file.
+    """Describes a kind of file.
 
     Attributes:
         format: name that the header carries, such as "torchpose-manifold".

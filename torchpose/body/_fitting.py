@@ -154,14 +154,14 @@ def joint_errors(
 
 
 class _Fit(NamedTuple):
-    """Root position [T, 3], world rotations of the parts [T, P, 3, 3]."""
+    """Holds the root position [T, 3], world rotations of the parts [T, P, 3, 3]."""
 
     position: Tensor
     rotations: Tensor
 
 
 class _Tilt(NamedTuple):
-    """Evidence of the tilt of the root part about the line of the hips.
+    """Holds the evidence of the tilt of the root part about the line of the hips.
 
     axis, spine: [3], the line and the rest direction of the spine across it, in the part's axes.
     seen: [T, 3], the recorded direction of the spine across the line of the hips, world axes.

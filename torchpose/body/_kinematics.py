@@ -46,7 +46,7 @@ _RELATIVE = slice(6, None)
 
 
 class _Geometry(NamedTuple):
-    """Tensors that follow from a body's measures; see `Body`. `centred`: whether a part has a centre."""
+    """Holds tensors derived from a body's measures, see `Body`; `centred`: whether a part has a centre."""
 
     offsets: Tensor
     centre_rotations: Tensor

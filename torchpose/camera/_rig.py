@@ -20,7 +20,7 @@ _OPENCV_DISTORTIONS = 14  # the longest list that OpenCV takes; zeros change not
 
 
 class RigView(NamedTuple):
-    """Points as every camera sees them.
+    """Holds points as every camera sees them.
 
     Attributes:
         pixels: [..., C, N, 2], u and v; they mean nothing where the depth is not positive.

@@ -13,7 +13,7 @@ __all__ = ["PAPER_VIEWS", "ViewRange", "Viewpoints", "sample_viewpoints"]
 
 
 class Viewpoints(NamedTuple):
-    """Camera poses: angles (roll, pitch, yaw) [N, 3] in radians, translation [N, 3] in metres."""
+    """Holds camera poses: angles (roll, pitch, yaw) [N, 3] in radians, translation [N, 3] in metres."""
 
     angles: Tensor
     translation: Tensor

@@ -47,7 +47,7 @@ _FRAMES_AT_A_TIME, _NUMBERS_AT_A_TIME = 4096, 1 << 24
 
 
 class PathModel(NamedTuple):
-    """Head and neck of a body that nothing is known about, in the prior's pixels.
+    """Models head and neck of a body about which nothing is known, in the prior's pixels.
 
     Attributes:
         neck: mean place [2]. height: mean of head minus neck [2]. variance: R of head and neck [2],
@@ -61,7 +61,7 @@ class PathModel(NamedTuple):
 
 
 class BodyPath(NamedTuple):
-    """Estimated neck, and head minus neck, at t - lag for each of S lags, [B, T, S, 2], pixels."""
+    """Holds the estimated neck, and head minus neck, at t - lag for each of S lags, [B, T, S, 2], pixels."""
 
     lags: tuple[int, ...]
     neck: Tensor
@@ -86,7 +86,7 @@ class BodyPath(NamedTuple):
 
 
 class BodyView(NamedTuple):
-    """A virtual camera for each frame.
+    """Holds a virtual camera for each frame.
 
     Attributes:
         rotation: from the axes of the camera to those of the virtual one [B, T, 3, 3].
@@ -150,7 +150,7 @@ def memory_frames(lags: tuple[int, ...], fps: float) -> int:
 
 
 class _Regression(NamedTuple):
-    """Covariances of the measured pixels [N, N], and of the wanted values with them [2 S, N]."""
+    """Holds the covariances of the measured pixels [N, N], and of the wanted values with them [2 S, N]."""
 
     measured: Tensor
     wanted: Tensor

@@ -37,7 +37,7 @@ exit codes: 0 done; 1 done, but the result is not good; 2 refused, with one line
 
 
 class Given(NamedTuple):
-    """What was given to a command.
+    """Holds the arguments that were given to a command.
 
     Attributes:
         words: after the program, such as ("fit", "limbs"). values: of all options by key.
@@ -74,7 +74,7 @@ class Given(NamedTuple):
 
 
 class Command(NamedTuple):
-    """A function as a command, whose options are the function's parameters.
+    """Wraps a function as a command, whose options are the function's parameters.
 
     Parameters before `*` are given by their place.
     A parameter named in `groups` is no option itself: the function gets a dictionary with the values of the

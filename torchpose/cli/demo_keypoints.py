@@ -38,7 +38,7 @@ MEAN_POSE = "mean pose"
 
 
 class Scores(NamedTuple):
-    """How good an estimate of the performance is.
+    """Holds the errors of an estimate of the performance.
 
     Attributes:
         errors3d: [T, 8] metres, after Procrustes. errors2d: [T, 8] pixels, None for the mean pose.
@@ -51,7 +51,7 @@ class Scores(NamedTuple):
 
 
 class Hidden(NamedTuple):
-    """Frames in which a joint is hidden."""
+    """Holds the frames in which a joint is hidden."""
 
     joint: str
     frames: slice

@@ -27,7 +27,7 @@ _EXAMPLES: dict[Data, str] = {
 
 
 class Protocol(NamedTuple):
-    """An evaluation as a command.
+    """Describes an evaluation as a command.
 
     Attributes:
         module: full name of the module whose `run(data, out, *, seed, progress, ...)` it is.

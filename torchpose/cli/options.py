@@ -24,7 +24,7 @@ _SCALARS = (bool, int, float, str)
 
 
 class Option(NamedTuple):
-    """One option of a command, or one of its positional arguments.
+    """Describes one option of a command, or one of its positional arguments.
 
     Attributes:
         name: of the parameter that it is read from. key: its name on the command line and in

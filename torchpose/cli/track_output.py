@@ -32,7 +32,7 @@ __all__ = [
 
 
 class Job(NamedTuple):
-    """What is to be tracked, how, and where the results go.
+    """Holds the input, the settings and the output folder of one run of tracking.
 
     Attributes:
         input: as it was given. out: folder of the results. files: that the command reads.

@@ -201,7 +201,7 @@ def make_test_set(
 
 
 class Estimate(NamedTuple):
-    """Poses of a method: joints2d [B, T, 8, 2], joints3d [B, T, 8, 3], covariance3d or None."""
+    """Holds the poses of a method: joints2d [B, T, 8, 2], joints3d [B, T, 8, 3], covariance3d or None."""
 
     joints2d: Tensor
     joints3d: Tensor

@@ -54,14 +54,14 @@ _Persons = dict[str, list[Recording]]
 
 
 class _Split(NamedTuple):
-    """Persons of a data set: to train on and to test."""
+    """Holds the persons of a data set: to train on, and to test on."""
 
     train: _Persons
     tested: _Persons
 
 
 class _Alike(NamedTuple):
-    """Data sets with the same joints, by name.
+    """Holds the data sets with the same joints, by name.
 
     Attributes:
         drawn: to train on, made-up heads with residuals. mean: to test, without.
@@ -75,7 +75,7 @@ class _Alike(NamedTuple):
 
 
 class _Held(NamedTuple):
-    """Persons left out, and training sets for them: alone first, then with motion capture."""
+    """Holds the persons left out, and training sets for them: alone first, then with motion capture."""
 
     tests: _Persons
     trains: dict[str, list[Recording]]

@@ -19,7 +19,7 @@ __all__ = ["Crossed", "add_added", "add_cross", "plot_cross"]
 
 
 class Crossed(NamedTuple):
-    """How data sets are compared.
+    """Holds the settings of the comparison of data sets.
 
     Attributes:
         persons: of each data set. tested: those that no prior saw.

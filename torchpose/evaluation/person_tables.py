@@ -135,7 +135,7 @@ def plot_persons(persons: Mapping[str, Scored], title: str) -> Any:
 
 
 class Curve(NamedTuple):
-    """Mean error (cm) at each number of persons, with its spread over draws and over test persons."""
+    """Holds the mean error (cm) by number of persons, with its spread over draws and over test persons."""
 
     counts: list[int]
     mean: list[float]

@@ -24,7 +24,7 @@ Cell = float | int | str | None
 
 @dataclass
 class Table:
-    """Numbers by method (row) and quantity (column).
+    """Holds numbers by method (row) and quantity (column).
 
     Args:
         title: one line above the table, with the unit.

@@ -49,7 +49,7 @@ _DEFAULT_RATE = 30.0
 
 
 class _PersonScores(NamedTuple):
-    """How a person was tracked, and how far off the mean pose of the prior is [N, 8], metres."""
+    """Holds the scores of a person, and the errors of the prior's mean pose [N, 8], metres."""
 
     scored: Scored
     baseline: Tensor

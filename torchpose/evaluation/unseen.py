@@ -69,7 +69,7 @@ _STANDS_FOR = {"hand": "wrist", "wrist": "hand"}
 
 @dataclass(frozen=True)
 class ScoreSettings:
-    """How persons are tracked and scored.
+    """Holds the settings of tracking and scoring.
 
     Args:
         seed: of the noise, and of the viewpoints of the likelihood. every: of the sequences of a
@@ -88,7 +88,7 @@ class ScoreSettings:
 
 
 class Scored(NamedTuple):
-    """How well a person was tracked, frame by frame.
+    """Holds the errors of tracking a person, frame by frame.
 
     Attributes:
         filtered, smoothed: metres after fixed-scale Procrustes, NaN for joints that do not count.
@@ -107,7 +107,7 @@ class Scored(NamedTuple):
 
 @dataclass(frozen=True)
 class Job:
-    """A fit, and whom it is scored on.
+    """Holds a fit and the persons that it is scored on.
 
     Args:
         label: for the bar. train: recordings of the fit. tests: recordings of each person by name.

@@ -27,7 +27,7 @@ __all__ = [
 
 
 class Measurements(NamedTuple):
-    """Checked measurements of a batch of sequences.
+    """Holds the checked measurements of a batch of sequences.
 
     Attributes:
         z: [B, T, Z], zero where missing. mask: [B, T, Z], True where measured.

@@ -37,7 +37,7 @@ __all__ = ["MKFState", "MixtureKalmanFilter"]
 
 
 class MKFState(NamedTuple):
-    """Weighted Kalman tracks.
+    """Holds weighted Kalman tracks.
 
     Attributes:
         log_weights: log w that the next step starts from (epsilon mixed in), [B, M].

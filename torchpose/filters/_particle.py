@@ -45,7 +45,7 @@ _STARTS = ("prior", "measured")
 
 
 class ParticleState(NamedTuple):
-    """Weighted particles after a step, before they are resampled.
+    """Holds weighted particles after a step, before they are resampled.
 
     Attributes:
         white: particles [B, N, D] in the whitened coordinates of the filter; see
@@ -63,7 +63,7 @@ class ParticleState(NamedTuple):
 
 
 class _Constants(NamedTuple):
-    """Tensors that the model determines before any measurement.
+    """Holds the tensors that the model determines before any measurement.
 
     Attributes:
         walk: prior density and evidence in whitened coordinates. initial: maps noise to the first

@@ -24,7 +24,7 @@ __all__ = ["TrackStep", "run_steps", "step_estimate", "step_tracks", "weigh_trac
 
 
 class TrackStep(NamedTuple):
-    """All tracks after one step, before their weights.
+    """Holds all tracks after one step, before their weights.
 
     Attributes:
         predicted, mean: track means before and after the measurement [B, M, D].

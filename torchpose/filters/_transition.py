@@ -31,7 +31,7 @@ BURN_IN_SCALE = 100.0
 
 
 class Transition(NamedTuple):
-    """x_t = F x_{t-1} + b + N(0, N), one linear-Gaussian model per component.
+    """Holds one linear-Gaussian model per component, x_t = F x_{t-1} + b + N(0, N).
 
     Attributes:
         matrix: F [K, D, D]. offset: b = (I - F) mu [K, D]. noise: N [K, D, D].

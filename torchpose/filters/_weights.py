@@ -28,7 +28,7 @@ __all__ = [
 
 
 class WeightRule(NamedTuple):
-    """Settings of the weights of fixed tracks.
+    """Holds the settings of the weights of fixed tracks.
 
     Attributes:
         log_prior: log pi [M], in the dtype of the weights.

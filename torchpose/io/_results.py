@@ -22,7 +22,7 @@ _LISTED = 5
 
 
 class ResultsFolder:
-    """Folder that stages the files of a run and puts them in their places together.
+    """Stages the files of a run in a folder, and puts them in their places together.
 
     A list in the folder, `.torchpose-KIND.json`, says which files a run has put there, by name, size
     and SHA-256. Only these, as long as nobody has changed them, are replaced or deleted by the next

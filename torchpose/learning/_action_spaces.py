@@ -137,7 +137,7 @@ def _checked(performances: Sequence[Tensor], n_dimensions: int) -> list[Tensor]:
 
 
 class Performed(NamedTuple):
-    """A recording or a single performance.
+    """Holds a recording or a single performance.
 
     Attributes:
         person, action: who and what. postures: [T, 36], degrees.

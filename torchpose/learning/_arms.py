@@ -54,7 +54,7 @@ def arm_directions(joints: Float[Tensor, "N 8 3"]) -> Float[Tensor, "N 2 6"]:
 
 
 class _Person(NamedTuple):
-    """What the recordings of a person say.
+    """Holds the measures of a person from the recordings.
 
     Attributes:
         directions: of both arms, [N, 2, 6], NaN of an arm that is not known. lengths: medians, [5].

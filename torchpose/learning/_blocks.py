@@ -36,7 +36,7 @@ def _sum_over_processes(values: Tensor) -> Tensor:
 
 
 class Share(NamedTuple):
-    """The share of the blocks that one process takes.
+    """Describes the share of the blocks that one process takes.
 
     Attributes:
         rank, size: number of this process, and of all processes.

@@ -110,7 +110,7 @@ def fit_gplvm(
 
 
 class FitTarget(NamedTuple):
-    """Poses of all sequences, with the centred and scaled poses that the objective is of.
+    """Holds the poses of all sequences, with the centred and scaled poses that the objective is of.
 
     Attributes:
         poses: [T, Q]. lengths: frames of each sequence. scale: s [Q]. scaled: (poses - mean) / s.

@@ -49,7 +49,7 @@ START_SAMPLES = 100_000
 
 
 class StreamedEM(MixtureFit):
-    """The fit of a mixture to sources of states in blocks.
+    """Runs the fit of a mixture to sources of states in blocks.
 
     `expect` sums up samples, and `accumulate` a whole source, of which every process does its share.
     Attributes and arguments are those of `MixtureFit`.
@@ -250,7 +250,7 @@ _ROWS = 1024  # states at a time, whose squares are 17 MB
 
 
 class ColumnsSource:
-    """Some dimensions of the states of another source.
+    """Yields some dimensions of the states of another source.
 
     Args:
         source: of whole states. columns: which dimensions, in order.
@@ -328,7 +328,7 @@ def complete_mixture(
 
 
 class MixtureTask(NamedTuple):
-    """One mixture to be fitted.
+    """Describes one mixture to be fitted.
 
     Attributes:
         source: of its training states. n_components: K. max_iter, tol: of the steps of EM; a

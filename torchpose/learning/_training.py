@@ -57,7 +57,7 @@ _UNSEEN = [i for i, name in enumerate(UPPER_BODY) if name.startswith(("elbow", "
 
 @runtime_checkable
 class RecordingLike(Protocol):
-    """The attributes of a `torchpose.io.Recording` that fits use."""
+    """Declares the attributes of a `torchpose.io.Recording` that fits use."""
 
     names: tuple[str, ...]
     fps: float | None
@@ -70,7 +70,7 @@ class RecordingLike(Protocol):
 
 
 class PoseSet(NamedTuple):
-    """Centred poses of many recordings, with one kind of neck.
+    """Holds the centred poses of many recordings, with one kind of neck.
 
     Attributes:
         joints: [N, 8, 3], metres, camera axes; NaN where a joint is missing.
@@ -268,7 +268,7 @@ def arm_sources(
 
 
 class ArmPoses(NamedTuple):
-    """Poses [N, 5, 3] of an arm, which of them are complete and have weight, and weights [N]."""
+    """Holds poses [N, 5, 3] of an arm, which of them are complete and have weight, and weights [N]."""
 
     points: Tensor
     known: Tensor

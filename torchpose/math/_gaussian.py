@@ -198,7 +198,7 @@ def condition(
 
 
 class Gain(NamedTuple):
-    """The part of a Kalman update that does not depend on the measured values.
+    """Holds the part of a Kalman update that does not depend on the measured values.
 
     Attributes:
         factor: lower Cholesky factor L of the innovation covariance (BL 39), [..., Z, Z]; a missing

@@ -37,7 +37,7 @@ __all__ = [
 
 
 class MixtureFit(nn.Module):
-    """A Gaussian mixture in the middle of its fit; all there is to know is in its `state_dict`.
+    """Fits a Gaussian mixture step by step; the whole state of the fit is in its `state_dict`.
 
     The sums of all points together go to `maximise`, and that is one step of EM. Buffers are float64
     and in units in which the points have about unit covariance, y = L^-1 (x - m), which takes away the

@@ -330,7 +330,7 @@ def mean_rotation(
 
 
 class RigidMotion(NamedTuple):
-    """x -> R x + t. rotation [*batch, 3, 3] (det +1), translation [*batch, 3], metres."""
+    """Holds the motion x -> R x + t: rotation [*batch, 3, 3] (det +1), translation [*batch, 3], metres."""
 
     rotation: Tensor
     translation: Tensor

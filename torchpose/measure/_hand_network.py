@@ -37,7 +37,7 @@ _WIDTHS = (12, 24, 8, 32, 48, 64)
 
 @dataclass(frozen=True)
 class HandNetworkInfo:
-    """Facts about the fit of a `HandNetwork`.
+    """Holds facts about the fit of a `HandNetwork`.
 
     Attributes:
         name: of the network. clips, persons: that it was fitted to. licence: of the clips and parameters.

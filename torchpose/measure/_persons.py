@@ -112,7 +112,7 @@ def _histogram(image: Image, face: list[float]) -> np.ndarray:
 
 
 class PersonRegister(nn.Module):
-    """Numbers persons in the order of their appearance, and recognises them by their clothes.
+    """Assigns numbers to persons in the order of their appearance, and recognises them by their clothes.
 
     A new face is associated with a person who left within `within` frames if the histograms of their
     clothes are similar, sum_k sqrt(p_k q_k) >= `likeness` (Bhattacharyya).

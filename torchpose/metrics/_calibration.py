@@ -32,7 +32,7 @@ RELIABILITY_LEVELS = tuple(round(0.05 * i, 2) for i in range(1, 20))
 
 
 class Coverage(NamedTuple):
-    """Share of true joints inside the ellipsoids of nominal probability `levels`.
+    """Holds the share of true joints inside the ellipsoids of nominal probability `levels`.
 
     Attributes:
         levels: nominal probability [L].

@@ -50,7 +50,7 @@ PCP_THRESHOLDS = tuple(round(0.05 * i, 2) for i in range(1, 21))
 
 
 class Alignment(NamedTuple):
-    """Points after a rigid motion, their covariances if given, and the motion itself."""
+    """Holds points after a rigid motion, their covariances if given, and the motion itself."""
 
     points: Tensor
     covariance: Tensor | None
@@ -104,7 +104,7 @@ def align(
 
 
 class ErrorSummary(NamedTuple):
-    """Means of joint errors over everything but the joints.
+    """Holds the means of joint errors over everything but the joints.
 
     Attributes:
         mean: over all joints and frames pooled [].
@@ -229,7 +229,7 @@ def share_below(
 
 
 class PCP(NamedTuple):
-    """Percentage of correct parts as a curve.
+    """Holds the percentage of correct parts as a curve.
 
     Attributes:
         thresholds: fraction of the true limb's length [P].

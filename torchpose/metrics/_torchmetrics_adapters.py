@@ -35,7 +35,7 @@ __all__ = ["EllipsoidCoverage", "MeanPerJointError", "PercentageOfCorrectParts"]
 
 
 class MeanPerJointError(Metric):
-    """Mean distance of estimated from true joints, see `torchpose.metrics.joint_errors`.
+    """Computes the mean distance of estimated from true joints, see `torchpose.metrics.joint_errors`.
 
     Args:
         n_joints: J.
@@ -87,7 +87,7 @@ class MeanPerJointError(Metric):
 
 
 class PercentageOfCorrectParts(Metric):
-    """Share of limbs with both end points within threshold x true length: `torchpose.metrics.pcp`.
+    """Computes the share of limbs with both ends within threshold x true length, see `torchpose.metrics.pcp`.
 
     Args:
         thresholds: [P], fractions of the limb's true length.
@@ -129,7 +129,7 @@ class PercentageOfCorrectParts(Metric):
 
 
 class EllipsoidCoverage(Metric):
-    """Share of true joints inside their ellipsoids, see `torchpose.metrics.coverage`.
+    """Computes the share of true joints inside their ellipsoids, see `torchpose.metrics.coverage`.
 
     Args:
         n_joints: J.

@@ -31,7 +31,7 @@ _PARTS = ("weights", "means", "covariances")
 
 @dataclass(frozen=True)
 class ArmPriorInfo:
-    """Facts about the fit of an `ArmPrior`.
+    """Holds facts about the fit of an `ArmPrior`.
 
     Attributes:
         name: of the prior. persons: ids of the persons in the training recordings.
@@ -55,7 +55,7 @@ _KIND = FileKind("torchpose-arms", 1, ArmPriorInfo)
 
 
 class ArmPrior(nn.Module):
-    """Density over the directions of an arm's two bones, and a Gaussian over log-lengths of bones.
+    """Holds a density over the directions of an arm's two bones, and a Gaussian over log-lengths of bones.
 
         p(d_u, d_f) = (1 - b) / Z sum_k pi_k N([d_u, d_f]; mu_k, Sigma_k) + b / (4 pi)^2
 

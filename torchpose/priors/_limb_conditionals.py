@@ -49,7 +49,7 @@ _SAME_CENTRE = 1e-6  # of a quaternion vector
 
 @dataclass(frozen=True)
 class LimbInfo:
-    """Facts about the fit of limb conditionals; fields that are not known are empty.
+    """Holds facts about the fit of limb conditionals; fields that are not known are empty.
 
     Attributes:
         name: of the conditionals.
@@ -95,7 +95,7 @@ class _Products(NamedTuple):
 
 
 class LimbConditionals(nn.Module):
-    """Gaussians over the rotations between connected parts, and over those from frame to frame.
+    """Holds Gaussians over the rotations between connected parts, and over those from frame to frame.
 
     p(x_j | x_i, c_ij) ~ F(q_i, N(x_ij; mu_ij, Sigma_ij)),   q_ij = q_i^-1 q_j               (DX 3)
     p(x_j^{t+1} | x_j^t) ~ F(mu_j^t, N(0, Sigma'_j)),        q' = (q_j^t)^-1 q_j^{t+1}       (DX 14)

@@ -71,7 +71,7 @@ _NECKS = (("neck", None), ("upper_neck", "neck"), ("shoulder_center", "neck"),
 
 
 class UpperBodyMap(NamedTuple):
-    """Places of the eight joints of `UPPER_BODY` in a joint set.
+    """Holds the places of the eight joints of `UPPER_BODY` in a joint set.
 
     indices: eight indices into the set, -1 where it has no such joint. missing: names of those.
     neck: kind of neck, None if the names do not tell (or there is none). hand: ``"hand"``,
@@ -86,7 +86,7 @@ class UpperBodyMap(NamedTuple):
 
 
 class UpperBody(NamedTuple):
-    """Eight joints [..., 8, C], NaN where absent, and the kinds of their neck, hand and head."""
+    """Holds eight joints [..., 8, C], NaN where absent, and the kinds of their neck, hand and head."""
 
     joints: Tensor
     neck: str | None

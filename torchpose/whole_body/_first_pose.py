@@ -30,7 +30,7 @@ _BEND, _STEP = 0.1, 0.1  # metres of either that say about as much
 
 
 class FirstPose(NamedTuple):
-    """The pose that was found, and the candidates it was chosen among.
+    """Holds the pose that was found, and the candidates from which it was chosen.
 
     Attributes:
         state: [D], in the first frame.

@@ -43,7 +43,7 @@ _ONE_MODE = math.sin(math.pi / 8)  # particles turned by less than 45 degrees fr
 
 
 class SilhouettePlace(NamedTuple):
-    """Middle of the body by the silhouettes.
+    """Holds the middle of the body according to the silhouettes.
 
     Attributes:
         position: [..., 3], metres, world axes. cov: [..., 3, 3].
@@ -125,7 +125,7 @@ def place_from_silhouettes(
 
 
 class PoseCandidates(NamedTuple):
-    """The best pose of every sector of headings.
+    """Holds the best pose of every sector of headings.
 
     Attributes:
         states: [B, S, D]. log_likelihood: of each [B, S].
@@ -268,7 +268,7 @@ def find_candidates(
 
 
 class _Sectors(NamedTuple):
-    """Headings: the middle of each sector [S], and half its width, radians."""
+    """Holds sectors of headings: the middle of each sector [S], and half its width, radians."""
 
     middle: Tensor
     half_width: float

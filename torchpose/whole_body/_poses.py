@@ -211,7 +211,7 @@ class BodyPoses:
 
 @dataclass
 class CameraPoses:
-    """Poses in the axes of a camera; see `torchpose.viz._report.packing.ReportedTrack`."""
+    """Holds poses in the axes of a camera; see `torchpose.viz._report.packing.ReportedTrack`."""
 
     joints3d: Tensor
     covariance3d: Tensor

@@ -33,7 +33,7 @@ class ValidationSequence(NamedTuple):
 
 
 class SharpnessFit(NamedTuple):
-    """The exponent with the smallest error, and all that were tried.
+    """Holds the exponent with the smallest error, and all that were tried.
 
     Attributes:
         sharpness: the best of `tried`. tried: [K]. errors: metres [K], mean over sequences and runs.

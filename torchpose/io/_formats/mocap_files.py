@@ -177,7 +177,7 @@ def _check(path: Path) -> None:
 
 
 class C3DPoints(NamedTuple):
-    """Points of a file: their labels, [T, N, 3] as written, frames per second, unit, axis up."""
+    """Holds the points of a file: their labels, [T, N, 3] as written, frames per second, unit, axis up."""
 
     labels: list[str]
     points: np.ndarray

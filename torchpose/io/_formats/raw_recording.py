@@ -39,7 +39,7 @@ _SHOWN_RANGES = 4
 
 @dataclass
 class RawRecording:
-    """A sequence of joints as a file has them.
+    """Holds a sequence of joints as a file has them.
 
     Args:
         path: the file.
@@ -76,7 +76,7 @@ class RawRecording:
 
 
 class BodyFrame(NamedTuple):
-    """One body in one frame: its number in the file, joints [J, 3] and weights [J]."""
+    """Holds one body in one frame: its number in the file, joints [J, 3] and weights [J]."""
 
     frame: int
     body: str

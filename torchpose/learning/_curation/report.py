@@ -12,7 +12,7 @@ _SHOWN_NOTES = 20
 
 
 class Drop(NamedTuple):
-    """Frames of one recording that were left out for one reason.
+    """Describes the frames of one recording that were left out for one reason.
 
     Attributes:
         reason: ``jump``, ``bone length``, ``no body``, ``no person's size``, ``companion``,
@@ -41,7 +41,7 @@ class Drop(NamedTuple):
 
 
 class Size(NamedTuple):
-    """Number of persons, recordings and frames, and of measured joints among the eight."""
+    """Holds the number of persons, recordings and frames, and of measured joints among the eight."""
 
     persons: int
     recordings: int
@@ -57,7 +57,7 @@ class Size(NamedTuple):
 
 
 class CurationReport(NamedTuple):
-    """Counts before and after curation, and what was left out.
+    """Holds the counts before and after curation, and what was left out.
 
     Attributes:
         before, after: counts. drops: one per file, joint and reason. notes: what reading assumed and

@@ -36,7 +36,7 @@ _MISSING = -(2**40)
 
 
 class Duplicate(NamedTuple):
-    """Two recordings with the same frames: their indices, and the share of the shorter one's frames."""
+    """Holds the indices of two recordings with the same frames, and the share of the shorter one's frames."""
 
     first: int
     second: int
@@ -132,7 +132,7 @@ def _frame_keys(joints: Float[Tensor, "T 8 3"]) -> Int[Tensor, " N"]:
 
 
 class PersonSplit(NamedTuple):
-    """Recordings to train on, recordings of other persons to test on, and the test persons."""
+    """Holds the recordings to train on, recordings of other persons to test on, and the test persons."""
 
     train: list[Recording]
     test: list[Recording]

@@ -73,7 +73,7 @@ class ActionRecipe:
 
 @dataclass(frozen=True)
 class Performances:
-    """Performances of one action or several, and those of held-out persons.
+    """Holds the performances of one action or several, and those of held-out persons.
 
     Attributes:
         actions: in the order asked for. fps: of the postures. postures: "joints" or "body".
@@ -163,7 +163,7 @@ class Performances:
 
 @dataclass(frozen=True)
 class FittedActions:
-    """Action spaces by name, with the synchronised performances, and how many postures their gates accept.
+    """Holds action spaces by name, the synchronised performances, and the acceptance of their gates.
 
     Attributes:
         spaces: by action. accepted: share of the held-out postures that pass the gate when j is drawn

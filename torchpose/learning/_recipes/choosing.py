@@ -35,7 +35,7 @@ __all__ = [
 
 
 class ChosenRecordings(NamedTuple):
-    """Recordings to fit to, and those of held-out persons, each in the order of the files."""
+    """Holds the recordings to fit to, and those of held-out persons, each in the order of the files."""
 
     train: list[Recording]
     watched: list[Recording]

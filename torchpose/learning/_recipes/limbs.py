@@ -38,7 +38,7 @@ __all__ = ["LimbSpread", "LimbStates", "check_least_std", "fit_limbs", "held_out
 
 @dataclass(frozen=True)
 class LimbStates:
-    """Recorded states of all persons, on one body with safe centres (DX 1), at one frame rate.
+    """Holds the recorded states of all persons, on one body with safe centres (DX 1), at one frame rate.
 
     Attributes:
         body: whose frame and centres the states have. fps: of the states.
@@ -101,7 +101,7 @@ class LimbStates:
 
 
 class LimbSpread(NamedTuple):
-    """Deviation and speed of held-out persons, relative to those of the persons fitted to.
+    """Holds the deviation and speed of held-out persons, relative to those of the persons fitted to.
 
     Attributes:
         deviation: of their limbs, in standard deviations of the conditionals; 1 if they are alike.

@@ -85,7 +85,7 @@ class ManifoldRecipe:
 
 @dataclass(frozen=True)
 class ManifoldPoses:
-    """Poses to fit a manifold to, and held-out poses of other recordings.
+    """Holds the poses to fit a manifold to, and held-out poses of other recordings.
 
     Attributes:
         train, watched: [T, Q] for each recording. fps: of `watched`; `train` is thinned out.
@@ -160,7 +160,7 @@ class ManifoldPoses:
 
 
 class ManifoldFitting(nn.Module):
-    """The fit of a manifold, whose whole state beside its arguments is in its `state_dict`.
+    """Fits a manifold; the whole state of the fit beside its arguments is in its `state_dict`.
 
     Args:
         poses: to fit to. recipe: settings.

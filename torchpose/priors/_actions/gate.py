@@ -33,7 +33,7 @@ _CHUNK = 4_000_000  # entries of a table of distances
 
 
 class Acceptance(NamedTuple):
-    """Share of postures that the gate lets through, by how j is chosen.
+    """Holds the share of postures that the gate accepts, for each way to choose j.
 
     Attributes:
         drawn: j drawn from its Gaussian, as in the filter. best: the most likely j. any: any j at all.

@@ -11,7 +11,7 @@ Axis = tuple[float, float, float]
 
 
 class PolarLimb(NamedTuple):
-    """Bone whose direction is given in the axes of its parent limb.
+    """Describes a bone whose direction is given in the axes of its parent limb.
 
     Attributes:
         name: of the limb. parent: name of the limb that it hangs on, "" for the root.

@@ -278,7 +278,9 @@ _ROOT_JOINTS = ("left_hip", "right_hip", "neck", "pelvis")
 
 
 class _Level(NamedTuple):
-    """Limbs of one depth. above: place of each one's parent among the carriers of the level before.
+    """Describes the limbs of one depth.
+
+    above: place of each one's parent among the carriers of the level before.
     carriers: places of those in the level that others hang on."""
 
     limbs: list[int]

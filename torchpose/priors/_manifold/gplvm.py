@@ -33,7 +33,7 @@ LEAST_FRAMES = 10
 
 
 class MotionNoise(NamedTuple):
-    """Standard deviations per frame.
+    """Holds standard deviations per frame.
 
     Attributes:
         std_latent: sigma x->z [d] (MR 27). std_pose: sigma z->x [Q] (MR 30). std_step: sigma x->x [Q]

@@ -98,7 +98,7 @@ def covariance(latents: Float[Tensor, "T d"], kernel: KernelParameters) -> Float
 
 
 class Prepared(NamedTuple):
-    """Tensors that follow from a fit and stay the same for every pose.
+    """Holds the tensors that follow from a fit and stay the same for every pose.
 
     Attributes:
         latents: z of the training poses [T, d]. mean: of these poses [Q].
@@ -117,7 +117,7 @@ class Prepared(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """Parameters and points that a fit has found.
+    """Holds the parameters and points that a fit has found.
 
     Attributes:
         scale: of columns [Q]. weights: a [T, d]. bias: b [d]. gamma_x: of (MR 22).

@@ -34,7 +34,7 @@ _LAYERS, _SURVIVAL = 5, 0.5
 
 
 class Annealing(NamedTuple):
-    """The particles of the last layer, and the exponents and survival rates of all.
+    """Holds the particles of the last layer, and the exponents and survival rates of all.
 
     Attributes:
         particles: [B, N, D]. log_weights: normalised [B, N]; NaN where all particles died.

@@ -35,7 +35,7 @@ Likelihood = Callable[[Tensor, Tensor], Tensor]
 
 
 class Frame(NamedTuple):
-    """Observation of one frame, and the score of states under it.
+    """Holds the observation of one frame, and the score of states under it.
 
     Attributes:
         score: states [B, N, D] -> sharpened log-likelihood [B, N], float64; 0 in elements that nobody

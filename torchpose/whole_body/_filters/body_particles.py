@@ -38,7 +38,7 @@ _LISTED = 8  # frames that a warning names
 
 @runtime_checkable
 class PoseSpace(Protocol):
-    """Protocol of the bodies that filters track; `torchpose.body.Body` has it.
+    """Declares what filters need of a body that they track; `torchpose.body.Body` has it.
 
     Attributes:
         dim: D. perturb(state, step): the state moved by a step, both [..., D].
@@ -56,7 +56,7 @@ class PoseSpace(Protocol):
 
 
 class BodyFilterOptions(TypedDict, total=False):
-    """The options of `SilhouetteParticleFilter`, which every filter over body poses has."""
+    """Declares the options of `SilhouetteParticleFilter`, which every filter over body poses has."""
 
     process_cov: Tensor | float | None
     step_std: Tensor | float | None
@@ -134,7 +134,7 @@ class BodyFilterState(NamedTuple):
 
 
 class WeightedParticles(NamedTuple):
-    """The particles of a new frame, as `SilhouetteParticleFilter.move` returns them.
+    """Holds the particles of a new frame, as `SilhouetteParticleFilter.move` returns them.
 
     Attributes:
         particles: [B, N, D]. log_weights: normalised [B, N], float64; NaN in an element whose particles

@@ -40,7 +40,7 @@ _ROOT = 6  # columns of a state: position and orientation of the root
 
 
 class PartGroup(NamedTuple):
-    """Parts of as many limbs each, that are counted at once.
+    """Holds parts with the same number of limbs, whose pixels are counted at once.
 
     Attributes:
         parts: G places among the parts without the root. limbs: [G][K] limbs of each.

@@ -30,7 +30,7 @@ _LEAST_STD = 1e-3  # of sigma z->x: the twist of a limb, which no joint shows, d
 
 @runtime_checkable
 class PoseManifold(Protocol):
-    """Protocol of the manifolds that the filter takes, as `torchpose.priors.BackConstrainedGPLVM`.
+    """Declares what the filter needs of a manifold, such as `torchpose.priors.BackConstrainedGPLVM`.
 
     Attributes:
         to_latent(x): g(x), [..., Q] -> [..., d] (MR 21). pose_mean(z): f(z), [..., d] -> [..., Q]

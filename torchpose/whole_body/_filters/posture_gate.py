@@ -26,7 +26,7 @@ Actions = Int[Tensor, " R"] | None
 
 
 class Rows(NamedTuple):
-    """Some rows of a batch of particles laid out one after the other.
+    """Holds some rows of a batch of particles laid out one after the other.
 
     Attributes:
         at: [r], row of the R = B N particles, rising. element: [r], which of the B each belongs to.
@@ -77,7 +77,7 @@ class Rows(NamedTuple):
 
 
 class Redrawn(NamedTuple):
-    """The states that were drawn for each of R rows.
+    """Holds the states that were drawn for each of R rows.
 
     Attributes:
         states: [R, D], the first accepted draw, or the last one where none was.
@@ -155,7 +155,7 @@ def all_accepted(states: Float[Tensor, "R D"]) -> Redrawn:
 
 
 class _Block(NamedTuple):
-    """The first accepted of several draws for each row (else the last one), and how many were so far."""
+    """Holds the first accepted draw of each row (else the last one), and the number of draws so far."""
 
     states: Tensor
     total: Tensor
@@ -177,7 +177,7 @@ def _place(total: Tensor, wanted: int) -> Tensor:
 
 
 class PostureGate(nn.Module):
-    """Gate that accepts states of an action, and finds the nearest ones that it accepts.
+    """Accepts states of an action, and finds the nearest accepted ones of others.
 
     The relative angles of a state are projected, a posture j of the mean performance is drawn for them
     (its match), and they are let through if they lie within two deviations of it in all dimensions
