@@ -25,7 +25,7 @@ def to_tensor(array: np.ndarray) -> Tensor:
 
 
 def frame_facts(path: str | Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Return what results of all kinds say beside their frames: `fps`, `notes` and `first_frame`.
+    """Return the facts that results of all kinds hold beside their frames: `fps`, `notes`, `first_frame`.
 
     Raises:
         FileFormatError: of another type, a rate that no camera has, or a negative frame.

@@ -34,7 +34,7 @@ def register_given(module: nn.Module, name: str, value: Tensor | None) -> None:
     made in inference mode keeps what it derives as any other does.
 
     Args:
-        module: where to. name: of the entry. value: None is registered as an empty entry.
+        module: that registers it. name: of the entry. value: None is registered as an empty entry.
     """
     if isinstance(value, nn.Parameter):
         module.register_parameter(name, value)
@@ -188,7 +188,7 @@ def _kept_in_this_run(key: Hashable, given: tuple[Tensor, ...], make: Callable[[
 
 
 def _is_opaque(tensor: Tensor) -> bool:
-    """Return whether a tensor has no version or no memory to be told by: of inference mode or a transform."""
+    """Return whether a tensor has no version or address to compare: of inference mode or a transform."""
     if tensor.is_inference():
         return True
     try:

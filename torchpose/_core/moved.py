@@ -399,7 +399,7 @@ def moved_names(package: str) -> Callable[[str], Any]:
 
 
 def moved_from(package: str) -> list[tuple[str, str, str]]:
-    """Return present home, old name and present name of everything that has left a package."""
+    """Return present home, old name and present name of each object that has left a package."""
     return [
         (home, old, new or old)
         for home, names in NAMES[package].items()
@@ -408,7 +408,7 @@ def moved_from(package: str) -> list[tuple[str, str, str]]:
 
 
 def moved_function(old: str, new: str) -> Callable[..., Any]:
-    """Return the function that a method has become, by its full name, and warn who called the method."""
+    """Look up the function that replaced a method, and warn the method's caller."""
     _warn(old, new)
     home, _, name = new.rpartition(".")
     function: Callable[..., Any] = getattr(import_module(home), name)

@@ -45,5 +45,5 @@ def without_value_checks() -> Iterator[None]:
 
 
 def values_visible() -> bool:
-    """Return whether values may be looked at: not while traced, nor in `without_value_checks`."""
+    """Return whether code may depend on values: not while traced, nor in `without_value_checks`."""
     return not (torch.compiler.is_compiling() or _HIDDEN.get())

@@ -372,7 +372,7 @@ def _bones(skeleton: BodySkeleton, joints: Tensor) -> Tensor:
 
 
 def _known_joints(skeleton: BodySkeleton, joints: Tensor) -> Bool[Tensor, " J"]:
-    """Tell which joints are there in all frames, with all joints between them and the root."""
+    """Return which joints [J] are known in all frames, with all joints between them and the root."""
     check_shape("joints", joints, ["T", len(skeleton.names), 3])
     if joints.shape[0] == 0:
         raise InputError("a fit needs at least one frame, got none")

@@ -153,12 +153,12 @@ class Body(nn.Module):
 
     @property
     def joint_weights(self) -> Float[Tensor, "P3 J"]:
-        """Return how the joints depend on the columns of the parts' rotations, [3 P, J]."""
+        """Return the linear map [3 P, J] from the columns of the parts' rotations to the joints."""
         return self._geometry().joint_weights
 
     @property
     def limb_weights(self) -> Float[Tensor, "P3 L2"]:
-        """Return how the ends of the limbs depend on them, [3 P, 2 L]."""
+        """Return the linear map [3 P, 2 L] from the columns of the parts' rotations to the limbs' ends."""
         return self._geometry().limb_weights
 
     def _geometry(self) -> "_Geometry":

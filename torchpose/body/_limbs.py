@@ -133,7 +133,7 @@ def checked_radii(skeleton: BodySkeleton, radii: Tensor) -> Tensor:
 
 
 def point_weights(skeleton: BodySkeleton, offsets: Tensor, tips: Tensor) -> Tensor:
-    """Return how every point depends on the columns of every part's rotation, [3 P, J + K]."""
+    """Return the linear map [3 P, J + K] from the columns of the parts' rotations to all points."""
     n_points = len(skeleton.points)
     weights = offsets.new_zeros(len(skeleton.parts), 3, n_points)
     for level in skeleton.joint_levels[1:]:  # a joint moves with all that moves its parent

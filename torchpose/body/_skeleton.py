@@ -28,7 +28,7 @@ class Tip:
     """Describes a point of the body beyond its joints, fixed in a part's axes.
 
     Args:
-        name: what it is called.
+        name: of the tip.
         joint: name of the joint it is measured from.
         part: name of the part that carries it.
         offset: from the joint, in the part's axes, as fractions of the body height.
@@ -45,7 +45,7 @@ class TaperedCylinder:
     """Describes a limb as the convex hull of two spheres.
 
     Args:
-        name: what it is called; ``left_`` and ``right_`` in front tell limbs of the two sides.
+        name: of the limb; ``left_`` and ``right_`` in front tell limbs of the two sides.
         start, end: names of joints or tips, the centres of the two spheres.
         radii: of a clothed adult at start and end, as fractions of the body height.
     """
@@ -64,7 +64,7 @@ class BodySkeleton:
     part turns about the joint where it meets its parent part.
 
     Args:
-        name: what the skeleton is called.
+        name: of the skeleton.
         names: of the J joints.
         parents: index of each joint's parent, -1 for the root.
         parts: names of the P rigid parts; the first one is the root part.

@@ -40,7 +40,7 @@ class PinholeCamera(nn.Module):
     Args:
         fx, fy: focal lengths, pixels. cx, cy: principal point, pixels.
         width, height: image size, pixels, if known.
-        name: what the camera is called.
+        name: of the camera.
         skew: K[0, 1], pixels; nearly always 0.
         distortions: OpenCV's k1, k2, p1, p2, ...; kept and saved, not applied by `forward`.
         rotation, translation: pose, x_camera = R(rotation) x_world + translation; a Rodrigues

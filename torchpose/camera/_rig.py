@@ -45,7 +45,7 @@ class CameraRig(nn.Module):
         distortions [C, 14] in OpenCV's order.
 
     Attributes:
-        names: what the cameras are called ("cam_01", ... where they have no name).
+        names: of the cameras ("cam_01", ... where they have no name).
         sizes: (height, width) of every camera's image in pixels, or None where it is not known.
 
     Raises:
@@ -270,7 +270,7 @@ def undistortion_maps(
     matrix: Float[Tensor, "3 3"], distortions: Float[Tensor, " n"], fisheye: bool,
     size: tuple[int, int],
 ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
-    """Return where each pixel of an image without distortion is to be looked up, for `cv2.remap`.
+    """Return the source pixel of each pixel of an undistorted image, for `cv2.remap`.
 
     Args:
         matrix: K, the same before and after. distortions: OpenCV's. size: (width, height).

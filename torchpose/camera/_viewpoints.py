@@ -85,7 +85,7 @@ def sample_viewpoints(
     """Draw camera poses, every angle and translation uniform within its limits.
 
     Args:
-        n: how many.
+        n: number of viewpoints.
         view_range: the limits.
         generator: source of random numbers; its device is that of the result.
         dtype: of the result.

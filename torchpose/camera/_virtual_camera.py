@@ -73,7 +73,7 @@ class BodyPath(NamedTuple):
         return self.neck[:, :, i], self.height[:, :, i]
 
     def carried(self, uv: Float[Tensor, "B T 2"], lag: int) -> Float[Tensor, "B T 2"]:
-        """Return where pixels on the body of `lag` frames ago lie on the body in the present frame.
+        """Map pixels from `lag` frames ago to the body's current position.
 
         It moves along with the neck, and away from it as the body comes nearer:
             u' = n_t + (u - n_{t-lag}) |h_t| / |h_{t-lag}|
@@ -119,7 +119,7 @@ def body_path(
 
     Args:
         uv, mask: the eight joints. lags: S lags in frames, positive is the past. ahead: number of
-            later frames that may be used. fps: frame rate. model: what is known beforehand.
+            later frames that may be used. fps: frame rate. model: prior knowledge of head and neck.
         start: first frame that is wanted; those before it are its past. Returned are T - start.
         variance: R of head and neck, pixels squared, if it is not that of `model` throughout.
     """
@@ -145,7 +145,7 @@ def body_path(
 
 
 def memory_frames(lags: tuple[int, ...], fps: float) -> int:
-    """Return how many frames before the present one `body_path` and windows of these lags go back."""
+    """Return the number of past frames that `body_path` and windows with these lags need."""
     return max(round(MEMORY * fps), *lags)
 
 
@@ -213,7 +213,7 @@ def _walk(times: Tensor, spread: float, speed: float, acceleration: float) -> Te
 
 
 def _distinct(patterns: Bool[Tensor, "F N"]) -> tuple[Bool[Tensor, "P N"], Tensor]:
-    """Return the distinct rows, and which of them each row is."""
+    """Return the distinct rows, and the index of each row among them."""
     if bool((patterns == patterns[:1]).all()):
         return patterns[:1], torch.zeros(len(patterns), dtype=torch.long, device=patterns.device)
     pieces = patterns.split(62, 1)  # as many bits as fit into a whole number
@@ -240,7 +240,7 @@ def view_body(
     leaves them within an arm's reach.
 
     Args:
-        neck, height: pixels, see `BodyPath`. model: what the prior expects. matrix: K of the pixels.
+        neck, height: pixels, see `BodyPath`. model: expectation of the prior. matrix: K of the pixels.
         reach: how far from the neck a hand is measured, pixels; 0 (or None) where none is.
     """
     offset = neck - model.neck.to(neck)

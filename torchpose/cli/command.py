@@ -121,7 +121,7 @@ class Command(NamedTuple):
         return parser
 
     def given(self, arguments: Sequence[str]) -> Given:
-        """Return what arguments give to the command.
+        """Parse command-line arguments.
 
         Raises:
             ArgumentError: arguments that it does not take.
@@ -216,7 +216,7 @@ def _item(kind: Any) -> Any:
 
 
 def _one_of(option: Option) -> Callable[[Any], Any]:
-    """Return what refuses other words than the choices of an option."""
+    """Return a parser that accepts only the choices of an option."""
 
     def check(value: Any) -> Any:
         if value not in option.choices:

@@ -89,7 +89,7 @@ def _errors(joints: "Tensor", truth: "Tensor") -> "Tensor":
 
 
 def _still(truth: "Tensor") -> "Tensor":
-    """Return the errors of whoever stays as they are in the first frame."""
+    """Return the errors of the baseline that keeps the pose of the first frame."""
     return _errors(truth[:1].expand_as(truth), truth)
 
 

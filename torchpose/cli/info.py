@@ -31,7 +31,7 @@ def main(arguments: list[str]) -> int:
 
 
 def run(what: str | None = None) -> int:
-    """Say which version and priors are there, or what a file holds.
+    """Print the version and the available priors, or a description of a file.
 
     That is a prior, a manifold, limb conditionals, an action space or bank, a file of poses, keypoints or
     recordings, or a camera file.
@@ -103,7 +103,7 @@ def _models_of(name: str) -> list[Path]:
 
 
 def _describe_npz(path: Path) -> str:
-    """Return what an .npz file holds, poses, recordings or keypoints by its keys."""
+    """Return a description of an .npz file of poses, recordings or keypoints, told apart by its keys."""
     from torchpose._core.reading import npz_keys
     from torchpose.io._keypoints import read_keypoints
 
@@ -125,7 +125,7 @@ def _describe_npz(path: Path) -> str:
 
 
 def describe_prior(prior: "UpperBodyPrior") -> str:
-    """Return what a prior's file says about itself."""
+    """Return a description of a prior: what it was fitted on, its noise and its camera."""
     from torchpose.cli.track_output import camera_text
 
     info = prior.info

@@ -44,12 +44,12 @@ class Option(NamedTuple):
 
     @property
     def flag(self) -> str:
-        """Return what is typed before its value."""
+        """Return the flag on the command line, such as ``--frame-rate``."""
         return f"--{self.key.replace('_', '-')}"
 
     @property
     def metavar(self) -> str:
-        """Return what stands for its value in the help: the choices, a letter for a number, or its name."""
+        """Return the placeholder of the value in the help: the choices, a letter for a number, or a name."""
         words = _words(self.kind)
         if words:
             return "|".join(words)
@@ -181,7 +181,7 @@ def documented(source: Callable[..., Any]) -> dict[str, str]:
 
 
 def summary_of(source: Callable[..., Any]) -> str:
-    """Return what a docstring says before its sections, on one line."""
+    """Return the text of a docstring before its sections, on one line."""
     text = re.split(r"\n\s*(?:Args|Attributes|Returns|Raises):\n", inspect.getdoc(source) or "")[0]
     return " ".join(text.split())
 

@@ -173,7 +173,7 @@ def camera_text(camera: Any) -> str:
 
 
 def smoothing_text(smoothing: int | str | None) -> str:
-    """Return how later frames were used, to follow the name of a method."""
+    """Return the words on smoothing that follow the name of a method."""
     if smoothing is None:
         return ", filtered"
     return ", smoothed" if smoothing == "full" else f", smoothed with {smoothing} later frames"

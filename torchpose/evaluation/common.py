@@ -111,7 +111,7 @@ def read_kept(path: Path, kind: Callable[..., Any], fields: tuple[str, ...]) -> 
     """Return a tuple of tensors that `keep` wrote, or None where there is none; damaged files are deleted.
 
     Args:
-        path: of the file. kind: what is made of the tensors. fields: their names, in its order.
+        path: of the file. kind: named tuple to be made of the tensors. fields: their names, in its order.
     """
     if not path.is_file():
         return None
@@ -146,7 +146,7 @@ class Trials(NamedTuple):
 
     @property
     def inside(self) -> Bool[Tensor, "B T"]:
-        """True up to the length of each sequence."""
+        """Return the frame mask [B, T], True up to the length of each sequence."""
         return torch.arange(self.truth3d.shape[1]) < self.lengths[:, None]
 
 

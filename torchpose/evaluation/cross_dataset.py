@@ -219,7 +219,7 @@ def _split(persons: _Persons, tested: Sequence[str], name: str) -> _Split:
 
 
 def _held_out(persons: _Persons, tested: Sequence[str]) -> list[str]:
-    """Return who is tested: those who are named, else the last quarter."""
+    """Return the test persons: the named ones, else the last quarter."""
     last = list(persons)[-max(1, len(persons) // _HELD_SHARE) :]
     return [person for person in persons if person in tested] or last
 

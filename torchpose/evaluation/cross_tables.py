@@ -34,7 +34,7 @@ class Crossed(NamedTuple):
     donors: Sequence[str]
 
     def label(self, name: str, person: str) -> str:
-        """Return what a person of a data set is called."""
+        """Return the label of a person of a data set in the tables."""
         return f"{name} {person}"
 
 

@@ -182,7 +182,7 @@ def _imported(text: str) -> tuple[str, Recipe]:
 def _sources(
     data: Sequence[str | Path] | str | Path, more: Sequence[str]
 ) -> tuple[list[Path], list[Path], tuple[int, ...]]:
-    """Return where recordings are, where those of further persons are, and the usual counts if any."""
+    """Return the folders of the recordings and of further persons, and the usual counts, if any."""
     given = [Path(data)] if isinstance(data, str | Path) else [Path(path) for path in data]
     further = [Path(path) for path in more]
     home = given[0] if len(given) == 1 else Path()

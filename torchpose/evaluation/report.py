@@ -30,7 +30,7 @@ class Table:
         title: one line above the table, with the unit.
         columns: names of the columns.
         digits: decimals of numbers that are not whole; one number, or one for each column.
-        note: what a reader has to know, below the table.
+        note: remarks below the table.
     """
 
     title: str
@@ -189,7 +189,7 @@ def _text(value: Cell, digits: int) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return what JSON can hold."""
+    """Return a value converted to types that JSON has."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, Tensor):

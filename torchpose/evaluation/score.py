@@ -141,7 +141,7 @@ def _usual(
 
 
 def _known_to_arms(persons: Set[str], method: str) -> list[str]:
-    """Return those of the persons whom the prior over arms knows, if the method takes it."""
+    """Return the persons on whom the prior over arms was fitted, if the method uses it."""
     if "arms" not in method_options(method):
         return []
     return sorted(persons & set(shipped_arm_prior().info.persons))
@@ -210,7 +210,7 @@ def _tracked(
 def _mean_pose_errors(
     prior: UpperBodyPrior, truth: Float[Tensor, "N 8 3"], counted: Bool[Tensor, " 8"]
 ) -> Float[Tensor, "N 8"]:
-    """Return how far the mean pose of the prior is from the truth, aligned as estimates are."""
+    """Return the errors of the prior's mean pose, aligned as estimates are."""
     on = [joint for joint in ALIGN_JOINTS if bool(counted[joint])]
     still = prior.mean_pose().to(truth).expand_as(truth)
     errors = joint_errors(align(still, truth, on).points, truth)

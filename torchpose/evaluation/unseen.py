@@ -111,7 +111,7 @@ class Job:
 
     Args:
         label: for the bar. train: recordings of the fit. tests: recordings of each person by name.
-        settings: of the recipe. recipe: fits the prior. test: how persons are tracked.
+        settings: of the recipe. recipe: fits the prior. test: settings of the tracking.
     """
 
     label: str
@@ -149,7 +149,8 @@ def run_jobs(
     """Fit and score, in `workers` processes of one thread each (1: in this one).
 
     Args:
-        jobs: what to do. folder: where priors and scores are kept. progress: whether to show a bar.
+        jobs: fits with the persons that they are scored on.
+        folder: where priors and scores are kept. progress: whether to show a bar.
 
     Returns:
         Scores of each job by person.
@@ -320,7 +321,7 @@ def poses_to_score(
 
 
 def training_neck(train: Sequence[Recording], kind: str) -> NeckOffset:
-    """Return where training recordings whose neck is of this kind have it.
+    """Return the mean offset of the neck in the training recordings whose neck is of this kind.
 
     Raises:
         PriorError: there are fewer than ten such frames.

@@ -102,7 +102,7 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
 
     @property
     def weight_rule(self) -> WeightRule:
-        """Return how the tracks are weighted."""
+        """Return the settings of the tracks' weights."""
         log_prior, by_frame = self.log_prior.to(self.dtype), self.weighting == "frame"
         return WeightRule(
             log_prior, self.uniform_weight, self.likelihood_power, self.reset_below, by_frame

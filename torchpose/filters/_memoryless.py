@@ -219,7 +219,7 @@ class _FrameGains:
         self._found: dict[tuple[Any, ...], tuple[Gain, Tensor]] = {}
 
     def get(self, noise: Tensor, mask: Tensor) -> tuple[Gain, Tensor] | None:
-        """Return what is known for this pattern and noise, or None."""
+        """Return the stored gains for this pattern and noise, or None."""
         if torch.is_grad_enabled() and noise.requires_grad:
             return None
         key = _key(noise, mask)

@@ -379,7 +379,7 @@ def _kind_of(tracks: str) -> type[MixtureKalmanFilter]:
 
 
 def _options_of(kind: type[MixtureKalmanFilter], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those of the given options that a kind has; refuse others that are not at default."""
+    """Return the given options that a kind of tracks has; refuse others that are not at their default."""
     own, defaults = _defaults(kind), _defaults(MixtureKalmanFilter)
     for name in [name for name in given if name not in own]:
         value, default = given[name], defaults[name]

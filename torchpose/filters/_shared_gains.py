@@ -135,7 +135,7 @@ def _estimate(
     span: range,
     return_cov: bool,
 ) -> tuple[_Carry, StepOutput]:
-    """Return what some frames leave to the next, and their estimates, batch first."""
+    """Return the state after some frames, and their estimates, batch first."""
     tracks, deviation = _stepped_stretch(model, frames, history, carry.deviation, span)
     log_likelihood = tracks.log_likelihood.permute(1, 3, 2, 0).flatten(0, 1)
     own = None if marginal is None else marginal[span.start : span.stop]

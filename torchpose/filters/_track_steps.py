@@ -73,7 +73,7 @@ def weigh_tracks(
     """Return log-weights of the estimate [B, M], and log-evidence, 0 where nothing is measured [B].
 
     Args:
-        rule, log_weights, log_likelihood, log_marginal: as `step_weights`. frame: what was measured.
+        rule, log_weights, log_likelihood, log_marginal: as `step_weights`. frame: its measurements.
     """
     log_weights, log_evidence = step_weights(rule, log_weights, log_likelihood, log_marginal)
     measured = frame.mask.any(-1)

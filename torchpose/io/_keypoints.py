@@ -48,7 +48,7 @@ class Keypoints:
         image_size: (width, height), pixels, or None.
         neck: kind of neck if the joint set or the file tells, see `torchpose.skeleton`.
         path: the file or folder.
-        notes: what was made of the file's keypoints, in plain words.
+        notes: sentences on conversions of the file's keypoints.
     """
 
     keypoints: Tensor

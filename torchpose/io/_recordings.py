@@ -63,7 +63,7 @@ class Recording:
             alike.
         skeleton: name of the joint set, empty if it is no known one.
         rotation: M [3, 3] with x_camera = M x_file, to go back to the axes of the file.
-        notes: what reading assumed, converted or left out, for people.
+        notes: sentences on assumptions, conversions and omissions of the reader.
         companion: 0 for the person whose file it is, else which of the others in it.
         first_frame: number of the first frame in the file.
     """

@@ -124,7 +124,7 @@ class ResultsFolder:
             _refuse_stranger(self.folder / name, listed)
 
     def _present(self) -> list[Path]:
-        """Return what is in the folder under a name that a run of this kind may write."""
+        """Return the existing files of the folder under names that a run of this kind may write."""
         return [path for path in self.folder.iterdir() if self._own.fullmatch(path.name)]
 
     def _take_stage(self) -> Path:

@@ -128,7 +128,7 @@ def _one_of(pairs: Float[Tensor, "N 2 6"], generator: torch.Generator) -> Float[
 def _together(
     mixture: GaussianMixture, pairs: Float[Tensor, "N 2 6"], rounds: int = 100
 ) -> Float[Tensor, "K K"]:
-    """Return how often one arm is of one component and the other, mirrored, of another (EM).
+    """Return the joint probabilities of the components of both arms, the other arm mirrored (EM).
 
     Args:
         mixture: over one arm, which stays. pairs: of arms, both known.
@@ -156,7 +156,7 @@ def _with_sums(
 
 
 def _persons(recordings: Sequence[Recording]) -> dict[str, _Person]:
-    """Return what each person's recordings say, at 30 frames a second."""
+    """Return the arm directions and bone lengths of each person, at 30 frames a second."""
     directions: dict[str, list[Tensor]] = {}
     lengths: dict[str, list[Tensor]] = {}
     for recording in recordings:

@@ -72,7 +72,7 @@ def usable_samples(samples: Samples, name: str) -> Samples:
 
     Args:
         samples: states and weights.
-        name: what the samples are called in a message, such as their block.
+        name: of the samples, for a message, such as their block.
 
     Raises:
         InputError: weights that are negative or not finite, states of positive weight that are not.
@@ -111,7 +111,7 @@ def spread_samples(source: SampleSource, count: int) -> Samples:
 
     Args:
         source: the states; all of them are taken if there are no more than `count`.
-        count: how many.
+        count: number of samples.
 
     Raises:
         InputError: samples that are not finite; the block is named.

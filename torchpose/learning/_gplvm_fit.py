@@ -311,7 +311,7 @@ def best_fit(
     """Fit from several starts and return the fit with the lowest error, or else the highest objective.
 
     Args:
-        make: a fit at start 0, 1, ... n_init: how many. error: on poses that are not fitted to, of a
+        make: a fit at start 0, 1, ... n_init: number of starts. error: on poses that are not fitted to, of a
             fit as it stands. Others: as `run_fit`.
 
     Raises:

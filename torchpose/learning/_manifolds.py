@@ -78,8 +78,8 @@ def fit_gplvm(
             in the objective and in gamma_x; the published form does not.
         validation: poses of other trials. With them the fit stops after `patience` steps that
             bring them back no better, x - f(g(x)), and returns to the step that was best.
-        patience: see there.
-        info: what the poses are of. progress: show a bar for every start.
+        patience: number of steps without gain after which a fit with validation poses stops.
+        info: facts about the poses and their body. progress: show a bar for every start.
 
     Returns:
         `BackConstrainedGPLVM` without noise, see `fit_gplvm_noise`.
@@ -152,7 +152,7 @@ def gplvm_of_fit(
     """Return the manifold at the fit's current parameters, with latent axes turned to the principal ones.
 
     Args:
-        fit: to the scaled poses of `target`. info: what the poses are of.
+        fit: to the scaled poses of `target`. info: facts about the poses and their body.
     """
     with torch.no_grad():
         latents = fit.features @ fit.coordinates + fit.bias

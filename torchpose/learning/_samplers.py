@@ -282,7 +282,7 @@ class PoseFrames:
     def wanted(
         self, frames: Int[Tensor, " N"], lags: Sequence[int], fps: float
     ) -> Int[Tensor, "N L"]:
-        """Return where the frames at some lags would be, also beyond the ends of a recording.
+        """Return the indices of the frames at some lags, which may be beyond the ends of a recording.
 
         Args:
             frames: indices. lags: in frames at the rate `fps`; positive is the past.

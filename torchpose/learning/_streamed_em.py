@@ -87,7 +87,7 @@ class StreamedEM(MixtureFit):
             source: the states.
             n_components: number of Gaussians K.
             seed: an integer, or the generator to draw from.
-            start_samples: how many samples to look at, spread evenly over the source; every process
+            start_samples: number of samples to start from, spread evenly over the source; every process
                 looks at the same ones.
             covariance_floor: added to every variance, relative to the variance of the states in that
                 dimension (relative to one unit, where they do not vary at all).

@@ -328,7 +328,7 @@ def _names_by_kind(kinds: Sequence[str | None], names: Sequence[str], found: lis
 
 
 def _origin(recording: RecordingLike) -> str:
-    """Return where a recording comes from, without the path inside that place."""
+    """Return the data set or repository of a recording, without the path inside it."""
     repository, at, rest = recording.source.partition("@")
     if not repository:
         return recording.person_id.partition("#")[0]

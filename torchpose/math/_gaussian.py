@@ -301,7 +301,7 @@ def _log_norm(factor: Tensor, count: Tensor | int) -> Tensor:
 
 
 def _spare(columns: int) -> int:
-    """Return how many columns, at least one, make a matrix of so many a multiple of `_LANES` wide."""
+    """Return the number of columns, at least one, to add so that the width is a multiple of `_LANES`."""
     return _LANES - columns % _LANES
 
 
@@ -382,7 +382,7 @@ def mended_update(
     Float[Tensor, "..."],
     Float[Tensor, "..."] | None,
 ]:
-    """Return what `kalman_update` does, and the jitter of the innovation covariances (`mended_cholesky`)."""
+    """Return the result of `kalman_update`, and the jitter of innovation covariances (`mended_cholesky`)."""
     cross, factor, count, jitter = _innovation(cov, measurement_cov, observed, mask)
     residual = z - mean.index_select(-1, observed)
     if mask is not None:

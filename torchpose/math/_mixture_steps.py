@@ -69,7 +69,7 @@ class CyclicFeatures:
 
 
 def cyclic_order(dim: int, device: torch.device) -> Int[Tensor, " F"]:
-    """Return where the features of `CyclicFeatures` are in [1, x_i, x_i x_j (i <= j)], i before j."""
+    """Return the position of each feature of `CyclicFeatures` in [1, x_i, x_i x_j (i <= j)], i before j."""
     i = torch.arange(dim, device=device)
     left = i.repeat(dim // 2 + 1)[: dim * (dim + 1) // 2]
     right = (left + torch.arange(len(left), device=device) // dim) % dim
@@ -119,7 +119,7 @@ class SufficientStatistics(NamedTuple):
         return cls(table, table.new_zeros(()), table.new_zeros(()))
 
     def pack(self) -> Float[Tensor, " P"]:
-        """Return everything in one vector, which processes can sum up in a single exchange."""
+        """Return all sums in one vector, which processes can add up in a single exchange."""
         return torch.cat([self.table.flatten(), self.log_likelihood[None], self.weight[None]])
 
     @classmethod
@@ -217,7 +217,7 @@ def e_step(
 
 
 def _chunk_size(device: torch.device) -> int:
-    """Return how many points go into one product, so that features of 2 MB a core stay in its cache."""
+    """Return the number of points in one product, such that features of 2 MB a core stay in its cache."""
     return POINTS * (torch.get_num_threads() if device.type == "cpu" else 64)
 
 

@@ -78,7 +78,7 @@ def safe_centre(vectors: Float[Tensor, "*batch N 3"]) -> Float[Tensor, "*batch 3
 def angle_to_edge(
     vectors: Float[Tensor, "*batch N 3"], centre: Float[Tensor, "*#batch 3"] | None = None
 ) -> Float[Tensor, "*batch"]:
-    """Return how far the farthest of the rotations stays from the edge of the space around a centre.
+    """Return the least angle between the rotations and the edge of the space around a centre.
 
     pi - 2 arcsin(max_n |x_n|): 0 at the edge |x| = 1, pi where all rotations are the centre.
 

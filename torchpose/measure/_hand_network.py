@@ -88,7 +88,7 @@ class HandNetwork(nn.Module):
     relative to the face, in B. 0.25 million parameters.
 
     Args:
-        info: what it was fitted to.
+        info: facts about the fit.
     """
 
     def __init__(self, info: HandNetworkInfo | None = None) -> None:
@@ -139,7 +139,7 @@ class HandNetwork(nn.Module):
         inside: Float[Tensor, "N h w"],
         faces: Float[Tensor, "N 3"],
     ) -> HandPlaces:
-        """Return where hands are in windows of persons.
+        """Return the places of the hands in windows of persons.
 
         Args:
             lab: bytes, two pixels for a cell [N, 3, 160, 192]. maps: skin, difference from the last frame and

@@ -286,7 +286,7 @@ def _part_grid() -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _best_shift(model: Tensor, patch: Tensor) -> Tensor:
-    """Return how far the face has moved from the middle of its patch [N, 2], in pixels of it.
+    """Return the shift of the face from the middle of its patch [N, 2], in pixels of it.
 
     By normalised correlation at every shift, over every second pixel.
     """

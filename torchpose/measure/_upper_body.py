@@ -94,7 +94,7 @@ class UpperBodyMeasurer(nn.Module):
         background: whether to detect the foreground, for a static camera.
         elbows: whether to measure elbows, where the torso with its sleeves is widest.
         face_detector: by default Haar's. max_persons: the largest faces are taken.
-        head_neck: where head and neck are beside the face.
+        head_neck: offsets of head and neck from the face.
 
     Raises:
         InputError: settings out of range.

@@ -172,7 +172,7 @@ def joint_errors_3d(
     Args:
         estimate, truth: [*batch, J, 3], metres.
         mask: [*batch, J], True = count the joint, and use it to align.
-        joints: what each frame is aligned on; None = all joints.
+        joints: indices of the joints to align on; None = all joints.
         procrustes: False = no alignment at all.
 
     Returns:

@@ -40,7 +40,7 @@ class MeanPerJointError(Metric):
     Args:
         n_joints: J.
         procrustes: align each frame first (3D only): rigid, fixed scale, no reflection.
-        joints: what each frame is aligned on; None = all joints.
+        joints: indices of the joints to align on; None = all joints.
         per_joint: `compute` returns [J] instead of the mean over everything.
 
     Errors that are NaN are left out.
@@ -135,7 +135,7 @@ class EllipsoidCoverage(Metric):
         n_joints: J.
         levels: [L], nominal probabilities.
         procrustes: align each frame, and turn its covariances, first (3D only).
-        joints: what each frame is aligned on; None = all joints.
+        joints: indices of the joints to align on; None = all joints.
         per_joint: `compute` returns [L, J] instead of [L].
     """
 

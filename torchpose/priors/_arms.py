@@ -68,7 +68,7 @@ class ArmPrior(nn.Module):
 
     Args:
         directions: mixture over R^6. lengths: medians of `LENGTHS` [5], metres. spread: standard
-            deviations of their logs over persons [5]. broad: b. info: what it was fitted on.
+            deviations of their logs over persons [5]. broad: b. info: facts about the fit.
         together: A, symmetric, of which each row sums to pi_j; pi_j pi_k (arms apart) by default.
 
     Raises:

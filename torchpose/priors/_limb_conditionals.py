@@ -108,7 +108,7 @@ class LimbConditionals(nn.Module):
     columns.
 
     Args:
-        info: what it was fitted on.
+        info: facts about the fit.
         edges: [E, 2], indices of the parts above and below.
         mean, covariance: mu_ij [E, 3] and Sigma_ij [E, 3, 3].
         edge_centres: [E, 3], centres of the q_ij. centres: [P, 3], of the body's parts.
@@ -239,7 +239,7 @@ class LimbConditionals(nn.Module):
     # --- rates, bodies and files --------------------------------------------------------------
 
     def at_rate(self, fps: float, growth: float | None = None) -> "LimbConditionals":
-        """Return the same with the diffusion per frame of another frame rate, `info.fps`.
+        """Return the same conditionals with the diffusion per frame of another frame rate, `info.fps`.
 
         Sigma'_j(fps) = Sigma'_j (fps_0 / fps)^{g_j}
 

@@ -41,7 +41,7 @@ class UpperBodyPrior(nn.Module):
 
     Args:
         left, right: mixtures over the 21 dimensions of an arm's state (`arm_states`).
-        info: what they were fitted on, and in which conventions the states are.
+        info: facts about the fit, and the conventions of the states.
         noise: learnt noise as named tensors, such as increment_cov_left and increment_cov_right
             (`increment_covs`, of which each method makes its Q), process_cov_left, process_cov_right
             (Q itself, of the Kalman filters), measurement_std, gamma or calibration. They become

@@ -161,7 +161,7 @@ class Skeleton:
     """Describes a joint set and its kinematic tree.
 
     Args:
-        name: what the set is called.
+        name: of the set.
         joints: names in the order of the files.
         parents: index of each joint's parent, -1 for the root.
         axes: of files that do not state them: ``camera``, ``kinect``, ``y-up`` or ``z-up``.

@@ -121,7 +121,7 @@ def find_first_pose(
 
 
 def turned_round(body: Body, states: Float[Tensor, "K D"]) -> Float[Tensor, "K D"]:
-    """Return states with left and right exchanged: somebody in the same place who faces the other way.
+    """Return states with left and right exchanged: the person in the same place, facing the other way.
 
     The silhouettes are nearly the same; knees and elbows bend the other way.
     """
@@ -162,6 +162,6 @@ def _both_sides(body: Body, states: Tensor, joint: str) -> Float[Tensor, "*batch
 def _mean_log_likelihood(
     body: Body, track: Tensor, frames: Tensor, rig: Cameras, likelihood: str
 ) -> Float[Tensor, " K"]:
-    """Return the mean over the frames in which somebody is seen."""
+    """Return the mean over the frames in which a camera sees the person."""
     values = silhouette_score(body, frames, rig, likelihood)(track.transpose(0, 1))
     return values[is_seen(frames)].mean(0)

@@ -81,7 +81,7 @@ def world_up(rig: CameraRig, up: Tensor | None) -> Float[Tensor, "3"]:
 def place_from_silhouettes(
     silhouettes: Bool[Tensor, "B C H W"], rig: CameraRig, height: float
 ) -> SilhouettePlace:
-    """Return where the rays through the middles of the silhouettes meet, by least squares.
+    """Return the point nearest to the rays through the middles of the silhouettes (least squares).
 
     p = (sum_c A_c)^-1 sum_c A_c (o_c + h_c d_c),   A_c = I - (1 - e) d_c d_c^T,
 

@@ -71,7 +71,7 @@ class BodyTracker(nn.Module):
         height: height of the person, metres.
         manifold: poses of an action, by a name that `torchpose info` lists, or a file; in Python also the
             model itself. The first pose is looked for with it by every method.
-        conditionals: how limbs stand to each other and turn, by name, or a file.
+        conditionals: rotations of limbs against each other and over time, by name, or a file.
         action: postures of an action, or of several, by name, or a file.
         n_particles: likelihoods of a frame, of all layers together; a hypothesis of "root" counts seven.
         fps: frames per second; noise grows with the time between frames.
@@ -163,7 +163,7 @@ class BodyTracker(nn.Module):
 
     @property
     def upright(self) -> Body:
-        """Return the same person, on whom the first pose is looked for."""
+        """Return the person's body on which the first pose is looked for."""
         return self.body if self._upright is None else self._upright
 
     @property
@@ -195,7 +195,7 @@ class BodyTracker(nn.Module):
             initial_state: the pose before that frame [D], of `body`; found in half a second of frames
                 (`find_first_pose`) if None. generator: for what is drawn.
             progress: whether to show a bar. facing: [3], the world direction that the person looks in at
-                first, if it is known. n_frames: how many frames to expect, for the bar.
+                first, if it is known. n_frames: expected number of frames, for the bar.
 
         Returns:
             `BodyPoses`, from frame `first_frame`.
@@ -313,7 +313,7 @@ class BodyTracker(nn.Module):
 
 
 def all_see(silhouettes: Bool[Tensor, "C H W"]) -> bool:
-    """Tell whether every camera sees somebody in a frame: more than 0.2 % of its pixels."""
+    """Return whether the silhouette of every camera has more than 0.2 % of the frame's pixels."""
     return bool((silhouettes.double().mean((-2, -1)) > _SEEN).all())
 
 
@@ -337,7 +337,7 @@ def track_body(
         frames: silhouettes of the C cameras, frame after frame. cameras: theirs.
         initial_state: the pose before the first frame [D], recorded or from `find_first_pose`.
         generator: for what is drawn. initial_std: spread of the first particles [D]; none if None.
-        fps: of the frames, for the result. n_frames: how many to expect, for the progress bar.
+        fps: of the frames, for the result. n_frames: expected number of frames, for the progress bar.
         progress: whether to show it.
 
     Returns:
@@ -393,6 +393,6 @@ def _person(body: Body | str | Path | None, height: float) -> Body:
 
 
 def _model(kind: str, value: Any, fps: float) -> tuple[Any, str]:
-    """Return a model with its noise for a frame rate, and what is to be said of that."""
+    """Return a model with its noise for a frame rate, and notes about it."""
     model = LEARNT[kind].load(value) if isinstance(value, str | Path) else value
     return LEARNT[kind].at_rate(model, fps), LEARNT[kind].rescaled(model, fps)

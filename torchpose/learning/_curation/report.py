@@ -103,7 +103,7 @@ class CurationReport(NamedTuple):
         }
 
     def for_prior(self) -> dict[str, Any]:
-        """Return what the file of a prior says: counts, reasons and notes, without single drops."""
+        """Return the facts for the file of a prior: counts, reasons and notes, without single drops."""
         shown = ("before", "after", "dropped", "by_person", "notes")
         facts = self.facts()
         return {"curation": {name: facts[name] for name in shown}}

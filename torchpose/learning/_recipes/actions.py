@@ -149,7 +149,7 @@ class Performances:
         }  # fmt: skip
 
     def facts(self, action: str) -> ActionInfo:
-        """Return what is known of an action before it is fitted."""
+        """Return the facts about an action that are known before it is fitted."""
         learnt = {p.person for p in self.train if p.action == action}
         mine = [r for r in self.recordings if r.action == action and r.person_id in learnt]
         return ActionInfo(
@@ -209,7 +209,7 @@ class FittedActions:
         return bank
 
     def summary(self) -> str:
-        """Say what was fitted, a line for each action."""
+        """Return a summary of the fit, a line for each action."""
         lines = []
         for action, (space, _) in self.spaces.items():
             line = (

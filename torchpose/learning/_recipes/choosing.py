@@ -94,7 +94,7 @@ def choose_recordings(
 
 
 def recording_name(recording: Recording) -> str:
-    """Return what messages call a recording: its file without the suffix, or its person."""
+    """Return the name of a recording in messages: its file without the suffix, or its person."""
     return recording.person_id if recording.path is None else recording.path.stem
 
 

@@ -153,7 +153,7 @@ def check_least_std(least_std: float) -> None:
 def held_out_spread(
     conditionals: LimbConditionals, body: Body, sequences: Sequence[Float[Tensor, "_ D"]]
 ) -> LimbSpread:
-    """Return how far states that were not fitted to are from limb conditionals.
+    """Return the spread of held-out states relative to limb conditionals.
 
     deviation^2 = sum_ij E|x_ij - mu_ij|^2 / sum_ij tr Sigma_ij,
     speed^2 = sum_j E|q'_j|^2 / sum_j tr Sigma'_j,
@@ -175,7 +175,7 @@ def held_out_spread(
 
 
 def summary(conditionals: LimbConditionals, held_out: LimbSpread | None) -> str:
-    """Say what was fitted, in a sentence."""
+    """Return a one-sentence summary of the fit."""
     info = conditionals.info
     text = (
         f"{info.name}: {len(conditionals.edges)} limbs from {info.n_frames} frames of "

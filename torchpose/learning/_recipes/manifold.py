@@ -225,7 +225,7 @@ class ManifoldFitting(nn.Module):
         return found
 
     def summary(self, manifold: BackConstrainedGPLVM) -> str:
-        """Say what was fitted, in a sentence."""
+        """Return a one-sentence summary of the fit."""
         persons = ", ".join(manifold.info.persons)
         return (
             f"{manifold.info.name}: {len(manifold.poses)} frames of {persons}, best after "

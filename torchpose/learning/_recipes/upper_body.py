@@ -226,7 +226,7 @@ class UpperBodyRecipe:
         return tasks
 
     def _window_size(self, n_frames: int) -> tuple[int, int]:
-        """Return components and samples of a mixture over windows, for so many complete frames."""
+        """Return components and samples of a mixture over windows, for this number of complete frames."""
         components, samples = self.window_components, self.window_samples
         if components is None:
             most = max(1, n_frames // _FRAMES_PER_COMPONENT)
@@ -247,7 +247,7 @@ class UpperBodyRecipe:
         """Build a prior of fitted mixtures, with noise and windows; it is not calibrated.
 
         Args:
-            recordings: what `tasks` was given. mixtures: whole ones (`MixtureTask.whole`), by the
+            recordings: the same that `tasks` was given. mixtures: whole ones (`MixtureTask.whole`), by the
                 names of the tasks.
             name, licence, command: for `PriorInfo`.
 
@@ -325,7 +325,7 @@ class UpperBodyRecipe:
         of half the size to the others, in `info.extra["held_out"]`.
 
         Args:
-            prior: from `assemble`; it is changed. recordings: what it was fitted on.
+            prior: from `assemble`; it is changed. recordings: those that it was fitted on.
             progress: whether to show a bar.
 
         Returns:

@@ -50,7 +50,7 @@ def joint_set(n_keypoints: int, model: str) -> JointSet:
     """Return the joint set with this many keypoints.
 
     Args:
-        n_keypoints: J. model: what it is called in messages.
+        n_keypoints: J. model: its name in messages.
 
     Raises:
         InputError: no known set has as many.

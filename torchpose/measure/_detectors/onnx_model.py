@@ -21,7 +21,7 @@ class OnnxModel:
     """Detects the keypoints of all persons by a model that sees the whole image.
 
     Args:
-        network: of the model. layout: of its outputs. model: what it is called in messages.
+        network: of the model. layout: of its outputs. model: its name in messages.
 
     Attributes:
         names: of the keypoints.

@@ -107,6 +107,6 @@ def passes_any_gate(
 
 
 def check_gate_width(width: float) -> None:
-    """Raise `InputError` unless a gate can be so many deviations wide."""
+    """Check that the width of a gate, in deviations, is positive and finite."""
     if not 0 < width < float("inf"):
         raise InputError(f"the gate's width must be positive, in deviations, got {width}")

@@ -49,7 +49,7 @@ class ActionSpace(nn.Module):
         performance: g, [K, D]. std: sigma, [K, D]. match_std: root of Delta, [D]. All in degrees.
         variances: of the training postures along each axis, [D]. lost_variance: of all other
             directions together; degrees^2.
-        info: what it was fitted on.
+        info: facts about the fit.
 
     Buffers: the seven tensors.
 
@@ -163,7 +163,7 @@ class ActionSpace(nn.Module):
         """Return the same action in its first dimensions only.
 
         Args:
-            n_dimensions: how many of the D dimensions to keep.
+            n_dimensions: number of dimensions to keep, 1 to D.
 
         Returns:
             `ActionSpace` of that many dimensions.

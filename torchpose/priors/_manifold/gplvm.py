@@ -103,8 +103,8 @@ class BackConstrainedGPLVM(nn.Module):
         lengths: frames of each sequence in them [S].
         weights: a [T, d]. bias: b [d]. gamma_x: of (MR 22), one over squared units of the poses.
         kernel: beta, beta_0, gamma_z, sigma_z.
-        scale: what columns are divided by [Q]; ones in the published form.
-        info: what it was fitted on.
+        scale: divisor of every column [Q]; ones in the published form.
+        info: facts about the fit.
 
     Attributes:
         std_latent: sigma x->z [d] (MR 27). std_pose: sigma z->x [Q] (MR 30). std_step: sigma x->x
@@ -426,7 +426,7 @@ class BackConstrainedGPLVM(nn.Module):
         return Prepared(self.latents, *(getattr(self, f"_{name}") for name in Prepared._fields[1:]))
 
     def _prepare(self) -> None:
-        """Return what prediction needs and follows from the rest."""
+        """Return the tensors that prediction needs and that follow from the fit."""
         for name, value in gplvm_prediction.prepare(self.poses, self._fitted)._asdict().items():
             own = name if name == "latents" else f"_{name}"
             self.register_buffer(own, value.to(self.poses.dtype), persistent=False)

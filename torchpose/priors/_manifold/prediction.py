@@ -54,7 +54,7 @@ class KernelParameters(NamedTuple):
 def rbf_rows(
     centres: Float[Tensor, "T D"], gamma: Float[Tensor, ""], log_scale: Float[Tensor, ""]
 ) -> Float[Tensor, "D+2 T"]:
-    """Return what `rbf_with_rows` needs of the centres, computed once.
+    """Return the terms of `rbf_with_rows` that depend on the centres alone, computed once.
 
     The exponent log s - gamma / 2 ||x - c||^2 is the product of [gamma x, -gamma / 2 ||x||^2, 1]
     with a column [c, 1, log s - gamma / 2 ||c||^2].

@@ -98,7 +98,7 @@ def see_frame(
 
 
 def _sharpened(raw: Score, sharpness: float, seen: Bool[Tensor, " B"]) -> Score:
-    """Return the likelihood with its exponent, and 0 for elements that nobody sees."""
+    """Return the log-likelihood times its exponent; 0 for elements without a silhouette."""
     nobody = not bool(seen.any())
 
     def score(states: Tensor) -> Tensor:

@@ -174,7 +174,9 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
 
         Args:
             state: of the last frame, its particles resampled if that was due, with what was remembered
-                of them. frame: what is seen. generator: one generator, or a list of one for each element.
+                of them.
+            frame: the observation of the frame.
+            generator: one generator, or a list of one for each element.
 
         Returns:
             `WeightedParticles` [B, N, D] of the next frame.

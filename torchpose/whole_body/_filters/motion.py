@@ -252,7 +252,7 @@ def rescale_std(
 
 
 def _errors(body: PoseSpace, states: Tensor, rate: float) -> Tensor:
-    """Return what is missed in every frame but the first two, [T - 2, D]."""
+    """Return the prediction errors in every frame but the first two, [T - 2, D]."""
     velocity = body.difference(states[1:-1], states[:-2])
     if rate > 0:
         velocity = _smoothed(velocity, rate)

@@ -49,7 +49,7 @@ class Rows(NamedTuple):
         return self._replace(at=self.at[kept], element=self.element[kept])
 
     def repeated(self, times: int) -> "Rows":
-        """Return every row so many times in turn."""
+        """Return every row `times` times in turn."""
         if times == 1:
             return self
         at, element = (x.repeat_interleave(times) for x in (self.at, self.element))
@@ -149,7 +149,7 @@ def redraw_until_accepted(
 
 
 def all_accepted(states: Float[Tensor, "R D"]) -> Redrawn:
-    """Return what `redraw_until_accepted` does where there is nothing to accept."""
+    """Return the result of `redraw_until_accepted` for states without a gate: all accepted at first."""
     yes = torch.ones(len(states), dtype=torch.bool, device=states.device)
     return Redrawn(states, yes, yes, yes.long(), yes.double())
 
@@ -172,7 +172,7 @@ def _block(
 
 
 def _place(total: Tensor, wanted: int) -> Tensor:
-    """Return the number of draws until so many were accepted, or all of them [r]."""
+    """Return the number of draws [r] until `wanted` were accepted, or all draws."""
     return (total < wanted).sum(1).add_(1).clamp_max_(total.shape[1])
 
 
@@ -245,7 +245,7 @@ class PostureGate(nn.Module):
     def log_evidence(
         self, states: Float[Tensor, "B N D"], actions: Int[Tensor, "B N"], fps: float | None
     ) -> Float[Tensor, "B N"]:
-        """Return how likely postures are under their own actions, to the power that a frame counts, float64.
+        """Return the log-likelihood of postures under their own actions, times the share of a frame, float64.
 
         The gate only says yes or no, which hardly tells actions apart that begin alike.
         """

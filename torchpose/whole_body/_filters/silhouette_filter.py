@@ -146,7 +146,9 @@ class SilhouetteParticleFilter(nn.Module, ABC):
 
         Args:
             state: of the last frame, its particles resampled if that was due, with what was remembered
-                of them. frame: what is seen. generator: one generator, or a list of one for each element.
+                of them.
+            frame: the observation of the frame.
+            generator: one generator, or a list of one for each element.
 
         Returns:
             `WeightedParticles` [B, N, D] of the next frame.

@@ -200,7 +200,7 @@ def _union(opposing: Limbs, batch: tuple[int, ...], near: float) -> Limbs:
 
 
 def _shared(silhouettes: PreparedSilhouettes, batch: tuple[int, ...]) -> int:
-    """Return how many silhouettes the batch has; 1 if it shares one."""
+    """Return the number of silhouettes of the batch; 1 if it shares one."""
     leading = tuple(silhouettes.area.shape[:-1])
     if batch[: len(leading)] != leading:
         raise ShapeError(
