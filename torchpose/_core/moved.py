@@ -377,7 +377,8 @@ def present_module(old: str) -> str | None:
     for length in range(len(parts), 0, -1):
         home = MODULES.get(".".join(parts[:length]))
         if home is not None:
-            return ".".join(["torchpose", home, *parts[length:]])
+            present = ".".join(["torchpose", home, *parts[length:]])
+            return present_module(present) or present  # which may have moved once more
     *folder, name = parts
     if (_PACKAGE.joinpath(*folder) / f"_{name}.py").is_file():
         return ".".join(["torchpose", *folder, f"_{name}"])

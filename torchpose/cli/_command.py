@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from jsonargparse import ActionConfigFile, ArgumentParser
 
-from torchpose.cli.options import REQUIRED, Option, options_of, summary_of
+from torchpose.cli._options import REQUIRED, Option, options_of, summary_of
 
 __all__ = ["Command", "Given", "add_options", "new_parser", "parse_seed"]
 

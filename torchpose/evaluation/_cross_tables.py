@@ -5,15 +5,15 @@ from typing import Any, NamedTuple
 
 import torch
 
-from torchpose.evaluation.person_tables import (
+from torchpose.evaluation._person_tables import (
     SHORT_NAMES,
     add_pose_classes,
     mean_error,
     pooled,
 )
-from torchpose.evaluation.persons import spread
-from torchpose.evaluation.report import Report
-from torchpose.evaluation.unseen import Scored
+from torchpose.evaluation._persons import spread
+from torchpose.evaluation._report import Report
+from torchpose.evaluation._unseen import Scored
 
 __all__ = ["Crossed", "add_added", "add_cross", "plot_cross"]
 

@@ -22,18 +22,18 @@ import torch
 
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
-from torchpose.evaluation.common import Recipe, draw_picture
-from torchpose.evaluation.completion import (
+from torchpose.evaluation._common import Recipe, draw_picture
+from torchpose.evaluation._completion import (
     Completion,
     complete,
     facing_pieces,
     learn_completion,
     with_wrists,
 )
-from torchpose.evaluation.cross_tables import Crossed, add_added, add_cross, plot_cross
-from torchpose.evaluation.persons import by_person
-from torchpose.evaluation.report import Report
-from torchpose.evaluation.unseen import Job, ScoreSettings, fit_settings, run_jobs
+from torchpose.evaluation._cross_tables import Crossed, add_added, add_cross, plot_cross
+from torchpose.evaluation._persons import by_person
+from torchpose.evaluation._report import Report
+from torchpose.evaluation._unseen import Job, ScoreSettings, fit_settings, run_jobs
 from torchpose.io._recordings import Recording, read_recordings
 from torchpose.learning._recipes.upper_body import fit_kinect_prior
 from torchpose.skeleton._upper_body import upper_body_indices

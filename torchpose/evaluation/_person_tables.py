@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import torch
 
-from torchpose.evaluation.persons import POSE_CLASSES, spread
-from torchpose.evaluation.report import Report, Table
-from torchpose.evaluation.unseen import Scored
+from torchpose.evaluation._persons import POSE_CLASSES, spread
+from torchpose.evaluation._report import Report, Table
+from torchpose.evaluation._unseen import Scored
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
 __all__ = [

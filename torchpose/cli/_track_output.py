@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from torchpose.cli.common import save_pictures
+from torchpose.cli._common import save_pictures
 
 if TYPE_CHECKING:
     from torchpose.io._results import ResultsFolder

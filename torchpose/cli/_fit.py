@@ -4,11 +4,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from torchpose._core.terminal import show_progress
-from torchpose.cli.command import Command, Given
-from torchpose.cli.common import pictures_possible
-from torchpose.cli.fit_bodies import KINDS
-from torchpose.cli.fit_bodies import main as fit_bodies
-from torchpose.cli.options import options_of
+from torchpose.cli._command import Command, Given
+from torchpose.cli._common import pictures_possible
+from torchpose.cli._fit_bodies import KINDS
+from torchpose.cli._fit_bodies import main as fit_bodies
+from torchpose.cli._options import options_of
 from torchpose.errors import InputError
 from torchpose.io._formats.axes import Axes
 

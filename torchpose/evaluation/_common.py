@@ -21,7 +21,7 @@ from torchpose._core.reading import read_npz
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import project
 from torchpose.errors import InputError, TorchposeError
-from torchpose.evaluation.report import RESULTS, Report
+from torchpose.evaluation._report import RESULTS, Report
 from torchpose.filters._base import Generators
 from torchpose.io._recordings import Recording
 from torchpose.io._results import replace_own

@@ -18,17 +18,24 @@ from tqdm.auto import tqdm
 from torchpose._core.checks import check_count
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError, OverlapError
-from torchpose.evaluation.common import CAMERA, MEASURED, Trials, draw_picture, make_test_set, track
-from torchpose.evaluation.person_tables import (
+from torchpose.evaluation._common import (
+    CAMERA,
+    MEASURED,
+    Trials,
+    draw_picture,
+    make_test_set,
+    track,
+)
+from torchpose.evaluation._person_tables import (
     add_persons,
     add_pose_classes,
     mean_error,
     plot_persons,
     pooled,
 )
-from torchpose.evaluation.persons import by_person, pose_classes, spread
-from torchpose.evaluation.report import Report
-from torchpose.evaluation.unseen import (
+from torchpose.evaluation._persons import by_person, pose_classes, spread
+from torchpose.evaluation._report import Report
+from torchpose.evaluation._unseen import (
     LEVELS,
     Scored,
     compare,

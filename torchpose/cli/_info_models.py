@@ -121,7 +121,7 @@ DESCRIBED: dict[str, Callable[[Path], Facts]] = {
 
 def describe_body_poses(path: Path) -> Facts:
     """Return the facts about poses of a whole body, from `torchpose track-body`."""
-    from torchpose.cli.track_body_output import action_text
+    from torchpose.cli._track_body_output import action_text
     from torchpose.whole_body._poses import BodyPoses
 
     poses = BodyPoses.load(path)

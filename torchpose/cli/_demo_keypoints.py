@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from torchpose._core.terminal import show_progress
-from torchpose.cli.common import save_pictures
-from torchpose.cli.track_output import track_pictures, write_track
+from torchpose.cli._common import save_pictures
+from torchpose.cli._track_output import track_pictures, write_track
 
 if TYPE_CHECKING:
     from torch import Tensor

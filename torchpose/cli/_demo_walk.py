@@ -28,7 +28,7 @@ _PARTS = ("neck", "elbow", "wrist", "hip", "knee", "ankle")
 
 def demo_walk(folder: str, seconds: float, seed: int, pictures: bool) -> int:
     """Render, track by `torchpose track-body`, score; return exit code 1 if standing still is not beaten."""
-    from torchpose.cli import track_body
+    from torchpose.cli import _track_body as track_body
     from torchpose.demo._rendering.walk import walk
     from torchpose.whole_body._poses import BodyPoses
 

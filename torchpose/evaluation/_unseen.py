@@ -19,7 +19,7 @@ from tqdm.auto import tqdm
 
 from torchpose.camera._viewpoints import ViewRange, sample_viewpoints
 from torchpose.errors import InputError, PriorError
-from torchpose.evaluation.common import (
+from torchpose.evaluation._common import (
     CAMERA,
     MEASURED,
     Estimate,
@@ -33,7 +33,7 @@ from torchpose.evaluation.common import (
     settings_hash,
     track,
 )
-from torchpose.evaluation.persons import LEAST_FRAMES, complete_pieces, pose_classes
+from torchpose.evaluation._persons import LEAST_FRAMES, complete_pieces, pose_classes
 from torchpose.io._recordings import Recording
 from torchpose.learning._recipes.upper_body import fit_kinect_prior
 from torchpose.metrics._calibration import chi2_quantile, mahalanobis_squared
