@@ -19,7 +19,7 @@ _ASYMMETRY = _BELOW_ZERO = 1e-4  # of the largest entry; poses are kept in singl
 
 
 def to_tensor(array: np.ndarray) -> Tensor:
-    """Return a tensor of an array, whatever order its bytes have in the file."""
+    """Return a tensor of an array of either byte order."""
     kind = array.dtype.newbyteorder("=")
     return torch.from_numpy(np.ascontiguousarray(array, kind).reshape(array.shape))
 

@@ -74,7 +74,7 @@ def _why_no_file(path: Path) -> str:
 
 @contextlib.contextmanager
 def reading(path: str | Path, expected: str) -> Iterator[None]:
-    """Turn what goes wrong while a file is read into one typed error that names it.
+    """Turn an error while a file is read into one typed error that names the file.
 
     Args:
         path: the file. expected: the expected kind of file, as "a TOML camera file".

@@ -147,7 +147,7 @@ def point_weights(skeleton: BodySkeleton, offsets: Tensor, tips: Tensor) -> Tens
 
 
 def check_limb_lengths(skeleton: BodySkeleton, limb_weights: Tensor) -> None:
-    """Raise if a limb has no length whatever the pose: both ends depend on the same rotations."""
+    """Check that no limb has zero length in every pose, as one whose ends turn with the same parts."""
     start, end = limb_weights.unflatten(-1, (-1, 2)).unbind(-1)
     lengths = (end - start).norm(dim=0)
     if bool((lengths < _SHORTEST).any()):

@@ -297,7 +297,7 @@ Cameras = CameraRig | PinholeCamera | Iterable[PinholeCamera] | Mapping[str, Pin
 
 
 def as_rig(cameras: Cameras) -> CameraRig:
-    """Return a rig of whatever holds cameras: a rig, one camera, several, or a mapping of names.
+    """Return a rig of cameras given as a rig, one camera, several, or a mapping of names.
 
     Raises:
         CameraError: it holds no cameras.

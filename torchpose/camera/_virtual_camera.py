@@ -109,7 +109,7 @@ def body_path(
     start: int = 0,
     variance: Float[Tensor, "B T 2"] | None = None,
 ) -> BodyPath:
-    """Return the neck and head at t - lag, by regression on what was measured from a second ago to `ahead`.
+    """Return the neck and head at t - lag, by regression on the measurements from a second ago to `ahead`.
 
     The neck moves with a velocity that is a random walk, and so, much more slowly, does the height
     of the head above it; the head nods besides:

@@ -138,7 +138,7 @@ class Command(NamedTuple):
         return self.call(self.given(arguments))
 
     def call(self, given: Given) -> int:
-        """Call the function with what was given, and return the exit code."""
+        """Call the function with the given options, and return the exit code."""
         values: dict[str, Any] = {option.name: given.values[option.key] for option in self.own}
         for parameter, group in self.groups.items():
             values[parameter] = {option.name: given.values[option.key] for option in group}

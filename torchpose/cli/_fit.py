@@ -169,7 +169,7 @@ def _fit_recipe(
 def _curated(
     recordings: list["Recording"], settings: dict[str, Any] | None
 ) -> tuple[list["Recording"], str, dict[str, Any]]:
-    """Return recordings without what is no body, what was dropped in words, and as facts for the card."""
+    """Return curated recordings, a description of the omissions, and facts about them for the card."""
     if settings is None:
         return recordings, f"read     {_count(recordings)}", {}
     from torchpose.learning._curation import curate

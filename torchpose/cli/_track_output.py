@@ -120,7 +120,7 @@ def track_pictures(track: "PoseTrack", truth: Any = None, labels: Any = None) ->
 def summary(
     track: "PoseTrack", written: list[Path], settings: dict[str, str], notes: Sequence[str] = ()
 ) -> str:
-    """Return some lines on frames, what was measured, what was assumed, and the files."""
+    """Return some lines on frames, measurements, assumptions and the files."""
     n, fps = track.joints3d.shape[1], track.fps
     length = f" ({n / fps:.1f} s at {fps:g} fps)" if fps else ""
     shares = track.observed[0].double().mean(0).tolist()

@@ -211,7 +211,7 @@ class Estimate(NamedTuple):
 def own_method(
     prior: UpperBodyPrior, fps: float | None = None, smoothing: int | str | None = None
 ) -> str:
-    """Return the method that a prior has by itself: windows where they suit, else single poses."""
+    """Return the default method of a prior: windows where they suit, else single poses."""
     return choose_method(prior, None, smoothing, fps, (), windows=True).method
 
 

@@ -203,7 +203,7 @@ def _doubling(most: int) -> tuple[int, ...]:
 
 
 def _others(folders: Sequence[Path], most: int, count: int) -> dict[str, list[Recording]]:
-    """Return further training persons, as many as are missing."""
+    """Return the missing number of further training persons."""
     missing = count - most
     if missing <= 0:
         return {}

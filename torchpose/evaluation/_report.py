@@ -144,7 +144,7 @@ class Report(Mapping[str, Table]):
         return "\n\n".join(parts) + "\n"
 
     def to_json(self) -> str:
-        """Return all of it as JSON; what is not finite is null."""
+        """Return the report as JSON; numbers that are not finite are null."""
         tables = {
             key: {
                 "title": t.title,

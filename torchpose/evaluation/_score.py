@@ -142,7 +142,7 @@ def _usual(
     fps: float | None = None,
     smoothing: str | None = None,
 ) -> str:
-    """Return the method that the tracker takes by itself for these joints."""
+    """Return the default method of the tracker for these joints."""
     there = [joint in names for joint in UPPER_BODY]
     return choose_method(prior, None, smoothing, fps, ()).with_joints(there, wrists=False)
 

@@ -131,7 +131,7 @@ def fit_settings(
     window_samples: int | None,
     calibration_folds: int,
 ) -> dict[str, Any]:
-    """Return the settings of a recipe: what was asked for, small sizes for a quick run, else its own."""
+    """Return the settings of a recipe: the given ones, small sizes for a quick run, else its own."""
     settings: dict[str, Any] = {"name": name, "seed": seed}
     settings |= QUICK if quick else {}
     sizes = {

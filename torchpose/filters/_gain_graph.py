@@ -81,7 +81,7 @@ class GainGraph:
         self._blocks: dict[tuple[int, int, torch.dtype], BlockModel] = {}
 
     def full(self) -> bool:
-        """Return whether no more edges should be added; the caller then goes without the graph."""
+        """Return whether the graph has its largest size; the caller then filters without it."""
         return len(self.edges) >= _MOST_EDGES
 
     def edge(self, node: int, pattern: int) -> Edge:
@@ -226,7 +226,7 @@ def find_history(model: MixtureKalmanFilter, frames: Measurements) -> History | 
 
 
 def _one_history(graph: GainGraph, row: list[int], group: Tensor) -> History | None:
-    """Return the walk of a single history; what is steady is walked through in one stride."""
+    """Return the walk of a single history; a steady stretch is walked through in one stride."""
     node, edges, steady = 0, [], []
     for pattern, run in groupby(row):
         left = sum(1 for _ in run)

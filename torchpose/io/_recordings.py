@@ -261,7 +261,7 @@ def _looks_recorded(path: Path) -> bool:
 
 
 def _finish(raw: RawRecording, axes: str | None) -> Recording:
-    """Check what was read and turn it into metres and camera axes."""
+    """Check the joints of a file and turn them into metres and camera axes."""
     where = raw.where()
     _check_shapes(raw)
     try:

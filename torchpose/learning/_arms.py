@@ -220,7 +220,7 @@ def _tilted(pairs: Float[Tensor, "N 2 6"], generator: torch.Generator) -> Float[
 def _length_statistics(
     lengths: Float[Tensor, "P 5"], trust: Float[Tensor, " P"], of: Int[Tensor, " P"]
 ) -> tuple[Tensor, Tensor]:
-    """Return the weighted median of each length, and the spread of its log, shrunk to what is usual.
+    """Return the weighted median of each length, and the spread of its log, shrunk to the usual spread.
 
     The persons of a set were measured alike: a set counts as one, however many persons it has.
 

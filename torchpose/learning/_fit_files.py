@@ -91,7 +91,7 @@ def write_fit(
 def write_prior_files(
     prior: UpperBodyPrior, results: ResultsFolder, file: str, picture: bool = False
 ) -> str:
-    """Write a prior of the upper body, its card and a picture of its mean poses; return what was done.
+    """Write a prior of the upper body, its card and a picture of its mean poses; return a report.
 
     Args:
         prior: that was fitted. results: folder of the files. file: name of the prior's.
@@ -112,7 +112,7 @@ def write_prior_files(
 def write_manifold_files(
     fitting: ManifoldFitting, results: ResultsFolder, file: str, picture: bool = False, **facts: str
 ) -> str:
-    """Write a fitted manifold, its card and its latent space; return what was done.
+    """Write a fitted manifold, its card and its latent space; return a report.
 
     Args:
         fitting: at its end. results: folder of the files. file: name of the manifold's.
@@ -133,7 +133,7 @@ def write_manifold_files(
 def write_limb_files(
     states: LimbStates, results: ResultsFolder, file: str, least_std: float = 0.01, **facts: str
 ) -> str:  # fmt: skip
-    """Fit limb conditionals, write them and their card, and return what was done.
+    """Fit limb conditionals, write them and their card; return a report.
 
     Args:
         states: to fit to. results: folder of the files. file: name of the conditionals'.
@@ -147,7 +147,7 @@ def write_limb_files(
 def write_action_files(
     fitted: FittedActions, results: ResultsFolder, file: str, picture: bool = False, **facts: str
 ) -> str:
-    """Write an action space or a bank, its card and a picture of each action; return what was done.
+    """Write an action space or a bank, its card and a picture of each action; return a report.
 
     Args:
         fitted: to be written. results: folder of the files. file: name of the space's or bank's.

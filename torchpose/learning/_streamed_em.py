@@ -161,7 +161,7 @@ class StreamedEM(MixtureFit):
         return SufficientStatistics.unpack(share.total(total.pack()), len(self.means))
 
     def mixture(self) -> GaussianMixture:
-        """Return the mixture as it is, in units of the states; its `fit_report` says how the fit went."""
+        """Return the present mixture in units of the states, with a `fit_report`."""
         mixture = GaussianMixture(*self.parameters_of_points())
         mixture.fit_report = self.report()
         return mixture

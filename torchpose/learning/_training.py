@@ -173,7 +173,7 @@ def collect_poses(
 
 
 def short_paths(poses: PoseSet, room: float) -> PoseSet:
-    """Return recordings cut where the neck has gone far, each part centred on the mean of its neck.
+    """Return recordings cut where the neck is far from its start, each part centred on its mean neck.
 
     Args:
         poses: from `collect_poses`. room: diagonal of the box that holds a part's necks, at most;

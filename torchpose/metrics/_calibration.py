@@ -181,7 +181,7 @@ def predictive_log_likelihood(
     covariance: Float[Tensor, "*batch M D D"],
     value: Float[Tensor, "*batch D"],
 ) -> Float[Tensor, "*batch"]:
-    """Return the log density of what came next under a mixture that predicted it.
+    """Return the log density of observed values under a mixture that predicted them.
 
     log sum_m w_m N(value; mean_m, C_m), the weights normalised here.
 

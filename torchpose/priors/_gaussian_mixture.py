@@ -193,7 +193,7 @@ class GaussianMixture(nn.Module):
         progress: bool = False,
         dtype: torch.dtype = torch.float64,
     ) -> GaussianMixture:
-        """Fit a mixture by expectation-maximisation; `fit_report` of the result says how it went.
+        """Fit a mixture by expectation-maximisation; the result has a `fit_report`.
 
         Args:
             x: points [N, D], finite.

@@ -241,7 +241,7 @@ def method_options(method: str) -> tuple[str, ...]:
 
 
 def check_options(method: str, options: Iterable[str]) -> None:
-    """Refuse options that a method does not use, and say which method does.
+    """Refuse options that a method does not use, and name the method that does.
 
     Raises:
         InputError: such an option.

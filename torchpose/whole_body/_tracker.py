@@ -187,7 +187,7 @@ class BodyTracker(nn.Module):
         facing: Float[Tensor, "3"] | None = None,
         n_frames: int | None = None,
     ) -> BodyPoses:
-        """Track one person from the first frame in which all cameras see somebody.
+        """Track one person from the first frame whose silhouettes all show a person.
 
         Args:
             silhouettes: bool [T, C, H, W], or frames [C, H, W] one after the other, of which memory then

@@ -72,7 +72,7 @@ DEFAULTS = CurationSettings()
 
 
 class Curated(NamedTuple):
-    """Holds the recordings that are left, and a report on what was left out."""
+    """Holds the recordings that are left, and a report on the others."""
 
     recordings: list[Recording]
     report: CurationReport

@@ -57,7 +57,7 @@ class Size(NamedTuple):
 
 
 class CurationReport(NamedTuple):
-    """Holds the counts before and after curation, and what was left out.
+    """Holds the counts before and after curation, and the omissions.
 
     Attributes:
         before, after: counts. drops: one per file, joint and reason. notes: what reading assumed and
@@ -82,7 +82,7 @@ class CurationReport(NamedTuple):
         return "\n".join([*lines, *(f"note     {note}" for note in self.notes[:_SHOWN_NOTES])])
 
     def totals(self) -> dict[str, tuple[int, str]]:
-        """Count what was left out by reason, with its unit (joints or frames)."""
+        """Count the omissions by reason, with their unit (joints or frames)."""
         counts: Counter[tuple[str, str]] = Counter()
         for drop in self.drops:
             counts[drop.reason, "joints" if drop.joint else "frames"] += drop.n_frames

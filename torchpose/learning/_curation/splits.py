@@ -111,7 +111,7 @@ def refuse_shared_between_persons(
 
 
 def describe_duplicate(found: Duplicate, recordings: Sequence[Recording]) -> str:
-    """Say which recording is contained in which other one."""
+    """Return a sentence on which recording is contained in which other one."""
     first, second = recordings[found.first], recordings[found.second]
     return (
         f"{100 * found.shared:.0f} % of the frames of {label(second)} (person {second.person_id}) "

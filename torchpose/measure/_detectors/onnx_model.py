@@ -63,7 +63,7 @@ class CroppingOnnxModel(OnnxModel):
 
 
 def load_onnx(path: Path) -> OnnxModel:
-    """Return the detector of an ONNX file; its layout is told by the outputs for an empty image.
+    """Return the detector of an ONNX file; its outputs for an empty image determine the layout.
 
     Args:
         path: of the model.

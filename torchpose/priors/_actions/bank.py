@@ -424,7 +424,7 @@ class ActionBank(nn.Module):
 
     @property
     def _gated(self) -> int:
-        """Return the dimensions that the gates look at."""
+        """Return the number of dimensions that the gates use."""
         return min(self.info.gate_dimensions or self.basis.shape[-1], self.basis.shape[-1])
 
     def _there(self) -> Tensor:

@@ -215,7 +215,7 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
 def _process_cov(
     body: PoseSpace, manifold: PoseManifold, fps: float = 60.0, scale: float = 1.0
 ) -> Float[Tensor, " D"]:
-    """Return the variances [D] of the root by default, and of the parts by so many times sigma x->x."""
+    """Return the variances [D]: the root's by default, and of the parts (factor x sigma x->x) squared."""
     std = default_step_std(body, fps)
     columns = torch.as_tensor(body.relative_columns, dtype=torch.long)  # type: ignore[attr-defined]
     std[columns.to(std.device)] = scale * manifold.std_step.detach().to(std)

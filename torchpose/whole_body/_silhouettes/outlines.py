@@ -87,7 +87,7 @@ class Outlines(NamedTuple):
 
 
 def project_limbs(limbs: Limbs, rig: CameraRig, near: float = NEAR) -> ProjectedLimbs:
-    """Return the discs of both ends in every camera; what is nearer than `near` is cut off.
+    """Return the discs of both ends in every camera; parts nearer than `near` are cut off.
 
     Args:
         limbs: start and end [N, L, 3], radii [L, 2] or [N, L, 2], metres, world axes.
