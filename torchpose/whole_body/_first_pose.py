@@ -77,7 +77,7 @@ def find_first_pose(
     Args:
         body: whose pose it is. silhouettes: of the first frames, half a second or so; bool.
         cameras: the C cameras. prior: poses to start from, as `find_candidates`.
-        generator: for what is drawn.
+        generator: of random numbers.
         fps: of the frames. n_frames: that are looked at, evenly spread over those given.
         n_particles: of the search in the first frame. n_tracking: likelihoods of a candidate and frame.
         n_headings, likelihood, limits, up: as `find_candidates`.

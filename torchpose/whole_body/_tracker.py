@@ -38,7 +38,7 @@ class BodyStream(NamedTuple):
     """Holds the state of `BodyTracker.step` between two frames.
 
     Attributes:
-        filter: state of the filter. frame: number of the next frame. generator: for what is drawn.
+        filter: state of the filter. frame: number of the next frame. generator: of random numbers.
     """
 
     filter: BodyFilterState
@@ -193,7 +193,7 @@ class BodyTracker(nn.Module):
             silhouettes: bool [T, C, H, W], or frames [C, H, W] one after the other, of which memory then
                 holds those that the first pose is found in, and one more.
             initial_state: the pose before that frame [D], of `body`; found in half a second of frames
-                (`find_first_pose`) if None. generator: for what is drawn.
+                (`find_first_pose`) if None. generator: of random numbers.
             progress: whether to show a bar. facing: [3], the world direction that the person looks in at
                 first, if it is known. n_frames: expected number of frames, for the bar.
 
@@ -239,7 +239,7 @@ class BodyTracker(nn.Module):
         Args:
             silhouettes: bool, half a second in which the first pose is found; they are to be tracked
                 afterwards, with `step` or `advance`. initial_state: the pose before the first frame [D], of
-                `body`, instead. generator: for what is drawn; the state holds it. facing: as in `forward`.
+                `body`, instead. generator: of random numbers; the state holds it. facing: as in `forward`.
 
         Returns:
             `BodyStream` before the first frame.
@@ -336,7 +336,7 @@ def track_body(
         model: a filter over silhouettes, whose body is a `torchpose.body.Body`.
         frames: silhouettes of the C cameras, frame after frame. cameras: theirs.
         initial_state: the pose before the first frame [D], recorded or from `find_first_pose`.
-        generator: for what is drawn. initial_std: spread of the first particles [D]; none if None.
+        generator: of random numbers. initial_std: spread of the first particles [D]; none if None.
         fps: of the frames, for the result. n_frames: expected number of frames, for the progress bar.
         progress: whether to show it.
 

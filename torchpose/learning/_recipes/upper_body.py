@@ -282,8 +282,8 @@ class UpperBodyRecipe:
         Recordings of people who walk past the camera are cut into parts near its usual place.
 
         Args:
-            prior: mixtures over poses; a millionth of their variance keeps Q regular. recordings: what
-                they were fitted on.
+            prior: mixtures over poses; a millionth of their variance keeps Q regular. recordings: those
+                that they were fitted on.
 
         Returns:
             Covariances per frame by name, in the units of the state.

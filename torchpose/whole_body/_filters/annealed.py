@@ -170,8 +170,7 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
         """Anneal from the resampled particles of the last frame.
 
         Args:
-            state: of the last frame, its particles resampled if that was due, with what was remembered
-                of them.
+            state: of the last frame, with resampled particles and the filter's memory of them.
             frame: the observation of the frame.
             generator: one generator, or a list of one for each element.
 

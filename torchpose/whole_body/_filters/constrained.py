@@ -173,8 +173,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         """Predict within the action (AS 3, 6), then weigh by the image (AS 7).
 
         Args:
-            state: of the last frame, its particles resampled if that was due, with what was remembered
-                of them.
+            state: of the last frame, with resampled particles and the filter's memory of them.
             frame: the observation of the frame.
             generator: one generator, or a list of one for each element.
 

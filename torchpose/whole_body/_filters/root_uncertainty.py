@@ -208,8 +208,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         """Diffuse the roots, observe the parts, pass messages and weigh (DX 4-14).
 
         Args:
-            state: of the last frame, its particles resampled if that was due, with what was remembered
-                of them.
+            state: of the last frame, with resampled particles and the filter's memory of them.
             frame: the observation of the frame.
             generator: one generator, or a list of one for each element.
 

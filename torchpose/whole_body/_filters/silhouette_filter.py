@@ -145,8 +145,7 @@ class SilhouetteParticleFilter(nn.Module, ABC):
         """Return weighted particles of the next frame from those of the last.
 
         Args:
-            state: of the last frame, its particles resampled if that was due, with what was remembered
-                of them.
+            state: of the last frame, with resampled particles and the filter's memory of them.
             frame: the observation of the frame.
             generator: one generator, or a list of one for each element.
 
