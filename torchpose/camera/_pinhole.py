@@ -249,7 +249,8 @@ def save_cameras(cameras: Sequence[PinholeCamera], path: str | Path) -> None:
     """Write cameras as TOML, one table each, atomically: an interrupted write leaves no partial file.
 
     Args:
-        cameras: one or more, with different names; those without a name are called ``cam_01``, ....
+        cameras: one or more, with different names; those without a name are called ``cam_01``, ...
+            (a single one ``camera``).
         path: of the file, which is replaced.
 
     Raises:

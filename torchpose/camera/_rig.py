@@ -88,7 +88,7 @@ class CameraRig(nn.Module):
             path: of the file, see `load_cameras`.
 
         Returns:
-            Rig of all cameras; those without a name are called as their tables.
+            Rig of all cameras, named as their tables.
 
         Raises:
             InputError: no such file. FileFormatError: not such a file. CameraError: bad values.

@@ -158,7 +158,7 @@ def reliability(
         `Coverage` at the L levels.
 
     Raises:
-        ShapeError, InputError, CovarianceError: as `coverage`.
+        ShapeError, InputError: as `coverage`.
     """
     return coverage(estimate, covariance, truth, levels, mask)
 

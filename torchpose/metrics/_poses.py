@@ -197,7 +197,7 @@ def summarise_errors(errors: Float[Tensor, "*batch J"]) -> ErrorSummary:
         `ErrorSummary` in the same unit; NaN where nothing is left.
 
     Raises:
-        ShapeError: fewer than one dimension.
+        ShapeError: fewer than one dimension. InputError: whole or complex numbers.
     """
     errors = as_values("errors", errors, ["...", None])
     flat = errors.reshape(-1, errors.shape[-1])

@@ -310,7 +310,7 @@ class UpperBodyRecipe:
             mixtures: whole ones, by the names of `tasks`.
 
         Returns:
-            `WindowPrior` of both arms, in single precision.
+            `WindowPrior` of both arms, its numbers rounded to single precision.
         """
         # Single precision moves estimates by a thousandth of a millimetre, and files are half as large.
         left, right = (mixtures[f"{mode}.{side}"].rounded() for side in _SIDES)
