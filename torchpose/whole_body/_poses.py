@@ -43,7 +43,7 @@ _HEIGHTS = (0.3, 5.0)  # metres; between them is everybody, and what is no perso
 
 @dataclass
 class BodyPoses:
-    """Poses of one person in T frames; J joints and states of D numbers, as their body has.
+    """Holds the poses of one person in T frames; J joints and states of D numbers, as their body has.
 
     Attributes:
         body: whose states they are.
@@ -92,9 +92,14 @@ class BodyPoses:
         return int(first_true(self.respread))
 
     def save(self, path: str | Path) -> None:
-        """Write an .npz: what holds for each frame, `names`, `fps` (NaN if unknown), `notes`,
-        `first_frame`, `method`, `action_names`, details as `detail_acceptance` and so on, and the body as
-        `body_bone_lengths`, `body_radii` and so on.
+        """Write the poses as .npz, atomically: an interrupted write leaves no partial file.
+
+        Keys: what holds for each frame, `names`, `fps` (NaN if unknown), `notes`, `first_frame`, `method`,
+        `action_names`, details as `detail_acceptance` and so on, and the body as `body_bone_lengths`,
+        `body_radii` and so on.
+
+        Args:
+            path: of the file, which is replaced.
 
         Raises:
             OutputError: the file cannot be written.
@@ -118,6 +123,12 @@ class BodyPoses:
     @classmethod
     def load(cls, path: str | Path) -> Self:
         """Read what `save` wrote.
+
+        Args:
+            path: .npz file.
+
+        Returns:
+            The poses, with their body.
 
         Raises:
             InputError: no such file. FileFormatError: not such poses, or fields that do not agree: other
@@ -179,7 +190,14 @@ class BodyPoses:
             )
 
     def seen_by(self, camera: PinholeCamera) -> "CameraPoses":
-        """Return the joints in a camera's axes, for `torchpose.viz._report.write_report`."""
+        """Return the joints in a camera's axes, for `torchpose.viz._report.write_report`.
+
+        Args:
+            camera: with a pose in the room.
+
+        Returns:
+            `CameraPoses`: joints [1, T, J, 3], metres, and their covariances [1, T, J, 3, 3], square metres.
+        """
         R, t = (m.to(self.joints3d) for m in (camera.rotation_matrix, camera.translation))
         return CameraPoses(
             joints3d=(self.joints3d @ R.mT + t)[None],
@@ -193,7 +211,7 @@ class BodyPoses:
 
 @dataclass
 class CameraPoses:
-    """Poses in the axes of a camera; see `torchpose.viz._report.packing.ReportedTrack`."""
+    """Holds poses in the axes of a camera; see `torchpose.viz._report.packing.ReportedTrack`."""
 
     joints3d: Tensor
     covariance3d: Tensor
@@ -209,6 +227,12 @@ class CameraPoses:
 
 def load_body(path: str | Path) -> Body:
     """Read the body of poses that were saved: bone lengths, limbs and centres of a person.
+
+    Args:
+        path: .npz file of `BodyPoses`.
+
+    Returns:
+        `Body` in float64.
 
     Raises:
         InputError: no such file. FileFormatError: not such poses, or no body of a person.

@@ -35,10 +35,10 @@ _SEEN = 0.002  # of the image: fewer pixels are nobody
 
 
 class BodyStream(NamedTuple):
-    """State of `BodyTracker.step` between two frames.
+    """Holds the state of `BodyTracker.step` between two frames.
 
     Attributes:
-        filter: state of the filter. frame: number of the next frame. generator: for what is drawn.
+        filter: state of the filter. frame: number of the next frame. generator: of random numbers.
     """
 
     filter: BodyFilterState
@@ -47,7 +47,7 @@ class BodyStream(NamedTuple):
 
 
 class BodyTracker(nn.Module):
-    """Tracker of one person's whole body through the silhouettes of calibrated cameras, in 3D.
+    """Tracks one person's whole body through the silhouettes of calibrated cameras, in 3D.
 
     `forward` tracks a whole sequence and finds the first pose by itself; `init` and `step` track live,
     `advance` some frames at a time, with the same numbers.
@@ -71,7 +71,7 @@ class BodyTracker(nn.Module):
         height: height of the person, metres.
         manifold: poses of an action, by a name that `torchpose info` lists, or a file; in Python also the
             model itself. The first pose is looked for with it by every method.
-        conditionals: how limbs stand to each other and turn, by name, or a file.
+        conditionals: rotations of limbs against each other and over time, by name, or a file.
         action: postures of an action, or of several, by name, or a file.
         n_particles: likelihoods of a frame, of all layers together; a hypothesis of "root" counts seven.
         fps: frames per second; noise grows with the time between frames.
@@ -79,7 +79,7 @@ class BodyTracker(nn.Module):
             in squares of metres for the root and of sines of half angles for rotations; by default what
             suits the method.
         initial_cov: the same of the particles about the first pose; by default four times `process_cov`.
-        options: of the method's filter (`torchpose.whole_body._methods.method_options`), such as sharpness,
+        **options: of the method's filter (`torchpose.whole_body._methods.method_options`), such as sharpness,
             limits, leg_swap or n_layers.
 
     Attributes:
@@ -163,7 +163,7 @@ class BodyTracker(nn.Module):
 
     @property
     def upright(self) -> Body:
-        """Return the same person, on whom the first pose is looked for."""
+        """Return the person's body on which the first pose is looked for."""
         return self.body if self._upright is None else self._upright
 
     @property
@@ -187,15 +187,15 @@ class BodyTracker(nn.Module):
         facing: Float[Tensor, "3"] | None = None,
         n_frames: int | None = None,
     ) -> BodyPoses:
-        """Track one person from the first frame in which all cameras see somebody.
+        """Track one person from the first frame whose silhouettes all show a person.
 
         Args:
             silhouettes: bool [T, C, H, W], or frames [C, H, W] one after the other, of which memory then
                 holds those that the first pose is found in, and one more.
             initial_state: the pose before that frame [D], of `body`; found in half a second of frames
-                (`find_first_pose`) if None. generator: for what is drawn.
+                (`find_first_pose`) if None. generator: of random numbers.
             progress: whether to show a bar. facing: [3], the world direction that the person looks in at
-                first, if it is known. n_frames: how many frames to expect, for the bar.
+                first, if it is known. n_frames: expected number of frames, for the bar.
 
         Returns:
             `BodyPoses`, from frame `first_frame`.
@@ -239,7 +239,10 @@ class BodyTracker(nn.Module):
         Args:
             silhouettes: bool, half a second in which the first pose is found; they are to be tracked
                 afterwards, with `step` or `advance`. initial_state: the pose before the first frame [D], of
-                `body`, instead. generator: for what is drawn; the state holds it. facing: as in `forward`.
+                `body`, instead. generator: of random numbers; the state holds it. facing: as in `forward`.
+
+        Returns:
+            `BodyStream` before the first frame.
 
         Raises:
             InputError: neither silhouettes nor a pose, nobody seen in the first frame. ShapeError,
@@ -310,7 +313,7 @@ class BodyTracker(nn.Module):
 
 
 def all_see(silhouettes: Bool[Tensor, "C H W"]) -> bool:
-    """Tell whether every camera sees somebody in a frame: more than 0.2 % of its pixels."""
+    """Return whether the silhouette of every camera has more than 0.2 % of the frame's pixels."""
     return bool((silhouettes.double().mean((-2, -1)) > _SEEN).all())
 
 
@@ -333,8 +336,8 @@ def track_body(
         model: a filter over silhouettes, whose body is a `torchpose.body.Body`.
         frames: silhouettes of the C cameras, frame after frame. cameras: theirs.
         initial_state: the pose before the first frame [D], recorded or from `find_first_pose`.
-        generator: for what is drawn. initial_std: spread of the first particles [D]; none if None.
-        fps: of the frames, for the result. n_frames: how many to expect, for the progress bar.
+        generator: of random numbers. initial_std: spread of the first particles [D]; none if None.
+        fps: of the frames, for the result. n_frames: expected number of frames, for the progress bar.
         progress: whether to show it.
 
     Returns:
@@ -390,6 +393,6 @@ def _person(body: Body | str | Path | None, height: float) -> Body:
 
 
 def _model(kind: str, value: Any, fps: float) -> tuple[Any, str]:
-    """Return a model with its noise for a frame rate, and what is to be said of that."""
+    """Return a model with its noise for a frame rate, and notes about it."""
     model = LEARNT[kind].load(value) if isinstance(value, str | Path) else value
     return LEARNT[kind].at_rate(model, fps), LEARNT[kind].rescaled(model, fps)

@@ -38,7 +38,7 @@ _LISTED = 8  # frames that a warning names
 
 @runtime_checkable
 class PoseSpace(Protocol):
-    """Protocol of the bodies that filters track; `torchpose.body.Body` has it.
+    """Declares what filters need of a body that they track; `torchpose.body.Body` has it.
 
     Attributes:
         dim: D. perturb(state, step): the state moved by a step, both [..., D].
@@ -56,7 +56,7 @@ class PoseSpace(Protocol):
 
 
 class BodyFilterOptions(TypedDict, total=False):
-    """The options of `SilhouetteParticleFilter`, which every filter over body poses has."""
+    """Declares the options of `SilhouetteParticleFilter`, which every filter over body poses has."""
 
     process_cov: Tensor | float | None
     step_std: Tensor | float | None
@@ -73,7 +73,7 @@ class BodyFilterOptions(TypedDict, total=False):
 
 
 class BodyTrack(NamedTuple):
-    """Estimates of a sequence; [T, ...] from one sequence, [B, T, ...] from a batch, [B, ...] of a step.
+    """Holds the estimates of a sequence [T, ...], of a batch [B, T, ...], or of a step [B, ...].
 
     Past the length of a sequence its last estimate is repeated, with log-evidence 0.
 
@@ -103,13 +103,20 @@ class BodyTrack(NamedTuple):
         return first_true(self.respread)
 
     def element(self, index: int) -> "BodyTrack":
-        """Return the track of one element of a batch."""
+        """Return the track of one element of a batch.
+
+        Args:
+            index: of the element, 0 to B - 1.
+
+        Returns:
+            `BodyTrack` without the batch dimension.
+        """
         parts: dict[str, Any] = {name: getattr(self, name)[index] for name in self._fields[:-1]}
         return BodyTrack(**parts, details={n: value[index] for n, value in self.details.items()})
 
 
 class BodyFilterState(NamedTuple):
-    """Weighted particles after a step, before they are resampled.
+    """Holds weighted particles after a step, before they are resampled.
 
     Attributes:
         particles: [B, N, D]. log_weights: normalised, [B, N], float64. mean: last estimate [B, D].
@@ -127,7 +134,7 @@ class BodyFilterState(NamedTuple):
 
 
 class WeightedParticles(NamedTuple):
-    """The particles of a new frame, as `SilhouetteParticleFilter.move` returns them.
+    """Holds the particles of a new frame, as `SilhouetteParticleFilter.move` returns them.
 
     Attributes:
         particles: [B, N, D]. log_weights: normalised [B, N], float64; NaN in an element whose particles
@@ -182,7 +189,12 @@ def reweight(
     xi_n = pi_n omega_n / sum_j pi_j omega_j,   log p(I_t | I_1:t-1) = log sum_n omega_n pi_n / sum_n omega_n
 
     Args:
-        log_prior: omega, of the prediction, normalised or not. log_likelihood: pi.
+        particles: [B, N, D].
+        log_prior: log omega [B, N], of the prediction, normalised or not.
+        log_likelihood: log pi [B, N].
+
+    Returns:
+        `WeightedParticles`; the log-evidence is -inf where all particles died.
 
     Reference: (MR 5), (MR 9)-(MR 11).
     """
