@@ -3,7 +3,7 @@
 import sys
 
 from torchpose.cli import guarded
-from torchpose.cli.evaluate import Protocol, build, execute
+from torchpose.cli._evaluate import Protocol, build, execute
 
 PROTOCOLS = {
     "ub_people": Protocol(

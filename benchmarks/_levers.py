@@ -14,7 +14,7 @@ from tqdm.auto import tqdm
 from benchmarks._upper_body import data_folder, score, trials_of
 from torchpose._core.files import atomic_path
 from torchpose.camera import ViewRange
-from torchpose.evaluation.common import CAMERA, MEASURED, Estimate, Trials, settings_hash
+from torchpose.evaluation._common import CAMERA, MEASURED, Estimate, Trials, settings_hash
 from torchpose.filters import MixtureKalmanFilter
 from torchpose.io import Recording, read_recordings
 from torchpose.learning import TRAINING_VIEWS, UpperBodyRecipe

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from benchmarks._upper_body import Scores
 from torchpose.evaluation import Report
-from torchpose.evaluation.common import HANDS, Trials, add_picture
-from torchpose.evaluation.person_tables import SHORT_NAMES
+from torchpose.evaluation._common import HANDS, Trials, add_picture
+from torchpose.evaluation._person_tables import SHORT_NAMES
 from torchpose.metrics import jitter
 from torchpose.metrics._poses import share_below
 from torchpose.priors import UpperBodyPrior

@@ -14,7 +14,7 @@ from benchmarks import bones
 from benchmarks.engine import Experiment
 from torchpose.camera import PinholeCamera, project, sample_viewpoints
 from torchpose.errors import InputError
-from torchpose.evaluation.common import (
+from torchpose.evaluation._common import (
     CAMERA,
     Estimate,
     Trials,
@@ -43,7 +43,7 @@ from torchpose.upper_body._single_poses import default_process_cov
 
 MADE_WITH = (
     "torchpose/camera", "torchpose/filters", "torchpose/math", "torchpose/priors",
-    "torchpose/skeleton", "torchpose/upper_body", "torchpose/evaluation/common.py",
+    "torchpose/skeleton", "torchpose/upper_body", "torchpose/evaluation/_common.py",
 )  # fmt: skip
 """What the numbers of a tracker depend on beside its facts: files and folders of a checkout."""
 

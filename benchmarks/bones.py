@@ -41,7 +41,7 @@ import torchpose
 from benchmarks._table_file import table_file
 from torchpose._core.files import check_output_folder
 from torchpose.evaluation import Report
-from torchpose.evaluation.common import CAMERA, centred_on_neck, make_test_set
+from torchpose.evaluation._common import CAMERA, centred_on_neck, make_test_set
 from torchpose.io import Recording, read_recordings
 from torchpose.learning import fit_kinect_prior
 from torchpose.learning._arms import fit_arm_prior

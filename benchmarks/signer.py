@@ -24,7 +24,7 @@ from torchpose._core.files import check_output_folder
 from torchpose._core.reading import read_npz
 from torchpose.errors import FileFormatError
 from torchpose.evaluation import Report
-from torchpose.evaluation.common import add_picture
+from torchpose.evaluation._common import add_picture
 from torchpose.filters import MixtureKalmanFilter
 from torchpose.priors import GaussianMixture, UpperBodyPrior
 from torchpose.priors._upper_body import released_process_cov

@@ -32,7 +32,7 @@ from benchmarks._upper_body import score
 from benchmarks.ub_people import people, sway
 from torchpose.camera import project, sample_viewpoints
 from torchpose.evaluation import Report
-from torchpose.evaluation.common import (
+from torchpose.evaluation._common import (
     CAMERA,
     MEASURED,
     Estimate,
@@ -40,7 +40,7 @@ from torchpose.evaluation.common import (
     centred_on_neck,
     make_test_set,
 )
-from torchpose.evaluation.person_tables import SHORT_NAMES
+from torchpose.evaluation._person_tables import SHORT_NAMES
 from torchpose.learning import TRAINING_VIEWS
 from torchpose.math import euler_to_matrix
 from torchpose.skeleton import UPPER_BODY

@@ -77,9 +77,8 @@ def checked(function: Any) -> Any:
     if not inspect.isfunction(function) or hasattr(function, "__wrapped__"):
         return function
     check = _check_of(function)
-    told, named, returns, plain, passed = (
-        check.told, check.named, check.returns, check.plain, check.passed
-    )  # fmt: skip
+    told, named, returns = check.told, check.named, check.returns
+    plain, passed = check.plain, check.passed
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:

@@ -46,58 +46,58 @@ def printable(text: str, longest: int = _LONGEST) -> str:
 
 
 class TorchposeError(Exception):
-    """Base class of every error that torchpose raises on purpose; its message is `printable`."""
+    """Serves as the base class of the errors that torchpose raises on purpose; messages are `printable`."""
 
     def __init__(self, *args: Any, **facts: Any) -> None:
         super().__init__(*(printable(a) if isinstance(a, str) else a for a in args), **facts)
 
 
 class ShapeError(TorchposeError, ValueError):
-    """A tensor has the wrong number of dimensions or a wrong size."""
+    """Signals that a tensor has the wrong number of dimensions or a wrong size."""
 
 
 class InputError(TorchposeError, ValueError):
-    """A value is outside what is allowed: NaN, infinity, a negative weight, an empty sequence."""
+    """Signals a value outside what is allowed: NaN, infinity, a negative weight, an empty sequence."""
 
 
 class CovarianceError(InputError):
-    """A covariance is not symmetric or not positive definite."""
+    """Signals that a covariance is not symmetric or not positive definite."""
 
 
 class CameraError(InputError):
-    """A camera lacks a focal length, or no camera can be told for the input."""
+    """Signals that a camera lacks a focal length, or that no camera can be determined for the input."""
 
 
 class SkeletonError(InputError):
-    """Joint names are unknown, or the joints do not form the expected skeleton."""
+    """Signals that joint names are unknown, or that the joints do not form the expected skeleton."""
 
 
 class PriorError(InputError):
-    """A prior does not fit the task: other skeleton, rotation order, neck, or state size."""
+    """Signals that a prior does not fit the task: other skeleton, rotation order, neck, or state size."""
 
 
 class NobodySeenError(InputError):
-    """Nobody is seen by all cameras in any frame of some silhouettes."""
+    """Signals that no frame shows a person in the silhouettes of all cameras."""
 
 
 class OverlapError(InputError):
-    """A model would be scored on persons whom it was fitted on."""
+    """Signals that a model would be scored on persons on whom it was fitted."""
 
 
 class FileFormatError(TorchposeError, ValueError):
-    """A file is truncated, of another kind, or holds other keys than expected."""
+    """Signals that a file is truncated, of another kind, or holds other keys than expected."""
 
 
 class OutputError(TorchposeError, OSError):
-    """Output cannot be written where it was asked for."""
+    """Signals that output cannot be written to the given place."""
 
 
 class MissingDependencyError(TorchposeError, ImportError):
-    """An optional package is needed for this call and is not installed."""
+    """Signals that an optional package is needed for this call and is not installed."""
 
 
 class DegenerateFilterWarning(UserWarning):
-    """Some elements of a batch degenerated; the others finished."""
+    """Warns that some elements of a batch degenerated while the others finished."""
 
 
 def __dir__() -> list[str]:

@@ -24,13 +24,7 @@ from torchpose.upper_body import PoseTrack
 from torchpose.upper_body._keypoint_files import KeypointFileTracker, TrackSettings
 from train.predict_recordings import KeypointRecording, content_of
 
-__all__ = [
-    "BatchTracker",
-    "digest_of_prior",
-    "facts_of",
-    "read_origin",
-    "save_result",
-]
+__all__ = ["BatchTracker", "digest_of_prior", "facts_of", "read_origin", "save_result"]
 
 _FORMAT = 1  # of what is stored in a result; another one is made again
 _ORIGIN = "origin.npy"

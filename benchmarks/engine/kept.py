@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from torchpose.evaluation.common import keep, read_kept, settings_hash
+from torchpose.evaluation._common import keep, read_kept, settings_hash
 
 _CHECKOUT = Path(__file__).parents[2]
 

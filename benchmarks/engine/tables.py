@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from benchmarks.engine.experiment import Axis, Results, Row
 from benchmarks.engine.statistics import Cell
-from torchpose.evaluation.report import RESULTS, Report, Table
+from torchpose.evaluation._report import RESULTS, Report, Table
 from torchpose.io._results import replace_own
 
 Thing = TypeVar("Thing")

@@ -24,7 +24,7 @@ from benchmarks.bodies.clips import Split, take_frames, whole_frames
 from benchmarks.humaneva_files import FPS, PARTITIONS, HumanEvaTrial, find_humaneva, read_humaneva
 from torchpose.camera import CameraRig
 from torchpose.errors import InputError
-from torchpose.evaluation.common import keep, read_kept, settings_hash
+from torchpose.evaluation._common import keep, read_kept, settings_hash
 from torchpose.io._mocap import MocapClip, select_persons
 from torchpose.video import SilhouetteMeasurer, VideoSource, open_video, read_silhouettes
 from torchpose.video._silhouettes import SilhouetteView, clean_silhouette, fit_view, learning_frames

@@ -32,7 +32,7 @@ def main() -> None:
     made.add_argument("--mediapipe", type=Path, help="Python of an environment with mediapipe")
     made.add_argument("--repeat", type=int, default=2, help="how often the clips follow each other")
     args, report = begin("Speed of the video pipeline", made)
-    from torchpose.cli.common import share_cores
+    from torchpose.cli._common import share_cores
 
     share_cores()  # as the command does
     with tempfile.TemporaryDirectory() as folder:

@@ -8,7 +8,9 @@ import pytest
 import torch
 
 from torchpose.camera import lift
-from torchpose.cli import demo_keypoints, demo_walk, main
+from torchpose.cli import _demo_keypoints as demo_keypoints
+from torchpose.cli import _demo_walk as demo_walk
+from torchpose.cli import main
 from torchpose.io import read_keypoints
 from torchpose.math import euler_to_matrix
 from torchpose.priors import load_prior
@@ -140,7 +142,7 @@ def test_standing_still_that_is_no_worse_fails_the_demo(torchpose, walked, monke
     """Of the walk that is tracked already."""
     out, _ = walked
     monkeypatch.setattr(demo_walk, "_render", lambda *_: ([], []))
-    monkeypatch.setattr("torchpose.cli.track_body.main", lambda _: 0)
+    monkeypatch.setattr("torchpose.cli._track_body.main", lambda _: 0)
     monkeypatch.setattr(demo_walk, "_still", lambda truth: torch.zeros(len(truth), 15))
     options = ("--input", "walk", "--seconds", 1, "--pictures", "false")
     done = torchpose("demo", *options, "--out", out)

@@ -6,7 +6,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from torchpose.cli import evaluate
+from torchpose.cli import _evaluate as evaluate
 from torchpose.errors import OverlapError
 
 
@@ -39,9 +39,9 @@ def calls(monkeypatch):
         made.append({k: v for k, v in locals().items() if k != "made"})
         return SimpleNamespace(summary=lambda: "error 5.0 cm")
 
-    module = ModuleType("torchpose.evaluation.learning_curve")
+    module = ModuleType("torchpose.evaluation._learning_curve")
     module.run = run
-    monkeypatch.setitem(sys.modules, "torchpose.evaluation.learning_curve", module)
+    monkeypatch.setitem(sys.modules, "torchpose.evaluation._learning_curve", module)
     return made
 
 

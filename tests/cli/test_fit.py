@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchpose.cli.fit import command
+from torchpose.cli._fit import command
 from torchpose.io import read_recordings
 from torchpose.learning import fit_upper_body_prior
 from torchpose.learning._curation import curate

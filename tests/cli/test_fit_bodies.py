@@ -13,7 +13,7 @@ from tests.priors.motions import motion
 from tests.priors.performances import performances
 from torchpose._core.tensor_file import format_of
 from torchpose.body import BODY_15, Body
-from torchpose.cli.fit_bodies import KINDS, command, recorded_command
+from torchpose.cli._fit_bodies import KINDS, command, recorded_command
 from torchpose.learning._gplvm_fit import GPLVMFit
 from torchpose.priors import ActionBank, ActionSpace, BackConstrainedGPLVM
 from torchpose.priors._actions.postures import posture_angles, posture_to_state

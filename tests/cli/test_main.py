@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from torchpose.cli import COMMANDS, evaluate
+from torchpose.cli import COMMANDS
+from torchpose.cli import _evaluate as evaluate
 from torchpose.cli import main as main_function
-from torchpose.cli.command import Command
+from torchpose.cli._command import Command
 
 ROOT = Path(__file__).parents[2]
 HELP = [(name,) for name in COMMANDS] + [("evaluate", name) for name in evaluate.PROTOCOLS]
@@ -55,7 +56,7 @@ def test_interruption(torchpose, monkeypatch):
     def interrupt(arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torchpose.cli.info.main", interrupt)
+    monkeypatch.setattr("torchpose.cli._info.main", interrupt)
     assert torchpose("info").code == 130
 
 
@@ -63,7 +64,7 @@ def test_bugs_are_not_hidden(torchpose, monkeypatch):
     def broken(arguments):
         raise ZeroDivisionError
 
-    monkeypatch.setattr("torchpose.cli.info.main", broken)
+    monkeypatch.setattr("torchpose.cli._info.main", broken)
     with pytest.raises(ZeroDivisionError):
         torchpose("info")
 
@@ -85,7 +86,7 @@ def test_written_command_lines_parse(line, monkeypatch, tmp_path):
     """The parser of each takes it; the work is not done."""
     parsed = []
     monkeypatch.setattr(Command, "call", lambda _, given: parsed.append(given) or 0)
-    monkeypatch.setattr("torchpose.cli.evaluate.execute", lambda *args: parsed.append(args) or 0)
+    monkeypatch.setattr("torchpose.cli._evaluate.execute", lambda *args: parsed.append(args) or 0)
     words = shlex.split(line)[1:]
     if "--config" in words:  # the file has to be there
         config = tmp_path / "config.yaml"

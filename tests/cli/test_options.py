@@ -12,9 +12,15 @@ import pytest
 from torch import Tensor
 
 from tests.cli.conftest import keypoints
-from torchpose.cli import COMMANDS, demo, fit, fit_bodies, info, track, track_body
-from torchpose.cli.command import Command
-from torchpose.cli.options import REQUIRED, documented, options_of, options_of_methods
+from torchpose.cli import COMMANDS
+from torchpose.cli import _demo as demo
+from torchpose.cli import _fit as fit
+from torchpose.cli import _fit_bodies as fit_bodies
+from torchpose.cli import _info as info
+from torchpose.cli import _track as track
+from torchpose.cli import _track_body as track_body
+from torchpose.cli._command import Command
+from torchpose.cli._options import REQUIRED, documented, options_of, options_of_methods
 from torchpose.io import write_keypoints
 from torchpose.learning import ActionRecipe, ManifoldRecipe, UpperBodyRecipe
 from torchpose.upper_body import METHODS, method_options, register_method

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from torchpose.evaluation import Report
-from torchpose.evaluation.common import add_picture
+from torchpose.evaluation._common import add_picture
 from torchpose.io._results import ResultsFolder
 from torchpose.upper_body import PoseTrack
 from torchpose.video import VideoWriter
@@ -206,9 +206,9 @@ def protocol(monkeypatch):
         report.save(out)
         return report
 
-    module = ModuleType("torchpose.evaluation.learning_curve")
+    module = ModuleType("torchpose.evaluation._learning_curve")
     module.run = run
-    monkeypatch.setitem(sys.modules, "torchpose.evaluation.learning_curve", module)
+    monkeypatch.setitem(sys.modules, "torchpose.evaluation._learning_curve", module)
 
 
 def test_an_evaluation_spares_other_reports_and_moves_other_pictures(torchpose, protocol, tmp_path):

@@ -9,7 +9,7 @@ import torch
 
 from tests.cli.conftest import GAP, N_FRAMES, keypoints
 from torchpose.camera import PinholeCamera, save_cameras
-from torchpose.cli import track_output
+from torchpose.cli import _track_output as track_output
 from torchpose.io import read_keypoints, write_keypoints
 from torchpose.priors import load_prior
 from torchpose.skeleton import UPPER_BODY
@@ -108,7 +108,7 @@ def test_pictures(torchpose, files, tmp_path):
 
 
 def test_without_matplotlib_it_says_how_to_get_pictures(torchpose, files, tmp_path, monkeypatch):
-    monkeypatch.setattr("torchpose.cli.common.find_spec", lambda name: None)
+    monkeypatch.setattr("torchpose.cli._common.find_spec", lambda name: None)
     prior = files / "prior.safetensors"
     done = torchpose("track", files / "keypoints.npz", "--out", tmp_path, "--prior", prior)
     assert done.code == 0

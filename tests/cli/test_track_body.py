@@ -8,7 +8,7 @@ import torch
 from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, PinholeCamera, load_cameras, save_cameras
 from torchpose.cli import main
-from torchpose.cli.track_body_output import action_text
+from torchpose.cli._track_body_output import action_text
 from torchpose.learning import fit_action_space, fit_gplvm, fit_gplvm_noise, fit_limb_conditionals
 from torchpose.priors import ActionBank, ManifoldInfo
 from torchpose.priors._actions.postures import state_postures

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchpose import demo
-from torchpose.cli.common import UntilInterrupted
+from torchpose.cli._common import UntilInterrupted
 from torchpose.errors import OutputError
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack

@@ -11,8 +11,9 @@ from benchmarks.ub_people import mean_pose, nearest_neighbour, people, sway
 from tests.evaluation.recordings import poses, small_recipe, write_people
 from torchpose.camera import PinholeCamera
 from torchpose.errors import InputError
-from torchpose.evaluation import Report, common
-from torchpose.evaluation.common import (
+from torchpose.evaluation import Report
+from torchpose.evaluation import _common as common
+from torchpose.evaluation._common import (
     TEST_ANGLES,
     TEST_TRANSLATION,
     Estimate,

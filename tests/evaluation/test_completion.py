@@ -8,7 +8,7 @@ import torch
 from tests.data import data_dir_or_skip
 from tests.evaluation.recordings import write_people
 from torchpose.errors import PriorError, SkeletonError
-from torchpose.evaluation.completion import complete, facing_pieces, learn_completion, with_wrists
+from torchpose.evaluation._completion import complete, facing_pieces, learn_completion, with_wrists
 from torchpose.io import read_recordings
 from torchpose.math import euler_to_matrix
 

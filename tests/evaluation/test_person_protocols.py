@@ -13,13 +13,16 @@ import torch
 from benchmarks import uncommon_poses
 from tests.data import few_recordings
 from tests.evaluation.recordings import V1, poses, small_recipe, write_one, write_people
-from torchpose.cli import evaluate
+from torchpose.cli import _evaluate as evaluate
 from torchpose.errors import InputError, OutputError
-from torchpose.evaluation import cross_dataset, learning_curve, leave_one_person_out, unseen
-from torchpose.evaluation import persons as persons_module
-from torchpose.evaluation.learning_curve import cyclic_subsets, halves
-from torchpose.evaluation.person_tables import mean_error
-from torchpose.evaluation.persons import POSE_CLASSES
+from torchpose.evaluation import _cross_dataset as cross_dataset
+from torchpose.evaluation import _learning_curve as learning_curve
+from torchpose.evaluation import _leave_one_person_out as leave_one_person_out
+from torchpose.evaluation import _persons as persons_module
+from torchpose.evaluation import _unseen as unseen
+from torchpose.evaluation._learning_curve import cyclic_subsets, halves
+from torchpose.evaluation._person_tables import mean_error
+from torchpose.evaluation._persons import POSE_CLASSES
 from torchpose.io import read_recordings
 from torchpose.skeleton import SKELETONS
 

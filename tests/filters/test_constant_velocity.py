@@ -16,10 +16,8 @@ def dense_estimates(z: torch.Tensor, upto: list[int]) -> torch.Tensor:
     noise = RATIO * torch.tensor([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], dtype=torch.float64)
     mean = torch.zeros(2 * n).double()
     cov = torch.zeros(2 * n, 2 * n).double()
-    now, spread = (
-        torch.tensor([z[0], 0.0], dtype=torch.float64),
-        torch.diag(torch.tensor([1.0, 100.0], dtype=torch.float64)),
-    )
+    now = torch.tensor([z[0], 0.0], dtype=torch.float64)
+    spread = torch.diag(torch.tensor([1.0, 100.0], dtype=torch.float64))
     for t in range(n):
         if t:
             now, spread = matrix @ now, matrix @ spread @ matrix.T + noise

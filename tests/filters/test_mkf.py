@@ -362,10 +362,8 @@ def test_every_option_changes_what_it_is_said_to_change():
 def test_the_class_of_the_tracks_is_what_the_name_of_the_tracks_makes(tracks):
     p = Problem(n_frames=9, batch=2)
     arguments = p.mixture(), tensor(p.process), tensor(p.noise), OBSERVED
-    named, made = (
-        MixtureKalmanFilter(*arguments, tracks, burn_in=2),
-        KINDS[tracks](*arguments, burn_in=2),
-    )
+    named = MixtureKalmanFilter(*arguments, tracks, burn_in=2)
+    made = KINDS[tracks](*arguments, burn_in=2)
     assert type(named) is type(made) is KINDS[tracks]
     assert isinstance(made, MixtureKalmanFilter) and made.tracks == tracks
     options = {"generator": torch.Generator().manual_seed(2)}

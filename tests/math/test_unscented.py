@@ -45,11 +45,8 @@ def test_the_points_lie_where_the_paper_puts_them():
 
 @pytest.mark.parametrize(("centre", "directions"), OPTIONS)
 def test_it_is_exact_for_linear_maps_and_means_of_squares(rng, centre, directions):
-    mean, cov, matrix = (
-        rng.standard_normal(4),
-        random_covariance(rng, 4),
-        rng.standard_normal((3, 4)),
-    )
+    mean, cov = rng.standard_normal(4), random_covariance(rng, 4)
+    matrix = rng.standard_normal((3, 4))
     options = {"centre": centre, "directions": directions}
     new_mean, new_cov = unscented_transform(
         lambda x: x @ tensor(matrix).mT, tensor(mean), tensor(cov), **options
@@ -63,9 +60,8 @@ def test_it_is_exact_for_linear_maps_and_means_of_squares(rng, centre, direction
 @pytest.mark.parametrize(("centre", "directions"), OPTIONS)
 def test_the_update_of_a_linear_measurement_is_kalmans(rng, centre, directions):
     mean, cov = rng.standard_normal((2, 4)), random_covariance(rng, 4)
-    matrix, noise, z = (
-        rng.standard_normal((2, 4)), random_covariance(rng, 2), rng.standard_normal((2, 2))
-    )  # fmt: skip
+    matrix, noise = rng.standard_normal((2, 4)), random_covariance(rng, 2)
+    z = rng.standard_normal((2, 2))
     new_mean, new_cov, log_likelihood = unscented_update(
         lambda x: x @ tensor(matrix).mT, tensor(mean), tensor(cov).expand(2, 4, 4), tensor(z),
         tensor(noise), centre=centre, directions=directions,

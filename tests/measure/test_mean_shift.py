@@ -19,11 +19,8 @@ def blobs(n=6, seed=0, shape=(60, 80), bumps=3):
     maps = rng.uniform(0, 0.02, (n, *shape))
     for m in maps:
         for _ in range(bumps):
-            cx, cy, s = (
-                rng.uniform(8, shape[1] - 8),
-                rng.uniform(8, shape[0] - 8),
-                rng.uniform(3, 7),
-            )
+            cx, cy = rng.uniform(8, shape[1] - 8), rng.uniform(8, shape[0] - 8)
+            s = rng.uniform(3, 7)
             m += rng.uniform(0.4, 0.9) * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * s * s))
     return torch.from_numpy(maps.clip(0, 1))
 

@@ -217,11 +217,8 @@ def test_dark_sleeves_are_followed():
     folder = data_dir_or_skip("video_asl")
     with np.load(folder / "again_mediapipe_pose1.npz") as file:
         names, joints = list(file["names"]), file["joints2d"]
-    video, faces, tracker = (
-        cv2.VideoCapture(str(folder / "again.mkv")),
-        FaceTracker(),
-        MeanShiftHandTracker(),
-    )
+    video = cv2.VideoCapture(str(folder / "again.mkv"))
+    faces, tracker = FaceTracker(), MeanShiftHandTracker()
     tracks, state, errors = faces.init(), tracker.init(), []
     width = np.median(np.hypot(*(joints[:, 5] - joints[:, 6]).T))
     assert names[5:7] == ["left_shoulder", "right_shoulder"]

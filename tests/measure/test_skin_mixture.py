@@ -11,12 +11,8 @@ from torchpose.measure import SkinMixtureModel
 from torchpose.measure._skin import rgb_to_lab
 
 FACE = torch.tensor([[80.0, 40.0, 32.0]])
-SKIN, DARK, CLOTH, WALL = (
-    (0.80, 0.60, 0.50),
-    (0.50, 0.34, 0.28),
-    (0.15, 0.20, 0.45),
-    (0.75, 0.75, 0.7),
-)
+SKIN, DARK = (0.80, 0.60, 0.50), (0.50, 0.34, 0.28)
+CLOTH, WALL = (0.15, 0.20, 0.45), (0.75, 0.75, 0.7)
 
 
 def person(seed=0, skin=SKIN, noise=0.02):

@@ -10,7 +10,7 @@ import yaml
 from tests.data import data_dir_or_skip
 from torchpose import load_action, load_limb_conditionals, load_manifold
 from torchpose.body import BODY_15, Body
-from torchpose.cli.fit_bodies import command
+from torchpose.cli._fit_bodies import command
 from torchpose.errors import OverlapError, PriorError
 from torchpose.learning._model_card import body_card
 from torchpose.priors import BackConstrainedGPLVM, known_models

@@ -110,10 +110,8 @@ def test_augmented_bodies_keep_their_angles_and_their_symmetry():
     body = sequence()[:, None]
     other = augment_bodies(body, torch.Generator().manual_seed(0), size=0.2, bones=0.1)
     for parent, child in ((2, 1), (1, 0), (4, 3)):
-        before, after = (
-            body[:, 0, child] - body[:, 0, parent],
-            other[:, 0, child] - other[:, 0, parent],
-        )
+        before = body[:, 0, child] - body[:, 0, parent]
+        after = other[:, 0, child] - other[:, 0, parent]
         torch.testing.assert_close(torch.cosine_similarity(before, after), torch.ones(12).double())
         assert ((after.norm(dim=1) / before.norm(dim=1) - 1).abs() < 0.33).all()
     left = (other[:, 0, 1] - other[:, 0, 2]).norm(dim=1) / (body[:, 0, 1] - body[:, 0, 2]).norm(

@@ -17,8 +17,8 @@ import torch
 
 from tests.priors.poses import poses, recording
 from torchpose._core.files import atomic_path
-from torchpose.cli.track import command as track_command
-from torchpose.cli.track import main as track
+from torchpose.cli._track import command as track_command
+from torchpose.cli._track import main as track
 from torchpose.errors import InputError, OutputError, PriorError
 from torchpose.learning import fit_upper_body_prior
 from torchpose.upper_body import PoseTrack

@@ -39,7 +39,7 @@ def refuse_export(what: str, instead: str) -> None:
     """Raise `InputError` while `torch.export` traces what depends on values.
 
     Args:
-        what: cannot be exported. instead: what can.
+        what: name of what cannot be exported. instead: name of what can.
     """
     is_exporting = getattr(torch.compiler, "is_exporting", None)  # not in all releases
     if is_exporting is not None and is_exporting():
@@ -50,7 +50,7 @@ def check_shape(name: str, tensor: Tensor, expected: Sequence[int | str | None])
     """Raise `ShapeError` unless `tensor` has the expected sizes.
 
     Args:
-        name: what the tensor is called in the message.
+        name: of the tensor, for the message.
         tensor: the tensor to look at.
         expected: one entry per dimension; an int is a fixed size, a str or None is any size. A
             leading ``"..."`` stands for any number of leading dimensions.
@@ -170,7 +170,7 @@ def check_covariance(name: str, covariance: Tensor, tolerance: float = 1e-6) -> 
     """Raise `CovarianceError` unless every matrix is symmetric and positive definite.
 
     Args:
-        name: what the covariance is called in the message.
+        name: of the covariance, for the message.
         covariance: [..., D, D].
         tolerance: largest asymmetry, relative to the largest entry of each matrix.
 

@@ -19,13 +19,13 @@ _ASYMMETRY = _BELOW_ZERO = 1e-4  # of the largest entry; poses are kept in singl
 
 
 def to_tensor(array: np.ndarray) -> Tensor:
-    """Return a tensor of an array, whatever order its bytes have in the file."""
+    """Return a tensor of an array of either byte order."""
     kind = array.dtype.newbyteorder("=")
     return torch.from_numpy(np.ascontiguousarray(array, kind).reshape(array.shape))
 
 
 def frame_facts(path: str | Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Return what results of all kinds say beside their frames: `fps`, `notes` and `first_frame`.
+    """Return the facts that results of all kinds hold beside their frames: `fps`, `notes`, `first_frame`.
 
     Raises:
         FileFormatError: of another type, a rate that no camera has, or a negative frame.

@@ -34,7 +34,7 @@ def register_given(module: nn.Module, name: str, value: Tensor | None) -> None:
     made in inference mode keeps what it derives as any other does.
 
     Args:
-        module: where to. name: of the entry. value: None is registered as an empty entry.
+        module: that registers it. name: of the entry. value: None is registered as an empty entry.
     """
     if isinstance(value, nn.Parameter):
         module.register_parameter(name, value)
@@ -58,7 +58,7 @@ def wide_or_parameter(value: Tensor | float | Sequence[float] | None) -> Tensor 
 
 
 class _Mark(NamedTuple):
-    """Identity and version of a tensor when something was derived from it; any change of values shows."""
+    """Holds the identity and version of a tensor, by which a later change of its values is noticed."""
 
     tensor: Tensor
     version: int
@@ -78,7 +78,7 @@ class _Mark(NamedTuple):
 
 
 class _Entry(NamedTuple):
-    """Value that was derived, with the marks of the tensors that it came from."""
+    """Holds a derived value with the marks of the tensors that it was derived from."""
 
     marks: tuple[_Mark, ...]
     value: Any
@@ -89,7 +89,7 @@ _KEPT: "WeakKeyDictionary[nn.Module, dict[Hashable, _Entry]]" = WeakKeyDictionar
 
 
 class _Graphs(threading.local):
-    """Values derived with a graph while a run goes on in this thread."""
+    """Holds the values derived with a graph while a run goes on in this thread."""
 
     def __init__(self) -> None:
         self.depth = 0
@@ -188,7 +188,7 @@ def _kept_in_this_run(key: Hashable, given: tuple[Tensor, ...], make: Callable[[
 
 
 def _is_opaque(tensor: Tensor) -> bool:
-    """Return whether a tensor has no version or no memory to be told by: of inference mode or a transform."""
+    """Return whether a tensor has no version or address to compare: of inference mode or a transform."""
     if tensor.is_inference():
         return True
     try:
@@ -199,7 +199,7 @@ def _is_opaque(tensor: Tensor) -> bool:
 
 
 class WideModule(nn.Module):
-    """A module whose tensors keep their precision, whatever `.float()` or `.to(dtype)` ask for.
+    """Keeps the precision of its tensors, whatever `.float()` or `.to(dtype)` ask for.
 
     Covariances whose scales span ten orders of magnitude do not survive single precision. What such a
     call changes is `dtype`, the precision of what goes in and comes out; `.to(device)` moves

@@ -419,7 +419,8 @@ def present_module(old: str) -> str | None:
     for length in range(len(parts), 0, -1):
         home = MODULES.get(".".join(parts[:length]))
         if home is not None:
-            return ".".join(["torchpose", home, *parts[length:]])
+            present = ".".join(["torchpose", home, *parts[length:]])
+            return present_module(present) or present  # which may have moved once more
     *folder, name = parts
     if (_PACKAGE.joinpath(*folder) / f"_{name}.py").is_file():
         return ".".join(["torchpose", *folder, f"_{name}"])
@@ -441,7 +442,7 @@ def moved_names(package: str) -> Callable[[str], Any]:
 
 
 def moved_from(package: str) -> list[tuple[str, str, str]]:
-    """Return present home, old name and present name of everything that has left a package."""
+    """Return present home, old name and present name of each object that has left a package."""
     return [
         (home, old, new or old)
         for home, names in NAMES[package].items()
@@ -450,7 +451,7 @@ def moved_from(package: str) -> list[tuple[str, str, str]]:
 
 
 def moved_function(old: str, new: str) -> Callable[..., Any]:
-    """Return the function that a method has become, by its full name, and warn who called the method."""
+    """Look up the function that replaced a method, and warn the method's caller."""
     _warn(old, new)
     home, _, name = new.rpartition(".")
     function: Callable[..., Any] = getattr(import_module(home), name)
@@ -483,7 +484,7 @@ def _warn(old: str, new: str) -> None:
 
 
 class _OldNames:
-    """Finder of modules by their old names, which loads the present ones.
+    """Finds modules by their old names, and loads the present ones.
 
     A finder as `sys.meta_path` has them. The base classes of `importlib.abc` are not needed for that, and
     take as long to import as half of torchpose.
@@ -507,7 +508,7 @@ class _OldNames:
 
 
 class _Alias:
-    """Loader that returns the present module unchanged."""
+    """Returns the present module unchanged."""
 
     def __init__(self, present: str) -> None:
         self.present = present

@@ -74,10 +74,10 @@ def _why_no_file(path: Path) -> str:
 
 @contextlib.contextmanager
 def reading(path: str | Path, expected: str) -> Iterator[None]:
-    """Turn what goes wrong while a file is read into one typed error that names it.
+    """Turn an error while a file is read into one typed error that names the file.
 
     Args:
-        path: the file. expected: what it should be, as "a TOML camera file".
+        path: the file. expected: the expected kind of file, as "a TOML camera file".
 
     Raises:
         InputError: it cannot be opened or read. FileFormatError: whatever a parser raises at it. Errors
@@ -112,7 +112,7 @@ def read_text(path: str | Path, expected: str, encoding: str = "utf-8-sig") -> s
 
 
 def read_json(path: str | Path, expected: str) -> Any:
-    """Return what a file of JSON holds.
+    """Return the content of a JSON file.
 
     Raises:
         InputError: no such file. FileFormatError: no JSON, or too deeply nested.
@@ -123,7 +123,7 @@ def read_json(path: str | Path, expected: str) -> Any:
 
 
 def check_span(where: str | Path, frames: int, rows: int) -> None:
-    """Raise `FileFormatError` if so few rows claim to span so many frames.
+    """Check that the rows of a file are enough for the number of frames that they span.
 
     A table has a place for each frame between the first and the last one, so two damaged frame numbers
     could fill the memory.

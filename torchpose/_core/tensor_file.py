@@ -42,7 +42,7 @@ Info = TypeVar("Info")
 
 @dataclass(frozen=True)
 class FileKind(Generic[Info]):
-    """A kind of file.
+    """Describes a kind of file.
 
     Attributes:
         format: name that the header carries, such as "torchpose-manifold".
@@ -108,7 +108,7 @@ def write_tensors(
 
 
 def read_tensors(path: str | Path, kind: FileKind[Info]) -> tuple[Info, dict[str, Tensor]]:
-    """Return what the tensors of a file were fitted on, and the tensors by name, on the CPU.
+    """Return the facts about the fit of a file's tensors, and the tensors by name, on the CPU.
 
     Raises:
         InputError: no such file. FileFormatError: truncated, of another kind or version, or facts or

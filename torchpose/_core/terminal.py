@@ -24,5 +24,5 @@ def one_line(error: BaseException) -> str:
 
 
 def show_progress() -> bool:
-    """Return whether bars go to somebody who looks at them."""
+    """Return whether progress bars are shown: standard error is a terminal."""
     return sys.stderr.isatty()

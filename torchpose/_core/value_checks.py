@@ -25,6 +25,9 @@ def without_value_checks() -> Iterator[None]:
 
     `torch.compile` and `torch.export` see the step so without it.
 
+    Returns:
+        Context manager; checks are off inside its ``with`` block, in this thread.
+
     Example:
         >>> import torch, torchpose
         >>> from torchpose._core.checks import check_finite
@@ -42,5 +45,5 @@ def without_value_checks() -> Iterator[None]:
 
 
 def values_visible() -> bool:
-    """Return whether values may be looked at: not while traced, nor in `without_value_checks`."""
+    """Return whether code may depend on values: not while traced, nor in `without_value_checks`."""
     return not (torch.compiler.is_compiling() or _HIDDEN.get())

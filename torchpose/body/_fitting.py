@@ -64,6 +64,9 @@ def fit_body(
             "crown" goes: 0.11 where the joint is the head's centre (Kinect), 0 where it is its top
             (pose2sim). By default the top lies a fifth of the height above the shoulders.
 
+    Returns:
+        `Body` in float64, on the device of `joints`, with the person's bone lengths, directions and tips.
+
     Raises:
         InputError: a joint is missing in some frames only, a bone has no length, no joint of the
             pelvis or torso. ShapeError: another number of joints.
@@ -152,14 +155,14 @@ def fit_errors(
 
 
 class _Fit(NamedTuple):
-    """Root position [T, 3], world rotations of the parts [T, P, 3, 3]."""
+    """Holds the root position [T, 3], world rotations of the parts [T, P, 3, 3]."""
 
     position: Tensor
     rotations: Tensor
 
 
 class _Tilt(NamedTuple):
-    """Evidence of the tilt of the root part about the line of the hips.
+    """Holds the evidence of the tilt of the root part about the line of the hips.
 
     axis, spine: [3], the line and the rest direction of the spine across it, in the part's axes.
     seen: [T, 3], the recorded direction of the spine across the line of the hips, world axes.
@@ -370,7 +373,7 @@ def _bones(skeleton: BodySkeleton, joints: Tensor) -> Tensor:
 
 
 def _known_joints(skeleton: BodySkeleton, joints: Tensor) -> Bool[Tensor, " J"]:
-    """Tell which joints are there in all frames, with all joints between them and the root."""
+    """Return which joints [J] are known in all frames, with all joints between them and the root."""
     check_shape("joints", joints, ["T", len(skeleton.names), 3])
     if joints.shape[0] == 0:
         raise InputError("a fit needs at least one frame, got none")

@@ -44,7 +44,7 @@ _ROOT, _HEADING, _RELATIVE = slice(0, 3), slice(3, 6), slice(6, None)
 
 
 class _Geometry(NamedTuple):
-    """Tensors that follow from a body's measures; see `Body`. `centred`: whether a part has a centre."""
+    """Holds tensors derived from a body's measures, see `Body`; `centred`: whether a part has a centre."""
 
     offsets: Tensor
     centre_rotations: Tensor
@@ -54,7 +54,7 @@ class _Geometry(NamedTuple):
 
 
 class Body(nn.Module):
-    """A person: bone lengths, limbs, and the kinematics that turn states into them.
+    """Holds a person's bone lengths and limbs, and computes joints and limbs from states (kinematics).
 
     With ``frame="parent"`` (MR) and ``frame="body"`` (DX) a part's rotation to world axes is
 
@@ -141,7 +141,7 @@ class Body(nn.Module):
 
     @property
     def offsets(self) -> Float[Tensor, "J 3"]:
-        """Place of every joint from its parent in the rest pose, metres."""
+        """Return the position [J, 3] of every joint relative to its parent in the rest pose, metres."""
         return self._geometry().offsets
 
     @property
@@ -151,12 +151,12 @@ class Body(nn.Module):
 
     @property
     def joint_weights(self) -> Float[Tensor, "P3 J"]:
-        """Return how the joints depend on the columns of the parts' rotations, [3 P, J]."""
+        """Return the linear map [3 P, J] from the columns of the parts' rotations to the joints."""
         return self._geometry().joint_weights
 
     @property
     def limb_weights(self) -> Float[Tensor, "P3 L2"]:
-        """Return how the ends of the limbs depend on them, [3 P, 2 L]."""
+        """Return the linear map [3 P, 2 L] from the columns of the parts' rotations to the limbs' ends."""
         return self._geometry().limb_weights
 
     def _geometry(self) -> "_Geometry":
@@ -185,7 +185,19 @@ class Body(nn.Module):
         frame: Frame = "parent",
         dtype: torch.dtype = torch.float64,
     ) -> "Body":
-        """Return a person of average proportions and clothes, of this height in metres."""
+        """Build a person of average proportions and clothes from the body height.
+
+        Args:
+            skeleton: gives the proportions. height: metres.
+            frame: "parent" or "body", see `Body`.
+            dtype: of buffers and states.
+
+        Returns:
+            `Body` with the skeleton's standard lengths and radii.
+
+        Raises:
+            InputError: a height that is not positive, or an unknown frame.
+        """
         lengths, radii = skeleton.standard_lengths(height), skeleton.standard_radii(height)
         return cls(skeleton, lengths, radii, frame=frame, dtype=dtype)
 
@@ -199,6 +211,17 @@ class Body(nn.Module):
         """Return the same person with other radii, centres or frame.
 
         States of one mean nothing to another of other centres or frame: `convert` them.
+
+        Args:
+            radii: [L, 2] or [*B, L, 2], metres; None keeps this body's.
+            centres: [P, 3], quaternion vector of every part's centre; None keeps this body's.
+            frame: "parent" or "body"; None keeps this body's.
+
+        Returns:
+            `Body` of the same dtype and device.
+
+        Raises:
+            InputError: negative radii or an unknown frame. ShapeError: wrong sizes.
         """
         other = Body(
             self.skeleton,
@@ -225,7 +248,17 @@ class Body(nn.Module):
     # --- states to points ---------------------------------------------------------------------
 
     def part_rotations(self, state: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch P 3 3"]:
-        """Return rotations of all parts, from part axes to world axes."""
+        """Return the rotation of every part, from part axes to world axes.
+
+        Args:
+            state: [..., D], metres and quaternion vectors.
+
+        Returns:
+            Rotation matrices [..., P, 3, 3].
+
+        Raises:
+            ShapeError: another number of columns.
+        """
         self._check(state)
         turns = quaternion_vector_to_matrix(state[..., 3:].unflatten(-1, (-1, 3)))
         geometry = self._geometry()
@@ -243,17 +276,44 @@ class Body(nn.Module):
         return torch.cat(levels, -3).index_select(-3, self._order)
 
     def joints(self, state: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch J 3"]:
-        """Return positions of all joints, metres, world axes."""
+        """Return the positions of all joints.
+
+        Args:
+            state: [..., D], root position in metres, then a quaternion vector for each part.
+
+        Returns:
+            [..., J, 3], metres, world axes.
+
+        Raises:
+            ShapeError: another number of columns.
+        """
         return self._points(state, self.part_rotations(state), self.joint_weights)
 
     def limbs(self, state: Float[Tensor, "*batch D"]) -> Limbs:
-        """Return tapered cylinders of all limbs: start and end [..., L, 3], and the body's radii."""
+        """Return the tapered cylinders of all limbs.
+
+        Args:
+            state: [..., D], metres and quaternion vectors.
+
+        Returns:
+            `Limbs` with start and end [..., L, 3], metres, world axes, and the body's radii, metres.
+
+        Raises:
+            ShapeError: another number of columns.
+        """
         ends = self._points(state, self.part_rotations(state), self.limb_weights)
         start, end = ends.unflatten(-2, (-1, 2)).unbind(-2)
         return Limbs(start, end, self.radii)
 
     def forward(self, state: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch J 3"]:
-        """Return the same as `joints`."""
+        """Return the positions of all joints, as `joints` does.
+
+        Args:
+            state: [..., D], metres and quaternion vectors.
+
+        Returns:
+            [..., J, 3], metres, world axes.
+        """
         return self.joints(state)
 
     def _points(self, state: Tensor, rotations: Tensor, weights: Tensor) -> Tensor:
@@ -272,6 +332,12 @@ class Body(nn.Module):
 
         Args:
             state: [..., D]. step: [..., D], metres and quaternion vectors.
+
+        Returns:
+            States [..., D].
+
+        Raises:
+            ShapeError: another number of columns.
         """
         self._check(state, step)
         position = state[..., _ROOT] + step[..., _ROOT]
@@ -283,7 +349,17 @@ class Body(nn.Module):
     def difference(
         self, a: Float[Tensor, "*#batch D"], b: Float[Tensor, "*#batch D"]
     ) -> Float[Tensor, "*batch D"]:
-        """Return the step that leads from b to a: ``perturb(b, difference(a, b))`` is a."""
+        """Return the step that leads from b to a: ``perturb(b, difference(a, b))`` is a.
+
+        Args:
+            a, b: states [..., D], metres and quaternion vectors; they broadcast.
+
+        Returns:
+            Step [..., D]: metres for the root, quaternion vectors for the rotations.
+
+        Raises:
+            ShapeError: another number of columns.
+        """
         self._check(a, b)
         turn = compose(conjugate(b[..., _HEADING]), a[..., _HEADING])
         plain = a - b
@@ -297,8 +373,11 @@ class Body(nn.Module):
         Args:
             states: [..., N, D]. log_weights: [..., N], of any common factor.
 
+        Returns:
+            State [..., D], metres and quaternion vectors.
+
         Raises:
-            InputError: all weights of a batch element are zero.
+            InputError: all weights of a batch element are zero. ShapeError: other sizes.
         """
         self._check(states)
         check_shape("log_weights", log_weights, ["...", states.shape[-2]])
@@ -312,14 +391,35 @@ class Body(nn.Module):
         return torch.cat([plain[..., _ROOT], heading, plain[..., _RELATIVE]], -1)
 
     def relative(self, state: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch Q"]:
-        """Return the columns without the root's position and orientation."""
+        """Return the columns of a state without the root's position and orientation.
+
+        Args:
+            state: [..., D].
+
+        Returns:
+            [..., Q] with Q = D - 6: quaternion vectors of all parts but the root.
+
+        Raises:
+            ShapeError: another number of columns.
+        """
         self._check(state)
         return state[..., _RELATIVE]
 
     def with_relative(
         self, state: Float[Tensor, "*#batch D"], relative: Float[Tensor, "*#batch Q"]
     ) -> Float[Tensor, "*batch D"]:
-        """Return states with the root of `state` and other relative columns, kept in the unit ball."""
+        """Return states with the root of `state` and other relative columns, scaled back into the unit ball.
+
+        Args:
+            state: [..., D], gives root position and orientation.
+            relative: [..., Q] with Q = D - 6, quaternion vectors of all parts but the root.
+
+        Returns:
+            States [..., D]; the leading dimensions broadcast.
+
+        Raises:
+            ShapeError: other sizes.
+        """
         self._check(state)
         check_shape("relative", relative, ["...", self.dim - 6])
         # not torch.broadcast_shapes, whose first call imports a computer algebra system
@@ -338,6 +438,12 @@ class Body(nn.Module):
         Args:
             position: [..., 3], of the root, metres.
             rotations: [..., P, 3, 3], from part axes to world axes.
+
+        Returns:
+            State [..., D], metres and quaternion vectors.
+
+        Raises:
+            ShapeError: other sizes.
         """
         check_shape("position", position, ["...", 3])
         check_shape("rotations", rotations, ["...", len(self.skeleton.parts), 3, 3])
@@ -351,6 +457,13 @@ class Body(nn.Module):
 
     def convert(self, state: Float[Tensor, "*batch D"], other: "Body") -> Float[Tensor, "*batch D"]:
         """Return the same rotations as a state of another body: other centres, frame or person.
+
+        Args:
+            state: [..., D], of this body: metres and quaternion vectors.
+            other: of the same skeleton.
+
+        Returns:
+            State [..., D] of the other body, with the same root position, metres, and part rotations.
 
         Raises:
             SkeletonError: the other body has another skeleton.
@@ -387,6 +500,9 @@ def centres_of(body: Body, states: Float[Tensor, "*batch D"]) -> Float[Tensor, "
 
     Returns:
         [P, 3]; the root part's is zero.
+
+    Raises:
+        InputError: no state, or NaN or infinite ones.
 
     Reference: Daubney & Xie, equation (1).
     """

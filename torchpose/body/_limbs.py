@@ -24,7 +24,7 @@ __all__ = [
 
 
 class Limbs(NamedTuple):
-    """Tapered cylinders with round ends, L for each body.
+    """Holds the tapered cylinders with round ends of a body's L limbs.
 
     Attributes:
         start, end: [..., L, 3], the middles of both ends, metres, world axes.
@@ -37,7 +37,14 @@ class Limbs(NamedTuple):
     radii: Float[Tensor, "*radii L 2"]
 
     def select(self, index: Tensor) -> "Limbs":
-        """Return the limbs at `index` (indices [l], or bool [L])."""
+        """Return some of the limbs.
+
+        Args:
+            index: indices [l], or bool [L].
+
+        Returns:
+            `Limbs` with l limbs, in the order of `index`.
+        """
         return Limbs(self.start[..., index, :], self.end[..., index, :], self.radii[..., index, :])
 
 
@@ -126,7 +133,7 @@ def checked_radii(skeleton: BodySkeleton, radii: Tensor) -> Tensor:
 
 
 def point_weights(skeleton: BodySkeleton, offsets: Tensor, tips: Tensor) -> Tensor:
-    """Return how every point depends on the columns of every part's rotation, [3 P, J + K]."""
+    """Return the linear map [3 P, J + K] from the columns of the parts' rotations to all points."""
     n_points = len(skeleton.points)
     weights = offsets.new_zeros(len(skeleton.parts), 3, n_points)
     for level in skeleton.joint_levels[1:]:  # a joint moves with all that moves its parent
@@ -140,7 +147,7 @@ def point_weights(skeleton: BodySkeleton, offsets: Tensor, tips: Tensor) -> Tens
 
 
 def check_limb_lengths(skeleton: BodySkeleton, limb_weights: Tensor) -> None:
-    """Raise if a limb has no length whatever the pose: both ends depend on the same rotations."""
+    """Check that no limb has zero length in every pose, as one whose ends turn with the same parts."""
     start, end = limb_weights.unflatten(-1, (-1, 2)).unbind(-1)
     lengths = (end - start).norm(dim=0)
     if bool((lengths < _SHORTEST).any()):

@@ -80,8 +80,12 @@ class JointLimits(nn.Module):
             states: [..., D], of one body or of several with the same centres and frame.
             quantile: a. margin: m as a share of the range.
 
+        Returns:
+            `JointLimits` over the D - 6 relative columns.
+
         Raises:
-            InputError: no states, not finite, or quantile and margin out of range.
+            InputError: no states, not finite, or quantile and margin out of range. ShapeError: columns other
+                than 6 + 3 (P - 1).
         """
         columns = states.shape[-1] - _ROOT_COLUMNS
         if columns < 3 or columns % 3:
@@ -101,26 +105,63 @@ class JointLimits(nn.Module):
         return cls((low - width).clamp_min(-1), (high + width).clamp_max(1), width)
 
     def inside(self, state: Float[Tensor, "*batch D"]) -> Bool[Tensor, "*batch parts"]:
-        """Tell whether each part but the root, [..., P - 1], is within its limits."""
+        """Return whether each part but the root is within its limits.
+
+        Args:
+            state: [..., D], metres and quaternion vectors.
+
+        Returns:
+            Bool [..., P - 1].
+
+        Raises:
+            ShapeError: another number of columns than the limits are for.
+        """
         relative = self._relative(state)
         within = (relative >= self.lower) & (relative <= self.upper)
         return within.unflatten(-1, (-1, 3)).all(-1)
 
     def clamp(self, state: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D"]:
-        """Return the nearest state within the limits, entry by entry, and within the unit ball."""
+        """Return the nearest state within the limits, entry by entry, and within the unit ball.
+
+        Args:
+            state: [..., D], metres and quaternion vectors.
+
+        Returns:
+            [..., D], with the root as it was.
+
+        Raises:
+            ShapeError: another number of columns than the limits are for.
+        """
         relative = self._relative(state).clamp(self.lower, self.upper)
         relative = within_unit_ball(relative.unflatten(-1, (-1, 3))).flatten(-2)
         return torch.cat([state[..., :_ROOT_COLUMNS], relative], -1)
 
     def log_prob(self, state: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch"]:
-        """Return the log density of the relative columns, their entries taken as independent."""
+        """Return the log density of the relative columns, their entries taken as independent.
+
+        Args:
+            state: [..., D], metres and quaternion vectors.
+
+        Returns:
+            [...], natural logarithm.
+
+        Raises:
+            ShapeError: another number of columns than the limits are for.
+        """
         relative = self._relative(state)
         excess = torch.maximum(self.lower - relative, relative - self.upper).clamp_min(0)
         size = (self.upper - self.lower + math.sqrt(2 * math.pi) * self.softness).log()
         return (-0.5 * (excess / self.softness).square() - size).sum(-1)
 
     def forward(self, state: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch"]:
-        """Return the same as `log_prob`."""
+        """Return the log density of the relative columns, as `log_prob` does.
+
+        Args:
+            state: [..., D], metres and quaternion vectors.
+
+        Returns:
+            [...], natural logarithm.
+        """
         return self.log_prob(state)
 
     def _relative(self, state: Tensor) -> Tensor:

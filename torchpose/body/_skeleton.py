@@ -18,24 +18,17 @@ from torchpose.errors import InputError, SkeletonError
 from torchpose.math._tree_messages import tree_levels
 from torchpose.skeleton._joint_sets import canonical_names
 
-__all__ = [
-    "BODY_15",
-    "BodySkeleton",
-    "TaperedCylinder",
-    "Tip",
-    "body_joints",
-    "other_side",
-]
+__all__ = ["BODY_15", "BodySkeleton", "TaperedCylinder", "Tip", "body_joints", "other_side"]
 
 Offset = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Tip:
-    """A point of the body beyond its joints, fixed in a part's axes.
+    """Describes a point of the body beyond its joints, fixed in a part's axes.
 
     Args:
-        name: what it is called.
+        name: of the tip.
         joint: name of the joint it is measured from.
         part: name of the part that carries it.
         offset: from the joint, in the part's axes, as fractions of the body height.
@@ -49,10 +42,10 @@ class Tip:
 
 @dataclass(frozen=True)
 class TaperedCylinder:
-    """A limb: the convex hull of two spheres.
+    """Describes a limb as the convex hull of two spheres.
 
     Args:
-        name: what it is called; ``left_`` and ``right_`` in front tell limbs of the two sides.
+        name: of the limb; ``left_`` and ``right_`` in front tell limbs of the two sides.
         start, end: names of joints or tips, the centres of the two spheres.
         radii: of a clothed adult at start and end, as fractions of the body height.
     """
@@ -65,13 +58,13 @@ class TaperedCylinder:
 
 @dataclass(frozen=True)
 class BodySkeleton:
-    """A tree of joints, carried by a tree of rigid parts, with tapered cylinders around them.
+    """Describes a tree of joints, the tree of rigid parts that carries it, and the limbs around both.
 
     The offset of a joint from its parent joint is fixed in the axes of the part that carries it; a
     part turns about the joint where it meets its parent part.
 
     Args:
-        name: what the skeleton is called.
+        name: of the skeleton.
         names: of the J joints.
         parents: index of each joint's parent, -1 for the root.
         parts: names of the P rigid parts; the first one is the root part.
@@ -120,7 +113,7 @@ class BodySkeleton:
 
     @property
     def dim(self) -> int:
-        """Return how many numbers a state has: root position, and three for the orientation of every part."""
+        """Return the dimension D of a state: 3 for the root position, 3 for the orientation of every part."""
         return 3 + 3 * len(self.parts)
 
     @cached_property
@@ -147,6 +140,12 @@ class BodySkeleton:
     def joint(self, name: str) -> int:
         """Return the index of a joint.
 
+        Args:
+            name: of the joint, as in `names`.
+
+        Returns:
+            Index from 0 to J - 1.
+
         Raises:
             SkeletonError: there is no such joint.
         """
@@ -157,6 +156,12 @@ class BodySkeleton:
     def part(self, name: str) -> int:
         """Return the index of a part.
 
+        Args:
+            name: of the part, as in `parts`.
+
+        Returns:
+            Index from 0 to P - 1.
+
         Raises:
             SkeletonError: there is no such part.
         """
@@ -165,27 +170,61 @@ class BodySkeleton:
         return self.parts.index(name)
 
     def single_joint(self, part: int) -> int | None:
-        """Return the one joint that a part carries, or None: its twist about that bone is unseen."""
+        """Return the only joint that a part carries; the twist of that part about its bone is unobservable.
+
+        Args:
+            part: index of the part.
+
+        Returns:
+            Index of the joint; None where the part carries no joint or several.
+        """
         carried = [j for j, p in enumerate(self.part_of) if p == part and self.parents[j] >= 0]
         return carried[0] if len(carried) == 1 else None
 
     def standard_lengths(self, height: float) -> Float[Tensor, " J"]:
-        """Return bone lengths [J] of a person of this height, metres."""
+        """Return the bone lengths of a person of average proportions.
+
+        Args:
+            height: body height, metres.
+
+        Returns:
+            [J], metres, distance from each joint's parent; 0 for the root.
+
+        Raises:
+            InputError: the height is not positive and finite.
+        """
         return _positive("height", height) * torch.tensor(self.proportions, dtype=torch.float64)
 
     def standard_radii(self, height: float) -> Float[Tensor, "L 2"]:
-        """Return radii [L, 2] of the limbs of a clothed adult of this height, metres."""
+        """Return the radii of the limbs of a clothed adult.
+
+        Args:
+            height: body height, metres.
+
+        Returns:
+            [L, 2], metres, at start and end of every limb.
+
+        Raises:
+            InputError: the height is not positive and finite.
+        """
         radii = torch.tensor([limb.radii for limb in self.limbs], dtype=torch.float64)
         return _positive("height", height) * radii.reshape(-1, 2)
 
     def height(self, bone_lengths: Float[Tensor, " J"]) -> float:
-        """Return the body height by the lengths of the legs, whose joints all joint sets agree about.
+        """Return the body height that follows from the lengths of the legs.
 
-        H = sum of their lengths / sum of their proportions; the other bones count where all of
-        those are unknown. (CMU's wrist is 6 cm nearer to the elbow than that of others.)
+        H = sum of their lengths / sum of their proportions. Joint sets agree about the joints of the legs
+        (CMU's wrist is 6 cm nearer to the elbow than that of others); the other bones count where the lengths
+        of all leg bones are unknown.
 
         Args:
             bone_lengths: [J], metres, NaN where unknown.
+
+        Returns:
+            Height in metres.
+
+        Raises:
+            InputError: no bone length is finite.
         """
         share = torch.tensor(self.proportions, dtype=torch.float64)
         lengths = bone_lengths.detach().to("cpu", torch.float64)

@@ -17,7 +17,7 @@ def resolve_camera(
     matrix: Tensor | None,
     source: object,
 ) -> tuple[PinholeCamera, tuple[str, ...]]:
-    """Return the camera of keypoints or of a video, and notes on what was assumed.
+    """Return the camera of keypoints or of a video, and notes on assumptions.
 
     In this order: what was given; K that came with the input; its image size with f = 525/640 of the
     longer side.

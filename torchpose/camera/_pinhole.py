@@ -35,12 +35,12 @@ FOCAL_PER_WIDTH = 525 / 640  # Kinect's colour camera, and a fair guess for a we
 
 
 class PinholeCamera(nn.Module):
-    """A calibrated camera: K in pixels and, when it has one, its pose in the room.
+    """Holds a calibrated camera: K in pixels and, if it is known, its pose in the room.
 
     Args:
         fx, fy: focal lengths, pixels. cx, cy: principal point, pixels.
         width, height: image size, pixels, if known.
-        name: what the camera is called.
+        name: of the camera.
         skew: K[0, 1], pixels; nearly always 0.
         distortions: OpenCV's k1, k2, p1, p2, ...; kept and saved, not applied by `forward`.
         rotation, translation: pose, x_camera = R(rotation) x_world + translation; a Rodrigues
@@ -100,7 +100,15 @@ class PinholeCamera(nn.Module):
     def from_matrix(
         cls, matrix: Any, width: float | None = None, height: float | None = None, name: str = ""
     ) -> Self:
-        """Return the camera of a matrix K [3, 3] (tensor, array or nested list).
+        """Build a camera from its matrix K.
+
+        Args:
+            matrix: K [3, 3] in pixels, up to scale: a tensor, an array or a nested list.
+            width, height: image size, pixels, if known.
+            name: of the camera.
+
+        Returns:
+            Camera at the origin without distortions.
 
         Raises:
             CameraError: wrong shape, singular, or not of the form (BL 4).
@@ -118,6 +126,16 @@ class PinholeCamera(nn.Module):
     def from_image_size(cls, width: float, height: float, name: str = "") -> Self:
         """Guess a camera from the image size alone: f = 525/640 of the longer side, centre in the middle.
 
+        Args:
+            width, height: image size, pixels.
+            name: of the camera.
+
+        Returns:
+            Camera at the origin without distortions.
+
+        Raises:
+            CameraError: a side is missing or not positive.
+
         >>> PinholeCamera.from_image_size(640, 480).matrix[0].tolist()
         [525.0, 0.0, 319.5]
         """
@@ -132,8 +150,16 @@ class PinholeCamera(nn.Module):
     def load(cls, path: str | Path, name: str | None = None) -> "PinholeCamera":
         """Read one camera of a TOML file; `name` is needed when there are several.
 
+        Args:
+            path: TOML file, see `load_cameras`.
+            name: of the camera, as in the file; may be left out where the file holds one camera.
+
+        Returns:
+            The camera.
+
         Raises:
-            FileFormatError: not such a file. CameraError: no such camera, or several and no name.
+            InputError: no such file. FileFormatError: not such a file.
+            CameraError: no such camera, or several and no name.
         """
         cameras = load_cameras(path)
         if name is None and len(cameras) == 1:
@@ -144,7 +170,14 @@ class PinholeCamera(nn.Module):
         return cameras[name]
 
     def save(self, path: str | Path) -> None:
-        """Write this camera as TOML; the file appears whole or not at all."""
+        """Write this camera as TOML, atomically: an interrupted write leaves no partial file.
+
+        Args:
+            path: of the file, which is replaced.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
         save_cameras([self], path)
 
     @property
@@ -158,7 +191,17 @@ class PinholeCamera(nn.Module):
         return rotvec_to_matrix(self.rotation)
 
     def forward(self, points: Float[Tensor, "... J 3"]) -> Float[Tensor, "... J 3"]:
-        """Return (u, v, lambda) of world points [..., J, 3] by K, rotation and translation (BL 3)."""
+        """Project world points by K, rotation and translation (BL 3); distortions are not applied.
+
+        Args:
+            points: [..., J, 3], world axes, metres.
+
+        Returns:
+            (u, v, lambda) [..., J, 3]: pixels, and the depth along the optical axis in metres.
+
+        Raises:
+            ShapeError: the last dimension is not 3. InputError: not floating-point numbers.
+        """
         check_floating("points", points)
         K, R, t = (m.to(points) for m in (self.matrix, self.rotation_matrix, self.translation))
         return project(points, K, R, t)
@@ -175,6 +218,9 @@ def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
     One table per camera with `matrix` (3 x 3, pixels) and, optionally, `size` (width, height),
     `distortions`, `rotation` (Rodrigues vector), `translation` (metres), `name`, `fisheye`. A table
     `[metadata]` is passed over. Pose2Sim and Anipose write such files.
+
+    Args:
+        path: of the file.
 
     Returns:
         Cameras by the name of their table, in the order of the file.
@@ -200,10 +246,15 @@ def _cameras_of(path: str | Path, content: Mapping[str, Any]) -> dict[str, Pinho
 
 
 def save_cameras(cameras: Sequence[PinholeCamera], path: str | Path) -> None:
-    """Write cameras as TOML, one table each; the file appears whole or not at all.
+    """Write cameras as TOML, one table each, atomically: an interrupted write leaves no partial file.
+
+    Args:
+        cameras: one or more, with different names; those without a name are called ``cam_01``, ...
+            (a single one ``camera``).
+        path: of the file, which is replaced.
 
     Raises:
-        InputError: two cameras share a name. OutputError: the file cannot be written.
+        InputError: no camera, or two with one name. OutputError: the file cannot be written.
     """
     from torchpose._core.files import atomic_path  # io imports this module
 

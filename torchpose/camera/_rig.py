@@ -20,7 +20,7 @@ _OPENCV_DISTORTIONS = 14  # the longest list that OpenCV takes; zeros change not
 
 
 class RigView(NamedTuple):
-    """Points as every camera sees them.
+    """Holds points as every camera sees them.
 
     Attributes:
         pixels: [..., C, N, 2], u and v; they mean nothing where the depth is not positive.
@@ -32,7 +32,7 @@ class RigView(NamedTuple):
 
 
 class CameraRig(nn.Module):
-    """C calibrated cameras with poses in one room.
+    """Holds C calibrated cameras with poses in one room.
 
     x_camera = rotation x_world + translation, pixels by the matrix K (BL 3). Camera axes: x right,
     y down, z forward. Distortions are not applied by `forward`: images are undistorted when they
@@ -45,7 +45,7 @@ class CameraRig(nn.Module):
         distortions [C, 14] in OpenCV's order.
 
     Attributes:
-        names: what the cameras are called ("cam_01", ... where they have no name).
+        names: of the cameras ("cam_01", ... where they have no name).
         sizes: (height, width) of every camera's image in pixels, or None where it is not known.
 
     Raises:
@@ -84,6 +84,12 @@ class CameraRig(nn.Module):
     def load(cls, path: str | Path) -> "CameraRig":
         """Read all cameras of a TOML file, in its order.
 
+        Args:
+            path: of the file, see `load_cameras`.
+
+        Returns:
+            Rig of all cameras, named as their tables.
+
         Raises:
             InputError: no such file. FileFormatError: not such a file. CameraError: bad values.
         """
@@ -118,6 +124,12 @@ class CameraRig(nn.Module):
     def select(self, index: Sequence[int]) -> "CameraRig":
         """Return the rig of some of the cameras, in the given order.
 
+        Args:
+            index: indices of cameras; negative ones count from the end.
+
+        Returns:
+            Rig with as many cameras as there are indices.
+
         Raises:
             CameraError: no index, or one that no camera has.
         """
@@ -135,6 +147,12 @@ class CameraRig(nn.Module):
 
         Pixel centres are at whole numbers, so u' + 1/2 = (u + 1/2) width / old width, and the same
         for v. Distortions do not depend on the size.
+
+        Args:
+            height, width: of the other images, pixels.
+
+        Returns:
+            Rig with the same poses.
 
         Raises:
             CameraError: the size of a camera is not known. InputError: a side is not positive.
@@ -183,7 +201,15 @@ class CameraRig(nn.Module):
         return torch.from_numpy(out).to(images.device) if isinstance(images, Tensor) else out
 
     def check_images(self, name: str, shape: Sequence[int]) -> None:
-        """Raise `CameraError` unless a shape [..., C, H, W] is that of this rig's images."""
+        """Check that images have the number and the size of this rig's cameras.
+
+        Args:
+            name: of the images, for the message.
+            shape: [..., C, H, W].
+
+        Raises:
+            CameraError: another number of cameras, another size, or fewer than three dimensions.
+        """
         if len(shape) < 3:
             raise CameraError(f"{name} must have shape [..., C, H, W], got {list(shape)}")
         count, height, width = shape[-3:]
@@ -244,7 +270,7 @@ def undistortion_maps(
     matrix: Float[Tensor, "3 3"], distortions: Float[Tensor, " n"], fisheye: bool,
     size: tuple[int, int],
 ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
-    """Return where each pixel of an image without distortion is to be looked up, for `cv2.remap`.
+    """Return the source pixel of each pixel of an undistorted image, for `cv2.remap`.
 
     Args:
         matrix: K, the same before and after. distortions: OpenCV's. size: (width, height).
@@ -271,7 +297,7 @@ Cameras = CameraRig | PinholeCamera | Iterable[PinholeCamera] | Mapping[str, Pin
 
 
 def as_rig(cameras: Cameras) -> CameraRig:
-    """Return a rig of whatever holds cameras: a rig, one camera, several, or a mapping of names.
+    """Return a rig of cameras given as a rig, one camera, several, or a mapping of names.
 
     Raises:
         CameraError: it holds no cameras.

@@ -13,7 +13,7 @@ __all__ = ["PAPER_VIEWS", "ViewRange", "Viewpoints", "sample_viewpoints"]
 
 
 class Viewpoints(NamedTuple):
-    """Camera poses: angles (roll, pitch, yaw) [N, 3] in radians, translation [N, 3] in metres."""
+    """Holds camera poses: angles (roll, pitch, yaw) [N, 3] in radians, translation [N, 3] in metres."""
 
     angles: Tensor
     translation: Tensor
@@ -49,7 +49,14 @@ class ViewRange:
                 )
 
     def scaled(self, factor: float) -> "ViewRange":
-        """Return the limits of another width about the same middle; 1 changes nothing."""
+        """Return limits of another width about the same middle.
+
+        Args:
+            factor: of the width, 0 or more; 1 changes nothing.
+
+        Returns:
+            `ViewRange`, radians and metres.
+        """
 
         def about_middle(limits: tuple[float, float]) -> tuple[float, float]:
             low, high = limits
@@ -78,13 +85,16 @@ def sample_viewpoints(
     """Draw camera poses, every angle and translation uniform within its limits.
 
     Args:
-        n: how many.
+        n: number of viewpoints.
         view_range: the limits.
         generator: source of random numbers; its device is that of the result.
         dtype: of the result.
 
     Returns:
         `Viewpoints` with angles [n, 3] and translation [n, 3].
+
+    Raises:
+        InputError: n is negative.
 
     Reference: Burke & Lasenby, section 3.1 (angles up to 30 degrees, translations up to 0.5 m).
     """

@@ -47,7 +47,7 @@ _FRAMES_AT_A_TIME, _NUMBERS_AT_A_TIME = 4096, 1 << 24
 
 
 class PathModel(NamedTuple):
-    """Head and neck of a body that nothing is known about, in the prior's pixels.
+    """Models head and neck of a body about which nothing is known, in the prior's pixels.
 
     Attributes:
         neck: mean place [2]. height: mean of head minus neck [2]. variance: R of head and neck [2],
@@ -61,7 +61,7 @@ class PathModel(NamedTuple):
 
 
 class BodyPath(NamedTuple):
-    """Estimated neck, and head minus neck, at t - lag for each of S lags, [B, T, S, 2], pixels."""
+    """Holds the estimated neck, and head minus neck, at t - lag for each of S lags, [B, T, S, 2], pixels."""
 
     lags: tuple[int, ...]
     neck: Tensor
@@ -73,7 +73,7 @@ class BodyPath(NamedTuple):
         return self.neck[:, :, i], self.height[:, :, i]
 
     def carried(self, uv: Float[Tensor, "B T 2"], lag: int) -> Float[Tensor, "B T 2"]:
-        """Return where pixels on the body of `lag` frames ago lie on the body in the present frame.
+        """Map pixels from `lag` frames ago to the body's current position.
 
         It moves along with the neck, and away from it as the body comes nearer:
             u' = n_t + (u - n_{t-lag}) |h_t| / |h_{t-lag}|
@@ -86,7 +86,7 @@ class BodyPath(NamedTuple):
 
 
 class BodyView(NamedTuple):
-    """A virtual camera for each frame.
+    """Holds a virtual camera for each frame.
 
     Attributes:
         rotation: from the axes of the camera to those of the virtual one [B, T, 3, 3].
@@ -109,7 +109,7 @@ def body_path(
     start: int = 0,
     variance: Float[Tensor, "B T 2"] | None = None,
 ) -> BodyPath:
-    """Return the neck and head at t - lag, by regression on what was measured from a second ago to `ahead`.
+    """Return the neck and head at t - lag, by regression on the measurements from a second ago to `ahead`.
 
     The neck moves with a velocity that is a random walk, and so, much more slowly, does the height
     of the head above it; the head nods besides:
@@ -119,7 +119,7 @@ def body_path(
 
     Args:
         uv, mask: the eight joints. lags: S lags in frames, positive is the past. ahead: number of
-            later frames that may be used. fps: frame rate. model: what is known beforehand.
+            later frames that may be used. fps: frame rate. model: prior knowledge of head and neck.
         start: first frame that is wanted; those before it are its past. Returned are T - start.
         variance: R of head and neck, pixels squared, if it is not that of `model` throughout.
     """
@@ -145,12 +145,12 @@ def body_path(
 
 
 def memory_frames(lags: tuple[int, ...], fps: float) -> int:
-    """Return how many frames before the present one `body_path` and windows of these lags go back."""
+    """Return the number of past frames that `body_path` and windows with these lags need."""
     return max(round(MEMORY * fps), *lags)
 
 
 class _Regression(NamedTuple):
-    """Covariances of the measured pixels [N, N], and of the wanted values with them [2 S, N]."""
+    """Holds the covariances of the measured pixels [N, N], and of the wanted values with them [2 S, N]."""
 
     measured: Tensor
     wanted: Tensor
@@ -213,7 +213,7 @@ def _walk(times: Tensor, spread: float, speed: float, acceleration: float) -> Te
 
 
 def _distinct(patterns: Bool[Tensor, "F N"]) -> tuple[Bool[Tensor, "P N"], Tensor]:
-    """Return the distinct rows, and which of them each row is."""
+    """Return the distinct rows, and the index of each row among them."""
     if bool((patterns == patterns[:1]).all()):
         return patterns[:1], torch.zeros(len(patterns), dtype=torch.long, device=patterns.device)
     pieces = patterns.split(62, 1)  # as many bits as fit into a whole number
@@ -240,7 +240,7 @@ def view_body(
     leaves them within an arm's reach.
 
     Args:
-        neck, height: pixels, see `BodyPath`. model: what the prior expects. matrix: K of the pixels.
+        neck, height: pixels, see `BodyPath`. model: expectation of the prior. matrix: K of the pixels.
         reach: how far from the neck a hand is measured, pixels; 0 (or None) where none is.
     """
     offset = neck - model.neck.to(neck)

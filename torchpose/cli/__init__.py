@@ -92,7 +92,7 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     if first not in COMMANDS:
         raise ArgumentError(None, f"unknown command {first!r}; known are {', '.join(COMMANDS)}")
-    return import_module(f"torchpose.cli.{first.replace('-', '_')}").main(arguments[1:])
+    return import_module(f"torchpose.cli._{first.replace('-', '_')}").main(arguments[1:])
 
 
 def _help() -> str:

@@ -322,6 +322,10 @@ def noisy_keypoints(
 
     Returns:
         [T, 4, 2], pixels, in the order of `KEYPOINT_NAMES`; NaN in the gap.
+
+    Raises:
+        InputError: std_px negative or not finite, fps not positive, or an unknown keypoint in `gap`.
+        ShapeError: joints of another shape.
     """
     check_shape("joints", joints, [None, 8, 3])
     if not 0 <= std_px < math.inf or not fps > 0:

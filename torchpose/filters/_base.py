@@ -49,11 +49,14 @@ Generators = torch.Generator | Sequence[torch.Generator] | None
 def standard_normal(
     batch: int, shape: Sequence[int], generator: Generators, like: Tensor
 ) -> Float[Tensor, "B *shape"]:
-    """Draw standard normal numbers [B, *shape].
+    """Draw standard normal numbers.
 
     Args:
         batch: B. shape: of one element. generator: with a list, each element draws from its own, and its
             numbers do not depend on the batch. like: tells dtype and device.
+
+    Returns:
+        [B, *shape], of the dtype and on the device of `like`.
     """
     kind = {"dtype": like.dtype, "device": like.device}
     if isinstance(generator, torch.Generator) or generator is None:
@@ -64,7 +67,15 @@ def standard_normal(
 def uniform(
     batch: int, shape: Sequence[int], generator: Generators, like: Tensor
 ) -> Float[Tensor, "B *shape"]:
-    """Draw uniform numbers in [0, 1) [B, *shape]; arguments as `standard_normal`."""
+    """Draw uniform numbers in [0, 1).
+
+    Args:
+        batch: B. shape: of one element. generator: with a list, each element draws from its own, and its
+            numbers do not depend on the batch. like: tells dtype and device.
+
+    Returns:
+        [B, *shape], of the dtype and on the device of `like`.
+    """
     kind = {"dtype": like.dtype, "device": like.device}
     if isinstance(generator, torch.Generator) or generator is None:
         return torch.rand(batch, *shape, generator=generator, **kind)
@@ -110,7 +121,7 @@ def require_state(state: Any, kind: type, field: str, shape: Sequence[int | None
 
 
 class RecursiveFilter(WideModule, ABC):
-    """A recursive Bayesian filter over batches of sequences.
+    """Filters batches of sequences by a recursive Bayesian filter; base class of all filters.
 
     `forward` filters whole sequences; `init`, then `step` (one frame) or `advance` (some more frames)
     give the same numbers online. `smooth` uses later frames too, where a filter can. Randomness, masks
@@ -156,16 +167,46 @@ class RecursiveFilter(WideModule, ABC):
 
     @abstractmethod
     def init(self, batch_size: int, *, generator: Generators = None) -> Any:
-        """Return the state before the first measurement; the first step predicts, then updates."""
+        """Return the state before the first measurement; the first step predicts, then updates.
+
+        Args:
+            batch_size: B, number of sequences.
+            generator: for filters that draw; one generator, or a list of one for each sequence.
+
+        Returns:
+            State of B sequences, a named tuple of tensors.
+
+        Raises:
+            InputError: batch_size below 1.
+        """
 
     @abstractmethod
     def filter_frame(
         self, state: Any, frame: Measurements, generator: Generators, return_cov: bool
     ) -> tuple[Any, StepOutput]:
-        """Return the next state and the estimate, given checked measurements of one frame."""
+        """Filter one frame, given its checked measurements.
+
+        Args:
+            state: of the B sequences, from `init` or the frame before.
+            frame: checked measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z].
+            generator: for filters that draw; one generator, or a list of one for each sequence.
+            return_cov: whether to return the covariance as well.
+
+        Returns:
+            The next state, and a `StepOutput` with the mean [B, D].
+        """
 
     def check_state(self, state: Any, batch: int) -> None:
-        """Raise unless a state is one of this filter's with so many elements; may be left out."""
+        """Check that a state is one of this filter's, for a batch of this size; checks nothing by default.
+
+        Args:
+            state: as a step would take it.
+            batch: B, number of sequences.
+
+        Raises:
+            InputError: a state of another kind of filter. ShapeError: another batch size, or a filter
+                of other sizes.
+        """
 
     @takes_former_arguments
     def step(
@@ -296,10 +337,19 @@ class RecursiveFilter(WideModule, ABC):
     def smooth_frames(
         self, frames: Measurements, lag: int | None, return_cov: bool
     ) -> FilterOutput:
-        """Return smoothed estimates of whole sequences, given checked measurements.
+        """Smooth whole sequences, given checked measurements; refused here, by filters that cannot.
+
+        Args:
+            frames: checked measurements: z [B, T, Z], mask [B, T, Z], cov [Z, Z] or [B, T, Z, Z], lengths
+                [B].
+            lag: number of later frames that an estimate may use; None is all of them.
+            return_cov: whether to return covariances as well.
+
+        Returns:
+            `FilterOutput` with smoothed means [B, T, D].
 
         Raises:
-            InputError: the filter cannot smooth, as here.
+            InputError: the filter cannot smooth.
         """
         raise InputError(
             f"{type(self).__name__} cannot smooth: that needs tracks='fixed' (FixedTrackFilter), whose "
@@ -309,7 +359,18 @@ class RecursiveFilter(WideModule, ABC):
     def filter_frames(
         self, frames: Measurements, generator: Generators, return_cov: bool, progress: bool
     ) -> FilterOutput:
-        """Return the estimates of whole sequences, given checked measurements."""
+        """Filter whole sequences, given checked measurements.
+
+        Args:
+            frames: checked measurements: z [B, T, Z], mask [B, T, Z], cov [Z, Z] or [B, T, Z, Z], lengths
+                [B].
+            generator: for filters that draw; one generator, or a list of one for each sequence.
+            return_cov: whether to return covariances as well.
+            progress: whether to show a progress bar.
+
+        Returns:
+            `FilterOutput` with means [B, T, D].
+        """
         state = self.init(len(frames.z), generator=generator)
         return self.continue_frames(state, frames, generator, return_cov, progress)[1]
 
@@ -321,7 +382,19 @@ class RecursiveFilter(WideModule, ABC):
         return_cov: bool,
         progress: bool = False,
     ) -> tuple[Any, FilterOutput]:
-        """Return the state after some frames, and their estimates: the one loop over time."""
+        """Filter some more frames one by one, given checked measurements.
+
+        Args:
+            state: of the B sequences, from `init` or the frames before.
+            frames: checked measurements: z [B, T, Z], mask [B, T, Z], cov [Z, Z] or [B, T, Z, Z], lengths
+                [B].
+            generator: for filters that draw; one generator, or a list of one for each sequence.
+            return_cov: whether to return covariances as well.
+            progress: whether to show a progress bar.
+
+        Returns:
+            The next state, and a `FilterOutput` with means [B, T, D].
+        """
         steps = []
         times = range(frames.z.shape[1])
         # a bar that shows nothing would still keep torch.compile out
@@ -338,7 +411,22 @@ class RecursiveFilter(WideModule, ABC):
         lengths: Tensor | None,
         generator: Generators,
     ) -> Measurements:
-        """Return the arguments of `forward` as `Measurements`, checked before any work is done."""
+        """Check the arguments of `forward` before any work is done.
+
+        Args:
+            z: measurements [B, T, Z], in the units of the state.
+            mask: [B, T, Z], True where measured; None is everywhere.
+            measurement_cov: R [Z, Z] or [B, T, Z, Z]; None is the filter's own. lengths: [B], or None for T.
+            generator: one generator, a list of B of them, or None.
+
+        Returns:
+            `Measurements`, with the defaults filled in.
+
+        Raises:
+            ShapeError: wrong shapes. InputError: empty sequences, NaN or infinite values that are not masked,
+                lengths outside 1..T, a list of another number of generators.
+            CovarianceError: R not symmetric positive definite.
+        """
         like = torch.empty(0, dtype=self.dtype, device=self.observed.device)
         z, mask, lengths = check_values(z, mask, lengths, like, self.observed.numel())
         cov = self._own_noise() if measurement_cov is None else check_noise(measurement_cov, z)

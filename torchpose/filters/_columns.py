@@ -26,7 +26,7 @@ _FRAMES = 4  # at a time
 
 
 class _Step(NamedTuple):
-    """One step, for columns (v, d): whitened innovation over deviation, N = Z + D rows per track.
+    """Holds one step, for columns (v, d): whitened innovation over deviation, N = Z + D rows per track.
 
     Attributes:
         state: previous deviations to (v, d) [M, N, D]. inputs: (z, 1) to the same [M N, Z + 1].
@@ -143,7 +143,7 @@ def _run_part(
 
 
 class _LinearWeights:
-    """The recursion of `sequence_weights` with epsilon, on scaled linear numbers [S, M, B]."""
+    """Runs the recursion of `sequence_weights` with epsilon, on scaled linear numbers [S, M, B]."""
 
     def __init__(self, rule: WeightRule, batch: int) -> None:
         log_prior = rule.log_prior

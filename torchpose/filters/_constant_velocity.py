@@ -21,7 +21,7 @@ _VELOCITY_VARIANCE = 100.0  # at the start, in units of r per s^2
 
 
 class ConstantVelocityState(NamedTuple):
-    """Position and velocity of every number.
+    """Holds the position and velocity of every number.
 
     Attributes:
         mean: [B, 2, N], in the units of the numbers and per second. time: frames seen.
@@ -32,7 +32,7 @@ class ConstantVelocityState(NamedTuple):
 
 
 class _Gains(NamedTuple):
-    """The motion matrix [2, 2], and gains frame by frame: filter [S, 2], smoother [S, 2, 2]."""
+    """Holds the motion matrix [2, 2], and gains frame by frame: filter [S, 2], smoother [S, 2, 2]."""
 
     matrix: Tensor
     filter: Tensor
@@ -40,7 +40,7 @@ class _Gains(NamedTuple):
 
 
 class ConstantVelocityFilter(nn.Module):
-    """Kalman filter of numbers that are measured in every frame and move at nearly constant velocity.
+    """Filters numbers that move at nearly constant velocity and are measured in every frame (Kalman filter).
 
     Each number by itself, at all times with the same gains:
         (x, v)_t = [1 dt; 0 1] (x, v)_{t-1} + N(0, q [dt^3/3 dt^2/2; dt^2/2 dt]),   z_t = x_t + N(0, r).

@@ -31,7 +31,7 @@ _UNIFORM_WEIGHT = 1e-3
 
 
 class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
-    """Mixture Kalman filter with one track for each component, which it always keeps (BL 49).
+    """Filters by a mixture Kalman filter with one track for each component, which it always keeps (BL 49).
 
     Each track j is a Kalman filter; with a_j prop. to pi_j w_{t-1,j}, its weight and the evidence are
         w_j prop. to a_j N_j^power,  log p(z_t | z_1:t-1) = logsumexp_j(log a_j + log N_j),
@@ -103,7 +103,7 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
 
     @property
     def weight_rule(self) -> WeightRule:
-        """Return how the tracks are weighted."""
+        """Return the settings of the tracks' weights."""
         log_prior, by_frame = self.log_prior.to(self.dtype), self.weighting == "frame"
         return WeightRule(
             log_prior, self.uniform_weight, self.likelihood_power, self.reset_below, by_frame
@@ -130,7 +130,17 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
     def filter_frame(
         self, state: MKFState, frame: Measurements, generator: Generators, return_cov: bool
     ) -> tuple[MKFState, StepOutput]:
-        """Return the next state and the estimate, given checked measurements of one frame."""
+        """Filter one frame, given its checked measurements (BL 34-41, 49).
+
+        Args:
+            state: of the B sequences, from `init` or the frame before.
+            frame: checked measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z].
+            generator: for filters that draw; one generator, or a list of one for each sequence.
+            return_cov: whether to return the covariance as well.
+
+        Returns:
+            The next state, and a `StepOutput` with the mean [B, D].
+        """
         rule, way = self.weight_rule, self._way
         if way == "traced":
             return self._filter_unseen(rule, state, frame, return_cov)
@@ -172,10 +182,20 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
     def filter_frames(
         self, frames: Measurements, generator: Generators, return_cov: bool, progress: bool
     ) -> FilterOutput:
-        """Return the estimates of whole sequences, given checked measurements, by the fastest way.
+        """Filter whole sequences, given checked measurements, in the fastest way that gives these numbers.
 
         The plain recursion is left to noise that changes in each frame, to burn-in, and to gradients of
         model or noise.
+
+        Args:
+            frames: checked measurements: z [B, T, Z], mask [B, T, Z], cov [Z, Z] or [B, T, Z, Z], lengths
+                [B].
+            generator: for filters that draw; one generator, or a list of one for each sequence.
+            return_cov: whether to return covariances as well.
+            progress: whether to show a progress bar.
+
+        Returns:
+            `FilterOutput` with means [B, T, D].
         """
         if self._way != "tracked":
             return super().filter_frames(frames, generator, return_cov, progress)
@@ -202,7 +222,19 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
         return_cov: bool,
         progress: bool = False,
     ) -> tuple[MKFState, FilterOutput]:
-        """Return the state after some frames, and their estimates; without memory, all at once."""
+        """Filter some more frames, given checked measurements; all at once if the filter has no memory.
+
+        Args:
+            state: of the B sequences, from `init` or the frames before.
+            frames: checked measurements: z [B, T, Z], mask [B, T, Z], cov [Z, Z] or [B, T, Z, Z], lengths
+                [B].
+            generator: for filters that draw; one generator, or a list of one for each sequence.
+            return_cov: whether to return covariances as well.
+            progress: whether to show a progress bar.
+
+        Returns:
+            The next state, and a `FilterOutput` with means [B, T, D].
+        """
         if self._way != "alone":
             return super().continue_frames(state, frames, generator, return_cov, progress)
         rule, n_frames = self.weight_rule, frames.z.shape[1]
@@ -212,13 +244,22 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
     def smooth_frames(
         self, frames: Measurements, lag: int | None, return_cov: bool
     ) -> FilterOutput:
-        """Return smoothed estimates of whole sequences, given checked measurements.
+        """Smooth whole sequences, given checked measurements.
 
         Filters whose frames do not depend on each other have nothing to smooth: their estimates are
         those of `forward`.
 
+        Args:
+            frames: checked measurements: z [B, T, Z], mask [B, T, Z], cov [Z, Z] or [B, T, Z, Z], lengths
+                [B].
+            lag: number of later frames that an estimate may use; None is all of them.
+            return_cov: whether to return covariances as well.
+
+        Returns:
+            `FilterOutput` with smoothed means [B, T, D].
+
         Raises:
-            InputError: weights may be reset (`reset_below`).
+            InputError: the filter resets its weights (`reset_below`), which cuts the past off.
 
         Reference:
             H. Rauch, F. Tung, C. Striebel (1965); see `smooth_fixed_tracks`.

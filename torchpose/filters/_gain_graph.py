@@ -28,7 +28,7 @@ _MOST_EDGES = 1024
 
 
 class Edge(NamedTuple):
-    """One time step of all M tracks under one pattern of measured dimensions.
+    """Describes one time step of all M tracks under one pattern of measured dimensions.
 
     Attributes:
         target: the node that the step leads to. inverse_factor: L^-1 [M, Z, Z] of the innovation
@@ -47,7 +47,7 @@ class Edge(NamedTuple):
 
 
 class BlockModel(NamedTuple):
-    """The recursion of M tracks over blocks of n frames, for row vectors.
+    """Holds the recursion of M tracks over blocks of n frames, for row vectors.
 
     Attributes:
         length: n. outputs: [M, D + n Z + 1, n (D + Z)] takes a row (start, measurements, 1) to the
@@ -62,7 +62,7 @@ class BlockModel(NamedTuple):
 
 
 class GainGraph:
-    """The gains that were needed so far, by history.
+    """Holds the gains that were needed so far, by history.
 
     Args:
         transition: of the M tracks. observed: measured state dimensions [Z].
@@ -81,7 +81,7 @@ class GainGraph:
         self._blocks: dict[tuple[int, int, torch.dtype], BlockModel] = {}
 
     def full(self) -> bool:
-        """Return whether no more edges should be added; the caller then goes without the graph."""
+        """Return whether the graph has its largest size; the caller then filters without it."""
         return len(self.edges) >= _MOST_EDGES
 
     def edge(self, node: int, pattern: int) -> Edge:
@@ -184,7 +184,7 @@ def _block_model(
 
 
 class History(NamedTuple):
-    """Walk through the gain graph for H distinct histories of masks.
+    """Describes a walk through the gain graph for H distinct histories of masks.
 
     Attributes:
         graph: the graph. edges: per frame, one edge for each history, or a single one for all.
@@ -226,7 +226,7 @@ def find_history(model: MixtureKalmanFilter, frames: Measurements) -> History | 
 
 
 def _one_history(graph: GainGraph, row: list[int], group: Tensor) -> History | None:
-    """Return the walk of a single history; what is steady is walked through in one stride."""
+    """Return the walk of a single history; a steady stretch is walked through in one stride."""
     node, edges, steady = 0, [], []
     for pattern, run in groupby(row):
         left = sum(1 for _ in run)

@@ -28,7 +28,7 @@ __all__ = [
 
 
 class Measurements(NamedTuple):
-    """Checked measurements of a batch of sequences.
+    """Holds the checked measurements of a batch of sequences.
 
     Attributes:
         z: [B, T, Z], zero where missing. mask: [B, T, Z], True where measured.
@@ -41,12 +41,12 @@ class Measurements(NamedTuple):
     lengths: Tensor
 
     def frame(self, t: int) -> "Measurements":
-        """Return those of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z]."""
+        """Return the measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z]."""
         cov = self.cov if self.cov.ndim == 2 else self.cov[:, t]
         return Measurements(self.z[:, t], self.mask[:, t], cov, self.lengths)
 
     def as_sequences(self) -> "Measurements":
-        """Return those of one frame as sequences of a single frame."""
+        """Return the measurements of one frame as sequences of a single frame."""
         cov = self.cov if self.cov.ndim == 2 else self.cov[:, None]
         return Measurements(self.z[:, None], self.mask[:, None], cov, self.lengths)
 
@@ -105,7 +105,7 @@ def check_noise(measurement_cov: Tensor, z: Float[Tensor, "B T Z"]) -> Tensor:
     """Return R of these measurements, [Z, Z] or [B, T, Z, Z]; checked.
 
     Args:
-        measurement_cov: one R, or one for every frame, or their diagonals. z: what it is the noise of.
+        measurement_cov: one R, or one for every frame, or their diagonals. z: with this noise.
 
     Raises:
         ShapeError, CovarianceError: what does not fit.

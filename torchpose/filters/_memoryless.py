@@ -128,7 +128,7 @@ def step_memoryless(
 
 
 class _Group(NamedTuple):
-    """Frames whose gains are computed together.
+    """Holds the frames whose gains are computed together.
 
     Attributes:
         rows: which of the B T frames [N]. z: [N, Z].
@@ -213,13 +213,13 @@ def _make_gain(model: MixtureKalmanFilter, group: _Group) -> tuple[Gain, Tensor]
 
 
 class _FrameGains:
-    """The gains of the latest patterns of measured dimensions and noise, for one mixture."""
+    """Holds the gains of the latest patterns of measured dimensions and noise, for one mixture."""
 
     def __init__(self) -> None:
         self._found: dict[tuple[Any, ...], tuple[Gain, Tensor]] = {}
 
     def get(self, noise: Tensor, mask: Tensor) -> tuple[Gain, Tensor] | None:
-        """Return what is known for this pattern and noise, or None."""
+        """Return the stored gains for this pattern and noise, or None."""
         if torch.is_grad_enabled() and noise.requires_grad:
             return None
         key = _key(noise, mask)

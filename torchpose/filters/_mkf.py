@@ -38,7 +38,7 @@ __all__ = ["MKFState", "MixtureKalmanFilter"]
 
 
 class MKFState(NamedTuple):
-    """Weighted Kalman tracks.
+    """Holds weighted Kalman tracks.
 
     Attributes:
         log_weights: log w that the next step starts from (epsilon mixed in), [B, M].
@@ -56,7 +56,7 @@ class MKFState(NamedTuple):
 
 
 class MixtureKalmanFilter(RecursiveFilter):
-    """Mixture Kalman filter of a mixture of Ornstein-Uhlenbeck motion models.
+    """Filters by a mixture Kalman filter, a mixture of Ornstein-Uhlenbeck motion models.
 
     Given its indicator i, the state follows (BL 32)
         x_t = F_i x_{t-1} + (I - F_i) mu_i + N(0, N_i),  F_i = Sigma_i (Q + Sigma_i)^-1,
@@ -80,9 +80,9 @@ class MixtureKalmanFilter(RecursiveFilter):
         initial_cov: covariance of every track before the first prediction, [D, D], [D] or [K, D, D];
             by default that of its component.
         transition: "paper", "stationary" or "ou", see `make_transition`. gamma, subspace: of "ou".
-        burn_in: number of frames over which Q starts inflated by `burn_in_scale` (100 by default) and
-            decays to itself geometrically (paper section 3.3, after BL 26). 0 is no burn-in, as it has
-            to be for "ou", which has no Q.
+        burn_in: number of frames over which Q starts inflated and decays to itself geometrically (paper
+            section 3.3, after BL 26). 0 is no burn-in, as it has to be for "ou", which has no Q.
+        burn_in_scale: factor of Q in the first frame of the burn-in; 100 by default.
         dtype: of means and measurements; covariances are always float64.
         n_tracks: see `SampledTrackFilter`, `SplitTrackFilter`.
         resample_threshold: see `SampledTrackFilter`.
@@ -229,7 +229,14 @@ class MixtureKalmanFilter(RecursiveFilter):
         return False
 
     def transition(self, time: int) -> Transition:
-        """Return the transition into frame `time` (0-based), with the inflated Q of the burn-in."""
+        """Return the transition into one frame, with the inflated Q of the burn-in.
+
+        Args:
+            time: number of the frame, 0 is the first.
+
+        Returns:
+            `Transition` of K components: F [K, D, D], b [K, D] and N [K, D, D].
+        """
         if time < self.burn_in:
             return self._make_transition(inflation(time, self.burn_in, self.burn_in_scale))
         sources = (self.means, self.covariances, self.process_cov, self.gamma)
@@ -253,6 +260,9 @@ class MixtureKalmanFilter(RecursiveFilter):
         Args:
             batch_size: B. generator: for sampled tracks, which draw their components.
 
+        Returns:
+            `MKFState` with means [B, M, D].
+
         Raises:
             InputError: batch_size below 1.
         """
@@ -266,13 +276,32 @@ class MixtureKalmanFilter(RecursiveFilter):
         )
 
     def check_state(self, state: Any, batch: int) -> None:
-        """Raise unless a state is one of this filter's with so many elements."""
+        """Check that a state is one of this filter's, for a batch of this size.
+
+        Args:
+            state: as a step would take it.
+            batch: B, number of sequences.
+
+        Raises:
+            InputError: a state of another kind of filter. ShapeError: another batch size, or a filter
+                of other sizes.
+        """
         require_state(state, MKFState, "mean", (batch, self.n_tracks, self.dim))
 
     def filter_frame(
         self, state: MKFState, frame: Measurements, generator: Generators, return_cov: bool
     ) -> tuple[MKFState, StepOutput]:
-        """Return the next state and the estimate, given checked measurements of one frame."""
+        """Filter one frame, given its checked measurements; implemented for each kind of tracks.
+
+        Args:
+            state: of the B sequences, from `init` or the frame before.
+            frame: checked measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z].
+            generator: for filters that draw; one generator, or a list of one for each sequence.
+            return_cov: whether to return the covariance as well.
+
+        Returns:
+            The next state, and a `StepOutput` with the mean [B, D].
+        """
         raise NotImplementedError(f"{type(self).__name__} has no tracks")
 
     def extra_repr(self) -> str:
@@ -298,7 +327,7 @@ def _kind_of(tracks: str) -> type[MixtureKalmanFilter]:
 
 
 def _options_of(kind: type[MixtureKalmanFilter], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those of the given options that a kind has; refuse others that are not at default."""
+    """Return the given options that a kind of tracks has; refuse others that are not at their default."""
     own, defaults = _defaults(kind), _defaults(MixtureKalmanFilter)
     for name in [name for name in given if name not in own]:
         value, default = given[name], defaults[name]

@@ -24,7 +24,7 @@ __all__ = [
 
 
 class StepOutput(NamedTuple):
-    """The estimate after one time step.
+    """Holds the estimate after one time step.
 
     Attributes:
         mean: [B, D]. log_weights: of the M tracks or particles, normalised, [B, M].
@@ -42,7 +42,7 @@ class StepOutput(NamedTuple):
 
 
 class FilterOutput(NamedTuple):
-    """Estimates of a batch of sequences; past the length of a sequence its last one is repeated.
+    """Holds the estimates of a batch of sequences; past the length of a sequence its last one is repeated.
 
     Attributes:
         mean: [B, T, D]. log_weights: [B, T, M], of the estimate, normalised.

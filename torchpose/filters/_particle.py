@@ -46,7 +46,7 @@ _STARTS = ("prior", "measured")
 
 
 class ParticleState(NamedTuple):
-    """Weighted particles after a step, before they are resampled.
+    """Holds weighted particles after a step, before they are resampled.
 
     Attributes:
         white: particles [B, N, D] in the whitened coordinates of the filter; see
@@ -64,7 +64,7 @@ class ParticleState(NamedTuple):
 
 
 class _Constants(NamedTuple):
-    """Tensors that the model determines before any measurement.
+    """Holds the tensors that the model determines before any measurement.
 
     Attributes:
         walk: prior density and evidence in whitened coordinates. initial: maps noise to the first
@@ -80,7 +80,7 @@ class _Constants(NamedTuple):
 
 
 class BootstrapParticleFilter(RecursiveFilter):
-    """Particle filter under the mixture of discrete Ornstein-Uhlenbeck processes.
+    """Filters by particles under the mixture of discrete Ornstein-Uhlenbeck processes.
 
     Proposals and weights, w_t = w_{t-1} times
 
@@ -109,8 +109,9 @@ class BootstrapParticleFilter(RecursiveFilter):
         proposal: "mixture", "random-walk" or "random-walk-unscaled".
         n_particles: N. resample_threshold: share of N, 0 (never) to 1 (always).
         resampling: "systematic", "stratified", "multinomial" or "residual".
-        burn_in: number of frames over which Q starts inflated by `burn_in_scale` (100 by default) and
-            decays to itself geometrically, Q_t = scale^(1 - t / burn_in) Q. 0 is no burn-in.
+        burn_in: number of frames over which Q starts inflated and decays to itself geometrically,
+            Q_t = scale^(1 - t / burn_in) Q. 0 is no burn-in.
+        burn_in_scale: factor of Q in the first frame of the burn-in; 100 by default.
         initial_cov: the first particles are drawn from the prior, or if this is given ([D, D], [D]
             or [K, D, D]) from sum_i pi_i N(mu_i, initial_cov), as the mixture Kalman filter starts.
         start: "prior": x_0 is drawn from that density, and moved and weighed like any other.
@@ -217,7 +218,14 @@ class BootstrapParticleFilter(RecursiveFilter):
         return walk.moves(*parts)
 
     def inflation(self, time: int) -> float:
-        """Return the factor of Q in frame `time` (0-based), as `torchpose.filters._transition`."""
+        """Return the factor of Q in one frame, above 1 during the burn-in.
+
+        Args:
+            time: number of the frame, 0 is the first.
+
+        Returns:
+            scale^(1 - t / burn_in) for t < burn_in, then 1.
+        """
         return inflation(time, self.burn_in, self.burn_in_scale)
 
     @torch.no_grad()
@@ -227,6 +235,12 @@ class BootstrapParticleFilter(RecursiveFilter):
 
         Args:
             batch_size: B. generator: one generator, or a list of one for each element.
+
+        Returns:
+            `ParticleState` with N particles for each element.
+
+        Raises:
+            InputError: batch_size below 1.
         """
         check_count("batch_size", batch_size)
         weights = self.weights.double().expand(batch_size, -1)
@@ -234,7 +248,16 @@ class BootstrapParticleFilter(RecursiveFilter):
         return self._evenly(white, 0)
 
     def check_state(self, state: Any, batch: int) -> None:
-        """Raise unless a state is one of this filter's with so many elements."""
+        """Check that a state is one of this filter's, for a batch of this size.
+
+        Args:
+            state: as a step would take it.
+            batch: B, number of sequences.
+
+        Raises:
+            InputError: a state of another kind of filter. ShapeError: another batch size, or a filter
+                of other sizes.
+        """
         require_state(state, ParticleState, "white", (batch, self.n_particles, self.dim))
 
     def _draw(
@@ -277,14 +300,31 @@ class BootstrapParticleFilter(RecursiveFilter):
         return white, torch.logsumexp(log_weights, 1), mending(white, jitter, moves.jitter)
 
     def particles(self, state: ParticleState) -> Float[Tensor, "B N D"]:
-        """Return the particles in the units of the state (pixels, metres, radians), float64."""
+        """Return the particles in the units of the state.
+
+        Args:
+            state: from `init` or `step`.
+
+        Returns:
+            [B, N, D], pixels, metres and radians, float64.
+        """
         return self.walk.unwhiten(state.white)
 
     @torch.no_grad()
     def filter_frame(
         self, state: ParticleState, frame: Measurements, generator: Generators, return_cov: bool
     ) -> tuple[ParticleState, StepOutput]:
-        """Resample if due, propose, weigh, and return the next state and its estimate."""
+        """Filter one frame: resample if due, propose, weigh (BL 14, 23-26).
+
+        Args:
+            state: of the B sequences, from `init` or the frame before.
+            frame: checked measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z].
+            generator: for filters that draw; one generator, or a list of one for each sequence.
+            return_cov: whether to return the covariance as well.
+
+        Returns:
+            The next state, and a `StepOutput` with the mean [B, D].
+        """
         if state.time == 0 and self.start == "measured":
             white, evidence, work = self._draw_measured(frame, generator)
             return self._output(self._evenly(white, 1), evidence, frame.mask, return_cov, work)

@@ -67,7 +67,7 @@ def recomputed(function: Callable[..., _Result], *arguments: object) -> _Result:
 
 
 class _Slot:
-    """The place of a tensor that a gradient needs; it lives as long as the graph of that gradient."""
+    """Holds the place of a tensor that a gradient needs; it lives as long as the graph of that gradient."""
 
     def __init__(self, shape: torch.Size) -> None:
         self.shape = shape

@@ -22,7 +22,7 @@ __all__ = ["SampledTrackFilter"]
 
 
 class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
-    """Mixture Kalman filter whose M tracks draw a component from pi in every frame.
+    """Filters by a mixture Kalman filter whose M tracks draw a component from pi in every frame.
 
     A track is a Kalman filter under the components it drew; its weight is w_j prop. to w_{t-1,j} N_j
     (BL 47). Tracks are resampled, systematically, when the effective sample size (BL 25) falls below
@@ -76,6 +76,9 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
         Args:
             batch_size: B. generator: one generator, or a list of one for each element.
 
+        Returns:
+            `MKFState` with means [B, M, D].
+
         Raises:
             InputError: batch_size below 1.
         """
@@ -89,7 +92,17 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
     def filter_frame(
         self, state: MKFState, frame: Measurements, generator: Generators, return_cov: bool
     ) -> tuple[MKFState, StepOutput]:
-        """Draw an indicator for each track, filter, weight (BL 47), and resample if needed (BL 25)."""
+        """Filter one frame: draw indicators, filter, weigh (BL 47), and resample if needed (BL 25).
+
+        Args:
+            state: of the B sequences, from `init` or the frame before.
+            frame: checked measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z].
+            generator: for filters that draw; one generator, or a list of one for each sequence.
+            return_cov: whether to return the covariance as well.
+
+        Returns:
+            The next state, and a `StepOutput` with the mean [B, D].
+        """
         drawn = self._draw_components(frame.z.shape[0], generator)
         matrix, offset, noise = (part[drawn] for part in self.transition(state.time))
         wide = torch.float64

@@ -119,7 +119,7 @@ def run_for_gradients(
 
 
 class _Carry(NamedTuple):
-    """State handed from frame to frame: deviations of tracks [M, B, D] and log-weights [B, M]."""
+    """Holds the state handed from frame to frame: deviations of tracks [M, B, D] and log-weights [B, M]."""
 
     deviation: Tensor
     log_weights: Tensor
@@ -135,7 +135,7 @@ def _estimate(
     span: range,
     return_cov: bool,
 ) -> tuple[_Carry, StepOutput]:
-    """Return what some frames leave to the next, and their estimates, batch first."""
+    """Return the state after some frames, and their estimates, batch first."""
     tracks, deviation = _stepped_stretch(model, frames, history, carry.deviation, span)
     log_likelihood = tracks.log_likelihood.permute(1, 3, 2, 0).flatten(0, 1)
     own = None if marginal is None else marginal[span.start : span.stop]
@@ -159,7 +159,7 @@ def _marginal(model: MixtureKalmanFilter, rule: WeightRule, frames: Measurements
 
 
 class _Workspace:
-    """Memory shared by all stretches of a run: fresh pages cost more than the products in them."""
+    """Holds the memory shared by all stretches of a run: fresh pages cost more than the products in them."""
 
     def __init__(self) -> None:
         self._held: dict[str, Tensor] = {}

@@ -31,7 +31,7 @@ _BUFFER_NUMBERS = 1 << 26  # numbers held for one part of the batch: half a giga
 
 
 class _Pass(NamedTuple):
-    """A forward pass, time first.
+    """Holds a forward pass, time first.
 
     Attributes:
         mean: filtered track means [T, B, M, D]. correction: filtered minus predicted [T, B, M, D].

@@ -18,7 +18,7 @@ __all__ = ["SplitTrackFilter"]
 
 
 class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
-    """Mixture Kalman filter that continues every track by every component, and keeps the M likeliest.
+    """Filters by a mixture Kalman filter that splits every track by every component; the M likeliest stay.
 
     A candidate is track i continued by component j, of weight w_i pi_j N(z_t | i, j). In the first
     frame there is one track for each component. Without pruning (M = K^(T+1)) this is the exact
@@ -60,16 +60,34 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         )  # fmt: skip
 
     def check_state(self, state: Any, batch: int) -> None:
-        """Raise unless a state is one of this filter's with so many elements."""
+        """Check that a state is one of this filter's, for a batch of this size.
+
+        Args:
+            state: as a step would take it.
+            batch: B, number of sequences.
+
+        Raises:
+            InputError: a state of another kind of filter. ShapeError: another batch size, or a filter
+                of other sizes.
+        """
         # Any number of tracks: before the first frame there is one for each component.
         require_state(state, MKFState, "mean", (batch, None, self.dim))
 
     def filter_frame(
         self, state: MKFState, frame: Measurements, generator: Generators, return_cov: bool
     ) -> tuple[MKFState, StepOutput]:
-        """Continue each of the M tracks with each of the K components; keep the M likeliest.
+        """Filter one frame: continue each of the M tracks by each of the K components, keep the M likeliest.
 
         Only the measured block of the M K predicted covariances is formed before the selection.
+
+        Args:
+            state: of the B sequences, from `init` or the frame before.
+            frame: checked measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z].
+            generator: for filters that draw; one generator, or a list of one for each sequence.
+            return_cov: whether to return the covariance as well.
+
+        Returns:
+            The next state, and a `StepOutput` with the mean [B, D].
         """
         wide = torch.float64
         track_cov = state.cov[state.group]

@@ -24,7 +24,7 @@ __all__ = ["TrackStep", "run_steps", "step_estimate", "step_tracks", "weigh_trac
 
 
 class TrackStep(NamedTuple):
-    """All tracks after one step, before their weights.
+    """Holds all tracks after one step, before their weights.
 
     Attributes:
         predicted, mean: track means before and after the measurement [B, M, D].
@@ -73,7 +73,7 @@ def weigh_tracks(
     """Return log-weights of the estimate [B, M], and log-evidence, 0 where nothing is measured [B].
 
     Args:
-        rule, log_weights, log_likelihood, log_marginal: as `step_weights`. frame: what was measured.
+        rule, log_weights, log_likelihood, log_marginal: as `step_weights`. frame: its measurements.
     """
     log_weights, log_evidence = step_weights(rule, log_weights, log_likelihood, log_marginal)
     measured = frame.mask.any(-1)

@@ -31,7 +31,7 @@ BURN_IN_SCALE = 100.0
 
 
 class Transition(NamedTuple):
-    """x_t = F x_{t-1} + b + N(0, N), one linear-Gaussian model per component.
+    """Holds one linear-Gaussian model per component, x_t = F x_{t-1} + b + N(0, N).
 
     Attributes:
         matrix: F [K, D, D]. offset: b = (I - F) mu [K, D]. noise: N [K, D, D].
@@ -110,6 +110,9 @@ def make_transition(
         process_cov: Q [D, D]; not used by "ou".
         gamma: [K] or [], in [0, 1); only for "ou".
         subspace: number of principal directions, only for "ou".
+
+    Returns:
+        `Transition` with F [K, D, D], b [K, D] and N [K, D, D], symmetric.
 
     Raises:
         InputError: unknown kind, or gamma missing or outside [0, 1).

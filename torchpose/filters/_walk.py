@@ -23,7 +23,7 @@ NEGLIGIBLE = -80.0  # exp(-80) = 2e-35: no share of a sum, and not yet denormal 
 
 
 class Moves(NamedTuple):
-    """One affine map for each component: y' = [y, noise] @ matrix + offset.
+    """Holds one affine map for each component: y' = [y, noise] @ matrix + offset.
 
     Attributes:
         matrix: [K, 2 D, D]. offset: [K, D].
@@ -36,7 +36,7 @@ class Moves(NamedTuple):
 
 
 class MixtureWalk:
-    """Prior density and random-walk evidence of a mixture, from one product of residuals.
+    """Computes the prior density and the random-walk evidence of a mixture, from one product of residuals.
 
     In the generalised eigenbasis E_i of (Sigma_i, Q), with E_i E_i^T = Sigma_i and
     E_i diag(l_i) E_i^T = Q, the residuals r = E_i^-1 (x - mu_i) serve both densities:

@@ -28,7 +28,7 @@ __all__ = [
 
 
 class WeightRule(NamedTuple):
-    """Settings of the weights of fixed tracks.
+    """Holds the settings of the weights of fixed tracks.
 
     Attributes:
         log_prior: log pi [M], in the dtype of the weights.
@@ -101,7 +101,7 @@ def step_weights(
     log p(z_t | z_1:t-1) = logsumexp_j(log a_j + log N_j);   w_j prop. to a_j N_j^power.
 
     Args:
-        rule: how they are weighted. log_weights: log w_{t-1}, epsilon already mixed in.
+        rule: settings of the weights. log_weights: log w_{t-1}, epsilon already mixed in.
         log_likelihood: log N_j of the tracks' predictions (BL 41). log_marginal: for weights by frame,
             which are those of `frame_weights`.
 
@@ -128,7 +128,7 @@ def frame_weights(
     w_j prop. to pi_j N(z_t; H mu_j, H Sigma_j H^T + R)^power
 
     Args:
-        rule: how they are weighted. log_marginal: log N(z_t; H mu_j, H Sigma_j H^T + R).
+        rule: settings of the weights. log_marginal: log N(z_t; H mu_j, H Sigma_j H^T + R).
         log_likelihood: log N_j of the tracks' predictions (BL 41).
 
     Returns:
@@ -145,7 +145,7 @@ def sequence_weights(
     log_likelihood: Float[Tensor, "T B M"],
     log_marginal: Float[Tensor, "T B M"] | None = None,
 ) -> tuple[Float[Tensor, "T B M"], Float[Tensor, "T B"], Float[Tensor, "B M"]]:
-    """Return what `step_weights` gives over T frames, time first.
+    """Return the weights by `step_weights` over T frames, time first.
 
     Without epsilon the weights are a cumulative sum. With it they are a linear recursion,
     alpha_t = N_t pi (c_1 alpha_{t-1} + c_2 sum alpha_{t-1}), which runs on scaled linear numbers:
@@ -225,7 +225,7 @@ def _scaled_linear(
 
 
 def steps_between_rescaling(log_prior: Float[Tensor, " M"], epsilon: float) -> int:
-    """Return how many steps the linear recursion may go without rescaling, in its dtype's range."""
+    """Return the number of steps of the linear recursion without rescaling that stay in its dtype's range."""
     share = epsilon / (1 + log_prior.numel() * epsilon)
     smallest = math.log(share) + float(log_prior.detach().min())
     room = -0.85 * math.log(torch.finfo(log_prior.dtype).tiny)

@@ -37,7 +37,7 @@ _FAR = 1e9  # pixels; no keypoint is there
 
 @dataclass
 class Keypoints:
-    """A sequence of 2D keypoints of one person.
+    """Holds a sequence of 2D keypoints of one person.
 
     Args:
         keypoints: [T, J, 2] float64, pixels, NaN where missing.
@@ -48,7 +48,7 @@ class Keypoints:
         image_size: (width, height), pixels, or None.
         neck: kind of neck if the joint set or the file tells, see `torchpose.skeleton`.
         path: the file or folder.
-        notes: what was made of the file's keypoints, in plain words.
+        notes: sentences on conversions of the file's keypoints.
     """
 
     keypoints: Tensor
@@ -88,6 +88,9 @@ def read_keypoints(path: str | Path) -> Keypoints:
     Args:
         path: file or folder.
 
+    Returns:
+        `Keypoints` with [T, J, 2] in pixels, u to the right and v down.
+
     Raises:
         InputError: no such file, an empty sequence, nothing measured in any frame.
         FileFormatError: truncated, another kind of file, missing keys, wrong shapes, infinite
@@ -117,6 +120,10 @@ def write_keypoints(path: str | Path, keypoints: Keypoints) -> None:
     """Write keypoints as ``.npz`` or ``.csv`` (by suffix), in the form that `read_keypoints` reads.
 
     A ``.csv`` cannot hold the camera matrix.
+
+    Args:
+        path: of the file, which is replaced; ends in .npz or .csv.
+        keypoints: of one person.
 
     Raises:
         InputError: another suffix. OutputError: the file cannot be written.

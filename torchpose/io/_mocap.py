@@ -24,7 +24,7 @@ _UNNAMED = "unnamed"
 
 @dataclass(frozen=True)
 class MocapClip:
-    """One trial of one person.
+    """Describes one trial of one person.
 
     Args:
         joints: [T, 15, 3] of `torchpose.body.BODY_15`, metres, axes of the room (right-handed); NaN

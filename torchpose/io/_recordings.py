@@ -51,7 +51,7 @@ _FAR = 1e9  # in the unit of the file; no joint is there
 
 @dataclass
 class Recording:
-    """A sequence of 3D joints of one person.
+    """Holds a sequence of 3D joints of one person.
 
     Args:
         joints: [T, J, 3] float64, metres, camera axes; NaN where missing.
@@ -63,7 +63,7 @@ class Recording:
             alike.
         skeleton: name of the joint set, empty if it is no known one.
         rotation: M [3, 3] with x_camera = M x_file, to go back to the axes of the file.
-        notes: what reading assumed, converted or left out, for people.
+        notes: sentences on assumptions, conversions and omissions of the reader.
         companion: 0 for the person whose file it is, else which of the others in it.
         first_frame: number of the first frame in the file.
     """
@@ -99,7 +99,18 @@ class Recording:
         return f"{origin}#{self.person}{other}"
 
     def upper_body(self, nose_as_head: bool = False) -> UpperBody:
-        """Return the eight joints [T, 8, 3] with the kinds of neck, hand and head."""
+        """Pick the eight joints of `torchpose.skeleton.UPPER_BODY` out of the recording's joint set.
+
+        Args:
+            nose_as_head: take the nose where there is no head.
+
+        Returns:
+            `UpperBody` with joints [T, 8, 3], metres, camera axes, NaN where the set lacks one, and the
+            kinds of neck, hand and head.
+
+        Raises:
+            SkeletonError: unknown names, or none of the eight joints.
+        """
         return to_upper_body(self.joints, self.names, nose_as_head)
 
 
@@ -159,7 +170,19 @@ def _read_recording(
 def read_recordings(
     paths: str | Path | Iterable[str | Path], axes: str | None = None
 ) -> list[Recording]:
-    """Read every recording in files and folders; see `find_recordings` and `read_recording`."""
+    """Read every recording in files and folders.
+
+    Args:
+        paths: one path or several; folders are searched, see `find_recordings`.
+        axes: ``camera``, ``kinect``, ``y-up`` or ``z-up``, of all files; by default what each file or its
+            joint set says, see `read_recording`.
+
+    Returns:
+        Recordings in camera axes, metres, in the order of the files.
+
+    Raises:
+        InputError, FileFormatError, SkeletonError, MissingDependencyError: as `read_recording`.
+    """
     return [r for path in find_recordings(paths) for r in read_recording(path, axes)]
 
 
@@ -238,7 +261,7 @@ def _looks_recorded(path: Path) -> bool:
 
 
 def _finish(raw: RawRecording, axes: str | None) -> Recording:
-    """Check what was read and turn it into metres and camera axes."""
+    """Check the joints of a file and turn them into metres and camera axes."""
     where = raw.where()
     _check_shapes(raw)
     try:

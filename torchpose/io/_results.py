@@ -21,7 +21,7 @@ _LISTED = 5
 
 
 class ResultsFolder:
-    """Folder that stages the files of a run and puts them in their places together.
+    """Stages the files of a run in a folder, and puts them in their places together.
 
     A list in the folder, `.torchpose-KIND.json`, says which files a run has put there, by name, size
     and SHA-256. Only these, as long as nobody has changed them, are replaced or deleted by the next
@@ -123,7 +123,7 @@ class ResultsFolder:
             _refuse_stranger(self.folder / name, listed)
 
     def _present(self) -> list[Path]:
-        """Return what is in the folder under a name that a run of this kind may write."""
+        """Return the existing files of the folder under names that a run of this kind may write."""
         return [path for path in self.folder.iterdir() if self._own.fullmatch(path.name)]
 
     def _take_stage(self) -> Path:

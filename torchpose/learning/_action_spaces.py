@@ -50,6 +50,9 @@ def fit_action_space(
         n_postures: K; by default the median length. prominence: see `synchronise`.
         info: more facts; name, fps and what the fit finds are filled in.
 
+    Returns:
+        `ActionSpace` with D dimensions and K postures, degrees.
+
     Raises:
         InputError: one performance only, one with too few frames, NaN, D or fps not positive,
             nothing moves. ShapeError: postures of other than 36 angles.
@@ -131,7 +134,7 @@ def _checked(performances: Sequence[Tensor], n_dimensions: int) -> list[Tensor]:
 
 
 class Performed(NamedTuple):
-    """A recording or a single performance.
+    """Holds a recording or a single performance.
 
     Attributes:
         person, action: who and what. postures: [T, 36], degrees.

@@ -54,7 +54,7 @@ def arm_directions(joints: Float[Tensor, "N 8 3"]) -> Float[Tensor, "N 2 6"]:
 
 
 class _Person(NamedTuple):
-    """What the recordings of a person say.
+    """Holds the measures of a person from the recordings.
 
     Attributes:
         directions: of both arms, [N, 2, 6], NaN of an arm that is not known. lengths: medians, [5].
@@ -128,7 +128,7 @@ def _one_of(pairs: Float[Tensor, "N 2 6"], generator: torch.Generator) -> Float[
 def _together(
     mixture: GaussianMixture, pairs: Float[Tensor, "N 2 6"], rounds: int = 100
 ) -> Float[Tensor, "K K"]:
-    """Return how often one arm is of one component and the other, mirrored, of another (EM).
+    """Return the joint probabilities of the components of both arms, the other arm mirrored (EM).
 
     Args:
         mixture: over one arm, which stays. pairs: of arms, both known.
@@ -156,7 +156,7 @@ def _with_sums(
 
 
 def _persons(recordings: Sequence[Recording]) -> dict[str, _Person]:
-    """Return what each person's recordings say, at 30 frames a second."""
+    """Return the arm directions and bone lengths of each person, at 30 frames a second."""
     directions: dict[str, list[Tensor]] = {}
     lengths: dict[str, list[Tensor]] = {}
     for recording in recordings:
@@ -220,7 +220,7 @@ def _tilted(pairs: Float[Tensor, "N 2 6"], generator: torch.Generator) -> Float[
 def _length_statistics(
     lengths: Float[Tensor, "P 5"], trust: Float[Tensor, " P"], of: Int[Tensor, " P"]
 ) -> tuple[Tensor, Tensor]:
-    """Return the weighted median of each length, and the spread of its log, shrunk to what is usual.
+    """Return the weighted median of each length, and the spread of its log, shrunk to the usual spread.
 
     The persons of a set were measured alike: a set counts as one, however many persons it has.
 

@@ -12,14 +12,7 @@ from torch import Tensor
 from torchpose.errors import InputError
 from torchpose.learning._samplers import BLOCK, PRODUCT, Samples, SampleSource, join_samples
 
-__all__ = [
-    "ALONE",
-    "Share",
-    "joined_blocks",
-    "spread_samples",
-    "usable_block",
-    "usable_samples",
-]
+__all__ = ["ALONE", "Share", "joined_blocks", "spread_samples", "usable_block", "usable_samples"]
 
 K = TypeVar("K")
 _START_BLOCKS = 4  # times the blocks that the samples would fill, for variety
@@ -36,7 +29,7 @@ def _sum_over_processes(values: Tensor) -> Tensor:
 
 
 class Share(NamedTuple):
-    """The share of the blocks that one process takes.
+    """Describes the share of the blocks that one process takes.
 
     Attributes:
         rank, size: number of this process, and of all processes.
@@ -79,7 +72,7 @@ def usable_samples(samples: Samples, name: str) -> Samples:
 
     Args:
         samples: states and weights.
-        name: what the samples are called in a message, such as their block.
+        name: of the samples, for a message, such as their block.
 
     Raises:
         InputError: weights that are negative or not finite, states of positive weight that are not.
@@ -118,7 +111,7 @@ def spread_samples(source: SampleSource, count: int) -> Samples:
 
     Args:
         source: the states; all of them are taken if there are no more than `count`.
-        count: how many.
+        count: number of samples.
 
     Raises:
         InputError: samples that are not finite; the block is named.

@@ -41,7 +41,7 @@ def check_fit_file(name: str | Path) -> Path:
 
 
 def fit_results(out: Path, inputs: Iterable[str | Path], pictures: bool = True) -> ResultsFolder:
-    """Return where a fit puts its file, and those of the same name beside it.
+    """Return the results folder of a fit: its file, and those of the same name beside it.
 
     Args:
         out: the file, NAME.safetensors. inputs: files that are read. pictures: whether some are drawn.
@@ -69,7 +69,7 @@ def write_fit(
     The pictures only show the model, so that it is kept where one cannot be drawn.
 
     Args:
-        model: that was fitted. card: Markdown text on it. results: where the files go.
+        model: that was fitted. card: Markdown text on it. results: folder of the files.
         file: name of the model's. pictures: what draws each, by the name of its file; they need
             matplotlib.
     """
@@ -91,10 +91,10 @@ def write_fit(
 def write_prior_files(
     prior: UpperBodyPrior, results: ResultsFolder, file: str, picture: bool = False
 ) -> str:
-    """Write a prior of the upper body, its card and a picture of its mean poses; return what was done.
+    """Write a prior of the upper body, its card and a picture of its mean poses; return a report.
 
     Args:
-        prior: that was fitted. results: where the files go. file: name of the prior's.
+        prior: that was fitted. results: folder of the files. file: name of the prior's.
         picture: draw the mean poses, which needs matplotlib.
     """
 
@@ -112,10 +112,10 @@ def write_prior_files(
 def write_manifold_files(
     fitting: ManifoldFitting, results: ResultsFolder, file: str, picture: bool = False, **facts: str
 ) -> str:
-    """Write a fitted manifold, its card and its latent space; return what was done.
+    """Write a fitted manifold, its card and its latent space; return a report.
 
     Args:
-        fitting: at its end. results: where the files go. file: name of the manifold's.
+        fitting: at its end. results: folder of the files. file: name of the manifold's.
         picture: draw the latent space, which needs matplotlib. facts: name, licence, command.
     """
     manifold = fitting.manifold(**facts)
@@ -133,10 +133,10 @@ def write_manifold_files(
 def write_limb_files(
     states: LimbStates, results: ResultsFolder, file: str, least_std: float = 0.01, **facts: str
 ) -> str:  # fmt: skip
-    """Fit limb conditionals, write them and their card, and return what was done.
+    """Fit limb conditionals, write them and their card; return a report.
 
     Args:
-        states: to fit to. results: where the files go. file: name of the conditionals'.
+        states: to fit to. results: folder of the files. file: name of the conditionals'.
         least_std: see `fit_limbs`. facts: name, licence, command.
     """
     found, held_out = fit_limbs(states, least_std, **facts)
@@ -147,10 +147,10 @@ def write_limb_files(
 def write_action_files(
     fitted: FittedActions, results: ResultsFolder, file: str, picture: bool = False, **facts: str
 ) -> str:
-    """Write an action space or a bank, its card and a picture of each action; return what was done.
+    """Write an action space or a bank, its card and a picture of each action; return a report.
 
     Args:
-        fitted: to be written. results: where the files go. file: name of the space's or bank's.
+        fitted: to be written. results: folder of the files. file: name of the space's or bank's.
         picture: draw the synchronised performances, which needs
             matplotlib. facts: name, licence, command.
     """
@@ -173,7 +173,7 @@ def _written(results: ResultsFolder, written: Sequence[Path]) -> str:
 
 
 def _prior_lines(prior: UpperBodyPrior) -> list[str]:
-    """Return what was fitted, on what, and how well it will do, a line each."""
+    """Return a summary of the fit: the data, the size, and the expected errors, a line each."""
     info = prior.info
     windows = [w.left.n_components for w in prior.windows.values()]
     over = f" and {max(windows)} over windows" if windows else ""
@@ -195,7 +195,7 @@ def _prior_lines(prior: UpperBodyPrior) -> list[str]:
 
 
 def _expected(held_out: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """Return what somebody new can expect, from the errors of the persons that were held out."""
+    """Return the expected errors of an unseen person, from those of the persons that were held out."""
     lines = []
     for mode in ("causal", "full"):
         errors = [100 * error for error in held_out.get(mode, {}).values()]

@@ -115,7 +115,7 @@ def principal_start(
 
 
 class GPLVMFit(nn.Module):
-    """The fit of a back-constrained GPLVM, whose whole state is in its `state_dict`.
+    """Fits a back-constrained GPLVM; the whole state of the fit is in its `state_dict`.
 
     Maximises (MR 16) over the back constraints z_i = sum_t a_ti k_x(x, x_t) + b_i (MR 21), beta,
     beta_0 and sigma_z. The weights a are optimised as v = L^T a with K_x = L L^T, in which the
@@ -311,7 +311,7 @@ def best_fit(
     """Fit from several starts and return the fit with the lowest error, or else the highest objective.
 
     Args:
-        make: a fit at start 0, 1, ... n_init: how many. error: on poses that are not fitted to, of a
+        make: a fit at start 0, 1, ... n_init: number of starts. error: on poses that are not fitted to, of a
             fit as it stands. Others: as `run_fit`.
 
     Raises:

@@ -78,8 +78,11 @@ def fit_gplvm(
             in the objective and in gamma_x; the published form does not.
         validation: poses of other trials. With them the fit stops after `patience` steps that
             bring them back no better, x - f(g(x)), and returns to the step that was best.
-        patience: see there.
-        info: what the poses are of. progress: show a bar for every start.
+        patience: number of steps without gain after which a fit with validation poses stops.
+        info: facts about the poses and their body. progress: show a bar for every start.
+
+    Returns:
+        `BackConstrainedGPLVM` without noise, see `fit_gplvm_noise`.
 
     Raises:
         InputError: fewer than 10 frames, NaN (frame and column are named), no motion, bad
@@ -107,7 +110,7 @@ def fit_gplvm(
 
 
 class FitTarget(NamedTuple):
-    """Poses of all sequences, with the centred and scaled poses that the objective is of.
+    """Holds the poses of all sequences, with the centred and scaled poses that the objective is of.
 
     Attributes:
         poses: [T, Q]. lengths: frames of each sequence. scale: s [Q]. scaled: (poses - mean) / s.
@@ -149,7 +152,7 @@ def gplvm_of_fit(
     """Return the manifold at the fit's current parameters, with latent axes turned to the principal ones.
 
     Args:
-        fit: to the scaled poses of `target`. info: what the poses are of.
+        fit: to the scaled poses of `target`. info: facts about the poses and their body.
     """
     with torch.no_grad():
         latents = fit.features @ fit.coordinates + fit.bias
@@ -167,7 +170,7 @@ def fit_gplvm_noise(
     poses: Float[Tensor, "T Q"] | Sequence[Float[Tensor, "_ Q"]],
     fps: float,
 ) -> BackConstrainedGPLVM:
-    """Set the three standard deviations from validation poses; returns the manifold itmanifold.
+    """Set the three standard deviations of a manifold from validation poses.
 
     sigma x->z: root mean square of g(x_t) - g(x_t-1) (MR 27); sigma z->x: of x_t - f(g(x_t))
     (MR 30); sigma x->x: of x_t - x_t-1 (MR 29), each dimension apart; see `motion_noise`.
@@ -176,6 +179,9 @@ def fit_gplvm_noise(
         manifold: that is changed.
         poses: one sequence or several that were not fitted to; on those that were, sigma z->x
             comes out too small. fps: their frame rate, which all three are for.
+
+    Returns:
+        The same manifold, changed.
 
     Raises:
         InputError: fewer than 10 frames, NaN, a frame rate that is not positive, or frames that

@@ -279,6 +279,9 @@ def repetition_axis(recordings: Sequence[Float[Tensor, "_ Q"]]) -> Float[Tensor,
     Args:
         recordings: [T_r, Q] each, of one action, finite.
 
+    Returns:
+        Unit vector [Q].
+
     Raises:
         InputError: no recording, one without frames, or not finite. ShapeError: other columns.
     """

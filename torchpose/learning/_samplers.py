@@ -43,7 +43,7 @@ _GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 class Samples(NamedTuple):
-    """Training states with a weight each.
+    """Holds training states with a weight each.
 
     Attributes:
         states: float64. weight: in [0, 1]; a state of weight 0.5 counts half.
@@ -60,7 +60,7 @@ def join_samples(parts: Sequence[Samples]) -> Samples:
 
 @runtime_checkable
 class SampleSource(Protocol):
-    """Training states in blocks, each a function of the source, its number and the epoch."""
+    """Yields training states in blocks, each a function of the source, its number and the epoch."""
 
     @property
     def dim(self) -> int:
@@ -94,7 +94,7 @@ def derived_seed(seed: int, purpose: str) -> int:
 
 
 class _Blocks:
-    """Base of sources: the number of blocks and their rows."""
+    """Counts blocks and their rows; base class of sources."""
 
     n_samples: int
 
@@ -111,7 +111,7 @@ class _Blocks:
 
 
 class TensorSource(_Blocks):
-    """Given states, in memory or in a memory-mapped file.
+    """Yields given states, in memory or in a memory-mapped file.
 
     Args:
         states: [N, D], tensor or array (`numpy.memmap` for more than memory holds).
@@ -138,7 +138,7 @@ class TensorSource(_Blocks):
 
 
 class CachedSource(_Blocks):
-    """A source that keeps the blocks of another one once they were drawn.
+    """Keeps the blocks of another source once they were drawn.
 
     Args:
         source: whose blocks do not change with the epoch.
@@ -170,7 +170,7 @@ def cached(source: SampleSource, limit: int = _CACHE_BYTES) -> SampleSource:
 
 @dataclass(frozen=True, eq=False)
 class _Drawn(_Blocks):
-    """States of recorded poses seen from random viewpoints (BL section 3.1).
+    """Draws states of recorded poses seen from random viewpoints (BL section 3.1).
 
     Attributes:
         matrix: K, pixels. views, rotation_order: of the viewpoints. n_samples: how many states.
@@ -209,7 +209,7 @@ def _stride(n: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class ArmSource(_Drawn):
-    """States of one arm (`arm_state`) from random viewpoints (BL section 3.1).
+    """Draws states of one arm (`arm_state`) from random viewpoints (BL section 3.1).
 
     Args:
         arms: hand, elbow, shoulder, head, neck of each recorded pose, body axes, metres; complete.
@@ -236,7 +236,7 @@ class ArmSource(_Drawn):
 
 @dataclass(frozen=True, eq=False)
 class PoseFrames:
-    """Frames of all recordings in one tensor, with the first and last frame of each recording.
+    """Holds the frames of all recordings in one tensor, with the first and last frame of each recording.
 
     Attributes:
         joints: [F, 8, 3], centred, metres; NaN where missing. weight: [F, 8], in [0, 1].
@@ -282,7 +282,7 @@ class PoseFrames:
     def wanted(
         self, frames: Int[Tensor, " N"], lags: Sequence[int], fps: float
     ) -> Int[Tensor, "N L"]:
-        """Return where the frames at some lags would be, also beyond the ends of a recording.
+        """Return the indices of the frames at some lags, which may be beyond the ends of a recording.
 
         Args:
             frames: indices. lags: in frames at the rate `fps`; positive is the past.
@@ -299,7 +299,7 @@ class PoseFrames:
 
 @dataclass(frozen=True, eq=False)
 class WindowSource(_Drawn):
-    """Window states of one arm, each from a viewpoint and a body of its own.
+    """Draws window states of one arm, each from a viewpoint and a body of its own.
 
     Args:
         frames: recorded poses, centred on the neck. centres: frames whose windows are complete.

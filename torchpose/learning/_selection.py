@@ -22,7 +22,7 @@ RULES = ("best", "one-standard-error")
 
 
 class Candidate(NamedTuple):
-    """One row of the table.
+    """Holds one row of the table.
 
     Attributes:
         n_components: K. train, held_out: mean log-likelihoods, in units of the states.
@@ -43,7 +43,7 @@ class Candidate(NamedTuple):
 
 
 class Selection(NamedTuple):
-    """The table of candidates, the chosen number of components, and how it was chosen.
+    """Holds the table of candidates, the chosen number of components, and the criterion.
 
     Attributes:
         rows: one for each candidate. n_components: the choice. best: most likely on held-out states.

@@ -41,7 +41,7 @@ POWER, OFFSET = 0.6, 2.0
 
 
 class StepwiseState(NamedTuple):
-    """Blended statistics that are carried from step to step.
+    """Holds the blended statistics that are carried from step to step.
 
     Attributes:
         table: blended statistics s of `SufficientStatistics`, for one sample of weight one.
@@ -171,7 +171,7 @@ def stepwise_pass(
 
 
 class _Chosen:
-    """Some blocks of a source."""
+    """Yields some blocks of a source."""
 
     def __init__(self, source: SampleSource, blocks: list[int]) -> None:
         self.source, self.blocks = source, blocks

@@ -50,7 +50,7 @@ START_SAMPLES = 100_000
 
 
 class StreamedEM(MixtureFit):
-    """The fit of a mixture to sources of states in blocks.
+    """Runs the fit of a mixture to sources of states in blocks.
 
     `expect` sums up samples, and `accumulate` a whole source, of which every process does its share.
     Attributes and arguments are those of `MixtureFit`.
@@ -88,7 +88,7 @@ class StreamedEM(MixtureFit):
             source: the states.
             n_components: number of Gaussians K.
             seed: an integer, or the generator to draw from.
-            start_samples: how many samples to look at, spread evenly over the source; every process
+            start_samples: number of samples to start from, spread evenly over the source; every process
                 looks at the same ones.
             covariance_floor: added to every variance, relative to the variance of the states in that
                 dimension (relative to one unit, where they do not vary at all).
@@ -162,7 +162,7 @@ class StreamedEM(MixtureFit):
         return SufficientStatistics.unpack(share.total(total.pack()), len(self.means))
 
     def mixture(self) -> GaussianMixture:
-        """Return the mixture as it is, in units of the states; its `fit_report` says how the fit went."""
+        """Return the present mixture in units of the states, with a `fit_report`."""
         mixture = GaussianMixture(*self.parameters_of_points())
         mixture.fit_report = self.report()
         return mixture
@@ -260,7 +260,7 @@ _ROWS = 1024  # states at a time, whose squares are 17 MB
 
 
 class ColumnsSource:
-    """Some dimensions of the states of another source.
+    """Yields some dimensions of the states of another source.
 
     Args:
         source: of whole states. columns: which dimensions, in order.
@@ -338,7 +338,7 @@ def complete_mixture(
 
 
 class MixtureTask(NamedTuple):
-    """One mixture to be fitted.
+    """Describes one mixture to be fitted.
 
     Attributes:
         source: of its training states. n_components: K. max_iter, tol: of the steps of EM; a

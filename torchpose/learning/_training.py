@@ -57,7 +57,7 @@ _UNSEEN = [i for i, name in enumerate(UPPER_BODY) if name.startswith(("elbow", "
 
 @runtime_checkable
 class RecordingLike(Protocol):
-    """The attributes of a `torchpose.io.Recording` that fits use."""
+    """Declares the attributes of a `torchpose.io.Recording` that fits use."""
 
     names: tuple[str, ...]
     fps: float | None
@@ -70,7 +70,7 @@ class RecordingLike(Protocol):
 
 
 class PoseSet(NamedTuple):
-    """Centred poses of many recordings, with one kind of neck.
+    """Holds the centred poses of many recordings, with one kind of neck.
 
     Attributes:
         joints: [N, 8, 3], metres, camera axes; NaN where a joint is missing.
@@ -173,7 +173,7 @@ def collect_poses(
 
 
 def short_paths(poses: PoseSet, room: float) -> PoseSet:
-    """Return recordings cut where the neck has gone far, each part centred on the mean of its neck.
+    """Return recordings cut where the neck is far from its start, each part centred on its mean neck.
 
     Args:
         poses: from `collect_poses`. room: diagonal of the box that holds a part's necks, at most;
@@ -268,7 +268,7 @@ def arm_sources(
 
 
 class ArmPoses(NamedTuple):
-    """Poses [N, 5, 3] of an arm, which of them are complete and have weight, and weights [N]."""
+    """Holds poses [N, 5, 3] of an arm, which of them are complete and have weight, and weights [N]."""
 
     points: Tensor
     known: Tensor
@@ -328,7 +328,7 @@ def _names_by_kind(kinds: Sequence[str | None], names: Sequence[str], found: lis
 
 
 def _origin(recording: RecordingLike) -> str:
-    """Return where a recording comes from, without the path inside that place."""
+    """Return the data set or repository of a recording, without the path inside it."""
     repository, at, rest = recording.source.partition("@")
     if not repository:
         return recording.person_id.partition("#")[0]

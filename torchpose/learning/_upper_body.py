@@ -92,7 +92,10 @@ def fit_upper_body_prior(
         nose_as_head: take the nose where a joint set has no head.
         name, licence, command: for `info`.
         progress: show bars.
-        fit_options: to `GaussianMixture.fit`: n_init, max_iter, tol, covariance_floor, init.
+        **fit_options: to `GaussianMixture.fit`: n_init, max_iter, tol, covariance_floor, init.
+
+    Returns:
+        `UpperBodyPrior` in float64, without noise and windows.
 
     Raises:
         InputError: no recordings or no complete frames. PriorError: kinds of joints that cannot be

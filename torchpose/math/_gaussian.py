@@ -198,7 +198,7 @@ def condition(
 
 
 class Gain(NamedTuple):
-    """The part of a Kalman update that does not depend on the measured values.
+    """Holds the part of a Kalman update that does not depend on the measured values.
 
     Attributes:
         factor: lower Cholesky factor L of the innovation covariance (BL 39), [..., Z, Z]; a missing
@@ -239,6 +239,9 @@ def kalman_predict(
     Args:
         mean: [..., D]. cov: [..., D, D]. transition: F [..., D, D]. offset: b [..., D].
         noise: N [..., D, D]. Batch dimensions broadcast.
+
+    Returns:
+        Mean [..., D] and covariance [..., D, D] of the prediction.
     """
     dim = cov.shape[-1]
     right = _multiply(cov, pad(transition, (0, 0, 0, _spare(dim))).mT)
@@ -298,7 +301,7 @@ def _log_norm(factor: Tensor, count: Tensor | int) -> Tensor:
 
 
 def _spare(columns: int) -> int:
-    """Return how many columns, at least one, make a matrix of so many a multiple of `_LANES` wide."""
+    """Return the number of columns, at least one, to add so that the width is a multiple of `_LANES`."""
     return _LANES - columns % _LANES
 
 
@@ -353,8 +356,14 @@ def kalman_update(
 ) -> tuple[Float[Tensor, "... D"], Float[Tensor, "... D D"], Float[Tensor, "..."]]:
     """Update a Gaussian by a measurement of some of its dimensions (BL 38-41).
 
+    Args:
+        mean: [..., D]. cov: [..., D, D]. z: measurements [..., Z], in the units of the state.
+        measurement_cov: R [..., Z, Z]. observed: [Z], indices of the measured dimensions (the rows of H).
+        mask: [..., Z], True where measured; None is everywhere. Batch dimensions broadcast.
+
     Returns:
-        Mean, covariance and log-likelihood log N(z | H x, H P H^T + R) of what was measured.
+        Mean [..., D], covariance [..., D, D] and log-likelihood log N(z | H x, H P H^T + R) [...] of what
+        was measured.
     """
     mean, cov, log_likelihood, _ = mended_update(mean, cov, z, measurement_cov, observed, mask)
     return mean, cov, log_likelihood
@@ -373,7 +382,7 @@ def mended_update(
     Float[Tensor, "..."],
     Float[Tensor, "..."] | None,
 ]:
-    """Return what `kalman_update` does, and the jitter of the innovation covariances (`mended_cholesky`)."""
+    """Return the result of `kalman_update`, and the jitter of innovation covariances (`mended_cholesky`)."""
     cross, factor, count, jitter = _innovation(cov, measurement_cov, observed, mask)
     residual = z - mean.index_select(-1, observed)
     if mask is not None:

@@ -37,7 +37,7 @@ __all__ = [
 
 
 class MixtureFit(nn.Module):
-    """A Gaussian mixture in the middle of its fit; all there is to know is in its `state_dict`.
+    """Fits a Gaussian mixture step by step; the whole state of the fit is in its `state_dict`.
 
     The sums of all points together go to `maximise`, and that is one step of EM. Buffers are float64
     and in units in which the points have about unit covariance, y = L^-1 (x - m), which takes away the
@@ -191,7 +191,7 @@ class MixtureFit(nn.Module):
         return state._replace(means=state.means + self.shift)
 
     def report(self) -> FitReport:
-        """Return how the fit has gone so far."""
+        """Return a report of the iterations until now."""
         return FitReport(
             iterations=int(self.steps),
             log_likelihood=tuple(self.history.tolist()),
@@ -332,7 +332,7 @@ def map_mixture(state: MixtureParameters, matrix: Float[Tensor, "D D"]) -> Mixtu
 def whitening(
     x: Tensor, sample_weight: Tensor | None, diagonal: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the mean [D], x less it [D, N], and the factor [D, D] of the covariance of x, made regular."""
+    """Return the mean [D], the centred points [D, N], and a Cholesky factor [D, D] of their covariance."""
     share = None if sample_weight is None else sample_weight / sample_weight.sum()
     mean = x.mean(0) if share is None else share @ x
     centred = torch.sub(x.T, mean.unsqueeze(-1), out=x.new_empty(x.shape[1], len(x)))

@@ -32,7 +32,7 @@ __all__ = [
 
 
 class CyclicFeatures:
-    """phi(x) = [1, x_i, x_i x_(i + s mod D)] of chunk after chunk of points.
+    """Computes phi(x) = [1, x_i, x_i x_(i + s mod D)] of chunk after chunk of points.
 
     Over all i, with s from 0 to D / 2, every pair of dimensions comes once (for even D and s = D / 2
     half of the i do). The points are stored one and a half times in a row, so that x_(i + s mod D) is
@@ -69,7 +69,7 @@ class CyclicFeatures:
 
 
 def cyclic_order(dim: int, device: torch.device) -> Int[Tensor, " F"]:
-    """Return where the features of `CyclicFeatures` are in [1, x_i, x_i x_j (i <= j)], i before j."""
+    """Return the position of each feature of `CyclicFeatures` in [1, x_i, x_i x_j (i <= j)], i before j."""
     i = torch.arange(dim, device=device)
     left = i.repeat(dim // 2 + 1)[: dim * (dim + 1) // 2]
     right = (left + torch.arange(len(left), device=device) // dim) % dim
@@ -83,7 +83,7 @@ LOG_2, LOG_2PI = math.log(2.0), math.log(2.0 * math.pi)
 
 
 class MixtureParameters(NamedTuple):
-    """Weights, means and covariances of a Gaussian mixture, as plain tensors."""
+    """Holds the weights, means and covariances of a Gaussian mixture, as plain tensors."""
 
     weights: Float[Tensor, " K"]
     means: Float[Tensor, "K D"]
@@ -91,7 +91,7 @@ class MixtureParameters(NamedTuple):
 
 
 class SufficientStatistics(NamedTuple):
-    """Sums over points that an expectation step hands to the maximisation step.
+    """Holds the sums over points that an expectation step hands to the maximisation step.
 
     Attributes:
         table: sum_n w_n r_nk phi(x_n); the first column is the number of points per component.
@@ -119,7 +119,7 @@ class SufficientStatistics(NamedTuple):
         return cls(table, table.new_zeros(()), table.new_zeros(()))
 
     def pack(self) -> Float[Tensor, " P"]:
-        """Return everything in one vector, which processes can sum up in a single exchange."""
+        """Return all sums in one vector, which processes can add up in a single exchange."""
         return torch.cat([self.table.flatten(), self.log_likelihood[None], self.weight[None]])
 
     @classmethod
@@ -130,7 +130,7 @@ class SufficientStatistics(NamedTuple):
 
 @dataclass(frozen=True)
 class FitReport:
-    """Report of a fit: iterations, log-likelihoods, convergence.
+    """Reports on a fit: iterations, log-likelihoods, convergence.
 
     Attributes:
         iterations: maximisation steps taken.
@@ -217,7 +217,7 @@ def e_step(
 
 
 def _chunk_size(device: torch.device) -> int:
-    """Return how many points go into one product, so that features of 2 MB a core stay in its cache."""
+    """Return the number of points in one product, such that features of 2 MB a core stay in its cache."""
     return POINTS * (torch.get_num_threads() if device.type == "cpu" else 64)
 
 

@@ -78,7 +78,7 @@ def safe_centre(vectors: Float[Tensor, "*batch N 3"]) -> Float[Tensor, "*batch 3
 def angle_to_edge(
     vectors: Float[Tensor, "*batch N 3"], centre: Float[Tensor, "*#batch 3"] | None = None
 ) -> Float[Tensor, "*batch"]:
-    """Return how far the farthest of the rotations stays from the edge of the space around a centre.
+    """Return the least angle between the rotations and the edge of the space around a centre.
 
     pi - 2 arcsin(max_n |x_n|): 0 at the edge |x| = 1, pi where all rotations are the centre.
 
@@ -106,6 +106,9 @@ def fit_gaussian(
         vectors: rotations as quaternion vectors without a centre, [..., N, 3].
         centre: its quaternion vector [..., 3]; no rotation by default.
         log_weights: [..., N], of any common factor; equal ones by default.
+
+    Returns:
+        Mean [..., 3] and covariance [..., 3, 3] of the quaternion vectors relative to the centre.
     """
     local = vectors if centre is None else compose(conjugate(centre)[..., None, :], vectors)
     return moments(local, log_weights)
@@ -158,7 +161,15 @@ def gaussian_rotate(
 
     An upper limb q_i = C R(x) carries its uncertainty on to the lower limb q_j = q_i q_ij (DX 10).
 
-    Args, Returns: see `rotate_gaussian`.
+    Args:
+        mean, covariance: mu [..., 3] and Sigma [..., 3, 3], in the space around C.
+        rotation: q, a quaternion vector without a centre, [..., 3].
+        centre: C. new_centre: C', of the space of the result. Quaternion vectors [..., 3]; no
+            rotation by default.
+        directions: of the sigma points, see `rotate_gaussian`.
+
+    Returns:
+        mu' [..., 3] and Sigma' [..., 3, 3], symmetric.
 
     Reference: Daubney & Xie, section 3.3 and equation (10).
     """

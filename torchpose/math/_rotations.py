@@ -178,6 +178,15 @@ def quaternion_to_vector(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor,
 def quaternion_vector_to_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Return the rotation matrix R = I + 2 w [v]x + 2 [v]x^2 of a quaternion vector.
 
+    Args:
+        vector: [..., 3], v of the unit quaternion (v, w) with w = sqrt(1 - |v|^2).
+
+    Returns:
+        R [..., 3, 3].
+
+    Raises:
+        ShapeError: the last dimension is not 3.
+
     >>> quaternion_vector_to_matrix(torch.tensor([0.0, 1.0, 0.0])).diagonal()  # by pi about y
     tensor([-1.,  1., -1.])
     """
@@ -221,7 +230,14 @@ def matrix_to_quaternion_vector(
 
 
 def conjugate(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """Return the inverse rotation: -v."""
+    """Return the inverse of a rotation, -v.
+
+    Args:
+        vector: quaternion vector [..., 3].
+
+    Returns:
+        Quaternion vector [..., 3].
+    """
     return -vector
 
 
@@ -231,6 +247,12 @@ def compose(
     """Return the quaternion vector of the product R(first) R(second).
 
     v = w_1 v_2 + w_2 v_1 + v_1 x v_2, with the sign that makes w_1 w_2 - v_1 . v_2 >= 0.
+
+    Args:
+        first, second: quaternion vectors [..., 3]; they broadcast. The product turns by `second` first.
+
+    Returns:
+        Quaternion vector [..., 3] in the unit ball.
 
     >>> quarter = torch.tensor([0.0, 0.5**0.5, 0.0])
     >>> compose(quarter, -quarter)
@@ -289,8 +311,14 @@ def mean_rotation(
     It is the leading eigenvector of sum_n w_n q_n q_n^T, so that q and -q count alike.
 
     Args:
-        vectors: [..., N, 3].
+        vectors: quaternion vectors [..., N, 3].
         weights: [..., N], not negative; equal ones by default.
+
+    Returns:
+        Quaternion vector [..., 3] in the unit ball.
+
+    Raises:
+        ShapeError: the last dimension is not 3.
 
     Reference: Markley, Cheng, Crassidis & Oshman, Averaging quaternions, 2007, equation (12).
     """
@@ -302,7 +330,7 @@ def mean_rotation(
 
 
 class RigidMotion(NamedTuple):
-    """x -> R x + t. rotation [*batch, 3, 3] (det +1), translation [*batch, 3], metres."""
+    """Holds the motion x -> R x + t: rotation [*batch, 3, 3] (det +1), translation [*batch, 3], metres."""
 
     rotation: Tensor
     translation: Tensor

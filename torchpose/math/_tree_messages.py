@@ -22,7 +22,7 @@ Transport = Callable[[Tensor, Tensor, Tensor, bool], tuple[Tensor, Tensor]]
 
 
 class TreeLevel(NamedTuple):
-    """The edges whose lower nodes are of one depth.
+    """Holds the edges whose lower nodes are of one depth.
 
     Attributes:
         edges: [E_l], which ones. above, below: [E_l], their nodes.
@@ -36,7 +36,7 @@ class TreeLevel(NamedTuple):
 
 
 class MessageTree(NamedTuple):
-    """A forest for `propagate`, made by `message_tree`: V nodes, and its edges from the top down."""
+    """Describes a forest for `propagate`, from `message_tree`: V nodes, and its edges from the top down."""
 
     n_nodes: int
     levels: tuple[TreeLevel, ...]

@@ -156,7 +156,7 @@ def limb_votes(
     threshold: float = 0.3,
     along: bool = True,
 ) -> Float[Tensor, "*b"]:
-    """Return how many segments support each hypothesis of a limb.
+    """Return the number of segments that support each hypothesis of a limb.
 
         N(x_edge | x_pose, Sigma) > tau,   x = (u, v, angle),   Sigma = diag(s^2, s^2, a^2)   (BL 50)
 

@@ -61,7 +61,7 @@ class FaceDetector(Protocol):
         """Return centre (x, y) and size (side of the square bounding box) of every face, pixels.
 
         Args:
-            image: [H, W], uint8. region: where to search; None is the whole image.
+            image: [H, W], uint8. region: the searched part of the image; None is the whole image.
         """
         ...
 

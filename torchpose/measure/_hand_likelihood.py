@@ -57,12 +57,7 @@ class HandLikelihood(nn.Module):
         self.unknown = unknown
         self.register_buffer("cues", torch.tensor([core, disc, motion, unusual]))
         weights = [-beyond, towards, -beside, -beside]
-        offsets = [
-            [-beyond_at, 0.0],
-            [towards_at, 0.0],
-            [0.0, -beside_at],
-            [0.0, beside_at],
-        ]
+        offsets = [[-beyond_at, 0.0], [towards_at, 0.0], [0.0, -beside_at], [0.0, beside_at]]
         used = [i for i, weight in enumerate(weights) if weight]
         self.register_buffer("shape_weights", torch.tensor([weights[i] for i in used]))
         self.register_buffer(

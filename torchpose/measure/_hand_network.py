@@ -37,7 +37,7 @@ _WIDTHS = (12, 24, 8, 32, 48, 64)
 
 @dataclass(frozen=True)
 class HandNetworkInfo:
-    """Facts about the fit of a `HandNetwork`.
+    """Holds facts about the fit of a `HandNetwork`.
 
     Attributes:
         name: of the network. clips, persons: that it was fitted to. licence: of the clips and parameters.
@@ -88,7 +88,7 @@ class HandNetwork(nn.Module):
     relative to the face, in B. 0.25 million parameters.
 
     Args:
-        info: what it was fitted to.
+        info: facts about the fit.
     """
 
     def __init__(self, info: HandNetworkInfo | None = None) -> None:
@@ -139,7 +139,7 @@ class HandNetwork(nn.Module):
         inside: Float[Tensor, "N h w"],
         faces: Float[Tensor, "N 3"],
     ) -> HandPlaces:
-        """Return where hands are in windows of persons.
+        """Return the places of the hands in windows of persons.
 
         Args:
             lab: bytes, two pixels for a cell [N, 3, 160, 192]. maps: skin, difference from the last frame and

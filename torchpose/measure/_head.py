@@ -97,6 +97,12 @@ class HeadNeck(nn.Module):
 
         Args:
             faces: centre (x, y) and size B, pixels. face_cov: their covariance.
+
+        Returns:
+            Head and neck [N, 2, 2], pixels, and their covariances [N, 2, 2, 2], squared pixels.
+
+        Raises:
+            ShapeError: faces of another shape.
         """
         check_shape("faces", faces, ["N", 3])
         faces = faces.to(self.offset)
@@ -280,7 +286,7 @@ def _part_grid() -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _best_shift(model: Tensor, patch: Tensor) -> Tensor:
-    """Return how far the face has moved from the middle of its patch [N, 2], in pixels of it.
+    """Return the shift of the face from the middle of its patch [N, 2], in pixels of it.
 
     By normalised correlation at every shift, over every second pixel.
     """

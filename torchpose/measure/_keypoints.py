@@ -153,7 +153,7 @@ class KeypointMeasurer:
         return Detections(points, cast(Tensor, confidence))
 
     def _call(self, image: Image) -> Any:
-        """Return what the detector returns for a frame; its own errors name it."""
+        """Return the detections of a frame; errors of the detector are raised with its name."""
         try:
             return self.detector(image)
         except TorchposeError:
@@ -187,7 +187,7 @@ class KeypointMeasurer:
     def _number(
         self, state: KeypointState, tracks: PersonTracks, image: Image
     ) -> tuple[Persons, Int[Tensor, " P"]]:
-        """Return who the followed persons are: the next register, and numbers, -1 of who does not count."""
+        """Return the next register, and the numbers of the followed persons, -1 of those left out."""
         present = tracks.usable & (tracks.unseen <= _PRESENT * self.fps)
         faces = pseudo_faces(*self._scale(tracks.keypoints[present]))
         persons, number = self.register.step(

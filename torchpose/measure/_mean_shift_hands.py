@@ -150,7 +150,7 @@ class MeanShiftHandTracker(nn.Module):
         return take_rows(self._fresh(), slice(0, 0))
 
     def _fresh(self) -> MeanShiftHandState:
-        """Return the state of one newcomer, who has neither hands nor colours yet."""
+        """Return the state of one new person, without hands or colours."""
         mean, weak = self.matrix.new_zeros(1, 2, 4), torch.zeros(1, 2, dtype=torch.long)
         cov = self.matrix.new_zeros(1, 2, 4, 4)
         return MeanShiftHandState(mean, cov, weak > 0, weak, weak[:, 0], self.skin.init(1))
@@ -169,6 +169,9 @@ class MeanShiftHandTracker(nn.Module):
             state: from `init` or the step before. frame: RGB [H, W, 3], uint8.
             faces: centre (x, y) and size of the faces, pixels. identity: their numbers.
             foreground: [H, W], 0 where there is background; None is foreground everywhere.
+
+        Returns:
+            The next state, and `HandMeasurements` of N persons, pixels.
 
         Raises:
             ShapeError, InputError: frames, faces or masks of another kind.
@@ -265,7 +268,7 @@ class MeanShiftHandTracker(nn.Module):
         return start, (best > 0) & (better | ~same[:, None])
 
     def _areas(self, faces: Tensor, rows: Tensor, shape: tuple[int, int]) -> Tensor:
-        """Return how readily a hand is taken for the left or right one at each place [N, 2, H, W]."""
+        """Return the weight of each place for the left and the right hand [N, 2, H, W]."""
         x, y, size = faces[..., None].unbind(1)
         of_all = (torch.arange(shape[1]).to(faces) - x) / size
         across = of_all[rows]

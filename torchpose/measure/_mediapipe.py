@@ -238,7 +238,14 @@ class MediaPipePose(_Task):
         return PoseLandmarks(points, _given(visibility), joints3d)
 
     def of_one(self, found: PoseLandmarks) -> tuple[Tensor, Tensor]:
-        """Return keypoints [1, 37, 2] and confidence [1, 37] of the first person, missing without one."""
+        """Return the keypoints of the first person.
+
+        Args:
+            found: landmarks of N persons in one image.
+
+        Returns:
+            Keypoints [1, 37, 2], pixels, and confidence [1, 37], 0 to 1; NaN and 0 where nobody was found.
+        """
         if len(found.points):
             return found.points[:1], found.visibility[:1]
         return torch.full((1, len(self.names), 2), torch.nan), torch.zeros(1, len(self.names))

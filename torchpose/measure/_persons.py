@@ -41,7 +41,7 @@ class Persons(NamedTuple):
 
 
 def match_rows(known: Int[Tensor, " K"], wanted: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
-    """Return the row of each wanted person among the known ones, K for a newcomer.
+    """Return the row of each wanted person among the known ones, K for a new person.
 
     >>> match_rows(torch.tensor([7, 4]), torch.tensor([4, 9])).tolist()
     [1, 2]
@@ -51,7 +51,7 @@ def match_rows(known: Int[Tensor, " K"], wanted: Int[Tensor, " N"]) -> Int[Tenso
 
 
 def match_states(state: State, fresh: State, identity: Int[Tensor, " N"]) -> State:
-    """Return the rows of a state in the order of `identity`, a fresh row for each newcomer.
+    """Return the rows of a state in the order of `identity`, a fresh row for each new person.
 
     Args:
         state: with a field `identity`; every tensor has the persons as its first dimension.
@@ -112,7 +112,7 @@ def _histogram(image: Image, face: list[float]) -> np.ndarray:
 
 
 class PersonRegister(nn.Module):
-    """Numbers persons in the order of their appearance, and recognises them by their clothes.
+    """Assigns numbers to persons in the order of their appearance, and recognises them by their clothes.
 
     A new face is associated with a person who left within `within` frames if the histograms of their
     clothes are similar, sum_k sqrt(p_k q_k) >= `likeness` (Bhattacharyya).

@@ -103,7 +103,17 @@ class SkinMixtureModel(nn.Module):
     samples: Tensor
 
     def init(self, batch_size: int) -> SkinMixtureState:
-        """Return the state before the first frame."""
+        """Return the state before the first frame: equal weights for all components.
+
+        Args:
+            batch_size: B, number of persons.
+
+        Returns:
+            `SkinMixtureState` of B mixtures.
+
+        Raises:
+            InputError: batch_size below 1.
+        """
         check_count("batch_size", batch_size)
         shape = (batch_size, self.n_components)
         weights = self.samples.new_full(shape, 1 / self.n_components)
@@ -151,7 +161,14 @@ class SkinMixtureModel(nn.Module):
     def log_density(
         self, state: SkinMixtureState, colours: Float[Tensor, "B P 3"]
     ) -> Float[Tensor, "B P"]:
-        """Return log p(c) of colours."""
+        """Return the log density of colours under each person's mixture.
+
+        Args:
+            state: of B persons. colours: [B, P, 3], Lab, in the units of the fit (`step`).
+
+        Returns:
+            log p(c) [B, P].
+        """
         return (_features(colours) @ _theta(state).mT).logsumexp(-1)
 
     def _sample(self, lab: Tensor, faces: Tensor, hands: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -119,7 +119,7 @@ def elbows_from_torso(
 
 
 def _outline(body: Tensor, faces: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """Return how far the torso reaches in every row, and whether it meets the image's border, [N, H].
+    """Return the torso's half width per row in face sizes, and whether it meets the image's border, [N, H].
 
     Outwards from the axis, until a gap.
     """

@@ -94,7 +94,7 @@ class UpperBodyMeasurer(nn.Module):
         background: whether to detect the foreground, for a static camera.
         elbows: whether to measure elbows, where the torso with its sleeves is widest.
         face_detector: by default Haar's. max_persons: the largest faces are taken.
-        head_neck: where head and neck are beside the face.
+        head_neck: offsets of head and neck from the face.
 
     Raises:
         InputError: settings out of range.
@@ -146,6 +146,15 @@ class UpperBodyMeasurer(nn.Module):
         """Return the faces of the next frame, in pixels of a smaller image where the frame is large.
 
         They depend on the images alone, so this part of `step` may run ahead in another thread.
+
+        Args:
+            tracks: of the frame before. image: RGB, uint8 [H, W, 3].
+
+        Returns:
+            `FaceTracks` in this frame.
+
+        Raises:
+            InputError: another kind of image.
         """
         import cv2
 
@@ -169,6 +178,9 @@ class UpperBodyMeasurer(nn.Module):
             state: from `init` or the step before. image: RGB, uint8 [H, W, 3].
             tracks: faces of this frame by `follow_faces`, if that has been called already.
             candidates: hands of these persons by a pose filter; not for "mean-shift".
+
+        Returns:
+            The next state, and `FrameMeasurements` of all persons, pixels.
 
         Raises:
             InputError: another kind of image; candidates for a tracker that takes none.

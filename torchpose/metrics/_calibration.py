@@ -32,7 +32,7 @@ RELIABILITY_LEVELS = tuple(round(0.05 * i, 2) for i in range(1, 20))
 
 
 class Coverage(NamedTuple):
-    """Share of true joints inside the ellipsoids of nominal probability `levels`.
+    """Holds the share of true joints inside the ellipsoids of nominal probability `levels`.
 
     Attributes:
         levels: nominal probability [L].
@@ -146,12 +146,32 @@ def reliability(
     levels: Sequence[float] = RELIABILITY_LEVELS,
     mask: Bool[Tensor, "*batch J"] | None = None,
 ) -> Coverage:
-    """Return `coverage` over a grid of levels, 5 to 95 %: the curve of a reliability diagram."""
+    """Return `coverage` over a grid of levels, 5 to 95 %: the curve of a reliability diagram.
+
+    Args:
+        estimate, truth: [*batch, J, D], D = 3 (metres) or 2 (pixels).
+        covariance: [*batch, J, D, D], of the estimate, in squares of that unit.
+        levels: [L], nominal probabilities.
+        mask: [*batch, J], True = count this joint.
+
+    Returns:
+        `Coverage` at the L levels.
+
+    Raises:
+        ShapeError, InputError: as `coverage`.
+    """
     return coverage(estimate, covariance, truth, levels, mask)
 
 
 def calibration_error(curve: Coverage) -> Float[Tensor, " J"]:
-    """Return the largest gap |share - nominal| over the levels, per joint (0.05 = 5 points)."""
+    """Return the largest gap |share - nominal| over the levels, per joint (0.05 = 5 points).
+
+    Args:
+        curve: from `reliability` or `coverage`, L levels and J joints.
+
+    Returns:
+        [J], 0 to 1 (0.05 = 5 points); NaN for a joint without counts.
+    """
     return (curve.per_joint - curve.levels[:, None]).abs().amax(0)
 
 
@@ -161,7 +181,7 @@ def predictive_log_likelihood(
     covariance: Float[Tensor, "*batch M D D"],
     value: Float[Tensor, "*batch D"],
 ) -> Float[Tensor, "*batch"]:
-    """Return the log density of what came next under a mixture that predicted it.
+    """Return the log density of observed values under a mixture that predicted them.
 
     log sum_m w_m N(value; mean_m, C_m), the weights normalised here.
 

@@ -50,7 +50,7 @@ PCP_THRESHOLDS = tuple(round(0.05 * i, 2) for i in range(1, 21))
 
 
 class Alignment(NamedTuple):
-    """Points after a rigid motion, their covariances if given, and the motion itself."""
+    """Holds points after a rigid motion, their covariances if given, and the motion itself."""
 
     points: Tensor
     covariance: Tensor | None
@@ -77,6 +77,9 @@ def align(
     Returns:
         `Alignment`; NaN for a frame in which fewer than three of `joints` are there.
 
+    Raises:
+        InputError: fewer than three indices, or one that no joint has. ShapeError: other sizes.
+
     Reference: Burke & Lasenby, section 6 ("aligning the head, neck and shoulders using fixed scale
     Procrustes analysis").
     """
@@ -101,7 +104,7 @@ def align(
 
 
 class ErrorSummary(NamedTuple):
-    """Means of joint errors over everything but the joints.
+    """Holds the means of joint errors over everything but the joints.
 
     Attributes:
         mean: over all joints and frames pooled [].
@@ -141,7 +144,18 @@ def joint_errors_2d(
     truth: Float[Tensor, "*batch J 2"],
     mask: Bool[Tensor, "*batch J"] | None = None,
 ) -> Float[Tensor, "*batch J"]:
-    """Return the distance in pixels (BL Figure 3), see `joint_errors`."""
+    """Return the distance of every estimated joint from the true one in the image (BL Figure 3).
+
+    Args:
+        estimate, truth: [*batch, J, 2], pixels.
+        mask: [*batch, J], True = count this joint.
+
+    Returns:
+        [*batch, J], pixels; NaN where masked or where either side is NaN.
+
+    Raises:
+        ShapeError: other sizes.
+    """
     check_shape("estimate", estimate, ["...", None, 2])
     return joint_errors(estimate, truth, mask)
 
@@ -158,8 +172,14 @@ def joint_errors_3d(
     Args:
         estimate, truth: [*batch, J, 3], metres.
         mask: [*batch, J], True = count the joint, and use it to align.
-        joints: what each frame is aligned on; None = all joints.
+        joints: indices of the joints to align on; None = all joints.
         procrustes: False = no alignment at all.
+
+    Returns:
+        [*batch, J], metres; NaN where masked, where either side is NaN, and in frames without a motion.
+
+    Raises:
+        ShapeError: other sizes. InputError: as `align`.
     """
     check_shape("estimate", estimate, ["...", None, 3])
     if procrustes:
@@ -168,7 +188,17 @@ def joint_errors_3d(
 
 
 def summarise_errors(errors: Float[Tensor, "*batch J"]) -> ErrorSummary:
-    """Return the mean of all errors pooled and per joint, NaN left out (and NaN where nothing is left)."""
+    """Return mean, deviation and median of joint errors, pooled and per joint; NaN are left out.
+
+    Args:
+        errors: [*batch, J], from `joint_errors`, in any unit.
+
+    Returns:
+        `ErrorSummary` in the same unit; NaN where nothing is left.
+
+    Raises:
+        ShapeError: fewer than one dimension. InputError: whole or complex numbers.
+    """
     errors = as_values("errors", errors, ["...", None])
     flat = errors.reshape(-1, errors.shape[-1])
     flat = flat if len(flat) else flat.new_full((1, errors.shape[-1]), math.nan)
@@ -199,7 +229,7 @@ def share_below(
 
 
 class PCP(NamedTuple):
-    """Percentage of correct parts as a curve.
+    """Holds the percentage of correct parts as a curve.
 
     Attributes:
         thresholds: fraction of the true limb's length [P].

@@ -35,12 +35,12 @@ __all__ = ["EllipsoidCoverage", "MeanPerJointError", "PercentageOfCorrectParts"]
 
 
 class MeanPerJointError(Metric):
-    """Mean distance of estimated from true joints, see `torchpose.metrics.joint_errors`.
+    """Computes the mean distance of estimated from true joints, see `torchpose.metrics.joint_errors`.
 
     Args:
         n_joints: J.
         procrustes: align each frame first (3D only): rigid, fixed scale, no reflection.
-        joints: what each frame is aligned on; None = all joints.
+        joints: indices of the joints to align on; None = all joints.
         per_joint: `compute` returns [J] instead of the mean over everything.
 
     Errors that are NaN are left out.
@@ -87,7 +87,7 @@ class MeanPerJointError(Metric):
 
 
 class PercentageOfCorrectParts(Metric):
-    """Share of limbs with both end points within threshold x true length: `torchpose.metrics.pcp`.
+    """Computes the share of limbs with both ends within threshold x true length, see `torchpose.metrics.pcp`.
 
     Args:
         thresholds: [P], fractions of the limb's true length.
@@ -129,13 +129,13 @@ class PercentageOfCorrectParts(Metric):
 
 
 class EllipsoidCoverage(Metric):
-    """Share of true joints inside their ellipsoids, see `torchpose.metrics.coverage`.
+    """Computes the share of true joints inside their ellipsoids, see `torchpose.metrics.coverage`.
 
     Args:
         n_joints: J.
         levels: [L], nominal probabilities.
         procrustes: align each frame, and turn its covariances, first (3D only).
-        joints: what each frame is aligned on; None = all joints.
+        joints: indices of the joints to align on; None = all joints.
         per_joint: `compute` returns [L, J] instead of [L].
     """
 

@@ -31,7 +31,7 @@ _PARTS = ("weights", "means", "covariances")
 
 @dataclass(frozen=True)
 class ArmPriorInfo:
-    """Facts about the fit of an `ArmPrior`.
+    """Holds facts about the fit of an `ArmPrior`.
 
     Attributes:
         name: of the prior. persons: ids of the persons in the training recordings.
@@ -55,7 +55,7 @@ _KIND = FileKind("torchpose-arms", 1, ArmPriorInfo)
 
 
 class ArmPrior(nn.Module):
-    """Density over the directions of an arm's two bones, and a Gaussian over log-lengths of bones.
+    """Holds a density over the directions of an arm's two bones, and a Gaussian over log-lengths of bones.
 
         p(d_u, d_f) = (1 - b) / Z sum_k pi_k N([d_u, d_f]; mu_k, Sigma_k) + b / (4 pi)^2
 
@@ -68,7 +68,7 @@ class ArmPrior(nn.Module):
 
     Args:
         directions: mixture over R^6. lengths: medians of `LENGTHS` [5], metres. spread: standard
-            deviations of their logs over persons [5]. broad: b. info: what it was fitted on.
+            deviations of their logs over persons [5]. broad: b. info: facts about the fit.
         together: A, symmetric, of which each row sums to pi_j; pi_j pi_k (arms apart) by default.
 
     Raises:

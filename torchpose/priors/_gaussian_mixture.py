@@ -33,9 +33,14 @@ SAMPLE_CHUNK = 4096  # draws per product, which gathers a factor [D, D] for each
 
 
 class ConditionedMixture(NamedTuple):
-    """Mixture over the hidden dimensions, given values of the others.
+    """Holds a Gaussian mixture over the hidden dimensions, given values of the others.
 
     The covariances do not depend on the values, so they carry no batch dimensions.
+
+    Attributes:
+        log_weights: [..., K], normalised.
+        means: [..., K, H], in the units of the hidden dimensions.
+        covariances: [K, H, H].
     """
 
     log_weights: Float[Tensor, "*batch K"]
@@ -79,7 +84,7 @@ def component_log_density(
 
 
 class GaussianMixture(nn.Module):
-    """Mixture of K Gaussians with full covariances over D dimensions.
+    """Holds a mixture of K Gaussians with full covariances over D dimensions.
 
     p(x) = sum_k pi_k N(x; mu_k, Sigma_k)
 
@@ -160,7 +165,17 @@ class GaussianMixture(nn.Module):
 
     @classmethod
     def from_parameters(cls, parameters: MixtureParameters) -> GaussianMixture:
-        """Return the mixture of the given weights, means and covariances."""
+        """Return the mixture of the given weights, means and covariances.
+
+        Args:
+            parameters: weights [K], means [K, D] and covariances [K, D, D].
+
+        Returns:
+            `GaussianMixture`.
+
+        Raises:
+            ShapeError, InputError, CovarianceError: as the class.
+        """
         return cls(*parameters)
 
     @classmethod
@@ -178,7 +193,7 @@ class GaussianMixture(nn.Module):
         progress: bool = False,
         dtype: torch.dtype = torch.float64,
     ) -> GaussianMixture:
-        """Fit a mixture by expectation-maximisation; `fit_report` of the result says how it went.
+        """Fit a mixture by expectation-maximisation; the result has a `fit_report`.
 
         Args:
             x: points [N, D], finite.
@@ -193,6 +208,9 @@ class GaussianMixture(nn.Module):
             init: "k-means++" or "random" (means at points drawn at random).
             progress: show a bar for every start.
             dtype: of the products over the points; the mixture is float64.
+
+        Returns:
+            `GaussianMixture` in float64, with a `fit_report`.
 
         Raises:
             ShapeError, InputError: bad points, weights or settings, fewer points than components.
@@ -227,6 +245,9 @@ class GaussianMixture(nn.Module):
         Args:
             x: points, any leading dimensions.
 
+        Returns:
+            [..., K], natural logarithm.
+
         Raises:
             ShapeError: the last dimension is not D. InputError: complex points.
         """
@@ -240,13 +261,23 @@ class GaussianMixture(nn.Module):
         Args:
             x: points, any leading dimensions.
 
+        Returns:
+            [...], natural logarithm.
+
         Raises:
             ShapeError: the last dimension is not D. InputError: complex points.
         """
         return self.component_log_prob(x).logsumexp(-1)
 
     def forward(self, x: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch"]:
-        """Return `log_prob`."""
+        """Return the log density of the mixture, as `log_prob` does.
+
+        Args:
+            x: [..., D].
+
+        Returns:
+            [...], natural logarithm.
+        """
         return self.log_prob(x)
 
     def moments(self) -> tuple[Float[Tensor, " D"], Float[Tensor, "D D"]]:
@@ -283,6 +314,12 @@ class GaussianMixture(nn.Module):
 
     def marginal(self, indices: Sequence[int] | Int[Tensor, " S"]) -> GaussianMixture:
         """Return the mixture over a subset of the dimensions, in the order of `indices`.
+
+        Args:
+            indices: [S], distinct dimensions.
+
+        Returns:
+            `GaussianMixture` of K components over S dimensions.
 
         Raises:
             InputError: an index is out of range or given twice.

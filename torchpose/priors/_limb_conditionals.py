@@ -57,7 +57,7 @@ _SAME_CENTRE = 1e-6  # of a quaternion vector
 
 @dataclass(frozen=True)
 class LimbInfo:
-    """Facts about the fit of limb conditionals; fields that are not known are empty.
+    """Holds facts about the fit of limb conditionals; fields that are not known are empty.
 
     Attributes:
         name: of the conditionals.
@@ -106,7 +106,7 @@ class _Products(NamedTuple):
 
 
 class LimbConditionals(nn.Module):
-    """Gaussians over the rotations between connected parts, and over those from frame to frame.
+    """Holds Gaussians over the rotations between connected parts, and over those from frame to frame.
 
     p(x_j | x_i, c_ij) ~ F(q_i, N(x_ij; mu_ij, Sigma_ij)),   q_ij = q_i^-1 q_j               (DX 3)
     p(x_j^{t+1} | x_j^t) ~ F(mu_j^t, N(0, Sigma'_j)),        q' = (q_j^t)^-1 q_j^{t+1}       (DX 14)
@@ -119,7 +119,7 @@ class LimbConditionals(nn.Module):
     columns.
 
     Args:
-        info: what it was fitted on.
+        info: facts about the fit.
         edges: [E, 2], indices of the parts above and below.
         mean, covariance: mu_ij [E, 3] and Sigma_ij [E, 3, 3].
         edge_centres: [E, 3], centres of the q_ij. centres: [P, 3], of the body's parts.
@@ -262,7 +262,7 @@ class LimbConditionals(nn.Module):
     # --- rates, bodies and files --------------------------------------------------------------
 
     def at_rate(self, fps: float, growth: float | None = None) -> "LimbConditionals":
-        """Return the same with the diffusion per frame of another frame rate, `info.fps`.
+        """Return the same conditionals with the diffusion per frame of another frame rate, `info.fps`.
 
         Sigma'_j(fps) = Sigma'_j (fps_0 / fps)^{g_j}
 

@@ -31,7 +31,7 @@ CENTRES = ("neck", "head", "sequence")
 
 @dataclass(frozen=True)
 class PriorInfo:
-    """Facts about the fit of a prior, and the conventions of its states.
+    """Holds facts about the fit of a prior, and the conventions of its states.
 
     Attributes:
         name: of the prior.

@@ -35,7 +35,14 @@ KINDS = {
 
 
 def known_models(kind: str) -> list[str]:
-    """Return the names of the models of a kind, among `KINDS`, that come with the package."""
+    """Return the names of the models of a kind that come with the package.
+
+    Args:
+        kind: "manifolds", "conditionals", "actions" or another folder of models.
+
+    Returns:
+        Names in alphabetical order; none for an unknown kind.
+    """
     return sorted(path.stem for path in (WEIGHTS / kind).glob("*.safetensors"))
 
 
@@ -65,6 +72,9 @@ def load_manifold(name_or_path: str | Path) -> BackConstrainedGPLVM:
     Args:
         name_or_path: a name (``known_models("manifolds")``), or a file of `torchpose fit manifold`.
 
+    Returns:
+        `BackConstrainedGPLVM`.
+
     Raises:
         PriorError: neither a known name nor a file. FileFormatError: a damaged or foreign file.
 
@@ -81,6 +91,9 @@ def load_limb_conditionals(name_or_path: str | Path) -> LimbConditionals:
     Args:
         name_or_path: a name (``known_models("conditionals")``), or a file of `torchpose fit limbs`.
 
+    Returns:
+        `LimbConditionals`.
+
     Raises:
         PriorError: neither a known name nor a file. FileFormatError: a damaged or foreign file.
 
@@ -95,6 +108,9 @@ def load_action(name_or_path: str | Path) -> ActionSpace | ActionBank:
 
     Args:
         name_or_path: a name (``known_models("actions")``), or a file of `torchpose fit actions`.
+
+    Returns:
+        `ActionSpace` of one action, or `ActionBank` of several.
 
     Raises:
         PriorError: neither a known name nor a file. FileFormatError: a damaged or foreign file.

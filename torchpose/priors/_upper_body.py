@@ -37,11 +37,11 @@ _PARTS = ("weights", "means", "covariances")
 
 
 class UpperBodyPrior(nn.Module):
-    """Gaussian mixtures over the states of the left and the right arm (BL 7, section 3.1).
+    """Holds Gaussian mixtures over the states of the left and the right arm (BL 7, section 3.1).
 
     Args:
         left, right: mixtures over the 21 dimensions of an arm's state (`arm_states`).
-        info: what they were fitted on, and in which conventions the states are.
+        info: facts about the fit, and the conventions of the states.
         noise: learnt noise as named tensors, such as increment_cov_left and increment_cov_right
             (`increment_covs`, of which each method makes its Q), process_cov_left, process_cov_right
             (Q itself, of the Kalman filters), measurement_std, gamma or calibration. They become
@@ -91,6 +91,10 @@ class UpperBodyPrior(nn.Module):
     def set_noise(self, name: str, value: Tensor) -> None:
         """Store a tensor of learnt noise under a name.
 
+        Args:
+            name: an identifier, such as ``process_cov_left``.
+            value: finite floating-point tensor.
+
         Raises:
             InputError: not a finite floating-point tensor, one that noise of this name cannot be, or
                 the name is no identifier.
@@ -136,10 +140,13 @@ class UpperBodyPrior(nn.Module):
         return UpperBodyPrior(*arms, self.info, noise, windows)
 
     def check_unseen(self, persons: Collection[str]) -> None:
-        """Raise `OverlapError` if the prior was fitted on one of these persons.
+        """Check that the prior was fitted on none of some persons.
 
         Args:
             persons: ids, as `Recording.person_id`.
+
+        Raises:
+            OverlapError: it was fitted on one of them.
         """
         seen = sorted(set(persons) & set(self.info.persons))
         if seen:
@@ -176,7 +183,10 @@ class UpperBodyPrior(nn.Module):
         return replace(self.info, extra=self.info.extra | ({"windows": facts} if facts else {}))
 
     def save(self, path: str | Path) -> None:
-        """Write the prior as safetensors; the file appears whole or not at all.
+        """Write the prior as safetensors, atomically: an interrupted write leaves no partial file.
+
+        Args:
+            path: of the file, which is replaced.
 
         Raises:
             OutputError: the file cannot be written. CovarianceError: a mixture that `load` would
@@ -202,6 +212,12 @@ class UpperBodyPrior(nn.Module):
     @classmethod
     def load(cls, path: str | Path) -> UpperBodyPrior:
         """Read a prior that `save` wrote; tensors come back in float64.
+
+        Args:
+            path: safetensors file.
+
+        Returns:
+            The prior.
 
         Raises:
             InputError: no such file. FileFormatError: truncated, foreign, damaged, or of another
@@ -237,6 +253,9 @@ class UpperBodyPrior(nn.Module):
 
         Args:
             path: .npz with {left,right}_{weights,means,covariances}.
+
+        Returns:
+            `UpperBodyPrior` in float64.
 
         Raises:
             InputError: no such file. FileFormatError: not such an archive.
@@ -279,6 +298,9 @@ def load_prior(name_or_path: str | Path) -> UpperBodyPrior:
 
     Args:
         name_or_path: a name (`known_priors`), or a .safetensors file.
+
+    Returns:
+        `UpperBodyPrior` in float64.
 
     Raises:
         PriorError: neither a known name nor a file. FileFormatError: a damaged or foreign file.

@@ -134,7 +134,7 @@ class WindowPrior(nn.Module):
         self.settings = dict(settings)
 
     def facts(self) -> dict[str, Any]:
-        """Return what a prior file says about it, as JSON can hold it."""
+        """Return the facts that a prior file stores about the windows, as JSON values."""
         layout: dict[str, Any] = {"own": list(self.layout.own), "other": list(self.layout.other)}
         layout |= {"fps": self.layout.fps, "torso": self.layout.torso}
         return layout | {"settings": self.settings}
@@ -233,7 +233,7 @@ def window_measurements(
     path: BodyPath,
     start: int = 0,
 ) -> tuple[Float[Tensor, "B S H 2"], Bool[Tensor, "B S H"]]:
-    """Return where the hands of each frame's window were measured, relative to the body's place now.
+    """Return the measured pixels of the hands of each frame's window, relative to the body's present place.
 
     Poses of the prior are centred on the neck and seen from one place, so a hand of another frame is
     carried along with the body (`BodyPath.carried`). A hand that was not measured, or that lies

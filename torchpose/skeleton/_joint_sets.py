@@ -114,6 +114,9 @@ def canonical_name(name: str) -> str:
     Args:
         name: a joint's name as files spell it.
 
+    Returns:
+        The canonical name.
+
     Raises:
         SkeletonError: not a known name; the known ones are listed.
 
@@ -155,10 +158,10 @@ def canonical_names(names: Sequence[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Skeleton:
-    """A joint set and its kinematic tree.
+    """Describes a joint set and its kinematic tree.
 
     Args:
-        name: what the set is called.
+        name: of the set.
         joints: names in the order of the files.
         parents: index of each joint's parent, -1 for the root.
         axes: of files that do not state them: ``camera``, ``kinect``, ``y-up`` or ``z-up``.
@@ -176,7 +179,17 @@ class Skeleton:
     turned: bool = False
 
     def reordered(self, joints: Sequence[str]) -> "Skeleton":
-        """Return the same set with its joints in another order (and spelling)."""
+        """Return the same set with its joints in another order and spelling.
+
+        Args:
+            joints: all names of the set, in the new order, in any known spelling.
+
+        Returns:
+            `Skeleton` with these names, and the parents' indices in the new order.
+
+        Raises:
+            SkeletonError: an unknown name, or one name twice.
+        """
         own, other = canonical_names(self.joints), canonical_names(joints)
         parent = {c: (own[p] if p >= 0 else None) for c, p in zip(own, self.parents, strict=True)}
         parents = tuple(-1 if parent[c] is None else other.index(str(parent[c])) for c in other)

@@ -86,7 +86,7 @@ LEAST_FRAMES = 10
 
 
 class NeckOffset(NamedTuple):
-    """The neck above the middle of the shoulders, in units of the height h of the head above it.
+    """Places the neck above the middle of the shoulders, in units of the height h of the head above it.
 
     neck = middle + h (up e_up + forward e_forward), e_up pointing from the middle of the shoulders
     to the head, e_forward to the front, square to e_up and to the line of the shoulders. There is
@@ -105,7 +105,7 @@ class NeckOffset(NamedTuple):
 
 
 class NeckFraction(NamedTuple):
-    """The neck in an image, on the line from the middle of the shoulders to the head.
+    """Places the neck in an image, on the line from the middle of the shoulders to the head.
 
     neck = middle + fraction (head - middle) + N(0, spread^2)
 

@@ -71,7 +71,7 @@ _NECKS = (("neck", None), ("upper_neck", "neck"), ("shoulder_center", "neck"),
 
 
 class UpperBodyMap(NamedTuple):
-    """Places of the eight joints of `UPPER_BODY` in a joint set.
+    """Holds the places of the eight joints of `UPPER_BODY` in a joint set.
 
     indices: eight indices into the set, -1 where it has no such joint. missing: names of those.
     neck: kind of neck, None if the names do not tell (or there is none). hand: ``"hand"``,
@@ -86,7 +86,7 @@ class UpperBodyMap(NamedTuple):
 
 
 class UpperBody(NamedTuple):
-    """Eight joints [..., 8, C], NaN where absent, and the kinds of their neck, hand and head."""
+    """Holds eight joints [..., 8, C], NaN where absent, and the kinds of their neck, hand and head."""
 
     joints: Tensor
     neck: str | None
@@ -104,13 +104,15 @@ def upper_body_indices(names: Sequence[str], nose_as_head: bool = False) -> Uppe
         names: joint names of the set.
         nose_as_head: take the nose where there is no head.
 
+    Returns:
+        `UpperBodyMap` with eight indices into `names`, -1 where a joint is missing.
+
     Raises:
         SkeletonError: an unknown name, two names of one joint, a hand on one side and a wrist on
             the other, or none of the eight joints.
 
     >>> upper_body_indices(["head", "lwrist", "rwrist"])[:2]
-    ((1, -1, -1, 0, -1, -1, -1, 2), ('elbow_left', 'shoulder_left', 'neck', 'shoulder_right', \
-'elbow_right'))
+    ((1, -1, -1, 0, -1, -1, -1, 2), ('elbow_left', 'shoulder_left', 'neck', 'shoulder_right', 'elbow_right'))
     """
     return _find_upper_body(tuple(str(name) for name in names), nose_as_head)
 

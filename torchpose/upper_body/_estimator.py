@@ -127,7 +127,7 @@ class Bones(NamedTuple):
 
 
 class Estimates(NamedTuple):
-    """The states of both arms in T frames.
+    """Holds the states of both arms in T frames.
 
     Attributes:
         left, right: with covariances, float64; the first 21 dimensions are those of
@@ -153,7 +153,7 @@ class MotionRatios(NamedTuple):
 
 
 class Estimator(ABC):
-    """Estimator of the states of both arms from the measured joints; `METHODS` has one per method.
+    """Estimates the states of both arms from the measured joints; `METHODS` has one estimator per method.
 
     The constructor takes a `TrackerModel` and, by name, the options of the method. An estimator holds
     no state: what changes from frame to frame is the value that `init` makes and `advance` returns.
@@ -186,6 +186,9 @@ class Estimator(ABC):
 
         Args:
             batch_size: B. joints: that may be measured. generators: of each arm, for what draws.
+
+        Returns:
+            State of B streams, for `advance`.
         """
 
     @abstractmethod
@@ -194,6 +197,9 @@ class Estimator(ABC):
 
         Args:
             state: from `init` or the call before; it is not changed. measured: [B, T, ...].
+
+        Returns:
+            The next state, and `Estimates` with means [B, T, D].
         """
 
     @abstractmethod
@@ -210,6 +216,9 @@ class Estimator(ABC):
         Args:
             measured: [B, T, ...]. joints, generators: as in `init`. lengths: frames of each sequence,
                 [B]; past them the last estimate is repeated. progress: whether to show a bar.
+
+        Returns:
+            `Estimates` with means [B, T, D].
         """
 
 

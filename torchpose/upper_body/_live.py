@@ -34,7 +34,7 @@ class StreamState(NamedTuple):
 
 
 class LivePose(NamedTuple):
-    """The poses of one frame of B streams, under the names that `PoseTrack` has for all frames.
+    """Holds the poses of one frame of B streams, under the names that `PoseTrack` has for all frames.
 
     Attributes:
         joints2d: [B, 8, 2], pixels of the camera; joints in the order of `UPPER_BODY`.

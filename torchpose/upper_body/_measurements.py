@@ -411,14 +411,30 @@ def joint_covariances(
 
 
 def pixel_indices(joints: Sequence[str]) -> list[int]:
-    """Return the state dimensions of u and v of these joints of an arm."""
+    """Return the state dimensions of u and v of some joints of an arm.
+
+    Args:
+        joints: names among `torchpose.skeleton.ARM_JOINTS`.
+
+    Returns:
+        Two indices for each joint.
+    """
     return [3 * ARM_JOINTS.index(joint) + axis for joint in joints for axis in (0, 1)]
 
 
 def arm_measurements(
     arm: tuple[int, ...], joints: tuple[str, ...], measured: MeasuredJoints
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return z, mask and R of an arm's joints; R is [Z, Z], or [B, T, Z, Z] if it changes."""
+    """Return the measurements of an arm's joints, as filters take them.
+
+    Args:
+        arm: indices of its five joints, `torchpose.skeleton.LEFT_ARM` or its counterpart.
+        joints: names among `torchpose.skeleton.ARM_JOINTS`, J of them; Z = 2 J.
+        measured: joints of both arms, pixels.
+
+    Returns:
+        z [B, T, Z] in pixels, mask [B, T, Z], and R [Z, Z], or [B, T, Z, Z] if it changes.
+    """
     rows = [arm[ARM_JOINTS.index(joint)] for joint in joints]
     z = measured.uv[:, :, rows].flatten(-2)
     mask = measured.mask[:, :, rows].repeat_interleave(2, -1)

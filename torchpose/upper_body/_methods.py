@@ -104,6 +104,9 @@ def method_options(method: str) -> tuple[str, ...]:
     Args:
         method: one of `METHODS`.
 
+    Returns:
+        Names of the options.
+
     Raises:
         InputError: no such method.
 

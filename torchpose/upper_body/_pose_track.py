@@ -59,7 +59,7 @@ _FIELDS = {
 
 @dataclass
 class PoseTrack:
-    """Upper-body poses of B sequences of T frames; J = 8 joints in the order of `UPPER_BODY`.
+    """Holds the upper-body poses of B sequences of T frames; J = 8 joints in the order of `UPPER_BODY`.
 
     Past the length of a sequence its last pose is repeated.
 
@@ -134,7 +134,14 @@ class PoseTrack:
         return self.failed_at >= 0
 
     def sequence(self, index: int) -> "PoseTrack":
-        """Return one sequence, cut to its own length, as a batch of one."""
+        """Return one sequence, cut to its own length, as a batch of one.
+
+        Args:
+            index: of the sequence; -1 is the last.
+
+        Returns:
+            Track with B = 1 and T = `lengths[index]`.
+        """
         n = int(self.lengths[index])
         rows = slice(index, index + 1) if index != -1 else slice(-1, None)
         cut: dict[str, Any] = {name: getattr(self, name)[rows, :n] for name in FRAME_FIELDS}
@@ -142,7 +149,14 @@ class PoseTrack:
         return replace(self, **cut)
 
     def in_precision(self, dtype: torch.dtype) -> Self:
-        """Return the same poses with floating-point numbers of a dtype; this track if they are."""
+        """Return the same poses with floating-point numbers of a dtype.
+
+        Args:
+            dtype: such as torch.float32.
+
+        Returns:
+            Track with the same shapes; this one if it has the dtype.
+        """
         if self.joints3d.dtype == dtype:
             return self
         fields = {name: getattr(self, name) for name in FRAME_FIELDS}
@@ -156,6 +170,9 @@ class PoseTrack:
         apart. Keys: joints2d, joints3d, covariance2d, covariance3d, observed, log_evidence,
         log_evidence_arms, effective_sample_size, inlier_probability, bone_lengths, bone_covariance,
         bone_names, names, fps (NaN if unknown), K, frame, failed_at, lengths, notes, first_frame, method.
+
+        Args:
+            path: of the .npz file, which is replaced.
 
         Raises:
             OutputError: the file cannot be written.
@@ -184,6 +201,12 @@ class PoseTrack:
     @classmethod
     def load(cls, path: str | Path) -> Self:
         """Read what `save` wrote.
+
+        Args:
+            path: .npz file.
+
+        Returns:
+            Track with a batch dimension, of one sequence or several.
 
         Raises:
             InputError: no such file. FileFormatError: truncated, not poses, or fields that do not

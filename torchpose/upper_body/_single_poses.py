@@ -44,7 +44,7 @@ _WALK_RATE = 0.9  # of a component's covariance, per second; chosen as the metho
 
 
 class ProcessNoise(NamedTuple):
-    """Q of a method, in terms of the recorded steps that a prior brings.
+    """Computes Q of a method from the recorded steps that a prior brings.
 
     With S the second moment of the recorded steps (`increment_covs`) and k the factor, Q = k S for a
     walk, which has to step where the prior has bodies, and Q = k diag(S) for the others, whose
@@ -71,6 +71,9 @@ class ProcessNoise(NamedTuple):
 
         Args:
             prior: whose noise is taken. side: "left" or "right".
+
+        Returns:
+            Q [21, 21], or its diagonal [21], in squares of pixels, metres and radians.
         """
         noise = prior.noise
         stated = noise.get(f"process_cov_{side}", noise.get("process_cov"))
@@ -122,7 +125,7 @@ _GIVEN = ("measurement_cov", "observed")  # by the tracker, beside the mixture
 
 @dataclass(frozen=True)
 class PoseFilter:
-    """A filter over single poses as a method of the tracker: called, it makes the estimator.
+    """Makes an estimator of the tracker from a filter over single poses, when it is called.
 
     Args:
         filter: makes the filter of an arm from its mixture, `measurement_cov`, `observed` and
@@ -177,6 +180,9 @@ class PoseFilter:
             prior: what it brings is scaled to the frame rate, and left out where a choice of the
                 caller has no use for it. side: "left" or "right". fps: frame rate. options: of the
                 caller.
+
+        Returns:
+            Keyword arguments of the filter.
 
         Raises:
             InputError: process_cov for the transition "ou", which has no Q.

@@ -54,7 +54,7 @@ _NO_EXPORT = (
 
 
 class UpperBodyTracker(WideModule):
-    """Tracker of eight joints in 2D and 3D from any of them, typically head and hands.
+    """Tracks eight joints in 2D and 3D from any of them, typically head and hands.
 
     Each arm, with head and neck, is estimated from the same measurements (BL section 3.1); head, neck
     and camera of the two are averaged and their covariances bounded, never fused as if they were
@@ -109,7 +109,7 @@ class UpperBodyTracker(WideModule):
         max_gap: seconds over which nothing at all may be measured; None is no bound.
         outliers: look for keypoints that belong to no body, which count as missing, and for exchanged hands,
             which are exchanged back, frame by frame. False takes keypoints as they are.
-        options: of the method (`torchpose.upper_body.method_options`), such as n_particles,
+        **options: of the method (`torchpose.upper_body.method_options`), such as n_particles,
             n_tracks, uniform_weight or transition.
 
     Raises:
@@ -276,6 +276,9 @@ class UpperBodyTracker(WideModule):
         Args:
             batch_size: B, number of streams. names: of the keypoints, as in `forward`; any of them
                 may be missing in any frame. generator: as in `forward`; the state holds it.
+
+        Returns:
+            `StreamState` before the first frame.
 
         Raises:
             InputError: a tracker that smooths, no stream. SkeletonError: unknown names.

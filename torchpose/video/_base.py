@@ -32,6 +32,9 @@ class VideoSource(abc.ABC):
     or truncated file, repeated frames) are sentences in `notes`; some are known only after the last
     frame.
 
+    Args:
+        name: as given by the user.
+
     Attributes:
         name: as given by the user. fps: frames per second. size: (width, height) of every frame, pixels.
         n_frames: estimated number of frames; None if unknown (a camera).

@@ -315,6 +315,9 @@ def read_silhouettes(
         measurers: one per camera, such as a `SilhouetteMeasurer`.
         delays: frames to skip at the beginning of each video.
 
+    Yields:
+        Bool [C, H, W] for each frame, True on the person.
+
     Raises:
         InputError: numbers that do not match, or videos of different frame rates.
     """

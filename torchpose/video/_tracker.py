@@ -101,7 +101,7 @@ class VideoTracker(nn.Module):
         min_confidence: with a detector, of a keypoint, below which it is missing (default 0.3).
         max_gap: seconds without measurements after which a person has no pose; None is never.
         seed: of methods that draw; every person has a generator.
-        options: to `UpperBodyTracker`, such as method, smoothing or frame.
+        **options: to `UpperBodyTracker`, such as method, smoothing or frame.
 
     Raises:
         InputError, CameraError, PriorError: as those.

@@ -72,6 +72,13 @@ def plot_joint_curves(
         truth: [T, 8, D], drawn in dark grey.
         fps: frames per second. show: names of the joints, one row each.
         level: probability of the bands. title: above the picture.
+
+    Returns:
+        matplotlib `Figure`, a row for each joint and a column for each coordinate.
+
+    Raises:
+        ShapeError: other sizes. InputError: an unknown joint.
+            MissingDependencyError: matplotlib is missing.
     """
     check_shape("joints", joints, [None, 8, None])
     require_matplotlib()
@@ -157,6 +164,13 @@ def plot_errors_over_time(
             ("px", 1) for pixels.
         bound: a thin line at this error, in `unit`, e.g. 20 for the paper's 20 cm.
         title: above the picture.
+
+    Returns:
+        matplotlib `Figure`, two panels in a row.
+
+    Raises:
+        ShapeError: errors of another shape. InputError: an unknown joint.
+            MissingDependencyError: matplotlib is missing.
     """
     styles = method_styles(list(errors))
     rows = _indices(show)
@@ -207,6 +221,12 @@ def plot_error_bars(
         errors: by method, [..., 8], from `torchpose.metrics.joint_errors`; NaN are left out.
         unit, scale: as in `plot_errors_over_time`.
         title: above the picture.
+
+    Returns:
+        matplotlib `Figure`.
+
+    Raises:
+        ShapeError: errors of another number of joints. MissingDependencyError: matplotlib is missing.
     """
     require_matplotlib()
     from matplotlib.patches import Patch
@@ -245,6 +265,12 @@ def plot_pcp(curves: Mapping[str, PCP], by_limb: bool = False, title: str | None
         by_limb: panels for upper arms and forearms beside the one for all four; the curves must
             then have the limbs of `torchpose.metrics.ARM_LIMBS`.
         title: above the picture.
+
+    Returns:
+        matplotlib `Figure`.
+
+    Raises:
+        InputError: `by_limb` and curves of other limbs. MissingDependencyError: matplotlib is missing.
     """
     styles = method_styles(list(curves))
     parts: dict[str, list[int] | None] = {"upper arms and forearms": None}
@@ -288,6 +314,12 @@ def plot_reliability(
         names: of the joints, one panel each.
         tolerance: half width of the grey band about the diagonal (0.05 = 5 points).
         title: above the picture.
+
+    Returns:
+        matplotlib `Figure`, a panel for each joint.
+
+    Raises:
+        ShapeError: a curve of another number of joints. MissingDependencyError: matplotlib is missing.
     """
     require_matplotlib()
     from matplotlib.patches import Patch

@@ -66,6 +66,9 @@ def plot_manifold(
         resolution: points of the grey picture along either axis.
         title: above the picture; by default the manifold's name and size.
 
+    Returns:
+        matplotlib `Figure`.
+
     Raises:
         InputError: one latent dimension only, or fewer than two points or poses asked for.
         PriorError: a body of another skeleton. ShapeError: poses with other columns.
@@ -253,6 +256,9 @@ def plot_action_space(
         space: the fitted action. synchronised: its performances, of `fit_synchronised`.
         n_dimensions: that are shown, as many as there are at most. deviations: of the dashed lines.
         title: above the picture; by default the action's name and size.
+
+    Returns:
+        matplotlib `Figure`, a panel for each dimension.
 
     Raises:
         InputError: no dimension is asked for. ShapeError: performances of another action space.

@@ -57,6 +57,9 @@ def plot_rotations(
         view: of the virtual camera, degrees: from the front to the person's left, and upwards.
         draws: points of each cloud. generator: of the draws. title: above the panels.
 
+    Returns:
+        matplotlib `Figure`, a panel for each Gaussian.
+
     Raises:
         InputError: nothing to draw, or no direction. ShapeError: sizes other than these.
 

@@ -75,6 +75,9 @@ def draw_skeleton(
         limbs: pairs of indices; a limb between two colours is grey.
         level: probability of the ellipses.
         linewidth: of the limbs, points. alpha: opacity of everything.
+
+    Raises:
+        ShapeError: joints of another shape, or of another number than there are colours.
     """
     check_shape("joints", joints, [None, 2])
     colors = list(colors or joint_colors(UPPER_BODY))
@@ -166,6 +169,12 @@ def plot_pose(
         image_size: (width, height) of the frame to draw where there is no image.
         truth: [8, 2], drawn in grey.
         level: probability of the ellipses. title: above the picture.
+
+    Returns:
+        matplotlib `Figure`.
+
+    Raises:
+        ShapeError: other sizes. MissingDependencyError: matplotlib is missing.
     """
     check_shape("joints", joints, [8, 2])
     figure = new_figure(6.4, 5.6, title)
@@ -200,6 +209,12 @@ def plot_pose_3d(
             ellipse of its two coordinates' marginal.
         observed: [8], True = measured. truth: [8, 3], drawn in grey.
         level: probability of the ellipses. title: above the picture.
+
+    Returns:
+        matplotlib `Figure` of three panels.
+
+    Raises:
+        ShapeError: other sizes. MissingDependencyError: matplotlib is missing.
     """
     check_shape("joints", joints, [8, 3])
     figure = new_figure(11.0, 4.8, title)
@@ -256,10 +271,18 @@ def plot_pose_strip(
 
     Args:
         joints: [T, 8, 2], pixels, or [T, 8, 3], camera axes, metres.
-        frames: which to draw; by default `n_frames` spread over all. More than 10 take new lines.
+        frames: indices of the frames to draw; by default `n_frames` spread over all. More than 10 take new
+            lines.
+        n_frames: number of frames to draw where `frames` is None.
         fps: frames per second, for the times below the panels.
         observed: [T, 8], True = measured. truth: [T, 8, D], drawn in grey.
         labels: [T], a word for each frame. title: above the picture.
+
+    Returns:
+        matplotlib `Figure`.
+
+    Raises:
+        ShapeError: joints of another shape. MissingDependencyError: matplotlib is missing.
     """
     if joints.ndim != 3 or joints.shape[1] != 8 or joints.shape[2] not in (2, 3):
         raise ShapeError(f"joints must be [T, 8, 2] or [T, 8, 3], got {list(joints.shape)}")
@@ -320,6 +343,12 @@ def plot_prior_means(
             dimensions of the means are (u, v, lambda) of hand, elbow, shoulder, head, neck. A name
             that contains "right" is drawn in the colour of the right arm.
         n_shown: at most this many components of each. title: above the picture.
+
+    Returns:
+        matplotlib `Figure`.
+
+    Raises:
+        InputError: no mixture. ShapeError: states of fewer than 15 dimensions.
 
     The bar above a pose is its weight relative to the heaviest one's.
 

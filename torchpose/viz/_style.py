@@ -188,7 +188,15 @@ def to_numpy(tensor: Tensor | Any) -> Any:
 
 
 def save_figure(figure: Figure, path: str | Path, dpi: int = 150) -> Path:
-    """Write a picture, whole or not at all; the suffix gives the format (png, svg, pdf).
+    """Write a picture, atomically; the suffix gives the format (png, svg, pdf).
+
+    Args:
+        figure: from a function of `torchpose.viz`, or any other.
+        path: of the file, which is replaced.
+        dpi: dots per inch, of pixel formats.
+
+    Returns:
+        The path.
 
     Raises:
         InputError: a suffix that matplotlib cannot write.

@@ -30,7 +30,7 @@ _BEND, _STEP = 0.1, 0.1  # metres of either that say about as much
 
 
 class FirstPose(NamedTuple):
-    """The pose that was found, and the candidates it was chosen among.
+    """Holds the pose that was found, and the candidates from which it was chosen.
 
     Attributes:
         state: [D], in the first frame.
@@ -77,12 +77,15 @@ def find_first_pose(
     Args:
         body: whose pose it is. silhouettes: of the first frames, half a second or so; bool.
         cameras: the C cameras. prior: poses to start from, as `find_candidates`.
-        generator: for what is drawn.
+        generator: of random numbers.
         fps: of the frames. n_frames: that are looked at, evenly spread over those given.
         n_particles: of the search in the first frame. n_tracking: likelihoods of a candidate and frame.
         n_headings, likelihood, limits, up: as `find_candidates`.
         facing: [3], the world direction that the person faces to within 60 degrees, if it is known;
             then nothing is turned round.
+
+    Returns:
+        `FirstPose` with the state [D] and the K candidates [K, D].
 
     Raises:
         InputError: no frame, nobody seen in the first one, or a bad setting. Others: as
@@ -119,7 +122,7 @@ def find_first_pose(
 
 
 def turned_round(body: Body, states: Float[Tensor, "K D"]) -> Float[Tensor, "K D"]:
-    """Return states with left and right exchanged: somebody in the same place who faces the other way.
+    """Return states with left and right exchanged: the person in the same place, facing the other way.
 
     The silhouettes are nearly the same; knees and elbows bend the other way.
     """
@@ -160,6 +163,6 @@ def _both_sides(body: Body, states: Tensor, joint: str) -> Float[Tensor, "*batch
 def _mean_log_likelihood(
     body: Body, track: Tensor, frames: Tensor, rig: Cameras, likelihood: str
 ) -> Float[Tensor, " K"]:
-    """Return the mean over the frames in which somebody is seen."""
+    """Return the mean over the frames in which a camera sees the person."""
     values = silhouette_score(body, frames, rig, likelihood)(track.transpose(0, 1))
     return values[is_seen(frames)].mean(0)

@@ -24,7 +24,7 @@ _SEEN = 0.002  # of the image: fewer pixels are nobody
 
 
 def all_see(silhouettes: Bool[Tensor, "C H W"]) -> bool:
-    """Tell whether every camera sees somebody in a frame: more than 0.2 % of its pixels."""
+    """Return whether the silhouette of every camera has more than 0.2 % of the frame's pixels."""
     return bool((silhouettes.double().mean((-2, -1)) > _SEEN).all())
 
 
@@ -48,9 +48,9 @@ def track_body(
         model: a filter over silhouettes, whose body is a `torchpose.body.Body`.
         frames: silhouettes of the C cameras, frame after frame. cameras: theirs.
         initial_state: the pose before the first frame [D], recorded or from `find_first_pose`.
-        generator: for what is drawn. initial_cov: variances of the first particles, as the filter's
+        generator: of random numbers. initial_cov: variances of the first particles, as the filter's
             `process_cov`; none if None.
-        fps: of the frames, for the result. n_frames: how many to expect, for the progress bar.
+        fps: of the frames, for the result. n_frames: expected number of frames, for the progress bar.
         progress: whether to show it.
 
     Returns:

@@ -69,7 +69,7 @@ class BodyTrackerOptions(WeightingOptions, total=False):
 
 
 class BodyMethod(NamedTuple):
-    """A filter that `BodyTracker` tracks with.
+    """Describes a filter that `BodyTracker` tracks with.
 
     Attributes:
         filter: its class. needs: the kind of model that it tracks with, among `LEARNT`, which is also
@@ -118,7 +118,7 @@ def register_body_filter(
 
 
 class LearntKind(NamedTuple):
-    """A kind of model that filters track with.
+    """Describes a kind of model that filters track with.
 
     Attributes:
         load: (name or file) -> model. words: what it is, and the command that makes one.
@@ -265,7 +265,7 @@ def method_options(method: str) -> tuple[str, ...]:
 
 
 def check_options(method: str, options: Iterable[str]) -> None:
-    """Refuse options that a method does not use, and say which method does.
+    """Refuse options that a method does not use, and name the method that does.
 
     Raises:
         InputError: such an option.

@@ -43,7 +43,7 @@ _ONE_MODE = math.sin(math.pi / 8)  # particles turned by less than 45 degrees fr
 
 
 class SilhouettePlace(NamedTuple):
-    """Middle of the body by the silhouettes.
+    """Holds the middle of the body according to the silhouettes.
 
     Attributes:
         position: [..., 3], metres, world axes. cov: [..., 3, 3].
@@ -81,7 +81,7 @@ def world_up(rig: CameraRig, up: Tensor | None) -> Float[Tensor, "3"]:
 def place_from_silhouettes(
     silhouettes: Bool[Tensor, "B C H W"], rig: CameraRig, height: float
 ) -> SilhouettePlace:
-    """Return where the rays through the middles of the silhouettes meet, by least squares.
+    """Return the point nearest to the rays through the middles of the silhouettes (least squares).
 
     p = (sum_c A_c)^-1 sum_c A_c (o_c + h_c d_c),   A_c = I - (1 - e) d_c d_c^T,
 
@@ -125,7 +125,7 @@ def place_from_silhouettes(
 
 
 class PoseCandidates(NamedTuple):
-    """The best pose of every sector of headings.
+    """Holds the best pose of every sector of headings.
 
     Attributes:
         states: [B, S, D]. log_likelihood: of each [B, S].
@@ -160,8 +160,17 @@ def find_pose(
     come out turned by half a turn. `find_first_pose` lets several frames decide.
 
     Args:
-        silhouettes: bool [C, H, W], or [B, C, H, W] for several persons' frames.
-        All others: as `find_candidates`.
+        body: a `torchpose.body.Body`.
+        silhouettes: bool [C, H, W], or [B, C, H, W] for a frame of each of B persons.
+        cameras: the C cameras.
+        prior: poses to start from, as `find_candidates`; None is the rest pose.
+        generator: one generator, or a list of one for each of B.
+        n_particles: N, of all sectors together. n_layers: M; the search evaluates M N likelihoods.
+        n_headings: sectors of the circle. survival_rate: of a layer, above 0 to below 1.
+        likelihood: "bidirectional" or "overlap".
+        limits: joint limits with `clamp(states)`, or None.
+        up: [3], direction of the world's vertical; by `upward_direction` if None.
+        facing: [3], the world direction that the person faces to within 60 degrees, if it is known.
 
     Returns:
         State [D] or [B, D].
@@ -259,7 +268,7 @@ def find_candidates(
 
 
 class _Sectors(NamedTuple):
-    """Headings: the middle of each sector [S], and half its width, radians."""
+    """Holds sectors of headings: the middle of each sector [S], and half its width, radians."""
 
     middle: Tensor
     half_width: float

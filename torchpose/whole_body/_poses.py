@@ -44,7 +44,7 @@ _HEIGHTS = (0.3, 5.0)  # metres; between them is everybody, and what is no perso
 
 @dataclass
 class BodyTrack:
-    """Poses of one person in T frames; J joints and states of D numbers, as their body has.
+    """Holds the poses of one person in T frames; J joints and states of D numbers, as their body has.
 
     Named as in `torchpose.PoseTrack`, without the dimension of a batch. A filter over bodies that fails goes
     on with particles drawn anew, so there is a pose in every frame: `respread` tells the frames in which
@@ -102,9 +102,14 @@ class BodyTrack:
         return bool(self.respread.any())
 
     def save(self, path: str | Path) -> None:
-        """Write an .npz: what holds for each frame, `names`, `fps` (NaN if unknown), `notes`,
-        `first_frame`, `method`, `action_names`, details as `detail_acceptance` and so on, and the body as
-        `body_bone_lengths`, `body_radii` and so on.
+        """Write the poses as .npz, atomically: an interrupted write leaves no partial file.
+
+        Keys: what holds for each frame, `names`, `fps` (NaN if unknown), `notes`, `first_frame`, `method`,
+        `action_names`, details as `detail_acceptance` and so on, and the body as `body_bone_lengths`,
+        `body_radii` and so on.
+
+        Args:
+            path: of the file, which is replaced.
 
         Raises:
             OutputError: the file cannot be written.
@@ -128,6 +133,12 @@ class BodyTrack:
     @classmethod
     def load(cls, path: str | Path) -> Self:
         """Read what `save` wrote.
+
+        Args:
+            path: .npz file.
+
+        Returns:
+            The poses, with their body.
 
         Raises:
             InputError: no such file. FileFormatError: not such poses, or fields that do not agree: other
@@ -189,7 +200,14 @@ class BodyTrack:
             )
 
     def seen_by(self, camera: PinholeCamera) -> "CameraPoses":
-        """Return the joints in a camera's axes, for `torchpose.viz._report.write_report`."""
+        """Return the joints in a camera's axes, for `torchpose.viz._report.write_report`.
+
+        Args:
+            camera: with a pose in the room.
+
+        Returns:
+            `CameraPoses`: joints [1, T, J, 3], metres, and their covariances [1, T, J, 3, 3], square metres.
+        """
         R, t = (m.to(self.joints3d) for m in (camera.rotation_matrix, camera.translation))
         return CameraPoses(
             joints3d=(self.joints3d @ R.mT + t)[None],
@@ -217,7 +235,7 @@ def repeat_last(track: BodyTrack, count: int) -> BodyTrack:
 
 @dataclass
 class CameraPoses:
-    """Poses in the axes of a camera; see `torchpose.viz._report.packing.ReportedTrack`."""
+    """Holds poses in the axes of a camera; see `torchpose.viz._report.packing.ReportedTrack`."""
 
     joints3d: Tensor
     covariance3d: Tensor
@@ -233,6 +251,12 @@ class CameraPoses:
 
 def load_body(path: str | Path) -> Body:
     """Read the body of poses that were saved: bone lengths, limbs and centres of a person.
+
+    Args:
+        path: .npz file of `BodyTrack`.
+
+    Returns:
+        `Body` in float64.
 
     Raises:
         InputError: no such file. FileFormatError: not such poses, or no body of a person.

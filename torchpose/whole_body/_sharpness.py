@@ -33,7 +33,7 @@ class ValidationSequence(NamedTuple):
 
 
 class SharpnessFit(NamedTuple):
-    """The exponent with the smallest error, and all that were tried.
+    """Holds the exponent with the smallest error, and all that were tried.
 
     Attributes:
         sharpness: the best of `tried`. tried: [K]. errors: metres [K], mean over sequences and runs.
@@ -88,7 +88,8 @@ def fit_sharpness(
         make_filter: sharpness -> filter. An annealed filter with solved exponents does not depend
             on its sharpness; let this set its survival rate instead, and give `values`.
         sequences: of validation.
-        values: what to try; 1 (the published form) to 1000 in `n_values` equal ratios if None.
+        values: exponents to try; by default 1 (the published form) to 1000 in equal ratios.
+        n_values: number of exponents where `values` is None.
         seeds: runs per sequence, filtered as one batch.
         progress: whether to show a progress bar.
 

@@ -43,10 +43,10 @@ _LOOK_AHEAD = 0.5  # seconds that decide where the person looks at first
 
 
 class BodyStream(NamedTuple):
-    """State of `BodyTracker.step` between two frames.
+    """Holds the state of `BodyTracker.step` between two frames.
 
     Attributes:
-        filter: state of the filter. frame: number of the next frame. generator: for what is drawn.
+        filter: state of the filter. frame: number of the next frame. generator: of random numbers.
     """
 
     filter: BodyFilterState
@@ -55,7 +55,7 @@ class BodyStream(NamedTuple):
 
 
 class BodyTracker(nn.Module):
-    """Tracker of one person's whole body through the silhouettes of calibrated cameras, in 3D.
+    """Tracks one person's whole body through the silhouettes of calibrated cameras, in 3D.
 
     `forward` tracks a whole sequence and finds the first pose by itself; `init` and `step` track live,
     `advance` some frames at a time, with the same numbers.
@@ -79,7 +79,7 @@ class BodyTracker(nn.Module):
         height: height of the person, metres.
         manifold: poses of an action, by a name that `torchpose info` lists, or a file; in Python also the
             model itself. The first pose is looked for with it by every method.
-        conditionals: how limbs stand to each other and turn, by name, or a file.
+        conditionals: rotations of limbs against each other and over time, by name, or a file.
         action: postures of an action, or of several, by name, or a file.
         n_particles: likelihoods of a frame, of all layers together; a hypothesis of "root" counts seven.
         fps: frames per second; noise grows with the time between frames.
@@ -87,7 +87,7 @@ class BodyTracker(nn.Module):
             in squares of metres for the root and of sines of half angles for rotations; by default what
             suits the method.
         initial_cov: the same of the particles about the first pose; by default four times `process_cov`.
-        options: of the method's filter (`torchpose.whole_body._methods.method_options`), such as sharpness,
+        **options: of the method's filter (`torchpose.whole_body._methods.method_options`), such as sharpness,
             limits, leg_swap or n_layers.
 
     Attributes:
@@ -172,7 +172,7 @@ class BodyTracker(nn.Module):
 
     @property
     def upright(self) -> Body:
-        """Return the same person, on whom the first pose is looked for."""
+        """Return the person's body on which the first pose is looked for."""
         return self.body if self._upright is None else self._upright
 
     @property
@@ -205,17 +205,17 @@ class BodyTracker(nn.Module):
         n_frames: int | None = None,
         progress: bool = False,
     ) -> BodyTrack:
-        """Track one person from the first frame in which all cameras see somebody.
+        """Track one person from the first frame whose silhouettes all show a person.
 
         Args:
             silhouettes: bool [T, C, H, W], or frames [C, H, W] one after the other, of which memory then
                 holds those that the first pose is found in, and one more.
             initial_state: the pose before that frame [D], of `body`; found in half a second of frames
                 (`find_first_pose`) if None.
-            generator: for what is drawn. lengths: [1], frames of the sequence, if they are fewer; past them
+            generator: of random numbers. lengths: [1], frames of the sequence, if they are fewer; past them
                 the last pose is repeated.
             facing: [3], the world direction that the person looks in at first, if it is known.
-            n_frames: how many frames to expect, for the bar. progress: whether to show one.
+            n_frames: expected number of frames, for the bar. progress: whether to show one.
 
         Returns:
             `BodyTrack`, from frame `first_frame`.
@@ -266,7 +266,10 @@ class BodyTracker(nn.Module):
         Args:
             silhouettes: bool, half a second in which the first pose is found; they are to be tracked
                 afterwards, with `step` or `advance`. initial_state: the pose before the first frame [D], of
-                `body`, instead. generator: for what is drawn; the state holds it. facing: as in `forward`.
+                `body`, instead. generator: of random numbers; the state holds it. facing: as in `forward`.
+
+        Returns:
+            `BodyStream` before the first frame.
 
         Raises:
             InputError: neither silhouettes nor a pose, nobody seen in the first frame. ShapeError,
@@ -353,7 +356,7 @@ def _whole(lengths: Int[Tensor, "1"]) -> int:
 
 
 def _model(kind: str, value: Any, fps: float) -> tuple[Any, str]:
-    """Return a model with its noise for a frame rate, and what is to be said of that."""
+    """Return a model with its noise for a frame rate, and notes about it."""
     model = LEARNT[kind].load(value) if isinstance(value, str | Path) else value
     return LEARNT[kind].at_rate(model, fps), LEARNT[kind].rescaled(model, fps)
 

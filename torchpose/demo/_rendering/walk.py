@@ -89,7 +89,7 @@ def walk(
     """Return a walk past the origin along z, in a bend.
 
     Args:
-        seconds, fps: how long, and frames per second.
+        seconds: length of the walk. fps: frames per second.
         height: metres; of it, the legs have more and trunk and arms less than average.
         seed: of small differences from step to step. cadence: gait cycles (two steps) per second.
         stray: degrees by which the path bends from its start to its end.

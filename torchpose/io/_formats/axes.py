@@ -174,7 +174,7 @@ class Unit(NamedTuple):
 
 
 def unit_from_text(text: str) -> float | None:
-    """Return the metres per unit of what a file calls its unit, or None if it is none of the known ones."""
+    """Return the metres per unit by the name of the unit, or None for an unknown name."""
     word = text.strip().lower().rstrip("s.")
     known = {"m": 1.0, "metre": 1.0, "meter": 1.0, "cm": 0.01, "centimetre": 0.01,
              "centimeter": 0.01, "mm": 0.001, "millimetre": 0.001, "millimeter": 0.001}  # fmt: skip

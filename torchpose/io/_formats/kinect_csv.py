@@ -42,7 +42,7 @@ _PERSONS = ("person", "subject")
 
 
 class _Layout(NamedTuple):
-    """Layout of a row without a header."""
+    """Describes the layout of a row without a header."""
 
     skeleton: str
     numbers: int  # of each joint: x, y, z, and a state with four

@@ -177,7 +177,7 @@ def _check(path: Path) -> None:
 
 
 class C3DPoints(NamedTuple):
-    """Points of a file: their labels, [T, N, 3] as written, frames per second, unit, axis up."""
+    """Holds the points of a file: their labels, [T, N, 3] as written, frames per second, unit, axis up."""
 
     labels: list[str]
     points: np.ndarray
@@ -213,7 +213,7 @@ def read_c3d(path: Path) -> list[RawRecording]:
 
 
 def read_c3d_points(path: Path) -> C3DPoints:
-    """Read every point of a file, whatever it is called; NaN where the residual is -1.
+    """Read every point of a file under any label; NaN where the residual is -1.
 
     Raises:
         MissingDependencyError: c3d is not installed. FileFormatError: damaged or truncated.

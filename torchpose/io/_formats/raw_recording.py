@@ -39,7 +39,7 @@ _SHOWN_RANGES = 4
 
 @dataclass
 class RawRecording:
-    """A sequence of joints as a file has them.
+    """Holds a sequence of joints as a file has them.
 
     Args:
         path: the file.
@@ -52,7 +52,7 @@ class RawRecording:
         weights: [T, J] in [0, 1], None if the file does not say.
         companion: 0 for the person whose file it is, else which of the others.
         first_frame: number of the first frame in the file.
-        notes: what was assumed or left out, for people.
+        notes: sentences on assumptions and omissions of the reader.
     """
 
     path: Path
@@ -76,7 +76,7 @@ class RawRecording:
 
 
 class BodyFrame(NamedTuple):
-    """One body in one frame: its number in the file, joints [J, 3] and weights [J]."""
+    """Holds one body in one frame: its number in the file, joints [J, 3] and weights [J]."""
 
     frame: int
     body: str
@@ -158,7 +158,7 @@ def join_bodies(
 
 
 def _tracked(frames: Iterable[BodyFrame]) -> float:
-    """Return in how many frames a body is there, those of inferred joints counting less."""
+    """Return the number of frames with a body; frames of inferred joints count less."""
     return sum(1.0 if one.weights is None else float(one.weights.mean()) for one in frames)
 
 

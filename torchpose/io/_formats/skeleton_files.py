@@ -109,7 +109,7 @@ def read_ntu_skeleton(path: Path) -> list[RawRecording]:
 
 
 class _Lines:
-    """The lines of a file, one after the other."""
+    """Reads the lines of a file one after the other."""
 
     def __init__(self, path: Path, lines: list[str]) -> None:
         self.path, self.lines, self.place = path, lines, 0

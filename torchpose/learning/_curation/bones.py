@@ -44,14 +44,14 @@ _FARTHER = torch.tensor([farther for _, farther in BONES])
 
 
 class PersonBones(NamedTuple):
-    """Bones of one person: median length in metres and robust spread of its logarithm, each [7]."""
+    """Holds the bones of one person: median length in metres and robust spread of its logarithm, each [7]."""
 
     length: Tensor
     spread: Tensor
 
 
 class WrongJoints(NamedTuple):
-    """Joints [T, 8] at the end of a wrong bone, and frames [T] in which there is no body at all."""
+    """Marks the joints [T, 8] at the end of a wrong bone, and frames [T] in which there is no body at all."""
 
     joints: Tensor
     frames: Tensor

@@ -42,7 +42,7 @@ _LEFT, _RIGHT = UPPER_BODY.index("shoulder_left"), UPPER_BODY.index("shoulder_ri
 
 
 class CurationSettings(NamedTuple):
-    """Settings of `curate`.
+    """Holds the settings of `curate`.
 
     Attributes:
         jump_speeds: bounds in m/s of the eight joints (`find_jumps`); None leaves jumps in.
@@ -72,7 +72,7 @@ DEFAULTS = CurationSettings()
 
 
 class Curated(NamedTuple):
-    """Recordings that are left, and a report on what was left out."""
+    """Holds the recordings that are left, and a report on the others."""
 
     recordings: list[Recording]
     report: CurationReport
@@ -90,6 +90,9 @@ def curate(recordings: Sequence[Recording], settings: CurationSettings = DEFAULT
     Args:
         recordings: in camera axes (`torchpose.io.read_recordings`); they are not changed.
         settings: bounds and what to do.
+
+    Returns:
+        `Curated`: new recordings, and a `CurationReport` on what was left out.
 
     Raises:
         InputError: no recordings, none left, infinite values, unknown settings. PriorError: kinds of

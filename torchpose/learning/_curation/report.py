@@ -12,7 +12,7 @@ _SHOWN_NOTES = 20
 
 
 class Drop(NamedTuple):
-    """Frames of one recording that were left out for one reason.
+    """Describes the frames of one recording that were left out for one reason.
 
     Attributes:
         reason: ``jump``, ``bone length``, ``no body``, ``no person's size``, ``companion``,
@@ -41,7 +41,7 @@ class Drop(NamedTuple):
 
 
 class Size(NamedTuple):
-    """Number of persons, recordings and frames, and of measured joints among the eight."""
+    """Holds the number of persons, recordings and frames, and of measured joints among the eight."""
 
     persons: int
     recordings: int
@@ -57,7 +57,7 @@ class Size(NamedTuple):
 
 
 class CurationReport(NamedTuple):
-    """Counts before and after curation, and what was left out.
+    """Holds the counts before and after curation, and the omissions.
 
     Attributes:
         before, after: counts. drops: one per file, joint and reason. notes: what reading assumed and
@@ -82,7 +82,7 @@ class CurationReport(NamedTuple):
         return "\n".join([*lines, *(f"note     {note}" for note in self.notes[:_SHOWN_NOTES])])
 
     def totals(self) -> dict[str, tuple[int, str]]:
-        """Count what was left out by reason, with its unit (joints or frames)."""
+        """Count the omissions by reason, with their unit (joints or frames)."""
         counts: Counter[tuple[str, str]] = Counter()
         for drop in self.drops:
             counts[drop.reason, "joints" if drop.joint else "frames"] += drop.n_frames
@@ -103,7 +103,7 @@ class CurationReport(NamedTuple):
         }
 
     def for_prior(self) -> dict[str, Any]:
-        """Return what the file of a prior says: counts, reasons and notes, without single drops."""
+        """Return the facts for the file of a prior: counts, reasons and notes, without single drops."""
         shown = ("before", "after", "dropped", "by_person", "notes")
         facts = self.facts()
         return {"curation": {name: facts[name] for name in shown}}

@@ -36,7 +36,7 @@ _MISSING = -(2**40)
 
 
 class Duplicate(NamedTuple):
-    """Two recordings with the same frames: their indices, and the share of the shorter one's frames."""
+    """Holds the indices of two recordings with the same frames, and the share of the shorter one's frames."""
 
     first: int
     second: int
@@ -111,7 +111,7 @@ def refuse_shared_between_persons(
 
 
 def describe_duplicate(found: Duplicate, recordings: Sequence[Recording]) -> str:
-    """Say which recording is contained in which other one."""
+    """Return a sentence on which recording is contained in which other one."""
     first, second = recordings[found.first], recordings[found.second]
     return (
         f"{100 * found.shared:.0f} % of the frames of {label(second)} (person {second.person_id}) "
@@ -132,7 +132,7 @@ def _frame_keys(joints: Float[Tensor, "T 8 3"]) -> Int[Tensor, " N"]:
 
 
 class PersonSplit(NamedTuple):
-    """Recordings to train on, recordings of other persons to test on, and the test persons."""
+    """Holds the recordings to train on, recordings of other persons to test on, and the test persons."""
 
     train: list[Recording]
     test: list[Recording]
@@ -180,6 +180,9 @@ def split_persons(recordings: Sequence[Recording], test_persons: Iterable[str]) 
         recordings: all of them.
         test_persons: ids (`Recording.person_id`).
 
+    Returns:
+        `PersonSplit` with the recordings to train on and to test on.
+
     Raises:
         InputError: a person without a recording, or nobody left on one side. OverlapError: one
             recording, or part of it, on both sides under different persons.
@@ -208,6 +211,12 @@ def _split(recordings: Sequence[Recording], wanted: list[str]) -> PersonSplit:
 
 def leave_one_person_out(recordings: Sequence[Recording]) -> Iterator[PersonSplit]:
     """Return one split per person, in the order of their ids, with that person as the test.
+
+    Args:
+        recordings: of two persons or more.
+
+    Returns:
+        Iterator over `PersonSplit`, as many as there are persons.
 
     Raises:
         InputError: fewer than two persons. OverlapError: as `split_persons`.

@@ -36,7 +36,7 @@ _SMOOTH = 1e-3  # metres: distances below it count as squares, so that they have
 
 
 class TunableMixture(nn.Module):
-    """A Gaussian mixture with free parameters, as steps from a given one along each component's axes.
+    """Holds a Gaussian mixture with free parameters, as steps from a given one along each component's axes.
 
     pi_k prop. to pi0_k exp(a_k),   mu_k = mu0_k + L0_k b_k,   Sigma_k = (L0_k T_k) (L0_k T_k)^T,
 
@@ -108,7 +108,7 @@ def tuned_mixtures(
 
 
 class Positive(nn.Module):
-    """Positive numbers with a free parameter each: start exp(parameter)."""
+    """Holds positive numbers with a free parameter each: start exp(parameter)."""
 
     def __init__(self, start: Tensor) -> None:
         super().__init__()
@@ -122,7 +122,7 @@ class Positive(nn.Module):
 
 
 class Fraction(nn.Module):
-    """Numbers in (0, 1) with a logit each as free parameter."""
+    """Holds numbers in (0, 1) with a logit each as free parameter."""
 
     def __init__(self, start: Tensor) -> None:
         super().__init__()

@@ -103,7 +103,7 @@ def draw_sequences(
 
 
 class TunableKalman(nn.Module):
-    """Q, R, gamma and the mixtures of the filter over single poses (fixed tracks).
+    """Holds Q, R, gamma and the mixtures of the filter over single poses (fixed tracks).
 
     Args:
         prior: to start from; its transition is kept.

@@ -69,7 +69,7 @@ def draw_windows(
 
 
 class TunableWindow(nn.Module):
-    """The mixtures over windows of both arms, the noise of their hands, and the likelihood's power.
+    """Holds the mixtures over windows of both arms, the noise of their hands, and the likelihood's power.
 
     Frames do not depend on each other here, so the estimate is a closed form: with the gains G_j,
         x = sum_j w_j (mu_j + G_j (z - H mu_j)),  w_j prop. to pi_j N(z; H mu_j, S_j)^tau.

@@ -45,7 +45,7 @@ COMMON_HEIGHT = 1.75
 
 @dataclass(frozen=True)
 class ActionRecipe:
-    """Settings of the fit of an action space, or of a bank.
+    """Holds the settings of the fit of an action space, or of a bank.
 
     Args:
         n_dimensions: D, of the principal axes of the postures.
@@ -73,7 +73,7 @@ class ActionRecipe:
 
 @dataclass(frozen=True)
 class Performances:
-    """Performances of one action or several, and those of held-out persons.
+    """Holds the performances of one action or several, and those of held-out persons.
 
     Attributes:
         actions: in the order asked for. fps: of the postures. postures: "joints" or "body".
@@ -149,7 +149,7 @@ class Performances:
         }  # fmt: skip
 
     def facts(self, action: str) -> ActionInfo:
-        """Return what is known of an action before it is fitted."""
+        """Return the facts about an action that are known before it is fitted."""
         learnt = {p.person for p in self.train if p.action == action}
         mine = [r for r in self.recordings if r.action == action and r.person_id in learnt]
         return ActionInfo(
@@ -163,7 +163,7 @@ class Performances:
 
 @dataclass(frozen=True)
 class FittedActions:
-    """Action spaces by name, with the synchronised performances, and how many postures their gates accept.
+    """Holds action spaces by name, the synchronised performances, and the acceptance of their gates.
 
     Attributes:
         spaces: by action. accepted: share of the held-out postures that pass the gate when j is drawn
@@ -209,7 +209,7 @@ class FittedActions:
         return bank
 
     def summary(self) -> str:
-        """Say what was fitted, a line for each action."""
+        """Return a summary of the fit, a line for each action."""
         lines = []
         for action, (space, _) in self.spaces.items():
             line = (
@@ -230,6 +230,13 @@ class FittedActions:
 
 def fit_actions(performances: Performances, recipe: ActionRecipe) -> FittedActions:
     """Fit every action, and test its gate on held-out persons.
+
+    Args:
+        performances: of each action, and of held-out persons.
+        recipe: settings of the fits.
+
+    Returns:
+        `FittedActions` with an action space for each action, in degrees.
 
     Raises:
         InputError: as `fit_action_space`.

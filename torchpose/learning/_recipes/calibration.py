@@ -51,7 +51,7 @@ _NOISE = 3.0  # pixels
 
 
 class HeldOut(NamedTuple):
-    """Errors and covariances from tracking persons whom a fit did not see.
+    """Holds the errors and covariances from tracking persons whom a fit did not see.
 
     Attributes:
         errors: estimate minus truth after fixed-scale Procrustes, metres. covs: of the estimates.

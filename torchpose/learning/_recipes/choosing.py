@@ -35,7 +35,7 @@ __all__ = [
 
 
 class ChosenRecordings(NamedTuple):
-    """Recordings to fit to, and those of held-out persons, each in the order of the files."""
+    """Holds the recordings to fit to, and those of held-out persons, each in the order of the files."""
 
     train: list[Recording]
     watched: list[Recording]
@@ -94,7 +94,7 @@ def choose_recordings(
 
 
 def recording_name(recording: Recording) -> str:
-    """Return what messages call a recording: its file without the suffix, or its person."""
+    """Return the name of a recording in messages: its file without the suffix, or its person."""
     return recording.person_id if recording.path is None else recording.path.stem
 
 

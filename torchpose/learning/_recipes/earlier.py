@@ -48,7 +48,7 @@ def renew_noise(
     `UpperBodyRecipe.calibrate`, with the number of components, camera and seed of the prior.
 
     Args:
-        prior: that the recipe fitted. recordings: what it was fitted on.
+        prior: that the recipe fitted. recordings: those that it was fitted on.
         calibration_folds: groups of persons that are held out in turn. drawn_pieces: of each.
         command: to be noted. progress: whether to show a bar.
 

@@ -38,7 +38,7 @@ __all__ = ["LimbSpread", "LimbStates", "check_least_std", "fit_limbs", "held_out
 
 @dataclass(frozen=True)
 class LimbStates:
-    """Recorded states of all persons, on one body with safe centres (DX 1), at one frame rate.
+    """Holds the recorded states of all persons, on one body with safe centres (DX 1), at one frame rate.
 
     Attributes:
         body: whose frame and centres the states have. fps: of the states.
@@ -101,7 +101,7 @@ class LimbStates:
 
 
 class LimbSpread(NamedTuple):
-    """Deviation and speed of held-out persons, relative to those of the persons fitted to.
+    """Holds the deviation and speed of held-out persons, relative to those of the persons fitted to.
 
     Attributes:
         deviation: of their limbs, in standard deviations of the conditionals; 1 if they are alike.
@@ -122,7 +122,10 @@ def fit_limbs(
         states: to fit to.
         least_std: least deviation of a limb in any direction, sine of half an angle
             (`fit_limb_conditionals`).
-        facts: name, licence, command; those that are empty are left out.
+        **facts: name, licence, command; those that are empty are left out.
+
+    Returns:
+        The limb conditionals, and the spread of held-out persons, None without any.
 
     Raises:
         InputError: `least_std` is negative, and as `fit_limb_conditionals`.
@@ -150,7 +153,7 @@ def check_least_std(least_std: float) -> None:
 def held_out_spread(
     conditionals: LimbConditionals, body: Body, sequences: Sequence[Float[Tensor, "_ D"]]
 ) -> LimbSpread:
-    """Return how far states that were not fitted to are from limb conditionals.
+    """Return the spread of held-out states relative to limb conditionals.
 
     deviation^2 = sum_ij E|x_ij - mu_ij|^2 / sum_ij tr Sigma_ij,
     speed^2 = sum_j E|q'_j|^2 / sum_j tr Sigma'_j,
@@ -172,7 +175,7 @@ def held_out_spread(
 
 
 def summary(conditionals: LimbConditionals, held_out: LimbSpread | None) -> str:
-    """Say what was fitted, in a sentence."""
+    """Return a one-sentence summary of the fit."""
     info = conditionals.info
     text = (
         f"{info.name}: {len(conditionals.edges)} limbs from {info.n_frames} frames of "

@@ -49,7 +49,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class ManifoldRecipe:
-    """Settings of the fit of a manifold.
+    """Holds the settings of the fit of a manifold.
 
     Args:
         latent_dim: dimensions d of the latent space.
@@ -85,7 +85,7 @@ class ManifoldRecipe:
 
 @dataclass(frozen=True)
 class ManifoldPoses:
-    """Poses to fit a manifold to, and held-out poses of other recordings.
+    """Holds the poses to fit a manifold to, and held-out poses of other recordings.
 
     Attributes:
         train, watched: [T, Q] for each recording. fps: of `watched`; `train` is thinned out.
@@ -160,7 +160,7 @@ class ManifoldPoses:
 
 
 class ManifoldFitting(nn.Module):
-    """The fit of a manifold, whose whole state beside its arguments is in its `state_dict`.
+    """Fits a manifold; the whole state of the fit beside its arguments is in its `state_dict`.
 
     Args:
         poses: to fit to. recipe: settings.
@@ -225,7 +225,7 @@ class ManifoldFitting(nn.Module):
         return found
 
     def summary(self, manifold: BackConstrainedGPLVM) -> str:
-        """Say what was fitted, in a sentence."""
+        """Return a one-sentence summary of the fit."""
         persons = ", ".join(manifold.info.persons)
         return (
             f"{manifold.info.name}: {len(manifold.poses)} frames of {persons}, best after "

@@ -64,7 +64,7 @@ _FRAMES_PER_COMPONENT = 180  # of a mixture over windows; fewer explain the pers
 
 @dataclass(frozen=True)
 class UpperBodyRecipe:
-    """Settings and steps of the fit of an upper-body prior.
+    """Holds the settings of the fit of an upper-body prior, and runs its steps.
 
     1. One mixture per arm over single poses (BL section 3.1), and process noise for the filters, from
        how far a frame moves the recorded bodies (`increment_covs`).
@@ -160,7 +160,13 @@ class UpperBodyRecipe:
         )
 
     def poses(self, recordings: Sequence[RecordingLike]) -> PoseSet:
-        """Return the poses that are fitted, centred on the neck.
+        """Collect the poses that are fitted, centred on the neck.
+
+        Args:
+            recordings: in camera axes, metres.
+
+        Returns:
+            `PoseSet` of all recordings, with one kind of neck.
 
         Raises:
             InputError, PriorError: as `collect_poses`.
@@ -168,7 +174,16 @@ class UpperBodyRecipe:
         return collect_poses(recordings, self.neck, "neck", self.nose_as_head)
 
     def tasks(self, recordings: Sequence[RecordingLike]) -> dict[str, MixtureTask]:
-        """Return the mixtures to fit, by name: "pose" (and "pose.right"), "causal.left", ... "full.right".
+        """Return the mixtures to fit, by name.
+
+        Names are "pose" (and "pose.right" where arms are not mirrored), "causal.left", "causal.right",
+        "full.left" and "full.right".
+
+        Args:
+            recordings: in camera axes, metres.
+
+        Returns:
+            `MixtureTask` by name; each can be fitted in a process of its own.
 
         Raises:
             InputError: no usable frames. PriorError: kinds of joints that cannot be mixed.
@@ -212,7 +227,7 @@ class UpperBodyRecipe:
         return tasks
 
     def _window_size(self, n_frames: int) -> tuple[int, int]:
-        """Return components and samples of a mixture over windows, for so many complete frames."""
+        """Return components and samples of a mixture over windows, for this number of complete frames."""
         components, samples = self.window_components, self.window_samples
         if components is None:
             most = max(1, n_frames // _FRAMES_PER_COMPONENT)
@@ -233,9 +248,12 @@ class UpperBodyRecipe:
         """Build a prior of fitted mixtures, with noise and windows; it is not calibrated.
 
         Args:
-            recordings: what `tasks` was given. mixtures: whole ones (`MixtureTask.whole`), by the
+            recordings: the same that `tasks` was given. mixtures: whole ones (`MixtureTask.whole`), by the
                 names of the tasks.
             name, licence, command: for `PriorInfo`.
+
+        Returns:
+            `UpperBodyPrior`, not calibrated.
 
         Raises:
             PriorError: the mixture over poses is missing.
@@ -265,8 +283,11 @@ class UpperBodyRecipe:
         Recordings of people who walk past the camera are cut into parts near its usual place.
 
         Args:
-            prior: mixtures over poses; a millionth of their variance keeps Q regular. recordings: what
-                they were fitted on.
+            prior: mixtures over poses; a millionth of their variance keeps Q regular. recordings: those
+                that they were fitted on.
+
+        Returns:
+            Covariances per frame by name, in the units of the state.
         """
         poses = collect_poses(recordings, self.neck, "sequence", self.nose_as_head)
         seen = self.matrix, self.views, self.rotation_order, self.mirror, self.seed
@@ -283,7 +304,15 @@ class UpperBodyRecipe:
         return noise
 
     def window(self, mode: str, mixtures: Mapping[str, GaussianMixture]) -> WindowPrior:
-        """Return the window prior of one mode, of the mixtures that were fitted to it."""
+        """Build the window prior of one mode from the mixtures that were fitted to it.
+
+        Args:
+            mode: "causal" or "full".
+            mixtures: whole ones, by the names of `tasks`.
+
+        Returns:
+            `WindowPrior` of both arms, its numbers rounded to single precision.
+        """
         # Single precision moves estimates by a thousandth of a millimetre, and files are half as large.
         left, right = (mixtures[f"{mode}.{side}"].rounded() for side in _SIDES)
         return WindowPrior(left, right, self.layouts[mode], _window_settings(mode))
@@ -297,7 +326,7 @@ class UpperBodyRecipe:
         of half the size to the others, in `info.extra["held_out"]`.
 
         Args:
-            prior: from `assemble`; it is changed. recordings: what it was fitted on.
+            prior: from `assemble`; it is changed. recordings: those that it was fitted on.
             progress: whether to show a bar.
 
         Returns:
@@ -313,14 +342,33 @@ class UpperBodyRecipe:
     def hold_out(
         self, recordings: Sequence[RecordingLike], persons: set[str]
     ) -> dict[str, HeldOut]:
-        """Return errors on some persons, tracked with a fit of half the size to all others."""
+        """Return the errors on some persons, tracked with a fit of half the size to all others.
+
+        Args:
+            recordings: of all persons.
+            persons: ids (`Recording.person_id`) of those held out.
+
+        Returns:
+            `HeldOut` by mode of tracking: errors and covariances of 3D joints, metres.
+
+        Raises:
+            InputError, PriorError: as `tasks`, of the recordings that are left.
+        """
         seen = [r for r in recordings if r.person_id not in persons]
         partial = self.smaller().fit(seen)
         poses = self.poses(recordings)
         return track_held_out(partial, poses, persons, self.seed, self.drawn_pieces)
 
     def finish(self, prior: UpperBodyPrior, parts: Sequence[dict[str, HeldOut]]) -> UpperBodyPrior:
-        """Calibrate a prior by the errors that `hold_out` returned for each group of persons."""
+        """Calibrate a prior by the errors on held-out persons.
+
+        Args:
+            prior: from `assemble`; it is changed.
+            parts: what `hold_out` returned for each group of persons.
+
+        Returns:
+            The prior.
+        """
         found = HeldOut.join_modes(parts)
         for key, value in calibration_noise(found).items():
             prior.set_noise(key, value)
@@ -350,6 +398,14 @@ class UpperBodyRecipe:
     ) -> UpperBodyPrior:
         """Fit, assemble and calibrate a prior in this process.
 
+        Args:
+            recordings: in camera axes (`torchpose.io.read_recordings`), metres.
+            name, licence, command: for `PriorInfo`.
+            progress: whether to show bars.
+
+        Returns:
+            `UpperBodyPrior` in float64.
+
         Raises:
             InputError, PriorError: as `tasks`.
         """
@@ -376,8 +432,11 @@ def fit_kinect_prior(
 
     Args:
         recordings: in camera axes (`torchpose.io.read_recordings`).
-        n_components, seed, views, settings: of `UpperBodyRecipe`.
+        n_components, seed, views, **settings: of `UpperBodyRecipe`.
         name, licence, command: for `PriorInfo`. progress: whether to show bars.
+
+    Returns:
+        `UpperBodyPrior` in float64.
 
     Raises:
         InputError, PriorError: as `UpperBodyRecipe.tasks`.

@@ -57,7 +57,7 @@ class PersonTracks(NamedTuple):
 
     @property
     def usable(self) -> Bool[Tensor, " P"]:
-        """Return who was detected often enough."""
+        """Return the persons that were detected often enough."""
         return self.hits >= _LEAST_HITS
 
 
@@ -119,7 +119,7 @@ def _distances(
 
 
 def least_seen(n_keypoints: int) -> int:
-    """Return how many keypoints tell somebody: three, or half of a set of fewer than five."""
+    """Return the number of keypoints that make a person: three, or half of a set of fewer than five."""
     return min(_LEAST_SHARED, (n_keypoints + 1) // 2)
 
 

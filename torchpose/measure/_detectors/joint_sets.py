@@ -22,7 +22,7 @@ _WRISTS, _KNUCKLES = [9, 10], [100, 121]  # of COCO-WholeBody, left and right
 
 
 class JointSet(NamedTuple):
-    """Holds what is taken of the keypoints of a model.
+    """Holds the selection among the keypoints of a model.
 
     Attributes:
         title: of the set. names: of what is taken, of which the first keypoints of the model are the first.
@@ -50,7 +50,7 @@ def joint_set(n_keypoints: int, model: str) -> JointSet:
     """Return the joint set with this many keypoints.
 
     Args:
-        n_keypoints: J. model: what it is called in messages.
+        n_keypoints: J. model: its name in messages.
 
     Raises:
         InputError: no known set has as many.

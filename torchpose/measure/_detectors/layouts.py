@@ -69,7 +69,7 @@ def find_layout(
 
     Args:
         shapes: of the outputs. size: (w, h) of the input. channels_last: its order.
-        model: what it is called in messages. names: of the outputs.
+        model: its name in messages. names: of the outputs.
 
     Raises:
         InputError: none fits, or the joint set is not known.

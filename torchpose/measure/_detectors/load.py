@@ -48,7 +48,7 @@ def load_detector(
 
 
 def _from_factory(where: str) -> KeypointDetector:
-    """Return what a callable in a module returns."""
+    """Return the detector that a callable in a module returns."""
     module_name, _, name = where.partition(":")
     try:
         factory: Any = _import(module_name)
@@ -89,7 +89,7 @@ def check_detector(detector: Any, where: str) -> KeypointDetector:
     """Return a detector, or raise unless it can be called and names its keypoints.
 
     Args:
-        where: what it is called in messages.
+        where: its name in messages.
 
     Raises:
         InputError: another kind of object, or names that torchpose does not know.

@@ -53,7 +53,7 @@ def image_input(network: Network, model: str) -> ImageInput:
     """Return the input of a network that takes one image.
 
     Args:
-        model: what it is called in messages.
+        model: its name in messages.
 
     Raises:
         InputError: other inputs.

@@ -28,7 +28,7 @@ def read_inputs(data: bytes, model: str) -> list[TensorInfo]:
     """Return the inputs of a model, without its weights.
 
     Args:
-        data: of the file. model: what it is called in messages.
+        data: of the file. model: its name in messages.
 
     Raises:
         FileFormatError: no ONNX model.

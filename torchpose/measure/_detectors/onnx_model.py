@@ -21,7 +21,7 @@ class OnnxModel:
     """Detects the keypoints of all persons by a model that sees the whole image.
 
     Args:
-        network: of the model. layout: of its outputs. model: what it is called in messages.
+        network: of the model. layout: of its outputs. model: its name in messages.
 
     Attributes:
         names: of the keypoints.
@@ -63,7 +63,7 @@ class CroppingOnnxModel(OnnxModel):
 
 
 def load_onnx(path: Path) -> OnnxModel:
-    """Return the detector of an ONNX file; its layout is told by the outputs for an empty image.
+    """Return the detector of an ONNX file; its outputs for an empty image determine the layout.
 
     Args:
         path: of the model.

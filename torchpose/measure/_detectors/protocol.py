@@ -68,11 +68,11 @@ class CroppingDetector(KeypointDetector, Protocol):
 
 
 def checked_detections(found: Any, n_keypoints: int, detector: str) -> Detections:
-    """Return what a detector returned as tensors.
+    """Return the result of a detector as tensors.
 
     Args:
         found: keypoints and confidence. n_keypoints: J, as many as it has names.
-        detector: what it is called in messages.
+        detector: its name in messages.
 
     Raises:
         InputError: not a pair, other shapes, no numbers, or a confidence outside 0 to 1.

@@ -39,7 +39,7 @@ __all__ = ["ActionBank"]
 
 
 class ActionBank(nn.Module):
-    """Action spaces stacked by padding, with one more state: none of the actions.
+    """Holds the action spaces of several actions, padded to one size, with one more state: none of them.
 
     The likelihood of a posture phi under action a is a tube of Gaussians around the mean performance
     in the action's subspace, and one Gaussian in all directions outside of it:
@@ -122,7 +122,17 @@ class ActionBank(nn.Module):
     # --- gates ------------------------------------------------------------------------------------
 
     def project(self, postures: Float[Tensor, "*batch 36"]) -> Float[Tensor, "*batch A D"]:
-        """Return projections on the subspace of every action, degrees."""
+        """Project postures on the principal axes of every action.
+
+        Args:
+            postures: [..., 36], degrees.
+
+        Returns:
+            z [..., A, D], degrees; zero in the dimensions that an action lacks.
+
+        Raises:
+            ShapeError: other than 36 angles.
+        """
         check_shape("postures", postures, ["...", POSTURE_DIM])
         flat = self.basis.transpose(0, 1).flatten(1)  # [36, A D]
         offset = (self.mean[:, None] @ self.basis).flatten()
@@ -136,11 +146,14 @@ class ActionBank(nn.Module):
         *,
         uniform: Float[Tensor, "*batch"] | None = None,
     ) -> Int[Tensor, "*batch"]:
-        """Return the posture of its own action that each is matched with, see `ActionSpace.match`.
+        """Draw the posture of its own action that each posture is matched with, see `ActionSpace.match`.
 
         Args:
             postures: [..., 36]. actions: [...], A for none, for which the index means nothing.
             generator: of the random numbers. uniform: the numbers themselves, [...] in [0, 1).
+
+        Returns:
+            Indices [...] from 0 to K - 1.
         """
         own = actions.clamp_max(self.none - 1)
         gated = self._gated
@@ -160,7 +173,18 @@ class ActionBank(nn.Module):
         j: Int[Tensor, "*batch"],
         width: float = GATE_WIDTH,
     ) -> Bool[Tensor, "*batch"]:
-        """Return whether postures lie in the gates of their own actions (AS 6); always for none."""
+        """Return whether postures lie in the gates of their own actions (AS 6); always for none.
+
+        Args:
+            postures: [..., 36], degrees. actions: [...], A for none. j: [...], matched postures.
+            width: of the gate, in sigma to either side; 2 as published.
+
+        Returns:
+            Bool [...].
+
+        Raises:
+            ShapeError: other than 36 angles. InputError: a width that is not positive.
+        """
         check_gate_width(width)
         z, own = self._own(postures, actions)
         within = (z - self.performance[own, j]).abs() < width * self.std[own, j]
@@ -174,9 +198,22 @@ class ActionBank(nn.Module):
         width: float = GATE_WIDTH,
         rounds: int = CLAMP_ROUNDS,
     ) -> Float[Tensor, "*batch 36"]:
-        """Move postures into the gates of their own actions, see `ActionSpace.clamp_postures`.
+        """Move postures into the gates of their own actions; those without an action stay as they are.
+
+        See `ActionSpace.clamp_postures`.
 
         They stay as they are for none.
+
+        Args:
+            postures: [..., 36], degrees. actions: [...], A for none. j: [...], matched postures.
+            width: of the gate, in sigma to either side.
+            rounds: 0 clamps once and leaves the angles as they come out.
+
+        Returns:
+            Postures [..., 36], degrees.
+
+        Raises:
+            ShapeError: other than 36 angles. InputError: a width that is not positive.
         """
         own = actions.clamp_max(self.none - 1)
         centre, std, basis = self.performance[own, j], self.std[own, j], self.basis[own]
@@ -193,7 +230,17 @@ class ActionBank(nn.Module):
     # --- which action -----------------------------------------------------------------------------
 
     def log_likelihood(self, postures: Float[Tensor, "*batch 36"]) -> Float[Tensor, "*batch S"]:
-        """Return log p(phi | a) of a posture for every state, [..., A + 1], the last one none."""
+        """Return the log-likelihood log p(phi | a) of a posture under every action and under none.
+
+        Args:
+            postures: [..., 36], degrees.
+
+        Returns:
+            [..., A + 1], natural logarithm, the last one none.
+
+        Raises:
+            ShapeError: other than 36 angles.
+        """
         z = self.project(postures)
         std = self.info.spread * self.std
         used = torch.arange(std.shape[-1], device=z.device) < self.n_dimensions[:, None]  # [A, D]
@@ -208,10 +255,16 @@ class ActionBank(nn.Module):
         return both - 0.5 * POSTURE_DIM * math.log(2 * math.pi)
 
     def transition(self, fps: float | None = None) -> Float[Tensor, "S S"]:
-        """Return the probabilities [A + 1, A + 1] of going from each state to each in one frame.
+        """Return the probabilities of the changes from each state to each in one frame.
 
         Args:
             fps: frames per second; by default that of the performances.
+
+        Returns:
+            [A + 1, A + 1], rows sum to 1; the last state is none.
+
+        Raises:
+            InputError: as `frame_rate`.
         """
         return chain_transition(len(self.names), self.info.stay, self.frame_rate(fps), self.mean)
 
@@ -220,11 +273,23 @@ class ActionBank(nn.Module):
 
         Args:
             fps: frames per second; by default that of the performances.
+
+        Returns:
+            Exponent in (0, 1].
+
+        Raises:
+            InputError: as `frame_rate`.
         """
         return evidence_share(self.info.evidence_rate, self.frame_rate(fps))
 
     def frame_rate(self, fps: float | None = None) -> float:
         """Return the given frame rate, or that of the performances.
+
+        Args:
+            fps: frames per second; None is that of the performances.
+
+        Returns:
+            Frames per second.
 
         Raises:
             InputError: not positive, or there is none.
@@ -251,6 +316,12 @@ class ActionBank(nn.Module):
         Args:
             log_posterior: [..., A + 1], of the frame before. postures: [..., 36], of this frame.
             fps: frames per second; by default that of the performances.
+
+        Returns:
+            Log-posterior of this frame [..., A + 1], normalised.
+
+        Raises:
+            ShapeError: other than 36 angles. InputError: as `frame_rate`.
         """
         log_likelihood = self.log_likelihood(postures)
         log_transition = self.transition(fps).log()
@@ -286,13 +357,26 @@ class ActionBank(nn.Module):
     # --- files ------------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> None:
-        """Write it as safetensors; the file appears whole or not at all."""
+        """Write the bank as safetensors, atomically: an interrupted write leaves no partial file.
+
+        Args:
+            path: of the file, which is replaced.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
         tensors = {n: getattr(self, n) for n in (*BANK_FILE.tensors, *BANK_FILE.indices)}
         write_tensors(path, BANK_FILE, self.info, tensors)
 
     @classmethod
     def load(cls, path: str | Path) -> "ActionBank":
         """Read what `save` has written.
+
+        Args:
+            path: safetensors file.
+
+        Returns:
+            The bank, in float64.
 
         Raises:
             InputError: no such file, or settings out of range. FileFormatError: damaged, or a file
@@ -340,7 +424,7 @@ class ActionBank(nn.Module):
 
     @property
     def _gated(self) -> int:
-        """Return the dimensions that the gates look at."""
+        """Return the number of dimensions that the gates use."""
         return min(self.info.gate_dimensions or self.basis.shape[-1], self.basis.shape[-1])
 
     def _there(self) -> Tensor:

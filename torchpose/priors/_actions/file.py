@@ -17,7 +17,7 @@ _LIMBS = tuple(limb.name for limb in LIMBS_12)
 
 @dataclass(frozen=True)
 class ActionInfo:
-    """Facts about the fit of an action space; fields that are not known are empty.
+    """Holds facts about the fit of an action space; fields that are not known are empty.
 
     Attributes:
         name: of the action. fps: of the performances. limbs: that the postures are of.
@@ -42,7 +42,7 @@ class ActionInfo:
 
 @dataclass(frozen=True)
 class BankInfo:
-    """Facts about the actions of a bank, and the settings of its recognition.
+    """Holds facts about the actions of a bank, and the settings of its recognition.
 
     Attributes:
         names: of the A actions. fps: of their performances. limbs: that the postures are of.
@@ -110,7 +110,7 @@ BANK_FILE = FileKind(
 
 
 class Synchronised(NamedTuple):
-    """Performances with the same number K of postures.
+    """Holds performances with the same number K of postures.
 
     Attributes:
         before: [P, K, R], only their lengths normalised. after: [P, K, R], in step.

@@ -33,7 +33,7 @@ _CHUNK = 4_000_000  # entries of a table of distances
 
 
 class Acceptance(NamedTuple):
-    """Share of postures that the gate lets through, by how j is chosen.
+    """Holds the share of postures that the gate accepts, for each way to choose j.
 
     Attributes:
         drawn: j drawn from its Gaussian, as in the filter. best: the most likely j. any: any j at all.
@@ -107,6 +107,6 @@ def passes_any_gate(
 
 
 def check_gate_width(width: float) -> None:
-    """Raise `InputError` unless a gate can be so many deviations wide."""
+    """Check that the width of a gate, in deviations, is positive and finite."""
     if not 0 < width < float("inf"):
         raise InputError(f"the gate's width must be positive, in deviations, got {width}")

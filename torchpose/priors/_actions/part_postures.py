@@ -79,7 +79,7 @@ class PartPostures(nn.Module):
         return self.of_relative(states[:, 6:])
 
     def of_relative(self, relative: Float[Tensor, "N Q"]) -> Float[Tensor, "N 36"]:
-        """Return the same from the columns without the root, which make no difference."""
+        """Return postures from states without the columns of the root, on which they do not depend."""
         check_shape("relative", relative, ["N", self._dim - 6])
         relative = relative.to(self.bones)
         if len(relative) <= _CHUNK:

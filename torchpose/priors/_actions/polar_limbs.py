@@ -11,7 +11,7 @@ Axis = tuple[float, float, float]
 
 
 class PolarLimb(NamedTuple):
-    """Bone whose direction is given in the axes of its parent limb.
+    """Describes a bone whose direction is given in the axes of its parent limb.
 
     Attributes:
         name: of the limb. parent: name of the limb that it hangs on, "" for the root.
@@ -30,10 +30,7 @@ class PolarLimb(NamedTuple):
 
 def _limbs() -> list[tuple[str, str, str, str, Axis, Axis]]:
     up, down = (0.0, 1.0, 0.0), (0.0, -1.0, 0.0)
-    limbs = [
-        ("torso", "", "pelvis", "neck", up, up),
-        ("head", "torso", "neck", "head", up, up),
-    ]
+    limbs = [("torso", "", "pelvis", "neck", up, up), ("head", "torso", "neck", "head", up, up)]
     for side, x in (("left", 1.0), ("right", -1.0)):
         out = (x, 0.0, 0.0)
         clavicle, arm, forearm = (f"{side}_{kind}" for kind in ("clavicle", "upper_arm", "forearm"))

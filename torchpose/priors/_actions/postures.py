@@ -118,6 +118,13 @@ def posture_root(joints: Float[Tensor, "*batch 15 3"]) -> Float[Tensor, "*batch 
 def state_postures(body: Body, state: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch 36"]:
     """Return the relative angles, degrees, of the states of a body.
 
+    Args:
+        body: of the joints of `BODY_15`.
+        state: [..., D], metres and quaternion vectors.
+
+    Returns:
+        Postures [..., 36], degrees.
+
     Raises:
         SkeletonError: a body of other joints than those of `BODY_15`.
     """
@@ -271,7 +278,9 @@ _ROOT_JOINTS = ("left_hip", "right_hip", "neck", "pelvis")
 
 
 class _Level(NamedTuple):
-    """Limbs of one depth. above: place of each one's parent among the carriers of the level before.
+    """Describes the limbs of one depth.
+
+    above: place of each one's parent among the carriers of the level before.
     carriers: places of those in the level that others hang on."""
 
     limbs: list[int]

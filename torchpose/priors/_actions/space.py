@@ -31,7 +31,7 @@ __all__ = ["ActionSpace"]
 
 
 class ActionSpace(nn.Module):
-    """The action model Gamma = (Omega, g, sigma_k) of aSpace, over postures of 36 angles in degrees.
+    """Holds the action model Gamma = (Omega, g, sigma_k) of aSpace, over postures of 36 angles in degrees.
 
     With phi a posture, z = (phi - m) U its projection on the first D principal axes (Omega),
     g_k the k-th posture of the synchronised mean performance and sigma_k its deviation (AS 1):
@@ -49,7 +49,7 @@ class ActionSpace(nn.Module):
         performance: g, [K, D]. std: sigma, [K, D]. match_std: root of Delta, [D]. All in degrees.
         variances: of the training postures along each axis, [D]. lost_variance: of all other
             directions together; degrees^2.
-        info: what it was fitted on.
+        info: facts about the fit.
 
     Buffers: the seven tensors.
 
@@ -128,7 +128,15 @@ class ActionSpace(nn.Module):
         prominence: float = 0.15,
         info: ActionInfo | None = None,
     ) -> "ActionSpace":
-        """Fit an action. Deprecated: `torchpose.learning.fit_action_space` takes the same arguments."""
+        """Fit an action. Deprecated: `torchpose.learning.fit_action_space` takes the same arguments.
+
+        Args:
+            performances, n_dimensions, name, fps, n_postures, prominence, info: as
+                `torchpose.learning.fit_action_space`.
+
+        Returns:
+            What that returns.
+        """
         # learning is a layer above: until this goes, it is looked up by its name
         fit = moved_function("ActionSpace.fit", "torchpose.learning.fit_action_space")
         space: ActionSpace = fit(
@@ -149,7 +157,15 @@ class ActionSpace(nn.Module):
         prominence: float = 0.15,
         info: ActionInfo | None = None,
     ) -> tuple["ActionSpace", Any]:
-        """Fit an action. Deprecated: `torchpose.learning._action_spaces.fit_synchronised`."""
+        """Fit an action. Deprecated: `torchpose.learning._action_spaces.fit_synchronised`.
+
+        Args:
+            performances, n_dimensions, name, fps, n_postures, prominence, info: as
+                `torchpose.learning._action_spaces.fit_synchronised`.
+
+        Returns:
+            What that returns.
+        """
         # as in `fit`
         home = "torchpose.learning._action_spaces.fit_synchronised"
         fit = moved_function("ActionSpace.fit_synchronised", home)
@@ -174,6 +190,12 @@ class ActionSpace(nn.Module):
     def with_dimensions(self, n_dimensions: int) -> "ActionSpace":
         """Return the same action in its first dimensions only.
 
+        Args:
+            n_dimensions: number of dimensions to keep, 1 to D.
+
+        Returns:
+            `ActionSpace` of that many dimensions.
+
         Raises:
             InputError: more than there are, or none.
         """
@@ -194,19 +216,49 @@ class ActionSpace(nn.Module):
     # --- postures and the subspace ----------------------------------------------------------------
 
     def project(self, postures: Float[Tensor, "*batch 36"]) -> Float[Tensor, "*batch D"]:
-        """Return z = (phi - m) U, degrees."""
+        """Project postures on the first D principal axes, z = (phi - m) U.
+
+        Args:
+            postures: phi [..., 36], degrees.
+
+        Returns:
+            z [..., D], degrees.
+
+        Raises:
+            ShapeError: other than 36 angles.
+        """
         check_shape("postures", postures, ["...", POSTURE_DIM])
         return (postures - self.mean) @ self.basis
 
     def reconstruct(self, z: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch 36"]:
-        """Return the posture m + U z, degrees."""
+        """Return the posture m + U z.
+
+        Args:
+            z: [..., D], degrees.
+
+        Returns:
+            [..., 36], degrees.
+
+        Raises:
+            ShapeError: another number of dimensions.
+        """
         check_shape("z", z, ["...", self.n_dimensions])
         return self.mean + z @ self.basis.mT
 
     # --- the gate ---------------------------------------------------------------------------------
 
     def log_match(self, z: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch K"]:
-        """Return log N(z; g_k, Delta) of every k, up to a constant that all share."""
+        """Return log N(z; g_k, Delta) for every posture k, up to a constant that all of them share.
+
+        Args:
+            z: [..., D], degrees.
+
+        Returns:
+            [..., K], natural logarithm.
+
+        Raises:
+            ShapeError: another number of dimensions.
+        """
         check_shape("z", z, ["...", self.n_dimensions])
         a, b = z / self.match_std, self.performance / self.match_std
         return a @ b.mT - 0.5 * b.square().sum(-1) - 0.5 * a.square().sum(-1, keepdim=True)
@@ -218,12 +270,28 @@ class ActionSpace(nn.Module):
 
         Args:
             z: [..., D]. generator: of the random numbers.
+
+        Returns:
+            Indices [...] from 0 to K - 1.
+
+        Raises:
+            ShapeError: another number of dimensions.
         """
         uniform = torch.rand(z.shape[:-1], generator=generator, dtype=z.dtype, device=z.device)
         return match_postures(self.log_match(z), uniform)
 
     def best_match(self, z: Float[Tensor, "*batch D"]) -> Int[Tensor, "*batch"]:
-        """Return the most likely posture of every z."""
+        """Return the most likely posture j of the mean performance for every z.
+
+        Args:
+            z: [..., D], degrees.
+
+        Returns:
+            Indices [...] from 0 to K - 1.
+
+        Raises:
+            ShapeError: another number of dimensions.
+        """
         return self.log_match(z).argmax(-1)
 
     def inside(
@@ -233,6 +301,12 @@ class ActionSpace(nn.Module):
 
         Args:
             z: [..., D]. j: [...]. width: of the gate, in sigma to either side; 2 as published.
+
+        Returns:
+            Bool [...].
+
+        Raises:
+            InputError: a width that is not positive.
         """
         check_gate_width(width)
         return ((z - self.performance[j]).abs() < width * self.std[j]).all(-1)
@@ -240,7 +314,17 @@ class ActionSpace(nn.Module):
     def clamp(
         self, z: Float[Tensor, "*batch D"], j: Int[Tensor, "*batch"], width: float = GATE_WIDTH
     ) -> Float[Tensor, "*batch D"]:
-        """Return the nearest point of the gate of posture j; z itself where it is inside."""
+        """Return the nearest point of the gate of posture j.
+
+        Args:
+            z: [..., D], degrees. j: [...]. width: of the gate, in sigma to either side.
+
+        Returns:
+            [..., D], degrees; z itself where it is inside.
+
+        Raises:
+            InputError: a width that is not positive.
+        """
         check_gate_width(width)
         centre = self.performance[j]
         return centre + clamp_offset(z - centre, self.std[j], width)
@@ -262,6 +346,9 @@ class ActionSpace(nn.Module):
         Args:
             postures: [..., 36], degrees. j: [...]. width: of the gate.
             rounds: 0 clamps once and leaves the angles as they come out, inside in any case.
+
+        Returns:
+            Postures [..., 36], degrees.
         """
 
         def clamp(angles: Tensor, width: float) -> Tensor:
@@ -284,6 +371,12 @@ class ActionSpace(nn.Module):
 
         Args:
             postures: [N, 36], degrees. width: of the gate. generator: for the matching.
+
+        Returns:
+            `Acceptance`, three shares from 0 to 1.
+
+        Raises:
+            InputError: no posture. ShapeError: other than 36 angles.
         """
         z = self.project(postures)
         if len(z) == 0:
@@ -298,7 +391,10 @@ class ActionSpace(nn.Module):
     # --- files ------------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> None:
-        """Write it as safetensors; the file appears whole or not at all.
+        """Write the action space as safetensors, atomically: an interrupted write leaves no partial file.
+
+        Args:
+            path: of the file, which is replaced.
 
         Raises:
             OutputError: the file cannot be written.
@@ -310,6 +406,12 @@ class ActionSpace(nn.Module):
     def load(cls, path: str | Path) -> "ActionSpace":
         """Read what `save` has written.
 
+        Args:
+            path: safetensors file.
+
+        Returns:
+            The action space, in float64.
+
         Raises:
             InputError: no such file. FileFormatError: damaged, or a file of another kind.
             SkeletonError: limbs of other names.
@@ -319,7 +421,14 @@ class ActionSpace(nn.Module):
             return cls(**tensors, info=info)
 
     def check_for(self, limbs: Sequence[str]) -> None:
-        """Raise `PriorError` unless the postures are of these limbs."""
+        """Check that postures are of the limbs that this action is of.
+
+        Args:
+            limbs: their names, in order.
+
+        Raises:
+            PriorError: other limbs, or another order.
+        """
         if tuple(limbs) != self.info.limbs:
             raise PriorError(
                 f"the action space {self.info.name!r} is of the limbs {', '.join(self.info.limbs)}, "

@@ -29,7 +29,7 @@ _SAME_CENTRE = 1e-6  # of a quaternion vector
 
 @dataclass(frozen=True)
 class ManifoldInfo:
-    """Facts about the fit of a manifold; fields that are not known are empty.
+    """Holds facts about the fit of a manifold; fields that are not known are empty.
 
     Attributes:
         name: of the manifold.
@@ -60,7 +60,15 @@ class ManifoldInfo:
 
     @classmethod
     def of_body(cls, body: Any, **facts: Unpack[ManifoldFacts]) -> ManifoldInfo:
-        """Return info with the skeleton, columns, frame and centres of a body, and other facts as given."""
+        """Return info with the skeleton, columns, frame and centres of a body.
+
+        Args:
+            body: a `torchpose.body.Body`.
+            **facts: other fields.
+
+        Returns:
+            `ManifoldInfo`.
+        """
         return cls(
             skeleton=tuple(body.skeleton.names),
             columns=tuple(f"{part} {axis}" for part in body.skeleton.parts[1:] for axis in "xyz"),
@@ -70,7 +78,15 @@ class ManifoldInfo:
         )
 
     def check_for(self, body: Any, dim: int) -> None:
-        """Raise `PriorError` unless poses of a body, of so many columns, are those of the manifold."""
+        """Check that poses of a body are poses of the manifold.
+
+        Args:
+            body: whose skeleton, frame and centres are compared.
+            dim: Q, number of columns of the manifold's poses.
+
+        Raises:
+            PriorError: another skeleton, frame, centres or number of columns.
+        """
         theirs = ManifoldInfo.of_body(body)
         found = []
         for name in ("skeleton", "columns", "frame"):
@@ -88,7 +104,15 @@ class ManifoldInfo:
             )
 
     def check_rate(self, fps: float, known: bool) -> None:
-        """Raise `PriorError` unless the standard deviations are known, and for this frame rate."""
+        """Check that the standard deviations are known, and for this frame rate.
+
+        Args:
+            fps: frames per second of the frames to be tracked.
+            known: whether the manifold has standard deviations.
+
+        Raises:
+            PriorError: there are none, or those of another frame rate.
+        """
         if not known:
             raise PriorError(
                 f"the manifold {self.name!r} has no standard deviations yet; call fit_gplvm_noise with "
@@ -101,11 +125,26 @@ class ManifoldInfo:
             )
 
     def with_noise(self, fps: float, growth: Mapping[str, float]) -> ManifoldInfo:
-        """Return the same with the frame rate of the standard deviations, and how they grow with time."""
+        """Return the same info with the frame rate of the standard deviations, and how they grow with time.
+
+        Args:
+            fps: frames per second.
+            growth: exponents g of "latent" (sigma x->z) and "step" (sigma x->x), see `noise_factors`.
+
+        Returns:
+            `ManifoldInfo`.
+        """
         return replace(self, fps=float(fps), extra={**self.extra, _GROWTH: dict(growth)})
 
     def noise_factors(self, fps: float, known: bool) -> tuple[float, float]:
-        """Return factors of sigma x->z and sigma x->x for another frame rate.
+        """Return the factors of sigma x->z and sigma x->x for another frame rate.
+
+        Args:
+            fps: frames per second.
+            known: whether the manifold has standard deviations.
+
+        Returns:
+            Both factors, (fps_0 / fps)^g with the exponent g of each.
 
         Raises:
             PriorError: as `check_rate`, if nothing says how they grow.
@@ -123,7 +162,13 @@ class ManifoldInfo:
 
     @classmethod
     def from_json(cls, text: str) -> ManifoldInfo:
-        """Read `to_json` back.
+        """Read what `to_json` has written.
+
+        Args:
+            text: JSON.
+
+        Returns:
+            `ManifoldInfo`.
 
         Raises:
             FileFormatError: not JSON, other fields, or values of another kind.

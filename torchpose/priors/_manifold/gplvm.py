@@ -33,7 +33,7 @@ LEAST_FRAMES = 10
 
 
 class MotionNoise(NamedTuple):
-    """Standard deviations per frame.
+    """Holds standard deviations per frame.
 
     Attributes:
         std_latent: sigma x->z [d] (MR 27). std_pose: sigma z->x [Q] (MR 30). std_step: sigma x->x [Q]
@@ -88,7 +88,7 @@ def join_sequences(
 
 
 class BackConstrainedGPLVM(nn.Module):
-    """Manifold of poses: x = f(z) + noise with f a Gaussian process, z = g(x).
+    """Holds a manifold of poses: x = f(z) + noise with f a Gaussian process, z = g(x).
 
     k(z, z') = beta exp(-gamma_z / 2 ||z - z'||^2) + beta_0   (MR 14)
     g_i(x) = sum_t a_ti exp(-gamma_x / 2 ||x - x_t||^2) + b_i   (MR 21, 22)
@@ -103,8 +103,8 @@ class BackConstrainedGPLVM(nn.Module):
         lengths: frames of each sequence in them [S].
         weights: a [T, d]. bias: b [d]. gamma_x: of (MR 22), one over squared units of the poses.
         kernel: beta, beta_0, gamma_z, sigma_z.
-        scale: what columns are divided by [Q]; ones in the published form.
-        info: what it was fitted on.
+        scale: divisor of every column [Q]; ones in the published form.
+        info: facts about the fit.
 
     Attributes:
         std_latent: sigma x->z [d] (MR 27). std_pose: sigma z->x [Q] (MR 30). std_step: sigma x->x
@@ -198,7 +198,15 @@ class BackConstrainedGPLVM(nn.Module):
         info: ManifoldInfo | None = None,
         progress: bool = False,
     ) -> BackConstrainedGPLVM:
-        """Fit a manifold. Deprecated: `torchpose.learning.fit_gplvm` takes the same arguments."""
+        """Fit a manifold. Deprecated: `torchpose.learning.fit_gplvm` takes the same arguments.
+
+        Args:
+            poses, latent_dim, gamma_x, steps, seed, optimiser, learning_rate, tolerance, n_init, smoothness,
+                standardise, validation, patience, info, progress: as `torchpose.learning.fit_gplvm`.
+
+        Returns:
+            What that returns.
+        """
         # learning is a layer above: until this goes, it is looked up by its name
         fit = moved_function("BackConstrainedGPLVM.fit", "torchpose.learning.fit_gplvm")
         manifold: BackConstrainedGPLVM = fit(
@@ -212,7 +220,14 @@ class BackConstrainedGPLVM(nn.Module):
     def fit_noise(
         self, poses: Float[Tensor, "T Q"] | Sequence[Float[Tensor, "_ Q"]], fps: float
     ) -> BackConstrainedGPLVM:
-        """Set the noise. Deprecated: `torchpose.learning.fit_gplvm_noise`, with the manifold first."""
+        """Set the noise. Deprecated: `torchpose.learning.fit_gplvm_noise`, with the manifold first.
+
+        Args:
+            poses, fps: as `torchpose.learning.fit_gplvm_noise`.
+
+        Returns:
+            This manifold.
+        """
         # as in `fit`
         fit = moved_function("fit_noise", "torchpose.learning.fit_gplvm_noise")
         manifold: BackConstrainedGPLVM = fit(self, poses, fps)
@@ -223,6 +238,12 @@ class BackConstrainedGPLVM(nn.Module):
 
         sigma(fps) = sigma (fps_0 / fps)^g of sigma x->z and x->x, g learnt with them; sigma z->x does
         not depend on the rate.
+
+        Args:
+            fps: frames per second.
+
+        Returns:
+            A copy; this manifold does not change.
 
         Raises:
             PriorError: no standard deviations, or a file that does not say how they grow.
@@ -240,6 +261,12 @@ class BackConstrainedGPLVM(nn.Module):
     def to_latent(self, x: Float[Tensor, "*batch Q"]) -> Float[Tensor, "*batch d"]:
         """Return latent points of poses, z = g(x)   (MR 21).
 
+        Args:
+            x: poses [..., Q].
+
+        Returns:
+            Latent points [..., d].
+
         Raises:
             ShapeError: another number of columns.
         """
@@ -250,6 +277,12 @@ class BackConstrainedGPLVM(nn.Module):
 
     def pose_mean(self, z: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch Q"]:
         """Return the mean pose of latent points, f(z) = X^T K^-1 k   (MR 25).
+
+        Args:
+            z: latent points [..., d].
+
+        Returns:
+            Poses [..., Q].
 
         Raises:
             ShapeError: another number of latent dimensions.
@@ -268,6 +301,9 @@ class BackConstrainedGPLVM(nn.Module):
         The variance is that of a pose, noise included, where (MR 26) is that of f(z) alone. It takes
         most of the time; `pose_mean` leaves it out.
 
+        Args:
+            z: latent points [..., d].
+
         Returns:
             Mean [..., Q], and the variance [...] that all columns share; where `scale` is not one,
             that of column q is `variance * scale[q]**2`.
@@ -280,17 +316,47 @@ class BackConstrainedGPLVM(nn.Module):
         return mean.reshape(*z.shape[:-1], self.dim), variance.reshape(z.shape[:-1])
 
     def reconstruct(self, x: Float[Tensor, "*batch Q"]) -> Float[Tensor, "*batch Q"]:
-        """Return the pose on the manifold that a pose leads to, f(g(x))."""
+        """Return the pose on the manifold that a pose is mapped to, f(g(x)).
+
+        Args:
+            x: poses [..., Q].
+
+        Returns:
+            Poses [..., Q].
+
+        Raises:
+            ShapeError: another number of columns.
+        """
         return self.pose_mean(self.to_latent(x))
 
     def reconstruction_error(self, x: Float[Tensor, "*batch Q"]) -> float:
-        """Return the root mean square of x - f(g(x)) over all columns."""
+        """Return the root mean square of x - f(g(x)) over all poses and columns.
+
+        Args:
+            x: poses [..., Q].
+
+        Returns:
+            Error in the unit of the columns.
+
+        Raises:
+            ShapeError: another number of columns.
+        """
         return float((x - self.reconstruct(x)).square().mean().sqrt())
 
     def forward(
         self, x: Float[Tensor, "*batch Q"]
     ) -> tuple[Float[Tensor, "*batch Q"], Float[Tensor, "*batch"]]:
-        """Return mean and variance of f(g(x))."""
+        """Return the mean and variance of the pose on the manifold that a pose is mapped to, f(g(x)).
+
+        Args:
+            x: poses [..., Q].
+
+        Returns:
+            Mean [..., Q] and variance [...], as `to_pose`.
+
+        Raises:
+            ShapeError: another number of columns.
+        """
         return self.to_pose(self.to_latent(x))
 
     # --- what it is
@@ -336,7 +402,10 @@ class BackConstrainedGPLVM(nn.Module):
         )
 
     def save(self, path: str | Path) -> None:
-        """Write it as safetensors.
+        """Write the manifold as safetensors, atomically: an interrupted write leaves no partial file.
+
+        Args:
+            path: of the file, which is replaced.
 
         Raises:
             OutputError: the file cannot be written. PriorError: `info.extra` is not JSON.
@@ -346,6 +415,12 @@ class BackConstrainedGPLVM(nn.Module):
     @classmethod
     def load(cls, path: str | Path) -> BackConstrainedGPLVM:
         """Read what `save` has written.
+
+        Args:
+            path: safetensors file.
+
+        Returns:
+            The manifold, in float64.
 
         Raises:
             InputError: no such file. FileFormatError: truncated, or of another kind.
@@ -377,7 +452,7 @@ class BackConstrainedGPLVM(nn.Module):
         return Prepared(self.latents, *(getattr(self, f"_{name}") for name in Prepared._fields[1:]))
 
     def _prepare(self) -> None:
-        """Return what prediction needs and follows from the rest."""
+        """Return the tensors that prediction needs and that follow from the fit."""
         for name, value in gplvm_prediction.prepare(self.poses, self._fitted)._asdict().items():
             own = name if name == "latents" else f"_{name}"
             self.register_buffer(own, value.to(self.poses.dtype), persistent=False)

@@ -54,7 +54,7 @@ class KernelParameters(NamedTuple):
 def rbf_rows(
     centres: Float[Tensor, "T D"], gamma: Float[Tensor, ""], log_scale: Float[Tensor, ""]
 ) -> Float[Tensor, "D+2 T"]:
-    """Return what `rbf_with_rows` needs of the centres, computed once.
+    """Return the terms of `rbf_with_rows` that depend on the centres alone, computed once.
 
     The exponent log s - gamma / 2 ||x - c||^2 is the product of [gamma x, -gamma / 2 ||x||^2, 1]
     with a column [c, 1, log s - gamma / 2 ||c||^2].
@@ -98,7 +98,7 @@ def covariance(latents: Float[Tensor, "T d"], kernel: KernelParameters) -> Float
 
 
 class Prepared(NamedTuple):
-    """Tensors that follow from a fit and stay the same for every pose.
+    """Holds the tensors that follow from a fit and stay the same for every pose.
 
     Attributes:
         latents: z of the training poses [T, d]. mean: of these poses [Q].
@@ -117,7 +117,7 @@ class Prepared(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """Parameters and points that a fit has found.
+    """Holds the parameters and points that a fit has found.
 
     Attributes:
         scale: of columns [Q]. weights: a [T, d]. bias: b [d]. gamma_x: of (MR 22).

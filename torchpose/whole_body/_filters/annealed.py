@@ -34,7 +34,7 @@ _LAYERS, _SURVIVAL = 5, 0.5
 
 
 class Annealing(NamedTuple):
-    """The particles of the last layer, and the exponents and survival rates of all.
+    """Holds the particles of the last layer, and the exponents and survival rates of all.
 
     Attributes:
         particles: [B, N, D]. log_weights: normalised [B, N]; NaN where all particles died.
@@ -92,7 +92,7 @@ def anneal(
 
 
 class AnnealedParticleFilter(SilhouetteParticleFilter):
-    """Annealed particle filter: in every frame, layers from a broad to a peaked likelihood.
+    """Filters by annealing: in every frame, layers from a broad to a peaked likelihood.
 
     Each frame starts from the particles of the last, resampled. Layer m = 0, ..., M - 1:
         x ~ N(x, alpha^m diag(process_cov)),   w_n = p(I_t | x_n)^beta_m / sum_j p(I_t | x_j)^beta_m
@@ -112,7 +112,7 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
         survival_rate: alpha of every layer, at least 2 / N.
         schedule: M exponents, instead of those solved from the survival rate.
         noise_decay: factor of the noise's covariance per layer; alpha if None.
-        options: as `SilhouetteParticleFilter`.
+        **options: as `SilhouetteParticleFilter`.
 
     Raises:
         InputError, ShapeError: an argument is not as described.
@@ -154,13 +154,29 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
 
     @classmethod
     def likelihoods_per_particle(cls, options: Mapping[str, Any]) -> int:
-        """Return the number of layers."""
+        """Return the number of likelihoods that one particle costs in a frame: the number of layers.
+
+        Args:
+            options: of the filter, as given to it.
+
+        Returns:
+            Number of likelihoods for each particle and frame.
+        """
         return options.get("n_layers", _LAYERS)
 
     def move(
         self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
-        """Anneal from the resampled particles of the last frame."""
+        """Anneal from the resampled particles of the last frame.
+
+        Args:
+            state: of the last frame, with resampled particles and the filter's memory of them.
+            frame: the observation of the frame.
+            generator: one generator, or a list of one for each element.
+
+        Returns:
+            `WeightedParticles` [B, N, D] of the next frame.
+        """
         run = self.anneal(state.particles, frame.score, frame.seen, generator)
         no_evidence = torch.full_like(run.log_weights[:, 0], torch.nan)
         return WeightedParticles(run.particles, run.log_weights, no_evidence)
@@ -172,7 +188,17 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
         seen: Bool[Tensor, " B"],
         generator: Generators,
     ) -> Annealing:
-        """Run the layers of one frame, and return the last with the exponents and survival rates."""
+        """Run the layers of one frame.
+
+        Args:
+            particles: [B, N, D], resampled, of the last frame.
+            score: log-likelihood [B, N] of particles.
+            seen: [B], whether a camera sees the person of an element.
+            generator: one generator, or a list of one for each element.
+
+        Returns:
+            `Annealing` with the last layer, and the exponents and survival rates of all.
+        """
 
         def diffuse(particles: Tensor, layer: int) -> Tensor:
             std = self.step_std * self.noise_decay ** (layer / 2)

@@ -35,7 +35,7 @@ Likelihood = Callable[[Tensor, Tensor], Tensor]
 
 
 class Frame(NamedTuple):
-    """Observation of one frame, and the score of states under it.
+    """Holds the observation of one frame, and the score of states under it.
 
     Attributes:
         score: states [B, N, D] -> sharpened log-likelihood [B, N], float64; 0 in elements that nobody
@@ -98,7 +98,7 @@ def see_frame(
 
 
 def _sharpened(raw: Score, sharpness: float, seen: Bool[Tensor, " B"]) -> Score:
-    """Return the likelihood with its exponent, and 0 for elements that nobody sees."""
+    """Return the log-likelihood times its exponent; 0 for elements without a silhouette."""
     nobody = not bool(seen.any())
 
     def score(states: Tensor) -> Tensor:

@@ -40,7 +40,7 @@ _LISTED = 8  # frames that a warning names
 
 @runtime_checkable
 class PoseSpace(Protocol):
-    """Protocol of the bodies that filters track; `torchpose.body.Body` has it.
+    """Declares what filters need of a body that they track; `torchpose.body.Body` has it.
 
     Attributes:
         dim: D. perturb(state, step): the state moved by a step, both [..., D].
@@ -58,7 +58,7 @@ class PoseSpace(Protocol):
 
 
 class WeightingOptions(TypedDict, total=False):
-    """The options of `SilhouetteParticleFilter` but for its noise."""
+    """Declares the options of `SilhouetteParticleFilter` but for its noise."""
 
     likelihood: str | Likelihood
     sharpness: float
@@ -73,14 +73,14 @@ class WeightingOptions(TypedDict, total=False):
 
 
 class BodyFilterOptions(WeightingOptions, total=False):
-    """The options of `SilhouetteParticleFilter`, which every filter over body poses has."""
+    """Declares the options of `SilhouetteParticleFilter`, which every filter over body poses has."""
 
     process_cov: Tensor | float | None
     step_std: Tensor | float | None
 
 
 class BodyFilterOutput(NamedTuple):
-    """Estimates of a sequence; [T, ...] from one sequence, [B, T, ...] from a batch, [B, ...] of a step.
+    """Holds the estimates of a sequence [T, ...], of a batch [B, T, ...], or of a step [B, ...].
 
     A filter over bodies that fails goes on: in the frames of `respread` its particles are drawn anew.
 
@@ -117,7 +117,14 @@ class BodyFilterOutput(NamedTuple):
         return self.respread.any(-1)
 
     def element(self, index: int) -> "BodyFilterOutput":
-        """Return the track of one element of a batch."""
+        """Return the track of one element of a batch.
+
+        Args:
+            index: of the element, 0 to B - 1.
+
+        Returns:
+            `BodyFilterOutput` without the batch dimension.
+        """
         parts: dict[str, Any] = {name: getattr(self, name)[index] for name in self._fields[:-1]}
         return BodyFilterOutput(
             **parts, details={n: value[index] for n, value in self.details.items()}
@@ -125,7 +132,7 @@ class BodyFilterOutput(NamedTuple):
 
 
 class BodyFilterState(NamedTuple):
-    """Weighted particles after a step, before they are resampled.
+    """Holds weighted particles after a step, before they are resampled.
 
     Attributes:
         particles: [B, N, D]. log_weights: normalised, [B, N], float64. mean: last estimate [B, D].
@@ -143,7 +150,7 @@ class BodyFilterState(NamedTuple):
 
 
 class WeightedParticles(NamedTuple):
-    """The particles of a new frame, as `SilhouetteParticleFilter.move` returns them.
+    """Holds the particles of a new frame, as `SilhouetteParticleFilter.move` returns them.
 
     Attributes:
         particles: [B, N, D]. log_weights: normalised [B, N], float64; NaN in an element whose particles
@@ -202,7 +209,12 @@ def reweight(
     xi_n = pi_n omega_n / sum_j pi_j omega_j,   log p(I_t | I_1:t-1) = log sum_n omega_n pi_n / sum_n omega_n
 
     Args:
-        log_prior: omega, of the prediction, normalised or not. log_likelihood: pi.
+        particles: [B, N, D].
+        log_prior: log omega [B, N], of the prediction, normalised or not.
+        log_likelihood: log pi [B, N].
+
+    Returns:
+        `WeightedParticles`; the log-evidence is -inf where all particles died.
 
     Reference: (MR 5), (MR 9)-(MR 11).
     """

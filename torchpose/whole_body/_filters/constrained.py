@@ -52,7 +52,7 @@ _REJECTED = (
 
 
 class ConstrainedParticleFilter(SilhouetteParticleFilter):
-    """First-order motion, of which only postures of a known action are let through (aSpace).
+    """Filters by first-order motion, of which only postures of a known action are let through (aSpace).
 
     In frame t, for each particle s,
         phi^_s = phi_s + V_{t-1} + eta(sigma_phi)                                        (AS 3)
@@ -91,7 +91,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         posture_body: see `PostureGate`.
         fps: of the frames to be tracked, to which a bank's transitions are rescaled (`repr` says from
             which); that of its performances if None. One action is the same at any frame rate.
-        options: as `SilhouetteParticleFilter`; `process_cov` is sigma_phi^2 (`constant_velocity_std`), and
+        **options: as `SilhouetteParticleFilter`; `process_cov` is sigma_phi^2 (`constant_velocity_std`), and
             ``likelihood="overlap"`` the published one.
 
     Raises:
@@ -139,7 +139,14 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
     # --- what is remembered
 
     def first_memory(self, particles: Float[Tensor, "B N D"]) -> Tensor | None:
-        """Return the action of every particle [B, N], or its own number, by which copies are known."""
+        """Return the action of every new particle, or its index, by which its copies are recognised.
+
+        Args:
+            particles: [B, N, D], metres and quaternion vectors.
+
+        Returns:
+            [B, N] integers; None where neither is needed.
+        """
         batch, n = particles.shape[:2]
         if self.gate is not None and self.gate.several:
             return self.gate.first_actions(batch, n)
@@ -148,7 +155,14 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         return None
 
     def first_trend(self, mean: Float[Tensor, "B D"]) -> Tensor:
-        """Return the velocity, and the estimate before the last: [B, 2, D]."""
+        """Return the velocity, zero, and the estimate before the first frame.
+
+        Args:
+            mean: the first estimate [B, D].
+
+        Returns:
+            [B, 2, D], in the units of a step and of the state.
+        """
         return torch.stack([torch.zeros_like(mean), mean], 1)
 
     # --- a frame
@@ -156,7 +170,16 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
     def move(
         self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
-        """Predict within the action, weigh by the image."""
+        """Predict within the action (AS 3, 6), then weigh by the image (AS 7).
+
+        Args:
+            state: of the last frame, with resampled particles and the filter's memory of them.
+            frame: the observation of the frame.
+            generator: one generator, or a list of one for each element.
+
+        Returns:
+            `WeightedParticles` [B, N, D] of the next frame.
+        """
         trend = self._trend(state)
         batch, n, dim = state.particles.shape
         rows = Rows.all(batch, n, generator, state.particles.device)
@@ -178,7 +201,11 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         return moved._replace(memory=memory, trend=trend, details=details)
 
     def warn(self, track: BodyFilterOutput) -> None:
-        """Warn of the frames in which all particles died, or the gate rejected every draw."""
+        """Warn of the frames in which all particles died, or the gate rejected every draw.
+
+        Args:
+            track: of a batch, [B, T, ...].
+        """
         super().warn(track)
         warn_of_frames(track.details["clamped"] == 1, _REJECTED)
 
@@ -188,7 +215,14 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         return () if self.gate is None or not self.gate.several else tuple(self.gate.action.names)
 
     def notes(self, track: BodyFilterOutput, first_frame: int = 0) -> tuple[str, ...]:
-        """Return what the gate let through, and when it was released, in plain words."""
+        """Report the share of draws that the gate accepted, and when it was released.
+
+        Args:
+            track: of one sequence, [T, ...]. first_frame: number of its first frame.
+
+        Returns:
+            Sentences, none if there is nothing to report.
+        """
         if self.gate is None:
             return ()
         accepted, clamped = track.details["acceptance"], track.details["clamped"]
@@ -213,7 +247,14 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
 
     @classmethod
     def tracking_options(cls, body: Any, fps: float, learnt: Any = None) -> dict[str, Any]:
-        """Return twice the usual error of a constant velocity, and the published likelihood."""
+        """Return the options of tracking: twice the error of a constant velocity, the published likelihood.
+
+        Args:
+            body: that is tracked. fps: frames per second. learnt: the model that the filter needs, if any.
+
+        Returns:
+            Keyword arguments of the filter.
+        """
         step = torch.empty(body.dim, dtype=torch.float64)
         step[:3], step[3:6], step[6:] = _TRACKING_STD
         return {

@@ -30,7 +30,7 @@ _DIED = (
 
 
 class BodyFilterHooks(nn.Module, ABC):
-    """What `SilhouetteParticleFilter` and `BodyTracker` ask of a filter.
+    """Defines what `SilhouetteParticleFilter` and `BodyTracker` ask of a filter.
 
     Attributes:
         body: whose poses are tracked. step_std: standard deviations of the diffusion per frame [D].
@@ -50,20 +50,46 @@ class BodyFilterHooks(nn.Module, ABC):
         """Return weighted particles of the next frame from those of the last.
 
         Args:
-            state: of the last frame, its particles resampled if that was due, with what was remembered
-                of them. frame: what is seen. generator: for what is drawn.
+            state: of the last frame, with resampled particles and the filter's memory of them.
+            frame: the observation of the frame.
+            generator: one generator, or a list of one for each element.
+
+        Returns:
+            `WeightedParticles` [B, N, D] of the next frame.
         """
 
     def first_memory(self, particles: Float[Tensor, "B N D"]) -> Tensor | None:
-        """Return what is remembered of new particles, [B, N, ...]; nothing by default."""
+        """Return what the filter remembers of new particles beside their states; nothing by default.
+
+        Args:
+            particles: [B, N, D], metres and quaternion vectors.
+
+        Returns:
+            [B, N, ...], or None.
+        """
         return None
 
     def first_trend(self, mean: Float[Tensor, "B D"]) -> Tensor | None:
-        """Return what is remembered of an element before its first frame, [B, ...]; nothing by default."""
+        """Return what the filter remembers of an element before its first frame; nothing by default.
+
+        Args:
+            mean: the first estimate [B, D].
+
+        Returns:
+            [B, ...], or None.
+        """
         return None
 
     def swap_memory(self, memory: Tensor, swapped: Bool[Tensor, "B N"]) -> Tensor:
-        """Return the memory of particles of which some have exchanged their legs; the same by default."""
+        """Return the memory of particles of which some have exchanged their legs; the same by default.
+
+        Args:
+            memory: of the particles, as in the state.
+            swapped: [B, N], True where a particle has exchanged its legs.
+
+        Returns:
+            Memory of the same shape.
+        """
         return memory
 
     def spread(
@@ -73,32 +99,61 @@ class BodyFilterHooks(nn.Module, ABC):
         mean: Float[Tensor, "B D"],
         memory: Tensor | None,
     ) -> Float[Tensor, "B D"]:
-        """Return the standard deviation about the estimate, in the units of a step."""
+        """Return the standard deviation about the estimate, in the units of a step.
+
+        Args:
+            particles: [B, N, D]. log_weights: normalised, [B, N]. mean: the estimate [B, D].
+            memory: of the particles, as in the state.
+
+        Returns:
+            [B, D], metres for the root's position, sines of half angles for rotations.
+        """
         return particle_std(self.body, particles, log_weights, mean)
 
     def joint_covariance(
         self, state: BodyFilterState, mean: Float[Tensor, "B D"]
     ) -> Float[Tensor, "B J 3 3"]:
-        """Return the second moment of the joints of a `Body` about those of an estimate, metres squared."""
+        """Return the second moment of the joints of a `Body` about those of an estimate.
+
+        Args:
+            state: weighted particles after a step. mean: the estimate [B, D].
+
+        Returns:
+            [B, J, 3, 3], square metres, world axes.
+        """
         return joint_covariance(self.body, state, mean)  # type: ignore[arg-type]
 
     def warn(self, track: BodyFilterOutput) -> None:
-        """Warn of the frames of a track [B, T] in which the filter degenerated."""
+        """Warn of the frames of a track in which the filter degenerated.
+
+        Args:
+            track: of a batch, [B, T, ...].
+        """
         warn_of_frames(track.respread, _DIED)
 
     # --- how `BodyTracker` sets a filter up; a subclass may say otherwise
 
     @classmethod
     def likelihoods_per_particle(cls, options: Mapping[str, Any]) -> int:
-        """Return how many likelihoods of whole bodies one particle costs in a frame."""
+        """Return the number of likelihoods of whole bodies that one particle costs in a frame.
+
+        Args:
+            options: of the filter, as given to it.
+
+        Returns:
+            Number of likelihoods for each particle and frame.
+        """
         return 1
 
     @classmethod
     def tracking_options(cls, body: Any, fps: float, learnt: Any = None) -> dict[str, Any]:
-        """Return the options that `BodyTracker` gives the filter where it is given none itself.
+        """Return the options that `BodyTracker` passes to the filter where the user sets none.
 
         Args:
-            body: that is tracked. fps: frames per second. learnt: what the filter needs, if anything.
+            body: that is tracked. fps: frames per second. learnt: the model that the filter needs, if any.
+
+        Returns:
+            Keyword arguments of the filter.
         """
         return {"process_cov": default_step_std(body, fps).square(), "sharpness": _SHARPNESS}
 
@@ -117,5 +172,12 @@ class BodyFilterHooks(nn.Module, ABC):
         return ()
 
     def notes(self, track: BodyFilterOutput, first_frame: int = 0) -> tuple[str, ...]:
-        """Return what is to be said of a track [T], whose first frame has this number."""
+        """Report what is notable about a track; nothing by default.
+
+        Args:
+            track: of one sequence, [T, ...]. first_frame: number of its first frame.
+
+        Returns:
+            Sentences, none if there is nothing to report.
+        """
         return ()

@@ -77,7 +77,7 @@ def exchange_legs(body: Body, states: Float[Tensor, "*batch D"]) -> Float[Tensor
 
 
 def extra_copies(ancestors: Int[Tensor, "B N"]) -> Bool[Tensor, "B N"]:
-    """Tell which particles are copies beside the first one of the same ancestor.
+    """Return which particles are further copies of an ancestor, after the first one.
 
     Args:
         ancestors: of the resampled particles, in any order.

@@ -40,7 +40,7 @@ _ROOT = 6  # columns of a state: position and orientation of the root
 
 
 class PartGroup(NamedTuple):
-    """Parts of as many limbs each, that are counted at once.
+    """Holds parts with the same number of limbs, whose pixels are counted at once.
 
     Attributes:
         parts: G places among the parts without the root. limbs: [G][K] limbs of each.
@@ -246,7 +246,7 @@ def _limbs_of_parts(skeleton: BodySkeleton) -> list[tuple[int, ...]]:
 
 
 def _opposing_parts(skeleton: BodySkeleton) -> list[int]:
-    """Return the same part on the other side, without the root; a part in the middle is its own."""
+    """Return the index of each part's counterpart on the other side, its own in the middle; no root."""
     names = list(skeleton.parts)[1:]
     others = [other_side(name) for name in names]
     return [names.index(o) if o in names else i for i, o in enumerate(others)]

@@ -30,7 +30,7 @@ _LEAST_STD = 1e-3  # of sigma z->x: the twist of a limb, which no joint shows, d
 
 @runtime_checkable
 class PoseManifold(Protocol):
-    """Protocol of the manifolds that the filter takes, as `torchpose.priors.BackConstrainedGPLVM`.
+    """Declares what the filter needs of a manifold, such as `torchpose.priors.BackConstrainedGPLVM`.
 
     Attributes:
         to_latent(x): g(x), [..., Q] -> [..., d] (MR 21). pose_mean(z): f(z), [..., d] -> [..., Q]
@@ -50,7 +50,7 @@ class PoseManifold(Protocol):
 
 
 class ManifoldParticleFilter(SilhouetteParticleFilter):
-    """Particles that are also weighted by their distance from a learnt manifold of poses (MRPF).
+    """Filters by particles that are also weighted by their distance from a learnt manifold of poses (MRPF).
 
     Algorithm 1, in frame t, for each particle n, with S_xx = diag(sigma x->x^2) and S_zx alike:
         z_n ~ N(g(x_{t-1}), diag(sigma x->z^2))                                        (MR 27)
@@ -84,7 +84,7 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
             form holds poses so close to the manifold that they fall behind.
         fps: of the frames to be tracked; the manifold must have its noise for that rate. None if it
             does not matter.
-        options: as `SilhouetteParticleFilter`. `process_cov` [D] is the root's and sigma x->x^2; that of
+        **options: as `SilhouetteParticleFilter`. `process_cov` [D] is the root's and sigma x->x^2; that of
             the manifold's own `std_step` (and `default_step_std` for the root) if None.
 
     Raises:
@@ -122,7 +122,14 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
     def tracking_options(
         cls, body: Any, fps: float, learnt: PoseManifold | None = None
     ) -> dict[str, Any]:
-        """Return the usual options, with twice the noise of the manifold."""
+        """Return the options of tracking: the usual ones, with twice the noise of the manifold.
+
+        Args:
+            body: that is tracked. fps: frames per second. learnt: the model that the filter needs, if any.
+
+        Returns:
+            Keyword arguments of the filter.
+        """
         options = super().tracking_options(body, fps)
         if learnt is not None:
             options["process_cov"] = _process_cov(body, learnt, fps, _TRACKING_STEP)
@@ -131,7 +138,16 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
     def move(
         self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
-        """Take steps 3 to 7 of Algorithm 1."""
+        """Take steps 3 to 7 of Algorithm 1: draw targets, propose, weigh by the manifold and the image.
+
+        Args:
+            state: of the last frame, with resampled particles and the filter's memory of them.
+            frame: the observation of the frame.
+            generator: one generator, or a list of one for each element.
+
+        Returns:
+            `WeightedParticles` [B, N, D] of the next frame.
+        """
         particles, seen = state.particles, frame.seen
         before = particles.index_select(-1, self.columns)
         target = self.draw_targets(before, generator)
@@ -146,7 +162,15 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
     def draw_targets(
         self, before: Float[Tensor, "B N Q"], generator: Generators
     ) -> Float[Tensor, "B N Q"]:
-        """Return f(z) of a latent point z of each particle, drawn by (MR 27)."""
+        """Draw a latent point z of each particle (MR 27), and return its pose f(z).
+
+        Args:
+            before: relative columns [B, N, Q] of the last frame.
+            generator: one generator, or a list of one for each element.
+
+        Returns:
+            Relative columns [B, N, Q], quaternion vectors.
+        """
         latent = self.manifold.to_latent(before.to(self.manifold.std_latent.dtype))
         noise = standard_normal(len(latent), latent.shape[1:], generator, latent)
         latent = latent + noise * self.manifold.std_latent.to(latent)
@@ -190,7 +214,7 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
 def _process_cov(
     body: PoseSpace, manifold: PoseManifold, fps: float = 60.0, scale: float = 1.0
 ) -> Float[Tensor, " D"]:
-    """Return the variances [D] of the root by default, and of the parts by so many times sigma x->x."""
+    """Return the variances [D]: the root's by default, and of the parts (factor x sigma x->x) squared."""
     std = default_step_std(body, fps)
     columns = torch.as_tensor(body.relative_columns, dtype=torch.long)  # type: ignore[attr-defined]
     std[columns.to(std.device)] = scale * manifold.std_step.detach().to(std)

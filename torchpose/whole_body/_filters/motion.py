@@ -43,6 +43,12 @@ def default_step_std(body: PoseSpace, fps: float = _RATE) -> Float[Tensor, " D"]
 
     Args:
         body: of D columns. fps: frames per second.
+
+    Returns:
+        [D], standard deviation per frame: metres, and sines of half angles.
+
+    Raises:
+        InputError: a frame rate that is not positive.
     """
     std = torch.full((body.dim,), _PART_STD, dtype=torch.float64)
     std[:3], std[3:6] = _POSITION_STD, _HEADING_STD
@@ -57,9 +63,13 @@ def motion_std(
     Its square is a `process_cov` of the filters.
 
     Args:
+        body: of D columns, which tells how rotations differ.
         states: one sequence [T, D], or several. Frames with NaN are passed over.
         floor: no element is smaller. The twist of a limb, which no joint shows, does not vary in
             recorded states: with 0 it stays as it is.
+
+    Returns:
+        [D], standard deviation per frame: metres, and sines of half angles.
 
     Raises:
         InputError: no two frames that follow each other.
@@ -186,10 +196,12 @@ def constant_velocity_std(
     e is taken per entry and over all frames of all sequences.
 
     Args:
+        body: of D columns, which tells how rotations differ.
         sequences: states [T, D] of one sequence, or of several. Frames with NaN are passed over.
-        fps: of the sequences. target_fps: of the frames to be tracked. Where it is lower the model
+        fps: of the sequences.
+        target_fps: of the frames to be tracked; None is the same rate. Where it is lower the model
             predicts over as many frames at a time; what is left, and higher rates, go by
-            `rescale_std`. None: the same rate.
+            `rescale_std`.
         velocity_rate: a of V (`next_velocity`); 0 is plain constant velocity. With the rate of the
             filter the noise also covers how far its velocity lags behind.
         floor: no entry is smaller. The twist of a limb, which no joint shows, does not vary in
@@ -240,7 +252,7 @@ def rescale_std(
 
 
 def _errors(body: PoseSpace, states: Tensor, rate: float) -> Tensor:
-    """Return what is missed in every frame but the first two, [T - 2, D]."""
+    """Return the prediction errors in every frame but the first two, [T - 2, D]."""
     velocity = body.difference(states[1:-1], states[:-2])
     if rate > 0:
         velocity = _smoothed(velocity, rate)

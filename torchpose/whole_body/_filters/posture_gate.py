@@ -26,7 +26,7 @@ Actions = Int[Tensor, " R"] | None
 
 
 class Rows(NamedTuple):
-    """Some rows of a batch of particles laid out one after the other.
+    """Holds some rows of a batch of particles laid out one after the other.
 
     Attributes:
         at: [r], row of the R = B N particles, rising. element: [r], which of the B each belongs to.
@@ -49,7 +49,7 @@ class Rows(NamedTuple):
         return self._replace(at=self.at[kept], element=self.element[kept])
 
     def repeated(self, times: int) -> "Rows":
-        """Return every row so many times in turn."""
+        """Return every row `times` times in turn."""
         if times == 1:
             return self
         at, element = (x.repeat_interleave(times) for x in (self.at, self.element))
@@ -77,7 +77,7 @@ class Rows(NamedTuple):
 
 
 class Redrawn(NamedTuple):
-    """The states that were drawn for each of R rows.
+    """Holds the states that were drawn for each of R rows.
 
     Attributes:
         states: [R, D], the first accepted draw, or the last one where none was.
@@ -149,13 +149,13 @@ def redraw_until_accepted(
 
 
 def all_accepted(states: Float[Tensor, "R D"]) -> Redrawn:
-    """Return what `redraw_until_accepted` does where there is nothing to accept."""
+    """Return the result of `redraw_until_accepted` for states without a gate: all accepted at first."""
     yes = torch.ones(len(states), dtype=torch.bool, device=states.device)
     return Redrawn(states, yes, yes, yes.long(), yes.double())
 
 
 class _Block(NamedTuple):
-    """The first accepted of several draws for each row (else the last one), and how many were so far."""
+    """Holds the first accepted draw of each row (else the last one), and the number of draws so far."""
 
     states: Tensor
     total: Tensor
@@ -172,12 +172,12 @@ def _block(
 
 
 def _place(total: Tensor, wanted: int) -> Tensor:
-    """Return the number of draws until so many were accepted, or all of them [r]."""
+    """Return the number of draws [r] until `wanted` were accepted, or all draws."""
     return (total < wanted).sum(1).add_(1).clamp_max_(total.shape[1])
 
 
 class PostureGate(nn.Module):
-    """Gate that accepts states of an action, and finds the nearest ones that it accepts.
+    """Accepts states of an action, and finds the nearest accepted ones of others.
 
     The relative angles of a state are projected, a posture j of the mean performance is drawn for them
     (its match), and they are let through if they lie within two deviations of it in all dimensions
@@ -245,7 +245,7 @@ class PostureGate(nn.Module):
     def log_evidence(
         self, states: Float[Tensor, "B N D"], actions: Int[Tensor, "B N"], fps: float | None
     ) -> Float[Tensor, "B N"]:
-        """Return how likely postures are under their own actions, to the power that a frame counts, float64.
+        """Return the log-likelihood of postures under their own actions, times the share of a frame, float64.
 
         The gate only says yes or no, which hardly tells actions apart that begin alike.
         """

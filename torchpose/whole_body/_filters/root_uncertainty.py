@@ -70,7 +70,7 @@ _ROOT = 6  # columns of a state: position and orientation of the root
 
 
 class RootUncertaintyTracker(SilhouetteParticleFilter):
-    """Root hypotheses by sampling, and for each of them a Gaussian over every part's rotation.
+    """Tracks root hypotheses by sampling, and for each of them a Gaussian over every part's rotation.
 
     X_n = {x_r, mu_1, Sigma_1, ..., mu_{P-1}, Sigma_{P-1}, w}. In every frame the root diffuses,
     x_r <- x_r + N(0, process_cov), and the parts' covariances grow (DX 13-14). Seven sigma points of
@@ -106,7 +106,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         first_std: of every part at the start, and where all hypotheses died.
         weighting: "parts" (DX 12), or "body": the likelihood of the whole body at the posterior
             means, one more evaluation for each hypothesis.
-        options: as `SilhouetteParticleFilter`, but `estimate` is "map" by default, the means of the
+        **options: as `SilhouetteParticleFilter`, but `estimate` is "map" by default, the means of the
             hypothesis of the largest weight, and `limit_mode` "discard"; only the root's part of
             `process_cov` counts, `likelihood` only with ``weighting="body"``, and `sharpness` cancels.
 
@@ -161,12 +161,26 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
 
     @classmethod
     def likelihoods_per_particle(cls, options: Mapping[str, Any]) -> int:
-        """Return those of the places of all parts, and of the whole body where it is weighed."""
+        """Return the number of likelihoods that one hypothesis costs: its sigma points, and the whole body.
+
+        Args:
+            options: of the filter, as given to it.
+
+        Returns:
+            Number of likelihoods for each particle and frame.
+        """
         return _POINTS + (options.get("weighting") == "body")
 
     @classmethod
     def tracking_options(cls, body: Any, fps: float, learnt: Any = None) -> dict[str, Any]:
-        """Return the default diffusion of the root, and legs that are exchanged now and then."""
+        """Return the options of tracking: the default diffusion of the root, and legs exchanged now and then.
+
+        Args:
+            body: that is tracked. fps: frames per second. learnt: the model that the filter needs, if any.
+
+        Returns:
+            Keyword arguments of the filter.
+        """
         return {"process_cov": default_step_std(body, fps).square(), "leg_swap": _TRACKING_SWAP}
 
     def start_std(self) -> Float[Tensor, " D"]:
@@ -176,7 +190,14 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         return spread
 
     def first_memory(self, particles: Float[Tensor, "B N D"]) -> Float[Tensor, "B N V 3 3"]:
-        """Return the covariances of the parts of new hypotheses."""
+        """Return the covariances of the parts of new hypotheses.
+
+        Args:
+            particles: [B, N, D], metres and quaternion vectors.
+
+        Returns:
+            [B, N, P - 1, 3, 3], squares of sines of half angles.
+        """
         eye = torch.eye(3, dtype=particles.dtype, device=particles.device)
         shape = (*particles.shape[:2], self.conditionals.tree.n_nodes, 3, 3)
         return (self.first_std**2 * eye).expand(shape).clone()
@@ -184,7 +205,16 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
     def move(
         self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
-        """Diffuse, observe, pass messages and weigh."""
+        """Diffuse the roots, observe the parts, pass messages and weigh (DX 4-14).
+
+        Args:
+            state: of the last frame, with resampled particles and the filter's memory of them.
+            frame: the observation of the frame.
+            generator: one generator, or a list of one for each element.
+
+        Returns:
+            `WeightedParticles` [B, N, D] of the next frame.
+        """
         roots = self._diffuse_roots(state.particles, generator)
         mean = roots[..., _ROOT:].unflatten(-1, (-1, 3))
         covariance = self.conditionals.diffuse(mean, self._memory(state))[1]
@@ -209,6 +239,13 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         """Return covariances with those of the legs exchanged; left and right centres differ a little.
 
         x' = (w I + [v]_x) x + ... to first order, for the rotation (v, w) from one centre to the other.
+
+        Args:
+            memory: of the particles, as in the state.
+            swapped: [B, N], True where a particle has exchanged its legs.
+
+        Returns:
+            Memory of the same shape.
         """
         order = leg_permutation(self.body.skeleton)[1:].to(memory.device)
         centres = self.body.centres.to(memory)
@@ -224,7 +261,15 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         mean: Float[Tensor, "B D"],
         memory: Tensor | None,
     ) -> Float[Tensor, "B D"]:
-        """Return the deviation about the estimate: of the hypotheses, and within each of them."""
+        """Return the deviation about the estimate: of the hypotheses, and within each of them.
+
+        Args:
+            particles: [B, N, D]. log_weights: normalised, [B, N]. mean: the estimate [B, D].
+            memory: of the particles, as in the state.
+
+        Returns:
+            [B, D], metres for the root's position, sines of half angles for rotations.
+        """
         between = super().spread(particles, log_weights, mean, memory)
         if memory is None:
             return between
@@ -236,7 +281,14 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
     def joint_covariance(
         self, state: BodyFilterState, mean: Float[Tensor, "B D"]
     ) -> Float[Tensor, "B J 3 3"]:
-        """Return the second moment about the estimate's joints: of the hypotheses, and within each."""
+        """Return the second moment about the estimate's joints: of the hypotheses, and within each.
+
+        Args:
+            state: weighted particles after a step. mean: the estimate [B, D].
+
+        Returns:
+            [B, J, 3, 3], square metres, world axes.
+        """
         return joint_covariance_with_parts(self.body, state, self._memory(state), mean)
 
     # --- one frame

@@ -56,7 +56,7 @@ _MOST_SPREAD = 10  # frames over which the noise of a filter that stays lost kee
 
 
 class SilhouetteParticleFilter(BodyFilterHooks):
-    """Base of the particle filters over body poses; a subclass implements `move`.
+    """Filters body poses by particles from silhouettes; a subclass implements `move`.
 
     `forward` tracks whole sequences; `init`, then `step` (one frame) or `advance` (some more frames) give the
     same numbers online. Estimates have no gradients: nothing runs through particles.
@@ -188,14 +188,18 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         generator: Generators = None,
         initial_cov: Tensor | float | None = None,
     ) -> BodyFilterState:
-        """Return N copies of the initial state, spread if `initial_cov` is given (step 1, MR).
+        """Return N copies of the initial state, which are spread on request (step 1, MR).
 
         Args:
-            initial_state: the pose before the first frame, [D] or [B, D]. generator, initial_cov: as in
-                `forward`.
+            initial_state: [D] or [B, D], metres and quaternion vectors.
+            generator: one generator, or a list of one for each element.
+            initial_cov: [D], variances of the spread, as `process_cov`; None spreads nothing.
+
+        Returns:
+            `BodyFilterState` with particles [B, N, D].
 
         Raises:
-            ShapeError, InputError: as `forward`.
+            ShapeError: other sizes. InputError: NaN or infinite numbers.
         """
         start = initial_state.to(self.step_std).reshape(-1, initial_state.shape[-1])
         check_shape("initial_state", start, ["B", self.body.dim])
@@ -287,7 +291,16 @@ class SilhouetteParticleFilter(BodyFilterHooks):
     def filter_frame(
         self, state: BodyFilterState, silhouettes: Tensor, cameras: Any, generator: Generators
     ) -> tuple[BodyFilterState, BodyFilterOutput]:
-        """Return the next state and the estimate, given a checked frame [B, C, H, W]; without warnings."""
+        """Track one more frame, as `step`, of checked silhouettes; without warnings.
+
+        Args:
+            state: of B elements, from `init` or the frame before.
+            silhouettes: bool [B, C, H, W]. cameras: the C cameras.
+            generator: one generator, or a list of one for each element.
+
+        Returns:
+            The next state, and the `BodyFilterOutput` of the frame, [B, ...].
+        """
         frame = see_frame(
             self.body, silhouettes.to(self.step_std.device), cameras, self.likelihood,
             self.sharpness, self.limb_shape,
@@ -317,19 +330,42 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         std: Float[Tensor, "*B D"],
         generator: Generators,
     ) -> Float[Tensor, "B N D"]:
-        """Return x + N(0, diag(std^2)) (MR 29), within the joint limits; orientations are composed."""
+        """Return x + N(0, diag(std^2)) (MR 29), within the joint limits; orientations are composed.
+
+        Args:
+            particles: x [B, N, D], metres and quaternion vectors.
+            std: [D] or [B, 1, D], in the units of a step.
+            generator: one generator, or a list of one for each element.
+
+        Returns:
+            [B, N, D].
+        """
         batch, n, dim = particles.shape
         noise = standard_normal(batch, (n, dim), generator, particles)
         return self.constrain(self.body.perturb(particles, noise * std))
 
     def constrain(self, particles: Float[Tensor, "B N D"]) -> Float[Tensor, "B N D"]:
-        """Return particles moved to the joint limits, where `limit_mode` says so."""
+        """Move particles to the joint limits, where `limit_mode` is "clamp".
+
+        Args:
+            particles: [B, N, D], metres and quaternion vectors.
+
+        Returns:
+            [B, N, D].
+        """
         if self.limits is None or self.limit_mode != "clamp":
             return particles
         return self.limits.clamp(particles)
 
     def log_limits(self, particles: Float[Tensor, "B N D"]) -> Float[Tensor, "B N"]:
-        """Return -inf for particles outside joint limits that discard, else 0; float64."""
+        """Return -inf for particles outside joint limits that discard, else 0.
+
+        Args:
+            particles: [B, N, D], metres and quaternion vectors.
+
+        Returns:
+            [B, N], float64.
+        """
         zero = particles.new_zeros(particles.shape[:2], dtype=torch.float64)
         if self.limits is None or self.limit_mode != "discard":
             return zero

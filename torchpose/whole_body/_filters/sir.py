@@ -20,7 +20,7 @@ __all__ = ["SIRParticleFilter"]
 
 
 class SIRParticleFilter(SilhouetteParticleFilter):
-    """The Condensation algorithm: diffuse, weigh by the image, resample.
+    """Filters by the Condensation algorithm: diffuse, weigh by the image, resample.
 
     x_t ~ N(x_{t-1}, diag(process_cov)) (MR 29),   w_n = p(I_t | x_t^(n))^s / sum_j p(I_t | x_t^(j))^s
 
@@ -29,7 +29,7 @@ class SIRParticleFilter(SilhouetteParticleFilter):
     is NaN, since the weights are no posterior's.
 
     Args:
-        body, n_particles, options: as `SilhouetteParticleFilter`.
+        body, n_particles, **options: as `SilhouetteParticleFilter`.
         survival_rate: per frame, at least 2 / N, or None. Daubney & Xie have 0.01 per second
             (`survival_rate_per_frame`), 800 particles and `estimate="map"`.
 
@@ -57,7 +57,16 @@ class SIRParticleFilter(SilhouetteParticleFilter):
     def move(
         self, state: BodyFilterState, frame: Frame, generator: Generators
     ) -> WeightedParticles:
-        """Diffuse (MR 29) and weigh (MR 5)."""
+        """Diffuse the particles (MR 29), and weigh them by the image (MR 5).
+
+        Args:
+            state: of the last frame, with resampled particles and the filter's memory of them.
+            frame: the observation of the frame.
+            generator: one generator, or a list of one for each element.
+
+        Returns:
+            `WeightedParticles` [B, N, D] of the next frame.
+        """
         particles = self.diffuse(state.particles, self.step_std, generator)
         log_limits, log_likelihood = self.log_limits(particles), frame.score(particles)
         log_prior = state.log_weights + log_limits

@@ -55,7 +55,7 @@ def flatten_limbs(limbs: Limbs) -> Limbs:
 
 
 def which_silhouette(n_items: int, n_silhouettes: int, before: Tensor) -> Tensor | None:
-    """Return where each item's running sums begin [N]; None if all share one silhouette."""
+    """Return the start of each item's running sums [N]; None if all share one silhouette."""
     if n_silhouettes <= 1:
         return None
     begin = torch.arange(n_silhouettes, device=before.device) * before.shape[-1]

@@ -26,7 +26,7 @@ __all__ = ["PartCounts", "count_parts"]
 
 
 class PartCounts(NamedTuple):
-    """Weighted pixels of each position of a part in each camera.
+    """Holds the weighted pixels of each position of a part in each camera.
 
     Attributes:
         weight: [..., S, C], float64, silhouette pixels under the part, 1/2 where the opposing part may
@@ -118,7 +118,7 @@ def count_parts(
 
 
 class _Union(NamedTuple):
-    """Pixels that the opposing parts may cover: disjoint intervals in rising order, the first one empty.
+    """Holds the pixels that opposing parts may cover: disjoint intervals in rising order, the first empty.
 
     Attributes:
         start, stop: [R], packed item and place. before: [R], silhouette pixels of the union before
@@ -200,7 +200,7 @@ def _union(opposing: Limbs, batch: tuple[int, ...], near: float) -> Limbs:
 
 
 def _shared(silhouettes: PreparedSilhouettes, batch: tuple[int, ...]) -> int:
-    """Return how many silhouettes the batch has; 1 if it shares one."""
+    """Return the number of silhouettes of the batch; 1 if it shares one."""
     leading = tuple(silhouettes.area.shape[:-1])
     if batch[: len(leading)] != leading:
         raise ShapeError(

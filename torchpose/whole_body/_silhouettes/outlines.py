@@ -55,7 +55,7 @@ LEVEL = 1e-9
 
 
 class ProjectedLimbs(NamedTuple):
-    """Both ends of every limb in every camera, in pixels; index 0 is the start, 1 the end.
+    """Holds both ends of every limb in every camera, in pixels; index 0 is the start, 1 the end.
 
     Attributes:
         x, y: [2, C, N, L], centres. radius: [2, C, N, L].
@@ -69,7 +69,7 @@ class ProjectedLimbs(NamedTuple):
 
 
 class Outlines(NamedTuple):
-    """Row-wise description of each limb's outline, M = C N L limbs in this order.
+    """Holds the row-wise description of each limb's outline, M = C N L limbs in this order.
 
     Attributes:
         discs: [2, 3, M]: x, y and squared radius of both discs; [0, 3, M] for limbs without round ends.
@@ -87,7 +87,7 @@ class Outlines(NamedTuple):
 
 
 def project_limbs(limbs: Limbs, rig: CameraRig, near: float = NEAR) -> ProjectedLimbs:
-    """Return the discs of both ends in every camera; what is nearer than `near` is cut off.
+    """Return the discs of both ends in every camera; parts nearer than `near` are cut off.
 
     Args:
         limbs: start and end [N, L, 3], radii [L, 2] or [N, L, 2], metres, world axes.
@@ -171,7 +171,7 @@ _FAR = 1e12  # factor that pushes what a row misses out of every image
 
 
 class Strip(NamedTuple):
-    """Layout of packed places: `item << bits | place`.
+    """Describes the layout of packed places: `item << bits | place`.
 
     Attributes:
         cameras, height, width: of an item's images.
@@ -198,7 +198,7 @@ class Strip(NamedTuple):
 
 
 class RowIntervals(NamedTuple):
-    """Disjoint intervals in rising order.
+    """Holds disjoint intervals in rising order.
 
     Attributes:
         start, stop: [R], packed item and place, `stop` exclusive; many are empty (start == stop).

@@ -40,7 +40,7 @@ _PIXELS = 2**22  # rendered in one chunk
 
 @runtime_checkable
 class HasLimbs(Protocol):
-    """Protocol of what has limbs, such as `Body`."""
+    """Declares what rendering needs of a body with limbs, such as `Body`."""
 
     def limbs(self, state: Tensor) -> Limbs:
         """Return limbs [..., L] of states [..., D]."""
@@ -48,7 +48,7 @@ class HasLimbs(Protocol):
 
 
 class SilhouetteCounts(NamedTuple):
-    """Numbers of pixels for each hypothesis and camera.
+    """Holds the numbers of pixels for each hypothesis and camera.
 
     Attributes:
         model: [..., C], |S(x)|, pixels that the body covers.

@@ -19,17 +19,17 @@ import torch
 
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
-from torchpose.evaluation.common import Recipe, draw_picture
-from torchpose.evaluation.person_tables import (
+from torchpose.evaluation._common import Recipe, draw_picture
+from torchpose.evaluation._person_tables import (
     Curve,
     add_pose_classes,
     mean_error,
     plot_curves,
     pooled,
 )
-from torchpose.evaluation.persons import by_person, renamed, spread
-from torchpose.evaluation.report import Report
-from torchpose.evaluation.unseen import Job, Scored, ScoreSettings, fit_settings, run_jobs
+from torchpose.evaluation._persons import by_person, renamed, spread
+from torchpose.evaluation._report import Report
+from torchpose.evaluation._unseen import Job, Scored, ScoreSettings, fit_settings, run_jobs
 from torchpose.io._recordings import Recording, read_recordings
 from torchpose.learning._recipes.upper_body import fit_kinect_prior
 
@@ -182,7 +182,7 @@ def _imported(text: str) -> tuple[str, Recipe]:
 def _sources(
     data: Sequence[str | Path] | str | Path, more: Sequence[str]
 ) -> tuple[list[Path], list[Path], tuple[int, ...]]:
-    """Return where recordings are, where those of further persons are, and the usual counts if any."""
+    """Return the folders of the recordings and of further persons, and the usual counts, if any."""
     given = [Path(data)] if isinstance(data, str | Path) else [Path(path) for path in data]
     further = [Path(path) for path in more]
     home = given[0] if len(given) == 1 else Path()
@@ -203,7 +203,7 @@ def _doubling(most: int) -> tuple[int, ...]:
 
 
 def _others(folders: Sequence[Path], most: int, count: int) -> dict[str, list[Recording]]:
-    """Return further training persons, as many as are missing."""
+    """Return the missing number of further training persons."""
     missing = count - most
     if missing <= 0:
         return {}

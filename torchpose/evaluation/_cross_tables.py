@@ -5,21 +5,21 @@ from typing import Any, NamedTuple
 
 import torch
 
-from torchpose.evaluation.person_tables import (
+from torchpose.evaluation._person_tables import (
     SHORT_NAMES,
     add_pose_classes,
     mean_error,
     pooled,
 )
-from torchpose.evaluation.persons import spread
-from torchpose.evaluation.report import Report
-from torchpose.evaluation.unseen import Scored
+from torchpose.evaluation._persons import spread
+from torchpose.evaluation._report import Report
+from torchpose.evaluation._unseen import Scored
 
 __all__ = ["Crossed", "add_added", "add_cross", "plot_cross"]
 
 
 class Crossed(NamedTuple):
-    """How data sets are compared.
+    """Holds the settings of the comparison of data sets.
 
     Attributes:
         persons: of each data set. tested: those that no prior saw.
@@ -34,7 +34,7 @@ class Crossed(NamedTuple):
     donors: Sequence[str]
 
     def label(self, name: str, person: str) -> str:
-        """Return what a person of a data set is called."""
+        """Return the label of a person of a data set in the tables."""
         return f"{name} {person}"
 
 

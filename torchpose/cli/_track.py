@@ -6,10 +6,10 @@ from typing import Any
 
 from torchpose._core.checks import check_positive
 from torchpose._core.terminal import show_progress
-from torchpose.cli.command import Command, Given
-from torchpose.cli.common import pictures_possible
-from torchpose.cli.options import Option, options_of, options_of_methods
-from torchpose.cli.track_output import (
+from torchpose.cli._command import Command, Given
+from torchpose.cli._common import pictures_possible
+from torchpose.cli._options import Option, options_of, options_of_methods
+from torchpose.cli._track_output import (
     Job,
     camera_text,
     report_failure,
@@ -130,7 +130,7 @@ def run(
     options = {name: value for name, value in method_options.items() if value is not None}
     job = Job(input, out, given.files(), TrackSettings(**settings), options, pictures)
     if is_video(input):
-        from torchpose.cli.track_video import track_video
+        from torchpose.cli._track_video import track_video
 
         return track_video(job, video, face_model, overlay)
     return track_keypoints(job)

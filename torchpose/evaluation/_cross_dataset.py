@@ -22,18 +22,18 @@ import torch
 
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
-from torchpose.evaluation.common import Recipe, draw_picture
-from torchpose.evaluation.completion import (
+from torchpose.evaluation._common import Recipe, draw_picture
+from torchpose.evaluation._completion import (
     Completion,
     complete,
     facing_pieces,
     learn_completion,
     with_wrists,
 )
-from torchpose.evaluation.cross_tables import Crossed, add_added, add_cross, plot_cross
-from torchpose.evaluation.persons import by_person
-from torchpose.evaluation.report import Report
-from torchpose.evaluation.unseen import Job, ScoreSettings, fit_settings, run_jobs
+from torchpose.evaluation._cross_tables import Crossed, add_added, add_cross, plot_cross
+from torchpose.evaluation._persons import by_person
+from torchpose.evaluation._report import Report
+from torchpose.evaluation._unseen import Job, ScoreSettings, fit_settings, run_jobs
 from torchpose.io._recordings import Recording, read_recordings
 from torchpose.learning._recipes.upper_body import fit_kinect_prior
 from torchpose.skeleton._upper_body import upper_body_indices
@@ -54,14 +54,14 @@ _Persons = dict[str, list[Recording]]
 
 
 class _Split(NamedTuple):
-    """Persons of a data set: to train on and to test."""
+    """Holds the persons of a data set: to train on, and to test on."""
 
     train: _Persons
     tested: _Persons
 
 
 class _Alike(NamedTuple):
-    """Data sets with the same joints, by name.
+    """Holds the data sets with the same joints, by name.
 
     Attributes:
         drawn: to train on, made-up heads with residuals. mean: to test, without.
@@ -75,7 +75,7 @@ class _Alike(NamedTuple):
 
 
 class _Held(NamedTuple):
-    """Persons left out, and training sets for them: alone first, then with motion capture."""
+    """Holds the persons left out, and training sets for them: alone first, then with motion capture."""
 
     tests: _Persons
     trains: dict[str, list[Recording]]
@@ -219,7 +219,7 @@ def _split(persons: _Persons, tested: Sequence[str], name: str) -> _Split:
 
 
 def _held_out(persons: _Persons, tested: Sequence[str]) -> list[str]:
-    """Return who is tested: those who are named, else the last quarter."""
+    """Return the test persons: the named ones, else the last quarter."""
     last = list(persons)[-max(1, len(persons) // _HELD_SHARE) :]
     return [person for person in persons if person in tested] or last
 

@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import torch
 
-from torchpose.evaluation.persons import POSE_CLASSES, spread
-from torchpose.evaluation.report import Report, Table
-from torchpose.evaluation.unseen import Scored
+from torchpose.evaluation._persons import POSE_CLASSES, spread
+from torchpose.evaluation._report import Report, Table
+from torchpose.evaluation._unseen import Scored
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
 __all__ = [
@@ -135,7 +135,7 @@ def plot_persons(persons: Mapping[str, Scored], title: str) -> Any:
 
 
 class Curve(NamedTuple):
-    """Mean error (cm) at each number of persons, with its spread over draws and over test persons."""
+    """Holds the mean error (cm) by number of persons, with its spread over draws and over test persons."""
 
     counts: list[int]
     mean: list[float]

@@ -3,8 +3,8 @@
 import re
 from typing import Literal
 
-from torchpose.cli.command import Command, Given
-from torchpose.cli.common import pictures_possible
+from torchpose.cli._command import Command, Given
+from torchpose.cli._common import pictures_possible
 from torchpose.errors import InputError
 
 _EXAMPLES = """
@@ -49,7 +49,7 @@ def run(
         pictures: draw pictures.
         given: the command.
     """
-    from torchpose.cli.track_output import track_results
+    from torchpose.cli._track_output import track_results
     from torchpose.priors._upper_body import load_prior
 
     seconds = _SECONDS[input] if seconds is None else seconds
@@ -57,11 +57,11 @@ def run(
     if not 1 <= seconds <= most:
         raise InputError(f"--seconds must be from 1 to {most}, got {seconds:g}")
     if input == "walk":
-        from torchpose.cli.demo_walk import demo_walk
+        from torchpose.cli._demo_walk import demo_walk
 
         return demo_walk(out, seconds, seed, pictures_possible(pictures))
-    from torchpose.cli.demo_keypoints import demo_keypoints
-    from torchpose.cli.demo_video import demo_video
+    from torchpose.cli._demo_keypoints import demo_keypoints
+    from torchpose.cli._demo_video import demo_video
 
     model, pictures, video = load_prior(prior), pictures_possible(pictures), input == "video"
     expected = _VIDEO_FILES if video else (_KEYPOINT_FILES if pictures else _KEYPOINT_FILES[:1])

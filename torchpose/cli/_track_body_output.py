@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
     from torchpose.camera._pinhole import PinholeCamera
     from torchpose.camera._rig import CameraRig
-    from torchpose.cli.command import Given
+    from torchpose.cli._command import Given
     from torchpose.io._results import ResultsFolder
     from torchpose.video._base import VideoSource
     from torchpose.video._silhouettes import SilhouetteMeasurer, SilhouetteView

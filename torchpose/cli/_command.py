@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from jsonargparse import ActionConfigFile, ArgumentParser
 
-from torchpose.cli.options import REQUIRED, Option, options_of, summary_of
+from torchpose.cli._options import REQUIRED, Option, options_of, summary_of
 
 __all__ = ["Command", "Given", "add_options", "new_parser", "parse_seed"]
 
@@ -37,7 +37,7 @@ exit codes: 0 done; 1 done, but the result is not good; 2 refused, with one line
 
 
 class Given(NamedTuple):
-    """What was given to a command.
+    """Holds the arguments that were given to a command.
 
     Attributes:
         words: after the program, such as ("fit", "limbs"). values: of all options by key.
@@ -74,7 +74,7 @@ class Given(NamedTuple):
 
 
 class Command(NamedTuple):
-    """A function as a command, whose options are the function's parameters.
+    """Wraps a function as a command, whose options are the function's parameters.
 
     Parameters before `*` are given by their place.
     A parameter named in `groups` is no option itself: the function gets a dictionary with the values of the
@@ -121,7 +121,7 @@ class Command(NamedTuple):
         return parser
 
     def given(self, arguments: Sequence[str]) -> Given:
-        """Return what arguments give to the command.
+        """Parse command-line arguments.
 
         Raises:
             ArgumentError: arguments that it does not take.
@@ -138,7 +138,7 @@ class Command(NamedTuple):
         return self.call(self.given(arguments))
 
     def call(self, given: Given) -> int:
-        """Call the function with what was given, and return the exit code."""
+        """Call the function with the given options, and return the exit code."""
         values: dict[str, Any] = {option.name: given.values[option.key] for option in self.own}
         for parameter, group in self.groups.items():
             values[parameter] = {option.name: given.values[option.key] for option in group}
@@ -216,7 +216,7 @@ def _item(kind: Any) -> Any:
 
 
 def _one_of(option: Option) -> Callable[[Any], Any]:
-    """Return what refuses other words than the choices of an option."""
+    """Return a parser that accepts only the choices of an option."""
 
     def check(value: Any) -> Any:
         if value not in option.choices:

@@ -28,7 +28,7 @@ _PARTS = ("neck", "elbow", "wrist", "hip", "knee", "ankle")
 
 def demo_walk(folder: str, seconds: float, seed: int, pictures: bool) -> int:
     """Render, track by `torchpose track-body`, score; return exit code 1 if standing still is not beaten."""
-    from torchpose.cli import track_body
+    from torchpose.cli import _track_body as track_body
     from torchpose.demo._rendering.walk import walk
     from torchpose.whole_body._poses import BodyTrack
 
@@ -89,7 +89,7 @@ def _errors(joints: "Tensor", truth: "Tensor") -> "Tensor":
 
 
 def _still(truth: "Tensor") -> "Tensor":
-    """Return the errors of whoever stays as they are in the first frame."""
+    """Return the errors of the baseline that keeps the pose of the first frame."""
     return _errors(truth[:1].expand_as(truth), truth)
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torchpose._core.terminal import show_progress
-from torchpose.cli.common import save_pictures, share_cores
-from torchpose.cli.demo_keypoints import MEAN_POSE, beaten, report, score, score_mean_pose
-from torchpose.cli.track_output import camera_text, track_pictures
-from torchpose.cli.track_video import write_overlay, write_people
+from torchpose.cli._common import save_pictures, share_cores
+from torchpose.cli._demo_keypoints import MEAN_POSE, beaten, report, score, score_mean_pose
+from torchpose.cli._track_output import camera_text, track_pictures
+from torchpose.cli._track_video import write_overlay, write_people
 
 if TYPE_CHECKING:
     from torchpose.demo._performer import Performance

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchpose.cli.command import Command
+from torchpose.cli._command import Command
 from torchpose.errors import InputError
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def main(arguments: list[str]) -> int:
 
 
 def run(what: str | None = None) -> int:
-    """Say which version and priors are there, or what a file holds.
+    """Print the version and the available priors, or a description of a file.
 
     That is a prior, a manifold, limb conditionals, an action space or bank, a file of poses, keypoints or
     recordings, or a camera file.
@@ -72,7 +72,7 @@ def _describe(what: str) -> str:
     )
     if files and what not in known_priors():
         from torchpose._core.tensor_file import format_of
-        from torchpose.cli.info_models import DESCRIBED
+        from torchpose.cli._info_models import DESCRIBED
 
         found = [(DESCRIBED.get(format_of(file) or ""), file) for file in files]
         tables = [_table(describe(file)) for describe, file in found if describe is not None]
@@ -103,13 +103,13 @@ def _models_of(name: str) -> list[Path]:
 
 
 def _describe_npz(path: Path) -> str:
-    """Return what an .npz file holds, poses, recordings or keypoints by its keys."""
+    """Return a description of an .npz file of poses, recordings or keypoints, told apart by its keys."""
     from torchpose._core.reading import npz_keys
     from torchpose.io._keypoints import read_keypoints
 
     keys = set(npz_keys(path))
     if {"state", "body_frame"} <= keys:
-        from torchpose.cli.info_models import describe_body_poses
+        from torchpose.cli._info_models import describe_body_poses
 
         return _table(describe_body_poses(path))
     if {"joints3d", "covariance3d"} <= keys:
@@ -125,8 +125,8 @@ def _describe_npz(path: Path) -> str:
 
 
 def describe_prior(prior: "UpperBodyPrior") -> str:
-    """Return what a prior's file says about itself."""
-    from torchpose.cli.track_output import camera_text
+    """Return a description of a prior: what it was fitted on, its noise and its camera."""
+    from torchpose.cli._track_output import camera_text
 
     info = prior.info
     noise = ", ".join(f"{name} {list(value.shape)}" for name, value in prior.noise.items())
@@ -193,7 +193,7 @@ def _sample_sizes(size: "Tensor") -> str:
 def describe_keypoints(keypoints: "Keypoints") -> str:
     """Return the frames, joints and camera of a file of keypoints."""
     from torchpose.camera._pinhole import PinholeCamera
-    from torchpose.cli.track_output import camera_text, percent
+    from torchpose.cli._track_output import camera_text, percent
     from torchpose.skeleton._joint_sets import UPPER_BODY
     from torchpose.skeleton._upper_body import upper_body_indices
 
@@ -240,7 +240,7 @@ def _describe_recordings(path: Path) -> str:
 
 def _describe_cameras(path: Path) -> str:
     from torchpose.camera._pinhole import load_cameras
-    from torchpose.cli.track_output import camera_text
+    from torchpose.cli._track_output import camera_text
 
     return _table({name: camera_text(camera) for name, camera in load_cameras(path).items()})
 

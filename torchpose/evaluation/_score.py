@@ -18,17 +18,24 @@ from tqdm.auto import tqdm
 from torchpose._core.checks import check_count
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError, OverlapError
-from torchpose.evaluation.common import CAMERA, MEASURED, Trials, draw_picture, make_test_set, track
-from torchpose.evaluation.person_tables import (
+from torchpose.evaluation._common import (
+    CAMERA,
+    MEASURED,
+    Trials,
+    draw_picture,
+    make_test_set,
+    track,
+)
+from torchpose.evaluation._person_tables import (
     add_persons,
     add_pose_classes,
     mean_error,
     plot_persons,
     pooled,
 )
-from torchpose.evaluation.persons import by_person, pose_classes, spread
-from torchpose.evaluation.report import Report
-from torchpose.evaluation.unseen import (
+from torchpose.evaluation._persons import by_person, pose_classes, spread
+from torchpose.evaluation._report import Report
+from torchpose.evaluation._unseen import (
     LEVELS,
     Scored,
     compare,
@@ -49,7 +56,7 @@ _DEFAULT_RATE = 30.0
 
 
 class _PersonScores(NamedTuple):
-    """How a person was tracked, and how far off the mean pose of the prior is [N, 8], metres."""
+    """Holds the scores of a person, and the errors of the prior's mean pose [N, 8], metres."""
 
     scored: Scored
     baseline: Tensor
@@ -135,13 +142,13 @@ def _usual(
     fps: float | None = None,
     smoothing: str | None = None,
 ) -> str:
-    """Return the method that the tracker takes by itself for these joints."""
+    """Return the default method of the tracker for these joints."""
     there = [joint in names for joint in UPPER_BODY]
     return choose_method(prior, None, smoothing, fps, ()).with_joints(there, wrists=False)
 
 
 def _known_to_arms(persons: Set[str], method: str) -> list[str]:
-    """Return those of the persons whom the prior over arms knows, if the method takes it."""
+    """Return the persons on whom the prior over arms was fitted, if the method uses it."""
     if "arms" not in method_options(method):
         return []
     return sorted(persons & set(shipped_arm_prior().info.persons))
@@ -210,7 +217,7 @@ def _tracked(
 def _mean_pose_errors(
     prior: UpperBodyPrior, truth: Float[Tensor, "N 8 3"], counted: Bool[Tensor, " 8"]
 ) -> Float[Tensor, "N 8"]:
-    """Return how far the mean pose of the prior is from the truth, aligned as estimates are."""
+    """Return the errors of the prior's mean pose, aligned as estimates are."""
     on = [joint for joint in ALIGN_JOINTS if bool(counted[joint])]
     still = prior.mean_pose().to(truth).expand_as(truth)
     errors = joint_errors(align(still, truth, on).points, truth)

@@ -38,7 +38,7 @@ def complete_pieces(joints: Float[Tensor, "T 8 3"]) -> list[Float[Tensor, "S 8 3
 
 
 def pose_classes(poses: Float[Tensor, "N 8 3"]) -> Int[Tensor, "N 2"]:
-    """Return what the left and the right arm do: index into `POSE_CLASSES`, the first that applies.
+    """Return the pose class of the left and the right arm: index into `POSE_CLASSES`, the first that applies.
 
     Raised: the hand is above its shoulder. Crossed: it is on the other side of the middle of the
     shoulders, along their line. Near the body: within 20 cm of its shoulder, horizontally. Else it

@@ -10,8 +10,8 @@ from typing import Any, Literal, NamedTuple
 from jsonargparse import ArgumentParser, Namespace
 
 from torchpose._core.terminal import show_progress
-from torchpose.cli.command import add_options, new_parser
-from torchpose.cli.options import REQUIRED, Option, documented, options_of
+from torchpose.cli._command import add_options, new_parser
+from torchpose.cli._options import REQUIRED, Option, documented, options_of
 from torchpose.errors import InputError
 
 __all__ = ["BENCHMARKS", "PROTOCOLS", "Protocol", "build", "checked_data", "execute", "main"]
@@ -27,7 +27,7 @@ _EXAMPLES: dict[Data, str] = {
 
 
 class Protocol(NamedTuple):
-    """An evaluation as a command.
+    """Describes an evaluation as a command.
 
     Attributes:
         module: full name of the module whose `run(data, out, *, seed, progress, ...)` it is.
@@ -55,22 +55,22 @@ class Protocol(NamedTuple):
 
 PROTOCOLS = {
     "score": Protocol(
-        "torchpose.evaluation.score",
+        "torchpose.evaluation._score",
         "a prior and a tracker on recordings of persons whom the prior does not know",
         "recordings",
     ),
     "leave-one-person-out": Protocol(
-        "torchpose.evaluation.leave_one_person_out",
+        "torchpose.evaluation._leave_one_person_out",
         "each person of some recordings under a prior of the others",
         "recordings",
     ),
     "learning-curve": Protocol(
-        "torchpose.evaluation.learning_curve",
+        "torchpose.evaluation._learning_curve",
         "error over the number of training persons",
         "recordings",
     ),
     "cross-dataset": Protocol(
-        "torchpose.evaluation.cross_dataset",
+        "torchpose.evaluation._cross_dataset",
         "a prior of one data set on another one's persons, and what motion capture adds",
         "recordings",
     ),
@@ -215,7 +215,7 @@ def checked_data(data: Data, args: Namespace) -> Any:
 
 def _refuse_other_reports(out: Path) -> None:
     """Refuse to write the report over a file that is no earlier report."""
-    from torchpose.evaluation.report import RESULTS
+    from torchpose.evaluation._report import RESULTS
     from torchpose.io._results import refuse_stranger
 
     earlier = _is_report(out / "report.json")

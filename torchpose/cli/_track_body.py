@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from torchpose._core.checks import check_positive
 from torchpose._core.terminal import show_progress
-from torchpose.cli.command import Command, Given
-from torchpose.cli.common import pictures_possible, share_cores
-from torchpose.cli.options import Option, options_of, options_of_methods
-from torchpose.cli.track_body_output import (
+from torchpose.cli._command import Command, Given
+from torchpose.cli._common import pictures_possible, share_cores
+from torchpose.cli._options import Option, options_of, options_of_methods
+from torchpose.cli._track_body_output import (
     Recordings,
     body_results,
     draw,

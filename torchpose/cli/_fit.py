@@ -4,11 +4,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from torchpose._core.terminal import show_progress
-from torchpose.cli.command import Command, Given
-from torchpose.cli.common import pictures_possible
-from torchpose.cli.fit_bodies import KINDS
-from torchpose.cli.fit_bodies import main as fit_bodies
-from torchpose.cli.options import options_of
+from torchpose.cli._command import Command, Given
+from torchpose.cli._common import pictures_possible
+from torchpose.cli._fit_bodies import KINDS
+from torchpose.cli._fit_bodies import main as fit_bodies
+from torchpose.cli._options import options_of
 from torchpose.errors import InputError
 from torchpose.io._formats.axes import Axes
 
@@ -169,7 +169,7 @@ def _fit_recipe(
 def _curated(
     recordings: list["Recording"], settings: dict[str, Any] | None
 ) -> tuple[list["Recording"], str, dict[str, Any]]:
-    """Return recordings without what is no body, what was dropped in words, and as facts for the card."""
+    """Return curated recordings, a description of the omissions, and facts about them for the card."""
     if settings is None:
         return recordings, f"read     {_count(recordings)}", {}
     from torchpose.learning._curation import curate

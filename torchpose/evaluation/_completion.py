@@ -34,7 +34,7 @@ _AS_HAND = tuple(name.replace("neck", "shoulder_center") for name in UPPER_BODY)
 
 
 class Completion(NamedTuple):
-    """The conditional Gaussian of missing joints, and where the neck is.
+    """Holds the conditional Gaussian of missing joints, and the position of the neck.
 
     Attributes:
         targets: the joints y. weights: W. covariance: S. neck: of the recordings it was learnt on.

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchpose._core.terminal import show_progress
-from torchpose.cli.common import UntilInterrupted, pictures_possible, share_cores
-from torchpose.cli.track_output import (
+from torchpose.cli._common import UntilInterrupted, pictures_possible, share_cores
+from torchpose.cli._track_output import (
     Job,
     camera_text,
     report_failure,

@@ -24,7 +24,7 @@ _SCALARS = (bool, int, float, str)
 
 
 class Option(NamedTuple):
-    """One option of a command, or one of its positional arguments.
+    """Describes one option of a command, or one of its positional arguments.
 
     Attributes:
         name: of the parameter that it is read from. key: its name on the command line and in
@@ -44,12 +44,12 @@ class Option(NamedTuple):
 
     @property
     def flag(self) -> str:
-        """Return what is typed before its value."""
+        """Return the flag on the command line, such as ``--frame-rate``."""
         return f"--{self.key.replace('_', '-')}"
 
     @property
     def metavar(self) -> str:
-        """Return what stands for its value in the help: the choices, a letter for a number, or its name."""
+        """Return the placeholder of the value in the help: the choices, a letter for a number, or a name."""
         words = _words(self.kind)
         if words:
             return "|".join(words)
@@ -171,16 +171,17 @@ def documented(source: Callable[..., Any]) -> dict[str, str]:
     if not section or not names:
         return {}
     text = " ".join(section[1].split())
-    parts = re.split(rf"(?:^|(?<=[.;,?] ))((?:(?:{names}), )*(?:{names})): ", text)
+    name = rf"\*{{0,2}}(?:{names})"
+    parts = re.split(rf"(?:^|(?<=[.;,?] ))((?:{name}, )*{name}): ", text)
     return {
-        name: words.strip().rstrip(".,;")
+        name.lstrip("*"): words.strip().rstrip(".,;")
         for several, words in zip(parts[1::2], parts[2::2], strict=True)
         for name in several.split(", ")
     }
 
 
 def summary_of(source: Callable[..., Any]) -> str:
-    """Return what a docstring says before its sections, on one line."""
+    """Return the text of a docstring before its sections, on one line."""
     text = re.split(r"\n\s*(?:Args|Attributes|Returns|Raises):\n", inspect.getdoc(source) or "")[0]
     return " ".join(text.split())
 

@@ -12,7 +12,7 @@ _LISTED, _SOURCES = 12, 3  # persons or actions that are named, and sources
 
 
 def describe_manifold(path: Path) -> Facts:
-    """Return what a manifold of poses is."""
+    """Return the facts about a manifold of poses, by name."""
     from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 
     manifold = BackConstrainedGPLVM.load(path)
@@ -33,7 +33,7 @@ def describe_manifold(path: Path) -> Facts:
 
 
 def describe_limbs(path: Path) -> Facts:
-    """Return what limb conditionals are: how far each limb turns against the one above it, and how fast."""
+    """Return the facts about limb conditionals: how far each limb turns against its parent, and how fast."""
     from torchpose.priors._limb_conditionals import LimbConditionals
 
     limbs = LimbConditionals.load(path)
@@ -60,7 +60,7 @@ def describe_limbs(path: Path) -> Facts:
 
 
 def describe_action(path: Path) -> Facts:
-    """Return what the postures of one action are."""
+    """Return the facts about the action space of one action."""
     from torchpose.priors._actions.space import ActionSpace
 
     space = ActionSpace.load(path)
@@ -84,7 +84,7 @@ def describe_action(path: Path) -> Facts:
 
 
 def describe_bank(path: Path) -> Facts:
-    """Return what the postures of several actions are."""
+    """Return the facts about a bank of actions."""
     from torchpose.priors._actions.bank import ActionBank
 
     bank = ActionBank.load(path)
@@ -120,8 +120,8 @@ DESCRIBED: dict[str, Callable[[Path], Facts]] = {
 
 
 def describe_body_poses(path: Path) -> Facts:
-    """Return what poses of a whole body are, from `torchpose track-body`."""
-    from torchpose.cli.track_body_output import action_text
+    """Return the facts about poses of a whole body, from `torchpose track-body`."""
+    from torchpose.cli._track_body_output import action_text
     from torchpose.whole_body._poses import BodyTrack
 
     poses = BodyTrack.load(path)

@@ -21,7 +21,7 @@ from torchpose._core.reading import read_npz
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import project
 from torchpose.errors import InputError, TorchposeError
-from torchpose.evaluation.report import RESULTS, Report
+from torchpose.evaluation._report import RESULTS, Report
 from torchpose.filters._base import Generators
 from torchpose.io._recordings import Recording
 from torchpose.io._results import replace_own
@@ -109,7 +109,7 @@ def read_kept(path: Path, kind: Callable[..., Any], fields: tuple[str, ...]) -> 
     """Return a tuple of tensors that `keep` wrote, or None where there is none; damaged files are deleted.
 
     Args:
-        path: of the file. kind: what is made of the tensors. fields: their names, in its order.
+        path: of the file. kind: named tuple to be made of the tensors. fields: their names, in its order.
     """
     if not path.is_file():
         return None
@@ -144,7 +144,7 @@ class Trials(NamedTuple):
 
     @property
     def inside(self) -> Bool[Tensor, "B T"]:
-        """True up to the length of each sequence."""
+        """Return the frame mask [B, T], True up to the length of each sequence."""
         return torch.arange(self.truth3d.shape[1]) < self.lengths[:, None]
 
 
@@ -199,7 +199,7 @@ def make_test_set(
 
 
 class Estimate(NamedTuple):
-    """Poses of a method: joints2d [B, T, 8, 2], joints3d [B, T, 8, 3], covariance3d or None."""
+    """Holds the poses of a method: joints2d [B, T, 8, 2], joints3d [B, T, 8, 3], covariance3d or None."""
 
     joints2d: Tensor
     joints3d: Tensor
@@ -209,7 +209,7 @@ class Estimate(NamedTuple):
 def own_method(
     prior: UpperBodyPrior, fps: float | None = None, smoothing: int | str | None = None
 ) -> str:
-    """Return the method that a prior has by itself: windows where they suit, else single poses."""
+    """Return the default method of a prior: windows where they suit, else single poses."""
     return choose_method(prior, None, smoothing, fps, (), windows=True).method
 
 

@@ -24,13 +24,13 @@ Cell = float | int | str | None
 
 @dataclass
 class Table:
-    """Numbers by method (row) and quantity (column).
+    """Holds numbers by method (row) and quantity (column).
 
     Args:
         title: one line above the table, with the unit.
         columns: names of the columns.
         digits: decimals of numbers that are not whole; one number, or one for each column.
-        note: what a reader has to know, below the table.
+        note: remarks below the table.
     """
 
     title: str
@@ -114,7 +114,15 @@ class Report(Mapping[str, Table]):
         return len(self.tables)
 
     def table(self, key: str, title: str, columns: Sequence[str], **options: Any) -> Table:
-        """Add a new table, and return it."""
+        """Add an empty table to the report, and return it.
+
+        Args:
+            key: of the table in ``report.json``. title: above the table. columns: names of the columns.
+            **options: other fields of `Table`.
+
+        Returns:
+            The `Table`, to be filled with rows.
+        """
         self.tables[key] = Table(title, tuple(columns), **options)
         return self.tables[key]
 
@@ -136,7 +144,7 @@ class Report(Mapping[str, Table]):
         return "\n\n".join(parts) + "\n"
 
     def to_json(self) -> str:
-        """Return all of it as JSON; what is not finite is null."""
+        """Return the report as JSON; numbers that are not finite are null."""
         tables = {
             key: {
                 "title": t.title,
@@ -161,6 +169,9 @@ class Report(Mapping[str, Table]):
 
         Files of these names that are of something else are moved to a folder ``earlier-1``.
 
+        Args:
+            out: folder, which is made if it is missing.
+
         Raises:
             OutputError: a file cannot be written.
         """
@@ -178,7 +189,7 @@ def _text(value: Cell, digits: int) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return what JSON can hold."""
+    """Return a value converted to types that JSON has."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, Tensor):

@@ -19,7 +19,7 @@ from tqdm.auto import tqdm
 
 from torchpose.camera._viewpoints import ViewRange, sample_viewpoints
 from torchpose.errors import InputError, PriorError
-from torchpose.evaluation.common import (
+from torchpose.evaluation._common import (
     CAMERA,
     MEASURED,
     Estimate,
@@ -33,7 +33,7 @@ from torchpose.evaluation.common import (
     settings_hash,
     track,
 )
-from torchpose.evaluation.persons import LEAST_FRAMES, complete_pieces, pose_classes
+from torchpose.evaluation._persons import LEAST_FRAMES, complete_pieces, pose_classes
 from torchpose.io._recordings import Recording
 from torchpose.learning._recipes.upper_body import fit_kinect_prior
 from torchpose.metrics._calibration import chi2_quantile, mahalanobis_squared
@@ -69,7 +69,7 @@ _STANDS_FOR = {"hand": "wrist", "wrist": "hand"}
 
 @dataclass(frozen=True)
 class ScoreSettings:
-    """How persons are tracked and scored.
+    """Holds the settings of tracking and scoring.
 
     Args:
         seed: of the noise, and of the viewpoints of the likelihood. every: of the sequences of a
@@ -88,7 +88,7 @@ class ScoreSettings:
 
 
 class Scored(NamedTuple):
-    """How well a person was tracked, frame by frame.
+    """Holds the errors of tracking a person, frame by frame.
 
     Attributes:
         filtered, smoothed: metres after fixed-scale Procrustes, NaN for joints that do not count.
@@ -107,11 +107,11 @@ class Scored(NamedTuple):
 
 @dataclass(frozen=True)
 class Job:
-    """A fit, and whom it is scored on.
+    """Holds a fit and the persons that it is scored on.
 
     Args:
         label: for the bar. train: recordings of the fit. tests: recordings of each person by name.
-        settings: of the recipe. recipe: fits the prior. test: how persons are tracked.
+        settings: of the recipe. recipe: fits the prior. test: settings of the tracking.
     """
 
     label: str
@@ -131,7 +131,7 @@ def fit_settings(
     window_samples: int | None,
     calibration_folds: int,
 ) -> dict[str, Any]:
-    """Return the settings of a recipe: what was asked for, small sizes for a quick run, else its own."""
+    """Return the settings of a recipe: the given ones, small sizes for a quick run, else its own."""
     settings: dict[str, Any] = {"name": name, "seed": seed}
     settings |= QUICK if quick else {}
     sizes = {
@@ -149,7 +149,8 @@ def run_jobs(
     """Fit and score, in `workers` processes of one thread each (1: in this one).
 
     Args:
-        jobs: what to do. folder: where priors and scores are kept. progress: whether to show a bar.
+        jobs: fits with the persons that they are scored on.
+        folder: where priors and scores are kept. progress: whether to show a bar.
 
     Returns:
         Scores of each job by person.
@@ -320,7 +321,7 @@ def poses_to_score(
 
 
 def training_neck(train: Sequence[Recording], kind: str) -> NeckOffset:
-    """Return where training recordings whose neck is of this kind have it.
+    """Return the mean offset of the neck in the training recordings whose neck is of this kind.
 
     Raises:
         PriorError: there are fewer than ten such frames.

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from torchpose.cli.common import save_pictures
+from torchpose.cli._common import save_pictures
 
 if TYPE_CHECKING:
     from torchpose.io._results import ResultsFolder
@@ -32,7 +32,7 @@ __all__ = [
 
 
 class Job(NamedTuple):
-    """What is to be tracked, how, and where the results go.
+    """Holds the input, the settings and the output folder of one run of tracking.
 
     Attributes:
         input: as it was given. out: folder of the results. files: that the command reads.
@@ -120,7 +120,7 @@ def track_pictures(track: "PoseTrack", truth: Any = None, labels: Any = None) ->
 def summary(
     track: "PoseTrack", written: list[Path], settings: dict[str, str], notes: Sequence[str] = ()
 ) -> str:
-    """Return some lines on frames, what was measured, what was assumed, and the files."""
+    """Return some lines on frames, measurements, assumptions and the files."""
     n, fps = track.joints3d.shape[1], track.fps
     length = f" ({n / fps:.1f} s at {fps:g} fps)" if fps else ""
     shares = track.observed[0].double().mean(0).tolist()
@@ -173,7 +173,7 @@ def camera_text(camera: Any) -> str:
 
 
 def smoothing_text(smoothing: int | str | None) -> str:
-    """Return how later frames were used, to follow the name of a method."""
+    """Return the words on smoothing that follow the name of a method."""
     if smoothing is None:
         return ", filtered"
     return ", smoothed" if smoothing == "full" else f", smoothed with {smoothing} later frames"

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from torchpose._core.terminal import show_progress
-from torchpose.cli.common import save_pictures
-from torchpose.cli.track_output import track_pictures, write_track
+from torchpose.cli._common import save_pictures
+from torchpose.cli._track_output import track_pictures, write_track
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -38,7 +38,7 @@ MEAN_POSE = "mean pose"
 
 
 class Scores(NamedTuple):
-    """How good an estimate of the performance is.
+    """Holds the errors of an estimate of the performance.
 
     Attributes:
         errors3d: [T, 8] metres, after Procrustes. errors2d: [T, 8] pixels, None for the mean pose.
@@ -51,7 +51,7 @@ class Scores(NamedTuple):
 
 
 class Hidden(NamedTuple):
-    """Frames in which a joint is hidden."""
+    """Holds the frames in which a joint is hidden."""
 
     joint: str
     frames: slice

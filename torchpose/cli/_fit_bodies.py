@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchpose._core.terminal import show_progress
-from torchpose.cli.command import Command, Given
-from torchpose.cli.common import pictures_possible
-from torchpose.cli.options import Option, options_of
+from torchpose.cli._command import Command, Given
+from torchpose.cli._common import pictures_possible
+from torchpose.cli._options import Option, options_of
 from torchpose.errors import InputError
 
 if TYPE_CHECKING:
