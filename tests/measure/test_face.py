@@ -183,7 +183,7 @@ def test_known_faces_are_looked_for_at_the_size_that_the_detector_likes(size):
 
 
 def test_a_far_smaller_face_on_the_chest_of_another_is_not_used():
-    person, collar, child = [300.0, 150.0, 100.0], [310.0, 270.0, 40.0], [310.0, 300.0, 80.0]
+    person, collar, child = [300.0, 150.0, 100.0], [310.0, 400.0, 40.0], [310.0, 300.0, 80.0]
     behind = [450.0, 150.0, 40.0]
     frames = [[person, collar, child, behind]] * 6
     tracker, states, _ = follow(frames, every=1, whole_every=1, gate=0.2)

@@ -35,7 +35,7 @@ _STRICTER = 1  # boxes more that must agree in an enlarged image
 _BRIGHT, _MOST_GAIN = 160.0, 6.0  # grey of the brightest parts of an image that needs no gain
 _TILT = 25.0  # degrees by which an image is turned to find tilted faces
 # Where a far smaller face is a pattern on somebody's head or clothes, in sizes of that person's face.
-_SMALLER_BY, _BESIDE, _ABOVE, _BELOW = 0.7, 0.8, 0.8, 2.0
+_SMALLER_BY, _BESIDE, _ABOVE, _BELOW = 0.7, 0.8, 0.8, 3.0
 
 
 def check_faces(faces: Float[Tensor, "N 3"], count: int | None = None) -> None:
@@ -308,7 +308,7 @@ class FaceTracker(nn.Module):
         return self.update(predicted, _without_doubles(torch.cat(found), self.gate))
 
     def _look_everywhere(self, image: Image, usual: bool, turn: float) -> Float[Tensor, "N 3"]:
-        """Return the detections in the whole image: without a `usual` face, small and tilted ones as well.
+        """Return the detections in the whole image: without a `usual` face, tilted or small ones as well.
 
         Args:
             usual: whether a face of the usual size is known. turn: of the image, degrees.
@@ -316,11 +316,11 @@ class FaceTracker(nn.Module):
         found = self.detector(image)
         if usual or len(found):
             return found
-        parts = [_turned_search(self.detector, image, None, turn)]
-        if self.smallest < _USUAL:
-            height, width = image.shape
-            parts.append(self.detector(image, Region(0, 0, width, height, self.smallest, _USUAL)))
-        return torch.cat(parts)
+        found = _turned_search(self.detector, image, None, turn)
+        if len(found) or self.smallest >= _USUAL:
+            return found
+        height, width = image.shape
+        return self.detector(image, Region(0, 0, width, height, self.smallest, _USUAL))
 
     def _look_near(self, image: Image, face: list[float]) -> Float[Tensor, "N 3"]:
         """Return the detections about a known face, scaled to the size `detail`, tilted if not upright."""
