@@ -25,7 +25,6 @@ all forward; with the person's own lengths they know what a tracker has to find 
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache, partial
@@ -38,7 +37,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 import torchpose
-from benchmarks._table_file import table_file
+from benchmarks._command import run_command
+from benchmarks._table_file import TableFile
 from torchpose._core.files import check_output_folder
 from torchpose.evaluation import Report
 from torchpose.evaluation.common import CAMERA, centred_on_neck, make_test_set
@@ -508,35 +508,42 @@ def draw(group: Group, prior: UpperBodyPrior, arms: ArmPrior, folder: Path, name
         viz.save_figure(figure, folder / f"{name}-{method}.png", dpi=110)
 
 
-def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder with the sets")
-    parser.add_argument("--threads", type=int, default=2, help="cores")
-    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
-    parser.add_argument("--quick", action="store_true", help="few recordings, to see that it works")
-    parser.add_argument("--pictures", type=Path, help="folder for strips of poses")
-    parser.add_argument(
-        "--fit", type=Path, help="file for a prior over arms, in place of the table"
-    )
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
-    if args.fit is not None:
-        fit_shipped(args.data, args.fit)
+def main(
+    *,
+    data: Path,
+    threads: int = 2,
+    out: TableFile | None = None,
+    quick: bool = False,
+    pictures: Path | None = None,
+    fit: Path | None = None,
+) -> None:
+    """Print the tables.
+
+    Args:
+        data: folder with the sets.
+        threads: cores.
+        out: file for the same as Markdown, or a folder.
+        quick: few recordings, to see that it works.
+        pictures: folder for strips of poses.
+        fit: file for a prior over arms, in place of the table.
+    """
+    torch.set_num_threads(threads)
+    if fit is not None:
+        fit_shipped(data, fit)
         return
-    if args.pictures is not None:
-        check_output_folder(args.pictures)
+    if pictures is not None:
+        check_output_folder(pictures)
     report = Report("Arms of strangers")
-    for group, name in zip(groups(args.data, args.quick), _NAMES, strict=True):
-        priors = priors_of(group, args.data, args.quick)
-        if args.pictures is not None:
-            draw(group, *priors, args.pictures, name)
+    for group, name in zip(groups(data, quick), _NAMES, strict=True):
+        priors = priors_of(group, data, quick)
+        if pictures is not None:
+            draw(group, *priors, pictures, name)
         add_group(report, group, *priors)
     tables = [table.to_markdown() for table in report.values()]
     print("\n\n".join(tables))
-    if args.out is not None:
-        args.out.write_text("\n\n".join(tables) + "\n")
+    if out is not None:
+        out.write_text("\n\n".join(tables) + "\n")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -6,7 +6,6 @@ them, the four views of a balancing man (`multicam_pose2sim`) are searched from 
     python -m benchmarks.first_pose --data DIR [--seeds 3] [--cameras 3] [--manifold]
 """
 
-import argparse
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -15,6 +14,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._command import run_command
 from benchmarks.bodies.clips import split_clips
 from benchmarks.bodies.views import Conditions
 from benchmarks.real_silhouettes import HEIGHT, four_views
@@ -94,22 +94,23 @@ def row(
     return f"| {name} | {right} of {count} | {sum(errors) / count:.0f} | {max(errors):.0f} |"
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--cameras", type=int, default=3)
-    parser.add_argument("--manifold", action="store_true")
-    args = parser.parse_args()
-    groups = {"walks": list(walks(args.data / "mocap_cmu_walk", args.cameras, args.manifold))}
-    if (args.data / "multicam_pose2sim").is_dir() and not args.manifold:
-        groups["balancing man"] = list(balancing(args.data))
+def main(*, data: Path, seeds: int = 3, cameras: int = 3, manifold: bool = False) -> None:
+    """Print the table.
+
+    Args:
+        data: folder of the data sets.
+        seeds: runs for each start.
+        cameras: around each walk.
+        manifold: poses of the manifold of walks in place of every pose.
+    """
+    groups = {"walks": list(walks(data / "mocap_cmu_walk", cameras, manifold))}
+    if (data / "multicam_pose2sim").is_dir() and not manifold:
+        groups["balancing man"] = list(balancing(data))
     print("| | faces the right way | error (mm) | largest (mm) |\n| --- | ---: | ---: | ---: |")
     for name, starts in groups.items():
-        print(row(f"{name}, one frame", starts, args.seeds, one_frame))
-        print(row(f"{name}, half a second", starts, args.seeds, half_a_second))
+        print(row(f"{name}, one frame", starts, seeds, one_frame))
+        print(row(f"{name}, half a second", starts, seeds, half_a_second))
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

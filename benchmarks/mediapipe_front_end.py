@@ -9,7 +9,6 @@ beside it stands how much its own full and heavy models differ.
     python -m benchmarks.mediapipe_front_end --data DIR
 """
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,8 @@ import torch
 from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, pad, read_clip
-from benchmarks._table_file import table_file
+from benchmarks._command import run_command
+from benchmarks._table_file import TableFile
 from torchpose.camera import PinholeCamera
 from torchpose.evaluation import Report
 from torchpose.metrics import jitter, joint_errors_3d
@@ -337,25 +337,31 @@ def gap_errors(bench: Bench, cases: list[tuple[int, int, int]], length: int) -> 
     return {name: float(value) for name, value in errors.items()}
 
 
-def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder with video_asl/")
-    parser.add_argument("--prior", default="kinect-upper-body", help="name or file")
-    parser.add_argument("--threads", type=int, default=2, help="cores")
-    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
-    parser.add_argument(
-        "--quick", action="store_true", help="the beginning of one clip, to see that it works"
-    )
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
-    folder = args.data / "video_asl" if (args.data / "video_asl").is_dir() else args.data
-    names = CLIPS[:1] if args.quick else CLIPS
+def main(
+    *,
+    data: Path,
+    prior: str = "kinect-upper-body",
+    threads: int = 2,
+    out: TableFile | None = None,
+    quick: bool = False,
+) -> None:
+    """Print the tables.
+
+    Args:
+        data: folder with video_asl/.
+        prior: name or file.
+        threads: cores.
+        out: file for the same as Markdown, or a folder.
+        quick: the beginning of one clip, to see that it works.
+    """
+    torch.set_num_threads(threads)
+    folder = data / "video_asl" if (data / "video_asl").is_dir() else data
+    names = CLIPS[:1] if quick else CLIPS
     clips, heavy = ([read_clip(folder, n, m) for n in names] for m in (1, 2))
-    if args.quick:
+    if quick:
         clips, heavy = ([begun(clip) for clip in whole] for whole in (clips, heavy))
-    prior = load_prior(args.prior)
-    bench = Bench(clips, heavy, prior)
+    fitted = load_prior(prior)
+    bench = Bench(clips, heavy, fitted)
     report = Report("MediaPipe as the measuring front end")
     tracks = {
         f"{front_end}, {mode}": bench.track(mode, joints)
@@ -363,22 +369,22 @@ def main() -> None:
         for mode in MODES
     }
     jitter_tables(bench, report, tracks)
-    gap_table(bench, report, *((60, GAPS[:1]) if args.quick else (10,)))
+    gap_table(bench, report, *((60, GAPS[:1]) if quick else (10,)))
     inferred_table(bench, report)
-    some = slice(1 if args.quick else None)
+    some = slice(1 if quick else None)
     place_table(bench, report, HEADS[some], NECKS[some])
     by_clip_table(bench, report, tracks)
     space_table(bench, report, tracks)
     report.settings = {
-        "prior": prior.info.name,
+        "prior": fitted.info.name,
         "clips": {c.name: f"{len(c.points)} frames, shoulders {c.width:.0f} px" for c in clips},
         "known": "visibility 0.5 or more, in the image, after 15 frames",
         "camera": "f = 525 px (assumed), 640x480, 30 fps",
     }
     print(report.summary())
-    if args.out:
-        args.out.write_text(report.to_markdown(), encoding="utf-8")
+    if out is not None:
+        out.write_text(report.to_markdown(), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -9,8 +9,7 @@ without it, and after a median over five frames.
     python -m benchmarks.outliers --data DIR --out DIR --persons s3 s6 --every 8
 """
 
-import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from benchmarks._command import run_command
 from benchmarks._upper_body import Tracker, data_folder, score, trials_of, with_bones
 from benchmarks.ub_people import TEST_PERSONS, TRAIN_PERSONS
 from torchpose._core.files import check_output_folder
@@ -35,6 +35,32 @@ IMAGE = (640.0, 480.0)
 _FIRST, _EVERY, _LATER = 15, 20, 3  # frames with an outlier, and how long after it is looked again
 _SHARE, _EXCHANGED, _LONGEST = 0.05, 0.02, 5
 _HANDS = ("hand_left", "hand_right")
+FIT: dict[str, Any] = {"n_components": 10, "window_components": 48, "calibration_folds": 2}
+QUICK_FIT: dict[str, Any] = QUICK | {"n_components": 2, "n_samples": 3000, "calibration_folds": 0}
+
+
+class Options(NamedTuple):
+    """What is tracked.
+
+    Attributes:
+        data: folder of the recordings.
+        out: folder for what is kept, and the report.
+        every: take every n-th sequence.
+        persons: who is tracked; no other is fitted.
+        quick: a tiny prior, to see that it works.
+        seed: of the outliers.
+        threads: cores.
+        progress: show bars.
+    """
+
+    data: Path
+    out: Path
+    every: int = 12
+    persons: Sequence[str] = TEST_PERSONS
+    quick: bool = False
+    seed: int = 0
+    threads: int = 2
+    progress: bool = False
 
 
 class Wild(NamedTuple):
@@ -238,56 +264,29 @@ def _errors(poses: PoseTrack, test: Trials) -> Float[Tensor, "B T"]:
     return 100 * (poses.joints3d - test.truth3d).norm(dim=-1).mean(-1)
 
 
-def main() -> None:
-    """Fit, track and write the report."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
-    parser.add_argument(
-        "--out", type=Path, required=True, help="folder for what is kept, and the report"
-    )
-    parser.add_argument("--every", type=int, default=12, help="take every n-th sequence")
-    parser.add_argument(
-        "--persons",
-        nargs="+",
-        default=list(TEST_PERSONS),
-        help="who is tracked; no other is fitted",
-    )
-    parser.add_argument("--quick", action="store_true", help="a tiny prior, to see that it works")
-    parser.add_argument("--seed", type=int, default=0, help="of the outliers")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--progress", action="store_true", help="show bars")
-    arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
-    arguments.out = check_output_folder(arguments.out)
-    run(arguments)
-    print((arguments.out / "report.md").read_text())
+def main(options: Options) -> None:
+    """Fit, track, write the report and print it."""
+    torch.set_num_threads(options.threads)
+    check_output_folder(options.out)
+    make_report(options).save(options.out)
+    print((options.out / "report.md").read_text())
 
 
-def run(arguments: argparse.Namespace) -> Report:
-    """Run the protocol, and return the report that it wrote."""
-    recordings = read_recordings(data_folder(arguments.data, "kinect_utd_mhad"))
-    everybody = {*TRAIN_PERSONS, *TEST_PERSONS} - {*arguments.persons}
+def make_report(options: Options) -> Report:
+    """Fit and track, and return the report."""
+    recordings = read_recordings(data_folder(options.data, "kinect_utd_mhad"))
+    everybody = {*TRAIN_PERSONS, *TEST_PERSONS} - {*options.persons}
     fitted = [r for r in recordings if r.person in everybody - {*TEST_PERSONS}]
-    test = trials_of([r for r in recordings if r.person in arguments.persons][:: arguments.every])
-    small: dict[str, Any] = {
-        "n_components": 10, "window_components": 48, "calibration_folds": 2,
-    }  # fmt: skip
-    if arguments.quick:
-        small = QUICK | {"n_components": 2, "n_samples": 3000, "calibration_folds": 0}
+    test = trials_of([r for r in recordings if r.person in options.persons][:: options.every])
+    small = QUICK_FIT if options.quick else FIT
     prior = cached_prior(
-        arguments.out,
-        fitted,
-        fit_kinect_prior,
-        arguments.progress,
-        seed=0,
-        name="UB-people",
-        **small,
+        options.out, fitted, fit_kinect_prior, options.progress, seed=0, name="UB-people", **small
     )
-    wild = spoiled(test, arguments.seed)
-    facts = {"every": arguments.every, "persons": arguments.persons, "seed": arguments.seed}
+    wild = spoiled(test, options.seed)
+    facts = {"every": options.every, "persons": options.persons, "seed": options.seed}
     facts |= {"sequences": len(test.lengths), "frames": int(test.lengths.sum()), **small}
     report = Report("Outliers", facts)
-    bones = with_bones(arguments.data, arguments.persons)
+    bones = with_bones(options.data, options.persons)
     trackers = {"multiple-model": Tracker(prior, bones)} if bones else {}
     trackers |= {
         "window-mixture": Tracker(prior, {"method": "window-mixture"}),
@@ -295,14 +294,13 @@ def run(arguments: argparse.Namespace) -> Report:
     }
     add_many(report, trackers, test, wild)
     add_found(report, next(iter(trackers.values())), test, wild)
-    add_single(report, trackers, test, arguments.seed)
+    add_single(report, trackers, test, options.seed)
     report.findings.append(
         "A keypoint that is left out costs what a missing one does: the numbers of sizes that are all found "
         "are alike."
     )
-    report.save(arguments.out)
     return report
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -11,7 +11,6 @@ real-bends of its pictures into the folder of the results.
     python -m benchmarks.real_bends --data DIR --out DIR
 """
 
-import argparse
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +20,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._command import run_command
 from benchmarks._depth_silhouettes import HEAD_TOP, PELVIS, Filmed, draw, kinect, one_view, seeded
 from benchmarks.bend.trackees import REDRAWS, SHARPNESS, fit_space
 from benchmarks.engine import Setting, choose_setting
@@ -193,26 +193,35 @@ def _say(report: Report, people: dict[str, Person], rows: dict[str, list[list[fl
         )
 
 
-def main() -> None:
-    """Print the table and write it as Markdown."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder of the data sets")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the results")
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--particles", type=int, default=1000)
-    parser.add_argument("--persons", nargs="+", default=list(TEST))
-    parser.add_argument("--threads", type=int, default=1)
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
-    out = check_output_folder(args.out)
+def main(
+    *,
+    data: Path,
+    out: Path,
+    seeds: int = 3,
+    particles: int = 1000,
+    persons: Sequence[str] = TEST,
+    threads: int = 1,
+) -> None:
+    """Print the table and write it as Markdown.
+
+    Args:
+        data: folder of the data sets.
+        out: folder of the results.
+        seeds: runs of each tracker.
+        particles: of each tracker.
+        persons: who is tracked.
+        threads: cores.
+    """
+    torch.set_num_threads(threads)
+    out = check_output_folder(out)
     report = Report("Real bends", {
-        "seeds": args.seeds, "particles": args.particles, "persons": args.persons, "redraws": REDRAWS,
+        "seeds": seeds, "particles": particles, "persons": persons, "redraws": REDRAWS,
     })  # fmt: skip
-    fill(report, args.data, out, args.particles, args.seeds, args.persons)
+    fill(report, data, out, particles, seeds, persons)
     print(report.summary())
     with atomic_path(out / "real-bends.md") as path:
         path.write_text(report.to_markdown(), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -14,17 +14,17 @@ results.
     python -m benchmarks.real_silhouettes --data DIR --out DIR
 """
 
-import argparse
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._command import run_command
 from benchmarks._depth_silhouettes import (
     HEAD_TOP,
     Filmed,
@@ -244,29 +244,38 @@ def best_sharpness(folder: Path, action: str) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    """Print the tables and write them as Markdown."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder of the data sets")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the results")
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--only", choices=["four", "one"])
-    parser.add_argument("--actions", nargs="+", default=list(ACTIONS))
-    parser.add_argument("--threads", type=int, default=2)
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
-    out = check_output_folder(args.out)
+def main(
+    *,
+    data: Path,
+    out: Path,
+    seeds: int = 3,
+    only: Literal["four", "one"] | None = None,
+    actions: Sequence[str] = ACTIONS,
+    threads: int = 2,
+) -> None:
+    """Print the tables and write them as Markdown.
+
+    Args:
+        data: folder of the data sets.
+        out: folder of the results.
+        seeds: runs of each tracker.
+        only: the tables of four cameras, or of one.
+        actions: in one camera.
+        threads: cores.
+    """
+    torch.set_num_threads(threads)
+    out = check_output_folder(out)
     report = Report("Real silhouettes", {
-        "seeds": args.seeds, "particles": N_PARTICLES, "actions": args.actions, "threads": args.threads
+        "seeds": seeds, "particles": N_PARTICLES, "actions": actions, "threads": threads
     })  # fmt: skip
-    if args.only != "one":
-        report_four(report, args.data, args.seeds, out)
-    if args.only != "four":
-        report_one(report, args.data, args.seeds, args.actions, out)
+    if only != "one":
+        report_four(report, data, seeds, out)
+    if only != "four":
+        report_one(report, data, seeds, actions, out)
     print(report.summary())
     with atomic_path(out / "real-silhouettes.md") as path:
         path.write_text(report.to_markdown(), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -399,6 +399,6 @@ def _cut(videos: Videos, n: int, frames: int) -> Videos:
 
 
 if __name__ == "__main__":
-    from benchmarks._command import main
+    from benchmarks._protocols import run_protocol
 
-    main("signer")
+    run_protocol("signer")

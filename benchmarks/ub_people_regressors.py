@@ -18,16 +18,17 @@ and its spread are printed.
 `--report` prints the rows of a finished `python -m benchmarks.ub_people` beside them.
 """
 
-import argparse
 import json
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
+from benchmarks._command import run_command
 from benchmarks._upper_body import score
 from benchmarks.ub_people import people, sway
 from torchpose.camera import project, sample_viewpoints
@@ -167,17 +168,24 @@ def estimate(model: nn.Module, test: Trials) -> Estimate:
     return Estimate(torch.full_like(test.truth2d, torch.nan), joints)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, required=True, help="folder kinect_utd_mhad")
-    parser.add_argument("--report", type=Path, help="report.json of python -m benchmarks.ub_people")
-    parser.add_argument("--seeds", type=int, default=1, help="runs of each; ten minutes each")
-    parser.add_argument("--targets", choices=("body", "camera"), default="body")
-    parser.add_argument("--quick", action="store_true", help="a minute, to see that it works")
-    args = parser.parse_args()
-    train, tested = people(args.data, args.quick)
+def main(
+    *,
+    data: Path,
+    report: Path | None = None,
+    seeds: int = 1,
+    targets: Literal["body", "camera"] = "body",
+    quick: bool = False,
+) -> None:
+    """Train, score and print the table.
+
+    Args:
+        data: folder kinect_utd_mhad.
+        report: report.json of python -m benchmarks.ub_people.
+        seeds: runs of each; ten minutes each.
+        targets: axes of the poses that are learnt.
+        quick: a minute, to see that it works.
+    """
+    train, tested = people(data, quick)
     poses = [centred_on_neck(r.upper_body().joints).float() for r in train]
     unseen = [centred_on_neck(r.upper_body().joints) for r in tested]
     fps = tested[0].fps or 30.0
@@ -185,15 +193,15 @@ def main() -> None:
     paths = [sway(len(p), fps, i / len(unseen)) for i, p in enumerate(unseen)]
     moving = make_test_set(unseen, CAMERA, fps, paths=paths)
     trainers: dict[str, Callable[[int], nn.Module]] = {
-        "MLP, per frame": lambda s: train_frames(poses, args.targets, s, args.quick),
-        "GRU, causal": lambda s: train_sequences(poses, args.targets, s, args.quick, False),
-        "GRU, both directions": lambda s: train_sequences(poses, args.targets, s, args.quick, True),
+        "MLP, per frame": lambda s: train_frames(poses, targets, s, quick),
+        "GRU, causal": lambda s: train_sequences(poses, targets, s, quick, False),
+        "GRU, both directions": lambda s: train_sequences(poses, targets, s, quick, True),
     }
-    n_seeds = 1 if args.quick else args.seeds
-    report = Report("UB-people, learned regressors")
-    table = report.table(
+    n_seeds = 1 if quick else seeds
+    tables = Report("UB-people, learned regressors")
+    table = tables.table(
         "errors_3d",
-        f"3D error after Procrustes (cm), {n_seeds} seed(s), targets in {args.targets} axes",
+        f"3D error after Procrustes (cm), {n_seeds} seed(s), targets in {targets} axes",
         ["mean", "spread", "moving root", "jitter (m/s2)", *SHORT_NAMES, "training (s)"],
         digits=(2, 2, 2, 1, *[1] * 8, 0),
     )
@@ -214,9 +222,9 @@ def main() -> None:
         spread = float(values[:, 0].std()) if len(rows) > 1 else float("nan")
         mean = values.mean(0).tolist()
         table.add(name, [mean[0], spread, *mean[1:]])
-    if args.report:
-        add_finished_rows(report, args.report)
-    print(report.summary())
+    if report is not None:
+        add_finished_rows(tables, report)
+    print(tables.summary())
 
 
 def add_finished_rows(report: Report, path: Path) -> None:
@@ -232,4 +240,4 @@ def add_finished_rows(report: Report, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -139,6 +139,6 @@ def without_raised(
 
 
 if __name__ == "__main__":
-    from benchmarks._command import main
+    from benchmarks._protocols import run_protocol
 
-    main("uncommon_poses")
+    run_protocol("uncommon_poses")

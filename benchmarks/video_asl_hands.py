@@ -16,22 +16,23 @@ draws frames of every kind of failure: rings are the truth, crosses what was fou
 left hand and red the right.
 """
 
-import argparse
 import math
 import os
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, FPS, Clip, read_clip
-from benchmarks._table_file import table_file
+from benchmarks._command import OneOf, run_command
+from benchmarks._table_file import TableFile
 from benchmarks.speed._timing import Report, limit_threads, machine_line
+from torchpose.errors import InputError
 from torchpose.measure import HandTracker
 from torchpose.measure._edges import edge_map
 from torchpose.measure._face import FaceTracker
@@ -102,30 +103,43 @@ class Score(NamedTuple):
     errors: Tensor
 
 
-def main() -> None:
-    """Print the tables."""
+def main(
+    *,
+    data: Path,
+    prior: str = "kinect-upper-body",
+    trackers: str = "grid",
+    ablation: bool = False,
+    changed: bool = False,
+    pictures: Path | None = None,
+    clips: Annotated[Sequence[str], OneOf(CLIPS)] = CLIPS,
+    threads: int = 1,
+    quick: bool = False,
+    out: TableFile | None = None,
+) -> None:
+    """Print the tables.
+
+    Args:
+        data: folder with video_asl/.
+        prior: name or file.
+        trackers: grid, mean-shift, or both.
+        ablation: switch parts off, one at a time.
+        changed: changed clips too.
+        pictures: folder for sheets of failures.
+        clips: which clips.
+        threads: cores.
+        quick: one clip only.
+        out: file for the same as Markdown, or a folder.
+    """
     import cv2
 
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder with video_asl/")
-    parser.add_argument("--prior", default="kinect-upper-body", help="name or file")
-    parser.add_argument("--trackers", default="grid", help="grid, mean-shift, or both")
-    parser.add_argument("--ablation", action="store_true", help="switch parts off, one at a time")
-    parser.add_argument("--changed", action="store_true", help="changed clips too")
-    parser.add_argument("--pictures", type=Path, help="folder for sheets of failures")
-    parser.add_argument("--clips", nargs="+", default=list(CLIPS), choices=CLIPS)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--quick", action="store_true", help="one clip only")
-    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
-    args = parser.parse_args()
-    limit_threads(args.threads)
-    cv2.setNumThreads(args.threads)  # faces differ a little with the number of threads
-    clips = args.clips[:1] if args.quick else args.clips
-    folder = args.data / "video_asl" if (args.data / "video_asl").is_dir() else args.data
-    prior = HandPrior.from_prior(load_prior(args.prior))
-    report = Report("Hands in the clips of video_asl", args.out)
+    limit_threads(threads)
+    cv2.setNumThreads(threads)  # faces differ a little with the number of threads
+    clips = list(clips[:1] if quick else clips)
+    folder = data / "video_asl" if (data / "video_asl").is_dir() else data
+    hand_prior = HandPrior.from_prior(load_prior(prior))
+    report = Report("Hands in the clips of video_asl", out)
     materials = {name: read_material(folder, name) for name in clips}
-    makers = trackers(args.trackers.split(","), prior, report)
+    makers = make_trackers(trackers.split(","), hand_prior, report)
     found = {}
     rows = []
     for name, make in makers.items():
@@ -135,27 +149,27 @@ def main() -> None:
     report.table(HEADER, rows)
     for name in makers:
         report.add(f"{name}: {calibration(found[name], materials)}")
-    if args.ablation:
+    if ablation:
         report.add("Parts switched off, one at a time:")
-        report.table(HEADER, ablation(prior, materials, args.quick))
-    if args.changed:
+        report.table(HEADER, ablation_rows(hand_prior, materials, quick))
+    if changed:
         report.add("Changed clips:")
-        report.table(HEADER, changed(makers, folder, clips))
-    if args.pictures:
+        report.table(HEADER, changed_rows(makers, folder, clips))
+    if pictures:
         name = next(iter(makers))
-        for kind, count, file in draw_failures(args.pictures, materials, found[name]):
-            near = os.path.relpath(file, args.out.parent if args.out else ".")
+        for kind, count, file in draw_failures(pictures, materials, found[name]):
+            near = os.path.relpath(file, out.parent if out else ".")
             report.add(f"{kind.capitalize()}, {count} hand-frames:")
             report.add(f"![Hands found {kind}]({near})")
     report.add(
         "First 3: again, brother, help. px: median distance of what is not missing. Swapped and missing in "
         "percent. ms: median CPU time of a frame, without face detection, beside other work. "
-        f" {machine_line(args.threads, ['opencv-python-headless'])}"
+        f" {machine_line(threads, ['opencv-python-headless'])}"
     )
     report.close()
 
 
-def trackers(
+def make_trackers(
     names: list[str], prior: HandPrior, report: Report
 ) -> dict[str, Callable[[float], Any]]:
     """What makes a tracker for a frame rate, by name."""
@@ -172,7 +186,7 @@ def trackers(
             made["mean-shift"] = lambda fps: MeanShiftHandTracker()
             made["mean-shift, skin ratio"] = lambda fps: MeanShiftHandTracker("ratio", prior=prior)
         else:
-            raise SystemExit(f"trackers are grid and mean-shift, got {name!r}")
+            raise InputError(f"trackers are grid and mean-shift, got {name!r}")
     return made
 
 
@@ -223,7 +237,7 @@ def _changed(
         late = truth.flip(0).clone()
         late[:BURN_IN] = torch.nan
         return frames[::-1].copy(), late, 1.0, FPS
-    raise SystemExit(f"changes are {', '.join(CHANGES)}, got {change!r}")
+    raise InputError(f"changes are {', '.join(CHANGES)}, got {change!r}")
 
 
 def follow_face(frames: np.ndarray) -> Tensor:
@@ -312,7 +326,9 @@ def _median(scores: Iterable[Score]) -> str:
     return f"{float(errors.median()):.1f}" if len(errors) else ""
 
 
-def ablation(prior: HandPrior, materials: dict[str, Material], quick: bool) -> Iterable[list[str]]:
+def ablation_rows(
+    prior: HandPrior, materials: dict[str, Material], quick: bool
+) -> Iterable[list[str]]:
     """Rows with parts switched off."""
     rows = []
     for name, off in list(ABLATION.items())[: 3 if quick else None]:
@@ -324,7 +340,7 @@ def ablation(prior: HandPrior, materials: dict[str, Material], quick: bool) -> I
     return rows
 
 
-def changed(
+def changed_rows(
     makers: dict[str, Callable[[float], Any]], folder: Path, clips: list[str]
 ) -> Iterable[list[str]]:
     """Rows on changed clips, and one with all of them."""
@@ -407,4 +423,4 @@ def _view(clip: str, t: int, material: Material, points: Tensor) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -10,7 +10,6 @@ its Figure 12 has the pipeline with and without background subtraction, as here.
     python -m benchmarks.video_asl_joints --data DIR --out video-joints.md --pictures DIR
 """
 
-import argparse
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -19,7 +18,8 @@ import torch
 from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, read_clip
-from benchmarks._table_file import table_file
+from benchmarks._command import run_command
+from benchmarks._table_file import TableFile
 from torchpose._core.files import check_output_folder
 from torchpose.camera import PinholeCamera
 from torchpose.evaluation import Report
@@ -182,7 +182,7 @@ def _arms(values: PCP) -> tuple[Tensor, Tensor]:
     return tuple(hits[r].sum(0) / weights[r].sum(0) for r in ([0, 2], [1, 3]))  # type: ignore[return-value]
 
 
-def pictures(
+def draw_pictures(
     clips: list[Clip], found: dict[str, list[Tensor]], curves: dict[str, PCP], out: Path
 ) -> list[str]:
     """The PCP curve (Figure 13) and the errors over time of one clip (Figure 12)."""
@@ -206,27 +206,36 @@ def pictures(
     return ["pcp.png", "errors-over-time.png"]
 
 
-def main() -> None:
-    """Print the tables, draw the pictures."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder with video_asl/")
-    parser.add_argument("--prior", default="kinect-upper-body", help="name or file")
-    parser.add_argument("--threads", type=int, default=2, help="cores")
-    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
-    parser.add_argument("--pictures", type=Path, help="folder for pcp.png and errors-over-time.png")
-    parser.add_argument("--quick", action="store_true", help="one clip, to see that it works")
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
-    folder = args.data / "video_asl" if (args.data / "video_asl").is_dir() else args.data
-    clips = [read_clip(folder, name) for name in (CLIPS[:1] if args.quick else CLIPS)]
-    prior = load_prior(args.prior)
+def main(
+    *,
+    data: Path,
+    prior: str = "kinect-upper-body",
+    threads: int = 2,
+    out: TableFile | None = None,
+    pictures: Path | None = None,
+    quick: bool = False,
+) -> None:
+    """Print the tables, draw the pictures.
+
+    Args:
+        data: folder with video_asl/.
+        prior: name or file.
+        threads: cores.
+        out: file for the same as Markdown, or a folder.
+        pictures: folder for pcp.png and errors-over-time.png.
+        quick: one clip, to see that it works.
+    """
+    torch.set_num_threads(threads)
+    folder = data / "video_asl" if (data / "video_asl").is_dir() else data
+    clips = [read_clip(folder, name) for name in (CLIPS[:1] if quick else CLIPS)]
+    fitted = load_prior(prior)
     methods = {
-        "video": from_video(folder, prior, False),
-        "video, background model": from_video(folder, prior, True),
-        "MediaPipe's head, neck, hands": from_landmarks(prior, (*TRUNK, *HANDS)),
-        "MediaPipe's head and neck": from_landmarks(prior, TRUNK),
+        "video": from_video(folder, fitted, False),
+        "video, background model": from_video(folder, fitted, True),
+        "MediaPipe's head, neck, hands": from_landmarks(fitted, (*TRUNK, *HANDS)),
+        "MediaPipe's head and neck": from_landmarks(fitted, TRUNK),
     }
-    if args.quick:
+    if quick:
         del methods["video, background model"]
     found = {name: [method(clip) for clip in clips] for name, method in methods.items()}
     report = Report("Joints in the image, on the webcam clips")
@@ -236,21 +245,21 @@ def main() -> None:
     report.findings.append(
         "The code of Eichner et al. (2012), which the paper compares itself with, is not to be had."
     )
-    if args.pictures:
-        report.pictures = pictures(clips, found, curves, check_output_folder(args.pictures))
-        if args.out and args.pictures.resolve().parent == args.out.resolve().parent:
-            report.pictures = [f"{args.pictures.name}/{name}" for name in report.pictures]
+    if pictures:
+        report.pictures = draw_pictures(clips, found, curves, check_output_folder(pictures))
+        if out and pictures.resolve().parent == out.resolve().parent:
+            report.pictures = [f"{pictures.name}/{name}" for name in report.pictures]
     report.settings = {
-        "prior": prior.info.name,
+        "prior": fitted.info.name,
         "reference": "MediaPipe 0.10.21 pose, full; visibility 0.5 or more, in the image, after 15 "
         "frames",
         "camera": "f = 525 px (assumed)",
         "clips": {c.name: f"{len(c.points)} frames, shoulders {c.width:.0f} px" for c in clips},
     }
     print(report.summary())
-    if args.out:
-        args.out.write_text(report.to_markdown(), encoding="utf-8")
+    if out:
+        out.write_text(report.to_markdown(), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -5,7 +5,6 @@ medians from one run. CPU time stands beside wall time: on a machine that is not
 a run with one thread is the figure to compare, since waiting for a core does not count.
 """
 
-import argparse
 import contextlib
 import os
 import platform
@@ -18,9 +17,25 @@ from typing import Any, NamedTuple
 
 import torch
 
-from benchmarks._table_file import table_file
+from benchmarks._table_file import TableFile
 
 THREAD_VARIABLES = ("OMP", "MKL", "OPENBLAS", "NUMBA")
+
+
+class Setup(NamedTuple):
+    """The options that benchmarks of speed share.
+
+    Attributes:
+        threads: cores for every library.
+        runs: timed runs of each method.
+        quick: a tiny problem, to see that it runs.
+        out: file for the same as Markdown, or a folder.
+    """
+
+    threads: int = 2
+    runs: int = 1
+    quick: bool = False
+    out: TableFile | None = None
 
 
 class Case(NamedTuple):
@@ -76,20 +91,6 @@ class Limits(NamedTuple):
     call_us: float
 
 
-def parser(text: str | None, runs: int) -> argparse.ArgumentParser:
-    """Return a command line with the options of every benchmark.
-
-    Args:
-        text: of the script, whose first line describes it. runs: timed runs by default.
-    """
-    made = argparse.ArgumentParser(description=(text or "").partition("\n")[0])
-    made.add_argument("--threads", type=int, default=2, help="cores for every library")
-    made.add_argument("--runs", type=int, default=runs, help="timed runs of each method")
-    made.add_argument("--quick", action="store_true", help="a tiny problem, to see that it runs")
-    made.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
-    return made
-
-
 def limit_threads(threads: int) -> None:
     """The same cores for every library; call it before peers are imported."""
     for name in THREAD_VARIABLES:
@@ -104,15 +105,14 @@ def limit_threads(threads: int) -> None:
         threadpool_limits(threads)
 
 
-def begin(title: str, options: argparse.ArgumentParser) -> tuple[argparse.Namespace, "Report"]:
-    """Parse the command line, pin every library to its cores, and return both options and report.
+def begin(title: str, setup: Setup) -> "Report":
+    """Pin every library to its cores, and return an empty report.
 
     Args:
-        title: of the report. options: from `parser`, perhaps with more of them.
+        title: of the report. setup: of the benchmark.
     """
-    args = options.parse_args()
-    limit_threads(args.threads)
-    return args, Report(title, args.out, args.threads)
+    limit_threads(setup.threads)
+    return Report(title, setup.out, setup.threads)
 
 
 def take_turns(cases: Sequence[Case], runs: int, warm: int = 1) -> list[Timing]:

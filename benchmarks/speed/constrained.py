@@ -12,7 +12,8 @@ import math
 
 import torch
 
-from benchmarks.speed._timing import Case, Report, begin, number, parser, take_turns
+from benchmarks._command import run_command
+from benchmarks.speed._timing import Case, Report, Setup, begin, number, take_turns
 from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.learning import fit_action_space
@@ -35,15 +36,16 @@ DIMENSIONS = 13
 BODY = Body.of_height(BODY_15, 1.75)
 
 
-def main() -> None:
-    args, report = begin("Constrained prediction", parser(__doc__, runs=5))
+def main(setup: Setup = Setup(runs=5)) -> None:
+    """Run and print the tables."""
+    report = begin("Constrained prediction", setup)
     performances = [performance(seed) for seed in range(12)]
     postures = [state_postures(BODY, states) for states in performances]
     action = fit_action_space(postures, DIMENSIONS, name="bend", fps=30.0)
     std = constant_velocity_std(BODY, performances)
-    sizes = (20, 40) if args.quick else PARTICLES
-    frames(action, std, sizes, args.runs, report)
-    pieces(action, std, sizes[-1], args.runs, report)
+    sizes = (20, 40) if setup.quick else PARTICLES
+    frames(action, std, sizes, setup.runs, report)
+    pieces(action, std, sizes[-1], setup.runs, report)
     report.close()
 
 
@@ -141,4 +143,4 @@ def pieces(action: ActionSpace, std: torch.Tensor, n: int, runs: int, report: Re
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

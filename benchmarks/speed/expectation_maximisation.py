@@ -7,7 +7,6 @@ One float64 function computes the mean log-likelihood of every result. scikit-le
 torchgmm and pomegranate, where they can be imported, only know float32.
 """
 
-import argparse
 import logging
 import math
 import sys
@@ -19,15 +18,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks._command import run_command
 from benchmarks.speed._timing import (
     Case,
     Limits,
     Report,
+    Setup,
     Timing,
     begin,
     measure_limits,
     number,
-    parser,
     ratio,
     take_turns,
 )
@@ -57,9 +57,15 @@ class Method(NamedTuple):
     call: Callable[[], Any]
 
 
-def main() -> None:
-    args, report = begin("Expectation-maximisation, 30 components, 21 dimensions", options())
-    points, iterations, n_components = (2000, 3, 4) if args.quick else (args.points, 20, 30)
+def main(setup: Setup = Setup(runs=3), *, points: int = 100_000) -> None:
+    """Run and print the table.
+
+    Args:
+        setup: see `Setup`.
+        points: to fit to.
+    """
+    report = begin("Expectation-maximisation, 30 components, 21 dimensions", setup)
+    points, iterations, n_components = (2000, 3, 4) if setup.quick else (points, 20, 30)
     problem = make_problem(points, n_components, iterations)
     report.add(
         f"{points:,} points, {n_components} components, {iterations} iterations from one start "
@@ -68,19 +74,13 @@ def main() -> None:
     methods = make_methods(problem, report)
     found = {m.name: mean_log_likelihood(problem.x, wide(m.call())) for m in methods}
     failed = report_agreement(report, found)
-    timings = take_turns([Case(m.name, m.call) for m in methods], args.runs, warm=0)
-    limits = measure_limits(args.quick)
+    timings = take_turns([Case(m.name, m.call) for m in methods], setup.runs, warm=0)
+    limits = measure_limits(setup.quick)
     report.table(HEADER, table_rows(timings, found, iterations))
     report.add(floor_text(problem, limits))
     report.close(PACKAGES, limits)
     if failed:
         sys.exit("torchpose and scikit-learn do not reach the same likelihood")
-
-
-def options() -> argparse.ArgumentParser:
-    made = parser(__doc__, runs=3)
-    made.add_argument("--points", type=int, default=100_000)
-    return made
 
 
 def make_problem(n: int, n_components: int, iterations: int) -> Problem:
@@ -258,4 +258,4 @@ def floor_text(problem: Problem, limits: Limits) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

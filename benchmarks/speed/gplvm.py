@@ -16,7 +16,7 @@ import contextlib
 import copy
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,16 +24,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks._command import run_command
 from benchmarks.speed._gplvm_walks import held_out_tables
 from benchmarks.speed._timing import (
     Case,
     Limits,
     Report,
+    Setup,
     Timing,
     begin,
     measure_limits,
     number,
-    parser,
     ratio,
     take_turns,
 )
@@ -62,17 +63,24 @@ class Method(NamedTuple):
     peer: bool = False
 
 
-def main() -> None:
-    options = parser(__doc__, runs=9)
-    options.add_argument(
-        "--data", type=Path, help="folder of mocap_cmu_walk; none: no held-out table"
-    )
-    options.add_argument("--persons", nargs="+", default=["07", "08", "35", "39"], help="of it")
-    args, report = begin("A manifold: prediction and fit", options)
-    frames, sizes = (40, (60,)) if args.quick else (FRAMES, SIZES)
+def main(
+    setup: Setup = Setup(runs=9),
+    *,
+    data: Path | None = None,
+    persons: Sequence[str] = ("07", "08", "35", "39"),
+) -> None:
+    """Run and print the tables.
+
+    Args:
+        setup: see `Setup`.
+        data: folder of mocap_cmu_walk; none: no held-out table.
+        persons: of it.
+    """
+    report = begin("A manifold: prediction and fit", setup)
+    frames, sizes = (40, (60,)) if setup.quick else (FRAMES, SIZES)
     poses = walk(frames)
     manifold = fit_gplvm(poses, steps=3)
-    limits, failed, rows, ratios = measure_limits(args.quick), False, [], []
+    limits, failed, rows, ratios = measure_limits(setup.quick), False, [], []
     for count in sizes:
         z = latent_points(manifold, count)
         truth = true_prediction(manifold, z)
@@ -84,7 +92,7 @@ def main() -> None:
             f"the largest value, at most {TOLERANCE:g} allowed."
         )
         failed |= not worst < TOLERANCE
-        timings = take_turns([Case(m.name, m.call) for m in methods], args.runs, warm=2)
+        timings = take_turns([Case(m.name, m.call) for m in methods], setup.runs, warm=2)
         rows += prediction_rows(methods, timings, errors, count)
         rows.append(floor_row(manifold, count, limits))
         ratios += speedups(methods, timings, count)
@@ -92,9 +100,9 @@ def main() -> None:
     report.add("mean, variance: largest |difference| over the largest |truth|.")
     if ratios:
         report.add(f"{'; '.join(ratios)} (the aim: {GOAL} times).")
-    report.table(FIT_HEADER, fit_rows(poses, manifold, args))
-    if args.data is not None:
-        held_out_tables(args, report)
+    report.table(FIT_HEADER, fit_rows(poses, manifold, setup.quick))
+    if data is not None:
+        held_out_tables(data, persons, report)
     report.close(PACKAGES, limits)
     if failed:
         sys.exit("torchpose differs from the plain computation by more than is allowed")
@@ -230,14 +238,14 @@ def gpytorch_model(manifold: BackConstrainedGPLVM, dtype: torch.dtype) -> Any:
 # --- fit
 
 
-def fit_rows(poses: Tensor, manifold: BackConstrainedGPLVM, args: Any) -> list[list[str]]:
+def fit_rows(poses: Tensor, manifold: BackConstrainedGPLVM, quick: bool) -> list[list[str]]:
     """Ten evaluations of objective and gradient of both, and a whole fit."""
     target, gamma = poses - poses.mean(0), float(manifold.gamma_x)
     ours = GPLVMFit(target, 2, gamma, "adam")
     cases = [Case("torchpose, 10 steps of Adam", ours.step)]
     with contextlib.suppress(ImportError):
         cases.append(Case("gpytorch, 10 steps of Adam", gpytorch_steps(manifold)))
-    runs = 1 if args.quick else 3
+    runs = 1 if quick else 3
     timings = take_turns(cases, runs)
     whole = Case(
         "torchpose, whole fit (3 steps of 10 L-BFGS iterations)",
@@ -330,4 +338,4 @@ def floor_row(manifold: BackConstrainedGPLVM, count: int, limits: Limits) -> lis
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

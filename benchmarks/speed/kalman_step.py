@@ -14,15 +14,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from benchmarks._command import run_command
 from benchmarks.speed._timing import (
     Case,
     Limits,
     Report,
+    Setup,
     Timing,
     begin,
     measure_limits,
     number,
-    parser,
     ratio,
     take_turns,
 )
@@ -65,10 +66,11 @@ class Method(NamedTuple):
     result: Callable[[Any], Step] = lambda out: Step(*out)
 
 
-def main() -> None:
-    args, report = begin("One Kalman step, 21 dimensions, 8 measured", parser(__doc__, runs=15))
-    sizes, inner = ((8,), 1) if args.quick else (SIZES, 50)
-    limits, failed = measure_limits(args.quick), False
+def main(setup: Setup = Setup(runs=15)) -> None:
+    """Run and print the tables."""
+    report = begin("One Kalman step, 21 dimensions, 8 measured", setup)
+    sizes, inner = ((8,), 1) if setup.quick else (SIZES, 50)
+    limits, failed = measure_limits(setup.quick), False
     rows: list[list[str]] = []
     for n_filters in sizes:
         problem = make_problem(n_filters)
@@ -82,7 +84,7 @@ def main() -> None:
         )
         failed |= not worst < TOLERANCE
         cases = [Case(m.name, m.call, 1, inner if fast(m) else 1) for m in methods]
-        timings = take_turns(cases, args.runs, warm=3)
+        timings = take_turns(cases, setup.runs, warm=3)
         rows += table_rows(timings, errors, n_filters)
         rows.append(floor_row(n_filters, limits))
     report.table(HEADER, rows)
@@ -308,4 +310,4 @@ def floor_row(n_filters: int, limits: Limits) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

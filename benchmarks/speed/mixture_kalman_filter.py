@@ -11,7 +11,6 @@ The prior is that of --prior, else the authors' released one if TORCHPOSE_DATA n
 holds it (signer/released_prior_Training20_02.npz), else a synthetic one of the same scales.
 """
 
-import argparse
 import itertools
 import sys
 from collections.abc import Callable, Iterator
@@ -22,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks._command import run_command
 from benchmarks.speed import _released
 from benchmarks.speed._arm import (
     DIM,
@@ -36,11 +36,11 @@ from benchmarks.speed._timing import (
     Case,
     Limits,
     Report,
+    Setup,
     Timing,
     begin,
     measure_limits,
     number,
-    parser,
     ratio,
     take_turns,
 )
@@ -76,10 +76,24 @@ class Method(NamedTuple):
     reference: np.ndarray | None = None
 
 
-def main() -> None:
-    args, report = begin("Mixture Kalman filter against the released algorithm", options())
-    sizes = Sizes(2, 40, 10, 10, 5) if args.quick else Sizes(args.batch, 1000, 200, 40, 10)
-    problem = make_problem(args.prior, args.synthetic)
+def main(
+    setup: Setup = Setup(runs=7),
+    *,
+    batch: int = 64,
+    prior: Path | None = None,
+    synthetic: bool = False,
+) -> None:
+    """Run and print the tables.
+
+    Args:
+        setup: see `Setup`.
+        batch: sequences of the large batch.
+        prior: .npz with left_weights, left_means, ....
+        synthetic: a synthetic prior in any case.
+    """
+    report = begin("Mixture Kalman filter against the released algorithm", setup)
+    sizes = Sizes(2, 40, 10, 10, 5) if setup.quick else Sizes(batch, 1000, 200, 40, 10)
+    problem = make_problem(prior, synthetic)
     report.add(describe(problem, sizes))
     loop = NumpyLoop(problem)
     with torch.inference_mode():
@@ -89,23 +103,15 @@ def main() -> None:
         z = draw_sequences(problem, 1, sizes.single)[0].numpy()
         peer = Case("released algorithm, NumPy loop", lambda: loop(z), len(z))
         cases = [Case(m.name, m.call, m.batch * m.frames) for m in methods]
-        timings = take_turns([peer, *cases], args.runs)
-        octave = octave_text(loop, z, args.runs)
-        limits = measure_limits(args.quick)
+        timings = take_turns([peer, *cases], setup.runs)
+        octave = octave_text(loop, z, setup.runs)
+        limits = measure_limits(setup.quick)
     report.table(HEADER, table_rows(methods, errors, timings))
     report.add(octave)
     report.add(floor_text(problem, limits))
     report.close(["numpy"], limits)
     if failed:
         sys.exit(f"these differ from the NumPy loop by more than is allowed: {'; '.join(failed)}")
-
-
-def options() -> argparse.ArgumentParser:
-    made = parser(__doc__, runs=7)
-    made.add_argument("--batch", type=int, default=64, help="sequences of the large batch")
-    made.add_argument("--prior", type=Path, help=".npz with left_weights, left_means, ...")
-    made.add_argument("--synthetic", action="store_true", help="a synthetic prior in any case")
-    return made
 
 
 def describe(problem: Problem, sizes: Sizes) -> str:
@@ -293,4 +299,4 @@ def floor_text(problem: Problem, limits: Limits) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -8,7 +8,6 @@ without a prior, which the libraries `particles`, `cuthbert` and `torchfilter` c
 where they are installed. Runs of all methods take turns, so that other work on the machine hits all.
 """
 
-import argparse
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks._command import run_command
 from benchmarks.speed._arm import DIM, PROCESS, released_prior
 from benchmarks.speed._particle_peers import (
     Problem,
@@ -26,7 +26,7 @@ from benchmarks.speed._particle_peers import (
     particles_walk,
     torchfilter_walk,
 )
-from benchmarks.speed._timing import Case, Report, begin, number, parser, take_turns
+from benchmarks.speed._timing import Case, Report, Setup, begin, number, take_turns
 from torchpose.filters import BootstrapParticleFilter, make_transition
 from torchpose.filters._walk import MixtureWalk
 from torchpose.priors import GaussianMixture
@@ -36,28 +36,35 @@ NOISE = [9.0] * 8
 MEASURED = [9, 10, 0, 1, 12, 13, 3, 4]  # u, v of head, hand, neck, elbow
 
 
-def main() -> None:
-    args, report = begin("Particle filters: one step", options())
-    n, steps = (200, 3) if args.quick else (args.particles, args.steps)
-    problem = arm_problem(args.prior, steps)
-    add_table(report, f"arm, {n} particles", arm_rows(problem, n), args.runs, steps)
+def main(
+    setup: Setup = Setup(runs=7),
+    *,
+    particles: int = 10_000,
+    steps: int = 20,
+    prior: Path | None = None,
+    no_peers: bool = False,
+) -> None:
+    """Run and print the tables.
+
+    Args:
+        setup: see `Setup`.
+        particles: of each filter.
+        steps: frames of a run.
+        prior: .npz with left_weights, left_means, ....
+        no_peers: leave out the other libraries.
+    """
+    report = begin("Particle filters: one step", setup)
+    n, steps = (200, 3) if setup.quick else (particles, steps)
+    problem = arm_problem(prior, steps)
+    add_table(report, f"arm, {n} particles", arm_rows(problem, n), setup.runs, steps)
     report.add(floor_text(problem, n))
     report.add(density_error_text(problem))
-    if not args.no_peers:
+    if not no_peers:
         shared = walk_problem(steps)
         report.add(f"Random walk without a prior, exact log-evidence {exact_evidence(shared):.2f}.")
         rows = walk_rows(shared, n, report)
-        add_table(report, f"random walk, {n} particles", rows, args.runs, steps)
+        add_table(report, f"random walk, {n} particles", rows, setup.runs, steps)
     report.close(PACKAGES)
-
-
-def options() -> argparse.ArgumentParser:
-    made = parser(__doc__, runs=7)
-    made.add_argument("--particles", type=int, default=10_000)
-    made.add_argument("--steps", type=int, default=20, help="frames of a run")
-    made.add_argument("--prior", type=Path, help=".npz with left_weights, left_means, ...")
-    made.add_argument("--no-peers", action="store_true", help="leave out the other libraries")
-    return made
 
 
 # --- problems
@@ -217,4 +224,4 @@ def density_error_text(problem: Problem) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

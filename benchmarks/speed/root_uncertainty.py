@@ -14,14 +14,15 @@ from typing import Any, NamedTuple
 
 import torch
 
+from benchmarks._command import run_command
 from benchmarks.speed._timing import (
     Case,
     Report,
+    Setup,
     Timing,
     begin,
     measure_limits,
     number,
-    parser,
     ratio,
     take_turns,
 )
@@ -64,16 +65,17 @@ class Scene(NamedTuple):
     silhouettes: torch.Tensor
 
 
-def main() -> None:
-    args, report = begin("Root uncertainty: one frame", parser(__doc__, runs=9))
-    n = 4 if args.quick else HYPOTHESES
-    sizes = ((30, 40),) if args.quick else SIZES
+def main(setup: Setup = Setup(runs=9)) -> None:
+    """Run and print the tables."""
+    report = begin("Root uncertainty: one frame", setup)
+    n = 4 if setup.quick else HYPOTHESES
+    sizes = ((30, 40),) if setup.quick else SIZES
     agree = check(make_scene(*sizes[0]), report)
     for size in sizes:
         scene = make_scene(*size)
-        compare(scene, n, args.runs, report)
-    where(make_scene(*sizes[0]), n, args.runs, report)
-    report.close(limits=measure_limits(args.quick))
+        compare(scene, n, setup.runs, report)
+    where(make_scene(*sizes[0]), n, setup.runs, report)
+    report.close(limits=measure_limits(setup.quick))
     if not agree:
         sys.exit("counts differ from those of rendered parts")
 
@@ -207,4 +209,4 @@ def one_frame(one: SilhouetteParticleFilter, scene: Scene) -> Callable[[], objec
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -20,7 +20,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from benchmarks.speed._timing import Case, Report, begin, number, parser, ratio, take_turns
+from benchmarks._command import run_command
+from benchmarks.speed._timing import Case, Report, Setup, begin, number, ratio, take_turns
 from torchpose.body import BODY_15, Body, Limbs
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.whole_body import count_pixels
@@ -61,18 +62,19 @@ class Problem(NamedTuple):
     width: int
 
 
-def main() -> None:
-    args, report = begin("Silhouettes: particles x cameras x limbs", parser(__doc__, runs=9))
+def main(setup: Setup = Setup(runs=9)) -> None:
+    """Run and print the tables."""
+    report = begin("Silhouettes: particles x cameras x limbs", setup)
     import cv2
 
-    cv2.setNumThreads(args.threads)
-    n = 8 if args.quick else PARTICLES
-    sizes = ((30, 40), (60, 80)) if args.quick else SIZES
+    cv2.setNumThreads(setup.threads)
+    n = 8 if setup.quick else PARTICLES
+    sizes = ((30, 40), (60, 80)) if setup.quick else SIZES
     wrong = [check(make_problem(3, CAMERAS, *size), report) for size in sizes]
-    compare(n, sizes, args.runs, report)
-    grow(n, sizes[0], args.runs, args.quick, report)
-    chunks(n, sizes, args.runs, args.quick, report)
-    sorting(n, sizes, args.runs, report)
+    compare(n, sizes, setup.runs, report)
+    grow(n, sizes[0], setup.runs, setup.quick, report)
+    chunks(n, sizes, setup.runs, setup.quick, report)
+    sorting(n, sizes, setup.runs, report)
     report.close(PACKAGES)
     if any(wrong):
         sys.exit("counts differ from those of the definition")
@@ -376,4 +378,4 @@ def sorting(n: int, sizes: tuple[tuple[int, int], ...], runs: int, report: Repor
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

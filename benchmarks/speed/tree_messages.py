@@ -13,7 +13,8 @@ import sys
 import torch
 from torch import Tensor
 
-from benchmarks.speed._timing import Case, begin, number, parser, take_turns
+from benchmarks._command import run_command
+from benchmarks.speed._timing import Case, Setup, begin, number, take_turns
 from torchpose.body import BODY_15
 from torchpose.math import compose, conjugate, fit_gaussian, rotate_gaussian
 from torchpose.math._tree_messages import message_tree, propagate
@@ -25,9 +26,10 @@ HYPOTHESES = 114
 CHAIN = ((0, 1), (1, 2))
 
 
-def main() -> None:
-    args, report = begin("Gaussian messages over rotations", parser(__doc__, runs=30))
-    draws, trials, sizes = (20_000, 2, (5,)) if args.quick else (1_000_000, 6, DEGREES)
+def main(setup: Setup = Setup(runs=30)) -> None:
+    """Run and print the tables."""
+    report = begin("Gaussian messages over rotations", setup)
+    draws, trials, sizes = (20_000, 2, (5,)) if setup.quick else (1_000_000, 6, DEGREES)
     worst = linear_error()
     report.add(
         f"Agreement on linear trees with the dense joint Gaussian: {worst:.1e}, at most "
@@ -44,7 +46,9 @@ def main() -> None:
         f"deviation. covariance: Frobenius norm of the difference, as a share. {draws:,} draws, whose "
         f"own error is in it; means of {trials} chains."
     )
-    report.table(("one pass, 10 parts", "hypotheses", "ms", "min ms", "CPU ms"), timing_rows(args))
+    report.table(
+        ("one pass, 10 parts", "hypotheses", "ms", "min ms", "CPU ms"), timing_rows(setup.runs)
+    )
     report.close()
     if not worst < TOLERANCE:
         sys.exit("messages differ from the dense joint Gaussian by more than is allowed")
@@ -157,7 +161,7 @@ def linear_error() -> float:
     return float(torch.maximum(off, (ours[1] - blocks).abs().max()))
 
 
-def timing_rows(args: object) -> list[list[str]]:
+def timing_rows(runs: int) -> list[list[str]]:
     g = torch.Generator().manual_seed(0)
     parts = BODY_15.parts
     edges = torch.tensor([[parts.index(name) for name in edge] for edge in PART_TREE])
@@ -177,7 +181,7 @@ def timing_rows(args: object) -> list[list[str]]:
                 return propagate(mean, cov, model.tree, model.transport)
 
             cases.append(Case(f"{directions}, {str(dtype).split('.')[1]}", call, inner=5))
-    timings = take_turns(cases, args.runs, warm=2)
+    timings = take_turns(cases, runs, warm=2)
     return [
         [t.case.name, str(HYPOTHESES), number(1e3 * t.median), number(1e3 * t.best),
          number(1e3 * t.median_cpu)]
@@ -186,4 +190,4 @@ def timing_rows(args: object) -> list[list[str]]:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

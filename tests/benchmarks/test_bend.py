@@ -243,12 +243,12 @@ def test_two_persons_are_too_few(tmp_path):
 
 
 def test_the_command_recognises_actions(folder, tmp_path, capsys):
-    from benchmarks._command import run
+    from benchmarks._protocols import execute_protocol
 
     line = ["--mocap", str(folder), "--out", str(tmp_path / "out")]
     line += ["--quick", "true", "--part", "actions", "--size", "64x48", "--at", "8"]
     line += ["--test-persons", "p2", "--frames", "4", "--validation-persons", "p3"]
-    assert run("bend", line) == 0
+    assert execute_protocol("bend", line) == 0
     text = capsys.readouterr().out
     assert "Actions from recorded joints" in text and "Tracked actions" in text
 

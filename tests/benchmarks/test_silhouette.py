@@ -337,10 +337,10 @@ def test_the_command(command, folder, tmp_path):
 
 @pytest.fixture
 def command(capsys):
-    from benchmarks._command import run
+    from benchmarks._protocols import execute_protocol
 
     def call(arguments):
-        code = run("silhouette", arguments)
+        code = execute_protocol("silhouette", arguments)
         captured = capsys.readouterr()
         return code, captured.out + captured.err
 
