@@ -119,6 +119,7 @@ def _new_parser(function: Callable[..., None], parameters: Iterable[_Parameter])
     parser = new_parser(name.removesuffix(".__main__"), text[0], examples, "python -m")
     for parameter in parameters:
         words = {o.key: "|".join(_words(parameter.kinds[o.name])) for o in parameter.options}
+        words |= {o.key: "[true|false]" for o in parameter.options if o.kind is bool}
         metavars = {key: word for key, word in words.items() if word}
         add_options(parser, parameter.options, metavars=metavars)
     return parser

@@ -102,7 +102,7 @@ class Persons(NamedTuple):
 
 
 def read_persons(data: Path, size: Size) -> Persons:
-    """The training persons of UB-people; files of the test persons are not opened."""
+    """Return the training persons of UB-people; files of the test persons are not opened."""
     folder = data_folder(data, "kinect_utd_mhad")
     recordings = read_recordings(_files(folder, FIT_PERSONS)[:: size.thin_fit])
     held_out = read_recordings(_files(folder, SCORED_PERSONS)[:: size.thin_scored])
@@ -134,7 +134,7 @@ class Measured(NamedTuple):
 
     @property
     def note(self) -> str:
-        """Return what was learnt about the noise, or nothing."""
+        """Return a sentence on the learnt noise, or an empty one."""
         if bool(self.evidence.isnan().any()):
             return ""
         pairs = zip(JOINTS, self.measurement_std.tolist(), strict=True)
@@ -161,7 +161,7 @@ class Bench:
         self.persons, self.size, self.out = persons, size, out
 
     def measure(self, lever: Lever, mode: str, seed: int) -> Measured:
-        """Return what a lever gives; it is fitted and tracked with unless that lies in the folder."""
+        """Return the numbers of a lever, from the folder or by a fit and a run of the tracker."""
         facts = [source_hash(*_TRACKED_WITH), self.size, self.persons.digest,
                  lever._replace(group="", name=""), mode]  # fmt: skip
 
@@ -234,7 +234,7 @@ class Bench:
     def _joined_window(
         self, base: UpperBodyPrior, spec: Windows, mode: str, seed: int
     ) -> tuple[WindowPrior, float]:
-        """Mixtures over windows, joined over seeds, and the seconds of their fits."""
+        """Return the mixtures over windows of all seeds as one, and the seconds of their fits."""
         fits = [self._window(base, spec, mode, seed + i) for i in range(spec.seeds)]
         windows = [window for window, _ in fits]
         left, right = (
@@ -260,7 +260,7 @@ class Bench:
         return prior.windows[mode], seconds
 
     def _window_recipe(self, spec: Windows, seed: int) -> UpperBodyRecipe:
-        """The recipe with what a lever turns of its windows."""
+        """Return the recipe with the settings of windows that a lever changes."""
         return UpperBodyRecipe(
             window_components=spec.components // self.size.shrink,
             window_samples=spec.samples // self.size.shrink,
@@ -273,7 +273,7 @@ class Bench:
 
 
 def _joined(mixtures: Sequence[GaussianMixture]) -> GaussianMixture:
-    """One mixture of all components, those of each mixture with an equal share."""
+    """Return one mixture of all components, in which every mixture has an equal share."""
     weights = torch.cat([mixture.weights for mixture in mixtures]) / len(mixtures)
     means = torch.cat([mixture.means for mixture in mixtures])
     return GaussianMixture(weights, means, torch.cat([m.covariances for m in mixtures]))
@@ -327,7 +327,7 @@ def learn_noise(
 def _evidence(
     prior: UpperBodyPrior, test: Trials, process_cov: Tensor, measurement_cov: Tensor
 ) -> Tensor:
-    """Log-evidence of both arms, mean over frames."""
+    """Return the log-evidence of both arms, mean over frames."""
     total = torch.zeros((), dtype=torch.float64)
     for side, mixture in (("left", prior.left), ("right", prior.right)):
         rows = [MEASURED.index(name) for name in (f"hand_{side}", "head", "neck")]

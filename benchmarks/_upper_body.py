@@ -56,7 +56,7 @@ class Tracker(NamedTuple):
 
 
 def tracker_facts(test: Trials, tracker: Tracker) -> list[Any]:
-    """Return what a run of a tracker on a test set depends on, beside its seed."""
+    """Return the inputs of a run of a tracker on a test set, beside its seed."""
     prior, options = tracker
     numbers = [value for value in options.values() if isinstance(value, Tensor)]
     numbers += [

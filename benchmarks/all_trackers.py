@@ -111,7 +111,7 @@ TRACKING = Experiment(
 
 
 def can_run(method: str, prior: UpperBodyPrior, bones: dict[str, Any] | None) -> bool:
-    """Return whether the prior has windows and there is a prior over arms, where the method needs them."""
+    """Return whether a method finds all that it needs: windows of the prior, a prior over arms."""
     of_windows = method in (WINDOWS, "multiple-model")
     return (bool(prior.windows) or not of_windows) and (
         bones is not None or "arms" not in method_options(method)
@@ -209,7 +209,7 @@ def row(run: Run, test: Trials) -> list[float | None]:
 
 
 def add_finding(report: Report, key: str) -> None:
-    """Say which methods are behind the mean pose."""
+    """Add a finding: the methods that are no better than the mean pose."""
     table = report[key]
     still = float(table["mean pose", "3D (cm)"])
     behind = [m for m in METHODS if m in table.rows and not float(table[m, "3D (cm)"]) < still]

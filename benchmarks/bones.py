@@ -371,7 +371,7 @@ def trackers(arms: ArmPrior) -> dict[str, dict[str, object]]:
 
 
 def lifts(mean: Float[Tensor, "2 2"]) -> dict[str, Callable[[View], Chains]]:
-    """Return what needs no tracker, by name.
+    """Return the methods that need no tracker, by name.
 
     Args:
         mean: lengths of other persons.
@@ -410,7 +410,7 @@ class Group(NamedTuple):
 
 
 def groups(data: Path, quick: bool) -> Iterator[Group]:
-    """Yield what is scored, set by set: little of each in a quick run."""
+    """Yield the groups of views to score, set by set; few views of each in a quick run."""
     for group in _groups(data, quick):
         views = [begun(view) for view in group.views] if quick else group.views
         yield group._replace(views=views)

@@ -127,7 +127,7 @@ def _measure(split: Split, effort: Effort, seed: int) -> Errors:
 
 
 def facts(split: Split, effort: Effort) -> list[Any]:
-    """Return what a run depends on, beside its seed."""
+    """Return the inputs of a run, beside its seed."""
     joints = [fact for r in split.seen for fact in (r.person_id, r.joints)]
     return [effort, *joints, split.test.keypoints, split.test.truth3d, split.test.lengths]
 

@@ -43,7 +43,7 @@ class Start(NamedTuple):
 
 
 def walks(folder: Path, cameras: int, with_manifold: bool) -> Iterator[Start]:
-    """The first frames of three trials of each person."""
+    """Yield the first frames of three trials of each person."""
     clips = read_mocap(folder, FPS)
     for split in split_clips(clips, WALKERS, WALKERS, TRIALS):
         trackee = prepare(split, Conditions(cameras_used=cameras), CLIP, LOOK_AHEAD)
@@ -56,7 +56,7 @@ def walks(folder: Path, cameras: int, with_manifold: bool) -> Iterator[Start]:
 
 
 def balancing(folder: Path) -> Iterator[Start]:
-    """Several frames of the four views, a body of average proportions."""
+    """Yield several frames of the four views, with a body of average proportions."""
     data, body = four_views(folder), Body.of_height(BODY_15, HEIGHT)
     for t in STARTS:
         frames = data.silhouettes[t : t + LOOK_AHEAD]
@@ -64,14 +64,14 @@ def balancing(folder: Path) -> Iterator[Start]:
 
 
 def one_frame(start: Start, generator: torch.Generator) -> Tensor:
-    """The pose that fits the first frame best."""
+    """Return the pose that fits the first frame best."""
     return find_pose(
         start.body, start.silhouettes[0], start.rig, start.manifold, generator, up=start.up
     )
 
 
 def half_a_second(start: Start, generator: torch.Generator) -> Tensor:
-    """The pose whose track tells best where it faces."""
+    """Return the first pose whose track over half a second fits best."""
     return find_first_pose(
         start.body, start.silhouettes, start.rig, start.manifold, generator, fps=FPS, up=start.up
     ).state
@@ -80,7 +80,7 @@ def half_a_second(start: Start, generator: torch.Generator) -> Tensor:
 def row(
     name: str, starts: Sequence[Start], seeds: int, find: Callable[[Start, torch.Generator], Tensor]
 ) -> str:
-    """How many face the right way, mean and largest error (mm)."""
+    """Return a row: how many found poses face the right way, mean and largest error (mm)."""
     right, errors = 0, []
     for start in tqdm(starts, desc=name, disable=None):
         truth = fit_state(start.body, start.joints[None])[0]

@@ -75,7 +75,7 @@ def main(
 def errors(
     prior: UpperBodyPrior, still: Trials, moving: Trials, factor: float, options: dict[str, object]
 ) -> list[str]:
-    """Mean 3D error of both tests after fixed-scale Procrustes, and mean pixel error of the first."""
+    """Return the mean 3D errors of both tests after fixed-scale Procrustes, and the first's pixel error."""
     focal = factor * FOCAL
     camera = PinholeCamera(focal, focal, *CENTRE, 640, 480)
     first, second = (score(track(prior, camera, test, **options), test) for test in (still, moving))
@@ -84,7 +84,7 @@ def errors(
 
 
 def note(prior: UpperBodyPrior, persons: set[str]) -> str:
-    """Which prior it was, and whether it has seen the test persons."""
+    """Return a sentence that names the prior and says whether it has seen the test persons."""
     name = prior.info.name or "unnamed"
     try:
         prior.check_unseen(persons)

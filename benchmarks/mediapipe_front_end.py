@@ -69,7 +69,7 @@ class Bench:
         points: Tensor | None = None,
         rows: Tensor | None = None,
     ) -> PoseTrack:
-        """Poses from some of the eight joints; a joint of visibility below 0.5 is missing."""
+        """Return poses from some of the eight joints; joints of visibility below 0.5 are missing."""
         rows = torch.arange(len(self.clips)) if rows is None else rows
         points = self.points[rows] if points is None else points
         chosen = list(joints)
@@ -82,13 +82,13 @@ class Bench:
             )
 
     def off_by_clip(self, estimate: Tensor, group: str) -> Tensor:
-        """The same in shoulder widths, for each clip [clips]."""
+        """Return the mean distance of a group from MediaPipe's joints, in shoulder widths [clips]."""
         gap = (estimate - self.points).norm(dim=-1) / self.width[:, None, None]
         gap = torch.where(self.known, gap, torch.nan)[..., list(GROUPS[group])]
         return gap.flatten(1).nanmean(1)
 
     def off(self, estimate: Tensor, widths: bool = False) -> dict[str, float]:
-        """Mean distance from MediaPipe's joints by group, where those are known."""
+        """Return the mean distance from MediaPipe's joints by group, where those are known."""
         gap = (estimate - self.points).norm(dim=-1)
         if widths:
             gap = gap / self.width[:, None, None]
@@ -97,7 +97,7 @@ class Bench:
 
 
 def jitter_tables(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) -> None:
-    """Mean acceleration in the image and in space."""
+    """Add tables of the mean acceleration in the image and in space."""
     flat = report.table(
         "jitter2d",
         "Jitter in the image: mean acceleration (px/s²), and distance from MediaPipe's joints (px)",
@@ -134,14 +134,14 @@ def jitter_tables(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) ->
 
 
 def _mean(points: Tensor, before: int, after: int) -> Tensor:
-    """Mean over a few frames, the plainest way to take out jitter."""
+    """Return the mean over a few frames, the simplest smoother."""
     n = points.shape[1]
     rows = torch.arange(n)[:, None] + torch.arange(-before, after + 1)
     return points[:, rows.clamp(0, n - 1)].nanmean(2)
 
 
 def inferred_table(bench: Bench, report: Report) -> None:
-    """Elbows and shoulders from head, neck and hands, by what stands for head and hand."""
+    """Add the errors of inferred elbows and shoulders, for several definitions of head and hand."""
     table = report.table(
         "inferred",
         "Joints that are not measured, from head, neck and hands alone (filtered): mean distance from "
@@ -182,7 +182,7 @@ def inferred_table(bench: Bench, report: Report) -> None:
 def place_table(
     bench: Bench, report: Report, heads: Sequence[float], necks: Sequence[float]
 ) -> None:
-    """What the places of head and neck of `torchpose.skeleton._mediapipe_landmarks` were chosen from."""
+    """Add the errors for several places of head and neck (`torchpose.skeleton._mediapipe_landmarks`)."""
     table = report.table(
         "places",
         "Where head and neck are put: inferred elbows / shoulders (shoulder widths)",
@@ -214,7 +214,7 @@ def place_table(
 
 
 def unseen_signers(bench: Bench, errors: dict[tuple[float, float], Tensor]) -> list[str]:
-    """Places chosen on the clips of two signers, scored on those of the third."""
+    """Return the errors on each signer's clips of the places that are best on those of the others."""
     sentences = []
     for signer in SIGNERS:
         own = torch.tensor([c.name in signer for c in bench.clips])
@@ -230,7 +230,7 @@ def unseen_signers(bench: Bench, errors: dict[tuple[float, float], Tensor]) -> l
 
 
 def by_clip_table(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) -> None:
-    """Inferred elbows and shoulders of every clip."""
+    """Add the errors of inferred elbows and shoulders, clip by clip."""
     names = [n for n in tracks if n.startswith("head")]
     table = report.table(
         "by_clip",
@@ -250,7 +250,7 @@ def by_clip_table(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) ->
 
 
 def space_table(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) -> None:
-    """Distance in space from MediaPipe's own 3D joints."""
+    """Add the distance in space from MediaPipe's own 3D joints."""
     table = report.table(
         "space",
         "Difference from MediaPipe's 3D joints after fixed-scale Procrustes on head, neck and "
@@ -272,7 +272,7 @@ def space_table(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) -> N
 
 
 def gap_cases(bench: Bench, length: int, step: int) -> list[tuple[int, int, int]]:
-    """(clip, hand, first frame) of hidden stretches whose ends are in view."""
+    """Return (clip, hand, first frame) of stretches to hide; a hand is in view at both ends."""
     cases = []
     for clip in range(len(bench.clips)):
         last = int(bench.lengths[clip]) - length - 1
@@ -284,7 +284,7 @@ def gap_cases(bench: Bench, length: int, step: int) -> list[tuple[int, int, int]
 
 
 def gap_table(bench: Bench, report: Report, step: int, gaps: tuple[int, ...] = GAPS) -> None:
-    """Hidden hands: how far what is filled in lies from the hidden landmark."""
+    """Add the errors of hidden hands, by the way in which gaps are filled."""
     table = report.table(
         "gaps",
         "A hand hidden for n frames: mean distance of what is filled in from the hidden landmark (px)",
@@ -305,7 +305,7 @@ def gap_table(bench: Bench, report: Report, step: int, gaps: tuple[int, ...] = G
 
 
 def gap_errors(bench: Bench, cases: list[tuple[int, int, int]], length: int) -> dict[str, float]:
-    """Mean error of every way to fill these gaps."""
+    """Return the mean error of every way to fill these gaps."""
     clip, hand, start = torch.tensor(cases).T
     n = torch.arange(len(cases))
     frames = start[:, None] + torch.arange(length)

@@ -197,7 +197,7 @@ def _error_and_coverage(poses: PoseTrack, test: Trials) -> list[float]:
 
 
 def add_found(report: Report, how: Tracker, test: Trials, wild: Wild) -> None:
-    """Add which keypoints were left out."""
+    """Add the shares of keypoints that are left out."""
     rows = [UPPER_BODY.index(name) for name in test.names]
     table = report.table(
         "found",
@@ -226,7 +226,7 @@ def add_found(report: Report, how: Tracker, test: Trials, wild: Wild) -> None:
 
 
 def add_single(report: Report, trackers: Mapping[str, Tracker], test: Trials, seed: int) -> None:
-    """Add what one outlier of each size at each joint adds to the error."""
+    """Add the error that one outlier of each size adds at each joint."""
     table = report.table(
         "single",
         f"One outlier: error added in its frame and {_LATER} frames later (cm)",

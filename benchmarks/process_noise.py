@@ -69,7 +69,7 @@ def main(
 
 
 def error(prior: UpperBodyPrior, method: str, options: dict[str, Any], test: Trials) -> float:
-    """Mean 3D error after Procrustes, cm."""
+    """Return the mean 3D error after Procrustes, cm."""
     generator = torch.Generator().manual_seed(0)
     found = score(track(prior, CAMERA, test, method=method, generator=generator, **options), test)
     return 100 * float(found.errors3d.nanmean())

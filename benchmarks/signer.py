@@ -111,7 +111,7 @@ def run(
 
 
 def read_videos(folder: Path) -> Videos:
-    """Head, hand and neck of every annotated video; zero coordinates are missing.
+    """Return head, hand and neck of every annotated video; zero coordinates are missing.
 
     Raises:
         InputError: no such file. FileFormatError: no videos, or not [T, 3, 2].
@@ -137,7 +137,7 @@ def read_videos(folder: Path) -> Videos:
 
 
 def released_filter(mixture: GaussianMixture, elbow: bool = True) -> MixtureKalmanFilter:
-    """The released tracker of one arm: its Q, R, P0 = 5000 I, epsilon = 0.
+    """Return the released tracker of one arm: its Q, R, P0 = 5000 I, epsilon = 0.
 
     Args:
         mixture: its prior. elbow: whether its constant dummy elbow is measured too.
@@ -156,7 +156,7 @@ def released_filter(mixture: GaussianMixture, elbow: bool = True) -> MixtureKalm
 def hand_log_density(
     model: MixtureKalmanFilter, z: Float[Tensor, "V T 6"], hidden: Bool[Tensor, "V T"]
 ) -> Float[Tensor, "V T"]:
-    """log p(hand_t | z_1:t-1), R included, where hands are hidden from the filter in some frames.
+    """Return log p(hand_t | z_1:t-1), R included, with hands hidden from the filter in some frames.
 
     The log-evidence of a step in which the hand alone is measured is that density; the step itself
     is thrown away, and the filter goes on with what it may see.
@@ -197,7 +197,7 @@ class Noise(NamedTuple):
 def learn_noise(
     prior: UpperBodyPrior, videos: Videos, transition: str, n_steps: int, progress: bool = False
 ) -> Noise:
-    """Q, R and gamma that make the measurements likeliest, by Adam on their logarithms.
+    """Return Q, R and gamma of most log-evidence, by Adam on their logarithms.
 
     Both arms share them. Pixels only: R stays at a quarter of a square pixel or more, since the
     annotations are whole numbers (variance 1/12) of a point that is itself uncertain.
@@ -292,7 +292,7 @@ Predictions = dict[str, dict[float, Tensor]]
 def _predictions(
     models: dict[str, list[MixtureKalmanFilter]], videos: Videos, progress: bool
 ) -> Predictions:
-    """Log densities of the frames that count [2, V, T], NaN elsewhere, by model and gap."""
+    """Return log densities of the frames that count [2, V, T], NaN elsewhere, by model and gap."""
     found: Predictions = {name: {} for name in models}
     bar = tqdm(total=len(models) * len(GAPS), disable=not progress, desc="prediction")
     for name, arms in models.items():
@@ -368,7 +368,7 @@ def _add_noise(report: Report, learnt: dict[str, Noise]) -> None:
 
 
 def _picture(report: Report, out: Path, found: Predictions) -> None:
-    """Mean log-density over the time since the hand was last seen."""
+    """Draw the mean log-density over the time since the hand was last seen."""
     from torchpose.viz._style import INK, NORMAL, add_legend, method_styles, new_figure, style_axes
 
     styles = method_styles(list(found))

@@ -99,7 +99,7 @@ def aligned(found: Estimate, test: Trials) -> HeldOut:
 
 
 def calibrated_coverage(person: str, parts: dict[str, HeldOut]) -> Tensor:
-    """Share inside the ellipsoids [2, 8], calibrated on all other persons."""
+    """Return shares inside the ellipsoids [2, 8], calibrated on all other persons."""
     others = [part for name, part in parts.items() if name != person]
     errors = torch.cat([part.points - part.truth for part in others])
     scale, floor = fit_calibration(errors, torch.cat([part.covs for part in others]), LEVELS)

@@ -45,7 +45,7 @@ HEADER = ("lever", "filtered (cm)", "jitter", "fit (s)", "smoothed (cm)", "jitte
 
 
 def layouts(own: Sequence[int], other: Sequence[int]) -> dict[str, WindowLayout]:
-    """Lags of the past for the filter; to both sides for the smoother."""
+    """Return the lags of both hands: of the past for the filter, to both sides for the smoother."""
     there, elsewhere = (
         tuple(dict.fromkeys(sign * lag for lag in lags for sign in (1, -1)))
         for lags in (own, other)
@@ -57,12 +57,12 @@ def layouts(own: Sequence[int], other: Sequence[int]) -> dict[str, WindowLayout]
 
 
 def without_bodies(**kept: float) -> Windows:
-    """Windows of bodies as they were recorded, but for what is given."""
+    """Return windows of bodies as they were recorded, but for the given changes."""
     return Windows(bodies=tuple(({"body_size": 0.0, "bone_lengths": 0.0} | kept).items()))
 
 
 def levers() -> list[Lever]:
-    """All rows of the table, those of most interest first."""
+    """Return all rows of the table, the most interesting first."""
     ou = {"transition": "ou"}
     return [
         Lever("default", "default"),
@@ -129,7 +129,7 @@ class Task(NamedTuple):
 
 
 def cells(found: Sequence[Measured], n_seeds: int) -> tuple[str, str, str]:
-    """Error, jitter and seconds, means over seeds; dashes until all seeds are there."""
+    """Return error, jitter and seconds, means over seeds; dashes until all seeds are there."""
     if len(found) < n_seeds:
         return "-", "-", "-"
     errors, jitters, seconds = (
@@ -159,7 +159,7 @@ def table(tasks: Sequence[Task], known: Sequence[Measured], n_seeds: int) -> str
 
 
 def settings_line(bench: Bench, seeds: Sequence[int]) -> str:
-    """What was fitted and tracked."""
+    """Return a line on what was fitted and tracked."""
     test, size = bench.persons.test, bench.size
     return (
         f"Fitted: {len(bench.persons.fitted)} sequences of {', '.join(FIT_PERSONS)}; tracked: "

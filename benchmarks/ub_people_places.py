@@ -40,7 +40,7 @@ PLACES = {
 
 
 def paths(name: str, poses: list[Tensor], fps: float) -> list[Tensor]:
-    """Where the bodies are in every frame of each sequence [T, 3], metres from the usual place."""
+    """Return the places of the bodies in every frame of each sequence [T, 3], metres from the usual one."""
     if name == "walking in a circle":
         return [sway(len(p), fps, i / len(poses)) for i, p in enumerate(poses)]
     place = torch.tensor(PLACES[name], dtype=torch.float64)
@@ -48,7 +48,7 @@ def paths(name: str, poses: list[Tensor], fps: float) -> list[Tensor]:
 
 
 def error(prior: UpperBodyPrior, test: Trials, options: dict[str, object]) -> str:
-    """Mean 3D error after Procrustes, cm."""
+    """Return the mean 3D error after Procrustes, cm."""
     errors = score(track_test(prior, CAMERA, test, **options), test).errors3d
     return f"{float(errors[test.inside].mean()) * 100:.2f}"
 

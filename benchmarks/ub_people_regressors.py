@@ -54,7 +54,7 @@ METRES = 0.2  # scale of the targets
 
 
 def features(keypoints: Tensor) -> Tensor:
-    """Head and hands relative to the neck, and the neck, [..., 8], about 1 in size."""
+    """Return head and hands relative to the neck, and the neck, [..., 8], scaled to about 1."""
     neck = keypoints[..., 1:2, :]
     centre = keypoints.new_tensor([319.5, 239.5])
     rest = keypoints[..., [0, 2, 3], :] - neck
@@ -62,13 +62,13 @@ def features(keypoints: Tensor) -> Tensor:
 
 
 def views(n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Rotation [n, 3, 3] and translation [n, 3] of random training viewpoints, float32."""
+    """Draw rotation [n, 3, 3] and translation [n, 3] of training viewpoints, float32."""
     found = sample_viewpoints(n, TRAINING_VIEWS, generator)
     return euler_to_matrix(found.angles, "zxy").float(), found.translation.float()
 
 
 def examples(poses: Tensor, targets: str, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Inputs [N, T, 8] and targets [N, T, 24] of sequences [N, T, 8, 3], each from one viewpoint."""
+    """Return inputs [N, T, 8] and targets [N, T, 24] of sequences [N, T, 8, 3], each from one viewpoint."""
     flip = torch.rand(len(poses), generator=generator) < 0.5
     poses = torch.where(flip[:, None, None, None], mirror_pose(poses), poses)
     rotation, translation = views(len(poses), generator)
@@ -89,7 +89,7 @@ class Recurrent(nn.Module):
         self.out = nn.Linear(256 if both else 128, 24)
 
     def forward(self, x: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """Outputs [B, T, 24]; what lies past a length is not read, backwards neither."""
+        """Return outputs [B, T, 24]; in both directions, frames past a length are not read."""
         if lengths is None:
             return self.out(self.cells(x)[0])
         packed = nn.utils.rnn.pack_padded_sequence(x, lengths, True, enforce_sorted=False)
@@ -106,7 +106,7 @@ def multilayer() -> nn.Module:
 
 
 def train_frames(poses: list[Tensor], targets: str, seed: int, quick: bool) -> nn.Module:
-    """The per-frame MLP on 100,000 projected poses."""
+    """Train the per-frame MLP on 100,000 projected poses."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     frames = torch.cat(poses)
@@ -125,7 +125,7 @@ def train_frames(poses: list[Tensor], targets: str, seed: int, quick: bool) -> n
 def train_sequences(
     poses: list[Tensor], targets: str, seed: int, quick: bool, both: bool
 ) -> nn.Module:
-    """A GRU on random pieces of 64 frames of the training sequences."""
+    """Train a GRU on random pieces of 64 frames of the training sequences."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     lengths = torch.tensor([len(p) for p in poses])
@@ -146,7 +146,7 @@ def train_sequences(
 def fit(
     model: nn.Module, batch: Callable[[int], tuple[Tensor, Tensor]], n_steps: int, label: str
 ) -> None:
-    """Adam with one cycle of the learning rate; the loss is the mean distance of the joints."""
+    """Fit a model by Adam with one cycle of the learning rate, to the mean distance of the joints."""
     adam = torch.optim.Adam(model.parameters(), lr=2e-3)
     cycle = torch.optim.lr_scheduler.OneCycleLR(adam, 2e-3, total_steps=n_steps)
     for step in tqdm(range(n_steps), desc=label, leave=False):
@@ -160,7 +160,7 @@ def fit(
 
 
 def estimate(model: nn.Module, test: Trials) -> Estimate:
-    """Poses of a test set. The regressors give no pixels: those are NaN."""
+    """Return the poses of a test set; pixels are NaN, since the regressors give none."""
     with torch.inference_mode():
         inputs = features(test.keypoints).nan_to_num().float()
         found = model(inputs, test.lengths) if isinstance(model, Recurrent) else model(inputs)
@@ -228,7 +228,7 @@ def main(
 
 
 def add_finished_rows(report: Report, path: Path) -> None:
-    """The methods of a finished run of the protocol, below the regressors."""
+    """Add the methods of a finished run of the protocol below the regressors."""
     tables = json.loads(path.read_text(encoding="utf-8"))["tables"]
     moved = tables["moving_root_3d"]["rows"]
     for name, row in tables["errors_3d"]["rows"].items():

@@ -20,7 +20,7 @@ import math
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -172,7 +172,7 @@ def main(
 def make_trackers(
     names: list[str], prior: HandPrior, report: Report
 ) -> dict[str, Callable[[float], Any]]:
-    """What makes a tracker for a frame rate, by name."""
+    """Return functions that make a tracker for a frame rate, by name."""
     made: dict[str, Callable[[float], Any]] = {}
     for name in names:
         if name == "grid":
@@ -191,7 +191,7 @@ def make_trackers(
 
 
 def read_material(folder: Path, name: str, change: str = "") -> Material:
-    """A clip, as it is or changed, with its faces."""
+    """Return a clip, as it is or changed, with its faces."""
     clip = read_clip(folder, name)
     with open_video(folder / f"{name}.mkv") as video:
         frames = np.stack([frame.image for frame in video])
@@ -212,7 +212,7 @@ def _truth(clip: Clip) -> Tensor:
 def _changed(
     change: str, frames: np.ndarray, truth: Tensor
 ) -> tuple[np.ndarray, Tensor, float, float]:
-    """Frames and truth after a change, the scale of the image, and the frame rate."""
+    """Return frames and truth after a change, the scale of the image, and the frame rate."""
     import cv2
 
     width = frames.shape[2]
@@ -241,7 +241,7 @@ def _changed(
 
 
 def follow_face(frames: np.ndarray) -> Tensor:
-    """The longest-lived face of every frame [T, 3], NaN where none may be used."""
+    """Return the longest-lived face of every frame [T, 3], NaN where none may be used."""
     import cv2
 
     tracker = FaceTracker()
@@ -256,7 +256,7 @@ def follow_face(frames: np.ndarray) -> Tensor:
 
 
 def track(tracker: Any, material: Material) -> Found:
-    """Hands of the one person in a clip."""
+    """Return the hands of the one person in a clip."""
     state, points, covariance, seconds = tracker.init(), [], [], []
     nobody = torch.full((2, 2), torch.nan, dtype=torch.float64)
     for frame, face in zip(material.frames, material.faces, strict=True):
@@ -274,7 +274,7 @@ def track(tracker: Any, material: Material) -> Found:
 
 
 def score(points: Tensor, material: Material) -> Score:
-    """Counts and errors of a clip."""
+    """Return counts and errors of a clip."""
     truth = material.truth
     known, given = ~truth.isnan().any(-1), ~points.isnan().any(-1)
     error = (points - truth).norm(dim=-1)
@@ -286,7 +286,7 @@ def score(points: Tensor, material: Material) -> Score:
 
 
 def row(name: str, found: dict[str, Found], materials: dict[str, Material]) -> list[str]:
-    """A line of the table."""
+    """Return a row of the table."""
     scores = {clip: score(f.points, materials[clip]) for clip, f in found.items()}
     easy = [s for clip, s in scores.items() if clip in EASY]
     cells = [_percent([scores[clip]], "right") if clip in scores else "" for clip in CLIPS]
@@ -298,7 +298,7 @@ def row(name: str, found: dict[str, Found], materials: dict[str, Material]) -> l
 
 
 def calibration(found: dict[str, Found], materials: dict[str, Material]) -> str:
-    """How many of the hands that were found lie within their own ellipses, a sentence."""
+    """Return a sentence on how many of the found hands lie within their ellipses."""
     inside, right = [], []
     for clip, material in materials.items():
         error = found[clip].points - material.truth
@@ -329,7 +329,7 @@ def _median(scores: Iterable[Score]) -> str:
 def ablation_rows(
     prior: HandPrior, materials: dict[str, Material], quick: bool
 ) -> Iterable[list[str]]:
-    """Rows with parts switched off."""
+    """Return rows with parts switched off."""
     rows = []
     for name, off in list(ABLATION.items())[: 3 if quick else None]:
         settings = HandSettings(**off)
@@ -343,7 +343,7 @@ def ablation_rows(
 def changed_rows(
     makers: dict[str, Callable[[float], Any]], folder: Path, clips: list[str]
 ) -> Iterable[list[str]]:
-    """Rows on changed clips, and one with all of them."""
+    """Return rows on changed clips, and one with all of them."""
     rows, kept = [], {name: {} for name in makers}  # type: ignore[var-annotated]
     everything: dict[str, Material] = {}
     for change in CHANGES:
@@ -363,7 +363,7 @@ def changed_rows(
 def draw_failures(
     folder: Path, materials: dict[str, Material], found: dict[str, Found]
 ) -> Iterator[tuple[str, int, Path]]:
-    """One sheet for each kind of failure, at most eight frames that are not neighbours."""
+    """Draw a sheet for each kind of failure, of at most eight frames that are not neighbours."""
     import cv2
 
     kinds: dict[str, list[tuple[str, int]]] = {}
@@ -383,7 +383,7 @@ def draw_failures(
 
 
 def failures(points: Tensor, material: Material) -> Iterator[tuple[int, str]]:
-    """Frames with a hand that is wrong, and in which way."""
+    """Yield the frames with a wrong hand, and the kind of failure."""
     truth, near = material.truth, material.tolerance
     for t, k in torch.nonzero(~truth.isnan().any(-1)).tolist():
         point, face = points[t, k], material.faces[t]
@@ -402,7 +402,7 @@ def failures(points: Tensor, material: Material) -> Iterator[tuple[int, str]]:
 
 
 def _view(clip: str, t: int, material: Material, points: Tensor) -> np.ndarray:
-    """Edges of a frame with true and found hands: a drawing, as the recordings are not ours to copy."""
+    """Draw the edges of a frame with true and found hands; the recordings must not be copied."""
     import cv2
 
     grey = cv2.cvtColor(material.frames[t], cv2.COLOR_RGB2GRAY)

@@ -40,7 +40,7 @@ Method = Callable[[Clip], Tensor]
 
 
 def from_video(folder: Path, prior: UpperBodyPrior, background: bool) -> Method:
-    """Joints [T, 8, 2] of the person seen longest, by the pipeline."""
+    """Return a method: joints [T, 8, 2] of the person seen longest, by the pipeline."""
 
     def run(clip: Clip) -> Tensor:
         video = open_video(folder / f"{clip.name}.mkv")
@@ -63,7 +63,7 @@ def from_video(folder: Path, prior: UpperBodyPrior, background: bool) -> Method:
 
 
 def watched(frames: Iterable[VideoFrame], own: list[int]) -> Iterator[VideoFrame]:
-    """The frames; `own` gets the indices of those that are no repetition of the one before.
+    """Yield the frames, and add the indices of those that differ from the one before to `own`.
 
     A video that lacks a frame is read with the one before twice; MediaPipe saw what there is.
     """
@@ -76,7 +76,7 @@ def watched(frames: Iterable[VideoFrame], own: list[int]) -> Iterator[VideoFrame
 
 
 def from_landmarks(prior: UpperBodyPrior, joints: Sequence[int]) -> Method:
-    """Joints [T, 8, 2] by the filter alone, from some of MediaPipe's."""
+    """Return a method: joints [T, 8, 2] by the filter alone, from some of MediaPipe's."""
     tracker = UpperBodyTracker(prior, PinholeCamera.from_image_size(*SIZE), fps=FPS, neck="neck")
 
     def run(clip: Clip) -> Tensor:
@@ -90,14 +90,14 @@ def from_landmarks(prior: UpperBodyPrior, joints: Sequence[int]) -> Method:
 
 
 def with_ears(clip: Clip) -> Tensor:
-    """The reference: MediaPipe's joints, with the middle of its ears for the head."""
+    """Return the reference: MediaPipe's joints, with the middle of its ears for the head."""
     points = clip.points.clone()
     points[:, HEAD] = clip.ears
     return points
 
 
 def error_tables(clips: list[Clip], found: dict[str, list[Tensor]], report: Report) -> None:
-    """Mean and median distances per joint."""
+    """Add mean and median distances per joint."""
     mean, median = (
         report.table(
             key,
@@ -127,7 +127,7 @@ def error_tables(clips: list[Clip], found: dict[str, list[Tensor]], report: Repo
 
 
 def clip_table(clips: list[Clip], found: dict[str, list[Tensor]], report: Report) -> None:
-    """Elbows and hands, clip by clip."""
+    """Add the errors of elbows and hands, clip by clip."""
     table = report.table(
         "by_clip",
         "Clip by clip, mean in shoulder widths: shoulders / elbows / hands",
@@ -146,7 +146,7 @@ def clip_table(clips: list[Clip], found: dict[str, list[Tensor]], report: Report
 
 
 def pcp_tables(clips: list[Clip], found: dict[str, list[Tensor]], report: Report) -> dict[str, PCP]:
-    """Shares of correct limbs, all clips pooled and clip by clip; returns the curves."""
+    """Add the shares of correct limbs, all clips pooled and clip by clip; return the curves."""
     table = report.table(
         "pcp",
         "PCP of upper arms and forearms: both ends within so many limb lengths of MediaPipe's (%)",
@@ -174,7 +174,7 @@ def pcp_tables(clips: list[Clip], found: dict[str, list[Tensor]], report: Report
 
 
 def _arms(values: PCP) -> tuple[Tensor, Tensor]:
-    """PCP of upper arms and of forearms, both sides pooled; limbs in the order of `ARM_LIMBS`."""
+    """Return the PCP of upper arms and of forearms, both sides pooled; limbs in the order of `ARM_LIMBS`."""
     if len(values.per_limb) != len(ARM_LIMBS):
         raise ValueError(f"expected {len(ARM_LIMBS)} limbs, got {len(values.per_limb)}")
     weights = values.counts[:, None].to(values.per_limb)
@@ -185,7 +185,7 @@ def _arms(values: PCP) -> tuple[Tensor, Tensor]:
 def draw_pictures(
     clips: list[Clip], found: dict[str, list[Tensor]], curves: dict[str, PCP], out: Path
 ) -> list[str]:
-    """The PCP curve (Figure 13) and the errors over time of one clip (Figure 12)."""
+    """Draw the PCP curve (Figure 13) and the errors over time of one clip (Figure 12)."""
     from torchpose import viz
     from torchpose.viz import save_figure
 

@@ -106,7 +106,7 @@ def main(*, data: Path, quick: bool = False, out: TableFile | None = None) -> No
 
 
 def read_frames(folder: Path, name: str, every: int) -> Iterator[Frame]:
-    """Frames in which a face is followed."""
+    """Yield the frames in which a face is followed."""
     import cv2
 
     hands = read_clip(folder, name)
@@ -130,7 +130,7 @@ def read_frames(folder: Path, name: str, every: int) -> Iterator[Frame]:
 
 
 def score(model: torch.nn.Module, frames: list[Frame]) -> tuple[float, list[float]]:
-    """Mean area under the curve over the frames, and the CPU seconds of each."""
+    """Return the mean area under the curve over the frames, and the CPU seconds of each."""
     state, areas, times = model.init(1), [], []  # type: ignore[operator]
     for frame in frames:
         start = time.process_time()
@@ -144,7 +144,7 @@ def score(model: torch.nn.Module, frames: list[Frame]) -> tuple[float, list[floa
 
 
 def pixels(frame: Frame) -> tuple[Tensor, Tensor]:
-    """Which pixels belong to hands, and which to neither hands nor head, bool [H, W]."""
+    """Return the pixels of hands, and those of neither hands nor head, bool [H, W]."""
     height, width = frame.lab.shape[2:]
     u, v = torch.arange(width), torch.arange(height)[:, None]
     x, y, size = frame.face[0]
@@ -156,7 +156,7 @@ def pixels(frame: Frame) -> tuple[Tensor, Tensor]:
 
 
 def area_under_curve(positive: np.ndarray, negative: np.ndarray) -> float:
-    """Probability that a positive is above a negative; equal ones count half."""
+    """Return the probability that a positive is above a negative; equal ones count half."""
     values = np.sort(negative)
     below = np.searchsorted(values, positive, "left") + np.searchsorted(values, positive, "right")
     return float(below.mean() / (2 * len(values)))

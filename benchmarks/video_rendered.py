@@ -178,7 +178,7 @@ def track_clip(clip: Clip, tracker: Tracker, seeds: Sequence[int]) -> list[Outco
 
 
 def clip_facts(clip: Clip, tracker: Tracker) -> list[Any]:
-    """Return what an outcome depends on: prior, options, video and truth."""
+    """Return the inputs of an outcome: prior, options, video and truth."""
     prior, options = tracker
     video = hashlib.sha256(clip.path.read_bytes()).hexdigest()
     return [dict(options), prior.info.transition, *prior.state_dict().values(),
@@ -203,7 +203,7 @@ def from_truth(prior: UpperBodyPrior, clip: Clip) -> Outcome:
 
 
 def compare(track: PoseTrack, truth: Tensor) -> Tensor:
-    """3D errors [T, 8], metres."""
+    """Return the 3D errors [T, 8], metres."""
     return joint_errors_3d(track.joints3d[0].double(), truth)
 
 
@@ -211,18 +211,18 @@ def compare(track: PoseTrack, truth: Tensor) -> Tensor:
 
 
 def centimetres(errors: Tensor) -> str:
-    """Mean over what is there."""
+    """Return the mean of the errors that are there, cm."""
     return f"{100 * float(errors.nanmean()):.1f}"
 
 
 def percent(values: list[float]) -> str:
-    """Mean share, or a dash."""
+    """Return the mean share, or a dash."""
     mean = float(np.mean(values))
     return "-" if np.isnan(mean) else f"{100 * mean:.0f} %"
 
 
 def report(outcomes: dict[str, list[Outcome]], clips: list[Clip], look: str) -> str:
-    """Error by joint, by sequence, and what became of the hands."""
+    """Return the errors by joint and by sequence, and the shares of found hands."""
     by_joint, by_clip = [], []
     for name, done in outcomes.items():
         errors = torch.cat([one.errors for one in done])
@@ -256,7 +256,7 @@ def report(outcomes: dict[str, list[Outcome]], clips: list[Clip], look: str) -> 
 
 
 def draw(outcomes: dict[str, list[Outcome]], clips: list[Clip], out: Path) -> None:
-    """Figures 10 and 11: mean error of each joint, and errors over time."""
+    """Draw Figures 10 and 11: mean error of each joint, and errors over time."""
     shown = [n for n in (*list(TRACKERS)[:1], "mean shift", TRUE_2D, MEAN_POSE) if n in outcomes]
     means = {name: torch.cat([one.errors for one in outcomes[name]]) for name in shown}
     save_figure(

@@ -246,7 +246,7 @@ def tracked_decisions(runs: Results, banks: Mapping[str, ActionBank]) -> list[Re
 
 
 def add_release(report: Report, runs: Results) -> None:
-    """Add what a bank is worth: errors with the bank, the bend alone, and free.
+    """Add the errors with a bank of actions, with the bend alone, and without constraint.
 
     Args:
         report: gets the table. runs: of `track_actions`.

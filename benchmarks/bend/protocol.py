@@ -104,7 +104,7 @@ class _Stage:
         return TRACKING.run(grids, self.seeds, self.out, progress=self.progress, title=title)
 
     def settings(self, variants: Mapping[str, Variant]) -> dict[str, Tuning]:
-        """Return what the judges' clips choose for every tracker."""
+        """Return the settings that the judges' clips choose for every tracker."""
         scales, values = ((1.0,), SHARPNESS[:2]) if self.quick else (SCALES, SHARPNESS)
         return {
             name: tune_variant(self.judges, variant, self.out, scales=scales, values=values)
@@ -301,7 +301,7 @@ def _occlusion(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> Non
 
 
 def _actions(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> None:
-    """Add which action it is, from recorded joints and from silhouettes."""
+    """Add the recognition of actions, from recorded joints and from silhouettes."""
     there = {clip.action for clip in stage.clips}
     names = [n for n in (*bend_actions.KNOWN, *bend_actions.OTHERS) if n in there]
     library = action_clips(stage.clips, names)
@@ -369,7 +369,7 @@ def _numbers(name: str, given: Sequence[int]) -> list[int]:
 def _persons(
     clips: Sequence[MocapClip], testers: Sequence[str], judges: Sequence[str], quick: bool
 ) -> tuple[list[str], list[str]]:
-    """Return who is tracked, and whose clips choose the settings."""
+    """Return the tracked persons, and those whose clips choose the settings."""
     everybody = list(select_persons(clips, ()))
     if len(everybody) < 3:
         raise InputError(

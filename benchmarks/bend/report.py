@@ -94,7 +94,7 @@ def add_particles(report: Report, runs: Results) -> None:
 
 
 def _say_particles(report: Report, runs: Results) -> None:
-    """Say whether the paper's two claims hold, with intervals, and how the error falls."""
+    """Add findings: whether the paper's two claims hold, with intervals, and how the error falls."""
     errors = {
         (method, int(name.replace(",", ""))): own.values(mean_squared)
         for (method, name), own in runs.by("method", "condition").items()
@@ -124,7 +124,7 @@ def _say_particles(report: Report, runs: Results) -> None:
 def csv_columns(
     conditions: Mapping[str, Grid[Any, Filter]],
 ) -> dict[str, Callable[[Row], Any]]:
-    """Return what a line of runs.csv says.
+    """Return the columns of runs.csv, as functions of a row.
 
     Args:
         conditions: of the runs, by name; their filters' variants are told.
@@ -211,7 +211,7 @@ def add_limb_shapes(report: Report, runs: Results) -> None:
 
 
 def add_tuning(report: Report, tunings: Mapping[str, Tuning]) -> None:
-    """Add what the clips of other persons chose for every tracker."""
+    """Add the settings that the clips of other persons chose for every tracker."""
 
     def flat(found: Tuning) -> float:
         return found.error_of(Setting(1.0, found.setting.scale))

@@ -50,7 +50,7 @@ class Variant(NamedTuple):
 
     @property
     def label(self) -> str:
-        """What it is called in tables."""
+        """Return the name in tables."""
         return "constrained" if self.constrained else "first order"
 
 
@@ -142,7 +142,7 @@ def synchronised_space(
 
 
 def known_angles(clip: MocapClip) -> Bool[Tensor, "36"]:
-    """Return which angles are of limbs whose joints are recorded."""
+    """Return True for the angles of limbs whose joints are recorded."""
     there = dict(zip(BODY_15.names, clip.joints.isfinite().all(-1).all(0).tolist(), strict=True))
     return torch.tensor([there[limb.start] and there[limb.end] for limb in LIMBS_12 for _ in "xyz"])
 

@@ -96,7 +96,7 @@ def _track(subject: Subject[BendTrackee], how: Filter, seeds: Sequence[int]) -> 
 
 
 def _facts(subject: Subject[BendTrackee], how: Filter) -> list[Any]:
-    """Return what a run depends on; without constraint the action space counts for nothing."""
+    """Return the inputs of a run; without constraint the action space is none of them."""
     variant = how.variant
     if not variant.constrained:
         plain = [False, variant.particles, variant.limb_shape]

@@ -79,7 +79,7 @@ class Results:
 
     @property
     def runs(self) -> list[Any]:
-        """What was found in each row."""
+        """Return the runs of all rows."""
         return [row.run for row in self.rows]
 
     def values(self, measure: Measure) -> Float[Tensor, "Q S"]:

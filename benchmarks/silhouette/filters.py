@@ -72,7 +72,7 @@ both Gaussians; ``mrpf-published`` weighs by (MR 30) alone and samples the diffu
 
 
 def label_of(method: str) -> str:
-    """Return what a method is called in tables and pictures; its name, if it is none of `METHODS`."""
+    """Return the name of a method in tables and pictures; the given one if it is none of `METHODS`."""
     return METHODS[method].label if method in METHODS else method
 
 

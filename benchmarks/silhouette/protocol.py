@@ -164,7 +164,7 @@ def _splits(
     data: str | Path, actions: tuple[str, ...], test_actions: tuple[str, ...],
     train_persons: tuple[str, ...], test_persons: tuple[str, ...], clips: int,
 ) -> list[Split]:  # fmt: skip
-    """Return who is tracked with what, everybody and every action by the names that were given."""
+    """Return the splits of clips, with the given names completed by those that are recorded."""
     recorded = read_mocap(data, FPS, actions)
     _one_action(recorded)
     if not test_actions:
@@ -184,7 +184,7 @@ def _splits(
 def _given_settings(
     methods: Sequence[str], sharpness: float | None, settings: str | None
 ) -> dict[str, Tuning]:
-    """Return what stands instead of a validation; nothing if that shall choose."""
+    """Return the settings that are given, without validation; an empty dictionary if it is to choose."""
     if settings is not None:
         if sharpness is not None:
             raise InputError("--settings holds a sharpness already: leave --sharpness out")
@@ -211,7 +211,7 @@ def _named(cases: Sequence[Case]) -> dict[str, Case]:
 
 
 def _grid(case: Case, likelihood: str, initial: str) -> Grid[Subject[Trackee], Filter]:
-    """Return who is tracked by what under one condition."""
+    """Return the persons and filters of one condition."""
     return Grid(
         subjects_of(case.trackees),
         {

@@ -183,7 +183,7 @@ def _comparable(runs: Results) -> bool:
 
 
 def _add_differences(report: Report, runs: Results, condition: str = "") -> None:
-    """Add what the manifold's methods have over the others, with intervals.
+    """Add the differences of the manifold's methods from the others, with intervals.
 
     Args:
         condition: of the runs, where a report has several; before the names of the rows.
@@ -207,7 +207,7 @@ def _add_differences(report: Report, runs: Results, condition: str = "") -> None
 
 
 def _order(runs: Results) -> list[str]:
-    """Return whether the order of the paper's tables appears, in words."""
+    """Return sentences on whether the order of the paper's tables appears."""
     if not {"sir", "apf", "mrpf"} <= {*runs.names("method")}:
         return []
     found = []
@@ -222,7 +222,7 @@ def _order(runs: Results) -> list[str]:
 
 
 def _add_tuning(report: Report, tunings: Mapping[str, Tuning], condition: str = "") -> None:
-    """Add what validation chose for every method, or what was given.
+    """Add the settings of every method, chosen by validation or given.
 
     Args:
         condition: of the runs, where a report has several; before the names of the rows.
@@ -274,7 +274,7 @@ def _add_sequences(report: Report, trackees: Sequence[Trackee], condition: str =
 
 
 def _manifold_of(split: Split) -> str:
-    """Return whether the manifold is the person's own, and of which action if of another one."""
+    """Return "yes" if the manifold is the person's own, else "no", and its action if that is another one."""
     actions = " ".join(dict.fromkeys(clip.action for clip in split.manifold))
     other = actions not in {clip.action for clip in split.test}
     return ("yes" if split.seen else "no") + (f", of {actions}" if other else "")

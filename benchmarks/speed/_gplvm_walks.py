@@ -46,7 +46,7 @@ def held_out_tables(data: Path, persons: Sequence[str], report: Report) -> None:
 
 
 def read_walks(folder: Path, person: str) -> Walks:
-    """The first two trials to test on, two to end the fit, the others to fit to."""
+    """Return two trials to test on, two to end the fit, and the others to fit to."""
     trials = []
     for file in sorted(folder.glob(f"s{person}_*.npz")):
         with np.load(file) as arrays:
@@ -92,7 +92,7 @@ def held_out_rows(people: dict[str, Walks]) -> list[list[str]]:
 def errors_of_walks(
     walks: Walks, row: bool = False, validation: bool = False, **options: Any
 ) -> tuple[float, float]:
-    """Of the test poses, and of the same where g is given noisy ones."""
+    """Return the error of the test poses, and that where g is given noisy ones."""
     train = [torch.cat(walks.train)[:TRAINED]] if row else thin(walks.train, TRAINED)
     watched = walks.validation if validation else None
     manifold = fit_gplvm(train, validation=watched, **options)

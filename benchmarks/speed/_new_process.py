@@ -10,7 +10,7 @@ from benchmarks.speed._timing import limit_threads
 
 
 def call_in_new_process(threads: int, module: str, function: str, *arguments: Any) -> Any:
-    """Return what a function returns in a new process.
+    """Call a function in a new process, and return its result.
 
     Args:
         threads: of the process. module: full name of the function's module. function: its name.

@@ -61,17 +61,17 @@ class Timing(NamedTuple):
 
     @property
     def median(self) -> float:
-        """Median wall time."""
+        """Return the median wall time."""
         return statistics.median(self.wall)
 
     @property
     def best(self) -> float:
-        """Smallest wall time."""
+        """Return the smallest wall time."""
         return min(self.wall)
 
     @property
     def median_cpu(self) -> float:
-        """Median CPU time of this process, over all of its threads."""
+        """Return the median CPU time of this process, over all of its threads."""
         return statistics.median(self.cpu)
 
 
@@ -92,7 +92,7 @@ class Limits(NamedTuple):
 
 
 def limit_threads(threads: int) -> None:
-    """The same cores for every library; call it before peers are imported."""
+    """Pin every library to the same cores; to be called before peers are imported."""
     for name in THREAD_VARIABLES:
         os.environ[f"{name}_NUM_THREADS"] = str(threads)
     torch.set_num_threads(threads)
@@ -138,12 +138,12 @@ def _time_once(timing: Timing) -> None:
 
 
 def ratio(peer: Timing, ours: Timing) -> Ratio:
-    """Ratio of medians per unit."""
+    """Return the ratio of the medians per unit."""
     return Ratio(peer.median / ours.median, peer.median_cpu / max(ours.median_cpu, 1e-12))
 
 
 def measure_limits(quick: bool = False) -> Limits:
-    """The floor's ingredients, each the best of several runs."""
+    """Measure the rates from which floors are computed, each the best of several runs."""
     size, runs = (256, 3) if quick else (1536, 7)
     rates = []
     for dtype in (torch.float64, torch.float32):
@@ -159,7 +159,7 @@ def measure_limits(quick: bool = False) -> Limits:
 
 
 def limits_line(limits: Limits) -> str:
-    """One line on what `measure_limits` found."""
+    """Return the limits of the machine as one line."""
     return (
         f"This machine: {limits.gflops_float64:.0f} GFLOP/s in float64, "
         f"{limits.gflops_float32:.0f} in float32 (products of large matrices), "
@@ -168,7 +168,7 @@ def limits_line(limits: Limits) -> str:
 
 
 def machine_line(threads: int, packages: Iterable[str] = ()) -> str:
-    """Processor, cores, versions, threads and load; nothing that names the machine."""
+    """Return processor, cores, versions, threads and load as one line that does not name the machine."""
     versions = [f"Python {platform.python_version()}", f"torch {torch.__version__}"]
     versions += [f"{name} {found}" for name in packages if (found := _version(name))]
     load = f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
@@ -179,7 +179,7 @@ def machine_line(threads: int, packages: Iterable[str] = ()) -> str:
 
 
 def processor_model() -> str:
-    """The processor's name, as far as the system tells."""
+    """Return the processor's name, as far as the system tells."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
@@ -195,7 +195,7 @@ def _version(package: str) -> str | None:
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table, padded so that it reads as text too; all columns but the first to the right."""
+    """Return a Markdown table padded to equal widths; all columns but the first are aligned to the right."""
     table = [list(header), *(list(row) for row in rows)]
     widths = [max(len(row[i]) for row in table) for i in range(len(header))]
     lines = [_table_line(row, widths) for row in table]
@@ -212,7 +212,7 @@ def _table_line(row: Sequence[str], widths: Sequence[int]) -> str:
 
 
 def number(value: float, digits: int = 3) -> str:
-    """`value` to a few significant digits, without an exponent where it is not needed."""
+    """Return a number with a few significant digits, without an exponent where it is not needed."""
     if value == 0 or not 1e-4 <= abs(value) < 1e7:
         return f"{value:.{digits - 1}e}" if value else "0"
     whole = len(str(int(abs(value)))) if abs(value) >= 1 else 0
@@ -229,16 +229,16 @@ class Report:
         self.add(f"## {title}")
 
     def add(self, text: str) -> None:
-        """One paragraph or table."""
+        """Print and keep one paragraph or table."""
         print(text, end="\n\n", flush=True)
         self.parts.append(text)
 
     def table(self, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-        """A Markdown table."""
+        """Print and keep a Markdown table."""
         self.add(markdown_table(header, rows))
 
     def close(self, packages: Iterable[str] = (), limits: Limits | None = None) -> None:
-        """Say what the machine is, and write the file.
+        """Add a line about the machine, and write the file.
 
         Args:
             packages: whose versions are told. limits: of the machine, where they were measured.

@@ -53,7 +53,7 @@ def main(setup: Setup = Setup()) -> None:
 
 
 def in_new_process(size: Size, threads: int) -> dict[str, Any]:
-    """Return what `measure` finds for a case alone in a process."""
+    """Call `measure` in a process of its own."""
     found: dict[str, Any] = call_in_new_process(threads, _MODULE, measure.__name__, *size)
     return found
 

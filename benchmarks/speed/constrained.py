@@ -50,7 +50,7 @@ def main(setup: Setup = Setup(runs=5)) -> None:
 
 
 def performance(seed: int, n_frames: int = 60) -> torch.Tensor:
-    """States [T, D] of one bend: trunk, legs and arms, each with a size and a timing of its own."""
+    """Return states [T, D] of one bend: trunk, legs and arms, each with its own size and timing."""
     g = torch.Generator().manual_seed(seed)
     t = torch.linspace(0, 1, n_frames, dtype=torch.float64)
     states = torch.zeros(n_frames, BODY.dim, dtype=torch.float64)
@@ -69,7 +69,7 @@ def performance(seed: int, n_frames: int = 60) -> torch.Tensor:
 
 
 def rig() -> CameraRig:
-    """One camera at the person's left, 3.4 m away."""
+    """Return one camera at the person's left, 3.4 m away."""
     turn = torch.tensor([[0.0, 0, -1], [0, -1, 0], [-1, 0, 0]], dtype=torch.float64)
     place = -turn @ torch.tensor([3.4, 0.95, 0.0], dtype=torch.float64)
     vector = (math.pi / 2**0.5, 0.0, -math.pi / 2**0.5)
@@ -83,7 +83,7 @@ def rig() -> CameraRig:
 def frames(
     action: ActionSpace, std: torch.Tensor, sizes: tuple[int, ...], runs: int, report: Report
 ) -> None:
-    """Cost per frame and acceptance over the number of particles."""
+    """Add the cost per frame and the acceptance over the number of particles."""
     states = performance(99)[SKIPPED : SKIPPED + FRAMES + 1]
     camera = rig()
     silhouettes = render(BODY, states[1:], camera, HEIGHT, WIDTH)
@@ -117,7 +117,7 @@ def frames(
 
 
 def pieces(action: ActionSpace, std: torch.Tensor, n: int, runs: int, report: Report) -> None:
-    """What a look at each particle costs, part by part."""
+    """Add the cost per particle of each part of a frame."""
     g = torch.Generator().manual_seed(0)
     noise = torch.randn(n, BODY.dim, generator=g, dtype=torch.float64)
     states = BODY.perturb(performance(99)[SKIPPED].expand(n, -1), noise * std)

@@ -84,7 +84,7 @@ def main(setup: Setup = Setup(runs=3), *, points: int = 100_000) -> None:
 
 
 def make_problem(n: int, n_components: int, iterations: int) -> Problem:
-    """Overlapping clusters of unequal shape, scaled to unit variance; one point of each starts it."""
+    """Draw overlapping clusters of unequal shape, scaled to unit variance; start from a point of each."""
     rng = np.random.default_rng(0)
     each = -(-n // n_components)
     parts = []
@@ -102,7 +102,7 @@ def make_problem(n: int, n_components: int, iterations: int) -> Problem:
 
 
 def mean_log_likelihood(x: Tensor, mixture: MixtureParameters) -> float:
-    """The same for everyone: whitened residuals, one component at a time, in float64."""
+    """Return the mean log-likelihood in float64, by whitened residuals of one component at a time."""
     terms = []
     for weight, mean, covariance in zip(*mixture, strict=True):
         factor = torch.linalg.cholesky(covariance)
@@ -113,7 +113,7 @@ def mean_log_likelihood(x: Tensor, mixture: MixtureParameters) -> float:
 
 
 def wide(result: Any) -> MixtureParameters:
-    """Whatever a method returned, as float64 tensors."""
+    """Return the result of any method as float64 tensors."""
     parts = (torch.as_tensor(part).detach().double() for part in result)
     return MixtureParameters(*parts)
 
@@ -122,7 +122,7 @@ def wide(result: Any) -> MixtureParameters:
 
 
 def make_methods(problem: Problem, report: Report) -> list[Method]:
-    """torchpose first, then every peer that can be imported."""
+    """Return torchpose's methods, then every peer that can be imported."""
     methods = [torchpose_fit(problem, dtype) for dtype in (torch.float64, torch.float32)]
     for name, make in PEERS.items():
         try:
@@ -222,7 +222,7 @@ PEERS: dict[str, Callable[[Problem], Method]] = {
 
 
 def report_agreement(report: Report, found: dict[str, float]) -> bool:
-    """Say how far torchpose and scikit-learn are apart; True if too far."""
+    """Report the difference of torchpose and scikit-learn; return True if it is too large."""
     ours, theirs = found["torchpose, float64"], found.get("scikit-learn, float64")
     if theirs is None:
         report.add("Agreement: scikit-learn cannot be imported, nothing to compare with.")
@@ -247,7 +247,7 @@ def table_rows(
 
 
 def floor_text(problem: Problem, limits: Limits) -> str:
-    """Two products of all points' features with one table, at the rate of large products."""
+    """Return the floor: two products of all points' features with one table, at the measured rate."""
     n_features = 1 + DIM + DIM * (DIM + 1) // 2
     flops = 4e-9 * len(problem.x) * n_features * len(problem.start.weights) * problem.iterations
     wide_s, narrow_s = flops / limits.gflops_float64, flops / limits.gflops_float32

@@ -109,7 +109,7 @@ def main(
 
 
 def walk(frames: int) -> Tensor:
-    """A cyclic motion of quaternion vectors."""
+    """Return a cyclic motion of quaternion vectors."""
     generator = torch.Generator().manual_seed(0)
     angle = 2 * math.pi * torch.arange(frames, dtype=torch.float64) / CYCLE
     waves = torch.stack([f(n * angle) for n in (1, 2, 3) for f in (torch.sin, torch.cos)], 1)
@@ -120,7 +120,7 @@ def walk(frames: int) -> Tensor:
 
 
 def latent_points(manifold: BackConstrainedGPLVM, count: int) -> Tensor:
-    """Particles about the trajectory."""
+    """Draw particles about the trajectory."""
     generator = torch.Generator().manual_seed(1)
     chosen = torch.randint(len(manifold.latents), (count,), generator=generator)
     noise = torch.randn(count, 2, generator=generator, dtype=torch.float64)
@@ -128,7 +128,7 @@ def latent_points(manifold: BackConstrainedGPLVM, count: int) -> Tensor:
 
 
 def true_prediction(manifold: BackConstrainedGPLVM, z: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """(MR 25) and (MR 26) with plain inverses, noise included."""
+    """Return (MR 25) and (MR 26) by plain inverses, noise included."""
     beta, beta0, gamma, _ = (float(value.exp()) for value in manifold.kernel)
     noise = float(manifold.kernel.noise)
     latents, mean = manifold.latents.numpy(), manifold.poses.mean(0).numpy()
@@ -149,7 +149,7 @@ def true_prediction(manifold: BackConstrainedGPLVM, z: Tensor) -> tuple[np.ndarr
 def make_methods(
     manifold: BackConstrainedGPLVM, z: Tensor, report: Report, quiet: bool
 ) -> list[Method]:
-    """torchpose first, then gpytorch if it can be imported."""
+    """Return torchpose's methods, then gpytorch's if it can be imported."""
     methods = [
         method
         for dtype in (torch.float64, torch.float32)
@@ -182,7 +182,7 @@ def torchpose_methods(
 
 
 def gpytorch_methods(manifold: BackConstrainedGPLVM, z: Tensor, dtype: torch.dtype) -> list[Method]:
-    """An exact GP with a batch of outputs that share the kernel."""
+    """Return an exact GP with a batch of outputs that share the kernel."""
     import gpytorch
 
     model = gpytorch_model(manifold, dtype)
@@ -207,7 +207,7 @@ def gpytorch_methods(manifold: BackConstrainedGPLVM, z: Tensor, dtype: torch.dty
 
 
 def gpytorch_model(manifold: BackConstrainedGPLVM, dtype: torch.dtype) -> Any:
-    """In evaluation mode, with the kernel, noise and latent points of the manifold."""
+    """Return gpytorch's model in evaluation mode, with kernel, noise and latent points of the manifold."""
     import gpytorch
 
     columns = manifold.dim
@@ -239,7 +239,7 @@ def gpytorch_model(manifold: BackConstrainedGPLVM, dtype: torch.dtype) -> Any:
 
 
 def fit_rows(poses: Tensor, manifold: BackConstrainedGPLVM, quick: bool) -> list[list[str]]:
-    """Ten evaluations of objective and gradient of both, and a whole fit."""
+    """Return the times of ten evaluations of objective and gradient of both, and of a whole fit."""
     target, gamma = poses - poses.mean(0), float(manifold.gamma_x)
     ours = GPLVMFit(target, 2, gamma, "adam")
     cases = [Case("torchpose, 10 steps of Adam", ours.step)]
@@ -263,7 +263,7 @@ def fit_rows(poses: Tensor, manifold: BackConstrainedGPLVM, quick: bool) -> list
 
 
 def gpytorch_steps(manifold: BackConstrainedGPLVM) -> Callable[[], None]:
-    """Ten steps of Adam on the marginal likelihood, latent points by back constraints."""
+    """Return ten steps of Adam on the marginal likelihood, with latent points by back constraints."""
     import gpytorch
 
     model = gpytorch_model(manifold, torch.float64).train()
@@ -291,7 +291,7 @@ def gpytorch_steps(manifold: BackConstrainedGPLVM) -> Callable[[], None]:
 
 
 def errors_of(method: Method, truth: tuple[np.ndarray, np.ndarray]) -> list[float]:
-    """Largest |difference| over the largest |truth|, of mean and variance."""
+    """Return the largest |difference| over the largest |truth|, of mean and variance."""
     errors = []
     for value, expected in zip(method.call(), truth, strict=True):
         if value is not None:
@@ -315,7 +315,7 @@ def prediction_rows(
 
 
 def speedups(methods: list[Method], timings: list[Timing], count: int) -> list[str]:
-    """gpytorch's time over torchpose's, in the same precision."""
+    """Return gpytorch's time over torchpose's in the same precision, in words."""
     found = []
     by_name = {method.name: timing for method, timing in zip(methods, timings, strict=True)}
     for method in methods:
@@ -330,7 +330,7 @@ def speedups(methods: list[Method], timings: list[Timing], count: int) -> list[s
 
 
 def floor_row(manifold: BackConstrainedGPLVM, count: int, limits: Limits) -> list[str]:
-    """Arithmetic of mean and variance at the rate of large products."""
+    """Return the arithmetic of mean and variance at the rate of large products as a row."""
     frames = len(manifold.poses)
     flops = count * frames * (2 * manifold.dim + frames + 2 * (manifold.latent_dim + 2))
     seconds = 1e-9 * flops / limits.gflops_float64

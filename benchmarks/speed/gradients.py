@@ -69,7 +69,7 @@ def main(setup: Setup = Setup()) -> None:
 
 
 def in_new_process(ways: Sequence[Way], threads: int) -> list[dict[str, Any]]:
-    """Return what `measure_all` finds in a new process; a peak is that of one way."""
+    """Call `measure_all` in a new process; a peak is that of one way."""
     found: list[dict[str, Any]] = call_in_new_process(
         threads, _MODULE, measure_all.__name__, list(ways)
     )
@@ -77,7 +77,7 @@ def in_new_process(ways: Sequence[Way], threads: int) -> list[dict[str, Any]]:
 
 
 def measure_all(ways: Sequence[Way]) -> list[dict[str, Any]]:
-    """Return what `measure` finds for some cases, with or without gradients."""
+    """Call `measure` for some cases, with or without gradients."""
     return [measure(Case(*case), gradients) for *case, gradients in ways]
 
 
@@ -118,7 +118,7 @@ def measure(case: Case, gradients: bool) -> dict[str, Any]:
 
 
 def slope_error(tracker: Any, keypoints: Any) -> float:
-    """|gradient - central difference| / |gradient| of the summed joints along a random direction."""
+    """Return |gradient - central difference| / |gradient| of the summed joints along a random direction."""
     import torch
 
     generator = torch.Generator().manual_seed(1)
@@ -132,7 +132,7 @@ def slope_error(tracker: Any, keypoints: Any) -> float:
 
 
 def draw_keypoints(batch: int, frames: int) -> Any:
-    """Head and hands that wander about, pixels [B, T, 3, 2]."""
+    """Draw head and hands that wander about, pixels [B, T, 3, 2]."""
     import torch
 
     generator = torch.Generator().manual_seed(0)

@@ -99,7 +99,7 @@ def fast(method: Method) -> bool:
 
 
 def make_problem(n_filters: int) -> Problem:
-    """Stable random systems."""
+    """Draw stable random systems."""
     rng = np.random.default_rng(0)
     transition = np.eye(DIM) + 0.01 * rng.standard_normal((n_filters, DIM, DIM))
     noise = 0.01 * np.eye(DIM) * rng.uniform(0.5, 2, (n_filters, 1, 1))
@@ -111,7 +111,7 @@ def make_problem(n_filters: int) -> Problem:
 
 
 def true_step(problem: Problem) -> Step:
-    """The textbook's formulas in float64 NumPy."""
+    """Return the step by the textbook's formulas in float64 NumPy."""
     F, Q, H, R, mean, cov, z = problem
     mean = np.einsum("bij,bj->bi", F, mean)
     cov = F @ cov @ F.transpose(0, 2, 1) + Q
@@ -129,12 +129,12 @@ def true_step(problem: Problem) -> Step:
 
 
 def stack_steps(steps: Any) -> Step:
-    """The steps of a loop over filters as one."""
+    """Return the steps of a loop over filters as one."""
     return Step(*(np.stack(parts) for parts in zip(*steps, strict=True)))
 
 
 def make_methods(problem: Problem, report: Report, quiet: bool) -> list[Method]:
-    """torchpose first, then every peer that can be imported."""
+    """Return torchpose's methods, then every peer that can be imported."""
     methods = [torchpose_step(problem, torch.float64), torchpose_step(problem, torch.float32)]
     methods.append(numpy_loop(problem))
     for name, make in PEERS.items():
@@ -279,7 +279,7 @@ PEERS: dict[str, Callable[[Problem], list[Method]]] = {
 
 
 def error_of(method: Method, truth: Step) -> list[float]:
-    """Largest |difference| / max(|truth|, 1) of mean, covariance and log-likelihood."""
+    """Return the largest |difference| / max(|truth|, 1) of mean, covariance and log-likelihood."""
     found = method.result(method.call())
     errors = []
     for value, expected in zip(found, truth, strict=True):
@@ -300,7 +300,7 @@ def table_rows(
 
 
 def floor_row(n_filters: int, limits: Limits) -> list[str]:
-    """Arithmetic at the rate of large products plus one pass over what goes in and out."""
+    """Return the time of the arithmetic and of one pass over inputs and outputs as a row."""
     z = len(OBSERVED)
     products = 4 * DIM**3 + 4 * DIM**2  # F P F^T, F m and their sums
     update = z**3 / 3 + z * z * DIM + 2 * z * DIM * DIM + 4 * z * DIM  # factor, solve, W^T W, mean

@@ -143,7 +143,7 @@ class NumpyLoop:
 
 
 def make_methods(problem: Problem, loop: NumpyLoop, sizes: Sizes) -> list[Method]:
-    """Every row of torchpose, for one sequence and for a batch."""
+    """Return all methods of torchpose, for one sequence and for a batch."""
     made: list[Method] = []
     for batch in (1, sizes.batch):
         z = draw_sequences(problem, batch, sizes.long)
@@ -206,14 +206,14 @@ def run_online(tracker: MixtureKalmanFilter, z: Tensor) -> Tensor:
 
 
 def random_noise(batch: int, frames: int, n_obs: int) -> Tensor:
-    """R [B, T, Z, Z], between half and one and a half times nine pixels squared."""
+    """Draw R [B, T, Z, Z], between half and one and a half times nine pixels squared."""
     generator = torch.Generator().manual_seed(5)
     scale = 0.5 + torch.rand(batch, frames, n_obs, generator=generator, dtype=torch.float64)
     return torch.diag_embed(9 * scale)
 
 
 def random_masks(batch: int, frames: int, n_obs: int) -> Iterator[Tensor]:
-    """Masks [B, T, Z] in which each joint is missing in 5 % of the frames; new ones in every call."""
+    """Yield masks [B, T, Z] in which each joint is missing in 5 % of the frames."""
     generator = torch.Generator().manual_seed(6)
     while True:
         seen = torch.rand(batch, frames, n_obs // 2, generator=generator) > 0.05
@@ -224,7 +224,7 @@ def random_masks(batch: int, frames: int, n_obs: int) -> Iterator[Tensor]:
 
 
 def error_of(method: Method) -> float | None:
-    """Largest |difference| / max(|reference|, 1) of the first sequence's means; NaN if any is lost."""
+    """Return the largest |difference| / max(|reference|, 1) of the first means; NaN if any is lost."""
     means = method.call().double().numpy()
     if not np.isfinite(means).all():
         return float("nan")
@@ -237,7 +237,7 @@ def error_of(method: Method) -> float | None:
 def report_agreement(
     report: Report, methods: list[Method], errors: list[float | None]
 ) -> list[str]:
-    """Say how far torchpose is from the NumPy loop; returns the methods that are too far."""
+    """Report the difference from the NumPy loop, and return the methods that differ too much."""
     pairs = [(m, e) for m, e in zip(methods, errors, strict=True) if e is not None]
     said = []
     for dtype, allowed in TOLERANCE.items():
@@ -272,7 +272,7 @@ def row(timing: Timing, loop: Timing, batch: int, dtype: str, error: str) -> lis
 
 
 def octave_text(loop: NumpyLoop, z: np.ndarray, runs: int) -> str:
-    """The same loop in Octave, right after the others; no part of it is torchpose."""
+    """Run the same loop in Octave, and return its speed in words; no part of it is torchpose."""
     program = find_octave()
     if program is None:
         return "Octave is not installed: its row is left out."
@@ -286,7 +286,7 @@ def octave_text(loop: NumpyLoop, z: np.ndarray, runs: int) -> str:
 
 
 def floor_text(problem: Problem, limits: Limits) -> str:
-    """What no arrangement of fixed tracks avoids, per frame, with known gains."""
+    """Return the floor of fixed tracks with known gains, per frame, in words."""
     n_tracks, n_obs = problem.prior.n_components, len(problem.observed)
     flops = 2 * n_tracks * (DIM * DIM + 2 * n_obs * DIM + n_obs * n_obs + DIM)
     written = 8 * (DIM + n_tracks + 1)

@@ -71,7 +71,7 @@ def main(
 
 
 def arm_problem(path: Path | None, n_steps: int) -> Problem:
-    """The arm model, and measurements of a path drawn from it."""
+    """Return the arm model, and measurements of a path drawn from it."""
     prior = synthetic_prior() if path is None else released_prior(path)
     process = torch.tensor(PROCESS, dtype=torch.float64)
     g = torch.Generator().manual_seed(1)
@@ -86,7 +86,7 @@ def arm_problem(path: Path | None, n_steps: int) -> Problem:
 
 
 def synthetic_prior(n_components: int = 30) -> GaussianMixture:
-    """Thirty components with the scales of an arm: pixels beside metres and radians."""
+    """Return thirty components with the scales of an arm: pixels beside metres and radians."""
     g = torch.Generator().manual_seed(0)
     scale = torch.tensor([120.0, 90.0, 0.4] * 5 + [0.1] * 3 + [0.2] * 3, dtype=torch.float64)
     low = torch.randn(n_components, DIM, 8, generator=g).double() / 8**0.5
@@ -98,7 +98,10 @@ def synthetic_prior(n_components: int = 30) -> GaussianMixture:
 
 
 def walk_problem(n_steps: int) -> Problem:
-    """x_t = x_{t-1} + N(0, Q) from N(0, I), 8 of 21 dimensions measured; a prior too wide to matter."""
+    """Return the random walk x_t = x_{t-1} + N(0, Q) from N(0, I), with 8 of 21 dimensions measured.
+
+    Its prior is too wide to matter.
+    """
     g = torch.Generator().manual_seed(2)
     a = 0.05 * torch.randn(DIM, DIM, generator=g).double()
     process = a @ a.mT + 0.01 * torch.eye(DIM)
@@ -112,7 +115,7 @@ def walk_problem(n_steps: int) -> Problem:
 
 
 def exact_evidence(problem: Problem) -> float:
-    """log p(z_1:T) of the random walk by the Kalman filter."""
+    """Return log p(z_1:T) of the random walk by the Kalman filter."""
     process, z = problem.process.numpy(), problem.z.numpy()
     h, noise = np.eye(DIM)[problem.observed], np.diag(problem.noise.numpy())
     m, p, total = np.zeros(DIM), np.eye(DIM), 0.0
@@ -174,7 +177,7 @@ def walk_rows(problem: Problem, n: int, report: Report) -> dict[str, Callable[[]
 def add_table(
     report: Report, title: str, calls: dict[str, Callable[[], float]], runs: int, steps: int
 ) -> None:
-    """Milliseconds of a step of every method, and the log-evidence of its first run."""
+    """Add the milliseconds of a step of every method, and the log-evidence of its first run."""
     evidence = {name: call() for name, call in calls.items()}  # warms up as well
     cases = [Case(name, call, steps) for name, call in calls.items()]
     timings = take_turns(cases, runs, warm=0)
@@ -191,7 +194,7 @@ def add_table(
 
 
 def floor_text(problem: Problem, n: int) -> str:
-    """What no arrangement avoids: the noise, and one product of all residuals, in cache."""
+    """Return the floor in words: drawing the noise, and one product of all residuals, in cache."""
     k = problem.prior.n_components
     rows, points = torch.randn(k * DIM, DIM + 1), torch.randn(DIM + 1, 512)
     out = torch.empty(k * DIM, 512)
@@ -210,7 +213,7 @@ def floor_text(problem: Problem, n: int) -> str:
 
 
 def density_error_text(problem: Problem) -> str:
-    """Largest error of the float32 log density against float64, on draws of the prior."""
+    """Return the largest error of the float32 log density on draws of the prior, in words."""
     covariance = torch.diag(problem.process)
     walk = MixtureWalk(problem.prior.parameters_tuple(), covariance, torch.float32)
     wide = MixtureWalk(problem.prior.parameters_tuple(), covariance, torch.float64)

@@ -81,7 +81,7 @@ def main(setup: Setup = Setup(runs=9)) -> None:
 
 
 def check(scene: Scene, report: Report) -> bool:
-    """Counts of a few hypotheses against images of every part at each of its places."""
+    """Compare counts of a few hypotheses with images of every part at each of its places."""
     spread = torch.full((scene.body.dim,), 0.05, dtype=torch.float64)
     one = tracker(scene, 3)
     states = one.init(scene.state[None], torch.Generator().manual_seed(1), spread).particles[0]
@@ -123,7 +123,7 @@ def make_scene(height: int, width: int) -> Scene:
 
 
 def compare(scene: Scene, n: int, runs: int, report: Report) -> None:
-    """Every filter on one frame, from the same particles each time."""
+    """Time every filter on one frame, from the same particles each time."""
     budget = POINTS * n
     filters: dict[str, SilhouetteParticleFilter] = {
         f"root uncertainty, {n} hypotheses": tracker(scene, n),
@@ -161,7 +161,7 @@ def row(timing: Timing, floor: Timing) -> list[str]:
 
 
 def where(scene: Scene, n: int, runs: int, report: Report) -> None:
-    """The steps of a frame one by one, on the same hypotheses."""
+    """Time the steps of a frame one by one, on the same hypotheses."""
     one, (height, width) = tracker(scene, n), scene.silhouettes.shape[-2:]
     spread = torch.full((scene.body.dim,), 0.02, dtype=torch.float64)
     state = one.init(scene.state[None], torch.Generator().manual_seed(0), spread)

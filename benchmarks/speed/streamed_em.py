@@ -92,7 +92,7 @@ def main(
 
 
 def report_scaling(report: Report, setup: Setup, data: str | None) -> bool:
-    """One process of one thread and two of one thread each, in turn; True if they disagree."""
+    """Time one process of one thread and two of one thread each, in turn; return True if they disagree."""
     samples, components = (20_000, 4) if setup.quick else (2 * MILLION, COMPONENTS)
     job = Job(samples, components, 3, data)
     idle = report_load(report, setup.quick)
@@ -125,7 +125,7 @@ def report_scaling(report: Report, setup: Setup, data: str | None) -> bool:
 
 
 def report_load(report: Report, quick: bool) -> float:
-    """Say how busy the machine is before anything is measured; the share of it that is free."""
+    """Report how busy the machine is before the runs, and return the share of it that is free."""
     before, seconds = _cpu_ticks(), 0.1 if quick else 2
     time.sleep(seconds)
     spent = [after - first for after, first in zip(_cpu_ticks(), before, strict=True)]
@@ -139,7 +139,7 @@ def report_load(report: Report, quick: bool) -> float:
 
 
 def _cpu_ticks() -> tuple[float, float]:
-    """Idle and all ticks of all cores so far."""
+    """Return idle and all ticks of all cores so far."""
     try:
         fields = Path("/proc/stat").read_text().splitlines()[0].split()[1:]
     except OSError:
@@ -149,7 +149,7 @@ def _cpu_ticks() -> tuple[float, float]:
 
 
 def report_streamed(report: Report, setup: Setup, samples: int, data: str | None) -> bool:
-    """20 steps over few and over many states; True if one process and two disagree."""
+    """Time 20 steps over few and over many states; return True if one process and two disagree."""
     samples, components, steps = (20_000, 4, 3) if setup.quick else (samples, COMPONENTS, STEPS)
     threads = setup.threads
     jobs = [
@@ -192,7 +192,7 @@ def streamed_row(run: Run) -> list[str]:
 
 
 def report_peers(report: Report, setup: Setup) -> bool:
-    """Steps from one start over states that everyone can hold; True if scikit-learn differs."""
+    """Time steps over states that all methods can hold; return True if scikit-learn differs."""
     points, n_components, steps = (2000, 4, 3) if setup.quick else (100_000, COMPONENTS, STEPS)
     problem = make_problem(points, n_components, steps)
     report.add(
@@ -216,7 +216,7 @@ def report_peers(report: Report, setup: Setup) -> bool:
 
 
 def peer_methods(problem: Problem, report: Report) -> Iterator[Method]:
-    """The streamed fit, the fit in memory, and every peer that can be imported."""
+    """Yield the streamed fit, the fit in memory, and every peer that can be imported."""
     for dtype in (torch.float64, torch.float32):
         yield streamed_fit(problem, dtype)
     in_memory = torchpose_fit(problem, torch.float64)

@@ -59,7 +59,7 @@ def normal(generator: torch.Generator, *sizes: int) -> Tensor:
 
 
 def covariances(generator: torch.Generator, degrees: float, *batch: int) -> Tensor:
-    """Random ones, of vectors; the deviation is the root mean square over the axes."""
+    """Draw covariances of vectors; the deviation is the root mean square over the axes."""
     a = normal(generator, *batch, 3, 3)
     cov = a @ a.mT + 0.05 * torch.eye(3).double()
     trace = cov.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
@@ -71,7 +71,7 @@ def drawn(generator: torch.Generator, mean: Tensor, cov: Tensor, count: int) -> 
 
 
 def angle(a: Tensor, b: Tensor) -> float:
-    """Degrees between rotations, root mean square."""
+    """Return the degrees between rotations, root mean square."""
     half = compose(conjugate(a), b).norm(dim=-1).asin()
     return float(2 * half.square().mean().sqrt().rad2deg())
 
@@ -81,7 +81,7 @@ def apart(a: Tensor, b: Tensor) -> float:
 
 
 def turn_row(degrees: float, count: int) -> list[str]:
-    """A limb in the space of its own part, where the part above is 40 degrees from its centre."""
+    """Return the errors of a limb in its own part's space, with the part above 40 degrees off its centre."""
     g = torch.Generator().manual_seed(0)
     turn = torch.tensor([0.3, -0.1, 0.1]).double()
     new_centre = torch.tensor([0.0, 0.05, -0.05]).double()
@@ -105,7 +105,7 @@ def chain_row(degrees: float, count: int, trials: int) -> list[str]:
 
 
 def chain_errors(g: torch.Generator, degrees: float, count: int) -> tuple[float, float, float]:
-    """Posterior's deviation, error of its mean, error of its covariance.
+    """Return the posterior's deviation, the error of its mean, and the error of its covariance.
 
     The exact posterior comes from draws of the top part and of the conditionals below it, weighted
     by the observations of the parts below.
@@ -137,7 +137,7 @@ def chain_errors(g: torch.Generator, degrees: float, count: int) -> tuple[float,
 
 
 def linear_error() -> float:
-    """Largest difference from the dense joint, x_j = A x_i + N(0, I) on a tree of six nodes."""
+    """Return the largest difference from the dense joint, x_j = A x_i + N(0, I) on a tree of six nodes."""
     g = torch.Generator().manual_seed(0)
     edges = torch.tensor([[0, 1], [0, 2], [2, 3], [2, 4], [4, 5]])
     matrix = torch.linalg.qr(normal(g, 5, 3, 3)).Q

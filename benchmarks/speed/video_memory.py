@@ -36,7 +36,7 @@ def main(setup: Setup = Setup(), *, data: Path, minutes: float = 60.0) -> None:
 
 
 def measure(report: Report, clip: Path, n_frames: int, folder: Path) -> None:
-    """Resident memory at some minutes, and while the result is written."""
+    """Report the resident memory at some minutes, and while the result is written."""
     from tqdm.auto import tqdm
 
     from torchpose import PinholeCamera, VideoTracker, load_prior
@@ -74,7 +74,7 @@ def measure(report: Report, clip: Path, n_frames: int, folder: Path) -> None:
 
 
 def loop(path: Path, n_frames: int) -> Iterator[Any]:
-    """A clip over and over, decoded anew each time."""
+    """Yield the frames of a clip again and again, decoded anew each time."""
     from torchpose.video import open_video
 
     count = 0
@@ -88,7 +88,7 @@ def loop(path: Path, n_frames: int) -> Iterator[Any]:
 
 
 def resident() -> float:
-    """Resident memory of this process, MB."""
+    """Return the resident memory of this process, MB."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE / 2**20
 
 

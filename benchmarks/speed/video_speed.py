@@ -55,7 +55,7 @@ def main(
 
 
 def join(clips: list[Path], path: Path) -> int:
-    """One file of several clips; returns the number of its frames."""
+    """Write several clips as one file, and return the number of its frames."""
     from torchpose.video import VideoWriter, open_video
 
     count = 0
@@ -69,7 +69,7 @@ def join(clips: list[Path], path: Path) -> int:
 
 
 def make_tracker(**options: Any) -> Any:
-    """The tracker with its defaults."""
+    """Return the tracker with its defaults."""
     from torchpose import PinholeCamera, VideoTracker, load_prior
 
     camera = PinholeCamera.from_image_size(640, 480)
@@ -77,7 +77,7 @@ def make_tracker(**options: Any) -> Any:
 
 
 def whole(report: Report, clip: Path, n_frames: int, setup: Setup, mediapipe: Path | None) -> None:
-    """Frames per second of the whole way, beside MediaPipe."""
+    """Time the whole pipeline, beside MediaPipe."""
     from torchpose.video import open_video
 
     def track(tracker: Any, **options: Any) -> None:
@@ -110,7 +110,7 @@ def whole(report: Report, clip: Path, n_frames: int, setup: Setup, mediapipe: Pa
 
 
 def row(timing: Timing) -> tuple[str, ...]:
-    """Medians."""
+    """Return the medians of a timing as a row."""
     return (
         timing.case.name,
         f"{1 / timing.median:.0f}",
@@ -120,7 +120,7 @@ def row(timing: Timing) -> tuple[str, ...]:
 
 
 def mediapipe_row(python: Path, clip: Path, setup: Setup) -> tuple[str, ...]:
-    """The full pose model of MediaPipe on the same file and cores."""
+    """Time the full pose model of MediaPipe on the same file and cores."""
     script = Path(__file__).parents[1] / "mediapipe_landmarks.py"
     command = [str(python), str(script), str(clip), "--time", "--threads", str(setup.threads)]
     command += ["--repeat", str(setup.runs)]
@@ -170,7 +170,7 @@ def stages(report: Report, clip: Path, n_frames: int) -> None:
 
 
 def timed(call: Any, name: str, spent: dict[str, float]) -> Any:
-    """`call`, whose time is added up."""
+    """Return `call` wrapped so that its time is added up."""
 
     @functools.wraps(call)
     def wrapped(*args: Any, **kwargs: Any) -> Any:
