@@ -22,7 +22,7 @@ from tqdm.auto import tqdm
 
 from benchmarks._command import run_command
 from benchmarks._depth_silhouettes import HEAD_TOP, PELVIS, Filmed, draw, kinect, one_view, seeded
-from benchmarks.bend.trackees import REDRAWS, SHARPNESS, fit_space
+from benchmarks.bend.variants import REDRAWS, SHARPNESS, fit_space
 from benchmarks.engine import Setting, choose_setting
 from torchpose._core.files import atomic_path, check_output_folder
 from torchpose.body import Body, centres_of, fit_body, fit_state

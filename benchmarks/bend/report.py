@@ -6,8 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.bend.trackees import BendTrackee, Variant, recorded_gap, true_acceptance
 from benchmarks.bend.tracking import BendRun, Filter, mean_squared
+from benchmarks.bend.variants import BendPerson, Variant, recorded_gap, true_acceptance
 from benchmarks.bodies.tracking import part_error
 from benchmarks.bodies.views import SEEN, Subject, subjects_of
 from benchmarks.engine import (
@@ -151,15 +151,15 @@ def csv_columns(
 # --- dimensions, limbs, settings, sequences -------------------------------------------------------
 
 
-def add_dimensions(report: Report, runs: Results, trackees: Sequence[BendTrackee]) -> None:
+def add_dimensions(report: Report, runs: Results, tracked_persons: Sequence[BendPerson]) -> None:
     """Add the number of dimensions: what is rejected, of predictions and of true postures.
 
     Args:
         report: gets the table. runs: by number of dimensions, "0" for the first order alone.
-        trackees: whose postures are put to the gates.
+        tracked_persons: whose postures are put to the gates.
     """
     shares = {
-        name: torch.tensor([true_acceptance(t, int(name)) for t in trackees]).mean(0)
+        name: torch.tensor([true_acceptance(t, int(name)) for t in tracked_persons]).mean(0)
         for name in runs.names("condition")
         if name != "0"
     }
@@ -230,15 +230,15 @@ def add_tuning(report: Report, tunings: Mapping[str, Tuning]) -> None:
     )  # fmt: skip
 
 
-def add_sequences(report: Report, trackees: Sequence[BendTrackee]) -> None:
+def add_sequences(report: Report, tracked_persons: Sequence[BendPerson]) -> None:
     """Add whom the cameras see, and how near the tracker's body can come."""
     floor, overlap, in_view = SEEN.items()
 
-    def trained(subject: Subject[BendTrackee]) -> int:
+    def trained(subject: Subject[BendPerson]) -> int:
         return len(subject.person.split.manifold)
 
     describe(
-        report, "sequences", "Sequences", subjects_of(trackees),
+        report, "sequences", "Sequences", subjects_of(tracked_persons),
         {
             "frames": lambda subject: len(subject.view.clip), "training performances": trained,
             **dict([floor, ("recorded angles", recorded_gap), overlap, in_view]),
