@@ -46,11 +46,11 @@ def walks(folder: Path, cameras: int, with_manifold: bool) -> Iterator[Start]:
     """Yield the first frames of three trials of each person."""
     clips = read_mocap(folder, FPS)
     for split in split_clips(clips, WALKERS, WALKERS, TRIALS):
-        trackee = prepare(split, Conditions(cameras_used=cameras), CLIP, LOOK_AHEAD)
-        manifold = trackee.manifold if with_manifold else None
-        for view in trackee.tests:
+        tracked = prepare(split, Conditions(cameras_used=cameras), CLIP, LOOK_AHEAD)
+        manifold = tracked.manifold if with_manifold else None
+        for view in tracked.tests:
             yield Start(
-                trackee.body, view.silhouettes[:LOOK_AHEAD], view.rig, manifold, view.clip.up,
+                tracked.body, view.silhouettes[:LOOK_AHEAD], view.rig, manifold, view.clip.up,
                 view.clip.joints[0],
             )  # fmt: skip
 

@@ -17,7 +17,7 @@ from benchmarks.bodies.tracking import PUBLISHED_SURVIVAL
 from benchmarks.bodies.views import Conditions, Subject, image_size, subjects_of
 from benchmarks.engine import Grid, Setting, Tuning, read_settings
 from benchmarks.humaneva_files import is_humaneva
-from benchmarks.silhouette.filters import METHODS, TRACKING, Filter, Trackee, prepare, tune
+from benchmarks.silhouette.filters import METHODS, TRACKING, Filter, SilhouettePerson, prepare, tune
 from benchmarks.silhouette.humaneva import HumanEvaFootage, humaneva_splits
 from benchmarks.silhouette.report import Case, fill_one, fill_several
 from torchpose._core.files import check_output_folder
@@ -126,16 +126,16 @@ def run(
     cases = []
     for text in size:
         conditions = Conditions(image_size(text), faults, cameras_used, rig, seed, footage=footage)
-        trackees = [
+        tracked_persons = [
             prepare(split, conditions, frames, 15 if quick else _VALIDATION_FRAMES, seed)
             for split in tqdm(splits, disable=not progress, desc="bodies and manifolds")
         ]
         for n in particles:
             tunings = given or {
-                name: tune(trackees, name, n, likelihood, out)
+                name: tune(tracked_persons, name, n, likelihood, out)
                 for name in tqdm(method, disable=not progress, desc="exponents")
             }
-            cases.append(Case(n, text, trackees, tunings))
+            cases.append(Case(n, text, tracked_persons, tunings))
     by_name = _named(cases)
     runs = TRACKING.run(
         {name: _grid(case, likelihood, initial) for name, case in by_name.items()},
@@ -210,10 +210,10 @@ def _named(cases: Sequence[Case]) -> dict[str, Case]:
     return {name(case): case for case in cases}
 
 
-def _grid(case: Case, likelihood: str, initial: str) -> Grid[Subject[Trackee], Filter]:
+def _grid(case: Case, likelihood: str, initial: str) -> Grid[Subject[SilhouettePerson], Filter]:
     """Return the persons and filters of one condition."""
     return Grid(
-        subjects_of(case.trackees),
+        subjects_of(case.tracked_persons),
         {
             name: Filter(name, tuning.setting, case.n_particles, likelihood, initial)
             for name, tuning in case.tunings.items()
