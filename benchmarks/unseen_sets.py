@@ -28,7 +28,7 @@ from benchmarks._table_file import TableFile
 from torchpose.evaluation import Report
 from torchpose.learning import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
-from torchpose.priors._arms import ArmPrior
+from torchpose.priors._arms import ArmPrior, shipped_arm_prior
 from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
 from torchpose.skeleton._torso import KINECT_NECK
 
@@ -68,7 +68,7 @@ def leave_out(data: Path, name: str, quick: bool) -> Unseen:
         data: folder with the sets. name: one of `bones.SETS`. quick: few recordings and
             steps, and the priors that come with torchpose.
     """
-    arms = bones.shipped_arm_prior() if quick else bones.fit_without(data, name)
+    arms = shipped_arm_prior() if quick else bones.fit_without(data, name)
     if name == _MHAD:
         views, few = bones.mhad_views(data, 150 if quick else 15), bones.FEW
         views = [bones.begun(view) for view in views] if quick else views

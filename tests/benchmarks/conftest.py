@@ -20,7 +20,7 @@ def run_here(monkeypatch, capsys):
 
     def run(script: str, *options: str) -> str:
         module = importlib.import_module(f"benchmarks.{script}")
-        monkeypatch.setattr(sys, "argv", [f"{script.rpartition('.')[2]}.py"])  # names its table
+        monkeypatch.setattr(sys, "argv", [f"{script.replace('.', '/')}.py"])  # names its table
         monkeypatch.setattr(os, "sched_setaffinity", lambda *_: None, raising=False)
         for library in THREAD_VARIABLES:  # which the script sets; they are put back afterwards
             monkeypatch.setenv(f"{library}_NUM_THREADS", "1")
