@@ -13,6 +13,7 @@ from torchpose._core.files import atomic_path, check_output_folder
 from torchpose.body import BODY_15, Body, body_joints
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.evaluation import Report
+from torchpose.metrics import joint_errors
 from torchpose.video._overlay import draw_body
 from torchpose.whole_body import render
 
@@ -38,7 +39,7 @@ def part_means(found: Tensor, truth: Tensor, centred: bool) -> list[float]:
     """
     if centred:
         found, truth = found - found[:, [PELVIS]], truth - truth[:, [PELVIS]]
-    gap = 1000 * (found - truth).norm(dim=-1)
+    gap = 1000 * joint_errors(found, truth)
     columns = [list(range(15)), *([BODY_15.joint(n) for n in names] for names in PARTS.values())]
     return [float(gap[:, c].nanmean()) for c in columns]
 

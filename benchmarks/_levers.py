@@ -187,7 +187,7 @@ class Bench:
         unknown = {"evidence": [torch.nan] * 2, "measurement_std": [torch.nan] * len(JOINTS)}
         learnt = base.info.extra.get("learnt_noise", unknown)
         numbers = (
-            100 * float(found.errors3d.nanmean()), float(found.jitter.mean()), seconds,
+            found.mean_error, float(found.jitter.mean()), seconds,
             learnt["evidence"], learnt["measurement_std"],
         )  # fmt: skip
         return Measured(*(torch.tensor(value, dtype=torch.float64) for value in numbers))

@@ -170,6 +170,11 @@ class Scores(NamedTuple):
     coverage: Coverage | None
     reliability: Coverage | None
 
+    @property
+    def mean_error(self) -> float:
+        """Return the mean 3D error of all joints and frames, cm."""
+        return 100 * float(self.errors3d.nanmean())
+
 
 def score(estimate: Estimate, test: Trials) -> Scores:
     """Return errors, correct limbs, smoothness and calibration of estimates."""

@@ -189,7 +189,7 @@ def compare(
         nothing = [None] * 5
         table.add(
             "mean pose",
-            [100 * float(found.errors3d.nanmean()), float(found.errors2d.nanmean()), *nothing],
+            [found.mean_error, float(found.errors2d.nanmean()), *nothing],
         )
         add_finding(report, f"{name} {recipe}")
 
@@ -203,7 +203,7 @@ def row(run: Run, test: Trials) -> list[float | None]:
     size = run.effective_sample_size[test.inside]
     lost = float(run.joints3d[test.inside].isnan().flatten(1).any(1).sum())
     return [
-        100 * float(found.errors3d.nanmean()), float(found.errors2d.nanmean()), *inside,
+        found.mean_error, float(found.errors2d.nanmean()), *inside,
         float(size.nanmedian()), 100 * float((size < 2).double().mean()), lost,
     ]  # fmt: skip
 

@@ -91,7 +91,7 @@ def tuned(
 def error(prior: UpperBodyPrior, test: Trials) -> float:
     """Return the mean 3D error in cm."""
     estimate = track(prior, CAMERA, test, method="mkf-fixed")
-    return 100 * float(score(estimate, test).errors3d.nanmean())
+    return score(estimate, test).mean_error
 
 
 def read_split(data: Path, split: str, effort: Effort) -> Split:

@@ -23,6 +23,7 @@ from benchmarks.silhouette.protocol import FPS, WALKERS
 from torchpose.body import BODY_15, Body, fit_state
 from torchpose.camera import CameraRig
 from torchpose.io import read_mocap
+from torchpose.metrics import joint_errors
 from torchpose.priors import BackConstrainedGPLVM
 from torchpose.whole_body import find_first_pose, find_pose
 
@@ -88,7 +89,7 @@ def row(
             found = find(start, torch.Generator().manual_seed(seed))
             ahead = start.body.part_rotations(torch.stack([found, truth]))[:, 0, :, 2]
             right += int(float(ahead[0] @ ahead[1]) > 0)
-            gap = (start.body.joints(found) - start.joints).norm(dim=-1)
+            gap = joint_errors(start.body.joints(found), start.joints)
             errors.append(1000 * float(gap.nanmean()))
     count = len(errors)
     return f"| {name} | {right} of {count} | {sum(errors) / count:.0f} | {max(errors):.0f} |"

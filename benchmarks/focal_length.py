@@ -79,8 +79,8 @@ def errors(
     focal = factor * FOCAL
     camera = PinholeCamera(focal, focal, *CENTRE, 640, 480)
     first, second = (score(track(prior, camera, test, **options), test) for test in (still, moving))
-    means = (100 * first.errors3d.nanmean(), 100 * second.errors3d.nanmean())
-    return [f"{float(value):.2f}" for value in (*means, first.errors2d.nanmean())]
+    numbers = (first.mean_error, second.mean_error, float(first.errors2d.nanmean()))
+    return [f"{number:.2f}" for number in numbers]
 
 
 def note(prior: UpperBodyPrior, persons: set[str]) -> str:

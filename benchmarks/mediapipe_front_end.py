@@ -21,7 +21,7 @@ from benchmarks._command import run_command
 from benchmarks._table_file import TableFile
 from torchpose.camera import PinholeCamera
 from torchpose.evaluation import Report
-from torchpose.metrics import jitter, joint_errors_3d
+from torchpose.metrics import jitter, joint_errors, joint_errors_3d
 from torchpose.priors import UpperBodyPrior, load_prior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack, UpperBodyTracker
@@ -83,16 +83,14 @@ class Bench:
 
     def off_by_clip(self, estimate: Tensor, group: str) -> Tensor:
         """Return the mean distance of a group from MediaPipe's joints, in shoulder widths [clips]."""
-        gap = (estimate - self.points).norm(dim=-1) / self.width[:, None, None]
-        gap = torch.where(self.known, gap, torch.nan)[..., list(GROUPS[group])]
-        return gap.flatten(1).nanmean(1)
+        gap = joint_errors(estimate, self.points, self.known) / self.width[:, None, None]
+        return gap[..., list(GROUPS[group])].flatten(1).nanmean(1)
 
     def off(self, estimate: Tensor, widths: bool = False) -> dict[str, float]:
         """Return the mean distance from MediaPipe's joints by group, where those are known."""
-        gap = (estimate - self.points).norm(dim=-1)
+        gap = joint_errors(estimate, self.points, self.known)
         if widths:
             gap = gap / self.width[:, None, None]
-        gap = torch.where(self.known, gap, torch.nan)
         return {name: float(gap[..., list(js)].nanmean()) for name, js in GROUPS.items()}
 
 
@@ -200,10 +198,8 @@ def place_table(
         cells = []
         for share in necks:
             points = bench.points.clone()
-            points[:, :, HEAD], points[:, :, NECK] = (
-                middle + height * up,
-                middle + share * height * up,
-            )
+            points[:, :, HEAD] = middle + height * up
+            points[:, :, NECK] = middle + share * height * up
             found = bench.track("filtered", FRONT_ENDS["head, neck, hands"], points).joints2d
             widths = bench.off(found, widths=True)
             cells.append(f"{widths['elbows']:.3f} / {widths['shoulders']:.3f}")
@@ -242,8 +238,8 @@ def by_clip_table(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) ->
     for i, clip in enumerate(bench.clips):
         cells = []
         for name in names:
-            gap = (tracks[name].joints2d[i] - bench.points[i]).norm(dim=-1) / clip.width
-            gap = torch.where(bench.known[i], gap, torch.nan)
+            gap = joint_errors(tracks[name].joints2d[i], bench.points[i], bench.known[i])
+            gap = gap / clip.width
             pair = [float(gap[:, list(GROUPS[g])].nanmean()) for g in ("elbows", "shoulders")]
             cells.append(f"{pair[0]:.3f} / {pair[1]:.3f}")
         table.add(clip.name, cells)

@@ -26,6 +26,7 @@ from torchpose.evaluation.common import CAMERA, Estimate, Trials, cached_prior
 from torchpose.evaluation.unseen import QUICK
 from torchpose.io import read_recordings
 from torchpose.learning import fit_kinect_prior
+from torchpose.metrics import joint_errors
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack, UpperBodyTracker
 
@@ -191,7 +192,7 @@ def _error_and_coverage(poses: PoseTrack, test: Trials) -> list[float]:
     if found.coverage is None:
         raise RuntimeError("a track has covariances")
     return [
-        100 * float(found.errors3d.nanmean()),
+        found.mean_error,
         *(100 * float(x) for x in found.coverage.overall),
     ]
 
@@ -261,7 +262,7 @@ def add_single(report: Report, trackers: Mapping[str, Tracker], test: Trials, se
 
 def _errors(poses: PoseTrack, test: Trials) -> Float[Tensor, "B T"]:
     """Return the mean error of the eight joints in camera axes, wherever the body is put, cm."""
-    return 100 * (poses.joints3d - test.truth3d).norm(dim=-1).mean(-1)
+    return 100 * joint_errors(poses.joints3d, test.truth3d).mean(-1)
 
 
 def main(options: Options) -> None:

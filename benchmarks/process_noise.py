@@ -72,7 +72,7 @@ def error(prior: UpperBodyPrior, method: str, options: dict[str, Any], test: Tri
     """Return the mean 3D error after Procrustes, cm."""
     generator = torch.Generator().manual_seed(0)
     found = score(track(prior, CAMERA, test, method=method, generator=generator, **options), test)
-    return 100 * float(found.errors3d.nanmean())
+    return found.mean_error
 
 
 if __name__ == "__main__":

@@ -214,7 +214,7 @@ def main(
             found = score(estimate(model, still), still)
             moved = score(estimate(model, moving), moving)
             rows.append([
-                100 * float(found.errors3d.nanmean()), 100 * float(moved.errors3d.nanmean()),
+                found.mean_error, moved.mean_error,
                 float(found.jitter.mean()), *(100 * found.errors3d.flatten(0, 1).nanmean(0)).tolist(),
                 seconds,
             ])  # fmt: skip

@@ -70,11 +70,8 @@ def tracked(
 def score(path: Path, reference: Path, prior: UpperBodyPrior, detector: str | None) -> Scores:
     """Return the scores of one clip."""
     landmarks = read_keypoints(reference)
-    names, points, sure = (
-        canonical_names(landmarks.names),
-        landmarks.keypoints,
-        landmarks.confidence,
-    )
+    names = canonical_names(landmarks.names)
+    points, sure = landmarks.keypoints, landmarks.confidence
     if sure is None:
         raise InputError(f"{reference}: expected a visibility of the landmarks")
     joints, measured, (_, height) = tracked(path, prior, detector)
