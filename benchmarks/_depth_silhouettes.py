@@ -1,4 +1,4 @@
-"""Real silhouettes of depth cameras and what is measured on them, shared by benchmarks."""
+"""Real silhouettes of depth cameras, and errors and pictures of bodies that are tracked in them."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""One hand hidden for some seconds: how well it is inferred, and what its return does to the rest."""
+"""Errors while one hand is hidden for some seconds, and jumps of the other joints when it returns."""
 
 from __future__ import annotations
 

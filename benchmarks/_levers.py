@@ -1,4 +1,4 @@
-"""What `ub_people_levers.py` turns: persons, fits that are kept in files, and the learnt noise."""
+"""Variants of the tracker of UB-people: persons, kept fits, and learnt noise."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence

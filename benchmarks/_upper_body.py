@@ -1,4 +1,4 @@
-"""What the upper-body benchmarks share: test sequences, poses to compare with, and scores."""
+"""Test sequences, reference poses and scores that the benchmarks of upper bodies share."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

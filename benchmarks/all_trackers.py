@@ -1,4 +1,4 @@
-"""Every tracker with what each shipped prior's recipe brings, by default, on persons never seen.
+"""Every tracker with its defaults and the recipes of the shipped priors, on persons never seen.
 
 UB-people (prior of s1 to s6, every n-th sequence of s7 and s8) and UB-one (prior of the first 60 % of
 one recording, the first frames of the rest), each with the number of components of kinect-upper-body

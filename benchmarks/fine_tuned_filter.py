@@ -1,4 +1,4 @@
-"""What fine-tuning through the filter gains: Q, R and mixtures by gradient of the 3D error.
+"""Gain of fine-tuning through the filter: Q, R and mixtures by gradient of the 3D error.
 
 On training persons of UB-people alone (s1 to s6 of UTD-MHAD): a prior over single poses is fitted to four
 of them, its filter is tuned on the same four, and every third sequence of the other two is tracked from

@@ -1,4 +1,4 @@
-"""Does a first pose that is found in silhouettes face the right way: one frame against half a second.
+"""Direction of first poses found in silhouettes, by one frame and by half a second.
 
 Walks of four persons (`mocap_cmu_walk`) are rendered as in the protocol Silhouette; where the data has
 them, the four views of a balancing man (`multicam_pose2sim`) are searched from several of their frames.

@@ -1,4 +1,4 @@
-"""What a wrong focal length costs.
+"""Errors with a wrong focal length.
 
 The test of `python -m benchmarks.ub_people` (persons s7 and s8 of UTD-MHAD, head, neck and hands with
 3 px noise), tracked with a camera whose focal length is so many times the true one. A camera that is

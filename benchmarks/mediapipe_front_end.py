@@ -1,4 +1,4 @@
-"""What the filter adds to a modern detector: MediaPipe's landmarks as the measuring front end.
+"""The tracker on MediaPipe's landmarks: jitter, gaps, and joints that are not measured.
 
 On the seven webcam clips of `video_asl` (three signers) the tracker is fed with MediaPipe's head, neck
 and hands, and with all eight joints. Against MediaPipe's own 2D and 3D joints (`*_pose1.npz`, the full

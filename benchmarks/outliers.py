@@ -1,4 +1,4 @@
-"""Outliers among the keypoints: what one does to the poses, and many, with hands exchanged now and then.
+"""Outliers among the keypoints: single ones, and many together with exchanged hands.
 
 UB-people: prior of s1 to s6, some sequences of s7 and s8, head, neck and hands measured with 3 pixels of
 noise. Tracked as they are, with one keypoint of one frame moved by 100 to a million pixels, and with 5 % of

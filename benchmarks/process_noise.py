@@ -1,4 +1,4 @@
-"""Factors of the recorded steps' second moment: the error of each method on training persons held out.
+"""Process noise of each method: errors over its factor, on training persons held out.
 
 A prior of s1 to s4 of UTD-MHAD tracks every n-th sequence of s5 and s6 in the test camera, with Q = k S
 for the walks and Q = k diag(S) for the others; the shipped factors are

@@ -1,4 +1,4 @@
-"""How much persons differ: the training persons of UB-people, each tracked by a prior of the others.
+"""Differences between persons: each training person of UB-people, tracked by a prior of the others.
 
 For each of s1 to s6 a prior is fitted to the other five, without calibration, and tracks that person
 in the test camera. Scale and floor of the covariances then come from the errors of the other five,

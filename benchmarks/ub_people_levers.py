@@ -1,4 +1,4 @@
-"""What each choice of the recipe gave: the tracker of UB-people with one of them changed at a time.
+"""Gain of each choice of the recipe: the tracker of UB-people with one of them changed at a time.
 
 Measured on training persons alone: s1, s2, s4 and s5 of UTD-MHAD are fitted, and every third sequence
 of s3 and s6 is tracked from head, neck and hands with 3 px noise, as `python -m benchmarks.ub_people`

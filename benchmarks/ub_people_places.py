@@ -1,4 +1,4 @@
-"""What it costs when a person is not where the prior's persons were: to the side, farther, nearer.
+"""Errors of persons who stand to the side, farther or nearer than the prior's persons.
 
 A prior is fitted to the training persons s1 to s3 of UB-people and tracks s4 to s6 in the test camera,
 still at the usual place (about 2 m away), walking in a circle, and standing elsewhere. Windows see

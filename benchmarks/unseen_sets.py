@@ -1,4 +1,4 @@
-"""Arms of persons of a set that no prior knows, beside learned lifters: leave one set out.
+"""Arms of persons of a data set that is left out of every fit, beside learned lifters.
 
 Each of four sets in turn is left out of the prior over arms (`bones.SETS`), of the tracker's prior (the other
 Kinect sets; for Berkeley MHAD the one that comes with torchpose) and of the lifters (`_lifters`). Its

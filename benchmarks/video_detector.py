@@ -1,4 +1,4 @@
-"""What a detector's keypoints become in video of strangers: hands found and invented, elbows, shoulders.
+"""A detector's keypoints in video of strangers: found and invented hands, elbows and shoulders.
 
 The clips of `video_people`: webcams, phones, studios. The reference is MediaPipe's landmarks beside each clip
 (`*_mediapipe_pose1.npz`), so for MediaPipe itself the table says what association, filter and prior leave

@@ -1,4 +1,4 @@
-"""3D error from video with known truth: what background model, edges and hand tracker do to it.
+"""3D error from video with known truth, with and without background model, edges and hand tracker.
 
     python -m benchmarks.video_rendered --out DIR
 

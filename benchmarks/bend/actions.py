@@ -1,4 +1,4 @@
-"""Part of the protocol Bend: which action somebody performs, from recorded and from tracked joints."""
+"""Part of the protocol Bend: recognise actions, from recorded and from tracked joints."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Part of the protocol Bend: from the side one arm hides the other (Figure 5 of the paper)."""
+"""Part of the protocol Bend: a view in which one arm hides the other (Figure 5 of the paper)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

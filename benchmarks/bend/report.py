@@ -1,4 +1,4 @@
-"""Tables of the protocol Bend, and what they say in words."""
+"""Tables and findings of the protocol Bend."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""Recorded clips: who trains, who is tracked, and where the cameras stand."""
+"""Recorded clips: splits into training, validation and test, and the places of the cameras."""
 
 import math
 from collections.abc import Sequence

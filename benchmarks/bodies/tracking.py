@@ -1,4 +1,4 @@
-"""Runs of body filters on silhouettes: what a run holds and depends on, and what is measured of it."""
+"""Runs of body filters on silhouettes, with their inputs and measures."""
 
 from collections.abc import Callable, Sequence
 from time import perf_counter

@@ -1,4 +1,4 @@
-"""People as cameras see them: the body that is tracked, and the silhouettes of every clip."""
+"""Views of recorded people: the tracker's body, and the silhouettes of every clip."""
 
 import re
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Experiments: subjects, methods, conditions and seeds in, one row for each run out."""
+"""Experiments: run a grid of subjects, methods, conditions and seeds, one row for each run."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Choose what a method is run with: a value of its own, and a scale of its noise.
+"""Choose the settings of a method: a value of its own, and a scale of its noise.
 
 `choose_setting` tries the same grid for every method. `search_setting` goes on where the best is at the
 edge of what was tried.

@@ -1,4 +1,4 @@
-"""Tables of the protocol Root uncertainty, and what they say about the paper's claims."""
+"""Tables of the protocol Root uncertainty, and findings on the paper's claims."""
 
 from collections.abc import Mapping, Sequence
 

@@ -1,4 +1,4 @@
-"""What the protocol Root uncertainty tracks with: bodies, limits, motion models, and three filters.
+"""Bodies, limits, motion models and filters of the protocol Root uncertainty.
 
 Parts turn in the body's own frame (DX), about centres that all persons share, so that one set of
 limb conditionals, limits and diffusion holds for everybody. They are learnt from trials of all

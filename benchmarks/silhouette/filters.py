@@ -1,4 +1,4 @@
-"""The filters of the protocol Silhouette, what a person is tracked with, and runs of both."""
+"""Persons, filters and runs of the protocol Silhouette."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""How well held-out trials of CMU walks come back from manifolds and from principal components."""
+"""Errors of held-out trials of CMU walks, reconstructed by manifolds and by principal components."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Steps of EM over states that are drawn anew in every step: in new processes, with what they took.
+"""Steps of EM over states drawn anew in every step, in new processes, with their time and memory.
 
 `benchmarks.speed.streamed_em` makes tables of them.
 """

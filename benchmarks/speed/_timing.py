@@ -1,4 +1,4 @@
-"""What every benchmark shares: taking turns, medians, the limits of the machine, tables.
+"""Options, timing in turns, limits of the machine, and tables that the benchmarks of speed share.
 
 Methods take turns (A B A B), so that other work on the machine hits all of them, and ratios are of
 medians from one run. CPU time stands beside wall time: on a machine that is not idle, the CPU time of

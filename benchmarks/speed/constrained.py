@@ -1,4 +1,4 @@
-"""What does it cost to let only postures of an action through?
+"""How much does a filter cost that admits only postures of an action?
 
     python -m benchmarks.speed.constrained --threads 1
 
