@@ -225,7 +225,7 @@ class HandSettings:
     least_skin: float = 0.15
     beside_network: float = 0.5
     exclusion_beside_network: float = 0.8
-    gone_bias: float = -2.5
+    gone_bias: float = -2.0
     gone_weight: float = 0.5
     gone_stay: float = 0.97
     most_gone: float = 0.5
