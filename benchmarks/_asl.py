@@ -40,7 +40,7 @@ class Clip(NamedTuple):
 
 
 def read_clip(folder: Path, name: str, model: int = 1) -> Clip:
-    """Landmarks of a clip by MediaPipe's full (1) or heavy (2) model."""
+    """Return MediaPipe's landmarks of a clip, those of its full (1) or heavy (2) model."""
     with np.load(folder / f"{name}_mediapipe_pose{model}.npz") as arrays:
         names = [str(n) for n in arrays["names"]]
         points = torch.from_numpy(arrays["joints2d"]).double()
@@ -71,7 +71,7 @@ def read_clip(folder: Path, name: str, model: int = 1) -> Clip:
 
 
 def pad(parts: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """Sequences as one batch, filled up with NaN (False), and their lengths."""
+    """Return sequences as one batch, padded with NaN (False), and their lengths."""
     lengths = torch.tensor([len(part) for part in parts])
     fill = False if parts[0].dtype == torch.bool else torch.nan
     batch = parts[0].new_full((len(parts), int(lengths.max()), *parts[0].shape[1:]), fill)

@@ -1,4 +1,4 @@
-"""Real silhouettes of depth cameras and what is measured on them, shared by benchmarks."""
+"""Real silhouettes of depth cameras, and errors and pictures of bodies that are tracked in them."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,6 +13,7 @@ from torchpose._core.files import atomic_path, check_output_folder
 from torchpose.body import BODY_15, Body, body_joints
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.evaluation import Report
+from torchpose.metrics import joint_errors
 from torchpose.video._overlay import draw_body
 from torchpose.whole_body import render
 
@@ -31,10 +32,14 @@ class Filmed(NamedTuple):
 
 
 def part_means(found: Tensor, truth: Tensor, centred: bool) -> list[float]:
-    """Mean distance of all joints and of each part, mm; without the place of the pelvis if asked."""
+    """Return the mean distance of all joints and of each part, mm.
+
+    Args:
+        found, truth: joints [T, 15, 3]. centred: whether the pelvis is moved to the origin first.
+    """
     if centred:
         found, truth = found - found[:, [PELVIS]], truth - truth[:, [PELVIS]]
-    gap = 1000 * (found - truth).norm(dim=-1)
+    gap = 1000 * joint_errors(found, truth)
     columns = [list(range(15)), *([BODY_15.joint(n) for n in names] for names in PARTS.values())]
     return [float(gap[:, c].nanmean()) for c in columns]
 
@@ -42,7 +47,7 @@ def part_means(found: Tensor, truth: Tensor, centred: bool) -> list[float]:
 def draw(
     report: Report, data: Filmed, body: Body, states: Tensor, out: Path, name: str, columns: int = 6
 ) -> None:
-    """Measured silhouettes in grey with the body over them: a row per camera, frames from left to right."""
+    """Draw the silhouettes in grey with the body over them, a row per camera, frames from left to right."""
     import cv2
 
     _, _, height, width = data.silhouettes.shape
@@ -68,25 +73,25 @@ def draw(
 
 
 def seeded(seed: int) -> torch.Generator:
-    """A generator of its own."""
+    """Return a new generator with this seed."""
     return torch.Generator().manual_seed(seed)
 
 
 def mean_of(found: Sequence[Tensor], truth: Tensor, centred: bool) -> list[float]:
-    """Mean over seeds of `part_means`."""
+    """Return the mean of `part_means` over seeds."""
     parts = torch.tensor([part_means(f, truth, centred) for f in found])
     return [float(x) for x in parts.mean(0)]
 
 
 def kinect(folder: Path, person: str, action: str, trials: str) -> Iterator[Tensor]:
-    """Recorded joints [T, 15, 3] of a person's trials, the room's axes made right-handed, y up."""
+    """Yield the recorded joints [T, 15, 3] of a person's trials, in right-handed axes of the room, y up."""
     for path in sorted((folder / "kinect_utd_mhad").glob(f"{person}_a*_{action}_t[{trials}].npz")):
         with np.load(path) as z:
             yield body_joints(torch.from_numpy(z["joints"]).double(), list(z["names"]))
 
 
 def one_view(folder: Path, person: str, action: str) -> Filmed:
-    """Segmented depth of trial 1 and its skeleton, at the lag that the set gives."""
+    """Return the segmented depth of trial 1 and its skeleton, shifted by the lag that the set gives."""
     path = next((folder / "utd_mhad_silhouettes").glob(f"{person}_a*_{action}_t1.npz"))
     with np.load(path) as z:
         shape = z["sil_shape"]

@@ -1,4 +1,4 @@
-"""One hand hidden for some seconds: how well it is inferred, and what its return does to the rest."""
+"""Errors while one hand is hidden for some seconds, and jumps of the other joints when it returns."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _ARMS = {"left": LEFT_ARM, "right": RIGHT_ARM}
 
 
 def back_and_forth(n_frames: int, wanted: int) -> Int[Tensor, " wanted"]:
-    """Frame numbers that play a sequence to its end, backwards, forwards and so on.
+    """Return frame numbers that play a sequence to its end, backwards, forwards and so on.
 
     >>> back_and_forth(3, 7).tolist()
     [0, 1, 2, 1, 0, 1, 2]
@@ -120,7 +120,7 @@ def add_gap_tables(
 
 
 def _models(prior: UpperBodyPrior) -> dict[str, tuple[UpperBodyPrior, dict[str, Any]]]:
-    """What is compared: the recipe's prior, single poses only, and hand-set noise."""
+    """Return the models to compare: the recipe's prior, single poses only, and hand-set noise."""
     plain = plain_prior(prior)
     models: dict[str, tuple[UpperBodyPrior, dict[str, Any]]] = {"MKF": (prior, {})}
     if prior.windows:
@@ -141,7 +141,7 @@ def _one_gap(
     seconds: float,
     options: dict[str, Any],
 ) -> tuple[list[float], list[float], Tensor]:
-    """Numbers of the two tables, and errors over time [T, 8] with the hidden side made left."""
+    """Return the numbers of both tables, and errors over time [T, 8], mirrored so that the left is hidden."""
     first = round(_START * test.fps)
     last = first + round(seconds * test.fps)
     mask = torch.ones(test.keypoints.shape[:3], dtype=torch.bool)
@@ -181,7 +181,7 @@ def _one_gap(
 def _jump(
     hidden: Estimate, whole: Estimate, joints: list[int], frames: list[int]
 ) -> Float[Tensor, " B"]:
-    """Largest |step with the gap - step without it| into these frames of each sequence, cm."""
+    """Return the largest |step with the gap - step without it| into these frames, per sequence, cm."""
     steps = [e.joints3d[:, :, joints].diff(dim=1) for e in (hidden, whole)]
     at = [f - 1 for f in frames]
     return 100 * (steps[0] - steps[1])[:, at].norm(dim=-1).flatten(1).amax(1)

@@ -1,8 +1,7 @@
-"""What `ub_people_levers.py` turns: persons, fits that are kept in files, and the learnt noise."""
+"""Variants of the tracker of UB-people: persons, kept fits, and learnt noise."""
 
-import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,14 +10,13 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from benchmarks._upper_body import data_folder, score, trials_of
-from torchpose._core.files import atomic_path
+from benchmarks._upper_body import MADE_WITH, data_folder, score, trials_of
+from benchmarks.engine import kept_prior, kept_runs, source_hash
 from torchpose.camera import ViewRange
 from torchpose.evaluation._common import CAMERA, MEASURED, Estimate, Trials, settings_hash
 from torchpose.filters import MixtureKalmanFilter
 from torchpose.io import Recording, read_recordings
 from torchpose.learning import TRAINING_VIEWS, UpperBodyRecipe
-from torchpose.learning._recipes import VERSION
 from torchpose.priors import GaussianMixture, UpperBodyPrior
 from torchpose.priors._window import WindowLayout, WindowPrior
 from torchpose.skeleton._upper_body import ARM_JOINTS
@@ -30,6 +28,16 @@ MODES: dict[str, dict[str, Any]] = {"causal": {}, "full": {"smoothing": "full"}}
 SAMPLES = 120_000
 JOINTS = ("hand", "head", "neck")
 _CHUNK = 24  # sequences that are tracked at a time
+_FITTED_WITH = (
+    "torchpose/camera", "torchpose/filters", "torchpose/learning", "torchpose/math", "torchpose/priors",
+    "torchpose/skeleton", "benchmarks/_levers.py",
+)  # fmt: skip
+_TRACKED_WITH = (
+    *MADE_WITH,
+    "torchpose/learning",
+    "benchmarks/_upper_body.py",
+    "benchmarks/_levers.py",
+)
 
 
 class Size(NamedTuple):
@@ -94,7 +102,7 @@ class Persons(NamedTuple):
 
 
 def read_persons(data: Path, size: Size) -> Persons:
-    """The training persons of UB-people; files of the test persons are not opened."""
+    """Return the training persons of UB-people; files of the test persons are not opened."""
     folder = data_folder(data, "kinect_utd_mhad")
     recordings = read_recordings(_files(folder, FIT_PERSONS)[:: size.thin_fit])
     held_out = read_recordings(_files(folder, SCORED_PERSONS)[:: size.thin_scored])
@@ -110,12 +118,36 @@ def _files(folder: Path, persons: Sequence[str]) -> list[Path]:
 
 
 class Measured(NamedTuple):
-    """Mean 3D error after Procrustes (cm), jitter (m/s^2), CPU seconds of the fit, and a note."""
+    """What a row of the table says.
 
-    error: float
-    jitter: float
+    Attributes:
+        error: mean 3D error after Procrustes, cm. jitter: m/s^2. seconds: CPU time of the fit.
+        evidence: log-evidence per frame before and after noise is learnt [2], NaN if none is.
+        measurement_std: what is learnt for `JOINTS`, pixels [3].
+    """
+
+    error: Tensor
+    jitter: Tensor
+    seconds: Tensor
+    evidence: Tensor
+    measurement_std: Tensor
+
+    @property
+    def note(self) -> str:
+        """Return a sentence on the learnt noise, or an empty one."""
+        if bool(self.evidence.isnan().any()):
+            return ""
+        pairs = zip(JOINTS, self.measurement_std.tolist(), strict=True)
+        pixels = ", ".join(f"{joint} {std:.1f}" for joint, std in pairs)
+        before, after = self.evidence.tolist()
+        return f"log-evidence {before:.2f} to {after:.2f} per frame; R {pixels} px"
+
+
+class Fit(NamedTuple):
+    """A prior, and the CPU seconds of its fit."""
+
+    prior: UpperBodyPrior
     seconds: float
-    note: str = ""
 
 
 class Bench:
@@ -127,24 +159,24 @@ class Bench:
 
     def __init__(self, persons: Persons, size: Size, out: Path) -> None:
         self.persons, self.size, self.out = persons, size, out
-        self._results = out / "results.json"
-
-    def known(self) -> dict[str, Measured]:
-        """What was measured before, by `key`."""
-        if not self._results.is_file():
-            return {}
-        found = json.loads(self._results.read_text(encoding="utf-8"))
-        return {key: Measured(**row["measured"]) for key, row in found.items()}
-
-    def key(self, lever: Lever, mode: str, seed: int) -> str:
-        """Changes with whatever a result depends on, but for the code of fit and tracker."""
-        facts = lever._replace(group="", name="")
-        return self._hash(facts, mode, seed)
 
     def measure(self, lever: Lever, mode: str, seed: int) -> Measured:
-        """Fit what a lever needs, unless it lies in the folder, and track with it."""
+        """Return the numbers of a lever, from the folder or by a fit and a run of the tracker."""
+        facts = [source_hash(*_TRACKED_WITH), self.size, self.persons.digest,
+                 lever._replace(group="", name=""), mode]  # fmt: skip
+
+        def make(seeds: Sequence[int]) -> list[Measured]:
+            return [self._measure(lever, mode, seed) for seed in seeds]
+
+        (measured,) = kept_runs(self.out, Measured, facts, [seed], make)
+        return measured
+
+    def _measure(self, lever: Lever, mode: str, seed: int) -> Measured:
         seed += lever.seed_offset
-        base, seconds, note = self._base(seed, lever.learnt_noise)
+        base, seconds = self._poses(seed)
+        if lever.learnt_noise:
+            base, added = self._learnt_noise(base, seed)
+            seconds += added
         prior = base
         if lever.windows is not None:
             window, seconds = self._joined_window(base, lever.windows, mode, seed)
@@ -152,21 +184,27 @@ class Bench:
             prior = UpperBodyPrior(base.left, base.right, base.info, base.noise, {mode: window})
         tracker = self._tracker(prior, lever, mode)
         found = score(_estimate(tracker, self.persons.test), self.persons.test)
-        error, jitter = 100 * float(found.errors3d.nanmean()), float(found.jitter.mean())
-        return Measured(error, jitter, seconds, note)
+        unknown = {"evidence": [torch.nan] * 2, "measurement_std": [torch.nan] * len(JOINTS)}
+        learnt = base.info.extra.get("learnt_noise", unknown)
+        numbers = (
+            found.mean_error, float(found.jitter.mean()), seconds,
+            learnt["evidence"], learnt["measurement_std"],
+        )  # fmt: skip
+        return Measured(*(torch.tensor(value, dtype=torch.float64) for value in numbers))
 
-    def store(self, key: str, lever: Lever, mode: str, seed: int, measured: Measured) -> None:
-        """Add a result to those in the folder."""
-        results = {}
-        if self._results.is_file():
-            results = json.loads(self._results.read_text(encoding="utf-8"))
-        names = {"group": lever.group, "name": lever.name, "mode": mode, "seed": seed}
-        results[key] = names | {"measured": measured._asdict()}
-        with atomic_path(self._results) as temporary:
-            temporary.write_text(json.dumps(results, indent=1), encoding="utf-8")
+    def _fit(self, name: str, facts: Sequence[Any], make: Callable[[], UpperBodyPrior]) -> Fit:
+        """Return a prior from the folder, or fit it and keep it with the seconds that this took."""
 
-    def _hash(self, *facts: Any) -> str:
-        return settings_hash([VERSION, self.size, self.persons.digest, *facts])
+        def timed() -> UpperBodyPrior:
+            start = time.process_time()
+            prior = make()
+            seconds = time.process_time() - start
+            prior.info = replace(prior.info, extra=prior.info.extra | {"fit_seconds": seconds})
+            return prior
+
+        known = [source_hash(*_FITTED_WITH), self.size, self.persons.digest]
+        prior = kept_prior(self.out, name, [*known, name, *facts], timed)
+        return Fit(prior, float(prior.info.extra["fit_seconds"]))
 
     def _tracker(self, prior: UpperBodyPrior, lever: Lever, mode: str) -> UpperBodyTracker:
         method = "mkf-fixed" if lever.windows is None else "window-mixture"
@@ -179,34 +217,24 @@ class Bench:
                 model.initial_cov = lever.start_factor * model.start_cov  # type: ignore[operator]
         return tracker
 
-    def _base(self, seed: int, learnt_noise: bool) -> tuple[UpperBodyPrior, float, str]:
-        """Mixtures over single poses with the released noise or with learnt noise."""
-        path = self.out / f"poses-{self._hash('poses', seed)}.safetensors"
-        if not path.is_file():
-            start = time.process_time()
-            recipe = UpperBodyRecipe(
-                self.size.pose_components, self.size.pose_samples, window_components=0,
-                calibration_folds=0, seed=seed,
-            )  # fmt: skip
-            prior = recipe.fit(self.persons.fitted)
-            _save(prior, path, fit_seconds=time.process_time() - start)
-        prior = UpperBodyPrior.load(path)
-        seconds = float(prior.info.extra["fit_seconds"])
-        if not learnt_noise:
-            return prior, seconds, ""
-        path = self.out / f"noise-{self._hash('noise', seed)}.safetensors"
-        if not path.is_file():
-            start = time.process_time()
-            note = learn_noise(prior, self.persons.fitted, self.size, seed)
-            _save(prior, path, noise_seconds=time.process_time() - start, note=note)
-        prior = UpperBodyPrior.load(path)
-        extra = prior.info.extra
-        return prior, seconds + float(extra["noise_seconds"]), str(extra["note"])
+    def _poses(self, seed: int) -> Fit:
+        """Return mixtures over single poses with the released noise."""
+        recipe = UpperBodyRecipe(
+            self.size.pose_components, self.size.pose_samples, window_components=0,
+            calibration_folds=0, seed=seed,
+        )  # fmt: skip
+        return self._fit("poses", [seed], lambda: recipe.fit(self.persons.fitted))
+
+    def _learnt_noise(self, prior: UpperBodyPrior, seed: int) -> Fit:
+        """Return mixtures over single poses with learnt noise."""
+        return self._fit(
+            "noise", [seed], lambda: learn_noise(prior, self.persons.fitted, self.size, seed)
+        )
 
     def _joined_window(
         self, base: UpperBodyPrior, spec: Windows, mode: str, seed: int
     ) -> tuple[WindowPrior, float]:
-        """Mixtures over windows, joined over seeds, and the seconds of their fits."""
+        """Return the mixtures over windows of all seeds as one, and the seconds of their fits."""
         fits = [self._window(base, spec, mode, seed + i) for i in range(spec.seeds)]
         windows = [window for window, _ in fits]
         left, right = (
@@ -218,24 +246,21 @@ class Bench:
     def _window(
         self, base: UpperBodyPrior, spec: Windows, mode: str, seed: int
     ) -> tuple[WindowPrior, float]:
+        """Return mixtures over windows of one seed, and the seconds of their fit."""
         recipe = self._window_recipe(spec, seed)
-        facts = spec._replace(layouts=None, seeds=1)
-        layout = recipe.layouts[mode]
-        path = self.out / f"window-{self._hash(facts, layout, mode, seed)}.safetensors"
-        if not path.is_file():
-            start = time.process_time()
+        facts = [spec._replace(layouts=None, seeds=1), recipe.layouts[mode], mode, seed]
+
+        def make() -> UpperBodyPrior:
             tasks = recipe.tasks(self.persons.fitted)
-            chosen = {key: task for key, task in tasks.items() if key.startswith(mode)}
-            fitted = {key: task.fit() for key, task in chosen.items()}
+            fitted = {key: task.fit() for key, task in tasks.items() if key.startswith(mode)}
             window = recipe.window(mode, fitted)
-            seconds = time.process_time() - start
-            prior = UpperBodyPrior(base.left, base.right, base.info, base.noise, {mode: window})
-            _save(prior, path, fit_seconds=seconds)
-        prior = UpperBodyPrior.load(path)
-        return prior.windows[mode], float(prior.info.extra["fit_seconds"])
+            return UpperBodyPrior(base.left, base.right, base.info, base.noise, {mode: window})
+
+        prior, seconds = self._fit("window", facts, make)
+        return prior.windows[mode], seconds
 
     def _window_recipe(self, spec: Windows, seed: int) -> UpperBodyRecipe:
-        """The recipe with what a lever turns of its windows."""
+        """Return the recipe with the settings of windows that a lever changes."""
         return UpperBodyRecipe(
             window_components=spec.components // self.size.shrink,
             window_samples=spec.samples // self.size.shrink,
@@ -247,13 +272,8 @@ class Bench:
         )
 
 
-def _save(prior: UpperBodyPrior, path: Path, **extra: Any) -> None:
-    prior.info = replace(prior.info, extra=prior.info.extra | extra)
-    prior.save(path)
-
-
 def _joined(mixtures: Sequence[GaussianMixture]) -> GaussianMixture:
-    """One mixture of all components, those of each mixture with an equal share."""
+    """Return one mixture of all components, in which every mixture has an equal share."""
     weights = torch.cat([mixture.weights for mixture in mixtures]) / len(mixtures)
     means = torch.cat([mixture.means for mixture in mixtures])
     return GaussianMixture(weights, means, torch.cat([m.covariances for m in mixtures]))
@@ -270,14 +290,16 @@ def _estimate(tracker: UpperBodyTracker, test: Trials) -> Estimate:
     return Estimate(joints2d, torch.cat([track.joints3d for track in tracks]))
 
 
-def learn_noise(prior: UpperBodyPrior, recordings: list[Recording], size: Size, seed: int) -> str:
+def learn_noise(
+    prior: UpperBodyPrior, recordings: list[Recording], size: Size, seed: int
+) -> UpperBodyPrior:
     """Set Q and R of single poses to those of most log-evidence on some training sequences.
 
     Adam on the logarithms of the diagonal of Q, one for both arms, and of the variances of hand,
     head and neck, from the noise that the prior has. The sequences are seen as the test is.
 
     Returns:
-        What was gained.
+        The prior, whose card holds what was learnt.
     """
     step = max(1, len(recordings) // size.noise_sequences)
     test = trials_of(recordings[::step], seed + 1)
@@ -297,14 +319,15 @@ def learn_noise(prior: UpperBodyPrior, recordings: list[Recording], size: Size, 
     learnt[rows] = (log_measurement.detach() / 2).exp()
     prior.set_noise("process_cov", log_process.detach().exp())
     prior.set_noise("measurement_std", learnt)
-    pixels = ", ".join(f"{j} {s:.1f}" for j, s in zip(JOINTS, learnt[rows].tolist(), strict=True))
-    return f"log-evidence {gains[0]:.2f} to {gains[-1]:.2f} per frame; R {pixels} px"
+    learning = {"evidence": [gains[0], gains[-1]], "measurement_std": learnt[rows].tolist()}
+    prior.info = replace(prior.info, extra=prior.info.extra | {"learnt_noise": learning})
+    return prior
 
 
 def _evidence(
     prior: UpperBodyPrior, test: Trials, process_cov: Tensor, measurement_cov: Tensor
 ) -> Tensor:
-    """Log-evidence of both arms, mean over frames."""
+    """Return the log-evidence of both arms, mean over frames."""
     total = torch.zeros((), dtype=torch.float64)
     for side, mixture in (("left", prior.left), ("right", prior.right)):
         rows = [MEASURED.index(name) for name in (f"hand_{side}", "head", "neck")]

@@ -44,7 +44,7 @@ def add_error_tables(
             hands = s.errors3d[..., list(HANDS)]
             share, _ = share_below(hands, 0.2)
             table.add(name, [
-                100 * float(s.errors3d.nanmean()), 100 * float(share.mean()), float(s.jitter.mean()),
+                s.mean_error, 100 * float(share.mean()), float(s.jitter.mean()),
                 *(100 * s.errors3d.flatten(0, 1).nanmean(0)).tolist(),
             ])  # fmt: skip
             by_joint = s.errors2d.flatten(0, 1).nanmean(0)

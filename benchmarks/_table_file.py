@@ -1,34 +1,44 @@
 """Take a file or a folder as the `--out` of a script that writes one table."""
 
-import argparse
 import os
 import sys
 from pathlib import Path
+from typing import Annotated
+
+from torchpose.errors import InputError
 
 
-def table_file(text: str) -> Path:
+def table_file(given: str | Path) -> Path:
     """Return the Markdown file that --out names: itself, or the script's own name in a folder.
 
     A name without a suffix is a folder, as is one that exists. Folders are made at once, so that a
     script refuses what it cannot write before its work and not after it.
 
     Args:
-        text: as given on the command line.
+        given: on the command line.
 
     Raises:
-        argparse.ArgumentTypeError: nothing can be written there.
+        InputError: nothing can be written there.
     """
-    path = Path(text)
+    path = Path(given)
     if path.is_dir() or not path.suffix:
-        path /= f"{Path(sys.argv[0]).stem}.md"
+        path /= f"{_script_name()}.md"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise argparse.ArgumentTypeError(
-            f"expected a file or a folder that can be written, got {text}: {error.strerror}"
+        raise InputError(
+            f"expected a file or a folder that can be written, got {given}: {error.strerror}"
         ) from error
     if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise argparse.ArgumentTypeError(
-            f"expected a file or a folder that can be written, got {text}"
-        )
+        raise InputError(f"expected a file or a folder that can be written, got {given}")
     return path
+
+
+TableFile = Annotated[Path, table_file]
+"""The file of a table as the type of an option."""
+
+
+def _script_name() -> str:
+    """Return the name of the script or the package that runs."""
+    script = Path(sys.argv[0])
+    return script.parent.name if script.stem == "__main__" else script.stem

@@ -128,7 +128,7 @@ def _behaviour(scores: Scores, raised: Bool[Tensor, "T 2"]) -> list[float]:
 def add_findings(
     report: Report, scores: Runs, times: Mapping[str, float], raised: Bool[Tensor, "T 2"]
 ) -> None:
-    """Say which findings of the paper's section 4 appear in these numbers, and which do not."""
+    """Add findings: which claims of the paper's section 4 hold in these numbers."""
     pixels, behaviour = report["errors_2d"], report["behaviour"]
 
     def px(name: str) -> float:

@@ -1,4 +1,4 @@
-"""What the upper-body benchmarks share: test sequences, poses to compare with, and scores."""
+"""Test sequences, reference poses and scores that the benchmarks of upper bodies share."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -56,7 +56,7 @@ class Tracker(NamedTuple):
 
 
 def tracker_facts(test: Trials, tracker: Tracker) -> list[Any]:
-    """Return what a run of a tracker on a test set depends on, beside its seed."""
+    """Return the inputs of a run of a tracker on a test set, beside its seed."""
     prior, options = tracker
     numbers = [value for value in options.values() if isinstance(value, Tensor)]
     numbers += [
@@ -169,6 +169,11 @@ class Scores(NamedTuple):
     jitter: Tensor
     coverage: Coverage | None
     reliability: Coverage | None
+
+    @property
+    def mean_error(self) -> float:
+        """Return the mean 3D error of all joints and frames, cm."""
+        return 100 * float(self.errors3d.nanmean())
 
 
 def score(estimate: Estimate, test: Trials) -> Scores:

@@ -1,4 +1,4 @@
-"""Every tracker with what each shipped prior's recipe brings, by default, on persons never seen.
+"""Every tracker with its defaults and the recipes of the shipped priors, on persons never seen.
 
 UB-people (prior of s1 to s6, every n-th sequence of s7 and s8) and UB-one (prior of the first 60 % of
 one recording, the first frames of the rest), each with the number of components of kinect-upper-body
@@ -10,15 +10,15 @@ a run that was stopped goes on.
     python -m benchmarks.all_trackers --data DIR --out DIR --every 12 --frames 300 --windows false
 """
 
-import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from benchmarks._command import OneOf, run_command
 from benchmarks._upper_body import (
     MADE_WITH,
     Tracker,
@@ -45,6 +45,35 @@ RECIPES: dict[str, dict[str, Any]] = {
     "kinect-upper-body-small": {"n_components": 10, "window_components": 48},
 }
 WINDOWS = "window-mixture"
+UB_PEOPLE, UB_ONE = "UB-people", "UB-one"
+
+
+class Options(NamedTuple):
+    """What is compared.
+
+    Attributes:
+        data: folder of the recordings.
+        out: folder for what is kept, and the report.
+        every: take every n-th sequence of UB-people.
+        frames: frames of UB-one (0: all).
+        particles: of each particle filter.
+        windows: fit windows as well.
+        folds: of the calibration (default the recipe's).
+        recipes: of the priors that are fitted.
+        protocols: which test sets.
+        progress: show bars.
+    """
+
+    data: Path
+    out: Path
+    every: int = 1
+    frames: int = 0
+    particles: int = 10_000
+    windows: bool = True
+    folds: int | None = None
+    recipes: Annotated[Sequence[str], OneOf(RECIPES)] = tuple(RECIPES)
+    protocols: Annotated[Sequence[str], OneOf((UB_PEOPLE, UB_ONE))] = (UB_PEOPLE, UB_ONE)
+    progress: bool = False
 
 
 class Run(NamedTuple):
@@ -82,7 +111,7 @@ TRACKING = Experiment(
 
 
 def can_run(method: str, prior: UpperBodyPrior, bones: dict[str, Any] | None) -> bool:
-    """Return whether the prior has windows and there is a prior over arms, where the method needs them."""
+    """Return whether a method finds all that it needs: windows of the prior, a prior over arms."""
     of_windows = method in (WINDOWS, "multiple-model")
     return (bool(prior.windows) or not of_windows) and (
         bones is not None or "arms" not in method_options(method)
@@ -100,40 +129,43 @@ def options_of(method: str, particles: int, bones: dict[str, Any] | None) -> dic
     return {name: value for name, value in given.items() if name in known} | {"method": method}
 
 
-def ub_people(arguments: argparse.Namespace) -> tuple[list[Recording], Trials]:
+def ub_people(options: Options) -> tuple[list[Recording], Trials]:
     """Return training recordings and test set: some sequences of persons never seen."""
-    train, tested = people(arguments.data)
-    tested = tested[:: arguments.every]
+    train, tested = people(options.data)
+    tested = tested[:: options.every]
     return train, trials_of(tested)
 
 
-def ub_one(arguments: argparse.Namespace) -> tuple[list[Recording], Trials]:
+def ub_one(options: Options) -> tuple[list[Recording], Trials]:
     """Return the first part of the authors' own recording, and frames of the rest."""
-    first, rest = split_recording(arguments.data)
-    return [first], trials_of([replace(rest, joints=rest.joints[: arguments.frames or None])])
+    first, rest = split_recording(options.data)
+    return [first], trials_of([replace(rest, joints=rest.joints[: options.frames or None])])
 
 
-PROTOCOLS = {"UB-people": ub_people, "UB-one": ub_one}
+PROTOCOLS: dict[str, Callable[[Options], tuple[list[Recording], Trials]]] = {
+    UB_PEOPLE: ub_people,
+    UB_ONE: ub_one,
+}
 
 
 def compare(
-    name: str, recordings: list[Recording], test: Trials, report: Report, arguments: Any
+    name: str, recordings: list[Recording], test: Trials, report: Report, options: Options
 ) -> None:
     """Add a table for each recipe: error, coverage and sample size of every method."""
-    unseen = TEST_PERSONS if name == "UB-people" else [r.person for r in recordings]
-    bones = with_bones(arguments.data, unseen)
+    unseen = TEST_PERSONS if name == UB_PEOPLE else [r.person for r in recordings]
+    bones = with_bones(options.data, unseen)
     still = mean_pose(test, *projected_training_poses(recordings, CAMERA, 20_000))
-    for recipe in arguments.recipes:
+    for recipe in options.recipes:
         settings = RECIPES[recipe]
-        if arguments.folds is not None:
-            settings = settings | {"calibration_folds": arguments.folds}
-        if not arguments.windows:
+        if options.folds is not None:
+            settings = settings | {"calibration_folds": options.folds}
+        if not options.windows:
             settings = settings | {"window_components": 0}
         prior = cached_prior(
-            arguments.out,
+            options.out,
             recordings,
             fit_kinect_prior,
-            arguments.progress,
+            options.progress,
             seed=0,
             name=name,
             **settings,
@@ -146,10 +178,10 @@ def compare(
             digits=(2, 1, 0, 0, 1, 0, 0),
         )  # fmt: skip
         methods = [m for m in METHODS if can_run(m, prior, bones)]
-        trackers = {m: Tracker(prior, options_of(m, arguments.particles, bones)) for m in methods}
+        trackers = {m: Tracker(prior, options_of(m, options.particles, bones)) for m in methods}
         grid = Grid({name: test}, trackers)
         runs = TRACKING.run(
-            {recipe: grid}, (0,), arguments.out, progress=arguments.progress, title=name
+            {recipe: grid}, (0,), options.out, progress=options.progress, title=name
         )
         for (method,), own in runs.by("method").items():
             table.add(method, row(own.runs[0], test))
@@ -157,7 +189,7 @@ def compare(
         nothing = [None] * 5
         table.add(
             "mean pose",
-            [100 * float(found.errors3d.nanmean()), float(found.errors2d.nanmean()), *nothing],
+            [found.mean_error, float(found.errors2d.nanmean()), *nothing],
         )
         add_finding(report, f"{name} {recipe}")
 
@@ -171,13 +203,13 @@ def row(run: Run, test: Trials) -> list[float | None]:
     size = run.effective_sample_size[test.inside]
     lost = float(run.joints3d[test.inside].isnan().flatten(1).any(1).sum())
     return [
-        100 * float(found.errors3d.nanmean()), float(found.errors2d.nanmean()), *inside,
+        found.mean_error, float(found.errors2d.nanmean()), *inside,
         float(size.nanmedian()), 100 * float((size < 2).double().mean()), lost,
     ]  # fmt: skip
 
 
 def add_finding(report: Report, key: str) -> None:
-    """Say which methods are behind the mean pose."""
+    """Add a finding: the methods that are no better than the mean pose."""
     table = report[key]
     still = float(table["mean pose", "3D (cm)"])
     behind = [m for m in METHODS if m in table.rows and not float(table[m, "3D (cm)"]) < still]
@@ -185,35 +217,16 @@ def add_finding(report: Report, key: str) -> None:
     report.findings.append(f"{table.title.partition(':')[0]}: mean pose {still:.2f} cm, {said}.")
 
 
-def main() -> None:
+def main(options: Options) -> None:
     """Fit, track and write the report."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
-    parser.add_argument(
-        "--out", type=Path, required=True, help="folder for what is kept, and the report"
-    )
-    parser.add_argument(
-        "--every", type=int, default=1, help="take every n-th sequence of UB-people"
-    )
-    parser.add_argument("--frames", type=int, default=0, help="frames of UB-one (0: all)")
-    parser.add_argument("--particles", type=int, default=10_000, help="of each particle filter")
-    parser.add_argument(
-        "--windows", choices=("true", "false"), default="true", help="fit windows as well"
-    )
-    parser.add_argument("--folds", type=int, help="of the calibration (default the recipe's)")
-    parser.add_argument("--recipes", nargs="+", choices=RECIPES, default=[*RECIPES])
-    parser.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=[*PROTOCOLS])
-    parser.add_argument("--progress", action="store_true", help="show bars")
-    arguments = parser.parse_args()
-    arguments.windows = arguments.windows == "true"
-    arguments.out = check_output_folder(arguments.out)
+    options = options._replace(out=check_output_folder(options.out))
     shown = ("every", "frames", "particles", "windows", "folds", "recipes", "protocols")
-    report = Report("All trackers", {name: getattr(arguments, name) for name in shown})
-    for name in arguments.protocols:
-        compare(name, *PROTOCOLS[name](arguments), report, arguments)
-    report.save(arguments.out)
-    print((arguments.out / "report.md").read_text())
+    report = Report("All trackers", {name: getattr(options, name) for name in shown})
+    for name in options.protocols:
+        compare(name, *PROTOCOLS[name](options), report, options)
+    report.save(options.out)
+    print((options.out / "report.md").read_text())
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -273,6 +273,6 @@ def _add_errors(report: Report, runs: Results) -> None:
 
 
 if __name__ == "__main__":
-    from benchmarks._command import main
+    from benchmarks._protocols import run_protocol
 
-    main("body_models")
+    run_protocol("body_models")

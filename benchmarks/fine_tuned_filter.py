@@ -1,4 +1,4 @@
-"""What fine-tuning through the filter gains: Q, R and mixtures by gradient of the 3D error.
+"""Gain of fine-tuning through the filter: Q, R and mixtures by gradient of the 3D error.
 
 On training persons of UB-people alone (s1 to s6 of UTD-MHAD): a prior over single poses is fitted to four
 of them, its filter is tuned on the same four, and every third sequence of the other two is tracked from
@@ -8,18 +8,20 @@ error is the 3D distance after fixed-scale Procrustes, pooled over joints and fr
 
     python -m benchmarks.fine_tuned_filter --data DIR --out DIR [--splits A B C] [--seeds 0 1 2]
 
-A seed of a split takes about a minute and a half. Finished ones lie in `--out` and are read from there.
+A seed of a split takes about a minute and a half. Finished ones are kept in `--out`.
 """
 
-import argparse
-import json
+from collections.abc import Sequence
 from pathlib import Path
-from statistics import fmean, stdev
+from typing import Annotated, Any, NamedTuple
 
 import torch
+from torch import Tensor
 from tqdm.auto import tqdm
 
-from benchmarks._upper_body import data_folder, plain_prior, score
+from benchmarks._command import OneOf, run_command
+from benchmarks._upper_body import MADE_WITH, data_folder, plain_prior, score
+from benchmarks.engine import Experiment, Grid, Results
 from benchmarks.speed._timing import machine_line, markdown_table
 from torchpose._core.files import atomic_path, check_output_folder
 from torchpose.evaluation._common import CAMERA, Trials, centred_on_neck, make_test_set, track
@@ -32,23 +34,50 @@ SPLITS = {"A": ("s3", "s6"), "B": ("s2", "s4"), "C": ("s1", "s5")}
 """Persons who are tracked; the other four of s1 to s6 are fitted and tuned on."""
 
 METHODS = ("hand-set Q and R", "released Q", "Q and R tuned", "Q, R and mixtures tuned")
-STEPS, RATE, SEQUENCES, FRAMES = 80, 0.1, 16, 48
+RATE, SEQUENCES, FRAMES = 0.1, 16, 48
 BODY_SIZE, BONE_LENGTHS = 0.3, 0.05
 
 
+class Effort(NamedTuple):
+    """How large the fits are, and how many sequences are read and tracked."""
+
+    components: int = 30
+    samples: int = 60_000
+    pose_steps: int = 60
+    tuning_steps: int = 80
+    every_file: int = 1
+    every_tracked: int = 3
+
+
+QUICK = Effort(4, 2_000, 5, 2, 40, 1)
+
+
+class Split(NamedTuple):
+    """Recordings to fit to and to tune on, and the test set of the persons who are held out."""
+
+    seen: list[Recording]
+    test: Trials
+
+
+class Errors(NamedTuple):
+    """Mean 3D errors in cm, in the order of `METHODS` [4]."""
+
+    by_method: Tensor
+
+
 def tuned(
-    prior: UpperBodyPrior, persons: list[Recording], seed: int, **options: bool
+    prior: UpperBodyPrior, persons: list[Recording], seed: int, steps: int, **options: bool
 ) -> UpperBodyPrior:
-    """The prior with its filter tuned; the learning rate falls over the second half."""
+    """Return the prior with its filter tuned; the learning rate falls over the second half."""
     poses = UpperBodyRecipe().poses(persons)
     sequences = list(poses.joints.split(poses.lengths))
     model = TunableKalman(prior, **options)
     adam = torch.optim.Adam(parameter_groups(model, RATE))
     rates = [group["lr"] for group in adam.param_groups]
     generator = torch.Generator().manual_seed(seed)
-    for step in tqdm(range(STEPS), desc="tune", leave=False):
+    for step in tqdm(range(steps), desc="tune", leave=False):
         for group, rate in zip(adam.param_groups, rates, strict=True):
-            group["lr"] = rate * min(1.0, 2 * (1 - step / STEPS))
+            group["lr"] = rate * min(1.0, 2 * (1 - step / steps))
         batch = draw_sequences(
             sequences, prior, SEQUENCES, generator, frames=FRAMES,
             body_size=BODY_SIZE, bone_lengths=BONE_LENGTHS,
@@ -60,77 +89,103 @@ def tuned(
 
 
 def error(prior: UpperBodyPrior, test: Trials) -> float:
-    """Mean 3D error in cm."""
+    """Return the mean 3D error in cm."""
     estimate = track(prior, CAMERA, test, method="mkf-fixed")
-    return 100 * float(score(estimate, test).errors3d.nanmean())
+    return score(estimate, test).mean_error
 
 
-def measure(data: Path, split: str, seed: int, quick: bool) -> dict[str, float]:
-    """Errors of all methods on one split."""
-    held_out = SPLITS[split]
+def read_split(data: Path, split: str, effort: Effort) -> Split:
+    """Return the recordings of a split."""
     files = sorted(data_folder(data, "kinect_utd_mhad").glob("s0[1-6]_*.npz"))
-    recordings = read_recordings(files[:: 40 if quick else 1])
-    seen = [r for r in recordings if r.person not in held_out]
-    own = [r for r in recordings if r.person in held_out][:: 1 if quick else 3]
-    test = make_test_set([centred_on_neck(r.upper_body().joints) for r in own], CAMERA, 30.0)
+    recordings = read_recordings(files[:: effort.every_file])
+    held_out = [r for r in recordings if r.person in SPLITS[split]][:: effort.every_tracked]
+    poses = [centred_on_neck(r.upper_body().joints) for r in held_out]
+    seen = [r for r in recordings if r.person not in SPLITS[split]]
+    return Split(seen, make_test_set(poses, CAMERA, 30.0))
+
+
+def measure(split: Split, effort: Effort, seeds: Sequence[int]) -> list[Errors]:
+    """Fit, tune and track once for each seed."""
+    return [_measure(split, effort, seed) for seed in seeds]
+
+
+def _measure(split: Split, effort: Effort, seed: int) -> Errors:
     recipe = UpperBodyRecipe(
-        4 if quick else 30, 2_000 if quick else 60_000, pose_steps=5 if quick else 60,
+        effort.components, effort.samples, pose_steps=effort.pose_steps,
         window_components=0, calibration_folds=0, seed=seed,
     )  # fmt: skip
-    prior = recipe.fit(seen)
+    prior = recipe.fit(split.seen)
+    steps = effort.tuning_steps
     priors = (
         plain_prior(prior),
         prior,
-        tuned(prior, seen, seed),
-        tuned(prior, seen, seed, mixtures=True),
+        tuned(prior, split.seen, seed, steps),
+        tuned(prior, split.seen, seed, steps, mixtures=True),
     )
-    return {name: error(p, test) for name, p in zip(METHODS, priors, strict=True)}
+    errors = [error(one, split.test) for one in priors]
+    return Errors(torch.tensor(errors, dtype=torch.float64))
 
 
-def table(found: dict[str, dict[str, float]], splits: list[str], seeds: list[int]) -> str:
-    """A row per method: mean and standard deviation over seeds for each split."""
-    rows = []
-    for method in METHODS:
-        row = [method]
-        for split in splits:
-            values = [
-                found[f"{split}{seed}"][method] for seed in seeds if f"{split}{seed}" in found
-            ]
-            spread = f" ± {stdev(values):.2f}" if len(values) > 1 else ""
-            row.append(f"{fmean(values):.2f}{spread}" if values else "-")
-        rows.append(row)
-    header = ["filter over single poses", *(f"{', '.join(SPLITS[s])} (cm)" for s in splits)]
-    return markdown_table(header, rows)
+def facts(split: Split, effort: Effort) -> list[Any]:
+    """Return the inputs of a run, beside its seed."""
+    joints = [fact for r in split.seen for fact in (r.person_id, r.joints)]
+    return [effort, *joints, split.test.keypoints, split.test.truth3d, split.test.lengths]
 
 
-def main() -> None:
-    """Measure what is not there yet, and print and write the table."""
-    global STEPS
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--splits", nargs="+", choices=sorted(SPLITS), default=sorted(SPLITS))
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--quick", action="store_true")
-    arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
-    if arguments.quick:
-        STEPS = 2
-    kept = check_output_folder(arguments.out) / "results.json"
-    found = json.loads(kept.read_text(encoding="utf-8")) if kept.is_file() else {}
-    for split in arguments.splits:
-        for seed in arguments.seeds:
-            if f"{split}{seed}" not in found:
-                found[f"{split}{seed}"] = measure(arguments.data, split, seed, arguments.quick)
-                with atomic_path(kept) as temporary:
-                    temporary.write_text(json.dumps(found, indent=1), encoding="utf-8")
-    text = table(found, arguments.splits, arguments.seeds)
-    note = f"Mean and standard deviation over {len(arguments.seeds)} seeds."
-    print(f"{text}\n\n{note}\n\n{machine_line(arguments.threads)}")
-    with atomic_path(arguments.out / "fine-tuned.md") as temporary:
+TUNING = Experiment(
+    Errors,
+    measure,
+    facts,
+    (
+        *MADE_WITH,
+        "torchpose/learning",
+        "benchmarks/_upper_body.py",
+        "benchmarks/fine_tuned_filter.py",
+    ),
+)
+
+
+def table(found: Results) -> str:
+    """Return a row per method: mean and standard deviation over seeds for each split."""
+    rows = [[method] for method in METHODS]
+    for (_,), own in found.by("subject").items():
+        errors = torch.stack([run.by_method for run in own.runs], 1)
+        for row, values in zip(rows, errors, strict=True):
+            spread = f" ± {float(values.std()):.2f}" if len(values) > 1 else ""
+            row.append(f"{float(values.mean()):.2f}{spread}")
+    splits = [", ".join(SPLITS[name]) for name in found.names("subject")]
+    return markdown_table(["filter over single poses", *(f"{s} (cm)" for s in splits)], rows)
+
+
+def main(
+    *,
+    data: Path,
+    out: Path,
+    splits: Annotated[Sequence[str], OneOf(SPLITS)] = tuple(SPLITS),
+    seeds: Sequence[int] = (0, 1, 2),
+    threads: int = 1,
+    quick: bool = False,
+) -> None:
+    """Measure what is not there yet, and print and write the table.
+
+    Args:
+        data: folder with kinect_utd_mhad/.
+        out: folder for what is kept, and the table.
+        splits: who is tracked.
+        seeds: of fits and batches.
+        threads: cores.
+        quick: tiny fits, to see that it works.
+    """
+    torch.set_num_threads(threads)
+    check_output_folder(out)
+    effort = QUICK if quick else Effort()
+    grid = Grid({name: read_split(data, name, effort) for name in splits}, {"": effort})
+    text = table(TUNING.run({"": grid}, seeds, out, progress=True, title="splits"))
+    note = f"Mean and standard deviation over {len(seeds)} seeds."
+    print(f"{text}\n\n{note}\n\n{machine_line(threads)}")
+    with atomic_path(out / "fine-tuned.md") as temporary:
         temporary.write_text(f"{text}\n\n{note}\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

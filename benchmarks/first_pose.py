@@ -1,4 +1,4 @@
-"""Does a first pose that is found in silhouettes face the right way: one frame against half a second.
+"""Direction of first poses found in silhouettes, by one frame and by half a second.
 
 Walks of four persons (`mocap_cmu_walk`) are rendered as in the protocol Silhouette; where the data has
 them, the four views of a balancing man (`multicam_pose2sim`) are searched from several of their frames.
@@ -6,7 +6,6 @@ them, the four views of a balancing man (`multicam_pose2sim`) are searched from 
     python -m benchmarks.first_pose --data DIR [--seeds 3] [--cameras 3] [--manifold]
 """
 
-import argparse
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -15,6 +14,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._command import run_command
 from benchmarks.bodies.clips import split_clips
 from benchmarks.bodies.views import Conditions
 from benchmarks.real_silhouettes import HEIGHT, four_views
@@ -23,6 +23,7 @@ from benchmarks.silhouette.protocol import FPS, WALKERS
 from torchpose.body import BODY_15, Body, fit_state
 from torchpose.camera import CameraRig
 from torchpose.io import read_mocap
+from torchpose.metrics import joint_errors
 from torchpose.priors import BackConstrainedGPLVM
 from torchpose.whole_body import find_first_pose, find_pose
 
@@ -43,20 +44,20 @@ class Start(NamedTuple):
 
 
 def walks(folder: Path, cameras: int, with_manifold: bool) -> Iterator[Start]:
-    """The first frames of three trials of each person."""
+    """Yield the first frames of three trials of each person."""
     clips = read_mocap(folder, FPS)
     for split in split_clips(clips, WALKERS, WALKERS, TRIALS):
-        trackee = prepare(split, Conditions(cameras_used=cameras), CLIP, LOOK_AHEAD)
-        manifold = trackee.manifold if with_manifold else None
-        for view in trackee.tests:
+        tracked = prepare(split, Conditions(cameras_used=cameras), CLIP, LOOK_AHEAD)
+        manifold = tracked.manifold if with_manifold else None
+        for view in tracked.tests:
             yield Start(
-                trackee.body, view.silhouettes[:LOOK_AHEAD], view.rig, manifold, view.clip.up,
+                tracked.body, view.silhouettes[:LOOK_AHEAD], view.rig, manifold, view.clip.up,
                 view.clip.joints[0],
             )  # fmt: skip
 
 
 def balancing(folder: Path) -> Iterator[Start]:
-    """Several frames of the four views, a body of average proportions."""
+    """Yield several frames of the four views, with a body of average proportions."""
     data, body = four_views(folder), Body.of_height(BODY_15, HEIGHT)
     for t in STARTS:
         frames = data.silhouettes[t : t + LOOK_AHEAD]
@@ -64,14 +65,14 @@ def balancing(folder: Path) -> Iterator[Start]:
 
 
 def one_frame(start: Start, generator: torch.Generator) -> Tensor:
-    """The pose that fits the first frame best."""
+    """Return the pose that fits the first frame best."""
     return find_pose(
         start.body, start.silhouettes[0], start.rig, start.manifold, generator, up=start.up
     )
 
 
 def half_a_second(start: Start, generator: torch.Generator) -> Tensor:
-    """The pose whose track tells best where it faces."""
+    """Return the first pose whose track over half a second fits best."""
     return find_first_pose(
         start.body, start.silhouettes, start.rig, start.manifold, generator, fps=FPS, up=start.up
     ).state
@@ -80,7 +81,7 @@ def half_a_second(start: Start, generator: torch.Generator) -> Tensor:
 def row(
     name: str, starts: Sequence[Start], seeds: int, find: Callable[[Start, torch.Generator], Tensor]
 ) -> str:
-    """How many face the right way, mean and largest error (mm)."""
+    """Return a row: how many found poses face the right way, mean and largest error (mm)."""
     right, errors = 0, []
     for start in tqdm(starts, desc=name, disable=None):
         truth = fit_state(start.body, start.joints[None])[0]
@@ -88,28 +89,29 @@ def row(
             found = find(start, torch.Generator().manual_seed(seed))
             ahead = start.body.part_rotations(torch.stack([found, truth]))[:, 0, :, 2]
             right += int(float(ahead[0] @ ahead[1]) > 0)
-            gap = (start.body.joints(found) - start.joints).norm(dim=-1)
+            gap = joint_errors(start.body.joints(found), start.joints)
             errors.append(1000 * float(gap.nanmean()))
     count = len(errors)
     return f"| {name} | {right} of {count} | {sum(errors) / count:.0f} | {max(errors):.0f} |"
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--cameras", type=int, default=3)
-    parser.add_argument("--manifold", action="store_true")
-    args = parser.parse_args()
-    groups = {"walks": list(walks(args.data / "mocap_cmu_walk", args.cameras, args.manifold))}
-    if (args.data / "multicam_pose2sim").is_dir() and not args.manifold:
-        groups["balancing man"] = list(balancing(args.data))
+def main(*, data: Path, seeds: int = 3, cameras: int = 3, manifold: bool = False) -> None:
+    """Print the table.
+
+    Args:
+        data: folder of the data sets.
+        seeds: runs for each start.
+        cameras: around each walk.
+        manifold: poses of the manifold of walks in place of every pose.
+    """
+    groups = {"walks": list(walks(data / "mocap_cmu_walk", cameras, manifold))}
+    if (data / "multicam_pose2sim").is_dir() and not manifold:
+        groups["balancing man"] = list(balancing(data))
     print("| | faces the right way | error (mm) | largest (mm) |\n| --- | ---: | ---: | ---: |")
     for name, starts in groups.items():
-        print(row(f"{name}, one frame", starts, args.seeds, one_frame))
-        print(row(f"{name}, half a second", starts, args.seeds, half_a_second))
+        print(row(f"{name}, one frame", starts, seeds, one_frame))
+        print(row(f"{name}, half a second", starts, seeds, half_a_second))
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -1,4 +1,4 @@
-"""What a wrong focal length costs.
+"""Errors with a wrong focal length.
 
 The test of `python -m benchmarks.ub_people` (persons s7 and s8 of UTD-MHAD, head, neck and hands with
 3 px noise), tracked with a camera whose focal length is so many times the true one. A camera that is
@@ -11,12 +11,12 @@ it the shipped prior is used, which has seen s7 and s8: then the table says so, 
 differences between its rows mean something.
 """
 
-import argparse
 from pathlib import Path
 
 import torch
 
-from benchmarks._table_file import table_file
+from benchmarks._command import run_command
+from benchmarks._table_file import TableFile
 from benchmarks._upper_body import score
 from benchmarks.ub_people import TEST_PERSONS, people, sway
 from torchpose.camera import PinholeCamera
@@ -34,55 +34,57 @@ TRACKERS = {
 HEADER = ("tracker", "f / true f", "3D error (cm)", "moving root (cm)", "pixel error")
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder with kinect_utd_mhad/")
-    parser.add_argument(
-        "--prior",
-        default="kinect-upper-body",
-        help="name or file; best of others than the test persons",
-    )
-    parser.add_argument("--threads", type=int, default=2, help="cores")
-    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
-    parser.add_argument(
-        "--quick", action="store_true", help="a few sequences, to see that it works"
-    )
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
-    prior = load_prior(args.prior)
-    _, tested = people(args.data, args.quick)
-    tested = tested[:: 3 if args.quick else 1]
+def main(
+    *,
+    data: Path,
+    prior: str = "kinect-upper-body",
+    threads: int = 2,
+    out: TableFile | None = None,
+    quick: bool = False,
+) -> None:
+    """Print the table.
+
+    Args:
+        data: folder with kinect_utd_mhad/.
+        prior: name or file; best of others than the test persons.
+        threads: cores.
+        out: file for the same as Markdown, or a folder.
+        quick: a few sequences, to see that it works.
+    """
+    torch.set_num_threads(threads)
+    fitted = load_prior(prior)
+    _, tested = people(data, quick)
+    tested = tested[:: 3 if quick else 1]
     poses = [centred_on_neck(recording.upper_body().joints) for recording in tested]
     fps = tested[0].fps or 30.0
     still = make_test_set(poses, CAMERA, fps)
     paths = [sway(len(p), fps, i / len(poses)) for i, p in enumerate(poses)]
     moving = make_test_set(poses, CAMERA, fps, paths=paths)
     lines = [f"| {' | '.join(HEADER)} |", f"|{' --- |' * len(HEADER)}"]
-    trackers = dict(list(TRACKERS.items())[: 1 if args.quick else None])
+    trackers = dict(list(TRACKERS.items())[: 1 if quick else None])
     for name, options in trackers.items():
-        for factor in FACTORS[: 3 if args.quick else None]:
-            row = [name, f"{factor:g}", *errors(prior, still, moving, factor, options)]
+        for factor in FACTORS[: 3 if quick else None]:
+            row = [name, f"{factor:g}", *errors(fitted, still, moving, factor, options)]
             lines.append(f"| {' | '.join(row)} |")
-    text = "\n".join([*lines, "", f"{note(prior, {r.person_id for r in tested})}\n"])
+    text = "\n".join([*lines, "", f"{note(fitted, {r.person_id for r in tested})}\n"])
     print(text, end="")
-    if args.out:
-        args.out.write_text(text, encoding="utf-8")
+    if out is not None:
+        out.write_text(text, encoding="utf-8")
 
 
 def errors(
     prior: UpperBodyPrior, still: Trials, moving: Trials, factor: float, options: dict[str, object]
 ) -> list[str]:
-    """Mean 3D error of both tests after fixed-scale Procrustes, and mean pixel error of the first."""
+    """Return the mean 3D errors of both tests after fixed-scale Procrustes, and the first's pixel error."""
     focal = factor * FOCAL
     camera = PinholeCamera(focal, focal, *CENTRE, 640, 480)
     first, second = (score(track(prior, camera, test, **options), test) for test in (still, moving))
-    means = (100 * first.errors3d.nanmean(), 100 * second.errors3d.nanmean())
-    return [f"{float(value):.2f}" for value in (*means, first.errors2d.nanmean())]
+    numbers = (first.mean_error, second.mean_error, float(first.errors2d.nanmean()))
+    return [f"{number:.2f}" for number in numbers]
 
 
 def note(prior: UpperBodyPrior, persons: set[str]) -> str:
-    """Which prior it was, and whether it has seen the test persons."""
+    """Return a sentence that names the prior and says whether it has seen the test persons."""
     name = prior.info.name or "unnamed"
     try:
         prior.check_unseen(persons)
@@ -95,4 +97,4 @@ def note(prior: UpperBodyPrior, persons: set[str]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

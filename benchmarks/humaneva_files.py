@@ -106,11 +106,11 @@ class HumanEvaTrial:
 
     @property
     def cameras(self) -> CameraRig:
-        """The rig of the cameras, at the size of their videos."""
+        """Return the rig of the cameras, at the size of their videos."""
         return CameraRig(self.calibrations)
 
     def clip(self, start: int | None = None, stop: int | None = None) -> MocapClip:
-        """Frames `start` to `stop`, numbered from one, both included, as a clip of fifteen joints."""
+        """Return frames `start` to `stop`, numbered from one, both included, as a clip of fifteen joints."""
         rows = slice(None if start is None else start - 1, stop)
         joints = self.joints[rows]
         up = joints.new_tensor([0.0, 0.0, 1.0])
@@ -130,7 +130,7 @@ def is_humaneva(root: str | Path) -> bool:
 
 
 def find_humaneva(root: str | Path) -> list[tuple[str, str, str]]:
-    """(person, action, trial) of every trial with motion capture below a folder.
+    """Return (person, action, trial) of every trial with motion capture below a folder.
 
     Raises:
         InputError: there is none.
@@ -310,7 +310,7 @@ def _by_label(labels: Sequence[str], points: np.ndarray) -> dict[str, np.ndarray
 
 
 def _points_of_mat(path: Path) -> dict[str, np.ndarray]:
-    """What the data set's tools keep of a .c3d: Markers [S, N, 3], and labels in ParameterGroup."""
+    """Return the markers in a .mat file of the data set's tools: Markers [S, N, 3], ParameterGroup."""
     try:
         from scipy.io import loadmat
     except ImportError as error:
@@ -330,7 +330,7 @@ def _points_of_mat(path: Path) -> dict[str, np.ndarray]:
 
 
 def _measures(folder: Path, person: str) -> tuple[dict[str, float], list[str]]:
-    """What the joint centres need of the person: half the shoulders' width, shoulder offsets (mm)."""
+    """Return half the shoulders' width and the shoulder offsets of a person (mm), and what is missing."""
     measures: dict[str, float] = {}
     notes = []
     static = folder / "Static.c3d"

@@ -1,4 +1,4 @@
-"""What the filter adds to a modern detector: MediaPipe's landmarks as the measuring front end.
+"""The tracker on MediaPipe's landmarks: jitter, gaps, and joints that are not measured.
 
 On the seven webcam clips of `video_asl` (three signers) the tracker is fed with MediaPipe's head, neck
 and hands, and with all eight joints. Against MediaPipe's own 2D and 3D joints (`*_pose1.npz`, the full
@@ -9,7 +9,6 @@ beside it stands how much its own full and heavy models differ.
     python -m benchmarks.mediapipe_front_end --data DIR
 """
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,10 +17,11 @@ import torch
 from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, pad, read_clip
-from benchmarks._table_file import table_file
+from benchmarks._command import run_command
+from benchmarks._table_file import TableFile
 from torchpose.camera import PinholeCamera
 from torchpose.evaluation import Report
-from torchpose.metrics import jitter, joint_errors_3d
+from torchpose.metrics import jitter, joint_errors, joint_errors_3d
 from torchpose.priors import UpperBodyPrior, load_prior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack, UpperBodyTracker
@@ -69,7 +69,7 @@ class Bench:
         points: Tensor | None = None,
         rows: Tensor | None = None,
     ) -> PoseTrack:
-        """Poses from some of the eight joints; a joint of visibility below 0.5 is missing."""
+        """Return poses from some of the eight joints; joints of visibility below 0.5 are missing."""
         rows = torch.arange(len(self.clips)) if rows is None else rows
         points = self.points[rows] if points is None else points
         chosen = list(joints)
@@ -82,22 +82,20 @@ class Bench:
             )
 
     def off_by_clip(self, estimate: Tensor, group: str) -> Tensor:
-        """The same in shoulder widths, for each clip [clips]."""
-        gap = (estimate - self.points).norm(dim=-1) / self.width[:, None, None]
-        gap = torch.where(self.known, gap, torch.nan)[..., list(GROUPS[group])]
-        return gap.flatten(1).nanmean(1)
+        """Return the mean distance of a group from MediaPipe's joints, in shoulder widths [clips]."""
+        gap = joint_errors(estimate, self.points, self.known) / self.width[:, None, None]
+        return gap[..., list(GROUPS[group])].flatten(1).nanmean(1)
 
     def off(self, estimate: Tensor, widths: bool = False) -> dict[str, float]:
-        """Mean distance from MediaPipe's joints by group, where those are known."""
-        gap = (estimate - self.points).norm(dim=-1)
+        """Return the mean distance from MediaPipe's joints by group, where those are known."""
+        gap = joint_errors(estimate, self.points, self.known)
         if widths:
             gap = gap / self.width[:, None, None]
-        gap = torch.where(self.known, gap, torch.nan)
         return {name: float(gap[..., list(js)].nanmean()) for name, js in GROUPS.items()}
 
 
 def jitter_tables(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) -> None:
-    """Mean acceleration in the image and in space."""
+    """Add tables of the mean acceleration in the image and in space."""
     flat = report.table(
         "jitter2d",
         "Jitter in the image: mean acceleration (px/s²), and distance from MediaPipe's joints (px)",
@@ -134,14 +132,14 @@ def jitter_tables(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) ->
 
 
 def _mean(points: Tensor, before: int, after: int) -> Tensor:
-    """Mean over a few frames, the plainest way to take out jitter."""
+    """Return the mean over a few frames, the simplest smoother."""
     n = points.shape[1]
     rows = torch.arange(n)[:, None] + torch.arange(-before, after + 1)
     return points[:, rows.clamp(0, n - 1)].nanmean(2)
 
 
 def inferred_table(bench: Bench, report: Report) -> None:
-    """Elbows and shoulders from head, neck and hands, by what stands for head and hand."""
+    """Add the errors of inferred elbows and shoulders, for several definitions of head and hand."""
     table = report.table(
         "inferred",
         "Joints that are not measured, from head, neck and hands alone (filtered): mean distance from "
@@ -182,7 +180,7 @@ def inferred_table(bench: Bench, report: Report) -> None:
 def place_table(
     bench: Bench, report: Report, heads: Sequence[float], necks: Sequence[float]
 ) -> None:
-    """What the places of head and neck of `torchpose.skeleton._mediapipe_landmarks` were chosen from."""
+    """Add the errors for several places of head and neck (`torchpose.skeleton._mediapipe_landmarks`)."""
     table = report.table(
         "places",
         "Where head and neck are put: inferred elbows / shoulders (shoulder widths)",
@@ -200,10 +198,8 @@ def place_table(
         cells = []
         for share in necks:
             points = bench.points.clone()
-            points[:, :, HEAD], points[:, :, NECK] = (
-                middle + height * up,
-                middle + share * height * up,
-            )
+            points[:, :, HEAD] = middle + height * up
+            points[:, :, NECK] = middle + share * height * up
             found = bench.track("filtered", FRONT_ENDS["head, neck, hands"], points).joints2d
             widths = bench.off(found, widths=True)
             cells.append(f"{widths['elbows']:.3f} / {widths['shoulders']:.3f}")
@@ -214,7 +210,7 @@ def place_table(
 
 
 def unseen_signers(bench: Bench, errors: dict[tuple[float, float], Tensor]) -> list[str]:
-    """Places chosen on the clips of two signers, scored on those of the third."""
+    """Return the errors on each signer's clips of the places that are best on those of the others."""
     sentences = []
     for signer in SIGNERS:
         own = torch.tensor([c.name in signer for c in bench.clips])
@@ -230,7 +226,7 @@ def unseen_signers(bench: Bench, errors: dict[tuple[float, float], Tensor]) -> l
 
 
 def by_clip_table(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) -> None:
-    """Inferred elbows and shoulders of every clip."""
+    """Add the errors of inferred elbows and shoulders, clip by clip."""
     names = [n for n in tracks if n.startswith("head")]
     table = report.table(
         "by_clip",
@@ -242,15 +238,15 @@ def by_clip_table(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) ->
     for i, clip in enumerate(bench.clips):
         cells = []
         for name in names:
-            gap = (tracks[name].joints2d[i] - bench.points[i]).norm(dim=-1) / clip.width
-            gap = torch.where(bench.known[i], gap, torch.nan)
+            gap = joint_errors(tracks[name].joints2d[i], bench.points[i], bench.known[i])
+            gap = gap / clip.width
             pair = [float(gap[:, list(GROUPS[g])].nanmean()) for g in ("elbows", "shoulders")]
             cells.append(f"{pair[0]:.3f} / {pair[1]:.3f}")
         table.add(clip.name, cells)
 
 
 def space_table(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) -> None:
-    """Distance in space from MediaPipe's own 3D joints."""
+    """Add the distance in space from MediaPipe's own 3D joints."""
     table = report.table(
         "space",
         "Difference from MediaPipe's 3D joints after fixed-scale Procrustes on head, neck and "
@@ -272,7 +268,7 @@ def space_table(bench: Bench, report: Report, tracks: dict[str, PoseTrack]) -> N
 
 
 def gap_cases(bench: Bench, length: int, step: int) -> list[tuple[int, int, int]]:
-    """(clip, hand, first frame) of hidden stretches whose ends are in view."""
+    """Return (clip, hand, first frame) of stretches to hide; a hand is in view at both ends."""
     cases = []
     for clip in range(len(bench.clips)):
         last = int(bench.lengths[clip]) - length - 1
@@ -284,7 +280,7 @@ def gap_cases(bench: Bench, length: int, step: int) -> list[tuple[int, int, int]
 
 
 def gap_table(bench: Bench, report: Report, step: int, gaps: tuple[int, ...] = GAPS) -> None:
-    """Hidden hands: how far what is filled in lies from the hidden landmark."""
+    """Add the errors of hidden hands, by the way in which gaps are filled."""
     table = report.table(
         "gaps",
         "A hand hidden for n frames: mean distance of what is filled in from the hidden landmark (px)",
@@ -305,7 +301,7 @@ def gap_table(bench: Bench, report: Report, step: int, gaps: tuple[int, ...] = G
 
 
 def gap_errors(bench: Bench, cases: list[tuple[int, int, int]], length: int) -> dict[str, float]:
-    """Mean error of every way to fill these gaps."""
+    """Return the mean error of every way to fill these gaps."""
     clip, hand, start = torch.tensor(cases).T
     n = torch.arange(len(cases))
     frames = start[:, None] + torch.arange(length)
@@ -337,25 +333,31 @@ def gap_errors(bench: Bench, cases: list[tuple[int, int, int]], length: int) -> 
     return {name: float(value) for name, value in errors.items()}
 
 
-def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder with video_asl/")
-    parser.add_argument("--prior", default="kinect-upper-body", help="name or file")
-    parser.add_argument("--threads", type=int, default=2, help="cores")
-    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
-    parser.add_argument(
-        "--quick", action="store_true", help="the beginning of one clip, to see that it works"
-    )
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
-    folder = args.data / "video_asl" if (args.data / "video_asl").is_dir() else args.data
-    names = CLIPS[:1] if args.quick else CLIPS
+def main(
+    *,
+    data: Path,
+    prior: str = "kinect-upper-body",
+    threads: int = 2,
+    out: TableFile | None = None,
+    quick: bool = False,
+) -> None:
+    """Print the tables.
+
+    Args:
+        data: folder with video_asl/.
+        prior: name or file.
+        threads: cores.
+        out: file for the same as Markdown, or a folder.
+        quick: the beginning of one clip, to see that it works.
+    """
+    torch.set_num_threads(threads)
+    folder = data / "video_asl" if (data / "video_asl").is_dir() else data
+    names = CLIPS[:1] if quick else CLIPS
     clips, heavy = ([read_clip(folder, n, m) for n in names] for m in (1, 2))
-    if args.quick:
+    if quick:
         clips, heavy = ([begun(clip) for clip in whole] for whole in (clips, heavy))
-    prior = load_prior(args.prior)
-    bench = Bench(clips, heavy, prior)
+    fitted = load_prior(prior)
+    bench = Bench(clips, heavy, fitted)
     report = Report("MediaPipe as the measuring front end")
     tracks = {
         f"{front_end}, {mode}": bench.track(mode, joints)
@@ -363,22 +365,22 @@ def main() -> None:
         for mode in MODES
     }
     jitter_tables(bench, report, tracks)
-    gap_table(bench, report, *((60, GAPS[:1]) if args.quick else (10,)))
+    gap_table(bench, report, *((60, GAPS[:1]) if quick else (10,)))
     inferred_table(bench, report)
-    some = slice(1 if args.quick else None)
+    some = slice(1 if quick else None)
     place_table(bench, report, HEADS[some], NECKS[some])
     by_clip_table(bench, report, tracks)
     space_table(bench, report, tracks)
     report.settings = {
-        "prior": prior.info.name,
+        "prior": fitted.info.name,
         "clips": {c.name: f"{len(c.points)} frames, shoulders {c.width:.0f} px" for c in clips},
         "known": "visibility 0.5 or more, in the image, after 15 frames",
         "camera": "f = 525 px (assumed), 640x480, 30 fps",
     }
     print(report.summary())
-    if args.out:
-        args.out.write_text(report.to_markdown(), encoding="utf-8")
+    if out is not None:
+        out.write_text(report.to_markdown(), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -60,7 +60,7 @@ def main() -> int:
 
 
 def detect(video: Path, complexity: int) -> tuple[dict[str, Any], list[float], list[float]]:
-    """Arrays of the landmarks, and seconds for decoding and for MediaPipe of every frame."""
+    """Return the arrays of the landmarks, and seconds for decoding and for MediaPipe of every frame."""
     capture = cv2.VideoCapture(str(video))
     size = [int(capture.get(k)) for k in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
     fps = capture.get(cv2.CAP_PROP_FPS)
@@ -93,7 +93,7 @@ def detect(video: Path, complexity: int) -> tuple[dict[str, Any], list[float], l
 
 
 def as_row(found: Any, n_joints: int, size: list[int]) -> list[tuple[float, ...]]:
-    """(u, v, visibility, x, y, z) of every joint."""
+    """Return (u, v, visibility, x, y, z) of every joint."""
     if found.pose_landmarks is None or found.pose_world_landmarks is None:
         return [(np.nan, np.nan, 0.0, np.nan, np.nan, np.nan)] * n_joints
     pairs = zip(found.pose_landmarks.landmark, found.pose_world_landmarks.landmark, strict=True)
@@ -101,7 +101,7 @@ def as_row(found: Any, n_joints: int, size: list[int]) -> list[tuple[float, ...]
 
 
 def timing(runs: list[tuple[dict[str, Any], list[float], list[float]]], args: Any) -> str:
-    """Medians over the runs of the mean time of a frame, the first ten frames left out."""
+    """Return the time of a frame: medians over runs of the mean, without the first ten frames."""
     means = [
         (1000 * statistics.fmean(d[10:] or d), 1000 * statistics.fmean(m[10:] or m))
         for _, d, m in runs

@@ -1,4 +1,4 @@
-"""Outliers among the keypoints: what one does to the poses, and many, with hands exchanged now and then.
+"""Outliers among the keypoints: single ones, and many together with exchanged hands.
 
 UB-people: prior of s1 to s6, some sequences of s7 and s8, head, neck and hands measured with 3 pixels of
 noise. Tracked as they are, with one keypoint of one frame moved by 100 to a million pixels, and with 5 % of
@@ -9,8 +9,7 @@ without it, and after a median over five frames.
     python -m benchmarks.outliers --data DIR --out DIR --persons s3 s6 --every 8
 """
 
-import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from benchmarks._command import run_command
 from benchmarks._upper_body import Tracker, data_folder, score, trials_of, with_bones
 from benchmarks.ub_people import TEST_PERSONS, TRAIN_PERSONS
 from torchpose._core.files import check_output_folder
@@ -26,6 +26,7 @@ from torchpose.evaluation._common import CAMERA, Estimate, Trials, cached_prior
 from torchpose.evaluation._unseen import QUICK
 from torchpose.io import read_recordings
 from torchpose.learning import fit_kinect_prior
+from torchpose.metrics import joint_errors
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import PoseTrack, UpperBodyTracker
 
@@ -35,6 +36,32 @@ IMAGE = (640.0, 480.0)
 _FIRST, _EVERY, _LATER = 15, 20, 3  # frames with an outlier, and how long after it is looked again
 _SHARE, _EXCHANGED, _LONGEST = 0.05, 0.02, 5
 _HANDS = ("hand_left", "hand_right")
+FIT: dict[str, Any] = {"n_components": 10, "window_components": 48, "calibration_folds": 2}
+QUICK_FIT: dict[str, Any] = QUICK | {"n_components": 2, "n_samples": 3000, "calibration_folds": 0}
+
+
+class Options(NamedTuple):
+    """What is tracked.
+
+    Attributes:
+        data: folder of the recordings.
+        out: folder for what is kept, and the report.
+        every: take every n-th sequence.
+        persons: who is tracked; no other is fitted.
+        quick: a tiny prior, to see that it works.
+        seed: of the outliers.
+        threads: cores.
+        progress: show bars.
+    """
+
+    data: Path
+    out: Path
+    every: int = 12
+    persons: Sequence[str] = TEST_PERSONS
+    quick: bool = False
+    seed: int = 0
+    threads: int = 2
+    progress: bool = False
 
 
 class Wild(NamedTuple):
@@ -165,13 +192,13 @@ def _error_and_coverage(poses: PoseTrack, test: Trials) -> list[float]:
     if found.coverage is None:
         raise RuntimeError("a track has covariances")
     return [
-        100 * float(found.errors3d.nanmean()),
+        found.mean_error,
         *(100 * float(x) for x in found.coverage.overall),
     ]
 
 
 def add_found(report: Report, how: Tracker, test: Trials, wild: Wild) -> None:
-    """Add which keypoints were left out."""
+    """Add the shares of keypoints that are left out."""
     rows = [UPPER_BODY.index(name) for name in test.names]
     table = report.table(
         "found",
@@ -200,7 +227,7 @@ def add_found(report: Report, how: Tracker, test: Trials, wild: Wild) -> None:
 
 
 def add_single(report: Report, trackers: Mapping[str, Tracker], test: Trials, seed: int) -> None:
-    """Add what one outlier of each size at each joint adds to the error."""
+    """Add the error that one outlier of each size adds at each joint."""
     table = report.table(
         "single",
         f"One outlier: error added in its frame and {_LATER} frames later (cm)",
@@ -235,59 +262,32 @@ def add_single(report: Report, trackers: Mapping[str, Tracker], test: Trials, se
 
 def _errors(poses: PoseTrack, test: Trials) -> Float[Tensor, "B T"]:
     """Return the mean error of the eight joints in camera axes, wherever the body is put, cm."""
-    return 100 * (poses.joints3d - test.truth3d).norm(dim=-1).mean(-1)
+    return 100 * joint_errors(poses.joints3d, test.truth3d).mean(-1)
 
 
-def main() -> None:
-    """Fit, track and write the report."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
-    parser.add_argument(
-        "--out", type=Path, required=True, help="folder for what is kept, and the report"
-    )
-    parser.add_argument("--every", type=int, default=12, help="take every n-th sequence")
-    parser.add_argument(
-        "--persons",
-        nargs="+",
-        default=list(TEST_PERSONS),
-        help="who is tracked; no other is fitted",
-    )
-    parser.add_argument("--quick", action="store_true", help="a tiny prior, to see that it works")
-    parser.add_argument("--seed", type=int, default=0, help="of the outliers")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--progress", action="store_true", help="show bars")
-    arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
-    arguments.out = check_output_folder(arguments.out)
-    run(arguments)
-    print((arguments.out / "report.md").read_text())
+def main(options: Options) -> None:
+    """Fit, track, write the report and print it."""
+    torch.set_num_threads(options.threads)
+    check_output_folder(options.out)
+    make_report(options).save(options.out)
+    print((options.out / "report.md").read_text())
 
 
-def run(arguments: argparse.Namespace) -> Report:
-    """Run the protocol, and return the report that it wrote."""
-    recordings = read_recordings(data_folder(arguments.data, "kinect_utd_mhad"))
-    everybody = {*TRAIN_PERSONS, *TEST_PERSONS} - {*arguments.persons}
+def make_report(options: Options) -> Report:
+    """Fit and track, and return the report."""
+    recordings = read_recordings(data_folder(options.data, "kinect_utd_mhad"))
+    everybody = {*TRAIN_PERSONS, *TEST_PERSONS} - {*options.persons}
     fitted = [r for r in recordings if r.person in everybody - {*TEST_PERSONS}]
-    test = trials_of([r for r in recordings if r.person in arguments.persons][:: arguments.every])
-    small: dict[str, Any] = {
-        "n_components": 10, "window_components": 48, "calibration_folds": 2,
-    }  # fmt: skip
-    if arguments.quick:
-        small = QUICK | {"n_components": 2, "n_samples": 3000, "calibration_folds": 0}
+    test = trials_of([r for r in recordings if r.person in options.persons][:: options.every])
+    small = QUICK_FIT if options.quick else FIT
     prior = cached_prior(
-        arguments.out,
-        fitted,
-        fit_kinect_prior,
-        arguments.progress,
-        seed=0,
-        name="UB-people",
-        **small,
+        options.out, fitted, fit_kinect_prior, options.progress, seed=0, name="UB-people", **small
     )
-    wild = spoiled(test, arguments.seed)
-    facts = {"every": arguments.every, "persons": arguments.persons, "seed": arguments.seed}
+    wild = spoiled(test, options.seed)
+    facts = {"every": options.every, "persons": options.persons, "seed": options.seed}
     facts |= {"sequences": len(test.lengths), "frames": int(test.lengths.sum()), **small}
     report = Report("Outliers", facts)
-    bones = with_bones(arguments.data, arguments.persons)
+    bones = with_bones(options.data, options.persons)
     trackers = {"multiple-model": Tracker(prior, bones)} if bones else {}
     trackers |= {
         "window-mixture": Tracker(prior, {"method": "window-mixture"}),
@@ -295,14 +295,13 @@ def run(arguments: argparse.Namespace) -> Report:
     }
     add_many(report, trackers, test, wild)
     add_found(report, next(iter(trackers.values())), test, wild)
-    add_single(report, trackers, test, arguments.seed)
+    add_single(report, trackers, test, options.seed)
     report.findings.append(
         "A keypoint that is left out costs what a missing one does: the numbers of sizes that are all found "
         "are alike."
     )
-    report.save(arguments.out)
     return report
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

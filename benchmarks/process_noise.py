@@ -1,4 +1,4 @@
-"""Factors of the recorded steps' second moment: the error of each method on training persons held out.
+"""Process noise of each method: errors over its factor, on training persons held out.
 
 A prior of s1 to s4 of UTD-MHAD tracks every n-th sequence of s5 and s6 in the test camera, with Q = k S
 for the walks and Q = k diag(S) for the others; the shipped factors are
@@ -8,12 +8,13 @@ for the walks and Q = k diag(S) for the others; the shipped factors are
     python -m benchmarks.process_noise --data DIR --every 5 --methods mkf-fixed mkf-sampled mkf-split
 """
 
-import argparse
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 
+from benchmarks._command import OneOf, run_command
 from benchmarks._upper_body import plain_prior, score, trials_of
 from benchmarks.ub_people import people
 from torchpose.evaluation._common import CAMERA, Trials, track
@@ -27,27 +28,34 @@ FACTORS = {
 SEEN, TRIED = ("s1", "s2", "s3", "s4"), ("s5", "s6")
 
 
-def main() -> None:
-    """Print a line for each method and factor."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
-    parser.add_argument("--every", type=int, default=24, help="take every n-th sequence")
-    parser.add_argument("--methods", nargs="+", choices=FACTORS, default=[*FACTORS])
-    parser.add_argument("--factors", nargs="+", type=float, default=[0.3, 1.0, 10.0, 100.0])
-    parser.add_argument("--particles", type=int, default=3000)
-    arguments = parser.parse_args()
-    train, _ = people(arguments.data)
+def main(
+    *,
+    data: Path,
+    every: int = 24,
+    methods: Annotated[Sequence[str], OneOf(FACTORS)] = tuple(FACTORS),
+    factors: Sequence[float] = (0.3, 1.0, 10.0, 100.0),
+    particles: int = 3000,
+) -> None:
+    """Print a line for each method and factor.
+
+    Args:
+        data: folder of the recordings.
+        every: take every n-th sequence.
+        methods: which trackers.
+        factors: multiples of the recorded steps' second moment.
+        particles: of each particle filter.
+    """
+    train, _ = people(data)
     recipe = UpperBodyRecipe(window_components=0, calibration_folds=0)
     prior = recipe.fit([r for r in train if r.person in SEEN])
-    tried = [r for r in train if r.person in TRIED][:: arguments.every]
+    tried = [r for r in train if r.person in TRIED][::every]
     test = trials_of(tried)
     print(f"{len(test.lengths)} sequences, {int(test.lengths.sum())} frames")
-    for method in arguments.methods:
-        particles = (
-            {"n_particles": arguments.particles} if "n_particles" in method_options(method) else {}
-        )
-        print(f"{method} released: {error(plain_prior(prior), method, particles, test):.2f} cm")
-        for factor in arguments.factors:
+    for method in methods:
+        drawn = "n_particles" in method_options(method)
+        options = {"n_particles": particles} if drawn else {}
+        print(f"{method} released: {error(plain_prior(prior), method, options, test):.2f} cm")
+        for factor in factors:
             ratio = factor / FACTORS[method]
             noise = {name: value for name, value in prior.noise.items() if "increment" in name}
             own = UpperBodyPrior(
@@ -55,17 +63,17 @@ def main() -> None:
             )
             shape = "S" if METHODS[method].noise.walks else "diag(S)"
             print(
-                f"{method} {factor:g} {shape}: {error(own, method, particles, test):.2f} cm",
+                f"{method} {factor:g} {shape}: {error(own, method, options, test):.2f} cm",
                 flush=True,
             )
 
 
 def error(prior: UpperBodyPrior, method: str, options: dict[str, Any], test: Trials) -> float:
-    """Mean 3D error after Procrustes, cm."""
+    """Return the mean 3D error after Procrustes, cm."""
     generator = torch.Generator().manual_seed(0)
     found = score(track(prior, CAMERA, test, method=method, generator=generator, **options), test)
-    return 100 * float(found.errors3d.nanmean())
+    return found.mean_error
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -11,7 +11,6 @@ real-bends of its pictures into the folder of the results.
     python -m benchmarks.real_bends --data DIR --out DIR
 """
 
-import argparse
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,8 +20,9 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._command import run_command
 from benchmarks._depth_silhouettes import HEAD_TOP, PELVIS, Filmed, draw, kinect, one_view, seeded
-from benchmarks.bend.trackees import REDRAWS, SHARPNESS, fit_space
+from benchmarks.bend.variants import REDRAWS, SHARPNESS, fit_space
 from benchmarks.engine import Setting, choose_setting
 from torchpose._core.files import atomic_path, check_output_folder
 from torchpose.body import Body, centres_of, fit_body, fit_state
@@ -59,7 +59,10 @@ class Found(NamedTuple):
 
 
 def prepare(folder: Path, person: str) -> Person:
-    """Bone lengths of the person's other trials, radii of another action's silhouettes."""
+    """Fit the body to other recordings of the person, and the action space to the other persons.
+
+    Bone lengths are those of the person's other trials, radii those of silhouettes of another action.
+    """
     trained = {p: list(kinect(folder, p, ACTION, "1234")) for p in OTHERS}
     plain = {p: fit_body(torch.cat(trials), head_top=HEAD_TOP) for p, trials in trained.items()}
     first = plain[OTHERS[0]]
@@ -82,7 +85,7 @@ def prepare(folder: Path, person: str) -> Person:
 
 
 def track(person: Person, dimensions: int | None, setting: Setting, n: int, seed: int) -> Found:
-    """Estimates from the true first pose."""
+    """Return the estimates from the true first pose."""
     action = None if dimensions is None else person.space.with_dimensions(dimensions)
     tracker = ConstrainedParticleFilter(
         person.body, action, n, process_cov=(setting.scale * person.step_std).square(), likelihood="overlap",
@@ -98,19 +101,23 @@ def track(person: Person, dimensions: int | None, setting: Setting, n: int, seed
 
 
 def squared(person: Person, states: Tensor) -> float:
-    """Mean squared error of the relative angles, degrees^2."""
+    """Return the mean squared error of the relative angles, degrees^2."""
     apart = state_postures(person.body, states) - state_postures(person.body, person.states)
     return float(apart.square().mean())
 
 
 def covered(person: Person, states: Tensor) -> float:
-    """Mean intersection over union with the silhouettes."""
+    """Return the mean intersection over union with the silhouettes."""
     counts = count_pixels(person.body, states[:, None], person.data.rig, person.data.silhouettes)
     return float(intersection_over_union(counts).mean())
 
 
 def errors(person: Person, states: Tensor) -> list[float]:
-    """Angles; joints about the pelvis, across and along the view; the pelvis likewise; coverage."""
+    """Return the numbers of a row, without the shares of accepted and clamped draws.
+
+    These are the error of the angles, that of joints about the pelvis, across and along the view, that of
+    the pelvis across and along the view, and the intersection over union with the silhouettes.
+    """
     gap = 1000 * (person.body.joints(states) - person.data.joints)
     about = gap - gap[:, [PELVIS]]
     root = gap[:, PELVIS]
@@ -123,7 +130,7 @@ def errors(person: Person, states: Tensor) -> list[float]:
 
 
 def tune(judge: Person, dimensions: int | None, n: int) -> Setting:
-    """Noise and exponent with the smallest error of the judge's joints, the same budget for all.
+    """Choose noise and exponent by the error of the judge's joints, each method with the same budget.
 
     Angles leave the root out: by their error a body that has turned over may be the best.
     """
@@ -137,7 +144,7 @@ def tune(judge: Person, dimensions: int | None, n: int) -> Setting:
 def fill(
     report: Report, folder: Path, out: Path, n: int, seeds: int, persons: Sequence[str]
 ) -> None:
-    """The table, the acceptance of true postures, the pictures, and what they say."""
+    """Add the table, the pictures, and findings with the acceptance of true postures."""
     table = report.table(
         "errors", "Picking up and throwing in one real view, mean over persons and seeds",
         ["angles (degrees^2)", "joints (mm)", "across", "along", "pelvis, across", "pelvis, along",
@@ -195,26 +202,35 @@ def _say(report: Report, people: dict[str, Person], rows: dict[str, list[list[fl
         )
 
 
-def main() -> None:
-    """Print the table and write it as Markdown."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder of the data sets")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the results")
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--particles", type=int, default=1000)
-    parser.add_argument("--persons", nargs="+", default=list(TEST))
-    parser.add_argument("--threads", type=int, default=1)
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
-    out = check_output_folder(args.out)
+def main(
+    *,
+    data: Path,
+    out: Path,
+    seeds: int = 3,
+    particles: int = 1000,
+    persons: Sequence[str] = TEST,
+    threads: int = 1,
+) -> None:
+    """Print the table and write it as Markdown.
+
+    Args:
+        data: folder of the data sets.
+        out: folder of the results.
+        seeds: runs of each tracker.
+        particles: of each tracker.
+        persons: who is tracked.
+        threads: cores.
+    """
+    torch.set_num_threads(threads)
+    out = check_output_folder(out)
     report = Report("Real bends", {
-        "seeds": args.seeds, "particles": args.particles, "persons": args.persons, "redraws": REDRAWS,
+        "seeds": seeds, "particles": particles, "persons": persons, "redraws": REDRAWS,
     })  # fmt: skip
-    fill(report, args.data, out, args.particles, args.seeds, args.persons)
+    fill(report, data, out, particles, seeds, persons)
     print(report.summary())
     with atomic_path(out / "real-bends.md") as path:
         path.write_text(report.to_markdown(), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -14,17 +14,17 @@ results.
     python -m benchmarks.real_silhouettes --data DIR --out DIR
 """
 
-import argparse
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._command import run_command
 from benchmarks._depth_silhouettes import (
     HEAD_TOP,
     Filmed,
@@ -70,7 +70,7 @@ Make = Callable[[float], SilhouetteParticleFilter]
 
 
 def four_views(folder: Path) -> Filmed:
-    """Silhouettes of the videos, and the set's triangulated 3D."""
+    """Return the silhouettes of the videos, and the set's triangulated 3D."""
     raw = folder / "multicam_pose2sim" / "raw"
     cameras = list(load_cameras(raw / "Calib_qualisys.toml").values())
     sources = [open_video(raw / f"cam{i:02d}.mp4") for i in range(1, 5)]
@@ -90,13 +90,13 @@ def four_views(folder: Path) -> Filmed:
 
 
 def facing(joints: Tensor) -> Tensor:
-    """Where the person of a frame looks, level, z up."""
+    """Return the horizontal direction in which the person of a frame looks, z up."""
     left = joints[BODY_15.joint("left_shoulder")] - joints[BODY_15.joint("right_shoulder")]
     return torch.linalg.cross(left, torch.tensor([0.0, 0.0, 1.0], dtype=left.dtype))
 
 
 def report_four(report: Report, folder: Path, seeds: int, out: Path) -> None:
-    """Difference from the triangulated 3D, from a given first pose and from one that is found."""
+    """Add the difference from the triangulated 3D, from a given first pose and from one that is found."""
     data = four_views(folder)
     table = report.table(
         "four", "Four cameras: distance from the triangulated 3D (mm)", ["all", *PARTS],
@@ -137,7 +137,7 @@ def report_four(report: Report, folder: Path, seeds: int, out: Path) -> None:
 def plain_filters(
     body: Body, process_cov: Tensor | None, limits: JointLimits | None = None
 ) -> dict[str, Make]:
-    """SIR and the annealed filter of as many likelihoods a frame."""
+    """Return SIR and the annealed filter, with equally many likelihoods a frame."""
     return {
         "SIR": lambda s: SIRParticleFilter(
             body, N_PARTICLES, process_cov=process_cov, sharpness=s, limits=limits
@@ -161,7 +161,7 @@ class Person(NamedTuple):
 
 
 def prepare(folder: Path, person: str, action: str) -> Person:
-    """Bone lengths from trials 2 to 4, radii from frames of another action's silhouettes."""
+    """Fit bone lengths to trials 2 to 4, radii to another action's silhouettes, and a manifold to others."""
     own = list(kinect(folder, person, action, "234"))
     body = fit_body(torch.cat(own), head_top=HEAD_TOP)
     other = one_view(folder, person, "clap" if action != "clap" else "wave")
@@ -185,7 +185,7 @@ def prepare(folder: Path, person: str, action: str) -> Person:
 
 
 def filters_of(person: Person) -> dict[str, Make]:
-    """The filters, the manifold's in its exact and its published form, with the same noise and limits."""
+    """Return all filters with the same noise and limits; the manifold's exact and as published."""
     common = {"process_cov": person.step_std.square(), "limits": person.limits}
 
     def with_manifold(options: dict[str, str]) -> Make:
@@ -200,14 +200,14 @@ def filters_of(person: Person) -> dict[str, Make]:
 
 
 def run(person: Person, make: Make, sharpness: float, data: Filmed, seed: int) -> Tensor:
-    """Joints of the estimates [T, 15, 3]."""
+    """Return the joints of the estimates [T, 15, 3]."""
     start = fit_state(person.body, data.joints[:1])[0]
     track = make(sharpness)(data.silhouettes, data.rig, start, generator=seeded(seed))
     return person.body.joints(track.mean)
 
 
 def report_one(report: Report, folder: Path, seeds: int, actions: Sequence[str], out: Path) -> None:
-    """Error of a single view, for each action."""
+    """Add the error of a single view, for each action."""
     centred = report.table(
         "one", "One depth camera: error without the place of the pelvis (mm)", ["all", *PARTS],
         note=f"Persons {', '.join(TEST)}, trial 1, {N_PARTICLES} likelihoods a frame, {seeds} seeds; "
@@ -238,7 +238,7 @@ def report_one(report: Report, folder: Path, seeds: int, actions: Sequence[str],
 
 
 def best_sharpness(folder: Path, action: str) -> dict[str, float]:
-    """The exponent of each filter with the smallest error on a person who is not tracked."""
+    """Return the exponent of each filter with the smallest error on a person who is not tracked."""
     data, person = one_view(folder, TUNING, action), prepare(folder, TUNING, action)
 
     def error(make: Make, sharpness: float) -> float:
@@ -250,29 +250,38 @@ def best_sharpness(folder: Path, action: str) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    """Print the tables and write them as Markdown."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder of the data sets")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the results")
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--only", choices=["four", "one"])
-    parser.add_argument("--actions", nargs="+", default=list(ACTIONS))
-    parser.add_argument("--threads", type=int, default=2)
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
-    out = check_output_folder(args.out)
+def main(
+    *,
+    data: Path,
+    out: Path,
+    seeds: int = 3,
+    only: Literal["four", "one"] | None = None,
+    actions: Sequence[str] = ACTIONS,
+    threads: int = 2,
+) -> None:
+    """Print the tables and write them as Markdown.
+
+    Args:
+        data: folder of the data sets.
+        out: folder of the results.
+        seeds: runs of each tracker.
+        only: the tables of four cameras, or of one.
+        actions: in one camera.
+        threads: cores.
+    """
+    torch.set_num_threads(threads)
+    out = check_output_folder(out)
     report = Report("Real silhouettes", {
-        "seeds": args.seeds, "particles": N_PARTICLES, "actions": args.actions, "threads": args.threads
+        "seeds": seeds, "particles": N_PARTICLES, "actions": actions, "threads": threads
     })  # fmt: skip
-    if args.only != "one":
-        report_four(report, args.data, args.seeds, out)
-    if args.only != "four":
-        report_one(report, args.data, args.seeds, args.actions, out)
+    if only != "one":
+        report_four(report, data, seeds, out)
+    if only != "four":
+        report_one(report, data, seeds, actions, out)
     print(report.summary())
     with atomic_path(out / "real-silhouettes.md") as path:
         path.write_text(report.to_markdown(), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -238,6 +238,6 @@ def time_step(tracker: Tracker, test: Trials, n_steps: int = 20) -> float:
 
 
 if __name__ == "__main__":
-    from benchmarks._command import main
+    from benchmarks._protocols import run_protocol
 
-    main("ub_one")
+    run_protocol("ub_one")

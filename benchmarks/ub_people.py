@@ -273,6 +273,6 @@ def nearest_neighbour(
 
 
 if __name__ == "__main__":
-    from benchmarks._command import main
+    from benchmarks._protocols import run_protocol
 
-    main("ub_people")
+    run_protocol("ub_people")

@@ -1,4 +1,4 @@
-"""How much persons differ: the training persons of UB-people, each tracked by a prior of the others.
+"""Differences between persons: each training person of UB-people, tracked by a prior of the others.
 
 For each of s1 to s6 a prior is fitted to the other five, without calibration, and tracks that person
 in the test camera. Scale and floor of the covariances then come from the errors of the other five,
@@ -10,7 +10,6 @@ and tracked is kept in the folder of the report.
     python -m benchmarks.ub_people_by_person --data DIR --out DIR
 """
 
-import argparse
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +18,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._command import run_command
 from benchmarks._upper_body import TRACKING, Tracker, trials_of
 from benchmarks.engine import Grid, describe
 from benchmarks.ub_people import people
@@ -35,6 +35,30 @@ from torchpose.metrics import align, coverage
 LEVELS = (0.5, 0.9)
 
 
+class Options(NamedTuple):
+    """What is fitted and tracked.
+
+    Attributes:
+        data: folder of kinect_utd_mhad.
+        out: folder for what is kept, and the report.
+        window_components: by default as the shipped prior.
+        window_samples: by default as the shipped prior.
+        every: track every n-th sequence.
+        seed: of fits and noise.
+        threads: cores.
+        quick: small, to see that all of it works.
+    """
+
+    data: Path
+    out: Path
+    window_components: int | None = None
+    window_samples: int | None = None
+    every: int = 1
+    seed: int = 0
+    threads: int = 2
+    quick: bool = False
+
+
 class HeldOut(NamedTuple):
     """Aligned estimates, covariances and truth of a person whom the prior never saw, [N, 8, ...]."""
 
@@ -44,22 +68,22 @@ class HeldOut(NamedTuple):
 
 
 def hold_out(
-    recordings: list[Recording], arguments: argparse.Namespace
+    recordings: list[Recording], options: Options
 ) -> Iterator[tuple[str, Trials, Tracker]]:
     """Yield every person with sequences and a tracker whose prior is of all others."""
-    settings = {"seed": arguments.seed, "calibration_folds": 0, "name": "ub-people-by-person"}
-    if arguments.quick:
+    settings = {"seed": options.seed, "calibration_folds": 0, "name": "ub-people-by-person"}
+    if options.quick:
         settings |= QUICK | {"n_samples": 3000, "window_steps": 5}
     else:
         settings |= {
-            "window_components": arguments.window_components,
-            "window_samples": arguments.window_samples,
+            "window_components": options.window_components,
+            "window_samples": options.window_samples,
         }
     for person in tqdm(sorted({r.person for r in recordings if r.person}), desc="persons held out"):
         seen = [r for r in recordings if r.person != person]
-        own = [r for r in recordings if r.person == person][:: arguments.every]
-        prior = cached_prior(arguments.out, seen, fit_kinect_prior, False, **settings)
-        yield person, trials_of(own, arguments.seed), Tracker(prior, {})
+        own = [r for r in recordings if r.person == person][:: options.every]
+        prior = cached_prior(options.out, seen, fit_kinect_prior, False, **settings)
+        yield person, trials_of(own, options.seed), Tracker(prior, {})
 
 
 def aligned(found: Estimate, test: Trials) -> HeldOut:
@@ -75,7 +99,7 @@ def aligned(found: Estimate, test: Trials) -> HeldOut:
 
 
 def calibrated_coverage(person: str, parts: dict[str, HeldOut]) -> Tensor:
-    """Share inside the ellipsoids [2, 8], calibrated on all other persons."""
+    """Return shares inside the ellipsoids [2, 8], calibrated on all other persons."""
     others = [part for name, part in parts.items() if name != person]
     errors = torch.cat([part.points - part.truth for part in others])
     scale, floor = fit_calibration(errors, torch.cat([part.covs for part in others]), LEVELS)
@@ -105,35 +129,23 @@ def fill(report: Report, parts: dict[str, HeldOut]) -> None:
     describe(report, "persons", title, numbers, columns, digits=2)
 
 
-def main() -> None:
-    """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", required=True, type=Path, help="folder of kinect_utd_mhad")
-    parser.add_argument(
-        "--out", required=True, type=Path, help="folder for what is kept, and the report"
-    )
-    parser.add_argument("--window-components", type=int, help="by default as the shipped prior")
-    parser.add_argument("--window-samples", type=int, help="by default as the shipped prior")
-    parser.add_argument("--every", type=int, default=1, help="track every n-th sequence")
-    parser.add_argument("--seed", type=int, default=0, help="of fits and noise")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--quick", action="store_true", help="small, to see that all of it works")
-    arguments = parser.parse_args()
-    arguments.out = check_output_folder(arguments.out)
-    torch.set_num_threads(arguments.threads)
-    recordings, _ = people(arguments.data, arguments.quick)
+def main(options: Options) -> None:
+    """Fit, track, write the report and print it."""
+    check_output_folder(options.out)
+    torch.set_num_threads(options.threads)
+    recordings, _ = people(options.data, options.quick)
     tests, grids = {}, {}
-    for person, test, tracker in hold_out(recordings, arguments):
+    for person, test, tracker in hold_out(recordings, options):
         tests[person] = test
         grids[person] = Grid({person: test}, {"prior of the others": tracker})
-    found = TRACKING.run(grids, (arguments.seed,), arguments.out)
+    found = TRACKING.run(grids, (options.seed,), options.out)
     parts = {row.subject: aligned(row.run, tests[row.subject]) for row in found.rows}
     shown = ("window_components", "window_samples", "every", "seed", "quick")
-    report = Report("UB-people by person", {name: getattr(arguments, name) for name in shown})
+    report = Report("UB-people by person", {name: getattr(options, name) for name in shown})
     fill(report, parts)
-    report.save(arguments.out)
+    report.save(options.out)
     print(report.to_markdown())
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -1,4 +1,4 @@
-"""What each choice of the recipe gave: the tracker of UB-people with one of them changed at a time.
+"""Gain of each choice of the recipe: the tracker of UB-people with one of them changed at a time.
 
 Measured on training persons alone: s1, s2, s4 and s5 of UTD-MHAD are fitted, and every third sequence
 of s3 and s6 is tracked from head, neck and hands with 3 px noise, as `python -m benchmarks.ub_people`
@@ -10,20 +10,19 @@ alone repeat the default's. "another seed" says how far two fits of the same kin
 
     python -m benchmarks.ub_people_levers --data DIR --out DIR [--only GROUP ...] [--seeds 0 1]
 
-All of it takes hours. Fits and finished rows lie in the folder `--out` and are read from there the
-next time; levers.md there holds the table as far as it goes. After a change of the tracker delete
-results.json, after one of the fit the folder.
+All of it takes hours. Fits and finished rows are kept in the folder `--out`, so that a run that was
+stopped goes on; levers.md there holds the table as far as it goes.
 """
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean, stdev
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from tqdm.auto import tqdm
 
+from benchmarks._command import OneOf, run_command
 from benchmarks._levers import (
     FIT_PERSONS,
     MODES,
@@ -46,7 +45,7 @@ HEADER = ("lever", "filtered (cm)", "jitter", "fit (s)", "smoothed (cm)", "jitte
 
 
 def layouts(own: Sequence[int], other: Sequence[int]) -> dict[str, WindowLayout]:
-    """Lags of the past for the filter; to both sides for the smoother."""
+    """Return the lags of both hands: of the past for the filter, to both sides for the smoother."""
     there, elsewhere = (
         tuple(dict.fromkeys(sign * lag for lag in lags for sign in (1, -1)))
         for lags in (own, other)
@@ -58,12 +57,12 @@ def layouts(own: Sequence[int], other: Sequence[int]) -> dict[str, WindowLayout]
 
 
 def without_bodies(**kept: float) -> Windows:
-    """Windows of bodies as they were recorded, but for what is given."""
+    """Return windows of bodies as they were recorded, but for the given changes."""
     return Windows(bodies=tuple(({"body_size": 0.0, "bone_lengths": 0.0} | kept).items()))
 
 
 def levers() -> list[Lever]:
-    """All rows of the table, those of most interest first."""
+    """Return all rows of the table, the most interesting first."""
     ou = {"transition": "ou"}
     return [
         Lever("default", "default"),
@@ -118,33 +117,41 @@ def _power(power: float) -> dict[str, float]:
     return {"likelihood_power": power}
 
 
+GROUPS = tuple(dict.fromkeys(lever.group for lever in levers()))
+
+
 class Task(NamedTuple):
     """One number of the table."""
 
-    key: str
     lever: Lever
     mode: str
     seed: int
 
 
 def cells(found: Sequence[Measured], n_seeds: int) -> tuple[str, str, str]:
-    """Error, jitter and seconds, means over seeds; dashes until all seeds are there."""
+    """Return error, jitter and seconds, means over seeds; dashes until all seeds are there."""
     if len(found) < n_seeds:
         return "-", "-", "-"
-    errors = [one.error for one in found]
+    errors, jitters, seconds = (
+        [float(getattr(one, name)) for one in found] for name in ("error", "jitter", "seconds")
+    )
     spread = f" ± {stdev(errors):.2f}" if n_seeds > 1 else ""
-    jitter, seconds = (mean(values) for values in zip(*((m[1], m[2]) for m in found), strict=True))
-    return f"{mean(errors):.2f}{spread}", f"{jitter:.1f}", f"{seconds:.0f}"
+    return f"{mean(errors):.2f}{spread}", f"{mean(jitters):.1f}", f"{mean(seconds):.0f}"
 
 
-def table(tasks: Sequence[Task], known: dict[str, Measured], n_seeds: int) -> str:
-    """The Markdown table, and what was learnt about the noise."""
+def table(tasks: Sequence[Task], known: Sequence[Measured], n_seeds: int) -> str:
+    """Return the Markdown table, and what was learnt about the noise.
+
+    Args:
+        tasks: numbers of the table. known: what was measured for the first of them.
+        n_seeds: number of seeds.
+    """
+    done = list(zip(tasks, known, strict=False))
     rows, notes = [], []
     for lever in dict.fromkeys(task.lever.name for task in tasks):
         row = [lever]
         for mode in MODES:
-            own = [t for t in tasks if t.lever.name == lever and t.mode == mode]
-            found = [known[t.key] for t in own if t.key in known]
+            found = [m for task, m in done if (task.lever.name, task.mode) == (lever, mode)]
             row += cells(found, n_seeds)
             notes += [f"{lever}: {m.note}." for m in found if m.note]
         rows.append(row)
@@ -152,7 +159,7 @@ def table(tasks: Sequence[Task], known: dict[str, Measured], n_seeds: int) -> st
 
 
 def settings_line(bench: Bench, seeds: Sequence[int]) -> str:
-    """What was fitted and tracked."""
+    """Return a line on what was fitted and tracked."""
     test, size = bench.persons.test, bench.size
     return (
         f"Fitted: {len(bench.persons.fitted)} sequences of {', '.join(FIT_PERSONS)}; tracked: "
@@ -163,45 +170,43 @@ def settings_line(bench: Bench, seeds: Sequence[int]) -> str:
     )
 
 
-def options() -> argparse.Namespace:
-    """The command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder with kinect_utd_mhad/")
-    parser.add_argument("--out", type=Path, required=True, help="folder of fits, rows and table")
-    groups = list(dict.fromkeys(lever.group for lever in levers()))
-    parser.add_argument("--only", nargs="+", choices=groups, help="groups of rows")
-    parser.add_argument("--modes", nargs="+", choices=list(MODES), help="one of both columns")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of the fits")
-    parser.add_argument("--threads", type=int, default=2, help="cores")
-    parser.add_argument("--quick", action="store_true", help="tiny fits, to see that it works")
-    return parser.parse_args()
+def main(
+    *,
+    data: Path,
+    out: Path,
+    only: Annotated[Sequence[str], OneOf(GROUPS)] | None = None,
+    modes: Annotated[Sequence[str], OneOf(MODES)] = tuple(MODES),
+    seeds: Sequence[int] = (0,),
+    threads: int = 2,
+    quick: bool = False,
+) -> None:
+    """Measure what is missing, filtered before smoothed, and print the table.
 
-
-def main() -> None:
-    """Measure what is missing, filtered before smoothed, and print the table."""
-    args = options()
-    torch.set_num_threads(args.threads)
-    size = QUICK if args.quick else Size()
-    bench = Bench(read_persons(args.data, size), size, check_output_folder(args.out))
-    chosen = [lever for lever in levers() if not args.only or lever.group in args.only]
-    tasks = [
-        Task(bench.key(lever, mode, seed), lever, mode, seed)
-        for mode in args.modes or MODES
-        for lever in chosen
-        for seed in args.seeds
-    ]
-    lines = [settings_line(bench, args.seeds), machine_line(args.threads)]
+    Args:
+        data: folder with kinect_utd_mhad/.
+        out: folder of fits, rows and table.
+        only: groups of rows.
+        modes: one of both columns.
+        seeds: of the fits.
+        threads: cores.
+        quick: tiny fits, to see that it works.
+    """
+    torch.set_num_threads(threads)
+    size = QUICK if quick else Size()
+    bench = Bench(read_persons(data, size), size, check_output_folder(out))
+    chosen = [lever for lever in levers() if only is None or lever.group in only]
+    tasks = [Task(lever, mode, seed) for mode in modes for lever in chosen for seed in seeds]
+    lines = [settings_line(bench, seeds), machine_line(threads)]
+    known: list[Measured] = []
     bar = tqdm(tasks, unit="row", smoothing=0.0)
     for task in bar:
         bar.set_postfix_str(f"{task.lever.name}, {task.mode}")
-        if task.key not in bench.known():
-            which = task.lever, task.mode, task.seed
-            bench.store(task.key, *which, bench.measure(*which))
-        text = "\n\n".join([table(tasks, bench.known(), len(args.seeds)), *lines]) + "\n"
-        with atomic_path(args.out / "levers.md") as temporary:
+        known.append(bench.measure(*task))
+        text = "\n\n".join([table(tasks, known, len(seeds)), *lines]) + "\n"
+        with atomic_path(out / "levers.md") as temporary:
             temporary.write_text(text, encoding="utf-8")
     print(text, end="")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -1,4 +1,4 @@
-"""What it costs when a person is not where the prior's persons were: to the side, farther, nearer.
+"""Errors of persons who stand to the side, farther or nearer than the prior's persons.
 
 A prior is fitted to the training persons s1 to s3 of UB-people and tracks s4 to s6 in the test camera,
 still at the usual place (about 2 m away), walking in a circle, and standing elsewhere. Windows see
@@ -7,13 +7,13 @@ the body by a virtual camera that follows it (`torchpose.camera._virtual_camera`
     python -m benchmarks.ub_people_places --data DIR --out DIR
 """
 
-import argparse
 from pathlib import Path
 
 import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._command import run_command
 from benchmarks._upper_body import score
 from benchmarks.ub_people import people, sway
 from torchpose._core.files import check_output_folder
@@ -46,7 +46,7 @@ PLACES = {
 
 
 def paths(name: str, poses: list[Tensor], fps: float) -> list[Tensor]:
-    """Where the bodies are in every frame of each sequence [T, 3], metres from the usual place."""
+    """Return the places of the bodies in every frame of each sequence [T, 3], metres from the usual one."""
     if name == "walking in a circle":
         return [sway(len(p), fps, i / len(poses)) for i, p in enumerate(poses)]
     place = torch.tensor(PLACES[name], dtype=torch.float64)
@@ -54,43 +54,52 @@ def paths(name: str, poses: list[Tensor], fps: float) -> list[Tensor]:
 
 
 def error(prior: UpperBodyPrior, test: Trials, options: dict[str, object]) -> str:
-    """Mean 3D error after Procrustes, cm."""
+    """Return the mean 3D error after Procrustes, cm."""
     errors = score(track_test(prior, CAMERA, test, **options), test).errors3d
     return f"{float(errors[test.inside].mean()) * 100:.2f}"
 
 
-def main() -> None:
-    """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", required=True, type=Path, help="folder of kinect_utd_mhad")
-    parser.add_argument("--out", required=True, type=Path, help="folder for the fitted prior")
-    parser.add_argument("--every", type=int, default=6, help="track every n-th sequence")
-    parser.add_argument("--seed", type=int, default=0, help="of fit and noise")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--quick", action="store_true", help="small, to see that all of it works")
-    arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
-    out = check_output_folder(arguments.out)
-    recordings, _ = people(arguments.data, arguments.quick)
-    sizes = (4, 8, 3000) if arguments.quick else (30, 120, 60_000)
+def main(
+    *,
+    data: Path,
+    out: Path,
+    every: int = 6,
+    seed: int = 0,
+    threads: int = 2,
+    quick: bool = False,
+) -> None:
+    """Fit, track and print the table.
+
+    Args:
+        data: folder of kinect_utd_mhad.
+        out: folder for the fitted prior.
+        every: track every n-th sequence.
+        seed: of fit and noise.
+        threads: cores.
+        quick: small, to see that all of it works.
+    """
+    torch.set_num_threads(threads)
+    out = check_output_folder(out)
+    recordings, _ = people(data, quick)
+    sizes = (4, 8, 3000) if quick else (30, 120, 60_000)
     settings = dict(
         zip(("n_components", "window_components", "window_samples"), sizes, strict=True)
     )
-    if arguments.quick:
+    if quick:
         settings |= {"n_samples": 3000, "window_steps": 5}
     prior = cached_prior(
         out, [r for r in recordings if r.person in FITTED], fit_kinect_prior, True,
-        seed=arguments.seed, calibration_folds=0, name="ub-people-places", **settings,
+        seed=seed, calibration_folds=0, name="ub-people-places", **settings,
     )  # fmt: skip
-    tracked = [r for r in recordings if r.person in TRACKED][:: arguments.every]
+    tracked = [r for r in recordings if r.person in TRACKED][::every]
     poses, fps = [centred_on_neck(r.upper_body().joints) for r in tracked], tracked[0].fps or 30.0
     print(f"| 3D error (cm), {sum(map(len, poses)):,} frames | {' | '.join(TRACKERS)} |")
     print("| --- |" + " ---: |" * len(TRACKERS))
     for name in tqdm([*PLACES, "walking in a circle"], desc="places"):
-        test = make_test_set(poses, CAMERA, fps, arguments.seed, paths=paths(name, poses, fps))
+        test = make_test_set(poses, CAMERA, fps, seed, paths=paths(name, poses, fps))
         row = " | ".join(error(prior, test, options) for options in TRACKERS.values())
         tqdm.write(f"| {name} | {row} |")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

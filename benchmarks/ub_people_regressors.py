@@ -18,16 +18,17 @@ and its spread are printed.
 `--report` prints the rows of a finished `python -m benchmarks.ub_people` beside them.
 """
 
-import argparse
 import json
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
+from benchmarks._command import run_command
 from benchmarks._upper_body import score
 from benchmarks.ub_people import people, sway
 from torchpose.camera import project, sample_viewpoints
@@ -53,7 +54,7 @@ METRES = 0.2  # scale of the targets
 
 
 def features(keypoints: Tensor) -> Tensor:
-    """Head and hands relative to the neck, and the neck, [..., 8], about 1 in size."""
+    """Return head and hands relative to the neck, and the neck, [..., 8], scaled to about 1."""
     neck = keypoints[..., 1:2, :]
     centre = keypoints.new_tensor([319.5, 239.5])
     rest = keypoints[..., [0, 2, 3], :] - neck
@@ -61,13 +62,13 @@ def features(keypoints: Tensor) -> Tensor:
 
 
 def views(n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Rotation [n, 3, 3] and translation [n, 3] of random training viewpoints, float32."""
+    """Draw rotation [n, 3, 3] and translation [n, 3] of training viewpoints, float32."""
     found = sample_viewpoints(n, TRAINING_VIEWS, generator)
     return euler_to_matrix(found.angles, "zxy").float(), found.translation.float()
 
 
 def examples(poses: Tensor, targets: str, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Inputs [N, T, 8] and targets [N, T, 24] of sequences [N, T, 8, 3], each from one viewpoint."""
+    """Return inputs [N, T, 8] and targets [N, T, 24] of sequences [N, T, 8, 3], each from one viewpoint."""
     flip = torch.rand(len(poses), generator=generator) < 0.5
     poses = torch.where(flip[:, None, None, None], mirror_pose(poses), poses)
     rotation, translation = views(len(poses), generator)
@@ -88,7 +89,7 @@ class Recurrent(nn.Module):
         self.out = nn.Linear(256 if both else 128, 24)
 
     def forward(self, x: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """Outputs [B, T, 24]; what lies past a length is not read, backwards neither."""
+        """Return outputs [B, T, 24]; in both directions, frames past a length are not read."""
         if lengths is None:
             return self.out(self.cells(x)[0])
         packed = nn.utils.rnn.pack_padded_sequence(x, lengths, True, enforce_sorted=False)
@@ -105,7 +106,7 @@ def multilayer() -> nn.Module:
 
 
 def train_frames(poses: list[Tensor], targets: str, seed: int, quick: bool) -> nn.Module:
-    """The per-frame MLP on 100,000 projected poses."""
+    """Train the per-frame MLP on 100,000 projected poses."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     frames = torch.cat(poses)
@@ -124,7 +125,7 @@ def train_frames(poses: list[Tensor], targets: str, seed: int, quick: bool) -> n
 def train_sequences(
     poses: list[Tensor], targets: str, seed: int, quick: bool, both: bool
 ) -> nn.Module:
-    """A GRU on random pieces of 64 frames of the training sequences."""
+    """Train a GRU on random pieces of 64 frames of the training sequences."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     lengths = torch.tensor([len(p) for p in poses])
@@ -145,7 +146,7 @@ def train_sequences(
 def fit(
     model: nn.Module, batch: Callable[[int], tuple[Tensor, Tensor]], n_steps: int, label: str
 ) -> None:
-    """Adam with one cycle of the learning rate; the loss is the mean distance of the joints."""
+    """Fit a model by Adam with one cycle of the learning rate, to the mean distance of the joints."""
     adam = torch.optim.Adam(model.parameters(), lr=2e-3)
     cycle = torch.optim.lr_scheduler.OneCycleLR(adam, 2e-3, total_steps=n_steps)
     for step in tqdm(range(n_steps), desc=label, leave=False):
@@ -159,7 +160,7 @@ def fit(
 
 
 def estimate(model: nn.Module, test: Trials) -> Estimate:
-    """Poses of a test set. The regressors give no pixels: those are NaN."""
+    """Return the poses of a test set; pixels are NaN, since the regressors give none."""
     with torch.inference_mode():
         inputs = features(test.keypoints).nan_to_num().float()
         found = model(inputs, test.lengths) if isinstance(model, Recurrent) else model(inputs)
@@ -167,17 +168,24 @@ def estimate(model: nn.Module, test: Trials) -> Estimate:
     return Estimate(torch.full_like(test.truth2d, torch.nan), joints)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, required=True, help="folder kinect_utd_mhad")
-    parser.add_argument("--report", type=Path, help="report.json of python -m benchmarks.ub_people")
-    parser.add_argument("--seeds", type=int, default=1, help="runs of each; ten minutes each")
-    parser.add_argument("--targets", choices=("body", "camera"), default="body")
-    parser.add_argument("--quick", action="store_true", help="a minute, to see that it works")
-    args = parser.parse_args()
-    train, tested = people(args.data, args.quick)
+def main(
+    *,
+    data: Path,
+    report: Path | None = None,
+    seeds: int = 1,
+    targets: Literal["body", "camera"] = "body",
+    quick: bool = False,
+) -> None:
+    """Train, score and print the table.
+
+    Args:
+        data: folder kinect_utd_mhad.
+        report: report.json of python -m benchmarks.ub_people.
+        seeds: runs of each; ten minutes each.
+        targets: axes of the poses that are learnt.
+        quick: a minute, to see that it works.
+    """
+    train, tested = people(data, quick)
     poses = [centred_on_neck(r.upper_body().joints).float() for r in train]
     unseen = [centred_on_neck(r.upper_body().joints) for r in tested]
     fps = tested[0].fps or 30.0
@@ -185,15 +193,15 @@ def main() -> None:
     paths = [sway(len(p), fps, i / len(unseen)) for i, p in enumerate(unseen)]
     moving = make_test_set(unseen, CAMERA, fps, paths=paths)
     trainers: dict[str, Callable[[int], nn.Module]] = {
-        "MLP, per frame": lambda s: train_frames(poses, args.targets, s, args.quick),
-        "GRU, causal": lambda s: train_sequences(poses, args.targets, s, args.quick, False),
-        "GRU, both directions": lambda s: train_sequences(poses, args.targets, s, args.quick, True),
+        "MLP, per frame": lambda s: train_frames(poses, targets, s, quick),
+        "GRU, causal": lambda s: train_sequences(poses, targets, s, quick, False),
+        "GRU, both directions": lambda s: train_sequences(poses, targets, s, quick, True),
     }
-    n_seeds = 1 if args.quick else args.seeds
-    report = Report("UB-people, learned regressors")
-    table = report.table(
+    n_seeds = 1 if quick else seeds
+    tables = Report("UB-people, learned regressors")
+    table = tables.table(
         "errors_3d",
-        f"3D error after Procrustes (cm), {n_seeds} seed(s), targets in {args.targets} axes",
+        f"3D error after Procrustes (cm), {n_seeds} seed(s), targets in {targets} axes",
         ["mean", "spread", "moving root", "jitter (m/s2)", *SHORT_NAMES, "training (s)"],
         digits=(2, 2, 2, 1, *[1] * 8, 0),
     )
@@ -206,7 +214,7 @@ def main() -> None:
             found = score(estimate(model, still), still)
             moved = score(estimate(model, moving), moving)
             rows.append([
-                100 * float(found.errors3d.nanmean()), 100 * float(moved.errors3d.nanmean()),
+                found.mean_error, moved.mean_error,
                 float(found.jitter.mean()), *(100 * found.errors3d.flatten(0, 1).nanmean(0)).tolist(),
                 seconds,
             ])  # fmt: skip
@@ -214,13 +222,13 @@ def main() -> None:
         spread = float(values[:, 0].std()) if len(rows) > 1 else float("nan")
         mean = values.mean(0).tolist()
         table.add(name, [mean[0], spread, *mean[1:]])
-    if args.report:
-        add_finished_rows(report, args.report)
-    print(report.summary())
+    if report is not None:
+        add_finished_rows(tables, report)
+    print(tables.summary())
 
 
 def add_finished_rows(report: Report, path: Path) -> None:
-    """The methods of a finished run of the protocol, below the regressors."""
+    """Add the methods of a finished run of the protocol below the regressors."""
     tables = json.loads(path.read_text(encoding="utf-8"))["tables"]
     moved = tables["moving_root_3d"]["rows"]
     for name, row in tables["errors_3d"]["rows"].items():
@@ -232,4 +240,4 @@ def add_finished_rows(report: Report, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -1,4 +1,4 @@
-"""What uncommon poses cost: UB-people, with training recordings of raised arms left out.
+"""Errors on uncommon poses: UB-people, with training recordings of raised arms left out.
 
 Three priors of the training persons of UB-people: one of all their recordings, one without those in
 which an arm is raised for long, and one without as many frames of recordings drawn at random, so
@@ -139,6 +139,6 @@ def without_raised(
 
 
 if __name__ == "__main__":
-    from benchmarks._command import main
+    from benchmarks._protocols import run_protocol
 
-    main("uncommon_poses")
+    run_protocol("uncommon_poses")

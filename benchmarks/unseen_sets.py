@@ -1,4 +1,4 @@
-"""Arms of persons of a set that no prior knows, beside learned lifters: leave one set out.
+"""Arms of persons of a data set that is left out of every fit, beside learned lifters.
 
 Each of four sets in turn is left out of the prior over arms (`bones.SETS`), of the tracker's prior (the other
 Kinect sets; for Berkeley MHAD the one that comes with torchpose) and of the lifters (`_lifters`). Its
@@ -12,7 +12,6 @@ Two tables for each set: all joints measured, and neck, hands and head (Berkeley
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -23,12 +22,13 @@ from torch import Tensor
 
 import torchpose
 from benchmarks import bones
+from benchmarks._command import run_command
 from benchmarks._lifters import FEW, LIFTERS, Lifter, fit_lifter
-from benchmarks._table_file import table_file
+from benchmarks._table_file import TableFile
 from torchpose.evaluation import Report
 from torchpose.learning import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
-from torchpose.priors._arms import ArmPrior
+from torchpose.priors._arms import ArmPrior, shipped_arm_prior
 from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
 from torchpose.skeleton._torso import KINECT_NECK
 
@@ -68,7 +68,7 @@ def leave_out(data: Path, name: str, quick: bool) -> Unseen:
         data: folder with the sets. name: one of `bones.SETS`. quick: few recordings and
             steps, and the priors that come with torchpose.
     """
-    arms = bones.shipped_arm_prior() if quick else bones.fit_without(data, name)
+    arms = shipped_arm_prior() if quick else bones.fit_without(data, name)
     if name == _MHAD:
         views, few = bones.mhad_views(data, 150 if quick else 15), bones.FEW
         views = [bones.begun(view) for view in views] if quick else views
@@ -143,23 +143,26 @@ def add_set(report: Report, name: str, unseen: Unseen) -> None:
             table.add(row, scored.nanmean(0)[_ROWS])
 
 
-def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder with the sets")
-    parser.add_argument("--threads", type=int, default=2, help="cores")
-    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
-    parser.add_argument("--quick", action="store_true", help="one set, few recordings")
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
+def main(
+    *, data: Path, threads: int = 2, out: TableFile | None = None, quick: bool = False
+) -> None:
+    """Print the tables.
+
+    Args:
+        data: folder with the sets.
+        threads: cores.
+        out: file for the same as Markdown, or a folder.
+        quick: one set, few recordings.
+    """
+    torch.set_num_threads(threads)
     report = Report("Sets that nobody knows")
-    for name in (_MHAD,) if args.quick else (*_KINECT, _MHAD):
-        add_set(report, name, leave_out(args.data, name, args.quick))
+    for name in (_MHAD,) if quick else (*_KINECT, _MHAD):
+        add_set(report, name, leave_out(data, name, quick))
     tables = [table.to_markdown() for table in report.values()]
     print("\n\n".join(tables))
-    if args.out is not None:
-        args.out.write_text("\n\n".join(tables) + "\n")
+    if out is not None:
+        out.write_text("\n\n".join(tables) + "\n")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -10,7 +10,6 @@ its Figure 12 has the pipeline with and without background subtraction, as here.
     python -m benchmarks.video_asl_joints --data DIR --out video-joints.md --pictures DIR
 """
 
-import argparse
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -19,7 +18,8 @@ import torch
 from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, FPS, GROUPS, SIZE, VISIBLE, Clip, read_clip
-from benchmarks._table_file import table_file
+from benchmarks._command import run_command
+from benchmarks._table_file import TableFile
 from torchpose._core.files import check_output_folder
 from torchpose.camera import PinholeCamera
 from torchpose.evaluation import Report
@@ -40,7 +40,7 @@ Method = Callable[[Clip], Tensor]
 
 
 def from_video(folder: Path, prior: UpperBodyPrior, background: bool) -> Method:
-    """Joints [T, 8, 2] of the person seen longest, by the pipeline."""
+    """Return a method: joints [T, 8, 2] of the person seen longest, by the pipeline."""
 
     def run(clip: Clip) -> Tensor:
         video = open_video(folder / f"{clip.name}.mkv")
@@ -63,7 +63,7 @@ def from_video(folder: Path, prior: UpperBodyPrior, background: bool) -> Method:
 
 
 def watched(frames: Iterable[VideoFrame], own: list[int]) -> Iterator[VideoFrame]:
-    """The frames; `own` gets the indices of those that are no repetition of the one before.
+    """Yield the frames, and add the indices of those that differ from the one before to `own`.
 
     A video that lacks a frame is read with the one before twice; MediaPipe saw what there is.
     """
@@ -76,7 +76,7 @@ def watched(frames: Iterable[VideoFrame], own: list[int]) -> Iterator[VideoFrame
 
 
 def from_landmarks(prior: UpperBodyPrior, joints: Sequence[int]) -> Method:
-    """Joints [T, 8, 2] by the filter alone, from some of MediaPipe's."""
+    """Return a method: joints [T, 8, 2] by the filter alone, from some of MediaPipe's."""
     tracker = UpperBodyTracker(prior, PinholeCamera.from_image_size(*SIZE), fps=FPS, neck="neck")
 
     def run(clip: Clip) -> Tensor:
@@ -90,14 +90,14 @@ def from_landmarks(prior: UpperBodyPrior, joints: Sequence[int]) -> Method:
 
 
 def with_ears(clip: Clip) -> Tensor:
-    """The reference: MediaPipe's joints, with the middle of its ears for the head."""
+    """Return the reference: MediaPipe's joints, with the middle of its ears for the head."""
     points = clip.points.clone()
     points[:, HEAD] = clip.ears
     return points
 
 
 def error_tables(clips: list[Clip], found: dict[str, list[Tensor]], report: Report) -> None:
-    """Mean and median distances per joint."""
+    """Add mean and median distances per joint."""
     mean, median = (
         report.table(
             key,
@@ -127,7 +127,7 @@ def error_tables(clips: list[Clip], found: dict[str, list[Tensor]], report: Repo
 
 
 def clip_table(clips: list[Clip], found: dict[str, list[Tensor]], report: Report) -> None:
-    """Elbows and hands, clip by clip."""
+    """Add the errors of elbows and hands, clip by clip."""
     table = report.table(
         "by_clip",
         "Clip by clip, mean in shoulder widths: shoulders / elbows / hands",
@@ -146,7 +146,7 @@ def clip_table(clips: list[Clip], found: dict[str, list[Tensor]], report: Report
 
 
 def pcp_tables(clips: list[Clip], found: dict[str, list[Tensor]], report: Report) -> dict[str, PCP]:
-    """Shares of correct limbs, all clips pooled and clip by clip; returns the curves."""
+    """Add the shares of correct limbs, all clips pooled and clip by clip; return the curves."""
     table = report.table(
         "pcp",
         "PCP of upper arms and forearms: both ends within so many limb lengths of MediaPipe's (%)",
@@ -174,7 +174,7 @@ def pcp_tables(clips: list[Clip], found: dict[str, list[Tensor]], report: Report
 
 
 def _arms(values: PCP) -> tuple[Tensor, Tensor]:
-    """PCP of upper arms and of forearms, both sides pooled; limbs in the order of `ARM_LIMBS`."""
+    """Return the PCP of upper arms and of forearms, both sides pooled; limbs in the order of `ARM_LIMBS`."""
     if len(values.per_limb) != len(ARM_LIMBS):
         raise ValueError(f"expected {len(ARM_LIMBS)} limbs, got {len(values.per_limb)}")
     weights = values.counts[:, None].to(values.per_limb)
@@ -182,10 +182,10 @@ def _arms(values: PCP) -> tuple[Tensor, Tensor]:
     return tuple(hits[r].sum(0) / weights[r].sum(0) for r in ([0, 2], [1, 3]))  # type: ignore[return-value]
 
 
-def pictures(
+def draw_pictures(
     clips: list[Clip], found: dict[str, list[Tensor]], curves: dict[str, PCP], out: Path
 ) -> list[str]:
-    """The PCP curve (Figure 13) and the errors over time of one clip (Figure 12)."""
+    """Draw the PCP curve (Figure 13) and the errors over time of one clip (Figure 12)."""
     from torchpose import viz
     from torchpose.viz import save_figure
 
@@ -206,27 +206,36 @@ def pictures(
     return ["pcp.png", "errors-over-time.png"]
 
 
-def main() -> None:
-    """Print the tables, draw the pictures."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder with video_asl/")
-    parser.add_argument("--prior", default="kinect-upper-body", help="name or file")
-    parser.add_argument("--threads", type=int, default=2, help="cores")
-    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
-    parser.add_argument("--pictures", type=Path, help="folder for pcp.png and errors-over-time.png")
-    parser.add_argument("--quick", action="store_true", help="one clip, to see that it works")
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
-    folder = args.data / "video_asl" if (args.data / "video_asl").is_dir() else args.data
-    clips = [read_clip(folder, name) for name in (CLIPS[:1] if args.quick else CLIPS)]
-    prior = load_prior(args.prior)
+def main(
+    *,
+    data: Path,
+    prior: str = "kinect-upper-body",
+    threads: int = 2,
+    out: TableFile | None = None,
+    pictures: Path | None = None,
+    quick: bool = False,
+) -> None:
+    """Print the tables, draw the pictures.
+
+    Args:
+        data: folder with video_asl/.
+        prior: name or file.
+        threads: cores.
+        out: file for the same as Markdown, or a folder.
+        pictures: folder for pcp.png and errors-over-time.png.
+        quick: one clip, to see that it works.
+    """
+    torch.set_num_threads(threads)
+    folder = data / "video_asl" if (data / "video_asl").is_dir() else data
+    clips = [read_clip(folder, name) for name in (CLIPS[:1] if quick else CLIPS)]
+    fitted = load_prior(prior)
     methods = {
-        "video": from_video(folder, prior, False),
-        "video, background model": from_video(folder, prior, True),
-        "MediaPipe's head, neck, hands": from_landmarks(prior, (*TRUNK, *HANDS)),
-        "MediaPipe's head and neck": from_landmarks(prior, TRUNK),
+        "video": from_video(folder, fitted, False),
+        "video, background model": from_video(folder, fitted, True),
+        "MediaPipe's head, neck, hands": from_landmarks(fitted, (*TRUNK, *HANDS)),
+        "MediaPipe's head and neck": from_landmarks(fitted, TRUNK),
     }
-    if args.quick:
+    if quick:
         del methods["video, background model"]
     found = {name: [method(clip) for clip in clips] for name, method in methods.items()}
     report = Report("Joints in the image, on the webcam clips")
@@ -236,21 +245,21 @@ def main() -> None:
     report.findings.append(
         "The code of Eichner et al. (2012), which the paper compares itself with, is not to be had."
     )
-    if args.pictures:
-        report.pictures = pictures(clips, found, curves, check_output_folder(args.pictures))
-        if args.out and args.pictures.resolve().parent == args.out.resolve().parent:
-            report.pictures = [f"{args.pictures.name}/{name}" for name in report.pictures]
+    if pictures:
+        report.pictures = draw_pictures(clips, found, curves, check_output_folder(pictures))
+        if out and pictures.resolve().parent == out.resolve().parent:
+            report.pictures = [f"{pictures.name}/{name}" for name in report.pictures]
     report.settings = {
-        "prior": prior.info.name,
+        "prior": fitted.info.name,
         "reference": "MediaPipe 0.10.21 pose, full; visibility 0.5 or more, in the image, after 15 "
         "frames",
         "camera": "f = 525 px (assumed)",
         "clips": {c.name: f"{len(c.points)} frames, shoulders {c.width:.0f} px" for c in clips},
     }
     print(report.summary())
-    if args.out:
-        args.out.write_text(report.to_markdown(), encoding="utf-8")
+    if out:
+        out.write_text(report.to_markdown(), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -12,7 +12,6 @@ Burke & Lasenby (section 5.2) replaced the mixture by back-projecting the face's
 slow and gave little. `ratio` compares that histogram with those of clothes and far background.
 """
 
-import argparse
 import statistics
 import time
 from collections.abc import Iterator
@@ -24,7 +23,8 @@ import torch
 from torch import Tensor
 
 from benchmarks._asl import BURN_IN, CLIPS, read_clip
-from benchmarks._table_file import table_file
+from benchmarks._command import run_command
+from benchmarks._table_file import TableFile
 from benchmarks.speed._timing import markdown_table, processor_model
 from torchpose.measure import SkinMixtureModel
 from torchpose.measure._face import FaceTracker
@@ -73,17 +73,18 @@ MODELS = {
 }
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder with video_asl/")
-    parser.add_argument("--quick", action="store_true", help="one clip, every tenth frame scored")
-    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
-    args = parser.parse_args()
+def main(*, data: Path, quick: bool = False, out: TableFile | None = None) -> None:
+    """Print the table.
+
+    Args:
+        data: folder with video_asl/.
+        quick: one clip, every tenth frame scored.
+        out: file for the same as Markdown, or a folder.
+    """
     torch.set_num_threads(1)
-    folder = args.data / "video_asl" if (args.data / "video_asl").is_dir() else args.data
-    clips = CLIPS[:1] if args.quick else CLIPS
-    every = 10 if args.quick else 3
+    folder = data / "video_asl" if (data / "video_asl").is_dir() else data
+    clips = CLIPS[:1] if quick else CLIPS
+    every = 10 if quick else 3
     areas: dict[str, list[float]] = {name: [] for name in MODELS}
     times: dict[str, list[float]] = {name: [] for name in MODELS}
     for clip in clips:
@@ -100,12 +101,12 @@ def main() -> None:
     text = markdown_table(["area under the curve", *clips, "mean", "ms a frame"], rows)
     text += f"\n\n{processor_model()}, one thread, median of CPU times at 160 x 120, Lab given.\n"
     print(text, end="")
-    if args.out:
-        args.out.write_text(text, encoding="utf-8")
+    if out is not None:
+        out.write_text(text, encoding="utf-8")
 
 
 def read_frames(folder: Path, name: str, every: int) -> Iterator[Frame]:
-    """Frames in which a face is followed."""
+    """Yield the frames in which a face is followed."""
     import cv2
 
     hands = read_clip(folder, name)
@@ -129,7 +130,7 @@ def read_frames(folder: Path, name: str, every: int) -> Iterator[Frame]:
 
 
 def score(model: torch.nn.Module, frames: list[Frame]) -> tuple[float, list[float]]:
-    """Mean area under the curve over the frames, and the CPU seconds of each."""
+    """Return the mean area under the curve over the frames, and the CPU seconds of each."""
     state, areas, times = model.init(1), [], []  # type: ignore[operator]
     for frame in frames:
         start = time.process_time()
@@ -143,7 +144,7 @@ def score(model: torch.nn.Module, frames: list[Frame]) -> tuple[float, list[floa
 
 
 def pixels(frame: Frame) -> tuple[Tensor, Tensor]:
-    """Which pixels belong to hands, and which to neither hands nor head, bool [H, W]."""
+    """Return the pixels of hands, and those of neither hands nor head, bool [H, W]."""
     height, width = frame.lab.shape[2:]
     u, v = torch.arange(width), torch.arange(height)[:, None]
     x, y, size = frame.face[0]
@@ -155,11 +156,11 @@ def pixels(frame: Frame) -> tuple[Tensor, Tensor]:
 
 
 def area_under_curve(positive: np.ndarray, negative: np.ndarray) -> float:
-    """Probability that a positive is above a negative; equal ones count half."""
+    """Return the probability that a positive is above a negative; equal ones count half."""
     values = np.sort(negative)
     below = np.searchsorted(values, positive, "left") + np.searchsorted(values, positive, "right")
     return float(below.mean() / (2 * len(values)))
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

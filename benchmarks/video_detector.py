@@ -1,4 +1,4 @@
-"""What a detector's keypoints become in video of strangers: hands found and invented, elbows, shoulders.
+"""A detector's keypoints in video of strangers: found and invented hands, elbows and shoulders.
 
 The clips of `video_people`: webcams, phones, studios. The reference is MediaPipe's landmarks beside each clip
 (`*_mediapipe_pose1.npz`), so for MediaPipe itself the table says what association, filter and prior leave
@@ -9,17 +9,18 @@ width; it is not there with one below 0.15 or below the image, and invented if i
     python -m benchmarks.video_detector --data DIR --detector pose_landmarker_full.task
 """
 
-import argparse
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from benchmarks._table_file import table_file
+from benchmarks._command import run_command
+from benchmarks._table_file import TableFile
 from benchmarks.hand_network.clips import BELOW, BURN_IN, LOWEST, SEEN, UNSEEN
 from torchpose import VideoTracker
 from torchpose.camera import PinholeCamera
+from torchpose.errors import InputError
 from torchpose.evaluation import Report
 from torchpose.io import read_keypoints
 from torchpose.priors import UpperBodyPrior, load_prior
@@ -69,13 +70,10 @@ def tracked(
 def score(path: Path, reference: Path, prior: UpperBodyPrior, detector: str | None) -> Scores:
     """Return the scores of one clip."""
     landmarks = read_keypoints(reference)
-    names, points, sure = (
-        canonical_names(landmarks.names),
-        landmarks.keypoints,
-        landmarks.confidence,
-    )
+    names = canonical_names(landmarks.names)
+    points, sure = landmarks.keypoints, landmarks.confidence
     if sure is None:
-        raise SystemExit(f"{reference}: expected a visibility of the landmarks")
+        raise InputError(f"{reference}: expected a visibility of the landmarks")
     joints, measured, (_, height) = tracked(path, prior, detector)
     n = min(len(points), len(joints))
     points, sure, joints, measured = points[:n], sure[:n], joints[:n], measured[:n]
@@ -107,38 +105,47 @@ def score(path: Path, reference: Path, prior: UpperBodyPrior, detector: str | No
     )  # fmt: skip
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder with video_people/")
-    parser.add_argument("--detector", help="as of torchpose track; without it torchpose measures")
-    parser.add_argument("--prior", default="kinect-upper-body", help="name or file")
-    parser.add_argument("--threads", type=int, default=2, help="cores")
-    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
-    parser.add_argument("--quick", action="store_true", help="one clip, to see that it works")
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
-    folder = args.data / "video_people" if (args.data / "video_people").is_dir() else args.data
-    references = sorted(folder.glob("*_mediapipe_pose1.npz"))[: 1 if args.quick else None]
-    prior = load_prior(args.prior)
+def main(
+    *,
+    data: Path,
+    detector: str | None = None,
+    prior: str = "kinect-upper-body",
+    threads: int = 2,
+    out: TableFile | None = None,
+    quick: bool = False,
+) -> None:
+    """Print the table.
+
+    Args:
+        data: folder with video_people/.
+        detector: as of torchpose track; without it torchpose measures.
+        prior: name or file.
+        threads: cores.
+        out: file for the same as Markdown, or a folder.
+        quick: one clip, to see that it works.
+    """
+    torch.set_num_threads(threads)
+    folder = data / "video_people" if (data / "video_people").is_dir() else data
+    references = sorted(folder.glob("*_mediapipe_pose1.npz"))[: 1 if quick else None]
+    fitted = load_prior(prior)
     report = Report("Keypoints of a detector in video of strangers")
     table = report.table("clips", "By clip: shares, and medians in widths of the shoulders", COLUMNS,
                          digits=(2, 2, 2, 2, 2))  # fmt: skip
     scores = []
     for reference in references:
         name = reference.name.removesuffix("_mediapipe_pose1.npz")
-        scores.append(score(folder / f"{name}.mp4", reference, prior, args.detector))
+        scores.append(score(folder / f"{name}.mp4", reference, fitted, detector))
         table.add(name, scores[-1].cells())
     rows = torch.tensor([one.cells() for one in scores], dtype=torch.float64)
     invented = sum(one.invented for one in scores) / max(1, sum(one.absent for one in scores))
     mean, middle = rows.nanmean(0).tolist(), rows.nanmedian(0).values.tolist()
     table.add("all (means of shares, medians of medians; invented pooled)",
               [mean[0], invented, *middle[2:4], mean[4]])  # fmt: skip
-    report.settings = {"detector": args.detector or "none", "prior": prior.info.name}
+    report.settings = {"detector": detector or "none", "prior": fitted.info.name}
     print(report.summary())
-    if args.out:
-        args.out.write_text(report.to_markdown(), encoding="utf-8")
+    if out is not None:
+        out.write_text(report.to_markdown(), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -1,4 +1,4 @@
-"""3D error from video with known truth: what background model, edges and hand tracker do to it.
+"""3D error from video with known truth, with and without background model, edges and hand tracker.
 
     python -m benchmarks.video_rendered --out DIR
 
@@ -14,17 +14,20 @@ going from four points to eight joints. `mean pose` does not look at the video a
 DIR keeps videos, truth and finished rows: started again, the script goes on where it stopped.
 """
 
-import argparse
-import json
+import hashlib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from benchmarks._command import OneOf, run_command
 from benchmarks._performances import PERFORMANCES, performance
+from benchmarks._upper_body import MADE_WITH, Tracker
+from benchmarks.engine import Experiment, Grid, source_hash
 from benchmarks.speed._timing import markdown_table, processor_model
 from torchpose import VideoTracker, load_prior, viz
 from torchpose._core.files import check_output_folder
@@ -57,9 +60,10 @@ TRUE_2D, MEAN_POSE = "true 2D", "mean pose"
 
 
 class Clip(NamedTuple):
-    """A rendered sequence and its truth: joints [T, 8, 3] and [T, 8, 2]."""
+    """A rendered sequence, the name of its picture, and its truth: joints [T, 8, 3] and [T, 8, 2]."""
 
     name: str
+    picture: str
     path: Path
     joints3d: Tensor
     joints2d: Tensor
@@ -73,45 +77,53 @@ class Outcome(NamedTuple):
     """
 
     errors: Tensor
-    near: float = float("nan")
-    swapped: float = float("nan")
-    others: int = 0
+    near: Tensor = torch.tensor(torch.nan)
+    swapped: Tensor = torch.tensor(torch.nan)
+    others: Tensor = torch.tensor(0)
 
 
-def main() -> None:
-    """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--out", required=True, type=Path, help="folder for videos and results")
-    parser.add_argument("--frames", type=int, default=1000, help="of each sequence")
-    parser.add_argument("--seeds", type=int, default=2, help="sequences of each kind")
-    parser.add_argument("--look", choices=[*LOOKS], default="dark sleeves")
-    parser.add_argument("--only", nargs="+", choices=[*TRACKERS], help="these rows")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--quick", action="store_true", help="small, to see that all of it works")
-    arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
-    out = check_output_folder(arguments.out)
-    n_frames, seeds = (40, 1) if arguments.quick else (arguments.frames, arguments.seeds)
-    names = PERFORMANCES[:1] if arguments.quick else PERFORMANCES
+def main(
+    *,
+    out: Path,
+    frames: int = 1000,
+    seeds: int = 2,
+    look: Annotated[str, OneOf(LOOKS)] = "dark sleeves",
+    only: Annotated[Sequence[str], OneOf(TRACKERS)] | None = None,
+    threads: int = 2,
+    quick: bool = False,
+) -> None:
+    """Run and print.
+
+    Args:
+        out: folder for videos and results.
+        frames: of each sequence.
+        seeds: sequences of each kind.
+        look: of the performers.
+        only: these rows.
+        threads: cores.
+        quick: small, to see that all of it works.
+    """
+    torch.set_num_threads(threads)
+    check_output_folder(out)
+    n_frames, seeds = (40, 1) if quick else (frames, seeds)
+    names = PERFORMANCES[:1] if quick else PERFORMANCES
     jobs = [(name, seed) for name in names for seed in range(seeds)]
     clips = [
-        make_clip(out, name, seed, n_frames, arguments.look)
-        for name, seed in tqdm(jobs, desc="rendering")
+        make_clip(out, name, seed, n_frames, look) for name, seed in tqdm(jobs, desc="rendering")
     ]
     prior = load_prior("kinect-upper-body")
-    rows = {n: TRACKERS[n] for n in TRACKERS if arguments.only is None or n in arguments.only}
-    outcomes: dict[str, list[Outcome]] = {}
-    for row, options in rows.items():
-        outcomes[row] = [
-            cached(out, row, clip, lambda c=clip, o=options: from_video(prior, c, o))
-            for clip in tqdm(clips, desc=row)
-        ]
+    rows = {n: options for n, options in TRACKERS.items() if only is None or n in only}
+    grid = Grid(
+        {clip.name: clip for clip in clips}, {n: Tracker(prior, o) for n, o in rows.items()}
+    )
+    found = TRACKING.run({"": grid}, (0,), out, progress=True, title="tracking")
+    outcomes = {name: own.runs for (name,), own in found.by("method").items()}
     outcomes[TRUE_2D] = [from_truth(prior, clip) for clip in clips]
     outcomes[MEAN_POSE] = [
         Outcome(joint_errors_3d(prior.mean_pose().expand_as(clip.joints3d), clip.joints3d))
         for clip in clips
     ]
-    text = report(outcomes, clips, arguments.look)
+    text = report(outcomes, clips, look)
     print(text, end="")
     (out / "video_rendered.md").write_text(text, encoding="utf-8")
     draw(outcomes, clips, out)
@@ -123,25 +135,14 @@ def main() -> None:
 def make_clip(out: Path, name: str, seed: int, n_frames: int, look: str) -> Clip:
     """Render a sequence, unless it is there already."""
     stem = f"{name}-{seed}-{look}-{n_frames}".replace(" ", "_")
-    path, truth = out / f"{stem}.mp4", out / f"{stem}.npz"
+    source = source_hash("torchpose/demo", "benchmarks/_performances.py")
+    path, truth = out / f"{stem}-{source}.mp4", out / f"{stem}-{source}.npz"
     if not (path.is_file() and truth.is_file()):
         clip = performance(name, n_frames, FPS, seed, DISTANCE)
         render_video(path, clip, demo_camera(), seed=seed, look=look, truth=truth)
     with np.load(truth) as arrays:
         joints3d, joints2d = (torch.from_numpy(arrays[k]) for k in ("joints3d", "joints2d"))
-    return Clip(f"{name} {seed + 1}", path, joints3d, joints2d)
-
-
-def cached(out: Path, row: str, clip: Clip, run: Any) -> Outcome:
-    """The outcome in the folder, or a new one."""
-    path = out / f"{clip.path.stem}.{row.replace(', ', '+').replace(' ', '_')}.json"
-    if path.is_file():
-        saved = json.loads(path.read_text(encoding="utf-8"))
-        return Outcome(torch.tensor(saved.pop("errors"), dtype=torch.float64), **saved)
-    outcome = run()
-    content = outcome._asdict() | {"errors": outcome.errors.tolist()}
-    path.write_text(json.dumps(content), encoding="utf-8")
-    return outcome
+    return Clip(f"{name} {seed + 1}", stem, path, joints3d, joints2d)
 
 
 # --- trackers -------------------------------------------------------------------------------------
@@ -154,7 +155,7 @@ def from_video(prior: UpperBodyPrior, clip: Clip, options: dict[str, Any]) -> Ou
         people = tracker(video)
     errors = torch.full(clip.joints3d.shape[:2], torch.nan, dtype=torch.float64)
     if not people:
-        return Outcome(errors, 0.0, 0.0)
+        return Outcome(errors, torch.tensor(0.0), torch.tensor(0.0))
     person = people[0]
     there = slice(person.first_frame, person.first_frame + len(person))
     errors[there] = compare(person.track, clip.joints3d[there])
@@ -168,7 +169,30 @@ def from_video(prior: UpperBodyPrior, clip: Clip, options: dict[str, Any]) -> Ou
     near = (right < width / 4).double().sum() / (2 * len(clip.joints2d))
     swapped = (wrong < right).all(-1) & (right > width / 4).all(-1)
     share = swapped.double().sum() / len(clip.joints2d)
-    return Outcome(errors, float(near), float(share), len(people) - 1)
+    return Outcome(errors, near, share, torch.tensor(len(people) - 1))
+
+
+def track_clip(clip: Clip, tracker: Tracker, seeds: Sequence[int]) -> list[Outcome]:
+    """Track a video once for each seed, on which nothing depends."""
+    return [from_video(tracker.prior, clip, dict(tracker.options)) for _ in seeds]
+
+
+def clip_facts(clip: Clip, tracker: Tracker) -> list[Any]:
+    """Return the inputs of an outcome: prior, options, video and truth."""
+    prior, options = tracker
+    video = hashlib.sha256(clip.path.read_bytes()).hexdigest()
+    return [dict(options), prior.info.transition, *prior.state_dict().values(),
+            video, clip.joints3d, clip.joints2d]  # fmt: skip
+
+
+TRACKING = Experiment(
+    Outcome,
+    track_clip,
+    clip_facts,
+    (*MADE_WITH, "torchpose/measure", "torchpose/metrics", "torchpose/video",
+     "torchpose/weights/arms/upper-body-arms.safetensors",
+     "torchpose/weights/hands/hands.safetensors", "benchmarks/video_rendered.py"),
+)  # fmt: skip
 
 
 def from_truth(prior: UpperBodyPrior, clip: Clip) -> Outcome:
@@ -179,7 +203,7 @@ def from_truth(prior: UpperBodyPrior, clip: Clip) -> Outcome:
 
 
 def compare(track: PoseTrack, truth: Tensor) -> Tensor:
-    """3D errors [T, 8], metres."""
+    """Return the 3D errors [T, 8], metres."""
     return joint_errors_3d(track.joints3d[0].double(), truth)
 
 
@@ -187,22 +211,22 @@ def compare(track: PoseTrack, truth: Tensor) -> Tensor:
 
 
 def centimetres(errors: Tensor) -> str:
-    """Mean over what is there."""
+    """Return the mean of the errors that are there, cm."""
     return f"{100 * float(errors.nanmean()):.1f}"
 
 
 def percent(values: list[float]) -> str:
-    """Mean share, or a dash."""
+    """Return the mean share, or a dash."""
     mean = float(np.mean(values))
     return "-" if np.isnan(mean) else f"{100 * mean:.0f} %"
 
 
 def report(outcomes: dict[str, list[Outcome]], clips: list[Clip], look: str) -> str:
-    """Error by joint, by sequence, and what became of the hands."""
+    """Return the errors by joint and by sequence, and the shares of found hands."""
     by_joint, by_clip = [], []
     for name, done in outcomes.items():
         errors = torch.cat([one.errors for one in done])
-        hands = [[getattr(one, k) for one in done] for k in ("near", "swapped")]
+        hands = [[float(getattr(one, k)) for one in done] for k in ("near", "swapped")]
         posed = float(errors.isfinite().all(-1).double().mean())
         by_joint.append(
             [name, *(centimetres(errors[:, j]) for j in range(8)), centimetres(errors),
@@ -217,7 +241,7 @@ def report(outcomes: dict[str, list[Outcome]], clips: list[Clip], look: str) -> 
         "swapped",
         "posed",
     ]
-    others = {n: sum(o.others for o in done) for n, done in outcomes.items()}
+    others = {n: sum(int(o.others) for o in done) for n, done in outcomes.items()}
     n_frames = sum(len(clip.joints3d) for clip in clips)
     lines = [
         markdown_table(head, by_joint),
@@ -232,7 +256,7 @@ def report(outcomes: dict[str, list[Outcome]], clips: list[Clip], look: str) -> 
 
 
 def draw(outcomes: dict[str, list[Outcome]], clips: list[Clip], out: Path) -> None:
-    """Figures 10 and 11: mean error of each joint, and errors over time."""
+    """Draw Figures 10 and 11: mean error of each joint, and errors over time."""
     shown = [n for n in (*list(TRACKERS)[:1], "mean shift", TRUE_2D, MEAN_POSE) if n in outcomes]
     means = {name: torch.cat([one.errors for one in outcomes[name]]) for name in shown}
     save_figure(
@@ -245,8 +269,8 @@ def draw(outcomes: dict[str, list[Outcome]], clips: list[Clip], out: Path) -> No
             bound=20,
             title=f"3D error, {clip.name}",
         )
-        save_figure(figure, out / f"{clip.path.stem}.png")
+        save_figure(figure, out / f"{clip.picture}.png")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -1,5 +1,5 @@
 """Run `python -m benchmarks.bend`."""
 
-from benchmarks._command import main
+from benchmarks._protocols import run_protocol
 
-main("bend")
+run_protocol("bend")

@@ -1,4 +1,4 @@
-"""Part of the protocol Bend: which action somebody performs, from recorded and from tracked joints."""
+"""Part of the protocol Bend: recognise actions, from recorded and from tracked joints."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -11,17 +11,17 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from benchmarks.bend.clips import first_bend, performances
-from benchmarks.bend.trackees import (
+from benchmarks.bend.tracking import TRACKING, BendRun, Filter
+from benchmarks.bend.variants import (
     DIMENSIONS,
     MOST_DIMENSIONS,
-    BendTrackee,
+    BendPerson,
     Performed,
     Variant,
     fit_space,
     perform,
     true_postures,
 )
-from benchmarks.bend.tracking import TRACKING, BendRun, Filter
 from benchmarks.bodies.views import Conditions, Subject, view_of
 from benchmarks.engine import Grid, Results, Setting, mean, pivot
 from benchmarks.engine.experiment import Measure
@@ -83,13 +83,13 @@ def perform_actions(
 
 
 def make_spaces(
-    trackee: BendTrackee, performed: Mapping[str, Mapping[str, Performed]]
+    tracked: BendPerson, performed: Mapping[str, Mapping[str, Performed]]
 ) -> list[ActionSpace]:
     """Return the actions of everybody else, put on the body that is tracked."""
-    person, fps = trackee.split.person, trackee.split.test[0].fps
+    person, fps = tracked.split.person, tracked.split.test[0].fps
     return [
         fit_space(
-            trackee.body, [one for name, one in persons.items() if name != person], action, fps
+            tracked.body, [one for name, one in persons.items() if name != person], action, fps
         )
         for action, persons in performed.items()
     ]
@@ -103,12 +103,12 @@ def make_bank(spaces: Sequence[ActionSpace], setting: BankSetting) -> ActionBank
     )
 
 
-def postures_of(trackee: BendTrackee, library: Library) -> list[tuple[str, Tensor]]:
+def postures_of(tracked: BendPerson, library: Library) -> list[tuple[str, Tensor]]:
     """Return action and postures [T, 36] of each of the person's recordings, from true joints."""
     return [
-        (action, true_postures(trackee.body, clip))
+        (action, true_postures(tracked.body, clip))
         for action, persons in library.items()
-        for clip in persons.get(trackee.split.person, ())
+        for clip in persons.get(tracked.split.person, ())
     ]
 
 
@@ -134,7 +134,7 @@ def _decide(
 
 
 def choose_bank(
-    trackees: Sequence[BendTrackee],
+    tracked_persons: Sequence[BendPerson],
     performed: Mapping[str, Mapping[str, Performed]],
     library: Library,
 ) -> tuple[BankSetting, dict[BankSetting, float]]:
@@ -144,7 +144,8 @@ def choose_bank(
         The settings, and the share of right frames of all that were tried.
     """
     people = [
-        (t.split.person, make_spaces(t, performed), postures_of(t, library)) for t in trackees
+        (t.split.person, make_spaces(t, performed), postures_of(t, library))
+        for t in tracked_persons
     ]
     shares = {}
     for setting in BANK_SETTINGS:
@@ -169,7 +170,7 @@ def _balanced(found: Sequence[Recognised]) -> float:
 
 
 def track_actions(
-    trackees: Sequence[BendTrackee], banks: Mapping[str, ActionBank],
+    tracked_persons: Sequence[BendPerson], banks: Mapping[str, ActionBank],
     performed: Mapping[str, Mapping[str, Performed]], library: Library, conditions: Conditions,
     setting: Setting, plain: Setting, folder: Path, *, particles: int, frames: int,
     seeds: Sequence[int], progress: bool,
@@ -177,7 +178,7 @@ def track_actions(
     """Track one recording of every action and person: with the bank, with the bend alone, and free.
 
     Args:
-        trackees: whose bodies. banks: by person. performed: for the noise, which is that of all
+        tracked_persons: whose bodies. banks: by person. performed: for the noise, which is that of all
             actions of the bank. library: what is tracked. conditions: of the silhouettes.
         setting: of the constrained trackers. plain: of the first-order one. folder: of kept runs.
         particles: of each tracker. frames: of each recording. seeds: of the runs.
@@ -191,10 +192,10 @@ def track_actions(
         "bend": Filter(Variant(True, particles), setting),
         "first order": Filter(Variant(False, particles), plain),
     }
-    subjects: dict[str, dict[str, Subject[BendTrackee]]] = {}
-    jobs = [(a, t) for a in library for t in trackees if t.split.person in library[a]]
-    for action, trackee in tqdm(jobs, disable=not progress, desc="actions"):
-        person = trackee.split.person
+    subjects: dict[str, dict[str, Subject[BendPerson]]] = {}
+    jobs = [(a, t) for a in library for t in tracked_persons if t.split.person in library[a]]
+    for action, tracked in tqdm(jobs, disable=not progress, desc="actions"):
+        person = tracked.split.person
         moves = [
             states
             for persons in performed.values()
@@ -203,7 +204,7 @@ def track_actions(
             for states in one
         ]
         other = replace(
-            trackee, step_std=constant_velocity_std(trackee.body, moves), bank=banks[person]
+            tracked, step_std=constant_velocity_std(tracked.body, moves), bank=banks[person]
         )
         view = view_of(other.body, first_bend(library[action][person][0], frames), conditions)
         subjects.setdefault(action, {})[person] = Subject(other, other.body, view)
@@ -246,7 +247,7 @@ def tracked_decisions(runs: Results, banks: Mapping[str, ActionBank]) -> list[Re
 
 
 def add_release(report: Report, runs: Results) -> None:
-    """Add what a bank is worth: errors with the bank, the bend alone, and free.
+    """Add the errors with a bank of actions, with the bend alone, and without constraint.
 
     Args:
         report: gets the table. runs: of `track_actions`.

@@ -1,4 +1,4 @@
-"""Clips of the protocol Bend: single performances cut out of recordings, and who trains for whom.
+"""Clips of the protocol Bend: single performances cut out of recordings, and their splits.
 
 A recording holds several bends; a performance is one of them, from upright to upright.
 """

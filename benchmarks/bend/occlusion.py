@@ -1,4 +1,4 @@
-"""Part of the protocol Bend: from the side one arm hides the other (Figure 5 of the paper)."""
+"""Part of the protocol Bend: a view in which one arm hides the other (Figure 5 of the paper)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.bend.trackees import BendTrackee, Variant
 from benchmarks.bend.tracking import TRACKING, BendRun, grid_of
+from benchmarks.bend.variants import BendPerson, Variant
 from benchmarks.bodies.views import View, subjects_of
 from benchmarks.engine import Results, Setting
 from torchpose.body import BODY_15, Limbs, fit_state
@@ -42,12 +42,12 @@ class HiddenArm(NamedTuple):
     near: dict[str, Tensor]
 
 
-def visible_share(trackee: BendTrackee, view: View, side: str = "right") -> Float[Tensor, " T"]:
+def visible_share(tracked: BendPerson, view: View, side: str = "right") -> Float[Tensor, " T"]:
     """Return the share of an arm's area in the image that no other limb covers, by the true states.
 
     |arm without rest| / |arm|: where it is small a silhouette says nothing about the arm.
     """
-    limbs = trackee.body.limbs(fit_state(trackee.body, view.clip.joints))
+    limbs = tracked.body.limbs(fit_state(tracked.body, view.clip.joints))
     arm = [i for i, name in enumerate(_LIMBS) if name in (f"{side}_upper_arm", f"{side}_forearm")]
     rest = [i for i in range(len(_LIMBS)) if i not in arm]
     height, width = view.silhouettes.shape[-2:]
@@ -67,34 +67,34 @@ def arm_errors(runs: Sequence[BendRun], side: str) -> Float[Tensor, "S T"]:
     return torch.stack([run.errors[:, _ARM[side]].double().mean(-1) for run in runs])
 
 
-def displaced(trackee: BendTrackee, view: View) -> Float[Tensor, " D"]:
+def displaced(tracked: BendPerson, view: View) -> Float[Tensor, " D"]:
     """Return the true first pose, but with the far arm swung by a quarter of a turn, as if lost."""
     part = BODY_15.part("right_upper_arm")
     step = torch.zeros_like(view.initial_state)
     step[3 + 3 * part] = SWING
-    return trackee.body.perturb(view.initial_state, step)
+    return tracked.body.perturb(view.initial_state, step)
 
 
-def with_lost_arm(trackee: BendTrackee) -> BendTrackee:
+def with_lost_arm(tracked: BendPerson) -> BendPerson:
     """Return the same person, tracked from `displaced` first poses."""
-    tests = [view._replace(initial_state=displaced(trackee, view)) for view in trackee.tests]
-    return replace(trackee, tests=tuple(tests))
+    tests = [view._replace(initial_state=displaced(tracked, view)) for view in tracked.tests]
+    return replace(tracked, tests=tuple(tests))
 
 
 def hidden_arms(
-    trackees: Sequence[BendTrackee], settings: Mapping[Variant, Setting], folder: Path,
+    tracked_persons: Sequence[BendPerson], settings: Mapping[Variant, Setting], folder: Path,
     seeds: Sequence[int], progress: bool,
 ) -> tuple[list[HiddenArm], Results]:  # fmt: skip
     """Track everybody from the side, and measure both arms.
 
     Args:
-        trackees: seen from `SIDE`. settings: of every tracker. folder: of kept runs.
+        tracked_persons: seen from `SIDE`. settings: of every tracker. folder: of kept runs.
         seeds: of the runs. progress: whether to show a bar.
     """
-    grid = grid_of(trackees, settings)
+    grid = grid_of(tracked_persons, settings)
     runs = TRACKING.run({"": grid}, seeds, folder, progress=progress, title="hidden arm")
     found = []
-    for name, subject in subjects_of(trackees).items():
+    for name, subject in subjects_of(tracked_persons).items():
         far, near = (
             {
                 label: arm_errors(own.runs, side)

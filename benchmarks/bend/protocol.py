@@ -28,11 +28,12 @@ from benchmarks.bend.report import (
     add_tuning,
     csv_columns,
 )
-from benchmarks.bend.trackees import (
+from benchmarks.bend.tracking import TRACKING, Filter, grid_of, tune_variant
+from benchmarks.bend.variants import (
     DIMENSIONS,
     REDRAWS,
     SHARPNESS,
-    BendTrackee,
+    BendPerson,
     Performed,
     Variant,
     arm_centres,
@@ -41,7 +42,6 @@ from benchmarks.bend.trackees import (
     prepare,
     synchronised_space,
 )
-from benchmarks.bend.tracking import TRACKING, Filter, grid_of, tune_variant
 from benchmarks.bodies.views import Conditions, Subject, image_size, view_of
 from benchmarks.engine import Grid, Results, Setting, Tuning, write_csv
 from benchmarks.engine.tuning import SCALES
@@ -68,8 +68,8 @@ _TRACKED = 4  # persons whose other actions are tracked: seven recordings and th
 class _Stage:
     """What all parts work with."""
 
-    trackees: list[BendTrackee]
-    judges: list[BendTrackee]
+    tracked_persons: list[BendPerson]
+    judges: list[BendPerson]
     performed: dict[str, Performed]
     clips: list[MocapClip]
     centres: Float[Tensor, "P 3"]
@@ -93,18 +93,18 @@ class _Stage:
         variants = [self.variant(c, n) for n in numbers for c in (True, False)]
         return {variant: tunings[variant.label].setting for variant in variants}
 
-    def grid(self, settings: Mapping[Variant, Setting]) -> Grid[Subject[BendTrackee], Filter]:
+    def grid(self, settings: Mapping[Variant, Setting]) -> Grid[Subject[BendPerson], Filter]:
         """Return everybody, and trackers of different labels."""
-        return grid_of(self.trackees, settings)
+        return grid_of(self.tracked_persons, settings)
 
     def run(
-        self, grids: Mapping[str, Grid[Subject[BendTrackee], Filter]], title: str = "tracking"
+        self, grids: Mapping[str, Grid[Subject[BendPerson], Filter]], title: str = "tracking"
     ) -> Results:
         """Make the runs that are not kept yet, and return all."""
         return TRACKING.run(grids, self.seeds, self.out, progress=self.progress, title=title)
 
     def settings(self, variants: Mapping[str, Variant]) -> dict[str, Tuning]:
-        """Return what the judges' clips choose for every tracker."""
+        """Return the settings that the judges' clips choose for every tracker."""
         scales, values = ((1.0,), SHARPNESS[:2]) if self.quick else (SCALES, SHARPNESS)
         return {
             name: tune_variant(self.judges, variant, self.out, scales=scales, values=values)
@@ -187,12 +187,12 @@ def run(
         for person, group in tqdm(parts.items(), disable=not progress, desc="performances")
     }
     splits = leave_one_out(moved, (*testers, *judges), n_clips=clips, n_frames=frames)
-    trackees = [
+    fitted = [
         prepare(split, performed, conditions, action, centres)
         for split in tqdm(splits, disable=not progress, desc="bodies and action spaces")
     ]
     stage = _Stage(
-        trackees[: len(testers)], trackees[len(testers) :], performed, everything, centres, conditions, out,
+        fitted[: len(testers)], fitted[len(testers) :], performed, everything, centres, conditions, out,
         range(seed, seed + seeds), at, gate_dimensions, numbers, wanted, progress, quick,
     )  # fmt: skip
     tunings = stage.settings({
@@ -212,7 +212,7 @@ def run(
     for name in chosen:
         _RUNNERS[name](report, stage, tunings)
     add_tuning(report, tunings)
-    add_sequences(report, stage.trackees)
+    add_sequences(report, stage.tracked_persons)
     report.save(out)
     return report
 
@@ -230,13 +230,13 @@ def _particles(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> Non
     add_particles(report, runs)
     write_csv(stage.out / "runs.csv", runs, csv_columns(grids))
     add_picture(report, stage.out, "error-over-particles.png", plot_particles(runs))
-    trackee = stage.trackees[0]
-    view = trackee.tests[0]
+    tracked = stage.tracked_persons[0]
+    view = tracked.tests[0]
     shown = [int(share * (len(view.clip) - 1)) for share in _SHOWN]
     drawn = {
         variant.label: [
             predictions(
-                make_filter(variant, trackee, tunings[variant.label].setting), view, t, _DRAWN
+                make_filter(variant, tracked, tunings[variant.label].setting), view, t, _DRAWN
             )
             for t in shown
         ]
@@ -244,18 +244,18 @@ def _particles(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> Non
     }
     figure = plot_predictions(view, shown, drawn)
     add_picture(report, stage.out, "predictions.png", figure)
-    others = [one for name, one in stage.performed.items() if name != trackee.split.person]
-    figure = plot_action_space(*synchronised_space(trackee.body, others, trackee.space.info))
+    others = [one for name, one in stage.performed.items() if name != tracked.split.person]
+    figure = plot_action_space(*synchronised_space(tracked.body, others, tracked.space.info))
     add_picture(report, stage.out, "action-space.png", figure)
 
 
 def _dimensions(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> None:
-    most = min(t.space.n_dimensions for t in stage.trackees)
+    most = min(t.space.n_dimensions for t in stage.tracked_persons)
     wanted = list(dict.fromkeys(min(d, most) for d in stage.dimensions))
     free, gated = (tunings[label].setting for label in (FIRST_ORDER, CONSTRAINED))
     grids = {"0": stage.grid({Variant(False, stage.at): free})}
     grids |= {str(d): stage.grid({Variant(True, stage.at, d): gated}) for d in wanted}
-    add_dimensions(report, stage.run(grids, "dimensions"), stage.trackees)
+    add_dimensions(report, stage.run(grids, "dimensions"), stage.tracked_persons)
 
 
 def _limbs(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> None:
@@ -278,7 +278,9 @@ def _occlusion(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> Non
     from benchmarks.bend.pictures import plot_hidden_arm, plot_predictions
 
     side = replace(stage.conditions, azimuths=(SIDE,))
-    seen = [replace(t, tests=(view_of(t.body, t.split.test[0], side),)) for t in stage.trackees]
+    seen = [
+        replace(t, tests=(view_of(t.body, t.split.test[0], side),)) for t in stage.tracked_persons
+    ]
     settings = stage.both(tunings, stage.at)
     common = (settings, stage.out, stage.seeds, stage.progress)
     given, runs = hidden_arms(seen, *common)
@@ -301,18 +303,18 @@ def _occlusion(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> Non
 
 
 def _actions(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> None:
-    """Add which action it is, from recorded joints and from silhouettes."""
+    """Add the recognition of actions, from recorded joints and from silhouettes."""
     there = {clip.action for clip in stage.clips}
     names = [n for n in (*bend_actions.KNOWN, *bend_actions.OTHERS) if n in there]
     library = action_clips(stage.clips, names)
     performed = bend_actions.perform_actions(library, stage.centres, stage.progress)
     setting, shares = bend_actions.choose_bank(stage.judges, performed, library)
     banks, found = {}, []
-    for trackee in tqdm(stage.trackees, disable=not stage.progress, desc="recognition"):
-        person = trackee.split.person
-        spaces = bend_actions.make_spaces(trackee, performed)
+    for tracked in tqdm(stage.tracked_persons, disable=not stage.progress, desc="recognition"):
+        person = tracked.split.person
+        spaces = bend_actions.make_spaces(tracked, performed)
         banks[person] = bend_actions.make_bank(spaces, setting)
-        recordings = bend_actions.postures_of(trackee, library)
+        recordings = bend_actions.postures_of(tracked, library)
         found += bend_actions.recognise_recorded(person, banks[person], recordings)
     columns = next(iter(banks.values())).names
     bend_actions.add_confusion(report, "actions", "Actions from recorded joints", found, columns)
@@ -321,16 +323,16 @@ def _actions(report: Report, stage: _Stage, tunings: dict[str, Tuning]) -> None:
     report.settings["right frames on the validation, by dimensions, spread and background"] = {
         ", ".join(f"{x:g}" for x in one): round(share, 3) for one, share in shares.items()
     }
-    frames = 8 if stage.quick else len(stage.trackees[0].tests[0].clip)
-    tracked = bend_actions.track_actions(
-        stage.trackees[:_TRACKED], banks, performed, library, stage.conditions,
+    frames = 8 if stage.quick else len(stage.tracked_persons[0].tests[0].clip)
+    runs = bend_actions.track_actions(
+        stage.tracked_persons[:_TRACKED], banks, performed, library, stage.conditions,
         tunings[CONSTRAINED].setting, tunings[FIRST_ORDER].setting, stage.out,
         particles=stage.at, frames=frames, seeds=stage.seeds[:1], progress=stage.progress,
     )  # fmt: skip
-    decisions = bend_actions.tracked_decisions(tracked, banks)
+    decisions = bend_actions.tracked_decisions(runs, banks)
     title = "Actions from one camera's silhouettes"
     bend_actions.add_confusion(report, "tracked_actions", title, decisions, columns)
-    bend_actions.add_release(report, tracked)
+    bend_actions.add_release(report, runs)
 
 
 _RUNNERS: dict[str, Callable[[Report, _Stage, dict[str, Tuning]], None]] = {
@@ -369,7 +371,7 @@ def _numbers(name: str, given: Sequence[int]) -> list[int]:
 def _persons(
     clips: Sequence[MocapClip], testers: Sequence[str], judges: Sequence[str], quick: bool
 ) -> tuple[list[str], list[str]]:
-    """Return who is tracked, and whose clips choose the settings."""
+    """Return the tracked persons, and those whose clips choose the settings."""
     everybody = list(select_persons(clips, ()))
     if len(everybody) < 3:
         raise InputError(

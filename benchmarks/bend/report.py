@@ -1,4 +1,4 @@
-"""Tables of the protocol Bend, and what they say in words."""
+"""Tables and findings of the protocol Bend."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -6,8 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.bend.trackees import BendTrackee, Variant, recorded_gap, true_acceptance
 from benchmarks.bend.tracking import BendRun, Filter, mean_squared
+from benchmarks.bend.variants import BendPerson, Variant, recorded_gap, true_acceptance
 from benchmarks.bodies.tracking import part_error
 from benchmarks.bodies.views import SEEN, Subject, subjects_of
 from benchmarks.engine import (
@@ -94,7 +94,7 @@ def add_particles(report: Report, runs: Results) -> None:
 
 
 def _say_particles(report: Report, runs: Results) -> None:
-    """Say whether the paper's two claims hold, with intervals, and how the error falls."""
+    """Add findings: whether the paper's two claims hold, with intervals, and how the error falls."""
     errors = {
         (method, int(name.replace(",", ""))): own.values(mean_squared)
         for (method, name), own in runs.by("method", "condition").items()
@@ -124,7 +124,7 @@ def _say_particles(report: Report, runs: Results) -> None:
 def csv_columns(
     conditions: Mapping[str, Grid[Any, Filter]],
 ) -> dict[str, Callable[[Row], Any]]:
-    """Return what a line of runs.csv says.
+    """Return the columns of runs.csv, as functions of a row.
 
     Args:
         conditions: of the runs, by name; their filters' variants are told.
@@ -151,15 +151,15 @@ def csv_columns(
 # --- dimensions, limbs, settings, sequences -------------------------------------------------------
 
 
-def add_dimensions(report: Report, runs: Results, trackees: Sequence[BendTrackee]) -> None:
+def add_dimensions(report: Report, runs: Results, tracked_persons: Sequence[BendPerson]) -> None:
     """Add the number of dimensions: what is rejected, of predictions and of true postures.
 
     Args:
         report: gets the table. runs: by number of dimensions, "0" for the first order alone.
-        trackees: whose postures are put to the gates.
+        tracked_persons: whose postures are put to the gates.
     """
     shares = {
-        name: torch.tensor([true_acceptance(t, int(name)) for t in trackees]).mean(0)
+        name: torch.tensor([true_acceptance(t, int(name)) for t in tracked_persons]).mean(0)
         for name in runs.names("condition")
         if name != "0"
     }
@@ -211,7 +211,7 @@ def add_limb_shapes(report: Report, runs: Results) -> None:
 
 
 def add_tuning(report: Report, tunings: Mapping[str, Tuning]) -> None:
-    """Add what the clips of other persons chose for every tracker."""
+    """Add the settings that the clips of other persons chose for every tracker."""
 
     def flat(found: Tuning) -> float:
         return found.error_of(Setting(1.0, found.setting.scale))
@@ -230,15 +230,15 @@ def add_tuning(report: Report, tunings: Mapping[str, Tuning]) -> None:
     )  # fmt: skip
 
 
-def add_sequences(report: Report, trackees: Sequence[BendTrackee]) -> None:
+def add_sequences(report: Report, tracked_persons: Sequence[BendPerson]) -> None:
     """Add whom the cameras see, and how near the tracker's body can come."""
     floor, overlap, in_view = SEEN.items()
 
-    def trained(subject: Subject[BendTrackee]) -> int:
+    def trained(subject: Subject[BendPerson]) -> int:
         return len(subject.person.split.manifold)
 
     describe(
-        report, "sequences", "Sequences", subjects_of(trackees),
+        report, "sequences", "Sequences", subjects_of(tracked_persons),
         {
             "frames": lambda subject: len(subject.view.clip), "training performances": trained,
             **dict([floor, ("recorded angles", recorded_gap), overlap, in_view]),

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from benchmarks.bend.trackees import (
+from benchmarks.bend.variants import (
     REDRAWS,
     SHARPNESS,
-    BendTrackee,
+    BendPerson,
     Variant,
     make_filter,
     true_postures,
@@ -67,7 +67,7 @@ class Filter(NamedTuple):
     bank: bool = False
 
 
-def _track(subject: Subject[BendTrackee], how: Filter, seeds: Sequence[int]) -> list[BendRun]:
+def _track(subject: Subject[BendPerson], how: Filter, seeds: Sequence[int]) -> list[BendRun]:
     person, body, view = subject
     bank = person.bank if how.bank else None
     tracker = make_filter(how.variant, person, how.setting, bank)
@@ -95,8 +95,8 @@ def _track(subject: Subject[BendTrackee], how: Filter, seeds: Sequence[int]) -> 
     ]  # fmt: skip
 
 
-def _facts(subject: Subject[BendTrackee], how: Filter) -> list[Any]:
-    """Return what a run depends on; without constraint the action space counts for nothing."""
+def _facts(subject: Subject[BendPerson], how: Filter) -> list[Any]:
+    """Return the inputs of a run; without constraint the action space is none of them."""
     variant = how.variant
     if not variant.constrained:
         plain = [False, variant.particles, variant.limb_shape]
@@ -108,7 +108,7 @@ def _facts(subject: Subject[BendTrackee], how: Filter) -> list[Any]:
 
 TRACKING = Experiment(
     BendRun, _track, _facts,
-    (*MADE_WITH, "benchmarks/bend/tracking.py", "benchmarks/bend/trackees.py"),
+    (*MADE_WITH, "benchmarks/bend/tracking.py", "benchmarks/bend/variants.py"),
     lambda subject, how: len(subject.view.clip) * how.variant.particles // 1000, "k particles",
 )  # fmt: skip
 """Runs of a `Filter` on a subject."""
@@ -120,19 +120,19 @@ def mean_squared(run: BendRun) -> Tensor:
 
 
 def grid_of(
-    trackees: Sequence[BendTrackee], filters: Mapping[Variant, Setting]
-) -> Grid[Subject[BendTrackee], Filter]:
+    tracked_persons: Sequence[BendPerson], filters: Mapping[Variant, Setting]
+) -> Grid[Subject[BendPerson], Filter]:
     """Return everybody, and the trackers by their labels.
 
     Args:
-        trackees: who is tracked. filters: settings of trackers of different labels.
+        tracked_persons: who is tracked. filters: settings of trackers of different labels.
     """
     methods = {variant.label: Filter(variant, setting) for variant, setting in filters.items()}
-    return Grid(subjects_of(trackees), methods)
+    return Grid(subjects_of(tracked_persons), methods)
 
 
 def tune_variant(
-    trackees: Sequence[BendTrackee],
+    tracked_persons: Sequence[BendPerson],
     variant: Variant,
     folder: Path,
     scales: Sequence[float] = SCALES,
@@ -145,7 +145,7 @@ def tune_variant(
     """
 
     def error(setting: Setting) -> float:
-        grid = grid_of(trackees, {variant: setting})
+        grid = grid_of(tracked_persons, {variant: setting})
         runs = TRACKING.run({"": grid}, (_VALIDATION_SEED,), folder)
         return float(runs.values(mean_squared).mean())
 

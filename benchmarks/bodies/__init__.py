@@ -1,1 +1,1 @@
-"""What the whole-body protocols share: recorded clips, what cameras see of them, runs of a filter."""
+"""Recorded clips, views and runs that the protocols over whole bodies share."""

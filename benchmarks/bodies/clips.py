@@ -1,4 +1,4 @@
-"""Recorded clips: who trains, who is tracked, and where the cameras stand."""
+"""Recorded clips: splits into training, validation and test, and the places of the cameras."""
 
 import math
 from collections.abc import Sequence
@@ -48,7 +48,7 @@ def split_clips(
     validation_frames: int = 300,
     tracked: Sequence[MocapClip] = (),
 ) -> list[Split]:
-    """Return who is tracked with what.
+    """Return a split for each tracked person: its clips, and those of training and validation.
 
     A person who trains as well is tracked in the first trials, and the manifold and the validation
     have the following ones. Somebody else is tracked with a manifold of the others; bone lengths and

@@ -163,7 +163,7 @@ def _shadow(clean: Tensor, scene: _Scene, t: int, severity: float) -> Tensor:
 
 
 def _ragged(mask: Tensor, noise: Tensor, size: float, severity: float) -> Tensor:
-    """Return where the blurred mask plus noise, strongest on the border, is above half its height."""
+    """Return the mask with a ragged border: blurred, with noise that is strongest there, cut at half."""
     sigma = max(size, 0.7)
     soft = _blur(mask.float(), sigma)
     noise = _unit(_blur(noise, sigma))
@@ -256,7 +256,7 @@ def _unit(fields: Tensor) -> Tensor:
 
 
 def _blur(images: Tensor, sigma: float) -> Tensor:
-    """Blur [C, H, W] by a Gaussian, the border repeated."""
+    """Return images [C, H, W] blurred by a Gaussian, with the border repeated."""
     radius = math.ceil(3 * sigma)
     kernel = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / sigma) ** 2)
     kernel = (kernel / kernel.sum()).view(1, 1, 1, -1)

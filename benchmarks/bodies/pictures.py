@@ -113,7 +113,7 @@ def plot_silhouettes(
     n_frames: int = 4,
     title: str | None = None,
 ) -> Figure:
-    """Draw what the cameras see, and the estimated bodies over it.
+    """Draw the observed silhouettes, and the estimated bodies over them.
 
     Both: dark; seen, but not in the model: blue; in the model only: orange.
 

@@ -1,4 +1,4 @@
-"""Runs of body filters on silhouettes: what a run holds and depends on, and what is measured of it."""
+"""Runs of body filters on silhouettes, with their inputs and measures."""
 
 from collections.abc import Callable, Sequence
 from time import perf_counter
@@ -104,7 +104,7 @@ def view_errors(
 
 
 def subject_facts(subject: Subject[Any]) -> list[Any]:
-    """Return what a run depends on, beside its filter: silhouettes, cameras, truth, body and noise."""
+    """Return the inputs of a run, beside its filter: silhouettes, cameras, truth, body and noise."""
     view, body = subject.view, subject.body
     return [
         view.silhouettes.byte(), view.rig.matrix, view.rig.rotation, view.rig.translation,
@@ -142,7 +142,7 @@ def drift(fps: float) -> Callable[[Run], Tensor]:
 
 
 def csv_columns(fps: float) -> dict[str, Callable[[Row], Any]]:
-    """Return what a line of runs.csv says: sequence, method, seed, errors by part (mm), drift (mm/s)."""
+    """Return the columns of runs.csv: sequence, method, seed, errors by part (mm), drift (mm/s)."""
 
     def number(measure: Callable[[Run], Tensor]) -> Callable[[Row], str]:
         return lambda row: f"{float(measure(row.run)):.3f}"

@@ -1,4 +1,4 @@
-"""People as cameras see them: the body that is tracked, and the silhouettes of every clip."""
+"""Views of recorded people: the tracker's body, and the silhouettes of every clip."""
 
 import re
 from collections.abc import Sequence
@@ -17,6 +17,7 @@ from torchpose.demo._rendering.clothed_body import TrueShape
 from torchpose.errors import InputError
 from torchpose.evaluation._common import settings_hash
 from torchpose.io._mocap import MocapClip
+from torchpose.metrics import joint_errors
 from torchpose.whole_body import count_pixels
 from torchpose.whole_body._silhouettes.likelihood import intersection_over_union
 from torchpose.whole_body._silhouettes.shape import fit_radii
@@ -190,7 +191,7 @@ def view_of(body: Body, clip: MocapClip, conditions: Conditions) -> View:
         raise InputError(f"{clip.person} {clip.trial}: joints are missing in the first frame")
     joints = clip.joints[whole]
     states = fit_state(body, joints)
-    apart = (body.joints(states) - joints).norm(dim=-1)
+    apart = joint_errors(body.joints(states), joints)
     counts = count_pixels(body, states[:, None], rig, silhouettes[whole])
     overlap = intersection_over_union(counts)
     return View(

@@ -8,7 +8,7 @@
 """
 
 from benchmarks.engine.experiment import Experiment, Grid, Results, Row
-from benchmarks.engine.kept import source_hash
+from benchmarks.engine.kept import kept_prior, kept_runs, source_hash
 from benchmarks.engine.pictures import plot_by_condition
 from benchmarks.engine.statistics import (
     bootstrap,
@@ -38,6 +38,8 @@ __all__ = [
     "bootstrap",
     "choose_setting",
     "describe",
+    "kept_prior",
+    "kept_runs",
     "mean",
     "mean_of",
     "pivot",

@@ -1,4 +1,4 @@
-"""Experiments: subjects, methods, conditions and seeds in, one row for each run out."""
+"""Experiments: run a grid of subjects, methods, conditions and seeds, one row for each run."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -79,7 +79,7 @@ class Results:
 
     @property
     def runs(self) -> list[Any]:
-        """What was found in each row."""
+        """Return the runs of all rows."""
         return [row.run for row in self.rows]
 
     def values(self, measure: Measure) -> Float[Tensor, "Q S"]:

@@ -1,4 +1,4 @@
-"""Runs kept in a folder, each under a name that changes with everything that the run depends on."""
+"""Runs and priors kept in a folder, each under a name that changes with everything that it depends on."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -6,7 +6,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from torchpose.errors import TorchposeError
 from torchpose.evaluation._common import keep, read_kept, settings_hash
+from torchpose.priors import UpperBodyPrior
 
 _CHECKOUT = Path(__file__).parents[2]
 
@@ -60,3 +62,24 @@ def kept_runs(
             keep(paths[seed], run)
             found[seed] = read(seed)
     return list(found.values())
+
+
+def kept_prior(
+    folder: Path, name: str, facts: Sequence[Any], make: Callable[[], UpperBodyPrior]
+) -> UpperBodyPrior:
+    """Return a prior from its file, which is made if it is not there.
+
+    Args:
+        folder: with a file for each prior; damaged files are replaced.
+        name: of the kind of prior, with which the file's name begins.
+        facts: everything that the prior depends on (`settings_hash`).
+        make: fits it.
+    """
+    path = folder / f"{name}-{settings_hash(facts)}.safetensors"
+    if path.is_file():
+        try:
+            return UpperBodyPrior.load(path)
+        except TorchposeError:
+            path.unlink()
+    make().save(path)
+    return UpperBodyPrior.load(path)

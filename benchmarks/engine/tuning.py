@@ -1,4 +1,4 @@
-"""Choose what a method is run with: a value of its own, and a scale of its noise.
+"""Choose the settings of a method: a value of its own, and a scale of its noise.
 
 `choose_setting` tries the same grid for every method. `search_setting` goes on where the best is at the
 edge of what was tried.
@@ -40,7 +40,7 @@ class Tuning(NamedTuple):
 
     @property
     def error(self) -> float:
-        """The error of what was chosen, NaN if nothing was tried."""
+        """Return the error of the chosen setting, NaN if none was tried."""
         return self.error_of(self.setting)
 
     def text(self, digits: str = "g") -> str:
@@ -145,7 +145,7 @@ def _descend(
 def read_settings(
     path: str | Path, methods: Sequence[str], condition: str | None = None
 ) -> dict[str, Setting]:
-    """Return what an earlier run chose for these methods.
+    """Return the settings that an earlier run chose for these methods.
 
     Args:
         path: report.json of the run, or its folder. methods: by name.

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -63,7 +64,7 @@ def score(clip: Clip, network: HandNetwork | None) -> Score:
         tracker = HandTracker(prior, fps=video.fps, network=network)
     right = invented = 0
     labels = clip.labels
-    for t, hands, _ in measure(clip, tracker):
+    for t, _, hands, _ in measure(clip, tracker):
         if t <= BURN_IN:
             continue
         near = (hands.points - labels.centres[t]).norm(dim=-1) < labels.width / 4
@@ -73,12 +74,16 @@ def score(clip: Clip, network: HandNetwork | None) -> Score:
     return Score(right, int((known == 1).sum()), invented, int((known == 0).sum()))
 
 
-def fitted(
-    clips: Sequence[tuple[Clip, Windows]], path: Path, info: HandNetworkInfo, steps: int
-) -> HandNetwork:
+@cache
+def cached_windows(clip: Clip) -> Windows:
+    """Return the windows of a clip, which are measured once and only if a fit needs them."""
+    return windows_of(clip)
+
+
+def fitted(clips: Sequence[Clip], path: Path, info: HandNetworkInfo, steps: int) -> HandNetwork:
     """Return the network of a file, or fit it and write the file."""
     if not path.is_file():
-        fit([(clip.person, windows) for clip, windows in clips], info, steps).save(path)
+        fit([(clip.person, cached_windows(clip)) for clip in clips], info, steps).save(path)
     return HandNetwork.load(path)
 
 
@@ -131,21 +136,21 @@ def main() -> None:
     if args.quick:
         chosen = ("akstheme_gesture", "milk")
         clips, rendered, steps = [c for c in clips if c.name in chosen], rendered[:1], _QUICK_STEPS
-    labelled = [(clip, windows_of(clip)) for clip in (*clips, *rendered)]
+    labelled = [*clips, *rendered]
     if args.fit is not None:
         command = (
             "python -m benchmarks.hand_network --data DIR --out FOLDER --fit hands.safetensors"
         )
-        info = facts([clip for clip, _ in labelled], "hands", command)
-        fit([(clip.person, w) for clip, w in labelled], info, steps).save(args.fit)
+        windows = [(clip.person, cached_windows(clip)) for clip in labelled]
+        fit(windows, facts(labelled, "hands", command), steps).save(args.fit)
         return
     scores = {}
     for number, persons in enumerate(FOLDS):
         left_out = [clip for clip in clips if clip.person in persons]
         if not left_out:
             continue
-        known = [(clip, w) for clip, w in labelled if clip.person not in persons]
-        info = facts([clip for clip, _ in known], f"without {', '.join(persons)}", "")
+        known = [clip for clip in labelled if clip.person not in persons]
+        info = facts(known, f"without {', '.join(persons)}", "")
         network = fitted(known, out / f"fold-{number}.safetensors", info, steps)
         for clip in left_out:
             scores[clip.name] = score(clip, None), score(clip, network)

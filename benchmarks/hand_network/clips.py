@@ -178,8 +178,10 @@ def render_clips(folder: Path) -> list[Clip]:
     return clips
 
 
-def measure(clip: Clip, tracker: HandTracker) -> Iterator[tuple[int, HandMeasurements, Tensor]]:
-    """Yield the frames in which the labelled person is found: number, hands, and the window's anchor.
+def measure(
+    clip: Clip, tracker: HandTracker
+) -> Iterator[tuple[int, int, HandMeasurements, Tensor]]:
+    """Yield the frames in which the labelled person is found: number, row, hands, the window's anchor.
 
     Args:
         clip: with its labels. tracker: of hands.
@@ -193,7 +195,7 @@ def measure(clip: Clip, tracker: HandTracker) -> Iterator[tuple[int, HandMeasure
             row = _person(found.faces, clip.labels.nose[t])
             if row is not None:
                 hands = HandMeasurements(*(value[row] for value in found.hands))
-                yield t, hands, state.hands.anchors[row]
+                yield t, row, hands, state.hands.anchors[row]
 
 
 def _person(faces: Float[Tensor, "N 3"], nose: Float[Tensor, " 2"]) -> int | None:
@@ -215,8 +217,8 @@ def windows_of(clip: Clip) -> Windows:
     prior = HandPrior.from_prior(load_prior("kinect-upper-body"))
     tracker = HandTracker(prior, HandSettings(beside_network=1.0), fps, recorder)
     rows: list[tuple[Tensor, ...]] = []
-    for t, _, anchor in measure(clip, tracker):
-        lab, maps, faces = (x[:1] for x in recorder.asked)
+    for t, row, _, anchor in measure(clip, tracker):
+        lab, maps, faces = (x[row : row + 1] for x in recorder.asked)
         place = pixels_to_cells(clip.labels.centres[t][None], anchor[None])
         small = nn.functional.avg_pool2d(maps, 2)
         rows.append((lab, small.half(), faces, place.float(), clip.labels.seen[t][None]))

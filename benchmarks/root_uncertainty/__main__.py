@@ -1,5 +1,5 @@
 """Run `python -m benchmarks.root_uncertainty`."""
 
-from benchmarks._command import main
+from benchmarks._protocols import run_protocol
 
-main("root_uncertainty")
+run_protocol("root_uncertainty")

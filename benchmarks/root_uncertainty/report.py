@@ -1,4 +1,4 @@
-"""Tables of the protocol Root uncertainty, and what they say about the paper's claims."""
+"""Tables of the protocol Root uncertainty, and findings on the paper's claims."""
 
 from collections.abc import Mapping, Sequence
 
@@ -86,7 +86,7 @@ def add_differences(report: Report, runs: Results) -> None:
 
 
 def add_order(report: Report, n_cameras: int, runs: Results) -> None:
-    """Say whether each order of the paper's tables appears."""
+    """Add findings: whether each order of the paper's tables appears."""
     sir, apf = METHODS["sir"].label, METHODS["apf"].label
     errors = _by_method(runs)
     if _ROOT not in errors:
@@ -178,7 +178,7 @@ def add_speed(report: Report, runs: Results, budget: str) -> None:
 def add_tuning(
     report: Report, tunings: Mapping[float, Mapping[str, Tuning]], budget: Budget
 ) -> None:
-    """Add what validation chose for every method at every frame rate, or what was given."""
+    """Add the settings of every method at every frame rate, chosen by validation or given."""
     table = report.table(
         "tuning", "What validation clips chose: the setting with the smallest error",
         ["survival", "particles", "diffusion", "error (mm)", "tried: survival x diffusion, error"],

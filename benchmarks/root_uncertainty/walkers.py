@@ -1,4 +1,4 @@
-"""What the protocol Root uncertainty tracks with: bodies, limits, motion models, and three filters.
+"""Bodies, limits, motion models and filters of the protocol Root uncertainty.
 
 Parts turn in the body's own frame (DX), about centres that all persons share, so that one set of
 limb conditionals, limits and diffusion holds for everybody. They are learnt from trials of all
@@ -174,7 +174,7 @@ def prepare(
 
 
 def _limits(states: Float[Tensor, "N D"]) -> JointLimits:
-    """Return what training has, and room beside it, also where joints tell nothing: about the twist."""
+    """Return limits with a margin about the training states, also of the twist, which joints do not show."""
     learnt = JointLimits.fit(states)
     lower, upper = (learnt.lower - _ROOM).clamp_min(-1), (learnt.upper + _ROOM).clamp_max(1)
     return JointLimits(lower, upper, learnt.softness)
@@ -281,7 +281,7 @@ def make_filter(
 
 
 def hypotheses(name: str, budget: Budget) -> int:
-    """Return how many root hypotheses cost as much as the particles of the others.
+    """Return the number of root hypotheses of the same cost as the particles of the other methods.
 
     One that is weighed by the whole body costs another likelihood beside the sigma points.
     """
@@ -290,7 +290,7 @@ def hypotheses(name: str, budget: Budget) -> int:
 
 
 def selected_among(name: str, budget: Budget) -> int:
-    """Return how many particles the survival keeps a share of: hypotheses, or those of a layer."""
+    """Return the number of particles of which a share survives: hypotheses, or those of a layer."""
     if name == "apf":
         return budget.particles // LAYERS
     return budget.particles if name == "sir" else hypotheses(name, budget)
@@ -313,7 +313,7 @@ def _track(subject: Subject[Walker], how: Filter, seeds: Sequence[int]) -> list[
 
 
 def filter_facts(subject: Subject[Walker], how: Filter) -> list[Any]:
-    """Return what a run depends on, beside its seed."""
+    """Return the inputs of a run, beside its seed."""
     walker = subject.person
     facts = [*how, METHODS[how.name].options, walker.fps, *subject_facts(subject)]
     if how.budget.limits:

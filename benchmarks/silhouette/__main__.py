@@ -1,5 +1,5 @@
 """Run `python -m benchmarks.silhouette`."""
 
-from benchmarks._command import main
+from benchmarks._protocols import run_protocol
 
-main("silhouette")
+run_protocol("silhouette")

@@ -1,4 +1,4 @@
-"""The filters of the protocol Silhouette, what a person is tracked with, and runs of both."""
+"""Persons, filters and runs of the protocol Silhouette."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -72,12 +72,12 @@ both Gaussians; ``mrpf-published`` weighs by (MR 30) alone and samples the diffu
 
 
 def label_of(method: str) -> str:
-    """Return what a method is called in tables and pictures; its name, if it is none of `METHODS`."""
+    """Return the name of a method in tables and pictures; the given one if it is none of `METHODS`."""
     return METHODS[method].label if method in METHODS else method
 
 
 @dataclass(frozen=True)
-class Trackee(Tracked):
+class SilhouettePerson(Tracked):
     """A person with a manifold.
 
     Args:
@@ -109,7 +109,7 @@ def prepare(
     test_frames: int,
     validation_frames: int,
     manifold_seed: int = 0,
-) -> Trackee:
+) -> SilhouettePerson:
     """Fit body, manifold and noise to a person's training clips, and render what cameras see.
 
     Args:
@@ -129,7 +129,7 @@ def prepare(
     owner = bodies[first.person]
     validation = ((owner, view_of(owner, first, conditions)),)
     step_std = any_heading(motion_std(body, moved), first.up)
-    return Trackee(split, body, step_std, tests, validation, manifold)
+    return SilhouettePerson(split, body, step_std, tests, validation, manifold)
 
 
 def _states(bodies: dict[str, Body], clip: MocapClip) -> Float[Tensor, "T D"]:
@@ -153,7 +153,7 @@ def _manifold(split: Split, bodies: dict[str, Body], seed: int) -> BackConstrain
 
 def make_filter(
     name: str,
-    trackee: Trackee,
+    tracked: SilhouettePerson,
     setting: Setting,
     n_particles: int = 500,
     likelihood: str = "bidirectional",
@@ -162,18 +162,18 @@ def make_filter(
     """Return a filter that evaluates `n_particles` likelihoods a frame, whatever its method.
 
     Args:
-        name: among `METHODS`. trackee: whose noise and manifold.
+        name: among `METHODS`. tracked: whose noise and manifold.
         setting: sharpness or survival rate, and factor of the diffusion.
-        n_particles, likelihood: as `Filter`. body: instead of the trackee's.
+        n_particles, likelihood: as `Filter`. body: instead of this person's.
 
     Raises:
         InputError: an unknown method, or fewer particles than an annealed filter has layers.
     """
     if name not in METHODS:
         raise InputError(f"method must be among {', '.join(METHODS)}, got {name!r}")
-    method, own = METHODS[name], trackee.body if body is None else body
+    method, own = METHODS[name], tracked.body if body is None else body
     common: dict[str, Any] = {
-        "process_cov": (setting.scale * trackee.step_std).square(),
+        "process_cov": (setting.scale * tracked.step_std).square(),
         "likelihood": likelihood,
     }
     if name == "apf":
@@ -185,14 +185,14 @@ def make_filter(
     if name == "sir":
         return SIRParticleFilter(own, n_particles, sharpness=setting.value, **common)
     return ManifoldParticleFilter(
-        own, trackee.manifold, n_particles, sharpness=setting.value, **method.options, **common
+        own, tracked.manifold, n_particles, sharpness=setting.value, **method.options, **common
     )
 
 
 # --- runs -----------------------------------------------------------------------------------------
 
 
-def _track(subject: Subject[Trackee], how: Filter, seeds: Sequence[int]) -> list[Run]:
+def _track(subject: Subject[SilhouettePerson], how: Filter, seeds: Sequence[int]) -> list[Run]:
     tracker = make_filter(
         how.name, subject.person, how.setting, how.n_particles, how.likelihood, subject.body
     )
@@ -203,7 +203,9 @@ def _track(subject: Subject[Trackee], how: Filter, seeds: Sequence[int]) -> list
     return track_view(tracker, subject.body, subject.view, start, generators)
 
 
-def _found_pose(subject: Subject[Trackee], generator: torch.Generator) -> Float[Tensor, " D"]:
+def _found_pose(
+    subject: Subject[SilhouettePerson], generator: torch.Generator
+) -> Float[Tensor, " D"]:
     """Return the first pose from the first silhouettes alone, about the poses of the manifold."""
     view = subject.view
     found = find_first_pose(
@@ -213,7 +215,7 @@ def _found_pose(subject: Subject[Trackee], generator: torch.Generator) -> Float[
     return found.state.to(view.initial_state)
 
 
-def _facts(subject: Subject[Trackee], how: Filter) -> list[Any]:
+def _facts(subject: Subject[SilhouettePerson], how: Filter) -> list[Any]:
     facts = [*how, *subject_facts(subject)]
     if how.name.startswith("mrpf") or how.initial == "found":
         manifold = subject.person.manifold
@@ -233,7 +235,9 @@ class _Validation(NamedTuple):
     error: Tensor
 
 
-def _validate(subject: Subject[Trackee], how: Filter, seeds: Sequence[int]) -> list[_Validation]:
+def _validate(
+    subject: Subject[SilhouettePerson], how: Filter, seeds: Sequence[int]
+) -> list[_Validation]:
     view = subject.view
     sequence = ValidationSequence(
         view.silhouettes, view.rig, None, view.initial_state, view.clip.joints
@@ -253,7 +257,11 @@ _VALIDATION = Experiment(_Validation, _validate, _facts, _SOURCES)
 
 
 def tune(
-    trackees: Sequence[Trackee], method: str, n_particles: int, likelihood: str, folder: Path
+    tracked_persons: Sequence[SilhouettePerson],
+    method: str,
+    n_particles: int,
+    likelihood: str,
+    folder: Path,
 ) -> Tuning:
     """Return the setting with the smallest mean error over everybody's validation clips.
 
@@ -261,10 +269,10 @@ def tune(
     Every method has the same clips, one seed and the same number of settings to choose among.
 
     Args:
-        trackees: with their validation clips. method: among `METHODS`.
+        tracked_persons: with their validation clips. method: among `METHODS`.
         n_particles, likelihood: as `Filter`. folder: where errors are kept.
     """
-    subjects = validation_subjects(trackees)
+    subjects = validation_subjects(tracked_persons)
 
     def error(setting: Setting) -> float:
         how = Filter(method, setting, n_particles, likelihood)

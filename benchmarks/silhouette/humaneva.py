@@ -21,10 +21,10 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from benchmarks.bodies.clips import Split, take_frames, whole_frames
+from benchmarks.engine import kept_runs, source_hash
 from benchmarks.humaneva_files import FPS, PARTITIONS, HumanEvaTrial, find_humaneva, read_humaneva
 from torchpose.camera import CameraRig
 from torchpose.errors import InputError
-from torchpose.evaluation._common import keep, read_kept, settings_hash
 from torchpose.io._mocap import MocapClip, select_persons
 from torchpose.video import SilhouetteMeasurer, VideoSource, open_video, read_silhouettes
 from torchpose.video._silhouettes import SilhouetteView, clean_silhouette, fit_view, learning_frames
@@ -36,7 +36,10 @@ _FILMED = "1"  # the trial with videos and motion capture
 _WITHHELD = "2"  # the data set's test trial: whoever has its motion capture shall not train on it
 _MANIFOLD_FRAMES, _VALIDATION_FRAMES = 350, 300
 _LEAST_FRAMES = 20  # of a piece between two gaps
-_VERSION = 1
+_MEASURED_WITH = (
+    "torchpose/camera", "torchpose/measure/_brightness_background.py", "torchpose/video",
+    "benchmarks/humaneva_files.py", "benchmarks/silhouette/humaneva.py",
+)  # fmt: skip
 
 Measure = Callable[[NDArray[np.uint8]], NDArray[np.bool_]]
 
@@ -62,7 +65,7 @@ def humaneva_splits(
     train_persons: Sequence[str] = (),
     test_persons: Sequence[str] = (),
 ) -> list[Split]:
-    """Return who is tracked with what: one split for every action and person.
+    """Return a split for every action and person.
 
     Args:
         root: the data set. footage: is told where the frames of each clip are.
@@ -229,7 +232,7 @@ class HumanEvaFootage:
         self._places[clip.person, clip.trial] = _Place(trial, start)
 
     def frames_of(self, trial: HumanEvaTrial) -> int:
-        """Return how many frames all videos of a trial have, from the trial's first frame on."""
+        """Return the number of frames that all videos of a trial have, from the trial's first frame on."""
         counts = []
         for camera, path in trial.videos.items():
             with _open(path) as source:
@@ -270,11 +273,10 @@ class HumanEvaFootage:
         key = (trial.person, trial.action, size)
         if key not in self._measured:
             views = _views(trial, size)
-            path = self._folder / f"silhouettes-{settings_hash(_facts(trial, views))}.npz"
-            packed = read_kept(path, _Packed, _Packed._fields)
-            if packed is None:
-                packed = self._measure(trial, views)
-                keep(path, packed)
+            facts = _facts(trial, views)
+            (packed,) = kept_runs(
+                self._folder, _Packed, facts, (0,), lambda _: [self._measure(trial, views)]
+            )
             self._measured[key] = CameraRig([view.camera for view in views]), packed
         return self._measured[key]
 
@@ -326,9 +328,10 @@ def _measure_of(view: SilhouetteView, backgrounds: Sequence[Path], video: Path) 
 
 
 def _facts(trial: HumanEvaTrial, views: Sequence[SilhouetteView]) -> list[object]:
-    """Return what silhouettes depend on."""
+    """Return the inputs of silhouettes."""
     files = [*trial.videos.values(), *(p for paths in trial.backgrounds.values() for p in paths)]
-    facts: list[object] = [_VERSION, trial.person, trial.action, sorted(trial.first_frames.items())]
+    facts: list[object] = [source_hash(*_MEASURED_WITH), trial.person, trial.action]
+    facts.append(sorted(trial.first_frames.items()))
     facts += [[path.name, path.stat().st_size, path.stat().st_mtime_ns] for path in files]
     facts += [v for view in views for v in (view.camera.matrix, view.source.distortions, view.size)]
     return [*facts, views[0].camera.image_size]

@@ -17,7 +17,7 @@ from benchmarks.bodies.tracking import PUBLISHED_SURVIVAL
 from benchmarks.bodies.views import Conditions, Subject, image_size, subjects_of
 from benchmarks.engine import Grid, Setting, Tuning, read_settings
 from benchmarks.humaneva_files import is_humaneva
-from benchmarks.silhouette.filters import METHODS, TRACKING, Filter, Trackee, prepare, tune
+from benchmarks.silhouette.filters import METHODS, TRACKING, Filter, SilhouettePerson, prepare, tune
 from benchmarks.silhouette.humaneva import HumanEvaFootage, humaneva_splits
 from benchmarks.silhouette.report import Case, fill_one, fill_several
 from torchpose._core.files import check_output_folder
@@ -126,16 +126,16 @@ def run(
     cases = []
     for text in size:
         conditions = Conditions(image_size(text), faults, cameras_used, rig, seed, footage=footage)
-        trackees = [
+        tracked_persons = [
             prepare(split, conditions, frames, 15 if quick else _VALIDATION_FRAMES, seed)
             for split in tqdm(splits, disable=not progress, desc="bodies and manifolds")
         ]
         for n in particles:
             tunings = given or {
-                name: tune(trackees, name, n, likelihood, out)
+                name: tune(tracked_persons, name, n, likelihood, out)
                 for name in tqdm(method, disable=not progress, desc="exponents")
             }
-            cases.append(Case(n, text, trackees, tunings))
+            cases.append(Case(n, text, tracked_persons, tunings))
     by_name = _named(cases)
     runs = TRACKING.run(
         {name: _grid(case, likelihood, initial) for name, case in by_name.items()},
@@ -164,7 +164,7 @@ def _splits(
     data: str | Path, actions: tuple[str, ...], test_actions: tuple[str, ...],
     train_persons: tuple[str, ...], test_persons: tuple[str, ...], clips: int,
 ) -> list[Split]:  # fmt: skip
-    """Return who is tracked with what, everybody and every action by the names that were given."""
+    """Return the splits of clips, with the given names completed by those that are recorded."""
     recorded = read_mocap(data, FPS, actions)
     _one_action(recorded)
     if not test_actions:
@@ -184,7 +184,7 @@ def _splits(
 def _given_settings(
     methods: Sequence[str], sharpness: float | None, settings: str | None
 ) -> dict[str, Tuning]:
-    """Return what stands instead of a validation; nothing if that shall choose."""
+    """Return the settings that are given, without validation; an empty dictionary if it is to choose."""
     if settings is not None:
         if sharpness is not None:
             raise InputError("--settings holds a sharpness already: leave --sharpness out")
@@ -210,10 +210,10 @@ def _named(cases: Sequence[Case]) -> dict[str, Case]:
     return {name(case): case for case in cases}
 
 
-def _grid(case: Case, likelihood: str, initial: str) -> Grid[Subject[Trackee], Filter]:
-    """Return who is tracked by what under one condition."""
+def _grid(case: Case, likelihood: str, initial: str) -> Grid[Subject[SilhouettePerson], Filter]:
+    """Return the persons and filters of one condition."""
     return Grid(
-        subjects_of(case.trackees),
+        subjects_of(case.tracked_persons),
         {
             name: Filter(name, tuning.setting, case.n_particles, likelihood, initial)
             for name, tuning in case.tunings.items()

@@ -25,7 +25,7 @@ from benchmarks.engine import (
     write_csv,
 )
 from benchmarks.engine.statistics import Cell
-from benchmarks.silhouette.filters import Trackee, label_of
+from benchmarks.silhouette.filters import SilhouettePerson, label_of
 from torchpose.evaluation import Report
 from torchpose.evaluation._common import add_picture
 
@@ -37,12 +37,12 @@ class Case(NamedTuple):
 
     Attributes:
         n_particles: likelihoods a frame. size: of the silhouettes, such as 160x120.
-        trackees: who is tracked. tunings: by method.
+        tracked_persons: who is tracked. tunings: by method.
     """
 
     n_particles: int
     size: str
-    trackees: Sequence[Trackee]
+    tracked_persons: Sequence[SilhouettePerson]
     tunings: Mapping[str, Tuning]
 
 
@@ -55,11 +55,11 @@ def fill_one(report: Report, case: Case, runs: Results, out: Path, fps: float) -
         _add_differences(report, runs)
         report.findings += _order(runs)
     _add_tuning(report, case.tunings)
-    _add_sequences(report, case.trackees)
+    _add_sequences(report, case.tracked_persons)
     write_csv(out / "runs.csv", runs, csv_columns(fps))
     add_picture(report, out, "error-over-time.png", plot_errors_by_time(runs, fps, label=label_of))
     add_picture(report, out, "error-by-part.png", plot_errors_by_part(runs, label_of))
-    name, subject = next(iter(subjects_of(case.trackees).items()))
+    name, subject = next(iter(subjects_of(case.tracked_persons).items()))
     last = runs.names("method")[-1]
     shown = [(label_of(last), runs.where(subject=name, method=last).runs[0])]
     title = f"{name}: silhouettes and estimates"
@@ -96,7 +96,7 @@ def fill_several(
     for name in cases:
         _add_errors(report, runs.where(condition=name), name)
     for size, case in {case.size: case for case in cases.values()}.items():
-        _add_sequences(report, case.trackees, size)
+        _add_sequences(report, case.tracked_persons, size)
     figure = plot_by_condition(runs, {"error (mm)": _WHOLE}, "Error by condition", label=label_of)
     add_picture(report, out, "error-by-condition.png", figure)
 
@@ -183,7 +183,7 @@ def _comparable(runs: Results) -> bool:
 
 
 def _add_differences(report: Report, runs: Results, condition: str = "") -> None:
-    """Add what the manifold's methods have over the others, with intervals.
+    """Add the differences of the manifold's methods from the others, with intervals.
 
     Args:
         condition: of the runs, where a report has several; before the names of the rows.
@@ -207,7 +207,7 @@ def _add_differences(report: Report, runs: Results, condition: str = "") -> None
 
 
 def _order(runs: Results) -> list[str]:
-    """Return whether the order of the paper's tables appears, in words."""
+    """Return sentences on whether the order of the paper's tables appears."""
     if not {"sir", "apf", "mrpf"} <= {*runs.names("method")}:
         return []
     found = []
@@ -222,7 +222,7 @@ def _order(runs: Results) -> list[str]:
 
 
 def _add_tuning(report: Report, tunings: Mapping[str, Tuning], condition: str = "") -> None:
-    """Add what validation chose for every method, or what was given.
+    """Add the settings of every method, chosen by validation or given.
 
     Args:
         condition: of the runs, where a report has several; before the names of the rows.
@@ -248,7 +248,9 @@ def _add_tuning(report: Report, tunings: Mapping[str, Tuning], condition: str = 
         )
 
 
-def _add_sequences(report: Report, trackees: Sequence[Trackee], condition: str = "") -> None:
+def _add_sequences(
+    report: Report, tracked_persons: Sequence[SilhouettePerson], condition: str = ""
+) -> None:
     """Add the sequences, and how near the tracker's body can come to what the cameras see.
 
     Args:
@@ -256,11 +258,11 @@ def _add_sequences(report: Report, trackees: Sequence[Trackee], condition: str =
     """
     name = f"sequences, {condition}" if condition else "sequences"
 
-    def frames(part: str) -> Callable[[Subject[Trackee]], int]:
+    def frames(part: str) -> Callable[[Subject[SilhouettePerson]], int]:
         return lambda subject: sum(map(len, getattr(subject.person.split, part)))
 
     describe(
-        report, name, name.capitalize(), subjects_of(trackees),
+        report, name, name.capitalize(), subjects_of(tracked_persons),
         {
             "frames": lambda subject: len(subject.view.clip),
             "manifold frames": frames("manifold"), "validation frames": frames("validation"),
@@ -274,7 +276,7 @@ def _add_sequences(report: Report, trackees: Sequence[Trackee], condition: str =
 
 
 def _manifold_of(split: Split) -> str:
-    """Return whether the manifold is the person's own, and of which action if of another one."""
+    """Return "yes" if the manifold is the person's own, else "no", and its action if that is another one."""
     actions = " ".join(dict.fromkeys(clip.action for clip in split.manifold))
     other = actions not in {clip.action for clip in split.test}
     return ("yes" if split.seen else "no") + (f", of {actions}" if other else "")

@@ -30,7 +30,7 @@ class Problem(NamedTuple):
 
 
 def make_problem(path: Path | None = None, synthetic: bool = False) -> Problem:
-    """The released prior where it lies, else a synthetic one of the same scales."""
+    """Return the problem with the released prior if there is one, else with a synthetic one of its scales."""
     found = path or (None if synthetic else _released_file())
     if found is None:
         source, prior = "synthetic prior of 30 components", synthetic_prior()
@@ -47,7 +47,7 @@ def _released_file() -> Path | None:
 
 
 def released_prior(path: Path) -> GaussianMixture:
-    """The left arm of a prior in the layout of the authors' released files."""
+    """Return the left arm of a prior in the layout of the authors' released files."""
     with np.load(path) as file:
         parts = (torch.tensor(file[f"left_{k}"]) for k in ("weights", "means", "covariances"))
         weights, means, covariances = (part.double() for part in parts)
@@ -56,7 +56,7 @@ def released_prior(path: Path) -> GaussianMixture:
 
 
 def synthetic_prior(n_components: int = 30) -> GaussianMixture:
-    """Components as ill-scaled as the released ones: eigenvalues from 1e-6 to 2e4."""
+    """Return a mixture as ill-scaled as the released one: eigenvalues from 1e-6 to 2e4."""
     generator = torch.Generator().manual_seed(0)
     scale = torch.tensor([60.0, 60.0, 0.3] * 5 + [0.1] * 3 + [0.2] * 3, dtype=torch.float64)
     centre = torch.tensor([320.0, 240.0, 2.0] * 5 + [0.0] * 6, dtype=torch.float64)
@@ -70,7 +70,7 @@ def synthetic_prior(n_components: int = 30) -> GaussianMixture:
 
 
 def draw_sequences(problem: Problem, batch: int, n_frames: int, seed: int = 1) -> Tensor:
-    """Measurements [B, T, Z] of states that follow one component for 50 frames, then another."""
+    """Return measurements [B, T, Z] of states that follow one component for 50 frames, then another."""
     generator = torch.Generator().manual_seed(seed)
     prior = problem.prior
     model = make_transition(
@@ -91,7 +91,7 @@ def draw_sequences(problem: Problem, batch: int, n_frames: int, seed: int = 1) -
 
 
 def make_filter(problem: Problem, **options: object) -> MixtureKalmanFilter:
-    """The mixture Kalman filter of the problem, without gradients."""
+    """Return the mixture Kalman filter of the problem, without gradients."""
     if options.get("tracks", "fixed") == "fixed":
         options.setdefault("uniform_weight", UNIFORM_WEIGHT)
     parts = (problem.prior, problem.process_cov, problem.measurement_cov, problem.observed)

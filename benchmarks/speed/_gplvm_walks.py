@@ -1,6 +1,6 @@
-"""How well held-out trials of CMU walks come back from manifolds and from principal components."""
+"""Errors of held-out trials of CMU walks, reconstructed by manifolds and by principal components."""
 
-import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from benchmarks.speed._timing import Report
 from torchpose.body import body_joints, fit_body, fit_state
+from torchpose.errors import InputError
 from torchpose.learning import fit_gplvm, fit_gplvm_noise
 from torchpose.learning._manifolds import thin
 
@@ -24,8 +25,9 @@ class Walks(NamedTuple):
     test: Tensor
 
 
-def held_out_tables(args: Any, report: Report) -> None:
-    people = {person: read_walks(args.data, person) for person in args.persons}
+def held_out_tables(data: Path, persons: Sequence[str], report: Report) -> None:
+    """Add the errors of held-out trials, and the standard deviations for the filter."""
+    people = {person: read_walks(data, person) for person in persons}
     report.table(("1000 x root mean square", *people, "mean"), held_out_rows(people))
     report.add(
         "Of a column of x - f(g(x)), quaternion vectors, in two trials of each person; two more end the "
@@ -44,14 +46,16 @@ def held_out_tables(args: Any, report: Report) -> None:
 
 
 def read_walks(folder: Path, person: str) -> Walks:
-    """The first two trials to test on, two to end the fit, the others to fit to."""
+    """Return two trials to test on, two to end the fit, and the others to fit to."""
     trials = []
     for file in sorted(folder.glob(f"s{person}_*.npz")):
         with np.load(file) as arrays:
             joints, names = torch.from_numpy(arrays["joints"]).double(), arrays["names"].tolist()
             trials.append(body_joints(joints[:: round(float(arrays["fps"]) / 60)], names))
     if len(trials) < 5:
-        sys.exit(f"{folder}: expected five trials or more of s{person}, found {len(trials)}")
+        raise InputError(
+            f"{folder}: expected five trials or more of s{person}, found {len(trials)}"
+        )
     body = fit_body(torch.cat(trials[2:]))
     poses = [body.relative(fit_state(body, joints)) for joints in trials]
     return Walks(poses[4:], poses[2:4], torch.cat(poses[:2]))
@@ -88,7 +92,7 @@ def held_out_rows(people: dict[str, Walks]) -> list[list[str]]:
 def errors_of_walks(
     walks: Walks, row: bool = False, validation: bool = False, **options: Any
 ) -> tuple[float, float]:
-    """Of the test poses, and of the same where g is given noisy ones."""
+    """Return the error of the test poses, and that where g is given noisy ones."""
     train = [torch.cat(walks.train)[:TRAINED]] if row else thin(walks.train, TRAINED)
     watched = walks.validation if validation else None
     manifold = fit_gplvm(train, validation=watched, **options)

@@ -10,7 +10,7 @@ MB = 2**20
 
 
 def resident() -> int:
-    """Bytes of resident memory now."""
+    """Return the bytes of resident memory now."""
     return _status("VmRSS") or peak_resident()
 
 
@@ -27,7 +27,7 @@ def forget_peak() -> None:
 
 
 def peak_resident() -> int:
-    """Largest resident memory so far, in bytes; getrusage also counts the process before `exec`."""
+    """Return the largest resident memory so far, bytes; getrusage also counts the process before `exec`."""
     used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return _status("VmHWM") or used * (1 if sys.platform == "darwin" else 1024)
 

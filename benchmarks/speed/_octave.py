@@ -13,7 +13,7 @@ SCRIPT = Path(__file__).with_name("released_tracker.m")
 
 
 def find_octave() -> str | None:
-    """The command line version, else the other; None if neither is on the PATH."""
+    """Return the path of octave-cli, else that of octave; None if neither is on the PATH."""
     return shutil.which("octave-cli") or shutil.which("octave")
 
 

@@ -26,7 +26,7 @@ class Problem(NamedTuple):
 
 
 def component_log_density(x: np.ndarray, means: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """log N(x | mu_i, L_i L_i^T), [N, K], one component after the other."""
+    """Return log N(x | mu_i, L_i L_i^T), [N, K], computed component by component."""
     out = np.empty((len(x), len(means)))
     for i, (mean, factor) in enumerate(zip(means, factors, strict=True)):
         white = np.linalg.solve(factor, (x - mean).T)
@@ -52,7 +52,7 @@ def likelihood(problem: Problem, x: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def numpy_model(problem: Problem) -> tuple[np.ndarray, ...]:
-    """log pi, mu, Cholesky factors of Sigma and of Q + Sigma, Q."""
+    """Return log pi, mu, Cholesky factors of Sigma and of Q + Sigma, and Q."""
     process = np.diag(problem.process.numpy())
     covs = problem.prior.covariances.numpy()
     factors = np.linalg.cholesky(covs), np.linalg.cholesky(covs + process)

@@ -31,7 +31,7 @@ def make_model(
     measurement_cov: Array,
     observed: list[int],
 ) -> Model:
-    """F = Sigma (Q + Sigma)^-1, offset (I - F) mu, noise F Q (BL 31-32, 35-37)."""
+    """Return the model: F = Sigma (Q + Sigma)^-1, offset (I - F) mu, noise F Q (BL 31-32, 35-37)."""
     weights, means, covariances = prior
     dim = means.shape[1]
     matrix = np.linalg.solve(covariances + process_cov, covariances).transpose(0, 2, 1)

@@ -1,4 +1,4 @@
-"""Steps of EM over states that are drawn anew in every step: in new processes, with what they took.
+"""Steps of EM over states drawn anew in every step, in new processes, with their time and memory.
 
 `benchmarks.speed.streamed_em` makes tables of them.
 """
@@ -45,32 +45,32 @@ class Run(NamedTuple):
 
     @property
     def step(self) -> float:
-        """Median time of a step; all processes end it together."""
+        """Return the median time of a step; all processes end it together."""
         return median(self.found[0]["steps"])
 
     @property
     def best(self) -> float:
-        """Smallest time of a step."""
+        """Return the smallest time of a step."""
         return min(self.found[0]["steps"])
 
     @property
     def cpu(self) -> float:
-        """CPU time of a step, over all processes."""
+        """Return the CPU time of a step, over all processes."""
         return sum(result["cpu"] for result in self.found) / self.job.steps
 
     @property
     def peak(self) -> float:
-        """Peak of the resident memory of the largest process, MB."""
+        """Return the peak of the resident memory of the largest process, MB."""
         return max(result["peak"] for result in self.found) / MB
 
     @property
     def log_likelihood(self) -> float:
-        """Mean, before the last step."""
+        """Return the mean log-likelihood before the last step."""
         return self.found[0]["log_likelihood"]
 
     @property
     def name(self) -> str:
-        """Processes and threads of each."""
+        """Return the number of processes and the threads of each."""
         return f"{self.job.size} x {self.job.threads}"
 
 
@@ -101,7 +101,7 @@ def work(job: Job) -> dict[str, Any]:
 
 
 def join(job: Job) -> Share:
-    """The group of processes, each on a core of its own."""
+    """Return the group of processes."""
     if job.size == 1:
         return Share()
     torch.distributed.init_process_group(
@@ -111,7 +111,7 @@ def join(job: Job) -> Share:
 
 
 def make_source(job: Job) -> SampleSource:
-    """States of left arms from random viewpoints, drawn whenever they are asked for."""
+    """Return states of left arms from random viewpoints, drawn whenever they are asked for."""
     from torchpose.learning import TRAINING_VIEWS
 
     matrix = torch.tensor([[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]])
@@ -146,7 +146,7 @@ def made_up_arms() -> torch.Tensor:
 
 
 def in_processes(job: Job, quick: bool = False) -> Run:
-    """`work` in `job.size` new processes, each with cores of its own where there are enough.
+    """Call `work` in `job.size` new processes, each with cores of its own where there are enough.
 
     Args:
         job: what to do. quick: whether one process may be this one, whose peak means nothing.

@@ -1,11 +1,10 @@
-"""What every benchmark shares: taking turns, medians, the limits of the machine, tables.
+"""Options, timing in turns, limits of the machine, and tables that the benchmarks of speed share.
 
 Methods take turns (A B A B), so that other work on the machine hits all of them, and ratios are of
 medians from one run. CPU time stands beside wall time: on a machine that is not idle, the CPU time of
 a run with one thread is the figure to compare, since waiting for a core does not count.
 """
 
-import argparse
 import contextlib
 import os
 import platform
@@ -18,9 +17,25 @@ from typing import Any, NamedTuple
 
 import torch
 
-from benchmarks._table_file import table_file
+from benchmarks._table_file import TableFile
 
 THREAD_VARIABLES = ("OMP", "MKL", "OPENBLAS", "NUMBA")
+
+
+class Setup(NamedTuple):
+    """The options that benchmarks of speed share.
+
+    Attributes:
+        threads: cores for every library.
+        runs: timed runs of each method.
+        quick: a tiny problem, to see that it runs.
+        out: file for the same as Markdown, or a folder.
+    """
+
+    threads: int = 2
+    runs: int = 1
+    quick: bool = False
+    out: TableFile | None = None
 
 
 class Case(NamedTuple):
@@ -46,17 +61,17 @@ class Timing(NamedTuple):
 
     @property
     def median(self) -> float:
-        """Median wall time."""
+        """Return the median wall time."""
         return statistics.median(self.wall)
 
     @property
     def best(self) -> float:
-        """Smallest wall time."""
+        """Return the smallest wall time."""
         return min(self.wall)
 
     @property
     def median_cpu(self) -> float:
-        """Median CPU time of this process, over all of its threads."""
+        """Return the median CPU time of this process, over all of its threads."""
         return statistics.median(self.cpu)
 
 
@@ -76,22 +91,8 @@ class Limits(NamedTuple):
     call_us: float
 
 
-def parser(text: str | None, runs: int) -> argparse.ArgumentParser:
-    """Return a command line with the options of every benchmark.
-
-    Args:
-        text: of the script, whose first line describes it. runs: timed runs by default.
-    """
-    made = argparse.ArgumentParser(description=(text or "").partition("\n")[0])
-    made.add_argument("--threads", type=int, default=2, help="cores for every library")
-    made.add_argument("--runs", type=int, default=runs, help="timed runs of each method")
-    made.add_argument("--quick", action="store_true", help="a tiny problem, to see that it runs")
-    made.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
-    return made
-
-
 def limit_threads(threads: int) -> None:
-    """The same cores for every library; call it before peers are imported."""
+    """Pin every library to the same cores; to be called before peers are imported."""
     for name in THREAD_VARIABLES:
         os.environ[f"{name}_NUM_THREADS"] = str(threads)
     torch.set_num_threads(threads)
@@ -104,15 +105,14 @@ def limit_threads(threads: int) -> None:
         threadpool_limits(threads)
 
 
-def begin(title: str, options: argparse.ArgumentParser) -> tuple[argparse.Namespace, "Report"]:
-    """Parse the command line, pin every library to its cores, and return both options and report.
+def begin(title: str, setup: Setup) -> "Report":
+    """Pin every library to its cores, and return an empty report.
 
     Args:
-        title: of the report. options: from `parser`, perhaps with more of them.
+        title: of the report. setup: of the benchmark.
     """
-    args = options.parse_args()
-    limit_threads(args.threads)
-    return args, Report(title, args.out, args.threads)
+    limit_threads(setup.threads)
+    return Report(title, setup.out, setup.threads)
 
 
 def take_turns(cases: Sequence[Case], runs: int, warm: int = 1) -> list[Timing]:
@@ -138,12 +138,12 @@ def _time_once(timing: Timing) -> None:
 
 
 def ratio(peer: Timing, ours: Timing) -> Ratio:
-    """Ratio of medians per unit."""
+    """Return the ratio of the medians per unit."""
     return Ratio(peer.median / ours.median, peer.median_cpu / max(ours.median_cpu, 1e-12))
 
 
 def measure_limits(quick: bool = False) -> Limits:
-    """The floor's ingredients, each the best of several runs."""
+    """Measure the rates from which floors are computed, each the best of several runs."""
     size, runs = (256, 3) if quick else (1536, 7)
     rates = []
     for dtype in (torch.float64, torch.float32):
@@ -159,7 +159,7 @@ def measure_limits(quick: bool = False) -> Limits:
 
 
 def limits_line(limits: Limits) -> str:
-    """One line on what `measure_limits` found."""
+    """Return the limits of the machine as one line."""
     return (
         f"This machine: {limits.gflops_float64:.0f} GFLOP/s in float64, "
         f"{limits.gflops_float32:.0f} in float32 (products of large matrices), "
@@ -168,7 +168,7 @@ def limits_line(limits: Limits) -> str:
 
 
 def machine_line(threads: int, packages: Iterable[str] = ()) -> str:
-    """Processor, cores, versions, threads and load; nothing that names the machine."""
+    """Return processor, cores, versions, threads and load as one line that does not name the machine."""
     versions = [f"Python {platform.python_version()}", f"torch {torch.__version__}"]
     versions += [f"{name} {found}" for name in packages if (found := _version(name))]
     load = f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
@@ -179,7 +179,7 @@ def machine_line(threads: int, packages: Iterable[str] = ()) -> str:
 
 
 def processor_model() -> str:
-    """The processor's name, as far as the system tells."""
+    """Return the processor's name, as far as the system tells."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
@@ -195,7 +195,7 @@ def _version(package: str) -> str | None:
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table, padded so that it reads as text too; all columns but the first to the right."""
+    """Return a Markdown table padded to equal widths; all columns but the first are aligned to the right."""
     table = [list(header), *(list(row) for row in rows)]
     widths = [max(len(row[i]) for row in table) for i in range(len(header))]
     lines = [_table_line(row, widths) for row in table]
@@ -212,7 +212,7 @@ def _table_line(row: Sequence[str], widths: Sequence[int]) -> str:
 
 
 def number(value: float, digits: int = 3) -> str:
-    """`value` to a few significant digits, without an exponent where it is not needed."""
+    """Return a number with a few significant digits, without an exponent where it is not needed."""
     if value == 0 or not 1e-4 <= abs(value) < 1e7:
         return f"{value:.{digits - 1}e}" if value else "0"
     whole = len(str(int(abs(value)))) if abs(value) >= 1 else 0
@@ -229,16 +229,16 @@ class Report:
         self.add(f"## {title}")
 
     def add(self, text: str) -> None:
-        """One paragraph or table."""
+        """Print and keep one paragraph or table."""
         print(text, end="\n\n", flush=True)
         self.parts.append(text)
 
     def table(self, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-        """A Markdown table."""
+        """Print and keep a Markdown table."""
         self.add(markdown_table(header, rows))
 
     def close(self, packages: Iterable[str] = (), limits: Limits | None = None) -> None:
-        """Say what the machine is, and write the file.
+        """Add a line about the machine, and write the file.
 
         Args:
             packages: whose versions are told. limits: of the machine, where they were measured.

@@ -7,18 +7,18 @@ Each case runs in a process of its own and reports the peak of its resident memo
 works; gains and libraries are loaded before, by a short run.
 """
 
-import argparse
-import json
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+from benchmarks._command import run_command
 from benchmarks.speed._memory import MB, forget_peak, peak_resident, resident, return_free_memory
-from benchmarks.speed._timing import Report, limit_threads, number, parser
+from benchmarks.speed._new_process import call_in_new_process
+from benchmarks.speed._timing import Setup, begin, number
 
 TOLERANCE = 1e-10
+_MODULE = "benchmarks.speed.batch_memory"
 HEADER = ("case", "B", "T", "inputs MB", "outputs MB", "beyond MB", "beyond/outputs", "frames/s")
 
 
@@ -30,17 +30,13 @@ class Size(NamedTuple):
     covariances: bool
 
 
-def main() -> None:
-    args = parse_args()
-    limit_threads(args.threads)
-    if args.worker:
-        print(json.dumps(measure(Size(*args.worker))))
-        return
-    report = Report("Memory of a batch of sequences", args.out, args.threads)
+def main(setup: Setup = Setup()) -> None:
+    """Run and print the table."""
+    report = begin("Memory of a batch of sequences", setup)
     sizes = [Size(1000, 1000, False), Size(100, 1000, False), Size(100, 1000, True)]
-    if args.quick:
+    if setup.quick:
         sizes = [Size(8, 200, True)]
-    found = [in_a_process(size, args.threads) for size in sizes]
+    found = [in_new_process(size, setup.threads) for size in sizes]
     report.table(HEADER, table_rows(sizes, found))
     worst = max(result["error"] for result in found)
     report.add(
@@ -56,36 +52,28 @@ def main() -> None:
         sys.exit("a sequence comes out differently in a batch")
 
 
-def parse_args() -> argparse.Namespace:
-    made = parser(__doc__, runs=1)
-    made.add_argument("--worker", type=int, nargs=3, help=argparse.SUPPRESS)
-    return made.parse_args()
+def in_new_process(size: Size, threads: int) -> dict[str, Any]:
+    """Call `measure` in a process of its own."""
+    found: dict[str, Any] = call_in_new_process(threads, _MODULE, measure.__name__, *size)
+    return found
 
 
-def in_a_process(size: Size, threads: int) -> dict[str, Any]:
-    """`measure` in a new process, so that the peak is that of one case."""
-    command = [sys.executable, __file__, "--threads", str(threads)]
-    command += ["--worker", *(str(int(value)) for value in size)]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-def measure(size: Size) -> dict[str, Any]:
-    """Filter once; bytes of inputs, outputs and the peak beyond both."""
+def measure(batch: int, frames: int, covariances: bool) -> dict[str, Any]:
+    """Filter once; return bytes of inputs, outputs and the peak beyond both, seconds and the error."""
     import torch
 
     from benchmarks.speed._arm import draw_sequences, make_filter, make_problem
 
     problem = make_problem()
     tracker = make_filter(problem)
-    z = draw_sequences(problem, size.batch, size.frames)
+    z = draw_sequences(problem, batch, frames)
     with torch.inference_mode():
-        tracker(z[:2], return_cov=size.covariances)
+        tracker(z[:2], return_cov=covariances)
         return_free_memory()
         before = resident()
         forget_peak()
         start = time.perf_counter()
-        out = tracker(z, return_cov=size.covariances)
+        out = tracker(z, return_cov=covariances)
         seconds, peak = time.perf_counter() - start, peak_resident()
         parts = [out.mean, out.log_weights, out.log_evidence, out.failed_at]
         parts += [] if out.cov is None else [out.cov]
@@ -107,4 +95,4 @@ def table_rows(sizes: list[Size], found: list[dict[str, Any]]) -> Iterator[list[
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

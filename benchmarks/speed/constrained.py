@@ -1,4 +1,4 @@
-"""What does it cost to let only postures of an action through?
+"""How much does a filter cost that admits only postures of an action?
 
     python -m benchmarks.speed.constrained --threads 1
 
@@ -12,7 +12,8 @@ import math
 
 import torch
 
-from benchmarks.speed._timing import Case, Report, begin, number, parser, take_turns
+from benchmarks._command import run_command
+from benchmarks.speed._timing import Case, Report, Setup, begin, number, take_turns
 from torchpose.body import BODY_15, Body
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.learning import fit_action_space
@@ -35,20 +36,21 @@ DIMENSIONS = 13
 BODY = Body.of_height(BODY_15, 1.75)
 
 
-def main() -> None:
-    args, report = begin("Constrained prediction", parser(__doc__, runs=5))
+def main(setup: Setup = Setup(runs=5)) -> None:
+    """Run and print the tables."""
+    report = begin("Constrained prediction", setup)
     performances = [performance(seed) for seed in range(12)]
     postures = [state_postures(BODY, states) for states in performances]
     action = fit_action_space(postures, DIMENSIONS, name="bend", fps=30.0)
     std = constant_velocity_std(BODY, performances)
-    sizes = (20, 40) if args.quick else PARTICLES
-    frames(action, std, sizes, args.runs, report)
-    pieces(action, std, sizes[-1], args.runs, report)
+    sizes = (20, 40) if setup.quick else PARTICLES
+    frames(action, std, sizes, setup.runs, report)
+    pieces(action, std, sizes[-1], setup.runs, report)
     report.close()
 
 
 def performance(seed: int, n_frames: int = 60) -> torch.Tensor:
-    """States [T, D] of one bend: trunk, legs and arms, each with a size and a timing of its own."""
+    """Return states [T, D] of one bend: trunk, legs and arms, each with its own size and timing."""
     g = torch.Generator().manual_seed(seed)
     t = torch.linspace(0, 1, n_frames, dtype=torch.float64)
     states = torch.zeros(n_frames, BODY.dim, dtype=torch.float64)
@@ -67,7 +69,7 @@ def performance(seed: int, n_frames: int = 60) -> torch.Tensor:
 
 
 def rig() -> CameraRig:
-    """One camera at the person's left, 3.4 m away."""
+    """Return one camera at the person's left, 3.4 m away."""
     turn = torch.tensor([[0.0, 0, -1], [0, -1, 0], [-1, 0, 0]], dtype=torch.float64)
     place = -turn @ torch.tensor([3.4, 0.95, 0.0], dtype=torch.float64)
     vector = (math.pi / 2**0.5, 0.0, -math.pi / 2**0.5)
@@ -81,7 +83,7 @@ def rig() -> CameraRig:
 def frames(
     action: ActionSpace, std: torch.Tensor, sizes: tuple[int, ...], runs: int, report: Report
 ) -> None:
-    """Cost per frame and acceptance over the number of particles."""
+    """Add the cost per frame and the acceptance over the number of particles."""
     states = performance(99)[SKIPPED : SKIPPED + FRAMES + 1]
     camera = rig()
     silhouettes = render(BODY, states[1:], camera, HEIGHT, WIDTH)
@@ -115,7 +117,7 @@ def frames(
 
 
 def pieces(action: ActionSpace, std: torch.Tensor, n: int, runs: int, report: Report) -> None:
-    """What a look at each particle costs, part by part."""
+    """Add the cost per particle of each part of a frame."""
     g = torch.Generator().manual_seed(0)
     noise = torch.randn(n, BODY.dim, generator=g, dtype=torch.float64)
     states = BODY.perturb(performance(99)[SKIPPED].expand(n, -1), noise * std)
@@ -141,4 +143,4 @@ def pieces(action: ActionSpace, std: torch.Tensor, n: int, runs: int, report: Re
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -7,7 +7,6 @@ One float64 function computes the mean log-likelihood of every result. scikit-le
 torchgmm and pomegranate, where they can be imported, only know float32.
 """
 
-import argparse
 import logging
 import math
 import sys
@@ -19,15 +18,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks._command import run_command
 from benchmarks.speed._timing import (
     Case,
     Limits,
     Report,
+    Setup,
     Timing,
     begin,
     measure_limits,
     number,
-    parser,
     ratio,
     take_turns,
 )
@@ -57,9 +57,15 @@ class Method(NamedTuple):
     call: Callable[[], Any]
 
 
-def main() -> None:
-    args, report = begin("Expectation-maximisation, 30 components, 21 dimensions", options())
-    points, iterations, n_components = (2000, 3, 4) if args.quick else (args.points, 20, 30)
+def main(setup: Setup = Setup(runs=3), *, points: int = 100_000) -> None:
+    """Run and print the table.
+
+    Args:
+        setup: see `Setup`.
+        points: to fit to.
+    """
+    report = begin("Expectation-maximisation, 30 components, 21 dimensions", setup)
+    points, iterations, n_components = (2000, 3, 4) if setup.quick else (points, 20, 30)
     problem = make_problem(points, n_components, iterations)
     report.add(
         f"{points:,} points, {n_components} components, {iterations} iterations from one start "
@@ -68,8 +74,8 @@ def main() -> None:
     methods = make_methods(problem, report)
     found = {m.name: mean_log_likelihood(problem.x, wide(m.call())) for m in methods}
     failed = report_agreement(report, found)
-    timings = take_turns([Case(m.name, m.call) for m in methods], args.runs, warm=0)
-    limits = measure_limits(args.quick)
+    timings = take_turns([Case(m.name, m.call) for m in methods], setup.runs, warm=0)
+    limits = measure_limits(setup.quick)
     report.table(HEADER, table_rows(timings, found, iterations))
     report.add(floor_text(problem, limits))
     report.close(PACKAGES, limits)
@@ -77,14 +83,8 @@ def main() -> None:
         sys.exit("torchpose and scikit-learn do not reach the same likelihood")
 
 
-def options() -> argparse.ArgumentParser:
-    made = parser(__doc__, runs=3)
-    made.add_argument("--points", type=int, default=100_000)
-    return made
-
-
 def make_problem(n: int, n_components: int, iterations: int) -> Problem:
-    """Overlapping clusters of unequal shape, scaled to unit variance; one point of each starts it."""
+    """Draw overlapping clusters of unequal shape, scaled to unit variance; start from a point of each."""
     rng = np.random.default_rng(0)
     each = -(-n // n_components)
     parts = []
@@ -102,7 +102,7 @@ def make_problem(n: int, n_components: int, iterations: int) -> Problem:
 
 
 def mean_log_likelihood(x: Tensor, mixture: MixtureParameters) -> float:
-    """The same for everyone: whitened residuals, one component at a time, in float64."""
+    """Return the mean log-likelihood in float64, by whitened residuals of one component at a time."""
     terms = []
     for weight, mean, covariance in zip(*mixture, strict=True):
         factor = torch.linalg.cholesky(covariance)
@@ -113,7 +113,7 @@ def mean_log_likelihood(x: Tensor, mixture: MixtureParameters) -> float:
 
 
 def wide(result: Any) -> MixtureParameters:
-    """Whatever a method returned, as float64 tensors."""
+    """Return the result of any method as float64 tensors."""
     parts = (torch.as_tensor(part).detach().double() for part in result)
     return MixtureParameters(*parts)
 
@@ -122,7 +122,7 @@ def wide(result: Any) -> MixtureParameters:
 
 
 def make_methods(problem: Problem, report: Report) -> list[Method]:
-    """torchpose first, then every peer that can be imported."""
+    """Return torchpose's methods, then every peer that can be imported."""
     methods = [torchpose_fit(problem, dtype) for dtype in (torch.float64, torch.float32)]
     for name, make in PEERS.items():
         try:
@@ -222,7 +222,7 @@ PEERS: dict[str, Callable[[Problem], Method]] = {
 
 
 def report_agreement(report: Report, found: dict[str, float]) -> bool:
-    """Say how far torchpose and scikit-learn are apart; True if too far."""
+    """Report the difference of torchpose and scikit-learn; return True if it is too large."""
     ours, theirs = found["torchpose, float64"], found.get("scikit-learn, float64")
     if theirs is None:
         report.add("Agreement: scikit-learn cannot be imported, nothing to compare with.")
@@ -247,7 +247,7 @@ def table_rows(
 
 
 def floor_text(problem: Problem, limits: Limits) -> str:
-    """Two products of all points' features with one table, at the rate of large products."""
+    """Return the floor: two products of all points' features with one table, at the measured rate."""
     n_features = 1 + DIM + DIM * (DIM + 1) // 2
     flops = 4e-9 * len(problem.x) * n_features * len(problem.start.weights) * problem.iterations
     wide_s, narrow_s = flops / limits.gflops_float64, flops / limits.gflops_float32
@@ -258,4 +258,4 @@ def floor_text(problem: Problem, limits: Limits) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

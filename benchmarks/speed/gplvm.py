@@ -16,7 +16,7 @@ import contextlib
 import copy
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,16 +24,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks._command import run_command
 from benchmarks.speed._gplvm_walks import held_out_tables
 from benchmarks.speed._timing import (
     Case,
     Limits,
     Report,
+    Setup,
     Timing,
     begin,
     measure_limits,
     number,
-    parser,
     ratio,
     take_turns,
 )
@@ -62,17 +63,24 @@ class Method(NamedTuple):
     peer: bool = False
 
 
-def main() -> None:
-    options = parser(__doc__, runs=9)
-    options.add_argument(
-        "--data", type=Path, help="folder of mocap_cmu_walk; none: no held-out table"
-    )
-    options.add_argument("--persons", nargs="+", default=["07", "08", "35", "39"], help="of it")
-    args, report = begin("A manifold: prediction and fit", options)
-    frames, sizes = (40, (60,)) if args.quick else (FRAMES, SIZES)
+def main(
+    setup: Setup = Setup(runs=9),
+    *,
+    data: Path | None = None,
+    persons: Sequence[str] = ("07", "08", "35", "39"),
+) -> None:
+    """Run and print the tables.
+
+    Args:
+        setup: see `Setup`.
+        data: folder of mocap_cmu_walk; none: no held-out table.
+        persons: of it.
+    """
+    report = begin("A manifold: prediction and fit", setup)
+    frames, sizes = (40, (60,)) if setup.quick else (FRAMES, SIZES)
     poses = walk(frames)
     manifold = fit_gplvm(poses, steps=3)
-    limits, failed, rows, ratios = measure_limits(args.quick), False, [], []
+    limits, failed, rows, ratios = measure_limits(setup.quick), False, [], []
     for count in sizes:
         z = latent_points(manifold, count)
         truth = true_prediction(manifold, z)
@@ -84,7 +92,7 @@ def main() -> None:
             f"the largest value, at most {TOLERANCE:g} allowed."
         )
         failed |= not worst < TOLERANCE
-        timings = take_turns([Case(m.name, m.call) for m in methods], args.runs, warm=2)
+        timings = take_turns([Case(m.name, m.call) for m in methods], setup.runs, warm=2)
         rows += prediction_rows(methods, timings, errors, count)
         rows.append(floor_row(manifold, count, limits))
         ratios += speedups(methods, timings, count)
@@ -92,16 +100,16 @@ def main() -> None:
     report.add("mean, variance: largest |difference| over the largest |truth|.")
     if ratios:
         report.add(f"{'; '.join(ratios)} (the aim: {GOAL} times).")
-    report.table(FIT_HEADER, fit_rows(poses, manifold, args))
-    if args.data is not None:
-        held_out_tables(args, report)
+    report.table(FIT_HEADER, fit_rows(poses, manifold, setup.quick))
+    if data is not None:
+        held_out_tables(data, persons, report)
     report.close(PACKAGES, limits)
     if failed:
         sys.exit("torchpose differs from the plain computation by more than is allowed")
 
 
 def walk(frames: int) -> Tensor:
-    """A cyclic motion of quaternion vectors."""
+    """Return a cyclic motion of quaternion vectors."""
     generator = torch.Generator().manual_seed(0)
     angle = 2 * math.pi * torch.arange(frames, dtype=torch.float64) / CYCLE
     waves = torch.stack([f(n * angle) for n in (1, 2, 3) for f in (torch.sin, torch.cos)], 1)
@@ -112,7 +120,7 @@ def walk(frames: int) -> Tensor:
 
 
 def latent_points(manifold: BackConstrainedGPLVM, count: int) -> Tensor:
-    """Particles about the trajectory."""
+    """Draw particles about the trajectory."""
     generator = torch.Generator().manual_seed(1)
     chosen = torch.randint(len(manifold.latents), (count,), generator=generator)
     noise = torch.randn(count, 2, generator=generator, dtype=torch.float64)
@@ -120,7 +128,7 @@ def latent_points(manifold: BackConstrainedGPLVM, count: int) -> Tensor:
 
 
 def true_prediction(manifold: BackConstrainedGPLVM, z: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """(MR 25) and (MR 26) with plain inverses, noise included."""
+    """Return (MR 25) and (MR 26) by plain inverses, noise included."""
     beta, beta0, gamma, _ = (float(value.exp()) for value in manifold.kernel)
     noise = float(manifold.kernel.noise)
     latents, mean = manifold.latents.numpy(), manifold.poses.mean(0).numpy()
@@ -141,7 +149,7 @@ def true_prediction(manifold: BackConstrainedGPLVM, z: Tensor) -> tuple[np.ndarr
 def make_methods(
     manifold: BackConstrainedGPLVM, z: Tensor, report: Report, quiet: bool
 ) -> list[Method]:
-    """torchpose first, then gpytorch if it can be imported."""
+    """Return torchpose's methods, then gpytorch's if it can be imported."""
     methods = [
         method
         for dtype in (torch.float64, torch.float32)
@@ -174,7 +182,7 @@ def torchpose_methods(
 
 
 def gpytorch_methods(manifold: BackConstrainedGPLVM, z: Tensor, dtype: torch.dtype) -> list[Method]:
-    """An exact GP with a batch of outputs that share the kernel."""
+    """Return an exact GP with a batch of outputs that share the kernel."""
     import gpytorch
 
     model = gpytorch_model(manifold, dtype)
@@ -199,7 +207,7 @@ def gpytorch_methods(manifold: BackConstrainedGPLVM, z: Tensor, dtype: torch.dty
 
 
 def gpytorch_model(manifold: BackConstrainedGPLVM, dtype: torch.dtype) -> Any:
-    """In evaluation mode, with the kernel, noise and latent points of the manifold."""
+    """Return gpytorch's model in evaluation mode, with kernel, noise and latent points of the manifold."""
     import gpytorch
 
     columns = manifold.dim
@@ -230,14 +238,14 @@ def gpytorch_model(manifold: BackConstrainedGPLVM, dtype: torch.dtype) -> Any:
 # --- fit
 
 
-def fit_rows(poses: Tensor, manifold: BackConstrainedGPLVM, args: Any) -> list[list[str]]:
-    """Ten evaluations of objective and gradient of both, and a whole fit."""
+def fit_rows(poses: Tensor, manifold: BackConstrainedGPLVM, quick: bool) -> list[list[str]]:
+    """Return the times of ten evaluations of objective and gradient of both, and of a whole fit."""
     target, gamma = poses - poses.mean(0), float(manifold.gamma_x)
     ours = GPLVMFit(target, 2, gamma, "adam")
     cases = [Case("torchpose, 10 steps of Adam", ours.step)]
     with contextlib.suppress(ImportError):
         cases.append(Case("gpytorch, 10 steps of Adam", gpytorch_steps(manifold)))
-    runs = 1 if args.quick else 3
+    runs = 1 if quick else 3
     timings = take_turns(cases, runs)
     whole = Case(
         "torchpose, whole fit (3 steps of 10 L-BFGS iterations)",
@@ -255,7 +263,7 @@ def fit_rows(poses: Tensor, manifold: BackConstrainedGPLVM, args: Any) -> list[l
 
 
 def gpytorch_steps(manifold: BackConstrainedGPLVM) -> Callable[[], None]:
-    """Ten steps of Adam on the marginal likelihood, latent points by back constraints."""
+    """Return ten steps of Adam on the marginal likelihood, with latent points by back constraints."""
     import gpytorch
 
     model = gpytorch_model(manifold, torch.float64).train()
@@ -283,7 +291,7 @@ def gpytorch_steps(manifold: BackConstrainedGPLVM) -> Callable[[], None]:
 
 
 def errors_of(method: Method, truth: tuple[np.ndarray, np.ndarray]) -> list[float]:
-    """Largest |difference| over the largest |truth|, of mean and variance."""
+    """Return the largest |difference| over the largest |truth|, of mean and variance."""
     errors = []
     for value, expected in zip(method.call(), truth, strict=True):
         if value is not None:
@@ -307,7 +315,7 @@ def prediction_rows(
 
 
 def speedups(methods: list[Method], timings: list[Timing], count: int) -> list[str]:
-    """gpytorch's time over torchpose's, in the same precision."""
+    """Return gpytorch's time over torchpose's in the same precision, in words."""
     found = []
     by_name = {method.name: timing for method, timing in zip(methods, timings, strict=True)}
     for method in methods:
@@ -322,7 +330,7 @@ def speedups(methods: list[Method], timings: list[Timing], count: int) -> list[s
 
 
 def floor_row(manifold: BackConstrainedGPLVM, count: int, limits: Limits) -> list[str]:
-    """Arithmetic of mean and variance at the rate of large products."""
+    """Return the arithmetic of mean and variance at the rate of large products as a row."""
     frames = len(manifold.poses)
     flops = count * frames * (2 * manifold.dim + frames + 2 * (manifold.latent_dim + 2))
     seconds = 1e-9 * flops / limits.gflops_float64
@@ -330,4 +338,4 @@ def floor_row(manifold: BackConstrainedGPLVM, count: int, limits: Limits) -> lis
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -9,23 +9,23 @@ peak of its resident memory beyond what was resident before; gains and libraries
 short run.
 """
 
-import argparse
-import json
-import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
+from benchmarks._command import run_command
 from benchmarks.speed._memory import MB, forget_peak, peak_resident, resident, return_free_memory
-from benchmarks.speed._timing import Report, limit_threads, number, parser
+from benchmarks.speed._new_process import call_in_new_process
+from benchmarks.speed._timing import Setup, begin, number
 
 METHODS = ("window-mixture", "mkf-fixed", "multiple-model")
-JUMPING = (
-    2  # poses of bones jump where other hypotheses are chosen: no differences are like its gradient
-)
+JUMPING = 2
+"""Poses of bones jump where other hypotheses are chosen: no differences are like its gradient."""
+
 NAMES = ("head", "hand_left", "hand_right")
 TOLERANCE, SLOPE_TOLERANCE = 1e-9, 1e-5
+_MODULE = "benchmarks.speed.gradients"
 HEADER = ("method", "B", "T", "CPU s", "with gradients", "ratio", "MB", "with gradients")
 
 
@@ -37,22 +37,22 @@ class Case(NamedTuple):
     frames: int
 
 
-def main() -> None:
-    args = parse_args()
-    limit_threads(args.threads)
-    if args.worker:
-        print(json.dumps([measure(Case(*case), on) for *case, on in json.loads(args.worker)]))
-        return
-    report = Report("Gradients of poses", args.out, args.threads)
+Way = tuple[int, int, int, bool]
+"""A case, and whether gradients are asked for."""
+
+
+def main(setup: Setup = Setup()) -> None:
+    """Run and print the table."""
+    report = begin("Gradients of poses", setup)
     cases = [Case(method, batch, 100) for method in (0, 1) for batch in (1, 16)]
     cases.append(Case(JUMPING, 1, 100))
-    if args.quick:
+    if setup.quick:
         cases = [Case(0, 1, 6), Case(1, 1, 6), Case(JUMPING, 1, 3)]
     ways = [(*case, on) for case in cases for on in (False, True)]
-    if args.quick:  # whose peaks mean nothing
-        results = in_a_process(ways, args.threads)
+    if setup.quick:  # whose peaks mean nothing
+        results = in_new_process(ways, setup.threads)
     else:
-        results = [result for way in ways for result in in_a_process([way], args.threads)]
+        results = [result for way in ways for result in in_new_process([way], setup.threads)]
     found = list(zip(results[::2], results[1::2], strict=True))
     report.table(HEADER, table_rows(cases, found))
     moved = max(result["moved"] for _, result in found)
@@ -68,18 +68,17 @@ def main() -> None:
         sys.exit("gradients are not those of the poses")
 
 
-def parse_args() -> argparse.Namespace:
-    made = parser(__doc__, runs=1)
-    made.add_argument("--worker", help=argparse.SUPPRESS)
-    return made.parse_args()
+def in_new_process(ways: Sequence[Way], threads: int) -> list[dict[str, Any]]:
+    """Call `measure_all` in a new process; a peak is that of one way."""
+    found: list[dict[str, Any]] = call_in_new_process(
+        threads, _MODULE, measure_all.__name__, list(ways)
+    )
+    return found
 
 
-def in_a_process(ways: list[tuple[Any, ...]], threads: int) -> list[dict[str, Any]]:
-    """`measure` in a new process for some cases, with and without gradients; a peak is that of one."""
-    command = [sys.executable, __file__, "--threads", str(threads)]
-    command += ["--worker", json.dumps(ways)]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    return json.loads(done.stdout.splitlines()[-1])
+def measure_all(ways: Sequence[Way]) -> list[dict[str, Any]]:
+    """Call `measure` for some cases, with or without gradients."""
+    return [measure(Case(*case), gradients) for *case, gradients in ways]
 
 
 def measure(case: Case, gradients: bool) -> dict[str, Any]:
@@ -119,7 +118,7 @@ def measure(case: Case, gradients: bool) -> dict[str, Any]:
 
 
 def slope_error(tracker: Any, keypoints: Any) -> float:
-    """|gradient - central difference| / |gradient| of the summed joints along a random direction."""
+    """Return |gradient - central difference| / |gradient| of the summed joints along a random direction."""
     import torch
 
     generator = torch.Generator().manual_seed(1)
@@ -133,7 +132,7 @@ def slope_error(tracker: Any, keypoints: Any) -> float:
 
 
 def draw_keypoints(batch: int, frames: int) -> Any:
-    """Head and hands that wander about, pixels [B, T, 3, 2]."""
+    """Draw head and hands that wander about, pixels [B, T, 3, 2]."""
     import torch
 
     generator = torch.Generator().manual_seed(0)
@@ -155,4 +154,4 @@ def table_rows(
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

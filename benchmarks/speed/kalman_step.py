@@ -14,15 +14,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from benchmarks._command import run_command
 from benchmarks.speed._timing import (
     Case,
     Limits,
     Report,
+    Setup,
     Timing,
     begin,
     measure_limits,
     number,
-    parser,
     ratio,
     take_turns,
 )
@@ -65,10 +66,11 @@ class Method(NamedTuple):
     result: Callable[[Any], Step] = lambda out: Step(*out)
 
 
-def main() -> None:
-    args, report = begin("One Kalman step, 21 dimensions, 8 measured", parser(__doc__, runs=15))
-    sizes, inner = ((8,), 1) if args.quick else (SIZES, 50)
-    limits, failed = measure_limits(args.quick), False
+def main(setup: Setup = Setup(runs=15)) -> None:
+    """Run and print the tables."""
+    report = begin("One Kalman step, 21 dimensions, 8 measured", setup)
+    sizes, inner = ((8,), 1) if setup.quick else (SIZES, 50)
+    limits, failed = measure_limits(setup.quick), False
     rows: list[list[str]] = []
     for n_filters in sizes:
         problem = make_problem(n_filters)
@@ -82,7 +84,7 @@ def main() -> None:
         )
         failed |= not worst < TOLERANCE
         cases = [Case(m.name, m.call, 1, inner if fast(m) else 1) for m in methods]
-        timings = take_turns(cases, args.runs, warm=3)
+        timings = take_turns(cases, setup.runs, warm=3)
         rows += table_rows(timings, errors, n_filters)
         rows.append(floor_row(n_filters, limits))
     report.table(HEADER, rows)
@@ -97,7 +99,7 @@ def fast(method: Method) -> bool:
 
 
 def make_problem(n_filters: int) -> Problem:
-    """Stable random systems."""
+    """Draw stable random systems."""
     rng = np.random.default_rng(0)
     transition = np.eye(DIM) + 0.01 * rng.standard_normal((n_filters, DIM, DIM))
     noise = 0.01 * np.eye(DIM) * rng.uniform(0.5, 2, (n_filters, 1, 1))
@@ -109,7 +111,7 @@ def make_problem(n_filters: int) -> Problem:
 
 
 def true_step(problem: Problem) -> Step:
-    """The textbook's formulas in float64 NumPy."""
+    """Return the step by the textbook's formulas in float64 NumPy."""
     F, Q, H, R, mean, cov, z = problem
     mean = np.einsum("bij,bj->bi", F, mean)
     cov = F @ cov @ F.transpose(0, 2, 1) + Q
@@ -127,12 +129,12 @@ def true_step(problem: Problem) -> Step:
 
 
 def stack_steps(steps: Any) -> Step:
-    """The steps of a loop over filters as one."""
+    """Return the steps of a loop over filters as one."""
     return Step(*(np.stack(parts) for parts in zip(*steps, strict=True)))
 
 
 def make_methods(problem: Problem, report: Report, quiet: bool) -> list[Method]:
-    """torchpose first, then every peer that can be imported."""
+    """Return torchpose's methods, then every peer that can be imported."""
     methods = [torchpose_step(problem, torch.float64), torchpose_step(problem, torch.float32)]
     methods.append(numpy_loop(problem))
     for name, make in PEERS.items():
@@ -277,7 +279,7 @@ PEERS: dict[str, Callable[[Problem], list[Method]]] = {
 
 
 def error_of(method: Method, truth: Step) -> list[float]:
-    """Largest |difference| / max(|truth|, 1) of mean, covariance and log-likelihood."""
+    """Return the largest |difference| / max(|truth|, 1) of mean, covariance and log-likelihood."""
     found = method.result(method.call())
     errors = []
     for value, expected in zip(found, truth, strict=True):
@@ -298,7 +300,7 @@ def table_rows(
 
 
 def floor_row(n_filters: int, limits: Limits) -> list[str]:
-    """Arithmetic at the rate of large products plus one pass over what goes in and out."""
+    """Return the time of the arithmetic and of one pass over inputs and outputs as a row."""
     z = len(OBSERVED)
     products = 4 * DIM**3 + 4 * DIM**2  # F P F^T, F m and their sums
     update = z**3 / 3 + z * z * DIM + 2 * z * DIM * DIM + 4 * z * DIM  # factor, solve, W^T W, mean
@@ -308,4 +310,4 @@ def floor_row(n_filters: int, limits: Limits) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

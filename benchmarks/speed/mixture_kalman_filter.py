@@ -11,7 +11,6 @@ The prior is that of --prior, else the authors' released one if TORCHPOSE_DATA n
 holds it (signer/released_prior_Training20_02.npz), else a synthetic one of the same scales.
 """
 
-import argparse
 import itertools
 import sys
 from collections.abc import Callable, Iterator
@@ -22,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks._command import run_command
 from benchmarks.speed import _released
 from benchmarks.speed._arm import (
     DIM,
@@ -36,11 +36,11 @@ from benchmarks.speed._timing import (
     Case,
     Limits,
     Report,
+    Setup,
     Timing,
     begin,
     measure_limits,
     number,
-    parser,
     ratio,
     take_turns,
 )
@@ -76,10 +76,24 @@ class Method(NamedTuple):
     reference: np.ndarray | None = None
 
 
-def main() -> None:
-    args, report = begin("Mixture Kalman filter against the released algorithm", options())
-    sizes = Sizes(2, 40, 10, 10, 5) if args.quick else Sizes(args.batch, 1000, 200, 40, 10)
-    problem = make_problem(args.prior, args.synthetic)
+def main(
+    setup: Setup = Setup(runs=7),
+    *,
+    batch: int = 64,
+    prior: Path | None = None,
+    synthetic: bool = False,
+) -> None:
+    """Run and print the tables.
+
+    Args:
+        setup: see `Setup`.
+        batch: sequences of the large batch.
+        prior: .npz with left_weights, left_means, ....
+        synthetic: a synthetic prior in any case.
+    """
+    report = begin("Mixture Kalman filter against the released algorithm", setup)
+    sizes = Sizes(2, 40, 10, 10, 5) if setup.quick else Sizes(batch, 1000, 200, 40, 10)
+    problem = make_problem(prior, synthetic)
     report.add(describe(problem, sizes))
     loop = NumpyLoop(problem)
     with torch.inference_mode():
@@ -89,23 +103,15 @@ def main() -> None:
         z = draw_sequences(problem, 1, sizes.single)[0].numpy()
         peer = Case("released algorithm, NumPy loop", lambda: loop(z), len(z))
         cases = [Case(m.name, m.call, m.batch * m.frames) for m in methods]
-        timings = take_turns([peer, *cases], args.runs)
-        octave = octave_text(loop, z, args.runs)
-        limits = measure_limits(args.quick)
+        timings = take_turns([peer, *cases], setup.runs)
+        octave = octave_text(loop, z, setup.runs)
+        limits = measure_limits(setup.quick)
     report.table(HEADER, table_rows(methods, errors, timings))
     report.add(octave)
     report.add(floor_text(problem, limits))
     report.close(["numpy"], limits)
     if failed:
         sys.exit(f"these differ from the NumPy loop by more than is allowed: {'; '.join(failed)}")
-
-
-def options() -> argparse.ArgumentParser:
-    made = parser(__doc__, runs=7)
-    made.add_argument("--batch", type=int, default=64, help="sequences of the large batch")
-    made.add_argument("--prior", type=Path, help=".npz with left_weights, left_means, ...")
-    made.add_argument("--synthetic", action="store_true", help="a synthetic prior in any case")
-    return made
 
 
 def describe(problem: Problem, sizes: Sizes) -> str:
@@ -137,7 +143,7 @@ class NumpyLoop:
 
 
 def make_methods(problem: Problem, loop: NumpyLoop, sizes: Sizes) -> list[Method]:
-    """Every row of torchpose, for one sequence and for a batch."""
+    """Return all methods of torchpose, for one sequence and for a batch."""
     made: list[Method] = []
     for batch in (1, sizes.batch):
         z = draw_sequences(problem, batch, sizes.long)
@@ -200,14 +206,14 @@ def run_online(tracker: MixtureKalmanFilter, z: Tensor) -> Tensor:
 
 
 def random_noise(batch: int, frames: int, n_obs: int) -> Tensor:
-    """R [B, T, Z, Z], between half and one and a half times nine pixels squared."""
+    """Draw R [B, T, Z, Z], between half and one and a half times nine pixels squared."""
     generator = torch.Generator().manual_seed(5)
     scale = 0.5 + torch.rand(batch, frames, n_obs, generator=generator, dtype=torch.float64)
     return torch.diag_embed(9 * scale)
 
 
 def random_masks(batch: int, frames: int, n_obs: int) -> Iterator[Tensor]:
-    """Masks [B, T, Z] in which each joint is missing in 5 % of the frames; new ones in every call."""
+    """Yield masks [B, T, Z] in which each joint is missing in 5 % of the frames."""
     generator = torch.Generator().manual_seed(6)
     while True:
         seen = torch.rand(batch, frames, n_obs // 2, generator=generator) > 0.05
@@ -218,7 +224,7 @@ def random_masks(batch: int, frames: int, n_obs: int) -> Iterator[Tensor]:
 
 
 def error_of(method: Method) -> float | None:
-    """Largest |difference| / max(|reference|, 1) of the first sequence's means; NaN if any is lost."""
+    """Return the largest |difference| / max(|reference|, 1) of the first means; NaN if any is lost."""
     means = method.call().double().numpy()
     if not np.isfinite(means).all():
         return float("nan")
@@ -231,7 +237,7 @@ def error_of(method: Method) -> float | None:
 def report_agreement(
     report: Report, methods: list[Method], errors: list[float | None]
 ) -> list[str]:
-    """Say how far torchpose is from the NumPy loop; returns the methods that are too far."""
+    """Report the difference from the NumPy loop, and return the methods that differ too much."""
     pairs = [(m, e) for m, e in zip(methods, errors, strict=True) if e is not None]
     said = []
     for dtype, allowed in TOLERANCE.items():
@@ -266,7 +272,7 @@ def row(timing: Timing, loop: Timing, batch: int, dtype: str, error: str) -> lis
 
 
 def octave_text(loop: NumpyLoop, z: np.ndarray, runs: int) -> str:
-    """The same loop in Octave, right after the others; no part of it is torchpose."""
+    """Run the same loop in Octave, and return its speed in words; no part of it is torchpose."""
     program = find_octave()
     if program is None:
         return "Octave is not installed: its row is left out."
@@ -280,7 +286,7 @@ def octave_text(loop: NumpyLoop, z: np.ndarray, runs: int) -> str:
 
 
 def floor_text(problem: Problem, limits: Limits) -> str:
-    """What no arrangement of fixed tracks avoids, per frame, with known gains."""
+    """Return the floor of fixed tracks with known gains, per frame, in words."""
     n_tracks, n_obs = problem.prior.n_components, len(problem.observed)
     flops = 2 * n_tracks * (DIM * DIM + 2 * n_obs * DIM + n_obs * n_obs + DIM)
     written = 8 * (DIM + n_tracks + 1)
@@ -293,4 +299,4 @@ def floor_text(problem: Problem, limits: Limits) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

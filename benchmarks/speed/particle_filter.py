@@ -8,7 +8,6 @@ without a prior, which the libraries `particles`, `cuthbert` and `torchfilter` c
 where they are installed. Runs of all methods take turns, so that other work on the machine hits all.
 """
 
-import argparse
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks._command import run_command
 from benchmarks.speed._arm import DIM, PROCESS, released_prior
 from benchmarks.speed._particle_peers import (
     Problem,
@@ -26,7 +26,7 @@ from benchmarks.speed._particle_peers import (
     particles_walk,
     torchfilter_walk,
 )
-from benchmarks.speed._timing import Case, Report, begin, number, parser, take_turns
+from benchmarks.speed._timing import Case, Report, Setup, begin, number, take_turns
 from torchpose.filters import BootstrapParticleFilter, make_transition
 from torchpose.filters._walk import MixtureWalk
 from torchpose.priors import GaussianMixture
@@ -36,35 +36,42 @@ NOISE = [9.0] * 8
 MEASURED = [9, 10, 0, 1, 12, 13, 3, 4]  # u, v of head, hand, neck, elbow
 
 
-def main() -> None:
-    args, report = begin("Particle filters: one step", options())
-    n, steps = (200, 3) if args.quick else (args.particles, args.steps)
-    problem = arm_problem(args.prior, steps)
-    add_table(report, f"arm, {n} particles", arm_rows(problem, n), args.runs, steps)
+def main(
+    setup: Setup = Setup(runs=7),
+    *,
+    particles: int = 10_000,
+    steps: int = 20,
+    prior: Path | None = None,
+    no_peers: bool = False,
+) -> None:
+    """Run and print the tables.
+
+    Args:
+        setup: see `Setup`.
+        particles: of each filter.
+        steps: frames of a run.
+        prior: .npz with left_weights, left_means, ....
+        no_peers: leave out the other libraries.
+    """
+    report = begin("Particle filters: one step", setup)
+    n, steps = (200, 3) if setup.quick else (particles, steps)
+    problem = arm_problem(prior, steps)
+    add_table(report, f"arm, {n} particles", arm_rows(problem, n), setup.runs, steps)
     report.add(floor_text(problem, n))
     report.add(density_error_text(problem))
-    if not args.no_peers:
+    if not no_peers:
         shared = walk_problem(steps)
         report.add(f"Random walk without a prior, exact log-evidence {exact_evidence(shared):.2f}.")
         rows = walk_rows(shared, n, report)
-        add_table(report, f"random walk, {n} particles", rows, args.runs, steps)
+        add_table(report, f"random walk, {n} particles", rows, setup.runs, steps)
     report.close(PACKAGES)
-
-
-def options() -> argparse.ArgumentParser:
-    made = parser(__doc__, runs=7)
-    made.add_argument("--particles", type=int, default=10_000)
-    made.add_argument("--steps", type=int, default=20, help="frames of a run")
-    made.add_argument("--prior", type=Path, help=".npz with left_weights, left_means, ...")
-    made.add_argument("--no-peers", action="store_true", help="leave out the other libraries")
-    return made
 
 
 # --- problems
 
 
 def arm_problem(path: Path | None, n_steps: int) -> Problem:
-    """The arm model, and measurements of a path drawn from it."""
+    """Return the arm model, and measurements of a path drawn from it."""
     prior = synthetic_prior() if path is None else released_prior(path)
     process = torch.tensor(PROCESS, dtype=torch.float64)
     g = torch.Generator().manual_seed(1)
@@ -79,7 +86,7 @@ def arm_problem(path: Path | None, n_steps: int) -> Problem:
 
 
 def synthetic_prior(n_components: int = 30) -> GaussianMixture:
-    """Thirty components with the scales of an arm: pixels beside metres and radians."""
+    """Return thirty components with the scales of an arm: pixels beside metres and radians."""
     g = torch.Generator().manual_seed(0)
     scale = torch.tensor([120.0, 90.0, 0.4] * 5 + [0.1] * 3 + [0.2] * 3, dtype=torch.float64)
     low = torch.randn(n_components, DIM, 8, generator=g).double() / 8**0.5
@@ -91,7 +98,10 @@ def synthetic_prior(n_components: int = 30) -> GaussianMixture:
 
 
 def walk_problem(n_steps: int) -> Problem:
-    """x_t = x_{t-1} + N(0, Q) from N(0, I), 8 of 21 dimensions measured; a prior too wide to matter."""
+    """Return the random walk x_t = x_{t-1} + N(0, Q) from N(0, I), with 8 of 21 dimensions measured.
+
+    Its prior is too wide to matter.
+    """
     g = torch.Generator().manual_seed(2)
     a = 0.05 * torch.randn(DIM, DIM, generator=g).double()
     process = a @ a.mT + 0.01 * torch.eye(DIM)
@@ -105,7 +115,7 @@ def walk_problem(n_steps: int) -> Problem:
 
 
 def exact_evidence(problem: Problem) -> float:
-    """log p(z_1:T) of the random walk by the Kalman filter."""
+    """Return log p(z_1:T) of the random walk by the Kalman filter."""
     process, z = problem.process.numpy(), problem.z.numpy()
     h, noise = np.eye(DIM)[problem.observed], np.diag(problem.noise.numpy())
     m, p, total = np.zeros(DIM), np.eye(DIM), 0.0
@@ -167,7 +177,7 @@ def walk_rows(problem: Problem, n: int, report: Report) -> dict[str, Callable[[]
 def add_table(
     report: Report, title: str, calls: dict[str, Callable[[], float]], runs: int, steps: int
 ) -> None:
-    """Milliseconds of a step of every method, and the log-evidence of its first run."""
+    """Add the milliseconds of a step of every method, and the log-evidence of its first run."""
     evidence = {name: call() for name, call in calls.items()}  # warms up as well
     cases = [Case(name, call, steps) for name, call in calls.items()]
     timings = take_turns(cases, runs, warm=0)
@@ -184,7 +194,7 @@ def add_table(
 
 
 def floor_text(problem: Problem, n: int) -> str:
-    """What no arrangement avoids: the noise, and one product of all residuals, in cache."""
+    """Return the floor in words: drawing the noise, and one product of all residuals, in cache."""
     k = problem.prior.n_components
     rows, points = torch.randn(k * DIM, DIM + 1), torch.randn(DIM + 1, 512)
     out = torch.empty(k * DIM, 512)
@@ -203,7 +213,7 @@ def floor_text(problem: Problem, n: int) -> str:
 
 
 def density_error_text(problem: Problem) -> str:
-    """Largest error of the float32 log density against float64, on draws of the prior."""
+    """Return the largest error of the float32 log density on draws of the prior, in words."""
     covariance = torch.diag(problem.process)
     walk = MixtureWalk(problem.prior.parameters_tuple(), covariance, torch.float32)
     wide = MixtureWalk(problem.prior.parameters_tuple(), covariance, torch.float64)
@@ -217,4 +227,4 @@ def density_error_text(problem: Problem) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -14,14 +14,15 @@ from typing import Any, NamedTuple
 
 import torch
 
+from benchmarks._command import run_command
 from benchmarks.speed._timing import (
     Case,
     Report,
+    Setup,
     Timing,
     begin,
     measure_limits,
     number,
-    parser,
     ratio,
     take_turns,
 )
@@ -64,22 +65,23 @@ class Scene(NamedTuple):
     silhouettes: torch.Tensor
 
 
-def main() -> None:
-    args, report = begin("Root uncertainty: one frame", parser(__doc__, runs=9))
-    n = 4 if args.quick else HYPOTHESES
-    sizes = ((30, 40),) if args.quick else SIZES
+def main(setup: Setup = Setup(runs=9)) -> None:
+    """Run and print the tables."""
+    report = begin("Root uncertainty: one frame", setup)
+    n = 4 if setup.quick else HYPOTHESES
+    sizes = ((30, 40),) if setup.quick else SIZES
     agree = check(make_scene(*sizes[0]), report)
     for size in sizes:
         scene = make_scene(*size)
-        compare(scene, n, args.runs, report)
-    where(make_scene(*sizes[0]), n, args.runs, report)
-    report.close(limits=measure_limits(args.quick))
+        compare(scene, n, setup.runs, report)
+    where(make_scene(*sizes[0]), n, setup.runs, report)
+    report.close(limits=measure_limits(setup.quick))
     if not agree:
         sys.exit("counts differ from those of rendered parts")
 
 
 def check(scene: Scene, report: Report) -> bool:
-    """Counts of a few hypotheses against images of every part at each of its places."""
+    """Compare counts of a few hypotheses with images of every part at each of its places."""
     spread = torch.full((scene.body.dim,), 0.05, dtype=torch.float64)
     one = tracker(scene, 3)
     states = one.init(
@@ -123,7 +125,7 @@ def make_scene(height: int, width: int) -> Scene:
 
 
 def compare(scene: Scene, n: int, runs: int, report: Report) -> None:
-    """Every filter on one frame, from the same particles each time."""
+    """Time every filter on one frame, from the same particles each time."""
     budget = POINTS * n
     filters: dict[str, SilhouetteParticleFilter] = {
         f"root uncertainty, {n} hypotheses": tracker(scene, n),
@@ -161,7 +163,7 @@ def row(timing: Timing, floor: Timing) -> list[str]:
 
 
 def where(scene: Scene, n: int, runs: int, report: Report) -> None:
-    """The steps of a frame one by one, on the same hypotheses."""
+    """Time the steps of a frame one by one, on the same hypotheses."""
     one, (height, width) = tracker(scene, n), scene.silhouettes.shape[-2:]
     spread = torch.full((scene.body.dim,), 0.02, dtype=torch.float64)
     state = one.init(
@@ -211,4 +213,4 @@ def one_frame(one: SilhouetteParticleFilter, scene: Scene) -> Callable[[], objec
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

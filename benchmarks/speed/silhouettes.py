@@ -20,7 +20,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from benchmarks.speed._timing import Case, Report, begin, number, parser, ratio, take_turns
+from benchmarks._command import run_command
+from benchmarks.speed._timing import Case, Report, Setup, begin, number, ratio, take_turns
 from torchpose.body import BODY_15, Body, Limbs
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.whole_body import count_pixels
@@ -61,18 +62,19 @@ class Problem(NamedTuple):
     width: int
 
 
-def main() -> None:
-    args, report = begin("Silhouettes: particles x cameras x limbs", parser(__doc__, runs=9))
+def main(setup: Setup = Setup(runs=9)) -> None:
+    """Run and print the tables."""
+    report = begin("Silhouettes: particles x cameras x limbs", setup)
     import cv2
 
-    cv2.setNumThreads(args.threads)
-    n = 8 if args.quick else PARTICLES
-    sizes = ((30, 40), (60, 80)) if args.quick else SIZES
+    cv2.setNumThreads(setup.threads)
+    n = 8 if setup.quick else PARTICLES
+    sizes = ((30, 40), (60, 80)) if setup.quick else SIZES
     wrong = [check(make_problem(3, CAMERAS, *size), report) for size in sizes]
-    compare(n, sizes, args.runs, report)
-    grow(n, sizes[0], args.runs, args.quick, report)
-    chunks(n, sizes, args.runs, args.quick, report)
-    sorting(n, sizes, args.runs, report)
+    compare(n, sizes, setup.runs, report)
+    grow(n, sizes[0], setup.runs, setup.quick, report)
+    chunks(n, sizes, setup.runs, setup.quick, report)
+    sorting(n, sizes, setup.runs, report)
     report.close(PACKAGES)
     if any(wrong):
         sys.exit("counts differ from those of the definition")
@@ -98,7 +100,7 @@ def make_problem(
 
 
 def make_rig(n: int, height: int, width: int) -> CameraRig:
-    """Cameras 3.5 m from the middle of the body, level; the person fills two thirds of the height."""
+    """Return level cameras 3.5 m from the middle of the body, which fills two thirds of the height."""
     import cv2
 
     cameras = []
@@ -139,7 +141,10 @@ def on_gpu(problem: Problem) -> Callable[[], SilhouetteCounts]:
 
 
 def tangent_polygons(limbs: ProjectedLimbs) -> np.ndarray:
-    """Where both outer tangents touch the discs, [C, N, L, 4, 2]; NaN if one disc holds the other."""
+    """Return the points where both outer tangents touch the discs, [C, N, L, 4, 2].
+
+    They are NaN if one disc holds the other.
+    """
     (ax, bx), (ay, by), (ra, rb) = (np.asarray(x) for x in limbs[:3])
     d = np.stack([bx - ax, by - ay], -1)
     squared, dr = (d * d).sum(-1), ra - rb
@@ -156,7 +161,7 @@ def tangent_polygons(limbs: ProjectedLimbs) -> np.ndarray:
 
 
 def opencv_loop(problem: Problem) -> SilhouetteCounts:
-    """One image per particle and camera: two circles and a polygon for each limb, then counting."""
+    """Count pixels by OpenCV: draw two circles and a polygon for each limb into an image per particle."""
     import cv2
 
     rig, height, width = problem.rig, problem.height, problem.width
@@ -188,7 +193,7 @@ def opencv_loop(problem: Problem) -> SilhouetteCounts:
 
 
 def packed_rows(problem: Problem) -> SilhouetteCounts:
-    """All rows of all limbs as words of 64 bits: or over limbs, and with the silhouette, count."""
+    """Count pixels by rows packed in words of 64 bits: unite the limbs, intersect with the silhouette."""
     height, width, rig = problem.height, problem.width, problem.rig
     n, n_limbs = problem.limbs.start.shape[:2]
     words = -(-width // 64)
@@ -219,14 +224,14 @@ def packed_rows(problem: Problem) -> SilhouetteCounts:
 
 
 def below(bits: np.ndarray) -> np.ndarray:
-    """Words with the lowest `bits` set; fewer than 0 counts as 0, more than 64 as 64."""
+    """Return words with the lowest `bits` set; fewer than 0 counts as 0, more than 64 as 64."""
     bits = bits.clip(0, 64).astype(np.uint64)
     full = bits == 64
     return np.where(full, ~np.uint64(0), (np.uint64(1) << (bits % np.uint64(64))) - np.uint64(1))
 
 
 def definition(problem: Problem) -> SilhouetteCounts:
-    """Every pixel against every limb: in a disc, or between the tangents."""
+    """Count pixels by the definition: a pixel is covered if it lies in a disc or between the tangents."""
     image = torch.zeros(len(problem.state), *problem.silhouettes.shape, dtype=torch.bool)
     y, x = torch.meshgrid(
         torch.arange(problem.height).double(), torch.arange(problem.width).double(), indexing="ij"
@@ -256,7 +261,7 @@ def definition(problem: Problem) -> SilhouetteCounts:
 
 
 def check(problem: Problem, report: Report) -> bool:
-    """Whether our counts differ from the definition's."""
+    """Return whether our counts differ from the definition's."""
     truth, counts = definition(problem), ours(problem)()
     wrong = any(not torch.equal(a, b) for a, b in zip(counts, truth, strict=True))
     packed, drawn = packed_rows(problem), opencv_loop(problem)
@@ -298,7 +303,7 @@ def compare(n: int, sizes: tuple[tuple[int, int], ...], runs: int, report: Repor
 
 
 def grow(n: int, size: tuple[int, int], runs: int, quick: bool, report: Report) -> None:
-    """Cost against particles and cameras."""
+    """Time counts against particles and cameras."""
     particles = (n, 2 * n) if quick else (100, 200, 500, 1000, 2000, 5000)
     problems = [
         (f"{m} x {CAMERAS}", m * CAMERAS, make_problem(m, CAMERAS, *size)) for m in particles
@@ -333,7 +338,7 @@ def chunks(
 
 
 def peak_memory(call: Callable[[], object]) -> float | None:
-    """Bytes that the process grows by at most during a call; None where the system does not tell."""
+    """Return the bytes that the process grows by during a call; None where the system does not tell."""
     status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
     if not (status.exists() and os.access(reset, os.W_OK)):
         return None
@@ -351,7 +356,7 @@ def peak_memory(call: Callable[[], object]) -> float | None:
 
 
 def sorting(n: int, sizes: tuple[tuple[int, int], ...], runs: int, report: Report) -> None:
-    """np.sort against torch.sort on the keys of one chunk."""
+    """Time np.sort against torch.sort on the keys of one chunk."""
     rows = []
     for size in sizes:
         problem = make_problem(min(n, 32), CAMERAS, *size)
@@ -376,4 +381,4 @@ def sorting(n: int, sizes: tuple[tuple[int, int], ...], runs: int, report: Repor
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

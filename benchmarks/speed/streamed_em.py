@@ -8,7 +8,6 @@ thread each take turns, and scikit-learn, torchgmm and the fit in memory take 20
 states that they can hold, all from one start.
 """
 
-import argparse
 import os
 import sys
 import time
@@ -18,16 +17,17 @@ from statistics import median
 
 import torch
 
+from benchmarks._command import run_command
 from benchmarks.speed._memory import MB
 from benchmarks.speed._streamed_jobs import Job, Run, in_processes
 from benchmarks.speed._timing import (
     Case,
     Report,
+    Setup,
     Timing,
-    limit_threads,
+    begin,
     measure_limits,
     number,
-    parser,
     ratio,
     take_turns,
 )
@@ -68,38 +68,38 @@ PEERS = (
 )
 
 
-def main() -> None:
-    args = parse_args()
-    limit_threads(args.threads)
-    report = Report("EM over states that are not held in memory", args.out, args.threads)
-    limits = measure_limits(args.quick)
-    failed = report_scaling(report, args)
-    failed |= report_streamed(report, args)
-    failed |= report_peers(report, args)
+def main(
+    setup: Setup = Setup(runs=3), *, samples: int = 10 * MILLION, data: str | None = None
+) -> None:
+    """Run and print the tables.
+
+    Args:
+        setup: see `Setup`.
+        samples: of the longest fit.
+        data: folder of recordings, such as kinect_utd_mhad.
+    """
+    report = begin("EM over states that are not held in memory", setup)
+    limits = measure_limits(setup.quick)
+    failed = report_scaling(report, setup, data)
+    failed |= report_streamed(report, setup, samples, data)
+    failed |= report_peers(report, setup)
     report.close(PACKAGES, limits)
     if failed:
         sys.exit("results that should be the same are not")
 
 
-def parse_args() -> argparse.Namespace:
-    made = parser(__doc__, runs=3)
-    made.add_argument("--samples", type=int, default=10 * MILLION, help="of the longest fit")
-    made.add_argument("--data", help="folder of recordings, such as kinect_utd_mhad")
-    return made.parse_args()
-
-
 # --- tables
 
 
-def report_scaling(report: Report, args: argparse.Namespace) -> bool:
-    """One process of one thread and two of one thread each, in turn; True if they disagree."""
-    samples, components = (20_000, 4) if args.quick else (2 * MILLION, COMPONENTS)
-    job = Job(samples, components, 3, args.data)
-    idle = report_load(report, args.quick)
+def report_scaling(report: Report, setup: Setup, data: str | None) -> bool:
+    """Time one process of one thread and two of one thread each, in turn; return True if they disagree."""
+    samples, components = (20_000, 4) if setup.quick else (2 * MILLION, COMPONENTS)
+    job = Job(samples, components, 3, data)
+    idle = report_load(report, setup.quick)
     runs: dict[int, list[Run]] = {1: [], 2: []}
-    for _ in range(args.runs):
+    for _ in range(setup.runs):
         for size, found in runs.items():
-            found.append(in_processes(job._replace(size=size), args.quick))
+            found.append(in_processes(job._replace(size=size), setup.quick))
     gain = median(r.step for r in runs[1]) / median(r.step for r in runs[2])
     rows = []
     for found in runs.values():
@@ -125,7 +125,7 @@ def report_scaling(report: Report, args: argparse.Namespace) -> bool:
 
 
 def report_load(report: Report, quick: bool) -> float:
-    """Say how busy the machine is before anything is measured; the share of it that is free."""
+    """Report how busy the machine is before the runs, and return the share of it that is free."""
     before, seconds = _cpu_ticks(), 0.1 if quick else 2
     time.sleep(seconds)
     spent = [after - first for after, first in zip(_cpu_ticks(), before, strict=True)]
@@ -139,7 +139,7 @@ def report_load(report: Report, quick: bool) -> float:
 
 
 def _cpu_ticks() -> tuple[float, float]:
-    """Idle and all ticks of all cores so far."""
+    """Return idle and all ticks of all cores so far."""
     try:
         fields = Path("/proc/stat").read_text().splitlines()[0].split()[1:]
     except OSError:
@@ -148,18 +148,18 @@ def _cpu_ticks() -> tuple[float, float]:
     return ticks[3] + ticks[4], sum(ticks)
 
 
-def report_streamed(report: Report, args: argparse.Namespace) -> bool:
-    """20 steps over few and over many states; True if one process and two disagree."""
-    samples, components, steps = (20_000, 4, 3) if args.quick else (args.samples, COMPONENTS, STEPS)
-    threads = args.threads
+def report_streamed(report: Report, setup: Setup, samples: int, data: str | None) -> bool:
+    """Time 20 steps over few and over many states; return True if one process and two disagree."""
+    samples, components, steps = (20_000, 4, 3) if setup.quick else (samples, COMPONENTS, STEPS)
+    threads = setup.threads
     jobs = [
-        Job(samples // 10, components, steps, args.data, threads),
-        Job(samples, components, steps, args.data, threads),
+        Job(samples // 10, components, steps, data, threads),
+        Job(samples, components, steps, data, threads),
     ]
     if threads > 1:
         jobs.append(jobs[-1]._replace(threads=1, size=threads))
-    report_load(report, args.quick)
-    runs = [in_processes(job, args.quick) for job in jobs]
+    report_load(report, setup.quick)
+    runs = [in_processes(job, setup.quick) for job in jobs]
     report.table(STREAMED, (streamed_row(run) for run in runs))
     small, large = runs[0], runs[1]
     share = large.found[0]["drawing"] / large.cpu
@@ -191,18 +191,18 @@ def streamed_row(run: Run) -> list[str]:
 # --- peers
 
 
-def report_peers(report: Report, args: argparse.Namespace) -> bool:
-    """Steps from one start over states that everyone can hold; True if scikit-learn differs."""
-    points, n_components, steps = (2000, 4, 3) if args.quick else (100_000, COMPONENTS, STEPS)
+def report_peers(report: Report, setup: Setup) -> bool:
+    """Time steps over states that all methods can hold; return True if scikit-learn differs."""
+    points, n_components, steps = (2000, 4, 3) if setup.quick else (100_000, COMPONENTS, STEPS)
     problem = make_problem(points, n_components, steps)
     report.add(
         f"{points:,} states, {n_components} components, {steps} steps from one start, "
-        f"{args.threads} threads. Nothing is extrapolated: the others hold states and "
+        f"{setup.threads} threads. Nothing is extrapolated: the others hold states and "
         "responsibilities in memory."
     )
     methods = list(peer_methods(problem, report))
     found = {m.name: mean_log_likelihood(problem.x, wide(m.call())) for m in methods}
-    timings = take_turns([Case(m.name, m.call) for m in methods], args.runs, warm=0)
+    timings = take_turns([Case(m.name, m.call) for m in methods], setup.runs, warm=0)
     report.table(PEERS, peer_rows(timings, found, problem))
     ours, theirs = found[methods[0].name], found.get("scikit-learn, float64")
     if theirs is None:
@@ -216,7 +216,7 @@ def report_peers(report: Report, args: argparse.Namespace) -> bool:
 
 
 def peer_methods(problem: Problem, report: Report) -> Iterator[Method]:
-    """The streamed fit, the fit in memory, and every peer that can be imported."""
+    """Yield the streamed fit, the fit in memory, and every peer that can be imported."""
     for dtype in (torch.float64, torch.float32):
         yield streamed_fit(problem, dtype)
     in_memory = torchpose_fit(problem, torch.float64)
@@ -253,4 +253,4 @@ def peer_rows(
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

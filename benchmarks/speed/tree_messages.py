@@ -13,7 +13,8 @@ import sys
 import torch
 from torch import Tensor
 
-from benchmarks.speed._timing import Case, begin, number, parser, take_turns
+from benchmarks._command import run_command
+from benchmarks.speed._timing import Case, Setup, begin, number, take_turns
 from torchpose.body import BODY_15
 from torchpose.math import compose, conjugate, fit_gaussian, rotate_gaussian
 from torchpose.math._tree_messages import message_tree, propagate
@@ -25,9 +26,10 @@ HYPOTHESES = 114
 CHAIN = ((0, 1), (1, 2))
 
 
-def main() -> None:
-    args, report = begin("Gaussian messages over rotations", parser(__doc__, runs=30))
-    draws, trials, sizes = (20_000, 2, (5,)) if args.quick else (1_000_000, 6, DEGREES)
+def main(setup: Setup = Setup(runs=30)) -> None:
+    """Run and print the tables."""
+    report = begin("Gaussian messages over rotations", setup)
+    draws, trials, sizes = (20_000, 2, (5,)) if setup.quick else (1_000_000, 6, DEGREES)
     worst = linear_error()
     report.add(
         f"Agreement on linear trees with the dense joint Gaussian: {worst:.1e}, at most "
@@ -44,7 +46,9 @@ def main() -> None:
         f"deviation. covariance: Frobenius norm of the difference, as a share. {draws:,} draws, whose "
         f"own error is in it; means of {trials} chains."
     )
-    report.table(("one pass, 10 parts", "hypotheses", "ms", "min ms", "CPU ms"), timing_rows(args))
+    report.table(
+        ("one pass, 10 parts", "hypotheses", "ms", "min ms", "CPU ms"), timing_rows(setup.runs)
+    )
     report.close()
     if not worst < TOLERANCE:
         sys.exit("messages differ from the dense joint Gaussian by more than is allowed")
@@ -55,7 +59,7 @@ def normal(generator: torch.Generator, *sizes: int) -> Tensor:
 
 
 def covariances(generator: torch.Generator, degrees: float, *batch: int) -> Tensor:
-    """Random ones, of vectors; the deviation is the root mean square over the axes."""
+    """Draw covariances of vectors; the deviation is the root mean square over the axes."""
     a = normal(generator, *batch, 3, 3)
     cov = a @ a.mT + 0.05 * torch.eye(3).double()
     trace = cov.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
@@ -67,7 +71,7 @@ def drawn(generator: torch.Generator, mean: Tensor, cov: Tensor, count: int) -> 
 
 
 def angle(a: Tensor, b: Tensor) -> float:
-    """Degrees between rotations, root mean square."""
+    """Return the degrees between rotations, root mean square."""
     half = compose(conjugate(a), b).norm(dim=-1).asin()
     return float(2 * half.square().mean().sqrt().rad2deg())
 
@@ -77,7 +81,7 @@ def apart(a: Tensor, b: Tensor) -> float:
 
 
 def turn_row(degrees: float, count: int) -> list[str]:
-    """A limb in the space of its own part, where the part above is 40 degrees from its centre."""
+    """Return the errors of a limb in its own part's space, with the part above 40 degrees off its centre."""
     g = torch.Generator().manual_seed(0)
     turn = torch.tensor([0.3, -0.1, 0.1]).double()
     new_centre = torch.tensor([0.0, 0.05, -0.05]).double()
@@ -101,7 +105,7 @@ def chain_row(degrees: float, count: int, trials: int) -> list[str]:
 
 
 def chain_errors(g: torch.Generator, degrees: float, count: int) -> tuple[float, float, float]:
-    """Posterior's deviation, error of its mean, error of its covariance.
+    """Return the posterior's deviation, the error of its mean, and the error of its covariance.
 
     The exact posterior comes from draws of the top part and of the conditionals below it, weighted
     by the observations of the parts below.
@@ -133,7 +137,7 @@ def chain_errors(g: torch.Generator, degrees: float, count: int) -> tuple[float,
 
 
 def linear_error() -> float:
-    """Largest difference from the dense joint, x_j = A x_i + N(0, I) on a tree of six nodes."""
+    """Return the largest difference from the dense joint, x_j = A x_i + N(0, I) on a tree of six nodes."""
     g = torch.Generator().manual_seed(0)
     edges = torch.tensor([[0, 1], [0, 2], [2, 3], [2, 4], [4, 5]])
     matrix = torch.linalg.qr(normal(g, 5, 3, 3)).Q
@@ -157,7 +161,7 @@ def linear_error() -> float:
     return float(torch.maximum(off, (ours[1] - blocks).abs().max()))
 
 
-def timing_rows(args: object) -> list[list[str]]:
+def timing_rows(runs: int) -> list[list[str]]:
     g = torch.Generator().manual_seed(0)
     parts = BODY_15.parts
     edges = torch.tensor([[parts.index(name) for name in edge] for edge in PART_TREE])
@@ -177,7 +181,7 @@ def timing_rows(args: object) -> list[list[str]]:
                 return propagate(mean, cov, model.tree, model.transport)
 
             cases.append(Case(f"{directions}, {str(dtype).split('.')[1]}", call, inner=5))
-    timings = take_turns(cases, args.runs, warm=2)
+    timings = take_turns(cases, runs, warm=2)
     return [
         [t.case.name, str(HYPOTHESES), number(1e3 * t.median), number(1e3 * t.best),
          number(1e3 * t.median_cpu)]
@@ -186,4 +190,4 @@ def timing_rows(args: object) -> list[list[str]]:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -7,33 +7,36 @@ A clip of video_asl is read over and over as one recording at 30 frames a second
 the poses of the whole recording are written.
 """
 
-import argparse
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from benchmarks.speed._timing import Report, begin, parser
+from benchmarks._command import run_command
+from benchmarks.speed._timing import Report, Setup, begin
 
 FPS = 30.0
 PAGE = 4096
 
 
-def main() -> None:
-    """Track, and print how memory went."""
-    made = parser(__doc__, runs=1)
-    made.add_argument("--data", type=Path, required=True, help="folder with video_asl/")
-    made.add_argument("--minutes", type=float, default=60.0, help="of video")
-    args, report = begin("Memory over a long video", made)
-    n_frames = 300 if args.quick else round(60 * FPS * args.minutes)
+def main(setup: Setup = Setup(), *, data: Path, minutes: float = 60.0) -> None:
+    """Track, and print how memory went.
+
+    Args:
+        setup: see `Setup`.
+        data: folder with video_asl/.
+        minutes: of video.
+    """
+    report = begin("Memory over a long video", setup)
+    n_frames = 300 if setup.quick else round(60 * FPS * minutes)
     with tempfile.TemporaryDirectory() as folder:
-        measure(report, args, n_frames, Path(folder))
+        measure(report, data / "video_asl" / "book.mkv", n_frames, Path(folder))
     report.close(("opencv-python-headless", "av"))
 
 
-def measure(report: Report, args: argparse.Namespace, n_frames: int, folder: Path) -> None:
-    """Resident memory at some minutes, and while the result is written."""
+def measure(report: Report, clip: Path, n_frames: int, folder: Path) -> None:
+    """Report the resident memory at some minutes, and while the result is written."""
     from tqdm.auto import tqdm
 
     from torchpose import PinholeCamera, VideoTracker, load_prior
@@ -45,7 +48,7 @@ def measure(report: Report, args: argparse.Namespace, n_frames: int, folder: Pat
 
     def frames() -> Iterator[Any]:
         every = max(1, min(n_frames // 6, round(60 * FPS)))
-        for index, frame in enumerate(loop(args.data / "video_asl" / "book.mkv", n_frames)):
+        for index, frame in enumerate(loop(clip, n_frames)):
             if index % every == every - 1:
                 seen.append(((index + 1) / FPS / 60, resident()))
                 tqdm.write(f"minute {seen[-1][0]:.1f}: {seen[-1][1]:.0f} MB")
@@ -71,7 +74,7 @@ def measure(report: Report, args: argparse.Namespace, n_frames: int, folder: Pat
 
 
 def loop(path: Path, n_frames: int) -> Iterator[Any]:
-    """A clip over and over, decoded anew each time."""
+    """Yield the frames of a clip again and again, decoded anew each time."""
     from torchpose.video import open_video
 
     count = 0
@@ -85,9 +88,9 @@ def loop(path: Path, n_frames: int) -> Iterator[Any]:
 
 
 def resident() -> float:
-    """Resident memory of this process, MB."""
+    """Return the resident memory of this process, MB."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE / 2**20
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

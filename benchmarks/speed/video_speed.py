@@ -9,7 +9,6 @@ drawing not. `--mediapipe` is the interpreter of an environment with mediapipe 0
 Stages are timed by the clock of the thread that they run in, in a run of their own.
 """
 
-import argparse
 import functools
 import re
 import subprocess
@@ -19,34 +18,44 @@ import time
 from pathlib import Path
 from typing import Any
 
-from benchmarks.speed._timing import Case, Report, Timing, begin, parser, take_turns
+from benchmarks._command import run_command
+from benchmarks.speed._timing import Case, Report, Setup, Timing, begin, take_turns
 
 CLIPS = ("again", "brother", "help", "bird", "milk", "book", "learn")
 FPS = 30.0
 
 
-def main() -> None:
-    """Print both tables."""
-    made = parser(__doc__, runs=3)
-    made.add_argument("--data", type=Path, required=True, help="folder with video_asl/")
-    made.add_argument("--mediapipe", type=Path, help="Python of an environment with mediapipe")
-    made.add_argument("--repeat", type=int, default=2, help="how often the clips follow each other")
-    args, report = begin("Speed of the video pipeline", made)
+def main(
+    setup: Setup = Setup(runs=3),
+    *,
+    data: Path,
+    mediapipe: Path | None = None,
+    repeat: int = 2,
+) -> None:
+    """Print both tables.
+
+    Args:
+        setup: see `Setup`.
+        data: folder with video_asl/.
+        mediapipe: Python of an environment with mediapipe.
+        repeat: how often the clips follow each other.
+    """
+    report = begin("Speed of the video pipeline", setup)
     from torchpose.cli._common import share_cores
 
     share_cores()  # as the command does
     with tempfile.TemporaryDirectory() as folder:
         clip = Path(folder) / "clips.mp4"
-        names = CLIPS[:1] if args.quick else CLIPS * args.repeat
-        n_frames = join([args.data / "video_asl" / f"{name}.mkv" for name in names], clip)
+        names = CLIPS[:1] if setup.quick else CLIPS * repeat
+        n_frames = join([data / "video_asl" / f"{name}.mkv" for name in names], clip)
         report.add(f"{n_frames} frames of 640 x 480, H.264.")
-        whole(report, clip, n_frames, args)
+        whole(report, clip, n_frames, setup, mediapipe)
         stages(report, clip, n_frames)
     report.close(("opencv-python-headless", "av"))
 
 
 def join(clips: list[Path], path: Path) -> int:
-    """One file of several clips; returns the number of its frames."""
+    """Write several clips as one file, and return the number of its frames."""
     from torchpose.video import VideoWriter, open_video
 
     count = 0
@@ -60,15 +69,15 @@ def join(clips: list[Path], path: Path) -> int:
 
 
 def make_tracker(**options: Any) -> Any:
-    """The tracker with its defaults."""
+    """Return the tracker with its defaults."""
     from torchpose import PinholeCamera, VideoTracker, load_prior
 
     camera = PinholeCamera.from_image_size(640, 480)
     return VideoTracker(load_prior("kinect-upper-body"), camera, fps=FPS, **options)
 
 
-def whole(report: Report, clip: Path, n_frames: int, args: argparse.Namespace) -> None:
-    """Frames per second of the whole way, beside MediaPipe."""
+def whole(report: Report, clip: Path, n_frames: int, setup: Setup, mediapipe: Path | None) -> None:
+    """Time the whole pipeline, beside MediaPipe."""
     from torchpose.video import open_video
 
     def track(tracker: Any, **options: Any) -> None:
@@ -93,15 +102,15 @@ def whole(report: Report, clip: Path, n_frames: int, args: argparse.Namespace) -
         Case("with the background model", lambda: track(parted), n_frames),
         Case("decoding alone", decode, n_frames),
     ]
-    timings = take_turns(cases, args.runs)
+    timings = take_turns(cases, setup.runs)
     rows = [row(timing) for timing in timings]
-    if args.mediapipe:
-        rows.append(mediapipe_row(args.mediapipe, clip, args))
+    if mediapipe is not None:
+        rows.append(mediapipe_row(mediapipe, clip, setup))
     report.table(("", "frames/s", "ms a frame", "CPU ms a frame"), rows)
 
 
 def row(timing: Timing) -> tuple[str, ...]:
-    """Medians."""
+    """Return the medians of a timing as a row."""
     return (
         timing.case.name,
         f"{1 / timing.median:.0f}",
@@ -110,11 +119,11 @@ def row(timing: Timing) -> tuple[str, ...]:
     )
 
 
-def mediapipe_row(python: Path, clip: Path, args: argparse.Namespace) -> tuple[str, ...]:
-    """The full pose model of MediaPipe on the same file and cores."""
+def mediapipe_row(python: Path, clip: Path, setup: Setup) -> tuple[str, ...]:
+    """Time the full pose model of MediaPipe on the same file and cores."""
     script = Path(__file__).parents[1] / "mediapipe_landmarks.py"
-    command = [str(python), str(script), str(clip), "--time", "--threads", str(args.threads)]
-    command += ["--repeat", str(args.runs)]
+    command = [str(python), str(script), str(clip), "--time", "--threads", str(setup.threads)]
+    command += ["--repeat", str(setup.runs)]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     found = re.search(r"together ([\d.]+) ms", done.stdout)
     if found is None:
@@ -161,7 +170,7 @@ def stages(report: Report, clip: Path, n_frames: int) -> None:
 
 
 def timed(call: Any, name: str, spent: dict[str, float]) -> Any:
-    """`call`, whose time is added up."""
+    """Return `call` wrapped so that its time is added up."""
 
     @functools.wraps(call)
     def wrapped(*args: Any, **kwargs: Any) -> Any:
@@ -175,4 +184,4 @@ def timed(call: Any, name: str, spent: dict[str, float]) -> Any:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

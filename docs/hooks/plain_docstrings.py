@@ -15,7 +15,7 @@ def _escape(line: str) -> str:
 
 
 def to_markdown(text: str) -> str:
-    """The docstring with its equations and doctests as blocks of code and the rest escaped."""
+    """Return the docstring with its equations and doctests as blocks of code and the rest escaped."""
     lines: list[str] = []
     state, previous = "text", ""
     for line in text.splitlines():

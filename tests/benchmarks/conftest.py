@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks._command import execute
 from benchmarks.speed._timing import THREAD_VARIABLES
 from tests.data import few_recordings
 
@@ -19,15 +20,16 @@ def run_here(monkeypatch, capsys):
 
     def run(script: str, *options: str) -> str:
         module = importlib.import_module(f"benchmarks.{script}")
-        file = f"{script.rpartition('.')[2]}.py"
-        monkeypatch.setattr(sys, "argv", [file, "--threads", "1", *options])
+        monkeypatch.setattr(sys, "argv", [f"{script.replace('.', '/')}.py"])  # names its table
         monkeypatch.setattr(os, "sched_setaffinity", lambda *_: None, raising=False)
         for library in THREAD_VARIABLES:  # which the script sets; they are put back afterwards
             monkeypatch.setenv(f"{library}_NUM_THREADS", "1")
         monkeypatch.setenv("PYTHONPATH", str(ROOT))  # of processes that the script starts
         capsys.readouterr()
-        module.main()
-        return capsys.readouterr().out
+        code = execute(module.main, ["--threads", "1", *options])
+        captured = capsys.readouterr()
+        assert code == 0, captured.err
+        return captured.out
 
     return run
 

@@ -13,7 +13,7 @@ from benchmarks.bend import protocol as bend
 from benchmarks.bend import report as bend_report
 from benchmarks.bend import tracking as bend_tracking
 from benchmarks.bend.clips import action_clips, first_bend, leave_one_out, performances
-from benchmarks.bend.trackees import known_angles, perform, prepare
+from benchmarks.bend.variants import known_angles, perform, prepare
 from benchmarks.bodies.views import Conditions
 from benchmarks.engine import Results, Row
 from tests.benchmarks.benders import bender, write_benders
@@ -93,12 +93,12 @@ def test_an_arm_is_hidden_from_the_side_and_seen_from_ahead(bends):
     shares = {}
     for azimuth in (0.0, 90.0):
         conditions = Conditions((96, 128), 0.0, 1, azimuths=(azimuth,))
-        trackee = prepare(split, performed, conditions)
-        shares[azimuth] = bend_occlusion.visible_share(trackee, trackee.tests[0])
+        tracked = prepare(split, performed, conditions)
+        shares[azimuth] = bend_occlusion.visible_share(tracked, tracked.tests[0])
     assert float(shares[0.0][:3].min()) > 0.5  # upright, arms up
     assert float(shares[90.0].mean()) < 0.6 * float(shares[0.0].mean())
-    lost = bend_occlusion.displaced(trackee, trackee.tests[0])
-    true, moved = (trackee.body.joints(s) for s in (trackee.tests[0].initial_state, lost))
+    lost = bend_occlusion.displaced(tracked, tracked.tests[0])
+    true, moved = (tracked.body.joints(s) for s in (tracked.tests[0].initial_state, lost))
     gap = (moved - true).norm(dim=-1)
     arm = [BODY_15.joint(f"right_{j}") for j in ("elbow", "wrist")]
     others = [j for j in range(15) if j not in arm]
@@ -243,12 +243,12 @@ def test_two_persons_are_too_few(tmp_path):
 
 
 def test_the_command_recognises_actions(folder, tmp_path, capsys):
-    from benchmarks._command import run
+    from benchmarks._protocols import execute_protocol
 
     line = ["--mocap", str(folder), "--out", str(tmp_path / "out")]
     line += ["--quick", "true", "--part", "actions", "--size", "64x48", "--at", "8"]
     line += ["--test-persons", "p2", "--frames", "4", "--validation-persons", "p3"]
-    assert run("bend", line) == 0
+    assert execute_protocol("bend", line) == 0
     text = capsys.readouterr().out
     assert "Actions from recorded joints" in text and "Tracked actions" in text
 

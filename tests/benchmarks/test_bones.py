@@ -32,7 +32,7 @@ def test_errors_of_the_truth_are_none(data):
 def test_quick_run_prints_every_method(run_here, data, tmp_path):
     pictures = tmp_path / "pictures"
     options = ("--data", str(data), "--out", str(tmp_path), "--pictures", str(pictures))
-    printed = run_here("bones", "--quick", *options)
+    printed = run_here("bones.__main__", "--quick", *options)
     assert len(list(pictures.glob("*.png"))) == 8
     for title in ("MHAD, seven joints", "Webcams, MediaPipe's 2D against its own 3D landmarks",
                   "MHAD, neck and wrists", "UTD-MHAD, eight joints",

@@ -20,6 +20,7 @@ from benchmarks.engine import (
     bootstrap,
     choose_setting,
     describe,
+    kept_prior,
     mean,
     mean_of,
     pivot,
@@ -34,6 +35,7 @@ from benchmarks.engine import (
 )
 from torchpose.errors import FileFormatError, InputError
 from torchpose.evaluation import Report
+from torchpose.priors import load_prior
 
 SHARES = (0.04, 0.06, 0.1, 0.16, 0.25, 0.4)
 
@@ -117,6 +119,26 @@ def test_the_hash_of_a_source_changes_with_a_constant(tmp_path):
     (tmp_path / "one" / "docs.py").write_text("not among them")
     source_hash.cache_clear()
     assert source_hash(*names, root=tmp_path / "one") == one
+
+
+def test_a_prior_is_fitted_again_for_other_facts_or_after_damage(tmp_path):
+    made = []
+
+    def kept(*facts):
+        def make():
+            made.append(facts)
+            return load_prior("kinect-upper-body-small")
+
+        return kept_prior(tmp_path, "poses", facts, make)
+
+    first, again = kept("tiny", 0), kept("tiny", 0)
+    assert torch.equal(first.left.means, again.left.means)
+    kept("tiny", 1)
+    assert made == [("tiny", 0), ("tiny", 1)]
+    for path in tmp_path.glob("poses-*.safetensors"):
+        path.write_bytes(b"damaged")
+    kept("tiny", 0)
+    assert len(made) == 3
 
 
 # --- tables ---------------------------------------------------------------------------------------

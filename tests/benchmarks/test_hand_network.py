@@ -4,9 +4,10 @@ import pytest
 import torch
 
 pytest.importorskip("cv2")
+from benchmarks.hand_network.changes import bare_skin, bordered, exchanged, lit, mirrored, moved
 from benchmarks.hand_network.clips import FOLDS, PEOPLE, SIGNERS, Windows
-from benchmarks.hand_network.training import _changed, _loss, _mirrored, fit
-from torchpose.measure._body_window import CELLS
+from benchmarks.hand_network.training import _loss, fit
+from torchpose.measure._body_window import CELL, CELLS, cell_centres
 from torchpose.measure._hand_network import HandPlaces
 
 
@@ -34,20 +35,73 @@ def brightest(maps):
 
 def test_labels_move_with_their_windows():
     torch.manual_seed(0)
-    moved = _changed(windows(12))
-    spots = brightest(moved.maps[:, :2])
-    as_they_are = (spots - moved.places).norm(dim=-1).amax(1) < 3.0
-    exchanged = (spots.flip(1) - moved.places).norm(dim=-1).amax(1) < 3.0
-    assert (
-        bool((as_they_are | exchanged).all()) and bool(as_they_are.any()) and bool(exchanged.any())
-    )
-    assert float((moved.faces[:, 2] - 1).abs().amax()) > 0.05
+    changed = mirrored(moved(windows(12)), torch.arange(12) < 6)
+    spots = brightest(changed.maps[:, :2])
+    away = (spots[6:] - changed.places[6:]).norm(dim=-1)
+    mirrored_away = (spots[:6].flip(1) - changed.places[:6]).norm(dim=-1)
+    assert float(away.amax()) < 3.0 and float(mirrored_away.amax()) < 3.0
+    assert float((changed.faces[:, 2] - 1).abs().amax()) > 0.05
 
 
 def test_mirrored_twice_is_as_it_was():
     every = torch.ones(6, dtype=torch.bool)
-    for once, twice in zip(windows(), _mirrored(_mirrored(windows(), every), every), strict=True):
+    for once, twice in zip(windows(), mirrored(mirrored(windows(), every), every), strict=True):
         torch.testing.assert_close(once, twice)
+
+
+def half_gone(count):
+    """Windows of which every second one shows no hand."""
+    batch = windows(count)
+    seen = (torch.arange(count) % 2)[:, None].expand(-1, 2).clone()
+    maps = batch.maps.clone()
+    maps[:, :2] *= seen[..., None, None]
+    return batch._replace(maps=maps, seen=seen)
+
+
+def test_exchanged_hands_are_where_the_labels_say():
+    torch.manual_seed(0)
+    before = half_gone(200)
+    after = exchanged(before)
+    highest = after.maps[:, :2].flatten(2).amax(-1)
+    away = (brightest(after.maps[:, :2]) - after.places).norm(dim=-1)
+    assert bool((highest[after.seen == 0] < 0.8).all())
+    assert bool((away[after.seen == 1] < 1.5).all() and (highest[after.seen == 1] > 0.7).all())
+    came, left = (after.seen == 1) & (before.seen == 0), (after.seen == 0) & (before.seen == 1)
+    assert int(came.sum()) > 20 and int(left.sum()) > 20
+
+
+def test_bare_skin_leaves_hands_and_faces_as_they_are():
+    torch.manual_seed(0)
+    before = windows(20)
+    after = bare_skin(before)
+    places = before.places * CELL + cell_centres()[0, 0]
+    for at in (*places.unbind(1), before.faces[:, :2]):
+        near = (cell_centres(2) - at[:, None, None]).norm(dim=-1) < 0.5
+        assert not bool((after.lab != before.lab)[near[:, None].expand(-1, 3, -1, -1)].any())
+    changed = (after.lab != before.lab).flatten(1).any(1)
+    assert 4 < int(changed.sum()) < 16
+    assert bool((after.maps[changed, 0] - before.maps[changed, 0] > 0.2).flatten(1).any(1).all())
+
+
+def test_hands_beyond_a_new_border_are_gone():
+    torch.manual_seed(0)
+    after = bordered(windows(200))
+    column, row = after.places.round().long().unbind(-1)
+    image = after.maps[torch.arange(200)[:, None], 3, row, column]
+    assert bool((image[after.seen == 0] == 0).all()) and bool((image[after.seen == 1] == 1).all())
+    assert int((after.seen == 0).sum()) > 10 and int((after.seen == 1).sum()) > 200
+    outside = after.maps[:, 3] == 0
+    assert not bool(after.maps[:, 1:3].movedim(1, 0)[:, outside].any())
+
+
+def test_light_changes_colours_and_no_labels():
+    torch.manual_seed(0)
+    before = windows()
+    after = lit(before)
+    assert float(after.lab.std()) > 0.2
+    for kept in ("faces", "places", "seen"):
+        assert getattr(after, kept) is getattr(before, kept)
+    torch.testing.assert_close(after.maps[:, 3], before.maps[:, 3])
 
 
 def test_the_loss_is_least_at_the_label():

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import torchpose
-from benchmarks._command import PROTOCOLS
+from benchmarks._protocols import PROTOCOLS
 from benchmarks.bodies.clips import split_clips
 from benchmarks.bodies.tracking import Run, generators_of, track_view
 from benchmarks.bodies.views import Conditions, subjects_of

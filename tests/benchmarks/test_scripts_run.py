@@ -1,12 +1,12 @@
 """Every benchmark runs on a tiny problem and finds that results agree; times are not tested."""
 
-import argparse
 import sys
 
 import pytest
 
 from benchmarks._table_file import table_file
 from tests.data import few_recordings
+from torchpose.errors import InputError
 
 SCRIPTS = (
     "speed.mixture_kalman_filter",
@@ -43,8 +43,11 @@ def test_a_table_goes_to_a_file_or_into_a_folder(tmp_path, monkeypatch):
         assert (tmp_path / file).parent.is_dir() and not (tmp_path / file).exists()
     (tmp_path / "file.md").write_text("")
     (tmp_path / "folder" / "gplvm.md").mkdir()
+    monkeypatch.setattr(sys, "argv", ["/checkout/benchmarks/bones/__main__.py"])
+    assert table_file(tmp_path / "v0.2") == tmp_path / "v0.2" / "bones.md"
+    monkeypatch.setattr(sys, "argv", ["/checkout/benchmarks/speed/gplvm.py"])
     for given in ("file.md/table.md", "folder"):
-        with pytest.raises(argparse.ArgumentTypeError, match="file or a folder that can be"):
+        with pytest.raises(InputError, match="file or a folder that can be"):
             table_file(str(tmp_path / given))
 
 

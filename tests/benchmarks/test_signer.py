@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from benchmarks import signer
+from benchmarks._signer_models import OBSERVED
 from tests.data import data_dir_or_skip
 from torchpose.errors import FileFormatError
 from torchpose.filters import MixtureKalmanFilter
@@ -58,7 +59,7 @@ def test_hand_density_against_a_plain_kalman_filter():
     q, r = np.diag(rng.uniform(0.5, 2, 21)), np.diag(rng.uniform(0.5, 2, 6))
     model = MixtureKalmanFilter(
         GaussianMixture(torch.ones(1).double(), torch.from_numpy(mean)[None], torch.from_numpy(sigma)[None]),
-        torch.from_numpy(q), torch.from_numpy(r), signer.OBSERVED[:6], uniform_weight=0.0,
+        torch.from_numpy(q), torch.from_numpy(r), OBSERVED[:6], uniform_weight=0.0,
     )  # fmt: skip
     z = rng.normal(size=(9, 6)) * 3
     z[4, 2:4] = np.nan
@@ -68,7 +69,7 @@ def test_hand_density_against_a_plain_kalman_filter():
         model, torch.from_numpy(z)[None], torch.from_numpy(hidden)[None]
     )[0]
 
-    observe = np.eye(21)[list(signer.OBSERVED[:6])]
+    observe = np.eye(21)[list(OBSERVED[:6])]
     f = sigma @ np.linalg.inv(q + sigma)
     noise = f @ q
     m, p = mean.copy(), sigma.copy()

@@ -41,7 +41,7 @@ def clips(folder):
 
 
 @pytest.fixture(scope="module")
-def trackee(clips):
+def tracked(clips):
     (split,) = body_clips.split_clips(clips, ["p1"], ["p1"], 1, 60, 60)
     return prepare(split, Conditions((48, 64), faults=0.0), 12, 10)
 
@@ -49,51 +49,51 @@ def trackee(clips):
 # --- filters --------------------------------------------------------------------------------------
 
 
-def test_every_filter_evaluates_the_same_number_of_likelihoods(trackee):
+def test_every_filter_evaluates_the_same_number_of_likelihoods(tracked):
     for name, method in METHODS.items():
-        tracker = make_filter(name, trackee, Setting(0.5, 2.0), 100)
+        tracker = make_filter(name, tracked, Setting(0.5, 2.0), 100)
         layers = tracker.n_layers if isinstance(tracker, AnnealedParticleFilter) else 1
         assert layers * tracker.n_particles == 100
-        torch.testing.assert_close(tracker.step_std, 2 * trackee.step_std)
+        torch.testing.assert_close(tracker.step_std, 2 * tracked.step_std)
         for key, value in method.options.items():
             assert getattr(tracker, key) == value
-    assert isinstance(make_filter("sir", trackee, Setting(30.0)), SIRParticleFilter)
+    assert isinstance(make_filter("sir", tracked, Setting(30.0)), SIRParticleFilter)
     with pytest.raises(InputError, match="method must be among sir"):
-        make_filter("kalman", trackee, Setting(1.0))
+        make_filter("kalman", tracked, Setting(1.0))
 
 
-def test_what_a_person_is_tracked_with(trackee):
-    (view,) = trackee.tests
+def test_what_a_person_is_tracked_with(tracked):
+    (view,) = tracked.tests
     assert view.silhouettes.shape == (12, 3, 48, 64) and view.floor < 15
     assert 0.5 < view.overlap < 1 and view.in_view == 1.0
-    at_start = 1000 * (trackee.body.joints(view.initial_state) - view.clip.joints[0]).norm(dim=-1)
+    at_start = 1000 * (tracked.body.joints(view.initial_state) - view.clip.joints[0]).norm(dim=-1)
     assert float(at_start.mean()) < 15
-    level = trackee.step_std[[0, 2]]
+    level = tracked.step_std[[0, 2]]
     assert float(level[0]) == pytest.approx(float(level[1]))  # no heading is known beforehand
-    assert trackee.manifold.info.fps == 60 and trackee.manifold.info.persons == ("p1",)
-    (_, validation) = trackee.validation[0]
-    assert validation.clip.trial not in {view.clip.trial, *trackee.manifold.info.sequences}
+    assert tracked.manifold.info.fps == 60 and tracked.manifold.info.persons == ("p1",)
+    (_, validation) = tracked.validation[0]
+    assert validation.clip.trial not in {view.clip.trial, *tracked.manifold.info.sequences}
 
 
-def test_validation_chooses_the_scale_first_and_then_the_exponent(trackee, tmp_path, monkeypatch):
+def test_validation_chooses_the_scale_first_and_then_the_exponent(tracked, tmp_path, monkeypatch):
     """Errors of a known landscape are put in place of those of filters."""
     tried = []
 
     def fit(make_filter, sequences, values, seeds):
         tracker = make_filter(values[0])
-        scale = float((tracker.step_std / trackee.step_std)[0])
+        scale = float((tracker.step_std / tracked.step_std)[0])
         tried.append((tracker.sharpness, round(scale, 6)))
         error = abs(math.log(scale / 1.4)) + 0.1 * abs(math.log(tracker.sharpness / 30))
         return SharpnessFit(values[0], tuple(values), (error,))
 
     monkeypatch.setattr(filters, "fit_sharpness", fit)
-    found = filters.tune([trackee], "sir", 20, "bidirectional", tmp_path)
+    found = filters.tune([tracked], "sir", 20, "bidirectional", tmp_path)
     assert found.setting == Setting(30.0, 1.4) and found.error == pytest.approx(0.0, abs=1e-6)
     assert tried[: len(SCALES)] == [(100.0, scale) for scale in SCALES]
     assert {scale for _, scale in tried[len(SCALES) :]} == {1.4}
     assert len(tried) == len(set(tried)) == len(found.tried)
     count = len(tried)
-    again = filters.tune([trackee], "sir", 20, "bidirectional", tmp_path)
+    again = filters.tune([tracked], "sir", 20, "bidirectional", tmp_path)
     assert len(tried) == count and again == found  # kept
     budgets = {len({*SCALES}) + len(m.values) - (m.first in m.values) for m in METHODS.values()}
     assert len(budgets) == 1
@@ -250,7 +250,7 @@ def test_several_conditions_with_the_settings_of_an_earlier_run(done, folder, tm
 def test_the_settings_of_each_condition_where_validation_chose_them(folder, tmp_path, monkeypatch):
     """Sharpness 30 is put in place of what validation chooses with 20 particles, else 300."""
 
-    def tune(trackees, method, n, likelihood, out):
+    def tune(tracked_persons, method, n, likelihood, out):
         found = Setting(30.0 if n == 20 else 300.0, 1.4)
         return Tuning(found, (found,), (50.0,))
 
@@ -337,10 +337,10 @@ def test_the_command(command, folder, tmp_path):
 
 @pytest.fixture
 def command(capsys):
-    from benchmarks._command import run
+    from benchmarks._protocols import execute_protocol
 
     def call(arguments):
-        code = run("silhouette", arguments)
+        code = execute_protocol("silhouette", arguments)
         captured = capsys.readouterr()
         return code, captured.out + captured.err
 

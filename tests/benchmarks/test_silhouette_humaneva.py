@@ -101,7 +101,7 @@ def test_silhouettes_are_kept(made, out, monkeypatch):
     monkeypatch.setattr(footage, "_measure", None)  # would be called
     _, again = footage(split.test[0], SIZE, 2)
     assert bool((again == found).all())
-    assert len(list(out.glob("silhouettes-*.npz"))) == 1
+    assert len(list(out.glob("run-*.npz"))) == 1
 
 
 def test_gaps_are_left_out(made, tmp_path, monkeypatch):

@@ -37,8 +37,7 @@ def follow(frames, **options):
     tracker = FaceTracker(detector, **options)
     states = [tracker.init()]
     for t in range(len(frames)):
-        image = np.zeros((480, 640), np.uint8)
-        image[0, 0] = t
+        image = np.full((480, 640), t, np.uint8)
         states.append(tracker.step(states[-1], image))
     return tracker, states[1:], detector
 
@@ -103,7 +102,8 @@ def test_known_faces_are_searched_where_they_are():
 
 def test_without_a_face_the_whole_image_is_searched_now_and_then():
     _, _, detector = follow([[]] * 11, search_every=5)
-    assert detector.asked == [None] * 3
+    small = Region(0, 0, 640, 480, 11.0, 40.0)
+    assert detector.asked == [None, None, small] * 3  # as it is, turned, and for small faces
     later = [[]] * 6 + [[[300.0, 200.0, 90.0]]] * 8
     tracker, states, _ = follow(later, search_every=5)
     assert [len(s.mean) for s in states] == [0] * 10 + [1] * 4
@@ -180,3 +180,53 @@ def test_known_faces_are_looked_for_at_the_size_that_the_detector_likes(size):
     np.testing.assert_allclose(state.mean[0, :3], [499.5, 399.5, size], atol=0.02 * size)
     assert all(side == pytest.approx(80.0, rel=0.2) for side, _, _ in seen)
     assert all(low < side < high for side, low, high in seen)
+
+
+def test_a_far_smaller_face_on_the_chest_of_another_is_not_used():
+    person, collar, child = [300.0, 150.0, 100.0], [310.0, 400.0, 40.0], [310.0, 300.0, 80.0]
+    behind = [450.0, 150.0, 40.0]
+    frames = [[person, collar, child, behind]] * 6
+    tracker, states, _ = follow(frames, every=1, whole_every=1, gate=0.2)
+    assert len(states[-1].mean) == 4
+    used = states[-1].mean[tracker.usable(states[-1]), :3]
+    torch.testing.assert_close(used, torch.tensor([person, child, behind]).double())
+
+
+def portrait(size, degrees=0.0, light=1.0):
+    """A face so many pixels large in the middle of a grey image of 480 x 270, turned and darkened."""
+    cv2 = pytest.importorskip("cv2")
+    pytest.importorskip("matplotlib")
+    from torchpose.demo._rendering import look
+
+    grey = cv2.cvtColor(look._read(), cv2.COLOR_RGB2GRAY)
+    scale = size / look._FACE_SIDE
+    matrix = cv2.getRotationMatrix2D(look._FACE, degrees, scale)
+    matrix[:, 2] += np.array([240, 135]) - look._FACE
+    if scale < 0.5:
+        grey = cv2.GaussianBlur(grey, (0, 0), 0.4 / scale)
+    image = cv2.warpAffine(
+        grey, matrix, (480, 270), borderMode=cv2.BORDER_CONSTANT, borderValue=120
+    )
+    return (light * image).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("size", "degrees", "light"),
+    [(16, 0, 1.0), (20, 0, 1.0), (30, 0, 0.4), (160, 0, 1.0), (70, 0, 0.15), (70, 32, 1.0), (70, -32, 0.3)],
+)  # fmt: skip
+def test_small_large_tilted_and_dark_faces_are_found_where_they_are(size, degrees, light):
+    image, tracker = portrait(size, degrees, light), FaceTracker()
+    state = tracker.init()
+    for _ in range(10):
+        state = tracker.step(state, image)
+    faces = state.mean[tracker.usable(state), :3]
+    assert len(faces) == 1
+    assert torch.dist(faces[0, :2], torch.tensor([240.0, 135.0]).double()) < 0.25 * size
+    assert 0.75 * size < faces[0, 2] < 1.4 * size
+
+
+def test_small_faces_are_not_searched_for_while_a_larger_one_is_known():
+    face = [[300.0, 200.0, 90.0]]
+    _, _, detector = follow([face] * 24, every=2, whole_every=10)
+    whole = [r for r in detector.asked if r is None or (r.right, r.bottom) == (640, 480)]
+    assert whole == [None] * 3

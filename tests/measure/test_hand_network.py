@@ -8,6 +8,7 @@ from tests.measure.test_hands import follow, scene
 from torchpose.errors import FileFormatError
 from torchpose.measure import HandTracker
 from torchpose.measure._body_window import CELLS, cell_centres
+from torchpose.measure._hand_likelihood import HandSettings
 from torchpose.measure._hand_network import (
     HandNetwork,
     HandNetworkInfo,
@@ -28,12 +29,15 @@ def windows(count=1, seed=0):
     return lab, maps, torch.ones(count, 160, 192), FACE.expand(count, -1)
 
 
+BIAS = HandSettings().gone_bias
+
+
 class Says(HandNetwork):
-    """Stands for a network that says the same log-odds in every frame, of places nothing."""
+    """Stands for a network after whose bias hands are gone with these log-odds; it says nothing of places."""
 
     def __init__(self, *gone):
         super().__init__()
-        self.said = iter(gone)
+        self.said = iter(odds - BIAS for odds in gone)
 
     def find(self, lab, maps, inside, faces):
         return HandPlaces(
@@ -58,6 +62,31 @@ def test_places_and_absence_are_one_distribution():
     every = torch.nn.functional.avg_pool2d(torch.cat([maps, inside[:, None]], 1), 4)
     share = torch.softmax(network(relative_colours(lab, faces), every, faces), -1)[..., -1]
     torch.testing.assert_close(torch.sigmoid(found.gone), share, atol=1e-5, rtol=1e-5)
+
+
+@torch.inference_mode()
+def test_only_places_tell_that_a_hand_is_there():
+    network = shipped_hand_network()
+    lab, maps, inside, faces = windows(3)
+    every = torch.nn.functional.avg_pool2d(torch.cat([maps, inside[:, None]], 1), 4)
+    logits = network(relative_colours(lab, faces), every, faces)
+    evidence = torch.logsumexp(logits[..., :-1], -1)
+    constant = network.find(lab, maps, inside, faces).gone + evidence
+    torch.testing.assert_close(constant, constant[:1].expand(3, -1), atol=1e-4, rtol=0)
+    assert float(evidence.std()) > 0.1
+
+
+@torch.inference_mode()
+def test_colours_beyond_the_image_do_not_count():
+    network = shipped_hand_network()
+    lab, maps, inside, faces = windows()
+    inside[:, 120:] = 0
+    other = lab.clone()
+    other[:, :, 120:] = 90
+    one, two = (network.find(colours, maps, inside, faces) for colours in (lab, other))
+    torch.testing.assert_close(one.log_prob, two.log_prob, rtol=0, atol=0)
+    inside[:, 120:] = 1
+    assert not torch.equal(one.log_prob, network.find(lab, maps, inside, faces).log_prob)
 
 
 @torch.inference_mode()
@@ -116,7 +145,7 @@ def test_how_long_a_hand_stays_gone_does_not_depend_on_the_frame_rate():
         tracker, _ = tracked(None, fps, 1)
         gone = torch.full((1, 2), 0.9)
         for _ in range(frames):
-            gone = tracker._gone(gone, torch.zeros(1, 2))
+            gone = tracker._gone(gone, torch.full((1, 2), -BIAS))
         found.append(gone)
     torch.testing.assert_close(found[0], found[1])
     assert 0.5 < float(found[0][0, 0]) < 0.9

@@ -282,7 +282,7 @@ def _nobody(
     for note in notes:
         print(f"note     {note}")
     what, wants = "face", (
-        "The detector wants faces from the front, upright and at least 40 pixels high; keypoints of "
+        "The detector wants faces from the front, tilted little and at least 16 pixels high; keypoints of "
         "another detector can be tracked instead (--detector)"
     )  # fmt: skip
     if detector is not None:

@@ -29,6 +29,13 @@ __all__ = [
 _ROI = 1.1  # half the side of the region searched about a known face, in its sizes
 _SMALLER, _LARGER = 0.75, 1.4  # sizes searched for there
 _SAME_SIZE = 1.25  # a face that differs by less from the size wanted is taken as it is
+_USUAL = 40.0  # size above which faces are searched for first, pixels
+_CLEAR = 26.0  # size to which the smallest face of a search is enlarged, pixels
+_STRICTER = 1  # boxes more that must agree in an enlarged image
+_BRIGHT, _MOST_GAIN = 160.0, 6.0  # grey of the brightest parts of an image that needs no gain
+_TILT = 25.0  # degrees by which an image is turned to find tilted faces
+# Where a far smaller face is a pattern on somebody's head or clothes, in sizes of that person's face.
+_SMALLER_BY, _BESIDE, _ABOVE, _BELOW = 0.7, 0.8, 0.8, 3.0
 
 
 def check_faces(faces: Float[Tensor, "N 3"], count: int | None = None) -> None:
@@ -82,9 +89,12 @@ def _frontal_faces() -> Any:
 class HaarFaceDetector:
     """Detects frontal faces by the cascade of Viola & Jones that comes with OpenCV.
 
+    In a region with faces below 26 pixels it enlarges the image, and asks for more boxes that agree.
+    Dark images are made brighter: the cascade takes windows of little contrast for plain walls.
+
     Args:
         scale_factor: between the sizes that are tried. min_neighbours: boxes that must agree.
-        min_size: of a face, pixels.
+        min_size: of a face, pixels; a region names its own.
 
     Raises:
         InputError: settings out of range, or an OpenCV without its cascades.
@@ -115,23 +125,52 @@ class HaarFaceDetector:
     def __call__(self, image: Image, region: Region | None = None) -> Float[Tensor, "N 3"]:
         """Return the faces of a grey image; see `FaceDetector`."""
         check_grey("image", image)
-        left, top, sizes = 0, 0, {"minSize": (self.min_size, self.min_size)}
-        if region is not None:
-            left, top = region.left, region.top
-            image = image[top : region.bottom, left : region.right]
-            smallest = max(self.min_size, int(region.smallest))
-            sizes = {
-                "minSize": (smallest,) * 2,
-                "maxSize": (max(smallest, int(region.largest)),) * 2,
-            }
-        if image.size == 0:
+        if region is None:
+            return self._detect(image, self.min_size, max(image.shape), self.min_neighbours)
+        part = image[region.top : region.bottom, region.left : region.right]
+        smallest, largest = int(region.smallest), int(region.largest)
+        if part.size == 0 or largest < 1:
             return torch.zeros(0, 3, dtype=torch.float64)
+        scale = max(1.0, _CLEAR / max(region.smallest, 1.0))
+        if scale == 1:
+            found = self._detect(part, smallest, largest, self.min_neighbours)
+        else:
+            sizes = (round(smallest * scale), round(largest * scale))
+            strict = self.min_neighbours + _STRICTER
+            found = _scaled_back(self._detect(_resized(part, scale), *sizes, strict), scale)
+        return found + found.new_tensor([region.left, region.top, 0])
+
+    def _detect(
+        self, image: Image, smallest: int, largest: int, neighbours: int
+    ) -> Float[Tensor, "N 3"]:
+        """Return the faces between two sizes."""
         boxes = self._cascade.detectMultiScale(
-            np.ascontiguousarray(image), self.scale_factor, self.min_neighbours, **sizes
-        )
+            np.ascontiguousarray(_brightened(image)), self.scale_factor, neighbours,
+            minSize=(smallest,) * 2, maxSize=(max(smallest, largest),) * 2,
+        )  # fmt: skip
         found = torch.from_numpy(np.asarray(boxes, dtype=np.float64).reshape(-1, 4))
-        centres = found[:, :2] + found[:, 2:] / 2 + torch.tensor([left, top])
-        return torch.cat([centres, found[:, 2:3]], 1)
+        return torch.cat([found[:, :2] + found[:, 2:] / 2, found[:, 2:3]], 1)
+
+
+def _brightened(image: Image) -> Image:
+    """Return the image, multiplied if its brightest parts are dark."""
+    gain = min(_MOST_GAIN, _BRIGHT / max(float(np.quantile(image[::4, ::4], 0.98)), 1.0))
+    if gain <= 1:
+        return image
+    return np.asarray((np.arange(256) * gain).clip(0, 255), np.uint8)[image]
+
+
+def _resized(image: Image, scale: float) -> Image:
+    """Return the image enlarged or made smaller by this factor."""
+    import cv2
+
+    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=way), np.uint8)
+
+
+def _scaled_back(faces: Float[Tensor, "N 3"], scale: float) -> Float[Tensor, "N 3"]:
+    """Return the faces of an image that was resized by this factor, in pixels of the original."""
+    return torch.cat([(faces[:, :2] + 0.5) / scale - 0.5, faces[:, 2:] / scale], 1)
 
 
 class FaceTracks(NamedTuple):
@@ -177,6 +216,8 @@ class FaceTracker(nn.Module):
         damping: d, of the velocity per frame.
         detail: size, in pixels, to which known faces are scaled before the search: cascades draw
             larger boxes about small faces, and large faces cost time.
+        smallest: size, in pixels, of faces that are searched for where none above 40 is found; reliably
+            found are those that are half as large again. 40 turns that off.
 
     Raises:
         InputError: settings out of range.
@@ -206,6 +247,7 @@ class FaceTracker(nn.Module):
         acceleration: float = 0.013,
         damping: float = 0.9,
         detail: float = 80.0,
+        smallest: float = 11.0,
     ) -> None:
         super().__init__()
         if min(every, whole_every, search_every, min_hits, memory) < 1 or memory < min_hits:
@@ -213,15 +255,16 @@ class FaceTracker(nn.Module):
                 "every, whole_every, search_every, min_hits and memory must be at least 1, and memory "
                 f"at least min_hits, got {every}, {whole_every}, {search_every}, {min_hits}, {memory}"
             )
-        if not (min(gate, std, acceleration, detail) > 0 and 0 <= damping <= 1):
+        if not (min(gate, std, acceleration, detail, smallest) > 0 and 0 <= damping <= 1):
             raise InputError(
-                "gate, std, acceleration and detail must be positive and damping in [0, 1], got "
-                f"{gate}, {std}, {acceleration}, {detail} and {damping}"
+                "gate, std, acceleration, detail and smallest must be positive and damping in [0, 1], "
+                f"got {gate}, {std}, {acceleration}, {detail}, {smallest} and {damping}"
             )
         self.detector = HaarFaceDetector() if detector is None else detector
         self.every, self.whole_every, self.search_every = every, whole_every, search_every
         self.gate, self.min_hits, self.memory = gate, min_hits, memory
-        self.std, self.acceleration, self.detail = std, acceleration, detail
+        self.std, self.acceleration = std, acceleration
+        self.detail, self.smallest = detail, smallest
         motion = torch.tensor([[1.0, 1.0], [0.0, damping]], dtype=torch.float64)
         self.register_buffer("matrix", torch.kron(motion, torch.eye(3, dtype=torch.float64)))
         self.register_buffer("observed", torch.arange(3))
@@ -237,8 +280,9 @@ class FaceTracker(nn.Module):
         )
 
     def usable(self, tracks: FaceTracks) -> Bool[Tensor, " N"]:
-        """Return which tracks have enough detections to be used."""
-        return tracks.hits >= self.min_hits
+        """Return which tracks have enough detections to be used, and are no pattern on another person."""
+        enough = tracks.hits >= self.min_hits
+        return enough & ~_on_somebody(tracks.mean[:, :3], enough)
 
     def step(self, tracks: FaceTracks, image: Image) -> FaceTracks:
         """Return the faces of the next frame.
@@ -256,29 +300,45 @@ class FaceTracker(nn.Module):
             return predicted
         found = [self._look_near(image, face) for face in predicted.mean[:, :3].tolist()]
         if everywhere:  # last, since sizes of known faces are measured better near them
-            found.append(self.detector(image))
+            used = predicted.mean[self.usable(predicted), 2]
+            turn = _TILT if tracks.frame // self.search_every % 2 else -_TILT
+            found.append(self._look_everywhere(image, bool((used > _USUAL).any()), turn))
         if not found:
             return predicted
         return self.update(predicted, _without_doubles(torch.cat(found), self.gate))
 
-    def _look_near(self, image: Image, face: list[float]) -> Float[Tensor, "N 3"]:
-        """Return the detections about a known face, scaled to the size `detail`."""
-        import cv2
+    def _look_everywhere(self, image: Image, usual: bool, turn: float) -> Float[Tensor, "N 3"]:
+        """Return the detections in the whole image: without a `usual` face, tilted or small ones as well.
 
+        Args:
+            usual: whether a face of the usual size is known. turn: of the image, degrees.
+        """
+        found = self.detector(image)
+        if usual or len(found):
+            return found
+        found = _turned_search(self.detector, image, None, turn)
+        if len(found) or self.smallest >= _USUAL:
+            return found
+        height, width = image.shape
+        return self.detector(image, Region(0, 0, width, height, self.smallest, _USUAL))
+
+    def _look_near(self, image: Image, face: list[float]) -> Float[Tensor, "N 3"]:
+        """Return the detections about a known face, scaled to the size `detail`, tilted if not upright."""
         region = _region(face, image.shape)
-        scale = self.detail / max(face[2], 1.0)
-        if 1 / _SAME_SIZE < scale < _SAME_SIZE:
-            return self.detector(image, region)
         part = image[region.top : region.bottom, region.left : region.right]
         if part.size == 0:
             return torch.zeros(0, 3, dtype=torch.float64)
-        way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-        part = np.asarray(cv2.resize(part, None, fx=scale, fy=scale, interpolation=way), np.uint8)
-        sizes = (region.smallest * scale, region.largest * scale)
-        found = self.detector(part, Region(0, 0, part.shape[1], part.shape[0], *sizes))
-        corner = torch.tensor([region.left, region.top], dtype=found.dtype)
-        centres = (found[:, :2] + 0.5) / scale - 0.5 + corner
-        return torch.cat([centres, found[:, 2:] / scale], 1)
+        scale = self.detail / max(face[2], 1.0)
+        if 1 / _SAME_SIZE < scale < _SAME_SIZE:
+            scale, found = 1.0, self.detector(image, region)
+            found = found - found.new_tensor([region.left, region.top, 0])
+        else:
+            part = _resized(part, scale)
+            found = self.detector(part, _whole(part, region, scale))
+        for turn in (-_TILT, _TILT):
+            if not len(found):
+                found = _turned_search(self.detector, part, _whole(part, region, scale), turn)
+        return _scaled_back(found, scale) + found.new_tensor([region.left, region.top, 0])
 
     def _predict(self, tracks: FaceTracks) -> FaceTracks:
         spread = (self.acceleration * tracks.mean[:, 2, None]).square().expand(-1, 6)
@@ -326,6 +386,28 @@ class FaceTracker(nn.Module):
         return torch.diag_embed((self.std * size[:, None]).square().expand(-1, 3))
 
 
+def _whole(image: Image, sizes: Region, scale: float) -> Region:
+    """Return a whole image as the region of a search, for the sizes of another region, scaled."""
+    smallest, largest = scale * sizes.smallest, scale * sizes.largest
+    return Region(0, 0, image.shape[1], image.shape[0], smallest, largest)
+
+
+def _turned_search(
+    detector: FaceDetector, image: Image, region: Region | None, degrees: float
+) -> Float[Tensor, "N 3"]:
+    """Return the detections in the image that is turned about its middle, and stays as large."""
+    import cv2
+
+    height, width = image.shape
+    matrix = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), degrees, 1.0)
+    turned = cv2.warpAffine(image, matrix, (width, height), borderMode=cv2.BORDER_REPLICATE)
+    found = detector(np.asarray(turned, np.uint8), region)
+    back = found.new_tensor(cv2.invertAffineTransform(matrix))
+    centres = found[:, :2] @ back[:, :2].T + back[:, 2]
+    inside = ((centres > 0) & (centres < centres.new_tensor([width, height]))).all(1)
+    return torch.cat([centres, found[:, 2:]], 1)[inside]
+
+
 def _region(face: list[float], shape: tuple[int, ...]) -> Region:
     x, y, size = face[0], face[1], max(face[2], 1.0)
     reach = _ROI * size
@@ -337,6 +419,14 @@ def _region(face: list[float], shape: tuple[int, ...]) -> Region:
         _SMALLER * size,
         _LARGER * size,
     )
+
+
+def _on_somebody(faces: Float[Tensor, "N 3"], known: Bool[Tensor, " N"]) -> Bool[Tensor, " N"]:
+    """Return which faces are far smaller than a known one on whose head or chest they are."""
+    size = faces[known, 2]
+    x, y = ((faces[:, None, :2] - faces[known, :2]) / size[:, None]).unbind(-1)
+    near = (x.abs() < _BESIDE) & (y > -_ABOVE) & (y < _BELOW)
+    return (near & (faces[:, 2, None] < _SMALLER_BY * size)).any(1)
 
 
 def _nearest(faces: Tensor, found: Tensor, gate: float) -> Int[Tensor, " n"]:

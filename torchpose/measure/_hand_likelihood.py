@@ -167,6 +167,9 @@ class HandSettings:
             plus the floor (a standard deviation).
         least_mass, least_skin: below these a hand is not `seen`.
         beside_network: weight of all other cues beside a network's.
+        exclusion_beside_network: takes the place of `exclusion` beside a network, which knows hands that
+            are joined and tells left from right itself.
+        gone_bias: added to a network's log-odds that a hand is gone: those of strangers look less like hands.
         gone_weight: share of a frame's log-odds that a hand is gone that counts; frames are alike.
         gone_stay: probability that it is still gone, or still there, in the next frame.
         most_gone: from that probability on a hand is not `seen`.
@@ -216,6 +219,8 @@ class HandSettings:
     least_mass: float = 0.3
     least_skin: float = 0.15
     beside_network: float = 0.5
+    exclusion_beside_network: float = 0.8
+    gone_bias: float = -2.0
     gone_weight: float = 0.5
     gone_stay: float = 0.97
     most_gone: float = 0.5

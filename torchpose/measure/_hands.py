@@ -275,9 +275,9 @@ class HandTracker(nn.Module):
         self, before: Float[Tensor, "N 2"], log_odds: Float[Tensor, "N 2"]
     ) -> Float[Tensor, "N 2"]:
         """Return the probability that hands are gone: a chain of two states, and a tempered likelihood."""
-        kept = (2 * self.settings.gone_stay - 1) ** self.rate
-        predicted = 0.5 + kept * (before - 0.5)
-        odds = torch.logit(predicted) + self.settings.gone_weight * log_odds
+        s = self.settings
+        predicted = 0.5 + (2 * s.gone_stay - 1) ** self.rate * (before - 0.5)
+        odds = torch.logit(predicted) + s.gone_weight * (log_odds + s.gone_bias)
         return torch.sigmoid(odds).clamp(_SUREST, 1 - _SUREST)
 
     def _prior(self, faces: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor]:
@@ -329,9 +329,10 @@ class HandTracker(nn.Module):
         )  # fmt: skip
         best = log_likelihood.amax((2, 3), keepdim=True)
         weight = (moves[:, None, None, None] * (log_likelihood - best)).clamp_min(-30).exp()
+        exclusion = s.exclusion if self.network is None else s.exclusion_beside_network
         return exclude(
             predicted * weight,
-            s.exclusion, s.exclusion_radius / CELL, s.crossing, s.crossing_soft / CELL,
+            exclusion, s.exclusion_radius / CELL, s.crossing, s.crossing_soft / CELL,
         )  # fmt: skip
 
     def _measure(

@@ -1,4 +1,4 @@
-"""What a person of the protocol Bend is tracked with: body, action model of the others, noise, views."""
+"""Variants of the tracker of the protocol Bend, and the person that they track: body, action model, views."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -50,7 +50,7 @@ class Variant(NamedTuple):
 
     @property
     def label(self) -> str:
-        """What it is called in tables."""
+        """Return the name in tables."""
         return "constrained" if self.constrained else "first order"
 
 
@@ -59,7 +59,7 @@ Performed = tuple[Tensor, ...]
 
 
 @dataclass(frozen=True)
-class BendTrackee(Tracked):
+class BendPerson(Tracked):
     """A person with an action model of the others.
 
     Args:
@@ -101,7 +101,7 @@ def prepare(
     conditions: Conditions,
     name: str = "bend",
     centres: Float[Tensor, "P 3"] | None = None,
-) -> BendTrackee:
+) -> BendPerson:
     """Fit body, action space and noise, and render what the camera sees.
 
     Args:
@@ -116,7 +116,7 @@ def prepare(
     step_std = constant_velocity_std(body, [s for one in others for s in one])
     tests = tuple(view_of(body, clip, conditions) for clip in split.test)
     own, trained = performed[split.person], others[0]
-    return BendTrackee(
+    return BendPerson(
         split, body, step_std, tests, (), space, known_angles(split.test[0]),
         state_postures(body, torch.cat(own)), state_postures(body, torch.cat(trained)),
     )  # fmt: skip
@@ -142,7 +142,7 @@ def synchronised_space(
 
 
 def known_angles(clip: MocapClip) -> Bool[Tensor, "36"]:
-    """Return which angles are of limbs whose joints are recorded."""
+    """Return True for the angles of limbs whose joints are recorded."""
     there = dict(zip(BODY_15.names, clip.joints.isfinite().all(-1).all(0).tolist(), strict=True))
     return torch.tensor([there[limb.start] and there[limb.end] for limb in LIMBS_12 for _ in "xyz"])
 
@@ -152,7 +152,7 @@ def true_postures(body: Body, clip: MocapClip) -> Float[Tensor, "T 36"]:
     return state_postures(body, fit_state(body, clip.joints))
 
 
-def recorded_gap(subject: Subject[BendTrackee]) -> float:
+def recorded_gap(subject: Subject[BendPerson]) -> float:
     """Return the mean squared difference of these from the angles of the recorded joints, degrees^2."""
     clip = subject.view.clip
     apart = true_postures(subject.body, clip) - posture_angles(clip.joints)
@@ -160,30 +160,30 @@ def recorded_gap(subject: Subject[BendTrackee]) -> float:
 
 
 def make_filter(
-    variant: Variant, trackee: BendTrackee, setting: Setting, action: Any = None
+    variant: Variant, tracked: BendPerson, setting: Setting, action: Any = None
 ) -> ConstrainedParticleFilter:
     """Return the tracker of a variant, in single precision.
 
     Args:
-        variant: which. trackee: whose body and action space. setting: sharpness, and factor of the
-            noise. action: a bank, or another space, instead of the trackee's.
+        variant: which. tracked: whose body and action space. setting: sharpness, and factor of the
+            noise. action: a bank, or another space, instead of this person's.
     """
     if action is None and variant.constrained:
-        action = trackee.space.with_dimensions(min(variant.dimensions, trackee.space.n_dimensions))
+        action = tracked.space.with_dimensions(min(variant.dimensions, tracked.space.n_dimensions))
     tracker = ConstrainedParticleFilter(
-        trackee.body, action if variant.constrained else None, variant.particles,
-        process_cov=(setting.scale * trackee.step_std).square(), likelihood="overlap",
+        tracked.body, action if variant.constrained else None, variant.particles,
+        process_cov=(setting.scale * tracked.step_std).square(), likelihood="overlap",
         sharpness=setting.value, limb_shape=variant.limb_shape, max_redraws=REDRAWS,
     )  # fmt: skip
     return copy.deepcopy(tracker).float()
 
 
-def true_acceptance(trackee: BendTrackee, dimensions: int) -> tuple[Acceptance, Acceptance]:
+def true_acceptance(tracked: BendPerson, dimensions: int) -> tuple[Acceptance, Acceptance]:
     """Return the share of recorded postures that pass: of the person left out, and of a trainer."""
-    space = trackee.space.with_dimensions(dimensions)
+    space = tracked.space.with_dimensions(dimensions)
     generators = [torch.Generator().manual_seed(seed) for seed in (0, 1)]
     unseen, trained = (
         space.acceptance(postures, generator=generator)
-        for postures, generator in zip((trackee.own, trackee.trained), generators, strict=True)
+        for postures, generator in zip((tracked.own, tracked.trained), generators, strict=True)
     )
     return unseen, trained

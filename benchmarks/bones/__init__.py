@@ -1,0 +1,38 @@
+"""Arms of strangers, by trackers and by elementary geometry: `python -m benchmarks.bones`."""
+
+from benchmarks.bones.fits import SETS, fit_without
+from benchmarks.bones.scoring import Chains, errors, lifted, lifts, tracked, trackers, true_lengths
+from benchmarks.bones.tables import FEW, FIT, FOUR
+from benchmarks.bones.views import (
+    ENDS,
+    View,
+    arm_rows,
+    begun,
+    mhad_views,
+    openpose_views,
+    recordings,
+    seen_by_camera,
+)
+
+__all__ = [
+    "ENDS",
+    "FEW",
+    "FIT",
+    "FOUR",
+    "SETS",
+    "Chains",
+    "View",
+    "arm_rows",
+    "begun",
+    "errors",
+    "fit_without",
+    "lifted",
+    "lifts",
+    "mhad_views",
+    "openpose_views",
+    "recordings",
+    "seen_by_camera",
+    "tracked",
+    "trackers",
+    "true_lengths",
+]
