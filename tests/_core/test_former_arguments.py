@@ -51,7 +51,13 @@ def test_other_names_keep_their_values(method):
 
 
 @pytest.mark.parametrize(
-    ("given", "named"), [((1, 2, 3, 4, 5), {}), ((1, 2), {"b": 3}), ((1,), {"none": 3})]
+    ("given", "named"),
+    [
+        ((1, 2, 3, 4, 5), {}),
+        ((1, 2), {"b": 3}),
+        ((1,), {"none": 3}),
+        ((1,), {"a_std": 2, "a_cov": 4}),
+    ],
 )
 def test_what_was_wrong_before_still_is(method, given, named):
     with pytest.raises(TypeError):

@@ -21,7 +21,8 @@ def takes_former_arguments(function: _Function) -> _Function:
     keyword that stands for it now. Standard deviations become variances where `_std` became `_cov`.
 
     Raises:
-        TypeError: as Python does for arguments that the former signature did not take either.
+        TypeError: as Python does for arguments that the former signature did not take either, or an
+            argument by its present and its former name.
     """
     positions, renamed = _former(function.__qualname__)
     parameters = inspect.signature(function).parameters.values()
@@ -43,6 +44,8 @@ def takes_former_arguments(function: _Function) -> _Function:
         options |= zip(names, beyond, strict=True)
         for old in renamed.keys() & options.keys():
             new, value = renamed[old], options.pop(old)
+            if new in options:
+                raise TypeError(f"{function.__qualname__} got {new} and, by its former name, {old}")
             if old not in names:
                 warn_of_former(f"{old} of {function.__qualname__} is {new} now; the old name goes")
             squared = old.endswith("_std") and new.endswith("_cov")
