@@ -20,7 +20,6 @@ from tqdm.auto import tqdm
 
 from torchpose._core.module_state import derived
 from torchpose.errors import InputError
-from torchpose.filters._base import Generators
 from torchpose.math._rotations import within_half_turn
 from torchpose.priors._arms import ArmPrior, shipped_arm_prior
 from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -44,7 +43,15 @@ from torchpose.upper_body._articulated_poses import (
     pose_of,
 )
 from torchpose.upper_body._body_lengths import BodyLengths, KnownBody, Lengths
-from torchpose.upper_body._estimator import ArmJoints, Bones, Estimates, Estimator, TrackerModel
+from torchpose.upper_body._estimator import (
+    ArmGenerators,
+    ArmJoints,
+    Bones,
+    Estimates,
+    Estimator,
+    TrackerModel,
+    repeat_last,
+)
 from torchpose.upper_body._face import FacePoints, face_evidence, head_in_face
 from torchpose.upper_body._lean import lean_angle, rolled, seen_lean
 from torchpose.upper_body._measurements import MeasuredJoints
@@ -219,7 +226,7 @@ class ArticulatedFilter(Estimator):
         self.matrix = info.matrix.to(like)
 
     def init(
-        self, batch_size: int, joints: ArmJoints, generators: dict[str, Generators]
+        self, batch_size: int, joints: ArmJoints, arm_generators: ArmGenerators
     ) -> ArticulatedState:
         """Return the state before the first frame; see `Estimator`."""
         root = self.grid.init(batch_size, self.lengths.size_spread)
@@ -229,38 +236,33 @@ class ArticulatedFilter(Estimator):
         return ArticulatedState(root, lengths, None, middle, lean, 0)
 
     def advance(
-        self, state: ArticulatedState, measured: MeasuredJoints
+        self, state: ArticulatedState, measured: MeasuredJoints, progress: bool = False
     ) -> tuple[ArticulatedState, Estimates]:
         """Return the next state and the estimates of T more frames; see `Estimator`."""
-        poses, last = [], state
-        for last, body, belief in self._steps(state, measured):  # noqa: B007  # the last one is returned
-            poses.append(self._pose(body, belief))
-        return last, estimates_of(poses, self.matrix, self.lengths.names)
+        poses = []
+        for step in self._steps(state, measured, progress):
+            state = step.state
+            poses.append(self._pose(step.body, step.arms))
+        return state, estimates_of(poses, self.matrix, self.lengths.names)
 
     def forward(
         self,
         measured: MeasuredJoints,
         joints: ArmJoints,
-        generators: dict[str, Generators],
+        arm_generators: ArmGenerators,
         lengths: Tensor | None = None,
         progress: bool = False,
     ) -> Estimates:
         """Return the estimates of whole sequences; see `Estimator`."""
-        state = self.init(len(measured.uv), joints, generators)
-        steps = self._steps(state, measured, progress)
-        if self.model.smoothing is None:
-            poses = [self._pose(body, belief) for _, body, belief in steps]
-        else:
-            poses = self._smoothed(list(steps), lengths)
-        return estimates_of(poses, self.matrix, self.lengths.names, lengths)
-
-    def _smoothed(self, steps: list[_Step], lengths: Tensor | None) -> list[FramePose]:
-        """Return the poses after the later frames were seen too."""
         smoothing = self.model.smoothing
+        if smoothing is None:
+            return super().forward(measured, joints, arm_generators, lengths, progress)
+        state = self.init(len(measured.uv), joints, arm_generators)
+        steps = list(self._steps(state, measured, progress))
         lag = int(smoothing) if isinstance(smoothing, int) else None
-        beliefs = self.chain.smoothed([step.arms for step in steps], lengths, lag)
-        pairs = zip(steps, beliefs, strict=True)
-        return [self._pose(step.body, belief) for step, belief in pairs]
+        smoothed = self.chain.smoothed([step.arms for step in steps], lengths, lag)
+        poses = [self._pose(step.body, arms) for step, arms in zip(steps, smoothed, strict=True)]
+        return repeat_last(estimates_of(poses, self.matrix, self.lengths.names), lengths)
 
     def _pose(self, body: SeenBody, belief: ArmState) -> FramePose:
         """Return the estimate of a frame."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.camera._projection import project
@@ -167,17 +167,14 @@ def estimates_of(
     poses: Sequence[FramePose],
     matrix: Float[Tensor, "3 3"],
     names: tuple[str, ...],
-    lengths: Int[Tensor, " B"] | None = None,
 ) -> Estimates:
-    """Return the estimates of both arms and the poses; past the lengths the last ones again.
+    """Return the estimates of both arms and the poses they were made from.
 
     Args:
-        poses: of each frame. matrix: K of their pixels. names: of the bones' lengths.
-        lengths: frames of each sequence, None for all.
+        poses: the pose of each frame. matrix: K of the prior's camera. names: the names of the bone
+            lengths.
     """
     stacked = FramePose(*(torch.stack(values, 1) for values in zip(*poses, strict=True)))
-    if lengths is not None:
-        stacked = _repeated(stacked, lengths.to(stacked.joints.device))
     neck = stacked.joints[:, :, _NECK]
     level = torch.zeros_like(stacked.turn)
     angles = torch.stack([stacked.lean, level, stacked.turn], -1)
@@ -197,16 +194,6 @@ def estimates_of(
     reading = ReadOut(joints, covs, angles, neck, uv, uv_covs)
     bones = Bones(names, stacked.bones, stacked.bone_covs)
     return Estimates(left, right, None, reading, bones)
-
-
-def _repeated(poses: FramePose, lengths: Int[Tensor, " B"]) -> FramePose:
-    """Return the poses with the last one of each sequence past its length, without evidence there."""
-    frames = torch.arange(poses.joints.shape[1], device=lengths.device)
-    last = frames.minimum(lengths[:, None] - 1)
-    rows = torch.arange(len(last), device=last.device)[:, None]
-    poses = FramePose(*(values[rows, last] for values in poses))
-    past = (frames >= lengths[:, None])[..., None]
-    return poses._replace(log_evidence=poses.log_evidence.masked_fill(past, 0.0))
 
 
 def _pixel_covs(

@@ -1,11 +1,11 @@
 """Define the interface of the estimators: measured joints in, the states of both arms out."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchpose._core.checks import check_rate
@@ -20,6 +20,7 @@ from torchpose.upper_body._measurements import MeasuredJoints
 
 __all__ = [
     "ARMS",
+    "ArmGenerators",
     "ArmJoints",
     "Bones",
     "Estimates",
@@ -34,11 +35,16 @@ __all__ = [
     "in_double",
     "joints_of_arm",
     "mending_notes",
+    "repeat_last",
+    "repeat_reading",
     "require_cov",
 ]
 
 ArmJoints = dict[str, tuple[str, ...]]
 """For each arm, "left" and "right", those of `ARM_JOINTS` that are measured."""
+
+ArmGenerators = dict[str, Generators]
+"""For each arm, "left" and "right", the random generators of its filter."""
 
 
 class TrackerModel(NamedTuple):
@@ -181,36 +187,46 @@ class Estimator(ABC):
         """Raise what does not fit, before any work; estimators may leave it out."""
 
     @abstractmethod
-    def init(self, batch_size: int, joints: ArmJoints, generators: dict[str, Generators]) -> Any:
+    def init(self, batch_size: int, joints: ArmJoints, arm_generators: ArmGenerators) -> Any:
         """Return the state before the first frame of B streams.
 
         Args:
-            batch_size: B. joints: that may be measured. generators: of each arm, for what draws.
+            batch_size: B. joints: the joints of each arm that may be measured.
+            arm_generators: the random generators of each arm (`generators_of_arms`), for methods that
+                draw.
         """
 
     @abstractmethod
-    def advance(self, state: Any, measured: MeasuredJoints) -> tuple[Any, Estimates]:
+    def advance(
+        self, state: Any, measured: MeasuredJoints, progress: bool = False
+    ) -> tuple[Any, Estimates]:
         """Return the next state and the estimates of T more frames, which later frames do not change.
 
         Args:
-            state: from `init` or the call before; it is not changed. measured: [B, T, ...].
+            state: the state from `init` or the previous call; it is not changed.
+            measured: the measurements, [B, T, ...]. progress: whether to show a progress bar.
         """
 
-    @abstractmethod
     def forward(
         self,
         measured: MeasuredJoints,
         joints: ArmJoints,
-        generators: dict[str, Generators],
-        lengths: Tensor | None = None,
+        arm_generators: ArmGenerators,
+        lengths: Int[Tensor, " B"] | None = None,
         progress: bool = False,
     ) -> Estimates:
-        """Return the estimates of whole sequences: those of `init` and `advance`, or smoothed ones.
+        """Return the estimates of whole sequences: `init`, then `advance` over all frames.
+
+        Estimators that smooth override it, and so may those that know a faster way to the same numbers.
 
         Args:
-            measured: [B, T, ...]. joints, generators: as in `init`. lengths: frames of each sequence,
-                [B]; past them the last estimate is repeated. progress: whether to show a bar.
+            measured: the measurements, [B, T, ...]. joints, arm_generators: as in `init`.
+            lengths: the number of frames of each sequence, [B]; past it the last estimate is repeated.
+            progress: whether to show a progress bar.
         """
+        state = self.init(len(measured.uv), joints, arm_generators)
+        _, estimates = self.advance(state, measured, progress)
+        return repeat_last(estimates, lengths)
 
 
 ARMS = {"left": LEFT_ARM, "right": RIGHT_ARM}
@@ -241,7 +257,7 @@ def arm_joints(there: Sequence[bool]) -> dict[str, tuple[str, ...]]:
     return {side: joints_of_arm(side, there) for side in ARMS}
 
 
-def generators_of_arms(generator: Generators) -> dict[str, Generators]:
+def generators_of_arms(generator: Generators) -> ArmGenerators:
     """Return a generator for each arm, so that neither's numbers depend on how many the other drew."""
     return dict(zip(ARMS, _pair(generator), strict=True))
 
@@ -259,6 +275,58 @@ def _pair(generator: Generators) -> tuple[Generators, Generators]:
     pairs = [_pair(g) for g in generator]
     lefts = [left for left, _ in pairs if isinstance(left, torch.Generator)]
     return lefts, [right for _, right in pairs if isinstance(right, torch.Generator)]
+
+
+def repeat_last(estimates: Estimates, lengths: Int[Tensor, " B"] | None) -> Estimates:
+    """Return the estimates with the last one of each sequence repeated past its length.
+
+    There the log-evidence is 0, no covariance counts as mended, and a failure does not count.
+
+    Args:
+        estimates: the estimates of T frames. lengths: the number of frames of each sequence, [B]; None
+            is T.
+    """
+    n_frames = estimates.left.mean.shape[1]
+    if lengths is None or bool((lengths >= n_frames).all()):
+        return estimates
+    lengths = lengths.to(estimates.left.mean.device)
+    view, reading, bones = estimates.view, estimates.reading, estimates.bones
+    return Estimates(
+        _repeat_output(estimates.left, lengths),
+        _repeat_output(estimates.right, lengths),
+        None if view is None else BodyView(*_held(view, lengths)),
+        None if reading is None else repeat_reading(reading, lengths),
+        None if bones is None else Bones(bones.names, *_held(bones[1:], lengths)),
+    )
+
+
+def repeat_reading(reading: ReadOut, lengths: Int[Tensor, " B"]) -> ReadOut:
+    """Return the poses with the last one of each sequence repeated past its length."""
+    return ReadOut(*_held(reading, lengths))
+
+
+def _repeat_output(out: FilterOutput, lengths: Int[Tensor, " B"]) -> FilterOutput:
+    mean, log_weights = _held((out.mean, out.log_weights), lengths)
+    frames = torch.arange(out.mean.shape[1], device=lengths.device)
+    inside = frames < lengths[:, None]
+    return FilterOutput(
+        mean,
+        log_weights,
+        torch.where(inside, out.log_evidence, torch.zeros_like(out.log_evidence)),
+        None if out.cov is None else _held((out.cov,), lengths)[0],
+        torch.where(out.failed_at < lengths, out.failed_at, -1),
+        None if out.mended is None else out.mended * inside,
+        None if out.jitter is None else out.jitter * inside,
+    )
+
+
+def _held(values: Iterable[Tensor], lengths: Int[Tensor, " B"]) -> list[Tensor]:
+    """Return values [B, T, ...] with those of the last frame of each sequence past its length."""
+    values = list(values)
+    frames = torch.arange(values[0].shape[1], device=values[0].device)
+    held = frames.minimum(lengths.to(frames)[:, None] - 1)
+    rows = torch.arange(len(held), device=held.device)[:, None]
+    return [value[rows, held] for value in values]
 
 
 def first_failure(left: FilterOutput, right: FilterOutput) -> Tensor:

@@ -22,7 +22,7 @@ class StreamState(NamedTuple):
         motion: state of the motion stage; None before the first frame, and where there is no stage.
         unseen: number of frames since any joint was measured, [B].
         n_keypoints: J. picked: where the eight joints are among them, and what was assumed.
-        screen: state of the search for outliers; None where there is none.
+        screen: state of the outlier screening; None without any.
     """
 
     estimator: Any

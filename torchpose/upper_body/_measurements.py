@@ -358,6 +358,10 @@ def check_gaps(
     inside = torch.ones_like(frames, dtype=torch.bool)
     if lengths is not None:
         check_shape("lengths", lengths, [batch])
+        if lengths.is_floating_point() or bool(((lengths < 1) | (lengths > n_frames)).any()):
+            raise InputError(
+                f"lengths must be integers from 1 to {n_frames}, got {lengths.tolist()}"
+            )
         inside = frames < lengths.to(measured.device)[:, None]
     seen = measured.any(-1) & inside
     empty = torch.nonzero(~seen.any(1)).flatten().tolist()

@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.filters._base import Generators
 from torchpose.math._rotations import (
     RotationOrder,
     euler_to_matrix,
@@ -23,11 +22,13 @@ from torchpose.priors._arms import ArmPrior
 from torchpose.upper_body._articulated import ArticulatedFilter, ArticulatedState
 from torchpose.upper_body._articulated_poses import ELBOWS, HANDS
 from torchpose.upper_body._estimator import (
+    ArmGenerators,
     ArmJoints,
     Estimates,
     Estimator,
     ReadOut,
     TrackerModel,
+    repeat_last,
 )
 from torchpose.upper_body._fusion import (
     MotionStage,
@@ -102,22 +103,22 @@ class MultipleModelFilter(Estimator):
         self.order: RotationOrder = model.prior.info.rotation_order  # type: ignore[assignment]
 
     def init(
-        self, batch_size: int, joints: ArmJoints, generators: dict[str, Generators]
+        self, batch_size: int, joints: ArmJoints, arm_generators: ArmGenerators
     ) -> MultipleModelState:
         """Return the state before the first frame; see `Estimator`."""
         return MultipleModelState(
-            self.windows.init(batch_size, joints, generators),
-            self.articulated.init(batch_size, joints, generators),
+            self.windows.init(batch_size, joints, arm_generators),
+            self.articulated.init(batch_size, joints, arm_generators),
             None,
             self.matrix.new_zeros(batch_size, 2),
         )
 
     def advance(
-        self, state: MultipleModelState, measured: MeasuredJoints
+        self, state: MultipleModelState, measured: MeasuredJoints, progress: bool = False
     ) -> tuple[MultipleModelState, Estimates]:
         """Return the next state and the estimates of T more frames; see `Estimator`."""
         windows, seen = self.windows.advance(state.windows, measured)
-        articulated, bodies = self.articulated.advance(state.articulated, measured)
+        articulated, bodies = self.articulated.advance(state.articulated, measured, progress)
         reading, motion = read_out(seen, self.matrix, self.order), state.motion
         if self._stage is not None:
             motion, reading = self._stage.advance(motion or self._stage.init(reading), reading)
@@ -129,7 +130,7 @@ class MultipleModelFilter(Estimator):
         self,
         measured: MeasuredJoints,
         joints: ArmJoints,
-        generators: dict[str, Generators],
+        arm_generators: ArmGenerators,
         lengths: Tensor | None = None,
         progress: bool = False,
     ) -> Estimates:
@@ -137,8 +138,10 @@ class MultipleModelFilter(Estimator):
 
         With smoothing "full" the log-odds are those of the frames before and after.
         """
-        seen = self.windows.forward(measured, joints, generators, lengths)
-        bodies = self.articulated.forward(measured, joints, generators, lengths, progress)
+        if self.model.smoothing is None:
+            return super().forward(measured, joints, arm_generators, lengths, progress)
+        seen = self.windows.forward(measured, joints, arm_generators, lengths)
+        bodies = self.articulated.forward(measured, joints, arm_generators, lengths, progress)
         reading = read_out(seen, self.matrix, self.order)
         if self._stage is not None:
             lag = stage_lag(self.model.smoothing, self.windows.ahead)
@@ -151,7 +154,7 @@ class MultipleModelFilter(Estimator):
         sums = self._sums(none, said)
         if self.model.smoothing == "full":
             sums = sums + self._sums(none, said.flip(1)).flip(1) - said
-        return self._mixed(sums, reading, seen, bodies, measured)
+        return repeat_last(self._mixed(sums, reading, seen, bodies, measured), lengths)
 
     @property
     def _stage(self) -> MotionStage | None:

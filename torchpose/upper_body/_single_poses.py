@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchpose._core.module_state import derived
 from torchpose.errors import DegenerateFilterWarning, InputError
-from torchpose.filters._base import Generators, RecursiveFilter
+from torchpose.filters._base import RecursiveFilter
 from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._outputs import FilterOutput
 from torchpose.priors._arm_state import STATE_DIM
@@ -22,6 +22,7 @@ from torchpose.priors._upper_body import UpperBodyPrior, released_process_cov
 from torchpose.skeleton._upper_body import ARM_JOINTS
 from torchpose.upper_body._estimator import (
     ARMS,
+    ArmGenerators,
     ArmJoints,
     Estimates,
     Estimator,
@@ -215,12 +216,13 @@ class PoseState(NamedTuple):
     """States of the filters of both arms, by "left" and "right", and what stays the same.
 
     Attributes:
-        filters: states. joints: that each arm's filter measures. generators: of each arm.
+        filters: the state of each arm's filter. joints: the joints that each arm's filter measures.
+        generators: the random generators of each arm.
     """
 
     filters: dict[str, Any]
     joints: ArmJoints
-    generators: dict[str, Generators]
+    generators: ArmGenerators
 
 
 class SinglePoses(Estimator):
@@ -267,26 +269,28 @@ class SinglePoses(Estimator):
         for side in ARMS:
             self.filter(side, ("hand", "head", "neck"))
 
-    def init(
-        self, batch_size: int, joints: ArmJoints, generators: dict[str, Generators]
-    ) -> PoseState:
+    def init(self, batch_size: int, joints: ArmJoints, arm_generators: ArmGenerators) -> PoseState:
         """Return the state before the first frame; see `Estimator`."""
         filters = {
-            side: self.filter(side, joints[side]).init(batch_size, generators[side])
+            side: self.filter(side, joints[side]).init(batch_size, arm_generators[side])
             for side in ARMS
         }
-        return PoseState(filters, joints, generators)
+        return PoseState(filters, joints, arm_generators)
 
-    def advance(self, state: PoseState, measured: MeasuredJoints) -> tuple[PoseState, Estimates]:
+    def advance(
+        self, state: PoseState, measured: MeasuredJoints, progress: bool = False
+    ) -> tuple[PoseState, Estimates]:
         """Return the next state and the estimates of T more frames; see `Estimator`."""
         filters, arms = {}, {}
         for side, arm in ARMS.items():
-            joints, model = state.joints[side], self.filter(side, state.joints[side])
-            z, mask, cov = arm_measurements(arm, joints, measured)
+            joints = state.joints[side]
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DegenerateFilterWarning)  # told by `failed`
-                filters[side], out = model.advance(
-                    state.filters[side], z, mask, cov, state.generators[side], return_cov=True
+                filters[side], out = self.filter(side, joints).advance(
+                    state.filters[side],
+                    *arm_measurements(arm, joints, measured),
+                    state.generators[side],
+                    return_cov=True,
                 )
             arms[side] = _wide(out)
         return state._replace(filters=filters), Estimates(arms["left"], arms["right"])
@@ -295,23 +299,26 @@ class SinglePoses(Estimator):
         self,
         measured: MeasuredJoints,
         joints: ArmJoints,
-        generators: dict[str, Generators],
+        arm_generators: ArmGenerators,
         lengths: Tensor | None = None,
         progress: bool = False,
     ) -> Estimates:
-        """Return the estimates of whole sequences; see `Estimator`."""
-        lag, arms = self.model.smoothing, {}
+        """Return the estimates of whole sequences; see `Estimator`.
+
+        `RecursiveFilter.forward` is `init` and `advance` of the filter, and knows which of its
+        covariances the sequences share.
+        """
+        smoothing, arms = self.model.smoothing, {}
         for side, arm in ARMS.items():
             model = self.filter(side, joints[side])
             z, mask, cov = arm_measurements(arm, joints[side], measured)
-            if lag is not None:
-                later = None if lag == "full" else int(lag)
-                smooth = cast(MixtureKalmanFilter, model).smooth  # or another filter that smooths
-                out = smooth(z, mask, cov, lengths, lag=later, return_cov=True)
+            if smoothing is None:
+                own = arm_generators[side]
+                out = model(z, mask, cov, lengths, own, return_cov=True, progress=progress)
             else:
-                out = model(
-                    z, mask, cov, lengths, generators[side], return_cov=True, progress=progress
-                )
+                lag = None if smoothing == "full" else int(smoothing)
+                smooth = cast(MixtureKalmanFilter, model).smooth  # or another filter that smooths
+                out = smooth(z, mask, cov, lengths, lag=lag, return_cov=True)
             arms[side] = in_double(out)
         return Estimates(arms["left"], arms["right"])
 

@@ -21,7 +21,6 @@ from torchpose.camera._virtual_camera import (
     view_jacobian,
 )
 from torchpose.errors import InputError
-from torchpose.filters._base import Generators
 from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._outputs import FilterOutput
 from torchpose.priors._arm_state import STATE_DIM
@@ -32,12 +31,14 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import ARM_JOINTS
 from torchpose.upper_body._estimator import (
     ARMS,
+    ArmGenerators,
     ArmJoints,
     Estimates,
     Estimator,
     MotionRatios,
     TrackerModel,
     in_double,
+    repeat_last,
     require_cov,
 )
 from torchpose.upper_body._measurements import (
@@ -149,8 +150,8 @@ class WindowState(NamedTuple):
     """State of `WindowMixture` between two frames.
 
     Attributes:
-        recent: the eight joints of the last N frames in the prior's pixels, the latest last, with R of
-            each frame [B, N, 8, 2, 2]. joints: that each arm's filter measures.
+        recent: the eight joints of the last frames, at most N, in the prior's pixels, the latest last,
+            with R of each frame [B, N, 8, 2, 2]. joints: the joints that each arm's filter measures.
     """
 
     recent: MeasuredJoints
@@ -206,14 +207,14 @@ class WindowMixture(Estimator):
                 self._filter(side, joints)
 
     def init(
-        self, batch_size: int, joints: ArmJoints, generators: dict[str, Generators]
+        self, batch_size: int, joints: ArmJoints, arm_generators: ArmGenerators
     ) -> WindowState:
         """Return the state before the first frame; see `Estimator`."""
-        like, n_frames = self.model.measurement_cov, self._n_recent
+        like = self.model.measurement_cov
         recent = MeasuredJoints(
-            like.new_zeros(batch_size, n_frames, 8, 2),
-            torch.zeros(batch_size, n_frames, 8, dtype=torch.bool, device=like.device),
-            like.expand(batch_size, n_frames, -1, -1, -1),
+            like.new_zeros(batch_size, 0, 8, 2),
+            torch.zeros(batch_size, 0, 8, dtype=torch.bool, device=like.device),
+            like.new_zeros(batch_size, 0, 8, 2, 2),
         )
         return WindowState(recent, joints)
 
@@ -222,27 +223,28 @@ class WindowMixture(Estimator):
         return 1 + memory_frames(self.layout.lags, self.layout.fps)
 
     def advance(
-        self, state: WindowState, measured: MeasuredJoints
+        self, state: WindowState, measured: MeasuredJoints, progress: bool = False
     ) -> tuple[WindowState, Estimates]:
         """Return the next state and the estimates of T more frames; see `Estimator`."""
-        n_frames = measured.uv.shape[1]
         frames = _append(state.recent, measured)
-        seen = self._see(frames, None, -n_frames)
+        seen = self._see(frames, None, -measured.uv.shape[1])
         seen = seen._replace(measured=seen.measured._replace(cov=measured.cov))
-        uv, mask, covs = (x[:, n_frames:] for x in frames[:3])
-        recent = MeasuredJoints(uv, mask, covs)
-        return WindowState(recent, state.joints), self._estimate(seen, state.joints)
+        estimates = self._estimate(seen, state.joints, None, progress)
+        return WindowState(_last(frames, self._n_recent), state.joints), estimates
 
     def forward(
         self,
         measured: MeasuredJoints,
         joints: ArmJoints,
-        generators: dict[str, Generators],
+        arm_generators: ArmGenerators,
         lengths: Tensor | None = None,
         progress: bool = False,
     ) -> Estimates:
         """Return the estimates of whole sequences; see `Estimator`."""
-        return self._estimate(self._see(measured, lengths, 0), joints, lengths, progress)
+        if self.model.smoothing is None:
+            return super().forward(measured, joints, arm_generators, lengths, progress)
+        seen = self._see(measured, lengths, 0)
+        return repeat_last(self._estimate(seen, joints, lengths, progress), lengths)
 
     def _see(self, measured: MeasuredJoints, lengths: Tensor | None, start: int) -> SeenInView:
         model = self.model
@@ -301,11 +303,24 @@ class WindowMixture(Estimator):
 
 
 def _append(frames: MeasuredJoints, new: MeasuredJoints) -> MeasuredJoints:
-    """Return the last frames, and the new ones after them."""
-    cov = new.cov.expand(*new.uv.shape[:2], *new.cov.shape[-3:])
-    pairs = zip(frames[:3], (new.uv, new.mask, cov), strict=True)
+    """Return the last frames, and the new ones after them; before the first frame the new ones alone."""
+    if frames.uv.shape[1] == 0:
+        return MeasuredJoints(*new[:3])
+    pairs = zip(frames[:3], (new.uv, new.mask, _cov_of_frames(new)), strict=True)
     uv, mask, covs = (torch.cat([old, latest], 1) for old, latest in pairs)
     return MeasuredJoints(uv, mask, covs)
+
+
+def _last(frames: MeasuredJoints, count: int) -> MeasuredJoints:
+    """Return the last frames, at most `count`, with R of each."""
+    return MeasuredJoints(
+        frames.uv[:, -count:], frames.mask[:, -count:], _cov_of_frames(frames)[:, -count:]
+    )
+
+
+def _cov_of_frames(measured: MeasuredJoints) -> Float[Tensor, "B T 8 2 2"]:
+    """Return R of each joint in each frame."""
+    return measured.cov.expand(*measured.uv.shape[:2], *measured.cov.shape[-3:])
 
 
 def _window_filter(
