@@ -169,17 +169,18 @@ class TrackedRecording:
         self.n_frames = 0
         self._people: dict[int, _Person] = {}
 
-    def append(self, tracked: Mapping[int, TrackedBlock], n_frames: int) -> None:
-        """Keep the next block.
+    def append(self, tracked: Mapping[int, Sequence[TrackedBlock]], n_frames: int) -> None:
+        """Keep the poses of the next block.
 
         Args:
-            tracked: by person. n_frames: of the block.
+            tracked: the parts of the block with poses, by person. n_frames: the length of the block.
 
         Raises:
             OutputError: the disk is full.
         """
-        for number, part in tracked.items():
-            self._keep(number, part)
+        for number, parts in tracked.items():
+            for part in parts:
+                self._keep(number, part)
         self.n_frames += n_frames
 
     def _keep(self, number: int, part: TrackedBlock) -> None:
