@@ -281,14 +281,15 @@ def _nobody(
         notes += (f"{out / 'poses.npz'} is of an earlier run",)
     for note in notes:
         print(f"note     {note}")
-    what, wants = "face", (
-        "The detector wants faces from the front, upright and at least 40 pixels high; keypoints of "
-        "another detector can be tracked instead (--detector)"
-    )  # fmt: skip
-    if detector is not None:
-        what, wants = "person", (
-            f"{detector} has to give three keypoints of the upper body; --min-confidence says how sure"
-        )  # fmt: skip
+    if detector is None:
+        what = "face"
+        wants = (
+            "The detector wants faces from the front, upright and at least 40 pixels high; keypoints of "
+            "another detector can be tracked instead (--detector)"
+        )
+    else:
+        what = "person"
+        wants = f"{detector} has to give three keypoints of the upper body; --min-confidence says how sure"
     print(
         f"torchpose: no {what} was seen for long enough in the {n_frames} frames of {where}, so "
         f"there are no poses. {wants}",

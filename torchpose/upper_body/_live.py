@@ -7,7 +7,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchpose.upper_body._fusion import MotionState
-from torchpose.upper_body._measurements import Picked
+from torchpose.upper_body._picked import Picked
 from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
 from torchpose.upper_body._screening import ScreenState
 

@@ -13,7 +13,8 @@ from torchpose.camera._projection import map_pixels
 from torchpose.priors._upper_body import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import OTHER_SIDE
-from torchpose.upper_body._measurements import Picked, pixels_per_metre
+from torchpose.upper_body._measurements import pixels_per_metre
+from torchpose.upper_body._picked import Picked
 
 __all__ = [
     "APART",

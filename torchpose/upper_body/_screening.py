@@ -24,13 +24,7 @@ from torchpose.upper_body._screen_model import (
     ScreenModel,
 )
 
-__all__ = [
-    "ScreenState",
-    "Screened",
-    "advance_screen",
-    "init_screen",
-    "screen_joints",
-]
+__all__ = ["ScreenState", "Screened", "advance_screen", "init_screen", "screen_joints"]
 
 _LEFT, _RIGHT = UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")
 _TRACKS = ("position", "velocity", "cov", "evidence")

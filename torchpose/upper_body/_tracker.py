@@ -32,14 +32,13 @@ from torchpose.upper_body._fusion import kept_stage, stage_lag
 from torchpose.upper_body._live import LivePose, StreamState, live_pose, unseen_frames
 from torchpose.upper_body._measurements import (
     MeasuredJoints,
-    Picked,
     check_gaps,
     in_prior_pixels,
     joint_covariances,
-    pick_joints,
 )
 from torchpose.upper_body._methods import METHODS, WINDOWS, choose_method, options_of_window
 from torchpose.upper_body._options import MethodOptions
+from torchpose.upper_body._picked import Picked, pick_joints
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._reading import PoseReader, check_frame, note_collapse
 from torchpose.upper_body._screen_model import ScreenModel, kept_screen_model

@@ -286,17 +286,10 @@ class WindowMixture(Estimator):
         """Return the filter of an arm; the same one as long as it holds."""
         window, cov = self.window, self.model.measurement_cov
         mixture: GaussianMixture = getattr(window, side)
+        settings = (*window.settings.items(), self.power, self.dtype)
         return derived(
             self.model.owner,
-            (
-                self.calibration,
-                side,
-                joints,
-                window.layout,
-                *window.settings.items(),
-                self.power,
-                self.dtype,
-            ),
+            (self.calibration, side, joints, window.layout, *settings),
             (*mixture.parameters_tuple(), cov),
             lambda: _window_filter(window, side, joints, cov, self.power, self.dtype),
         )
