@@ -372,7 +372,7 @@ def test_smoothing_sums_over_all_later_paths():
             for d, w, p in zip(directions, said, prior, strict=True)]  # fmt: skip
     states = [chain.start(arms[0])]
     for arm in arms[1:]:
-        states.append(chain.advance(states[-1], arm))
+        states.append(chain.update(states[-1], arm))
 
     def moves(t):
         return (1 - chain.anew) * chain._walk(

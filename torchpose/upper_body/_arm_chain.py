@@ -247,8 +247,8 @@ class ArmChain:
         prior = arms.log_prior[:, :, 0].exp()
         return _belief(arms, prior, prior)
 
-    def advance(self, state: ArmState, arms: Arms) -> ArmState:
-        """Return the belief after one more frame."""
+    def update(self, state: ArmState, arms: Arms) -> ArmState:
+        """Return the posterior after one more frame."""
         prior = arms.log_prior[:, :, 0].exp()
         walk = self._walk(state.directions, arms.directions[:, :, 0])
         moved = (state.weight[..., None, :] @ walk)[..., 0, :]

@@ -18,6 +18,7 @@ from torchpose.skeleton._torso import KINECT_NECK, NeckFraction
 from torchpose.skeleton._upper_body import ARM_JOINTS
 from torchpose.upper_body._face import FacePoints, measure_face
 from torchpose.upper_body._picked import Picked
+from torchpose.upper_body._picked import pick_joints as pick_joints  # for `torchpose.measurements`
 
 __all__ = [
     "MeasuredJoints",
