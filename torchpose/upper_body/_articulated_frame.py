@@ -15,7 +15,7 @@ from torchpose.upper_body._body_lengths import Lengths
 from torchpose.upper_body._face import FacePoints
 from torchpose.upper_body._lean import rolled
 from torchpose.upper_body._measurements import MeasuredJoints
-from torchpose.upper_body._root_grid import Torso, see_torso
+from torchpose.upper_body._torso import Torso, see_torso
 
 __all__ = ["ArticulatedState", "RayFrame", "UprightFrame", "frames_as_rays", "with_middle"]
 

@@ -11,7 +11,7 @@ from torchpose.skeleton._torso import KINECT_NECK
 from torchpose.upper_body._articulated_frame import UprightFrame
 from torchpose.upper_body._articulated_poses import SHOULDERS
 from torchpose.upper_body._face import head_in_face
-from torchpose.upper_body._root_grid import (
+from torchpose.upper_body._torso import (
     Root,
     TorsoLengths,
     half_widths,

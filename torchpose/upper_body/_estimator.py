@@ -53,13 +53,13 @@ class TrackerModel(NamedTuple):
     Attributes:
         owner: the module with which filters are kept between calls.
         prior: mixtures and noise. measurement_cov: R of the eight joints, [8, 2, 2], prior's pixels.
-        fps: frame rate, or None. smoothing: None, the number of later frames that an estimate may
+        fps: frames per second, or None. smoothing: None, the number of later frames that an estimate may
             use, or "full".
-        hand: kind of the measured hands, "hand" or "wrist"; None is the prior's.
-        middle: whether the middle of the shoulders is measured in place of the neck, and whether that is all
-            that is measured of them.
-        calibrated: whether covariances are recalibrated as the prior says.
-        steadied: whether what windows give is passed through filters of constant velocity.
+        hand: the kind of the measured hands, "hand" or "wrist"; None is the prior's.
+        middle: whether the middle of the shoulders is measured in place of the neck, and whether of the
+            shoulders their middle alone is measured.
+        calibrated: whether covariances are recalibrated by the noise of the prior.
+        steadied: whether the poses of windows pass filters of constant velocity.
     """
 
     owner: nn.Module
@@ -81,7 +81,7 @@ class TrackerModel(NamedTuple):
 def check_model(
     prior: UpperBodyPrior, camera: PinholeCamera | None, fps: float | None
 ) -> PinholeCamera:
-    """Return the camera, if what a tracker works with is all there.
+    """Return the camera, after checks of prior, camera and frame rate of a tracker.
 
     Raises:
         PriorError: no prior of the upper body. CameraError: no camera. InputError: a frame rate that is
@@ -102,12 +102,12 @@ def check_model(
 
 
 class ReadOut(NamedTuple):
-    """Poses, and where their bodies are.
+    """Poses, with the rotation and the place of the body.
 
     Attributes:
         joints: in the body's frame [B, T, 8, 3], metres. covs: [B, T, 8, 3, 3].
         angles: roll, pitch, yaw that turn the body's axes into the camera's [B, T, 3], radians.
-        place: of the body's centre in camera axes [B, T, 3], metres.
+        place: the body's centre in camera axes [B, T, 3], metres.
         uv: [B, T, 8, 2], pixels of the prior's camera. uv_covs: [B, T, 8, 2, 2].
     """
 
@@ -123,7 +123,7 @@ class Bones(NamedTuple):
     """Lengths of bones.
 
     Attributes:
-        names: of K lengths, as `torchpose.priors._arms.LENGTHS` has them.
+        names: the names of K lengths, as `torchpose.priors._arms.LENGTHS` has them.
         metres: [..., K]. covs: metres squared, [..., K, K].
     """
 
@@ -136,11 +136,11 @@ class Estimates(NamedTuple):
     """The states of both arms in T frames.
 
     Attributes:
-        left, right: with covariances, float64; the first 21 dimensions are those of
-            `torchpose.priors._arm_state`.
+        left, right: the states of each arm with covariances, float64; the first 21 dimensions are those
+            of `torchpose.priors._arm_state`.
         view: the virtual camera in whose pixels the states are; None is the prior's camera.
-        reading: the poses themselves, of estimators that do not estimate states of arms apart.
-        bones: lengths [B, T, K], of estimators that learn them.
+        reading: the poses, by estimators that do not estimate the states of single arms; else None.
+        bones: the lengths of bones [B, T, K], by estimators that learn them; else None.
     """
 
     left: FilterOutput
@@ -151,7 +151,7 @@ class Estimates(NamedTuple):
 
 
 class MotionRatios(NamedTuple):
-    """q/r, 1/s^3, of the constant-velocity filters over joints, their pixels and the placement."""
+    """Ratios q/r, 1/s^3, of the constant-velocity filters over joints, their pixels and the placement."""
 
     joint: float
     pixel: float
@@ -184,7 +184,7 @@ class Estimator(ABC):
     reads_rays: bool = False
 
     def check(self) -> None:  # noqa: B027  # most estimators have nothing to refuse
-        """Raise what does not fit, before any work; estimators may leave it out."""
+        """Raise the errors of the options before any work; estimators may leave it out."""
 
     @abstractmethod
     def init(self, batch_size: int, joints: ArmJoints, arm_generators: ArmGenerators) -> Any:
@@ -236,10 +236,10 @@ _USUAL = ("hand", "head", "neck")
 
 
 def joints_of_arm(side: str, there: Sequence[bool]) -> tuple[str, ...]:
-    """Return hand, head and neck of an arm, and those of its other joints that are there.
+    """Return hand, head and neck of an arm, and those of its other joints that are measured.
 
     Args:
-        side: "left" or "right". there: whether each of `UPPER_BODY` is.
+        side: "left" or "right". there: whether each of `UPPER_BODY` is measured.
 
     >>> joints_of_arm("left", [True, True, False, True, False, False, False, True])
     ('hand', 'elbow', 'head', 'neck')
@@ -252,13 +252,13 @@ def arm_joints(there: Sequence[bool]) -> dict[str, tuple[str, ...]]:
     """Return `joints_of_arm` of both arms.
 
     Args:
-        there: whether each of `UPPER_BODY` is.
+        there: whether each of `UPPER_BODY` is measured.
     """
     return {side: joints_of_arm(side, there) for side in ARMS}
 
 
 def generators_of_arms(generator: Generators) -> ArmGenerators:
-    """Return a generator for each arm, so that neither's numbers depend on how many the other drew."""
+    """Return a generator for each arm, so that the draws of one do not depend on those of the other."""
     return dict(zip(ARMS, _pair(generator), strict=True))
 
 

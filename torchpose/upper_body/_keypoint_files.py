@@ -16,7 +16,7 @@ from torchpose.io._keypoints import Keypoints
 from torchpose.priors._upper_body import load_prior
 from torchpose.skeleton._joint_sets import canonical_names
 from torchpose.skeleton._upper_body import NECK_KINDS
-from torchpose.upper_body._methods import METHODS, WINDOWS, method_options, options_of_before
+from torchpose.upper_body._methods import METHODS, WINDOWS, method_options, replace_window
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._tracker import UpperBodyTracker
 
@@ -98,7 +98,7 @@ class TrackSettings:
                 "both out",
                 file=sys.stderr,
             )
-            method, steady = options_of_before(method, self.window, steady)
+            method, steady = replace_window(method, self.window, steady)
         names = ("smoothing", "frame", "static_camera", "outliers")
         options = {name: getattr(self, name) for name in names}
         options |= {"method": method, "steady": steady}

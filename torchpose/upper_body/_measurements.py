@@ -25,6 +25,7 @@ __all__ = [
     "append_blocks",
     "arm_measurements",
     "check_gaps",
+    "check_sequences",
     "in_prior_pixels",
     "joint_covariances",
     "known_covariances",
@@ -61,7 +62,8 @@ class MeasuredJoints(NamedTuple):
         uv: [B, T, 8, 2], zero where missing. mask: [B, T, 8], True where measured.
         cov: R of each joint, [8, 2, 2], or [B, T, 8, 2, 2] if it changes.
         face: pixels of nose, eyes and ears, None if none is among the keypoints.
-        middle: what the neck was put by (`place_measured_neck`); None where it was measured itself.
+        middle: the point by which the neck was put (`place_measured_neck`); None where the neck itself was
+            measured.
         confidence: in the keypoints, [B, T, 8], 1 where missing; None where a detector gives none.
     """
 
@@ -91,9 +93,9 @@ def place_measured_neck(
     filter does not know.
 
     Args:
-        measured: whose neck is a keypoint in the middle of the shoulders; where that is missing, the
-            middle of two measured shoulders does. pixels_per_metre: at the body's usual distance.
-        neck: f and s.
+        measured: the joints, whose neck is a keypoint in the middle of the shoulders; where that is
+            missing, the middle of two measured shoulders does.
+        pixels_per_metre: the scale at the body's usual distance. neck: f and s.
     """
     uv, mask, cov = (x.clone() for x in measured[:3])
     point = MiddlePoint(
@@ -129,7 +131,7 @@ def place_measured_neck(
 def known_covariances(
     covariance: Float[Tensor, "B T J 2 2"], keypoints: Float[Tensor, "B T J 2"]
 ) -> Float[Tensor, "B T J 2 2"]:
-    """Return the covariances of the keypoints that are there, and the identity for the others."""
+    """Return the covariances of the keypoints that are measured, and the identity for the others."""
     check_shape("covariance", covariance, [*keypoints.shape, 2])
     eye = torch.eye(2).to(keypoints)
     there = keypoints.isfinite().all(-1)[..., None, None]
@@ -198,8 +200,9 @@ def in_prior_pixels(
 
     Args:
         keypoints, confidence, mask, covariance: as in `UpperBodyTracker.forward`.
-        picked: where the joints are among them. prior, camera: whose pixels are wanted and given.
-        measurement_cov: R where `covariance` does not say, in the prior's pixels.
+        picked: the places of the joints among them. prior, camera: the prior, in whose pixels the result
+            is, and the camera of the keypoints.
+        measurement_cov: R without `covariance`, in the prior's pixels.
 
     Raises:
         ShapeError, InputError: as `measure_joints`. CovarianceError: a covariance that is none.
@@ -230,6 +233,21 @@ def _check_confidence(confidence: Tensor, measured: Bool[Tensor, "B T J"]) -> No
             f"confidence must lie in [0, 1] (0 or NaN is missing), got {float(confidence[b, t, j]):g} "
             f"of keypoint {j} in frame {t} of sequence {b}; scale scores of another range to it"
         )
+
+
+def check_sequences(keypoints: Tensor) -> Float[Tensor, "B T J 2"]:
+    """Return keypoints of whole sequences after checks of type and shape.
+
+    Raises:
+        InputError: integers, no sequence or no frame. ShapeError: another shape.
+    """
+    check_floating("keypoints", keypoints)
+    check_shape("keypoints", keypoints, ["B", "T", "J", 2])
+    if keypoints.shape[0] == 0 or keypoints.shape[1] == 0:
+        raise InputError(
+            f"keypoints must hold at least one sequence of one frame, got {list(keypoints.shape)}"
+        )
+    return keypoints
 
 
 def check_gaps(
@@ -285,9 +303,9 @@ def joint_covariances(
     """Return R of each of the eight joints in the prior's pixels.
 
     Args:
-        prior: whose pixels are meant, and whose noise is taken where none is stated.
-        std: of a keypoint, pixels of the camera: None, one number, or one for each of `ARM_JOINTS`.
-        matrix: K of that camera.
+        prior: the prior, in whose pixels the result is, and whose noise is taken where none is stated.
+        std: the standard deviation of a keypoint, pixels of the camera: None, one number, or one for each
+            of `ARM_JOINTS`. matrix: K of that camera.
 
     Raises:
         ShapeError, InputError: another number of deviations, or some that are not positive.

@@ -38,12 +38,12 @@ class Picked(NamedTuple):
 
     @property
     def wrists_for_hands(self) -> bool:
-        """Return whether wrists are measured where the prior has hands."""
+        """Return whether wrists are measured in place of the prior's hands."""
         return self.hand == "wrist" and bool(self.of_hands)
 
     @property
     def middle_alone(self) -> bool:
-        """Return whether the middle of the shoulders is all that is measured of them."""
+        """Return whether of the shoulders their middle alone is measured."""
         return self.middle and min(self.indices[_LEFT], self.indices[_RIGHT]) < 0
 
     @property
@@ -62,8 +62,8 @@ def pick_joints(
     """Find the eight joints among the keypoints.
 
     Args:
-        n_joints: number of keypoints. names: of them, None if they are the eight in order.
-        neck: kind of neck of the keypoints where the names do not tell; one of another kind than
+        n_joints: the number of keypoints. names: their names; None if they are the eight in order.
+        neck: the kind of neck of the keypoints where the names do not tell; one of another kind than
             `wanted_neck` is not measured as it is. wanted_neck, wanted_hand: the prior's kinds.
 
     Raises:
@@ -101,7 +101,7 @@ def pick_joints(
 
 
 def _neck_notes(kind: str | None, wanted: str | None, middle: bool) -> list[str]:
-    """Return what is done about a neck of another kind, or about one that is missing (None)."""
+    """Return the notes about a neck of another kind, or about one that is missing (None)."""
     if middle:
         own = (
             "there is no neck among the keypoints"

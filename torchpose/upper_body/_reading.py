@@ -176,7 +176,7 @@ def _bone_fields(bones: Bones | None) -> dict[str, Any]:
 
 
 def check_frame(frame: str, static_camera: bool) -> None:
-    """Raise unless the axes of the results are known, and the camera can stand still in them.
+    """Check the axes of the results, and that the camera can stand still in them.
 
     Raises:
         InputError: another frame, or a static camera in the axes of the body.
@@ -199,7 +199,7 @@ def note_collapse(track: PoseTrack) -> PoseTrack:
     still is a Gaussian.
 
     Args:
-        track: of any method; frames that failed or do not know their sample size are not counted.
+        track: a track of any method; frames that failed or have no sample size are not counted.
     """
     method = METHODS.get(track.method)
     if method is None or not method.particles:

@@ -30,11 +30,12 @@ __all__ = [
 
 
 class _Kind(NamedTuple):
-    """What a joint of one kind can do.
+    """Place and motion of joints of one kind.
 
     Attributes:
-        below, spread: its place below the neck and the spread about it, metres.
-        speed: its usual speed. brisk: how much that changes at once where it is brisk, m/s.
+        below, spread: the mean place below the neck and the standard deviation about it, metres.
+        speed: the standard deviation of the velocity, m/s. brisk: that of its change in a frame in which
+            the joint is brisk, m/s.
     """
 
     below: float
@@ -130,8 +131,8 @@ def kept_screen_model(
     """Return `screen_model`, the same one as long as it holds.
 
     Args:
-        owner: the module with which it is kept. prior, camera, fps: of the tracker.
-        picked: where the joints are among the keypoints. like: tells the device.
+        owner: the module with which the model is kept. prior, camera, fps: those of the tracker.
+        picked: the places of the joints among the keypoints. like: a tensor on the device to work on.
     """
     info, joints = prior.info, tuple(i >= 0 for i in picked.indices)
     joints = tuple(given or (picked.middle and i == _NECK) for i, given in enumerate(joints))
@@ -155,9 +156,10 @@ def screen_model(
     """Return the model for keypoints of a camera.
 
     Args:
-        prior: whose pixels are meant. camera: of the keypoints; without an image size the image is taken to
-            be twice as wide and high as its principal point is far from the origin. fps: frame rate.
-        joints: which of `UPPER_BODY` are among the keypoints. like: tells device and dtype.
+        prior: the prior, in whose pixels the model is. camera: the camera of the keypoints; without an image
+            size the image is taken to be twice as wide and high as its principal point is far from the
+            origin. fps: frames per second. joints: which of `UPPER_BODY` are among the keypoints.
+        like: a tensor of the dtype and on the device to work in.
     """
     own, wanted = camera.matrix.to(like), prior.info.matrix.to(like)
     corners = map_pixels(
@@ -200,7 +202,7 @@ def _image_size(camera: PinholeCamera) -> Float[Tensor, "2"]:
 
 
 def _subsets(present: tuple[bool, ...]) -> Float[Tensor, "S 8"]:
-    """Return every choice of the joints that are there."""
+    """Return all subsets of the joints that are present."""
     there = [i for i, given in enumerate(present) if given]
     rows = torch.arange(2 ** len(there))
     chosen = torch.zeros(len(rows), len(present))

@@ -175,9 +175,9 @@ class PoseFilter:
         """Return the caller's options, and for the others the noise and transition of the prior.
 
         Args:
-            prior: what it brings is scaled to the frame rate, and left out where a choice of the
-                caller has no use for it. side: "left" or "right". fps: frame rate. options: of the
-                caller.
+            prior: the prior, whose noise is scaled to the frame rate, and left out where an option of the
+                caller has no use for it. side: "left" or "right". fps: frames per second. options: the
+                options of the caller.
 
         Raises:
             InputError: process_cov for the transition "ou", which has no Q.
@@ -213,7 +213,7 @@ class PoseFilter:
 
 
 class PoseState(NamedTuple):
-    """States of the filters of both arms, by "left" and "right", and what stays the same.
+    """States of the filters of both arms, by "left" and "right", with their joints and generators.
 
     Attributes:
         filters: the state of each arm's filter. joints: the joints that each arm's filter measures.
@@ -229,18 +229,18 @@ class SinglePoses(Estimator):
     """Estimator that follows single poses with a recursive filter of each arm.
 
     Args:
-        model: of the tracker. method: which filter, and what it takes from the prior.
-        options: of the method, from the user.
+        model: the model of the tracker. method: the filter, and what it takes from the prior.
+        options: the options of the method that the caller gave.
     """
 
     def __init__(self, model: TrackerModel, method: PoseFilter, options: Mapping[str, Any]) -> None:
         self.model, self.method, self.options = model, method, dict(options)
 
     def filter(self, side: str, joints: tuple[str, ...]) -> RecursiveFilter:
-        """Return the filter of an arm that measures these joints; the same one as long as it holds.
+        """Return the filter of an arm that measures these joints; made once for its prior, noise and options.
 
         Args:
-            side: "left" or "right". joints: of `ARM_JOINTS`.
+            side: "left" or "right". joints: some of `ARM_JOINTS`.
         """
         prior, cov = self.model.prior, self.model.measurement_cov
         tensors = [value for value in self.options.values() if isinstance(value, Tensor)]

@@ -33,10 +33,16 @@ from torchpose.upper_body._live import LivePose, StreamState, live_pose, unseen_
 from torchpose.upper_body._measurements import (
     MeasuredJoints,
     check_gaps,
+    check_sequences,
     in_prior_pixels,
     joint_covariances,
 )
-from torchpose.upper_body._methods import METHODS, WINDOWS, choose_method, options_of_window
+from torchpose.upper_body._methods import (
+    METHODS,
+    check_steady,
+    choose_method,
+    options_of_window,
+)
 from torchpose.upper_body._options import MethodOptions
 from torchpose.upper_body._picked import Picked, pick_joints
 from torchpose.upper_body._pose_track import PoseTrack
@@ -171,13 +177,7 @@ class UpperBodyTracker(WideModule):
             if isinstance(value, Tensor):
                 register_given(self, name, wide_or_parameter(value))
         estimator = self.estimator
-        can_steady = estimator.steadied_by is not None
-        self.steady = can_steady if steady is None else steady
-        if self.steady and not can_steady:
-            raise InputError(
-                f"steady=True needs method {WINDOWS!r} and a prior that says how brisk its motions "
-                f"are, got method {self.method!r}; leave it out"
-            )
+        self.steady = check_steady(steady, estimator, self.method)
         estimator.check()
 
     measurement_std: Tensor | None
@@ -206,7 +206,7 @@ class UpperBodyTracker(WideModule):
         return self._estimator_of(self.method)
 
     def _estimator_of(self, method: str, picked: Picked | None = None) -> Estimator:
-        """Return the estimator of a method for these keypoints; without any for the prior's joints."""
+        """Return the estimator of a method for these keypoints; without `picked` for the prior's joints."""
         make: Callable[..., Estimator] = METHODS[method]
         model = TrackerModel(
             self, self.prior, self.measurement_cov, self.fps, self.smoothing,
@@ -251,7 +251,7 @@ class UpperBodyTracker(WideModule):
         """
         refuse_export(*_NO_EXPORT)
         with one_run(self.measurement_cov.device):
-            keypoints = self._checked(keypoints)
+            keypoints = check_sequences(keypoints).to(self.measurement_cov)
             picked = self._pick(keypoints.shape[2], names)
             given = self._measure(keypoints, confidence, mask, covariance, picked)
             check_gaps(given.mask, lengths, self.max_gap, self.fps or 30.0)
@@ -373,16 +373,6 @@ class UpperBodyTracker(WideModule):
         """Return the notes about the choice of the method and about the kinds of neck and hands."""
         chosen = self.notes if method == self.method else ()
         return chosen + picked.notes + (() if estimator.knows_wrists else picked.of_hands)
-
-    def _checked(self, keypoints: Tensor) -> Float[Tensor, "B T J 2"]:
-        """Return the keypoints of whole sequences, where and as wide as the tracker's own tensors."""
-        check_floating("keypoints", keypoints)
-        check_shape("keypoints", keypoints, ["B", "T", "J", 2])
-        if keypoints.shape[0] == 0 or keypoints.shape[1] == 0:
-            raise InputError(
-                f"keypoints must hold at least one sequence of one frame, got {list(keypoints.shape)}"
-            )
-        return keypoints.to(self.measurement_cov)
 
     def _pick(self, n_keypoints: int, names: Sequence[str] | None) -> Picked:
         info = self.prior.info

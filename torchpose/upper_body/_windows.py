@@ -7,27 +7,17 @@ Mixtures over windows see the body through a virtual camera that follows it
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose._core.module_state import derived
-from torchpose.camera._virtual_camera import (
-    BodyView,
-    PathModel,
-    body_path,
-    memory_frames,
-    to_view,
-    view_body,
-    view_jacobian,
-)
+from torchpose.camera._virtual_camera import memory_frames
 from torchpose.errors import InputError
 from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._outputs import FilterOutput
 from torchpose.priors._arm_state import STATE_DIM
 from torchpose.priors._gaussian_mixture import GaussianMixture
-from torchpose.priors._upper_body import UpperBodyPrior
-from torchpose.priors._window import WindowLayout, WindowPrior, window_measurements
-from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.priors._window import WindowLayout, WindowPrior
 from torchpose.skeleton._upper_body import ARM_JOINTS
 from torchpose.upper_body._estimator import (
     ARMS,
@@ -46,104 +36,12 @@ from torchpose.upper_body._measurements import (
     append_blocks,
     arm_measurements,
     pixel_indices,
-    pixels_per_metre,
 )
+from torchpose.upper_body._window_view import SeenInView, see_in_view, suitable_window
 
-__all__ = ["SeenInView", "WindowMixture", "WindowState", "see_in_view", "suitable_window"]
+__all__ = ["WindowMixture", "WindowState"]
 
 _N_LIMB = 2  # hand and elbow, the first of an arm, which may be before or behind the body
-_HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
-_HANDS = [UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")]
-
-
-class SeenInView(NamedTuple):
-    """Measurements for a filter over windows, in the pixels of a virtual camera.
-
-    Attributes:
-        measured: the eight joints of each frame.
-        hands: values and mask [B, T, 2 H] of the hands of each frame's window, for both arms.
-        view: the virtual camera of each frame.
-        log_scale: log of the area that a pixel of the camera has in the virtual one, [B, T, 8].
-    """
-
-    measured: MeasuredJoints
-    hands: dict[str, tuple[Tensor, Tensor]]
-    view: BodyView
-    log_scale: Tensor
-
-
-def suitable_window(
-    prior: UpperBodyPrior, smoothing: int | str | None, fps: float
-) -> tuple[str, WindowLayout] | None:
-    """Return the name of the window that suits the smoothing, and its lags at this frame rate.
-
-    It is None where the prior has none, or where it looks farther ahead than estimates may.
-
-    Args:
-        prior: with its windows. smoothing: None, the number of later frames that an estimate may
-            use, or "full". fps: frame rate.
-    """
-    name = "causal" if smoothing is None else "full"
-    if name not in prior.windows:
-        return None
-    layout = prior.windows[name].layout.at_rate(fps)
-    too_far = isinstance(smoothing, int) and smoothing < layout.ahead
-    return None if too_far else (name, layout)
-
-
-def see_in_view(
-    measured: MeasuredJoints,
-    prior: UpperBodyPrior,
-    layout: WindowLayout,
-    measurement_cov: Float[Tensor, "8 2 2"],
-    lengths: Int[Tensor, " B"] | None = None,
-    start: int = 0,
-) -> SeenInView:
-    """Return the measurements of windows in a virtual camera that follows the body, from a frame on.
-
-    Args:
-        measured: the eight joints in the prior's pixels. prior: what is expected. layout: of a
-            window, at the frame rate of the measurements.
-        measurement_cov: R of the eight joints where it is not told frame by frame.
-        lengths: frames of each sequence, [B]. start: first frame that is wanted; may be negative.
-    """
-    uv, mask, matrix = measured.uv, measured.mask, prior.info.matrix.to(measured.uv)
-    if lengths is not None:
-        frames = torch.arange(mask.shape[1], device=mask.device)
-        mask = mask & (frames < lengths.to(mask.device)[:, None])[..., None]
-    start = start % mask.shape[1]
-    model = _path_model(prior, measurement_cov, uv)
-    noise = None
-    if measured.cov.ndim > 3:
-        noise = _of_anchors(measured.cov)
-    else:
-        model = model._replace(variance=_of_anchors(measured.cov))
-    path = body_path(uv, mask, layout.lags, layout.ahead, layout.fps, model, start, noise)
-    neck, height = path.at(0)
-    apart = (uv[:, start:, _HANDS] - neck[:, :, None]).norm(dim=-1)
-    reach = torch.where(mask[:, start:, _HANDS], apart, torch.zeros_like(apart)).amax(-1)
-    view = view_body(neck, height, model, matrix, reach)
-    hands = {}
-    for side in ARMS:
-        values, known = window_measurements(uv, mask, layout, side, path, start)
-        hands[side] = to_view(values, view, matrix).flatten(-2), known.repeat_interleave(2, -1)
-    now = to_view(uv[:, start:], view, matrix)
-    now = torch.where(mask[:, start:, :, None], now, torch.zeros_like(now))
-    cov = measured.cov if measured.cov.ndim == 3 else measured.cov[:, start:]
-    log_scale = -view_jacobian(now, view, matrix).det().abs().log()
-    return SeenInView(MeasuredJoints(now, mask[:, start:], cov), hands, view, log_scale)
-
-
-def _path_model(prior: UpperBodyPrior, measurement_cov: Tensor, like: Tensor) -> PathModel:
-    """Return head and neck of the prior's mean pose, and their measurement noise."""
-    both = (prior.left.moments()[0] + prior.right.moments()[0]) / 2
-    head, neck = both[9:11].to(like), both[12:14].to(like)
-    return PathModel(neck, head - neck, _of_anchors(measurement_cov), pixels_per_metre(prior))
-
-
-def _of_anchors(cov: Float[Tensor, "*batch 8 2 2"]) -> Float[Tensor, "*batch 2"]:
-    """Return the variance of a coordinate of head and neck, pixels squared."""
-    return cov[..., [_HEAD, _NECK], :, :].diagonal(dim1=-2, dim2=-1).mean(-1)
 
 
 class WindowState(NamedTuple):
@@ -277,13 +175,13 @@ class WindowMixture(Estimator):
     def _torso(
         self, seen: SeenInView, side: str, joints: tuple[str, ...], lengths: Tensor | None
     ) -> FilterOutput:
-        """Return the estimates of an arm from its torso and the hands of the window alone."""
+        """Return the estimates of an arm given its torso and the hands of the window alone."""
         torso = tuple(joint for joint in joints if joint not in ARM_JOINTS[:_N_LIMB])
         both, noise, _ = _window_inputs(seen, self.window, side, torso, self.model.measurement_cov)
         return self._filter(side, torso)(*both, noise, lengths)
 
     def _filter(self, side: str, joints: tuple[str, ...]) -> MixtureKalmanFilter:
-        """Return the filter of an arm; the same one as long as it holds."""
+        """Return the filter of an arm; made once for its prior, noise and settings."""
         window, cov = self.window, self.model.measurement_cov
         mixture: GaussianMixture = getattr(window, side)
         settings = (*window.settings.items(), self.power, self.dtype)
@@ -324,7 +222,7 @@ def _window_filter(
     likelihood_power: float,
     dtype: torch.dtype,
 ) -> MixtureKalmanFilter:
-    """Return fixed tracks over window states that measure these joints and all hands of the window."""
+    """Return the filter of fixed tracks over windows that measures these joints and a window's hands."""
     arm, layout = ARMS[side], window.layout
     blocks = [measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
     blocks += [_hand_cov(window, side, measurement_cov)] * layout.n_hands
@@ -344,7 +242,7 @@ def _window_filter(
 
 
 def _hand_cov(window: WindowPrior, side: str, measurement_cov: Tensor) -> Tensor:
-    """Return the noise of a hand of the window: that of a hand now, and what moving it here adds."""
+    """Return R of a hand of the window: that of a hand of this frame, and the spread that moving it adds."""
     own = measurement_cov[ARMS[side][0]]
     return own + window.settings["hand_std"] ** 2 * torch.eye(2, dtype=own.dtype, device=own.device)
 

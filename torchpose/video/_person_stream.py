@@ -35,8 +35,9 @@ class Measured(NamedTuple):
     Attributes:
         keypoints: pixels, NaN where missing [T, J, 2].
         covariance: [T, J, 2, 2]; None of a detector of keypoints.
-        size: of the face, of a detector about the width of the shoulders, NaN where there is none [T].
-        confidence: of a detector of keypoints, 0 to 1 [T, J], 0 where missing; else None.
+        size: the size of the face, by a detector about the width of the shoulders, pixels, NaN where there
+            is none [T].
+        confidence: 0 to 1 [T, J], 0 where missing, by a detector of keypoints; else None.
     """
 
     keypoints: Float[Tensor, "T J 2"]
@@ -46,7 +47,7 @@ class Measured(NamedTuple):
 
     @property
     def seen(self) -> Bool[Tensor, " T"]:
-        """Return in which frames anything was measured."""
+        """Return for each frame whether anything was measured in it."""
         return self.keypoints.isfinite().flatten(1).any(1)
 
     def frames(self, rows: slice) -> "Measured":
@@ -75,7 +76,8 @@ def unmeasured(n_frames: int, n_joints: int, detected: bool = False) -> Measured
     """Return frames without measurements.
 
     Args:
-        detected: by a detector of keypoints, which gives confidences in place of covariances.
+        n_frames: T. n_joints: J.
+        detected: whether by a detector of keypoints, which gives confidences in place of covariances.
     """
     points = torch.full((n_frames, n_joints, 2), torch.nan, dtype=torch.float64)
     size = torch.full((n_frames,), torch.nan, dtype=torch.float64)
@@ -124,8 +126,8 @@ class PersonStream(nn.Module):
     those of the selected one.
 
     Args:
-        tracker: of poses. names: of the measured joints. seed: of methods that draw.
-        association: of the hands; None takes the hands as measured.
+        tracker: the tracker of poses. names: the names of the measured joints. seed: the seed of methods
+            that draw. association: selects the hypothesis; None takes the hands as measured.
 
     Reference:
         Burke & Lasenby, section 5.3.
@@ -161,7 +163,7 @@ class PersonStream(nn.Module):
         """Return the poses of the next frames.
 
         Args:
-            state: from `init` or the call before. measured: in these frames.
+            state: the state from `init` or the previous call. measured: the measurements in these frames.
             images: the frames, RGB; used with `association` only.
 
         Returns:

@@ -153,9 +153,9 @@ class TrackedRecording:
     """Collects the tracked blocks of all persons (`PersonStream.advance_all`), and joins them at the end.
 
     Args:
-        tracker: of the poses. names: of the measured joints.
-        gap: frames without measurements after which a person has no pose.
-        folder: for temporary files.
+        tracker: the tracker of the poses. names: the names of the measured joints.
+        gap: the number of frames without measurements after which a person has no pose.
+        folder: the folder of temporary files; None is the system's.
     """
 
     def __init__(
@@ -206,7 +206,7 @@ class TrackedRecording:
         """Return the persons who were seen for half a second or longer, the longest seen first.
 
         Args:
-            smoother: of the whole recording; None keeps the filtered poses.
+            smoother: the smoother of whole recordings; None keeps the filtered poses.
         """
         least = _LEAST_SECONDS * (self.tracker.fps or 30.0)
         lasting = [person for person in self._people.values() if person.n_seen >= least]
@@ -235,7 +235,9 @@ def smoothed(
     """Return the smoothed poses of a person, from all measurements.
 
     Args:
-        names: of the measured joints. gap: frames after which there is no pose.
+        person: the person with all measurements. smoother: the smoother of whole recordings.
+        names: the names of the measured joints. gap: the number of frames without measurements after
+            which there is no pose.
     """
     with torch.no_grad():
         confidence, cov = (
@@ -249,7 +251,7 @@ def smoothed(
 
 
 def _joined(parts: Sequence[Tensor | None], count: int) -> Tensor | None:
-    """Return the first frames of some parts, None if these are not measured."""
+    """Return the first frames of the joined parts; None if these are not measured."""
     there = [part for part in parts if part is not None]
     return torch.cat(there)[:count] if there else None
 

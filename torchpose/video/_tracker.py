@@ -339,7 +339,7 @@ def _keypoint_measurer(
     max_persons: int | None,
     min_confidence: float | None,
 ) -> KeypointMeasurer:
-    """Return what measures by a detector, which is loaded if it is a file or the name of a factory."""
+    """Return the measurer of a detector, which is loaded if it is a file or the name of a factory."""
     if isinstance(detector, str | Path):
         name, loaded = str(detector), load_detector(detector, fps, max_persons)
     else:
@@ -378,7 +378,7 @@ def _images(frames: Iterable[Any] | Tensor) -> Iterator[Image]:
 
 
 def _candidates(poses: dict[int, PoseTrack]) -> dict[int, Candidates]:
-    """Return where the poses of a frame have the hands, by person."""
+    """Return the hands of the last poses with their covariances, by person."""
     return {
         n: Candidates(pose.joints2d[0, -1, _HANDS], pose.covariance2d[0, -1, _HANDS])
         for n, pose in poses.items()
