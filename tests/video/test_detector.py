@@ -81,6 +81,31 @@ def test_a_camera_gives_the_poses_of_a_recording(prior):
     torch.testing.assert_close(torch.stack(live), person.track.joints3d[0], rtol=1e-9, atol=1e-9)
 
 
+def test_some_frames_at_a_time_give_the_poses_of_single_ones(prior):
+    tracker = VideoTracker(prior, CAMERA, detector=Performers(-0.4, 0.45), method="mkf-fixed")
+    state, live = tracker.init(), {0: [], 1: []}
+    for image in FRAMES:
+        state, people = tracker.step(state, image)
+        for found in people:
+            live[found.number].append(found.pose.joints3d)
+    state, parts = tracker.init(), {0: [], 1: []}
+    for first, last in ((0, 5), (5, N)):  # the second longer than a block
+        state, tracked = tracker.advance(state, FRAMES[first:last])
+        for number, some in tracked.items():
+            parts[number] += some
+            assert all(0 <= part.start < last - first for part in some)
+    assert tracker.advance(state, [])[1] == {}
+    for number in (0, 1):
+        one_by_one = torch.cat(live[number], 1)
+        together = torch.cat([part.poses.joints3d for part in parts[number]], 1)
+        assert together.shape == (1, N - FIRST, 8, 3)
+        torch.testing.assert_close(together, one_by_one, rtol=1e-9, atol=1e-9)
+        start = parts[number][0].start
+        assert start == FIRST
+    with pytest.raises(InputError, match="another tracker"):
+        tracker.advance(state._replace(measurer=None), FRAMES[:1])
+
+
 def test_several_persons_have_poses_of_their_own(prior):
     detector = Performers(-0.4, 0.45)
     shown = []

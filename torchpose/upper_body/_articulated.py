@@ -204,21 +204,19 @@ class ArticulatedFilter(Estimator):
         if state.frame % self.stride == 0:
             evidence = partial(self.root.evidence_of_lengths, upright, root, middle)
             learnt = self.lengths.learn(learnt, upright.torso, root, evidence)
+        torso = self.lengths.torso(state.lengths)
         body = SeenBody(
-            torso_joints(
-                upright, root, middle, self.lengths.torso(state.lengths), self.grid.turn,
-                self.neck_between,
-            ),
-            frame.known,
-            frame.exact,
-            lengths,
-            self.lengths.shown(state.lengths, before.size, before.of_size),
-            self.lengths.scale.expand(len(middle)),
-            covs_of_roots(upright, roots, lengths),
-            self.grid.moments(roots.belief).of_depth,
-            root.turn[:, 0],
-            lean,
-        )  # fmt: skip
+            joints=torso_joints(upright, root, middle, torso, self.grid.turn, self.neck_between),
+            known=frame.known,
+            exact=frame.exact,
+            lengths=lengths,
+            bones=self.lengths.shown(state.lengths, before.size, before.of_size),
+            scale=self.lengths.scale.expand(len(middle)),
+            others=covs_of_roots(upright, roots, lengths),
+            far=self.grid.moments(roots.belief).of_depth,
+            turn=root.turn[:, 0],
+            lean=lean,
+        )
         last = rolled(middle[:, 0], lean)
         after = ArticulatedState(roots.belief, learnt, posterior, last, moments, state.frame + 1)
         return _Step(after, body, posterior)

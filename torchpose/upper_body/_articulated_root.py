@@ -58,7 +58,7 @@ class RootStep(NamedTuple):
     """Measurement update of the torso, with the arms given it.
 
     Attributes:
-        grid: the point-mass filter over size, depth and turn. chain: that over the arms.
+        grid: the point-mass filter over size, depth and turn. chain: the point-mass filter over the arms.
         lengths: the filter of the lengths of bones.
         stride: the number of frames that count as one, since they are alike.
     """

@@ -169,9 +169,10 @@ class Estimator(ABC):
             weighted points, which can collapse onto one of them (`note_collapse`).
         calibration: the name under which a prior keeps its calibration of the covariances; None goes
             by the name of the method.
-        steadied_by: of the motion stage that frames need, None where they follow each other smoothly.
-        ahead: number of later frames that an estimate uses by itself.
-        knows_wrists: whether wrists and hands are two joints to it (`TrackerModel.hand`).
+        steadied_by: the ratios of the motion stage that the poses need; None where they follow each other
+            smoothly.
+        ahead: the number of later frames that an estimate uses by itself.
+        knows_wrists: whether it tells wrists from hands (`TrackerModel.hand`).
         reads_rays: whether pixels and joints in space are two readings (`on_their_rays`).
     """
 

@@ -57,7 +57,8 @@ def measure_face(
     """Return nose, eyes and ears among the keypoints, in their pixels.
 
     Args:
-        keypoints, confidence, mask: as in `UpperBodyTracker.forward`. indices: of `FACE`, -1 if absent.
+        keypoints, confidence, mask: as in `UpperBodyTracker.forward`. indices: the places of `FACE` among
+            the keypoints, -1 if absent.
     """
     rows = [max(i, 0) for i in indices]
     expected = torch.tensor([i >= 0 for i in indices], device=keypoints.device)
@@ -94,8 +95,8 @@ def face_evidence(
     places = _horizontal(face, std, depth.expand(len(face.places), -1), turn)
     at_angle = heavy_tail(places.squared) + _visibility(face, turn)[:, None]
     most = at_angle.amax(-1, keepdim=True)
-    said = ((at_angle - most).exp() @ _turned_necks(turn, turn).mT).log() + most
-    return said - torch.logsumexp(said, -1, keepdim=True) + math.log(len(turn))
+    logs = ((at_angle - most).exp() @ _turned_necks(turn, turn).mT).log() + most
+    return logs - torch.logsumexp(logs, -1, keepdim=True) + math.log(len(turn))
 
 
 def head_in_face(
@@ -114,8 +115,8 @@ def head_in_face(
         depth, turn: those of the shoulders. angles: the angles of the head, at even steps round the circle.
     """
     places = _horizontal(face, std, depth[:, None], angles)
-    said = heavy_tail(places.squared)[:, 0] + _visibility(face, angles)
-    weight = torch.softmax(said + _turned_necks(turn, angles).log(), -1)
+    logs = heavy_tail(places.squared)[:, 0] + _visibility(face, angles)
+    weight = torch.softmax(logs + _turned_necks(turn, angles).log(), -1)
     across = (weight * places.middle[:, 0]).sum(-1)
     sure = face.confidence
     below = face.places[..., 1] * depth[:, None] - depth.new_tensor(_BELOW)

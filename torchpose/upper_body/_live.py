@@ -18,10 +18,10 @@ class StreamState(NamedTuple):
     """State of `UpperBodyTracker.step` between two frames.
 
     Attributes:
-        estimator: state of the method's estimator.
-        motion: state of the motion stage; None before the first frame, and where there is no stage.
-        unseen: number of frames since any joint was measured, [B].
-        n_keypoints: J. picked: where the eight joints are among them, and what was assumed.
+        estimator: the state of the method's estimator.
+        motion: the state of the motion stage; None before the first frame, and where there is no stage.
+        unseen: the number of frames since any joint was measured, [B].
+        n_keypoints: J. picked: the places of the eight joints among them, and the assumptions.
         screen: state of the outlier screening; None without any.
     """
 

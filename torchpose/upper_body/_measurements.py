@@ -64,7 +64,7 @@ class MeasuredJoints(NamedTuple):
         face: pixels of nose, eyes and ears, None if none is among the keypoints.
         middle: the point by which the neck was put (`place_measured_neck`); None where the neck itself was
             measured.
-        confidence: in the keypoints, [B, T, 8], 1 where missing; None where a detector gives none.
+        confidence: the confidence of the detector, [B, T, 8], 1 where missing; None where it gives none.
     """
 
     uv: Tensor
@@ -153,8 +153,8 @@ def measure_joints(
     Args:
         keypoints: NaN where missing. confidence: [B, T, J] in 0..1, or None: at 0 or NaN a keypoint is
             missing, and between, R is divided by it. mask: [B, T, J], False = ignore, or None.
-        indices: of the eight joints among the keypoints, -1 if absent. cov: R at full confidence.
-        own_cov: R of every single keypoint in place of that.
+        indices: the places of the eight joints among the keypoints, -1 if absent. cov: R at full
+            confidence. own_cov: R of every single keypoint instead.
 
     Raises:
         InputError: infinite values, or the confidence of a measured keypoint is outside 0..1.

@@ -125,7 +125,7 @@ def process_cov(prior: UpperBodyPrior, side: str, method: str) -> Tensor:
     """Return Q of a method, per frame at the prior's own rate; see `ProcessNoise`.
 
     Args:
-        prior: whose noise is taken. side: "left" or "right". method: over single poses.
+        prior: the prior that brings the noise. side: "left" or "right". method: one over single poses.
 
     Raises:
         InputError: no such method, or one that has no process noise.
@@ -166,7 +166,7 @@ def check_steady(steady: bool | None, estimator: Estimator, method: str) -> bool
 
     Args:
         steady: as in `UpperBodyTracker`; None is wherever the estimator has ratios for it.
-        estimator: of the method. method: its name.
+        estimator: the estimator of the method. method: the name of the method.
 
     Raises:
         InputError: steady without ratios.

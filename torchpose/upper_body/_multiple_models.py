@@ -195,8 +195,8 @@ class MultipleModelFilter(Estimator):
         if self.model.calibrated:
             noise, mode = self.model.prior.noise, str(self.windows.calibration)
             reading = reading._replace(covs=recalibrated(reading.covs, noise, mode))
-        mean_said = sums[..., 0] / sums[..., 1].clamp_min(1e-12)
-        share = torch.sigmoid(_FIRST + _SHARE * mean_said)
+        mean_ratio = sums[..., 0] / sums[..., 1].clamp_min(1e-12)
+        share = torch.sigmoid(_FIRST + _SHARE * mean_ratio)
         mixed = _averaged(share, reading, bodies.reading, self.order)
         if self.model.calibrated:
             trust = 1 - _BETWEEN * 4 * share * (1 - share)

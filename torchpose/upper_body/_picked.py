@@ -19,14 +19,14 @@ class Picked(NamedTuple):
     """Places of the eight joints among the keypoints.
 
     Attributes:
-        indices: of each, -1 if absent; with `middle`, that of the neck is the keypoint that lies in
-            the middle of the shoulders.
+        indices: the place of each joint, -1 if absent; with `middle`, that of the neck is the keypoint that
+            lies in the middle of the shoulders.
         middle: whether the neck is to be put between that, or else the middle of the measured
             shoulders, and the head (`place_measured_neck`).
-        notes: what was assumed about the neck. of_hands: about hands of another kind than the prior's,
+        notes: the assumptions about the neck. of_hands: those about hands of another kind than the prior's,
             by estimators that take one kind for the other.
-        hand: kind of the hands, "hand" or "wrist"; None where the names do not tell.
-        face: places of nose, eyes and ears (`FACE`) among the keypoints, -1 if absent.
+        hand: the kind of the hands, "hand" or "wrist"; None where the names do not tell.
+        face: the places of nose, eyes and ears (`FACE`) among the keypoints, -1 if absent.
     """
 
     indices: tuple[int, ...]

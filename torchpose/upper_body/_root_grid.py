@@ -84,7 +84,7 @@ class RootGrid:
     def predict(self, belief: Float[Tensor, "B S Z P"]) -> Float[Tensor, "B S Z P"]:
         """Return the predicted belief of the next frame: a random walk mixed with a restart from the prior.
 
-        The size stays; a share of 1e-6 of the belief starts anew from the prior over depth and turn.
+        The size stays; a share of 1e-6 of the belief restarts from the prior over depth and turn.
         """
         along, round_ = self._spread
         moved = _diffused(belief, along)

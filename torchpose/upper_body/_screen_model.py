@@ -84,18 +84,19 @@ class ScreenModel(NamedTuple):
 
     Attributes:
         dt: seconds between two frames. scale: pixels per metre of the prior's mean pose.
-        low, high: corners of the place where pixels are believed at all [2]. broad: variance of a joint
-            that may be anywhere in the image. start: log (1 - o) / (o u 2 pi), o the share of outliers
-            and u their density.
-        moving: makes (var x, cov x v, var v) of a frame ago those of now [3, 3]. drift, kept: seconds for
-            which a velocity moves a joint, and its share that is left.
-        agitation: what is added, at 1 pixel per metre [8, 3]. jump: variance of a brisk joint's place
-            beyond that [8]. speed: variance of a velocity [8].
-        log_scales: of the person, over `scale` [G]. usual: their log-probability [G]. memory: its share
-            that a frame leaves. below, spread: of each joint for each of them, pixels and squared [G, 8].
-        subsets: every choice of the joints that may be right [S, 8].
+        low, high: corners of the region outside of which every pixel is an outlier [2].
+        broad: the variance of a joint that may be anywhere in the image.
+        start: log (1 - o) / (o u 2 pi), o the share of outliers and u their density.
+        moving: the linear map of (var x, cov x v, var v) over one frame [3, 3].
+        drift, kept: the seconds for which a velocity moves a joint, and the share of it that is left.
+        agitation: the process noise of these moments, at 1 pixel per metre [8, 3].
+        jump: the further variance of the place of a brisk joint [8]. speed: the variance of a velocity [8].
+        log_scales: the logs of the person's scales over `scale` [G]. usual: their prior log-probability [G].
+        memory: the share of their log-weights that a frame keeps.
+        below, spread: the place of each joint below the neck at each scale, pixels, and its variance [G, 8].
+        subsets: all subsets of the joints that are present [S, 8].
         exchanges: for each way to exchange left and right, the joints to take [X, 8].
-        switching: log-probability of each way after each other one [X, X].
+        switching: the log-probability of each way after each other one [X, X].
     """
 
     dt: float

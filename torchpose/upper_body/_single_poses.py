@@ -71,7 +71,7 @@ class ProcessNoise(NamedTuple):
         `default_walk_cov`.
 
         Args:
-            prior: whose noise is taken. side: "left" or "right".
+            prior: the prior that brings the noise. side: "left" or "right".
         """
         noise = prior.noise
         stated = noise.get(f"process_cov_{side}", noise.get("process_cov"))
@@ -92,7 +92,7 @@ def default_process_cov(prior: UpperBodyPrior) -> Float[Tensor, " 21"]:
     same movement in metres is f / depth times as many pixels elsewhere.
 
     Args:
-        prior: whose camera, mean depth and frame rate are used.
+        prior: the prior; its camera, mean depth and frame rate are used.
     """
     depth = prior.left.moments()[0][2:15:3].mean().clamp_min(0.1)
     pixels = math.sqrt(prior.info.fx * prior.info.fy) / depth / (1550 / 4.5)
@@ -111,7 +111,7 @@ def default_walk_cov(prior: UpperBodyPrior, side: str) -> Float[Tensor, "21 21"]
     hardly any particle where the prior has bodies.
 
     Args:
-        prior: whose mixture and frame rate are used. side: "left" or "right".
+        prior: the prior; its mixture and frame rate are used. side: "left" or "right".
     """
     mixture = getattr(prior, side)
     within = torch.einsum("k,kij->ij", mixture.weights, mixture.covariances)
@@ -161,7 +161,7 @@ class PoseFilter:
         """Return the estimator of a tracker.
 
         Args:
-            model: of the tracker. options: among `options`.
+            model: the model of the tracker. options: some of `options`.
         """
         return SinglePoses(model, self, options)
 

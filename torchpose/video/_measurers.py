@@ -22,11 +22,11 @@ from torchpose.measure._upper_body import (
 
 __all__ = [
     "Found",
-    "MeasuredFrame",
+    "MeasuredBlock",
     "Measurer",
     "SeenFrame",
     "look_ahead",
-    "measure_ahead",
+    "measure_blocks",
     "measurer_of",
 ]
 
@@ -41,11 +41,11 @@ class SeenFrame(NamedTuple):
     faces: FaceTracks | None
 
 
-class MeasuredFrame(NamedTuple):
-    """Holds a frame, the measurements in it, and the state of the measurer after it."""
+class MeasuredBlock(NamedTuple):
+    """Holds some frames, the measurements in each, and the state of the measurer after the last."""
 
-    image: Image
-    found: Found
+    images: list[Image]
+    found: list[Found]
     state: Any
 
 
@@ -67,8 +67,8 @@ class Measurer(Protocol):
 
     def step(
         self, state: Any, frame: SeenFrame, candidates: Mapping[int, Candidates] | None = None
-    ) -> MeasuredFrame:
-        """Return the measurements of the next frame, with the next state.
+    ) -> tuple[Any, Found]:
+        """Return the next state and the measurements of the next frame.
 
         Args:
             state: the state from `init` or after the frame before. frame: from `look`.
@@ -112,11 +112,10 @@ class FaceStage(NamedTuple):
         state: MeasurerState,
         frame: SeenFrame,
         candidates: Mapping[int, Candidates] | None = None,
-    ) -> MeasuredFrame:
-        """Return the measurements of the next frame, with the next state."""
+    ) -> tuple[MeasurerState, FrameMeasurements]:
+        """Return the next state and the measurements of the next frame."""
         _check_state(state, MeasurerState)
-        state, found = self.own.step(state, frame.image, frame.faces, candidates)
-        return MeasuredFrame(frame.image, found, state)
+        return self.own.step(state, frame.image, frame.faces, candidates)
 
 
 class DetectorStage(NamedTuple):
@@ -142,11 +141,10 @@ class DetectorStage(NamedTuple):
         state: KeypointState,
         frame: SeenFrame,
         candidates: Mapping[int, Candidates] | None = None,
-    ) -> MeasuredFrame:
-        """Return the measurements of the next frame, with the next state."""
+    ) -> tuple[KeypointState, FrameKeypoints]:
+        """Return the next state and the measurements of the next frame."""
         _check_state(state, KeypointState)
-        state, found = self.own.step(state, frame.image)
-        return MeasuredFrame(frame.image, found, state)
+        return self.own.step(state, frame.image)
 
 
 def _check_state(state: Any, kind: type) -> None:
@@ -165,11 +163,22 @@ def look_ahead(measurer: Measurer, state: Any, images: Iterable[Image]) -> Itera
         yield frame
 
 
-def measure_ahead(
-    measurer: Measurer, state: Any, frames: Iterable[SeenFrame]
-) -> Iterator[MeasuredFrame]:
-    """Yield the measurements of frames, without the hands of the poses before."""
+def measure_blocks(
+    measurer: Measurer, state: Any, frames: Iterable[SeenFrame], size: int
+) -> Iterator[MeasuredBlock]:
+    """Yield blocks of measured frames, which the poses before do not change.
+
+    Args:
+        measurer: measures the persons. state: its state before the frames. frames: from `look_ahead`.
+        size: the number of frames of a block; the last one may be shorter.
+    """
+    images, found = [], []
     for frame in frames:
-        measured = measurer.step(state, frame)
-        state = measured.state
-        yield measured
+        state, one = measurer.step(state, frame)
+        images.append(frame.image)
+        found.append(one)
+        if len(images) == size:
+            yield MeasuredBlock(images, found, state)
+            images, found = [], []
+    if images:
+        yield MeasuredBlock(images, found, state)

@@ -206,7 +206,7 @@ class PersonStream(nn.Module):
             states: the states of the persons before the block. block: the measurements of each frame.
             images: the frames, RGB; used with `association` only.
             gap: the number of frames without measurements after which a person has neither pose nor
-                state; whoever returns is tracked anew.
+                state; a subject who returns is reinitialised.
 
         Returns:
             The states of those who were seen within the last `gap` frames, and for each person the

@@ -40,7 +40,7 @@ class PoseSpool:
     The files are deleted with the spool; poses that were read from it remain readable.
 
     Args:
-        folder: where the files are; None is the system's folder for temporary files.
+        folder: the folder of the files; None is the system's folder for temporary files.
 
     Raises:
         OutputError: the folder cannot be written to.
@@ -118,12 +118,13 @@ class TrackedPerson:
     """Holds the poses of one person of a video.
 
     Attributes:
-        number: in the order of appearance. first_frame: of the video, that of the first pose.
+        number: of the person, in the order of appearance. first_frame: the frame of the video that has the
+            first pose.
         track: poses as a batch of one; NaN where the person was absent for longer than `max_gap`.
         keypoints: measured [T, J, 2], pixels, NaN where missing, in the order of the
             measurer's `names`.
-        covariance: of these [T, J, 2, 2]; None of a detector of keypoints.
-        confidence: of a detector of keypoints [T, J], 0 to 1; else None.
+        covariance: of the keypoints [T, J, 2, 2]; None by a detector of keypoints.
+        confidence: 0 to 1 [T, J], by a detector of keypoints; else None.
     """
 
     number: int

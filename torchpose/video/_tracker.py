@@ -1,8 +1,7 @@
 """Track the poses of all persons in a video."""
 
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import islice
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Unpack
 
@@ -39,11 +38,11 @@ from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._tracker import UpperBodyTracker
 from torchpose.video._measurers import (
     Found,
-    MeasuredFrame,
+    MeasuredBlock,
     Measurer,
     SeenFrame,
     look_ahead,
-    measure_ahead,
+    measure_blocks,
     measurer_of,
 )
 from torchpose.video._person_stream import (
@@ -231,7 +230,7 @@ class VideoTracker(nn.Module):
         return state, [LivePerson(n, part.poses, part.measured) for n, part in last.items()]
 
     def advance(
-        self, state: VideoState, images: Sequence[Any] | Tensor
+        self, state: VideoState, images: Iterable[Any] | Tensor
     ) -> tuple[VideoState, dict[int, list[TrackedBlock]]]:
         """Return the next state and the poses in some more frames: those of `step` for one after the other.
 
@@ -254,7 +253,7 @@ class VideoTracker(nn.Module):
             for number, parts in poses.items():
                 placed = (part._replace(start=place + part.start) for part in parts)
                 tracked.setdefault(number, []).extend(placed)
-            place, last = place + len(block), after
+            place, last = place + len(block.images), after
         return last, tracked
 
     def forward(
@@ -286,10 +285,10 @@ class VideoTracker(nn.Module):
         size = _BLOCK if watch is None else 1
         with tqdm(total=n_frames, disable=not progress, unit="frame") as bar:
             for state, block, tracked in self._blocks(start, seen, size, ahead=True):
-                recording.append(tracked, len(block))
-                bar.update(len(block))
+                recording.append(tracked, len(block.images))
+                bar.update(len(block.images))
                 if watch is not None:
-                    watch(block[-1].image, block[-1].found, dict(state.poses))
+                    watch(block.images[-1], block.found[-1], dict(state.poses))
         return recording.finish(self.smoother)
 
     @property
@@ -298,39 +297,38 @@ class VideoTracker(nn.Module):
 
     def _blocks(
         self, state: VideoState, seen: Iterable[SeenFrame], size: int, ahead: bool = False
-    ) -> Iterator[tuple[VideoState, list[MeasuredFrame], dict[int, list[TrackedBlock]]]]:
-        """Yield the next state, the measured frames and the poses of each block of frames.
+    ) -> Iterator[tuple[VideoState, MeasuredBlock, dict[int, list[TrackedBlock]]]]:
+        """Yield the next state, the measurements and the poses of each block of frames.
 
         With candidates every frame is a block, since it is measured with the poses of the one before.
 
         Args:
             state: the state before the frames. seen: the frames with their faces.
-            size: the number of frames of a block, the last of which may be shorter.
+            size: the number of frames of a block; the last one may be shorter.
             ahead: whether frames are measured in another thread while the block before is filtered.
         """
         measurer = self._measurer
         if self.candidates:
             for frame in seen:
-                block = [measurer.step(state.measurer, frame, _candidates(state.poses))]
+                own, found = measurer.step(state.measurer, frame, _candidates(state.poses))
+                block = MeasuredBlock([frame.image], [found], own)
                 state, tracked = self._follow(state, block)
                 yield state, block, tracked
             return
-        measured = measure_ahead(measurer, state.measurer, seen)
-        if ahead:
-            measured = prefetch(measured, size)
-        while block := list(islice(measured, size)):
+        blocks = measure_blocks(measurer, state.measurer, seen, size)
+        for block in prefetch(blocks, 1) if ahead else blocks:
             state, tracked = self._follow(state, block)
             yield state, block, tracked
 
     def _follow(
-        self, state: VideoState, block: Sequence[MeasuredFrame]
+        self, state: VideoState, block: MeasuredBlock
     ) -> tuple[VideoState, dict[int, list[TrackedBlock]]]:
         """Return the next state and the poses in a block of measured frames."""
-        found, images = [frame.found for frame in block], [frame.image for frame in block]
+        images, found, own = block
         streams, tracked = self.stream.advance_all(state.streams, found, images, self.gap)
         last = {number: tracked[number][-1].poses for number in streams}
         poses = {number: pose for number, pose in last.items() if _ends_in_pose(pose)}
-        return VideoState(block[-1].state, streams, poses), tracked
+        return VideoState(own, streams, poses), tracked
 
 
 def _keypoint_measurer(
