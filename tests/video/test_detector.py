@@ -1,5 +1,8 @@
 """`VideoTracker` on the keypoints of a detector: the numbers of the keypoint tracker, for everybody."""
 
+import itertools
+import threading
+
 import numpy as np
 import pytest
 import torch
@@ -104,6 +107,26 @@ def test_some_frames_at_a_time_give_the_poses_of_single_ones(prior):
         assert start == FIRST
     with pytest.raises(InputError, match="another tracker"):
         tracker.advance(state._replace(measurer=None), FRAMES[:1])
+
+
+@pytest.mark.parametrize("broken", ["detector", "watch"])
+def test_no_thread_reads_on_after_an_error(prior, broken):
+    """The caller closes the file, which a thread must not be reading then."""
+
+    class Broken(Performers):
+        def __call__(self, image):
+            if broken == "detector" and self.at == 7:
+                raise InputError("broken")
+            return super().__call__(image)
+
+    def watch(image, found, poses):
+        if broken == "watch" and poses:
+            raise InputError("broken")
+
+    tracker = VideoTracker(prior, CAMERA, detector=Broken(0.0), method="mkf-fixed")
+    with pytest.raises(InputError, match="broken") as held:  # with its traceback
+        tracker(itertools.cycle(FRAMES), watch=watch)
+    assert not [one for one in threading.enumerate() if one.name == "torchpose-prefetch"], held
 
 
 def test_several_persons_have_poses_of_their_own(prior):

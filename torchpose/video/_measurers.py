@@ -4,7 +4,7 @@ A frame passes two stages. `look` sees what depends on the images alone, the fac
 ahead in another thread. `step` measures the persons, and may use the hands of the last poses.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -165,7 +165,7 @@ def look_ahead(measurer: Measurer, state: Any, images: Iterable[Image]) -> Itera
 
 def measure_blocks(
     measurer: Measurer, state: Any, frames: Iterable[SeenFrame], size: int
-) -> Iterator[MeasuredBlock]:
+) -> Generator[MeasuredBlock, None, None]:
     """Yield blocks of measured frames, which the poses before do not change.
 
     Args:

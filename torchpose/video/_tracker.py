@@ -1,7 +1,8 @@
 """Track the poses of all persons in a video."""
 
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple, Unpack
 
@@ -280,11 +281,14 @@ class VideoTracker(nn.Module):
             InputError: another kind of image. OutputError: the disk is full.
         """
         recording = TrackedRecording(self.tracker, self.stream.names, self.gap, folder)
-        start = self.init()
-        seen = prefetch(look_ahead(self._measurer, start.measurer, _images(frames)))
-        size = _BLOCK if watch is None else 1
-        with tqdm(total=n_frames, disable=not progress, unit="frame") as bar:
-            for state, block, tracked in self._blocks(start, seen, size, ahead=True):
+        start, size = self.init(), _BLOCK if watch is None else 1
+        ahead = prefetch(look_ahead(self._measurer, start.measurer, _images(frames)))
+        with (
+            closing(ahead) as seen,  # no thread reads on when the caller gets an error
+            closing(self._blocks(start, seen, size, ahead=True)) as blocks,
+            tqdm(total=n_frames, disable=not progress, unit="frame") as bar,
+        ):
+            for state, block, tracked in blocks:
                 recording.append(tracked, len(block.images))
                 bar.update(len(block.images))
                 if watch is not None:
@@ -297,7 +301,7 @@ class VideoTracker(nn.Module):
 
     def _blocks(
         self, state: VideoState, seen: Iterable[SeenFrame], size: int, ahead: bool = False
-    ) -> Iterator[tuple[VideoState, MeasuredBlock, dict[int, list[TrackedBlock]]]]:
+    ) -> Generator[tuple[VideoState, MeasuredBlock, dict[int, list[TrackedBlock]]], None, None]:
         """Yield the next state, the measurements and the poses of each block of frames.
 
         With candidates every frame is a block, since it is measured with the poses of the one before.
@@ -316,9 +320,10 @@ class VideoTracker(nn.Module):
                 yield state, block, tracked
             return
         blocks = measure_blocks(measurer, state.measurer, seen, size)
-        for block in prefetch(blocks, 1) if ahead else blocks:
-            state, tracked = self._follow(state, block)
-            yield state, block, tracked
+        with closing(prefetch(blocks, 1) if ahead else blocks) as measured:
+            for block in measured:
+                state, tracked = self._follow(state, block)
+                yield state, block, tracked
 
     def _follow(
         self, state: VideoState, block: MeasuredBlock
