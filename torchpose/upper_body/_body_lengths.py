@@ -23,9 +23,9 @@ BODY_LENGTHS = ("upper_arm", "forearm", "shoulder_width", "head_height")
 """Lengths that may be given: shoulder to elbow, elbow to the measured hand or wrist, between the
 shoulders, and from the neck up to the head."""
 
-_NUDGE = 0.03  # of a log-length, to see what a frame says about it
+_NUDGE = 0.03  # step of the finite differences in log-length
 _MOST = 0.1  # of a log-length that one frame may change it by
-_POWER = 0.1  # of what a frame says about lengths: frames of one pose are alike
+_POWER = 0.1  # of a frame's likelihood of the lengths: frames of one pose are alike
 _WIDTH_STD, _HEIGHT_STD = 0.05, 0.05  # metres: shoulders and heads move in their torsos
 _GIVEN = 0.02  # of the log of a length that was measured on the person
 _SHORTEST, _LONGEST = 0.05, 1.0  # metres

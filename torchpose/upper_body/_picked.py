@@ -48,7 +48,7 @@ class Picked(NamedTuple):
 
     @property
     def there(self) -> list[bool]:
-        """Return which of the eight joints are among the keypoints."""
+        """Return for each of the eight joints whether it is among the keypoints."""
         return [i >= 0 for i in self.indices]
 
 
