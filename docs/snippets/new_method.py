@@ -32,16 +32,13 @@ class FrameByFrame(Estimator):
     def __init__(self, model, *, widening: float = 1.0):  # an option, here and of the command
         self.prior, self.widening = model.prior, widening
 
-    def init(self, batch_size, joints, generators):
+    def init(self, batch_size, joints, arm_generators):
         return Alone(joints)
 
-    def advance(self, state, measured):
+    def advance(self, state, measured, progress=False):
         left = self.arm(self.prior.left, LEFT_ARM, state.joints["left"], measured)
         right = self.arm(self.prior.right, RIGHT_ARM, state.joints["right"], measured)
         return state, Estimates(left, right)
-
-    def forward(self, measured, joints, generators, lengths=None, progress=False):
-        return self.advance(Alone(joints), measured)[1]
 
     def arm(self, mixture, rows, joints, measured):
         z, mask, noise = arm_measurements(rows, joints, measured)

@@ -17,7 +17,7 @@ from torchpose.upper_body._arm_chain import Arms
 from torchpose.upper_body._articulated import ArticulatedFilter
 from torchpose.upper_body._articulated_poses import _trust
 from torchpose.upper_body._estimator import TrackerModel
-from torchpose.upper_body._root_grid import half_widths, see_torso
+from torchpose.upper_body._torso import half_widths, see_torso
 
 CAMERA = torchpose.PinholeCamera(525.0, 525.0, 319.5, 239.5)
 ROW = {name: i for i, name in enumerate(UPPER_BODY)}
@@ -372,7 +372,7 @@ def test_smoothing_sums_over_all_later_paths():
             for d, w, p in zip(directions, said, prior, strict=True)]  # fmt: skip
     states = [chain.start(arms[0])]
     for arm in arms[1:]:
-        states.append(chain.advance(states[-1], arm))
+        states.append(chain.update(states[-1], arm))
 
     def moves(t):
         return (1 - chain.anew) * chain._walk(

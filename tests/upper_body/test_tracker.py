@@ -98,6 +98,22 @@ def test_every_method_runs_and_honours_generators(prior, scene, method):
     torch.testing.assert_close(
         track.joints3d[1, :12], alone.joints3d[0], rtol=tolerance, atol=tolerance
     )
+    for name in (
+        "joints3d",
+        "joints2d",
+        "covariance3d",
+        "covariance2d",
+    ):  # the last pose is repeated
+        values = getattr(track, name)[1]
+        assert torch.equal(values[12:], values[11].expand(8, *values.shape[1:]))
+    assert not track.log_evidence[1, 12:].nan_to_num().any()
+
+
+@pytest.mark.parametrize("lengths", [[0, 20], [20, 21], [20.0, 12.0]])
+def test_lengths_that_no_sequence_has_are_refused(prior, scene, lengths):
+    batch = scene[1][None, :20].expand(2, -1, -1, -1)
+    with pytest.raises(InputError, match="lengths must be integers from 1 to 20"):
+        UpperBodyTracker(prior, demo_camera())(batch, names=NAMES, lengths=torch.tensor(lengths))
 
 
 def test_names_may_come_in_any_order_and_subset(prior, scene, plain):

@@ -1,5 +1,8 @@
 """`VideoTracker` on the keypoints of a detector: the numbers of the keypoint tracker, for everybody."""
 
+import itertools
+import threading
+
 import numpy as np
 import pytest
 import torch
@@ -79,6 +82,51 @@ def test_a_camera_gives_the_poses_of_a_recording(prior):
         state, people = tracker.step(state, image)
         live += [found.pose.joints3d[0, 0] for found in people]
     torch.testing.assert_close(torch.stack(live), person.track.joints3d[0], rtol=1e-9, atol=1e-9)
+
+
+def test_some_frames_at_a_time_give_the_poses_of_single_ones(prior):
+    tracker = VideoTracker(prior, CAMERA, detector=Performers(-0.4, 0.45), method="mkf-fixed")
+    state, live = tracker.init(), {0: [], 1: []}
+    for image in FRAMES:
+        state, people = tracker.step(state, image)
+        for found in people:
+            live[found.number].append(found.pose.joints3d)
+    state, parts = tracker.init(), {0: [], 1: []}
+    for first, last in ((0, 5), (5, N)):  # the second longer than a block
+        state, tracked = tracker.advance(state, FRAMES[first:last])
+        for number, some in tracked.items():
+            parts[number] += some
+            assert all(0 <= part.start < last - first for part in some)
+    assert tracker.advance(state, [])[1] == {}
+    for number in (0, 1):
+        one_by_one = torch.cat(live[number], 1)
+        together = torch.cat([part.poses.joints3d for part in parts[number]], 1)
+        assert together.shape == (1, N - FIRST, 8, 3)
+        torch.testing.assert_close(together, one_by_one, rtol=1e-9, atol=1e-9)
+        start = parts[number][0].start
+        assert start == FIRST
+    with pytest.raises(InputError, match="another tracker"):
+        tracker.advance(state._replace(measurer=None), FRAMES[:1])
+
+
+@pytest.mark.parametrize("broken", ["detector", "watch"])
+def test_no_thread_reads_on_after_an_error(prior, broken):
+    """The caller closes the file, which a thread must not be reading then."""
+
+    class Broken(Performers):
+        def __call__(self, image):
+            if broken == "detector" and self.at == 7:
+                raise InputError("broken")
+            return super().__call__(image)
+
+    def watch(image, found, poses):
+        if broken == "watch" and poses:
+            raise InputError("broken")
+
+    tracker = VideoTracker(prior, CAMERA, detector=Broken(0.0), method="mkf-fixed")
+    with pytest.raises(InputError, match="broken") as held:  # with its traceback
+        tracker(itertools.cycle(FRAMES), watch=watch)
+    assert not [one for one in threading.enumerate() if one.name == "torchpose-prefetch"], held
 
 
 def test_several_persons_have_poses_of_their_own(prior):

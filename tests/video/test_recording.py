@@ -84,20 +84,40 @@ def test_one_person_is_tracked_as_from_keypoints(tracker, keypoints, tracked_alo
 
 
 @pytest.mark.parametrize("size", [1, 9, 32])
+@pytest.mark.parametrize("n_before", [15, 30])
 def test_poses_end_when_somebody_is_away_for_too_long_and_begin_anew(
-    tracker, keypoints, tracked_alone, size
+    tracker, keypoints, tracked_alone, n_before, size
 ):
-    present = [[]] * 5 + [[0]] * 30 + [[]] * 35 + [[0]] * 20 + [[]] * 30
+    """With 15 frames before, somebody is away for too long and returns within one block of 32."""
+    present = [[]] * 5 + [[0]] * n_before + [[]] * 35 + [[0]] * 20 + [[]] * 30
     (person,) = record(tracker, frames(keypoints, present), size)
-    assert (person.first_frame, len(person)) == (5, 85)
+    back = n_before + 35
+    assert (person.first_frame, len(person)) == (5, back + 20)
     there = person.track.joints3d[0].isfinite().all(-1).all(-1)
-    assert torch.nonzero(~there).flatten().tolist() == list(range(30 + GAP, 65))
-    assert not person.track.observed[0, 30:65].any() and person.track.observed[0, 65:, 3:5].all()
-    anew = tracked_alone(70, 90)
+    assert torch.nonzero(~there).flatten().tolist() == list(range(n_before + GAP, back))
+    observed = person.track.observed[0]
+    assert not observed[n_before:back].any() and observed[back:, 3:5].all()
+    anew = tracked_alone(5 + back, 25 + back)
     torch.testing.assert_close(
-        person.track.joints3d[0, 65:], anew.joints3d[0], rtol=1e-9, atol=1e-9
+        person.track.joints3d[0, back:], anew.joints3d[0], rtol=1e-9, atol=1e-9
     )
     assert person.track.failed_at.tolist() == [-1]
+
+
+@pytest.mark.parametrize("size", [9, 32, 120])
+def test_blocks_give_what_single_frames_give(tracker, keypoints, size):
+    """Of two persons, one of whom leaves for too long twice, once within a block."""
+    present = [[]] * 5 + [[0]] * 15 + [[1]] * 35 + [[0, 1]] * 20 + [[1]] * 22 + [[0]] * 16
+    found = frames(keypoints, present)
+    one_by_one, blocks = record(tracker, found, 1), record(tracker, found, size)
+    assert [p.number for p in blocks] == [p.number for p in one_by_one] == [1, 0]
+    for alone, together in zip(one_by_one, blocks, strict=True):
+        for name in (*FIELDS, "observed", "log_evidence", "failed_at"):
+            torch.testing.assert_close(
+                getattr(together.track, name), getattr(alone.track, name),
+                rtol=1e-9, atol=1e-9, equal_nan=True,
+            )  # fmt: skip
+        torch.testing.assert_close(together.keypoints, alone.keypoints, equal_nan=True)
 
 
 def test_persons_do_not_mix_and_the_one_seen_longest_is_first(tracker, keypoints):

@@ -34,10 +34,8 @@ def demo_video(
     from torchpose.video._tracker import VideoTracker
 
     share_cores()
-    performance, camera = (
-        performer(round(seconds * _FPS), _FPS, seed, distance=_DISTANCE),
-        demo_camera(),
-    )
+    performance = performer(round(seconds * _FPS), _FPS, seed, distance=_DISTANCE)
+    camera = demo_camera()
     stage = results.stage
     clip, truth_file = stage / "clip.mp4", stage / "truth.npz"
     _render(clip, performance, seed)

@@ -99,7 +99,7 @@ def _open(where: str, fps: float | None) -> "VideoSource":
 
 
 def _refuse_options(job: Job, detector: str | None, face_model: str | None) -> None:
-    """Raise `InputError` for options that mean nothing for what is measured."""
+    """Raise `InputError` for options that the measurer does not have."""
     given = {"--nose-as-head": job.settings.nose_as_head}
     if detector is None:
         given |= {
@@ -267,7 +267,7 @@ def _write_report(
 
 
 def _measured_by(options: dict[str, Any]) -> str:
-    """Return in words what measures."""
+    """Return a phrase about the measurer, for the report."""
     if options["detector"] is not None:
         return f"keypoints by {options['detector']}"
     return f"hands by {options['hands']}"
@@ -276,19 +276,20 @@ def _measured_by(options: dict[str, Any]) -> str:
 def _nobody(
     where: str, n_frames: int, notes: tuple[str, ...], out: Path, detector: str | None
 ) -> int:
-    """Say that there is no pose, and why; return the exit code."""
+    """Print that there is no pose and the reason; return the exit code."""
     if (out / "poses.npz").exists():
         notes += (f"{out / 'poses.npz'} is of an earlier run",)
     for note in notes:
         print(f"note     {note}")
-    what, wants = "face", (
-        "The detector wants faces from the front, tilted little and at least 16 pixels high; keypoints of "
-        "another detector can be tracked instead (--detector)"
-    )  # fmt: skip
-    if detector is not None:
-        what, wants = "person", (
-            f"{detector} has to give three keypoints of the upper body; --min-confidence says how sure"
-        )  # fmt: skip
+    if detector is None:
+        what = "face"
+        wants = (
+            "The detector wants faces from the front, tilted little and at least 16 pixels high; keypoints of "
+            "another detector can be tracked instead (--detector)"
+        )
+    else:
+        what = "person"
+        wants = f"{detector} has to give three keypoints of the upper body; --min-confidence says how sure"
     print(
         f"torchpose: no {what} was seen for long enough in the {n_frames} frames of {where}, so "
         f"there are no poses. {wants}",
@@ -300,7 +301,7 @@ def _nobody(
 def _summary(
     people: list["TrackedPerson"], written: list[Path], facts: dict[str, str], notes: Sequence[str]
 ) -> str:
-    """Return in words what was found."""
+    """Return the summary that is printed: the persons, and the poses of the first."""
     first = summary(people[0].track, written, facts, notes)
     if len(people) == 1:
         return first

@@ -22,22 +22,25 @@ _ANGLES = 17  # of a bone whose end is measured
 _AROUND = 150  # directions of one whose end is not
 _BOTH = 68  # of each of two such bones
 _STEP = math.radians(10.0)  # of a direction from frame to frame at 30 frames a second
-_ANEW = 0.2  # share of an arm's belief that starts anew in a frame at 30 frames a second
+_ANEW = 0.2  # share of an arm's belief that is reinitialised in a frame at 30 frames a second
 _RATE = 30.0
 _NOTHING = -60.0
 _LEAST = 1e-30  # density
 _LIKELIEST = 32  # hypotheses of an arm that are compared with the other arm's
-_ROWS = 2048  # directions at a time, so that what is worked out stays in the cache
+_ROWS = 2048  # directions at a time, so that intermediate results stay in the cache
 
 
 class ArmInput(NamedTuple):
     """Measurements of both arms, the right one mirrored; shapes [B, 2, M] for M hypotheses of the root.
 
     Attributes:
-        shoulder: [B, 2, M, 3], metres. rays: of elbow and hand, [B, 2, 2, 3]. known: [B, 2, 2].
-        std: of a pixel over the focal length, of elbow and hand with their near ends, [B, 2, 2].
-        axes: from camera to upright axes, [B, 2, M, 3, 3]. lengths: of both bones, [B, 2, M, 2].
-        slack: standard deviation of the ends of both bones for want of their lengths, [B, 2], metres.
+        shoulder: camera axes, metres, [B, 2, M, 3]. rays: the rays of elbow and hand, [B, 2, 2, 3].
+        known: whether elbow and hand are measured, [B, 2, 2].
+        std: the standard deviation of a pixel over the focal length, of elbow and hand with their near
+            ends, [B, 2, 2].
+        axes: the rotation from camera to upright axes, [B, 2, M, 3, 3].
+        lengths: the lengths of both bones, metres, [B, 2, M, 2].
+        slack: the standard deviation of the ends of both bones for want of their lengths, metres, [B, 2].
     """
 
     shoulder: Tensor
@@ -53,9 +56,9 @@ class Arms(NamedTuple):
     """Hypotheses about both arms.
 
     Attributes:
-        directions: of upper arm and forearm in upright axes, [B, 2, M, N, 6].
-        log_weight: log of the likelihood times the node's share of the directions, [B, 2, M, N].
-        log_prior: log density of the prior, [B, 2, M, N].
+        directions: the directions of upper arm and forearm, upright axes, [B, 2, M, N, 6].
+        log_weight: the log of the likelihood times the node's share of the directions, [B, 2, M, N].
+        log_prior: the log-density of the prior, [B, 2, M, N].
     """
 
     directions: Tensor
@@ -64,24 +67,25 @@ class Arms(NamedTuple):
 
     @property
     def log_evidence(self) -> Float[Tensor, "B 2 M"]:
-        """Return the log of the prior predictive density of what is measured of each arm."""
+        """Return the log of the prior predictive density of the measurements of each arm."""
         return torch.logsumexp(self.log_weight + self.log_prior, -1)
 
     @property
     def mean_directions(self) -> Float[Tensor, "B 2 M 6"]:
-        """Return the mean of the directions of each hypothesis of the root; not of unit length."""
+        """Return the mean directions given each hypothesis of the root; not of unit length."""
         weight = torch.softmax(self.log_weight + self.log_prior, -1)
         return (weight[..., None] * self.directions).sum(-2)
 
 
 class ArmState(NamedTuple):
-    """Belief about both arms after a frame.
+    """Posterior of both arms after a frame.
 
     Attributes:
-        directions: of the hypotheses, upright axes, [B, 2, N, 6]. weight: normalised, [B, 2, N].
-        log_evidence: of the frame, [B, 2].
-        prior, predicted: density at each hypothesis, of the prior and as the frames before have it,
-            [B, 2, N].
+        directions: the directions of the hypotheses, upright axes, [B, 2, N, 6].
+        weight: their weights, normalised, [B, 2, N].
+        log_evidence: the log-evidence of the frame given those before, [B, 2].
+        prior, predicted: the density of the prior, and that predicted from the frames before, at each
+            hypothesis, [B, 2, N].
     """
 
     directions: Tensor
@@ -92,7 +96,7 @@ class ArmState(NamedTuple):
 
 
 class DirectionDensity:
-    """Log density of an `ArmPrior`, with what does not depend on the directions worked out once."""
+    """Log-density of an `ArmPrior`; what does not depend on the directions is computed once."""
 
     def __init__(self, prior: ArmPrior, device: torch.device | None = None) -> None:
         parts = (*prior.directions.parameters_tuple(), prior.log_mass)
@@ -113,7 +117,7 @@ class DirectionDensity:
         self.together = pad(tied, (0, 1, 0, 1), value=1.0)  # the broad part is tied to nothing
 
     def __call__(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
-        """Return log p(d_u, d_f), worked out in float32: unit vectors and a tenth of a radian."""
+        """Return log p(d_u, d_f), computed in float32, which unit vectors and spreads of 0.1 rad allow."""
         flat = directions.reshape(-1, 6).float()
         parts = [self._known(rows) for rows in flat.split(_ROWS)]
         known = torch.cat(parts).to(directions.dtype)
@@ -126,13 +130,13 @@ class DirectionDensity:
         return torch.softmax(logs, -1).to(directions.dtype).view(*directions.shape[:-1], -1)
 
     def _logs(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, "N K"]:
-        """Return the log density of each component of the mixture, times its weight."""
+        """Return the log-density of each component of the mixture, times its weight."""
         off = torch.addmm(self.shift, rows, self.rows, beta=-1).square()
         squared = off.view(len(rows), *self.size).sum(1)
         return self.constant - 0.5 * squared
 
     def _known(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, " N"]:
-        """Return the log density of the mixture."""
+        """Return the log-density of the mixture, without its broad part."""
         logs = self._logs(rows)
         most = logs.amax(-1, keepdim=True).detach()
         # exp of what is far below is slow where it is denormal, and adds nothing
@@ -142,13 +146,13 @@ class DirectionDensity:
 class ArmChain:
     """Point-mass filter over the directions of both bones of both arms.
 
-    A hypothesis of the frame before goes to one of this frame with the density of a heavy-tailed walk on
-    the directions, or starts anew from the prior:
+    A hypothesis of the frame before moves to one of this frame by a heavy-tailed random walk on the
+    directions, or is reinitialised from the prior:
 
         p(x' | x) = (1 - e) t_4(x'; x, s^2) + e p(x')
 
     Args:
-        density: of directions. fps: frames per second.
+        density: the log-density of the prior over directions. fps: frames per second.
     """
 
     def __init__(self, density: DirectionDensity, fps: float) -> None:
@@ -157,11 +161,11 @@ class ArmChain:
         self.anew = 1 - (1 - _ANEW) ** (_RATE / fps)
 
     def hypotheses(self, arm: ArmInput, angles: int = _ANGLES, around: int = _AROUND) -> Arms:
-        """Return hypotheses that agree with what is measured of each arm, for each hypothesis of the root.
+        """Return hypotheses that agree with the measurements of each arm, given each hypothesis of the root.
 
         Args:
-            arm: what is measured. angles: number of angles of a bone whose end is measured.
-            around: number of directions of one whose end is not.
+            arm: the measurements. angles: the number of angles of a bone whose end is measured.
+            around: the number of directions of one whose end is not.
         """
         count = angles * angles
         both = min(around, _BOTH)
@@ -187,7 +191,7 @@ class ArmChain:
     def _weighed(
         self, arm: ArmInput, upper: bool, lower: bool, sizes: tuple[int, int], count: int
     ) -> Arms:
-        """Return the `count` weightiest hypotheses of arms of which these ends are measured."""
+        """Return the `count` hypotheses of largest weight, of arms whose elbow and hand are measured so."""
         lengths, noise = arm.lengths, self._noise(arm)
         start = arm.shoulder
         ray = arm.rays[:, :, None, 0].expand_as(start)
@@ -225,7 +229,7 @@ class ArmChain:
         return ((arm.std[:, :, None] * depth).square() + slack).sqrt()
 
     def evidence_of_both(self, arms: Arms) -> Float[Tensor, "B M"]:
-        """Return the log of the prior predictive density of what is measured of both arms together.
+        """Return the log of the prior predictive density of the measurements of both arms together.
 
         Given the torso each arm's likelihood is its own, and `ArmPrior.together` ties components:
 
@@ -243,12 +247,12 @@ class ArmChain:
         return arms.log_evidence.sum(1) + tied.log()
 
     def start(self, arms: Arms) -> ArmState:
-        """Return the belief after the first frame, of arms with one hypothesis of the root each."""
+        """Return the posterior after the first frame, given one hypothesis of the root."""
         prior = arms.log_prior[:, :, 0].exp()
         return _belief(arms, prior, prior)
 
-    def advance(self, state: ArmState, arms: Arms) -> ArmState:
-        """Return the belief after one more frame."""
+    def update(self, state: ArmState, arms: Arms) -> ArmState:
+        """Return the posterior after one more frame."""
         prior = arms.log_prior[:, :, 0].exp()
         walk = self._walk(state.directions, arms.directions[:, :, 0])
         moved = (state.weight[..., None, :] @ walk)[..., 0, :]
@@ -257,39 +261,42 @@ class ArmChain:
     def smoothed(
         self, states: Sequence[ArmState], lengths: Tensor | None, lag: int | None
     ) -> list[ArmState]:
-        """Return the beliefs after the later frames were seen too (forward-backward algorithm).
+        """Return the posteriors given the later frames too (forward-backward algorithm).
 
         Args:
-            states: of all frames. lengths: frames of each sequence, None for all.
-            lag: number of later frames that an estimate may use, None for all.
+            states: the filtered posteriors of all frames. lengths: the number of frames of each sequence;
+                None is all.
+            lag: the number of later frames that an estimate may use; None is all.
         """
         n_frames = len(states)
-        said = [torch.ones_like(state.weight) for state in states]
+        messages = [torch.ones_like(state.weight) for state in states]
         for _ in range(1 if lag is None else lag):
-            source = said if lag is None else list(said)  # each round looks one frame farther
+            # with a lag, each round takes the messages of the round before: one frame farther ahead
+            source = messages if lag is None else list(messages)
             for t in range(n_frames - 2, -1, -1):
-                said[t] = self._said_later(states[t], states[t + 1], source[t + 1])
+                messages[t] = self._backward_message(states[t], states[t + 1], source[t + 1])
                 if lengths is not None:
-                    ended = (lengths.to(said[t].device) <= t + 1)[:, None, None]
-                    said[t] = torch.where(ended, 1.0, said[t])
-        weights = (state.weight * after for state, after in zip(states, said, strict=True))
+                    ended = (lengths.to(messages[t].device) <= t + 1)[:, None, None]
+                    messages[t] = torch.where(ended, 1.0, messages[t])
+        weights = (state.weight * after for state, after in zip(states, messages, strict=True))
         weights = (w / w.sum(-1, keepdim=True) for w in weights)
         return [state._replace(weight=w) for state, w in zip(states, weights, strict=True)]
 
-    def _said_later(
+    def _backward_message(
         self, state: ArmState, later: ArmState, after: Tensor
     ) -> Float[Tensor, "B 2 N"]:
-        """Return what the next frame says about the hypotheses of this one, up to a factor.
+        """Return the backward message from the next frame, unnormalised.
 
         Args:
-            state: of this frame. later: of the next one. after: what the frames after that say of it.
+            state: the posterior of this frame. later: that of the next one.
+            after: the backward message at the next frame.
         """
         ratio = later.weight / later.predicted.clamp_min(_LEAST) * after
         walk = self._walk(state.directions, later.directions)
         moved = (walk @ ratio[..., None])[..., 0]
         anew = (later.prior * ratio).sum(-1, keepdim=True)
-        said = (1 - self.anew) * moved + self.anew * anew
-        return said / said.amax(-1, keepdim=True).clamp_min(_LEAST)
+        message = (1 - self.anew) * moved + self.anew * anew
+        return message / message.amax(-1, keepdim=True).clamp_min(_LEAST)
 
     def _walk(self, before: Tensor, after: Tensor) -> Float[Tensor, "B 2 N M"]:
         """Return the density t_4(x'; x, s^2) of all pairs of directions of two frames."""
@@ -303,7 +310,8 @@ class ArmChain:
         """Return the mean direction of each bone, upright axes.
 
         Args:
-            state: belief. seen: whether elbow and hand are measured; if so means are given unit length.
+            state: the posterior. seen: whether elbow and hand are measured; if so the means have unit
+                length.
         """
         mean = (state.weight[..., None] * state.directions).sum(-2).unflatten(-1, (2, 3))
         return torch.where(seen[..., None, None], normalize(mean, dim=-1), mean)

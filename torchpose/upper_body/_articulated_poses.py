@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.camera._projection import project
@@ -38,23 +38,26 @@ SHOULDERS, ELBOWS, HANDS = (
 SIDES = ((1.0, 1.0, 1.0), (-1.0, 1.0, 1.0))
 """Signs of the axes by which right arms are mirrored."""
 _STD = 0.03  # metres: of every joint in space
-# Of the covariances of arms that are seen whole, and of those of which the hand is seen alone, where
-# nobody doubts it: what four sets needed that were in no fit (at the median 0.45 to 0.51 and 0.31 to
-# 0.74). Others hold as they are, with detectors' errors too.
+# Factors on the covariances of arms that are seen whole, and of those of which the hand is seen alone, at
+# full confidence: as four sets needed that were in no fit (at the median 0.45 to 0.51 and 0.31 to 0.74).
+# Other covariances hold as they are, with detectors' errors too.
 _WHOLE, _HAND_ALONE = 0.55, 0.75
 
 
 class SeenBody(NamedTuple):
-    """A body in one frame but for its arms, in the axes of a camera that leans as it does.
+    """A body in one frame but for its arms, in tilted axes: of a camera that is rolled by its lean.
 
     Attributes:
-        joints: [B, 8, 3], of shoulders, neck and head. known: which of the eight are measured, [B, 8].
-        exact: whether nobody doubts any of them, [B].
-        lengths: of the bones, [B, 4]. bones: the same as they are shown, with their covariances.
-        scale: deviation of the log of their common scale, [B].
-        others: covariances of both elbows, then both hands, for turns that were not chosen, [B, 4, 3, 3].
-        far: variance of the log of its depth, [B].
-        turn, lean: [B].
+        joints: shoulders, neck and head, metres, [B, 8, 3]; the others are 0.
+        known: which of the eight joints are measured, [B, 8].
+        exact: whether every keypoint has full confidence, [B].
+        lengths: the lengths of the bones, metres, [B, 4]. bones: the same as they are reported, with
+            their covariances.
+        scale: the standard deviation of the log of their common scale, [B].
+        others: the covariances of both elbows, then both hands, over the hypotheses of the root
+            (`covs_of_roots`), [B, 4, 3, 3].
+        far: the variance of the log of the depth, [B].
+        turn, lean: the turn of the shoulders and the roll of the tilted axes, radians, [B].
     """
 
     joints: Tensor
@@ -73,9 +76,11 @@ class FramePose(NamedTuple):
     """Estimate of one frame, or of T of them.
 
     Attributes:
-        joints: camera axes, [B, 8, 3]. covs: [B, 8, 3, 3]. turn, lean: of the shoulders, [B].
-        log_evidence: of both arms, [B, 2]. log_weights: of their hypotheses, [B, 2, N].
-        bones, bone_covs: lengths of bones, [B, 4], and their covariances, [B, 4, 4].
+        joints: camera axes, metres, [B, 8, 3]. covs: [B, 8, 3, 3].
+        turn, lean: of the shoulders, radians, [B].
+        log_evidence: the log-evidence of both arms, [B, 2].
+        log_weights: the log-weights of their hypotheses, [B, 2, N].
+        bones, bone_covs: the lengths of bones, [B, 4], and their covariances, [B, 4, 4].
     """
 
     joints: Tensor
@@ -96,8 +101,8 @@ def bones_of(
     """Return upper arms and forearms in camera axes, metres.
 
     Args:
-        directions: of left and mirrored right arms, upright axes. axes: from camera to upright axes.
-        lengths: of the bones.
+        directions: the directions of left and mirrored right arms, upright axes.
+        axes: the rotation from camera to upright axes. lengths: the lengths of the bones, metres.
     """
     flip = directions.new_tensor(SIDES)[:, None, None]
     return directions.unflatten(-1, (2, 3)) * flip @ axes * lengths[:, None, None, :2, None]
@@ -106,14 +111,15 @@ def bones_of(
 def pose_of(
     body: SeenBody, belief: ArmState, matrix: Float[Tensor, "3 3"], calibrated: bool = True
 ) -> FramePose:
-    """Return the estimate of a frame, in camera axes: bones point to the mean of what is believed.
+    """Return the estimate of a frame, in camera axes: bones point along their posterior mean direction.
 
-    They keep their lengths where elbow and hand are measured. Where not, joints are where they are expected,
-    which is nearer to the shoulder: the error of an unsure direction is least so.
+    They keep their lengths where elbow and hand are measured. Where not, the mean is not normalised, so that
+    the joints are nearer to the shoulder: this is the estimate of least mean squared error.
 
     Args:
-        body: but for its arms. belief: about these. matrix: K of their pixels.
-        calibrated: whether covariances are those that persons of other sets had.
+        body: the body but for its arms. belief: the posterior of the arms. matrix: K of the prior's camera.
+        calibrated: whether the covariances of measured arms are scaled as recordings of other persons
+            needed.
     """
     axes = upright_axes(body.turn)[:, None, None]
     known = body.known[:, [ELBOWS, HANDS]]
@@ -137,7 +143,7 @@ def pose_of(
 
 
 def _trust(known: Bool[Tensor, "B 8"], exact: Bool[Tensor, " B"]) -> Float[Tensor, "B 2"]:
-    """Return what covariances of both arms are multiplied by, for what is measured of each."""
+    """Return the factors on the covariances of both arms, by which of their joints are measured."""
     shoulder, elbow, hand = (known[:, rows] for rows in (SHOULDERS, ELBOWS, HANDS))
     one = torch.ones(elbow.shape, device=known.device)
     trust = torch.where(hand & ~elbow, _HAND_ALONE, one)
@@ -146,7 +152,7 @@ def _trust(known: Bool[Tensor, "B 8"], exact: Bool[Tensor, " B"]) -> Float[Tenso
 
 
 def _covs(body: SeenBody, belief: ArmState, joints: Tensor) -> Float[Tensor, "B 8 3 3"]:
-    """Return covariances: of the hypotheses about the estimate, of stiff torsos, and of the scale."""
+    """Return the covariances of the joints: posterior spread, stiffness of the torso, and common scale."""
     covs = torch.eye(3).to(joints).mul(_STD**2).expand(*joints.shape, 3).clone()
     axes = upright_axes(body.turn)[:, None, None]
     ends = bones_of(belief.directions, axes, body.lengths).cumsum(-2)
@@ -167,17 +173,14 @@ def estimates_of(
     poses: Sequence[FramePose],
     matrix: Float[Tensor, "3 3"],
     names: tuple[str, ...],
-    lengths: Int[Tensor, " B"] | None = None,
 ) -> Estimates:
-    """Return the estimates of both arms and the poses; past the lengths the last ones again.
+    """Return the estimates of both arms and the poses they were made from.
 
     Args:
-        poses: of each frame. matrix: K of their pixels. names: of the bones' lengths.
-        lengths: frames of each sequence, None for all.
+        poses: the pose of each frame. matrix: K of the prior's camera. names: the names of the bone
+            lengths.
     """
     stacked = FramePose(*(torch.stack(values, 1) for values in zip(*poses, strict=True)))
-    if lengths is not None:
-        stacked = _repeated(stacked, lengths.to(stacked.joints.device))
     neck = stacked.joints[:, :, _NECK]
     level = torch.zeros_like(stacked.turn)
     angles = torch.stack([stacked.lean, level, stacked.turn], -1)
@@ -197,16 +200,6 @@ def estimates_of(
     reading = ReadOut(joints, covs, angles, neck, uv, uv_covs)
     bones = Bones(names, stacked.bones, stacked.bone_covs)
     return Estimates(left, right, None, reading, bones)
-
-
-def _repeated(poses: FramePose, lengths: Int[Tensor, " B"]) -> FramePose:
-    """Return the poses with the last one of each sequence past its length, without evidence there."""
-    frames = torch.arange(poses.joints.shape[1], device=lengths.device)
-    last = frames.minimum(lengths[:, None] - 1)
-    rows = torch.arange(len(last), device=last.device)[:, None]
-    poses = FramePose(*(values[rows, last] for values in poses))
-    past = (frames >= lengths[:, None])[..., None]
-    return poses._replace(log_evidence=poses.log_evidence.masked_fill(past, 0.0))
 
 
 def _pixel_covs(

@@ -15,7 +15,7 @@ from torchpose.errors import InputError
 from torchpose.priors._arms import LENGTHS, ArmPrior
 from torchpose.upper_body._estimator import Bones
 from torchpose.upper_body._pose_track import PoseTrack
-from torchpose.upper_body._root_grid import NECK_HEIGHT, Root, Torso, TorsoLengths, inward_shares
+from torchpose.upper_body._torso import NECK_HEIGHT, Root, Torso, TorsoLengths, inward_shares
 
 __all__ = ["BODY_LENGTHS", "BodyLengths", "KnownBody", "Lengths"]
 
@@ -23,9 +23,9 @@ BODY_LENGTHS = ("upper_arm", "forearm", "shoulder_width", "head_height")
 """Lengths that may be given: shoulder to elbow, elbow to the measured hand or wrist, between the
 shoulders, and from the neck up to the head."""
 
-_NUDGE = 0.03  # of a log-length, to see what a frame says about it
+_NUDGE = 0.03  # step of the finite differences in log-length
 _MOST = 0.1  # of a log-length that one frame may change it by
-_POWER = 0.1  # of what a frame says about lengths: frames of one pose are alike
+_POWER = 0.1  # of a frame's likelihood of the lengths: frames of one pose are alike
 _WIDTH_STD, _HEIGHT_STD = 0.05, 0.05  # metres: shoulders and heads move in their torsos
 _GIVEN = 0.02  # of the log of a length that was measured on the person
 _SHORTEST, _LONGEST = 0.05, 1.0  # metres
@@ -38,11 +38,11 @@ _LEAST = 0.04  # of the log of a length that is only known in proportion
 
 
 class KnownBody(NamedTuple):
-    """What is known of a person beforehand, all of it optional.
+    """Facts about the subject that are known beforehand, all of them optional.
 
     Attributes:
-        lengths: metres by name of `BODY_LENGTHS`, as measured on the person. height: of the person,
-            metres. person: poses of the same person, or their file.
+        lengths: metres by name of `BODY_LENGTHS`, as measured on the subject. height: the height of the
+            subject, metres. person: poses of the same subject, or their file.
     """
 
     lengths: Mapping[str, float] | None = None
@@ -51,7 +51,7 @@ class KnownBody(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Return what tells it from others, as long as the poses exist."""
+        """Return a key that differs between subjects, as long as the poses exist."""
         person = id(self.person) if isinstance(self.person, PoseTrack) else self.person
         return str((self.lengths, self.height, person))
 
@@ -74,9 +74,10 @@ class BodyLengths:
     the surest stays as the prior, or who measured it, has it, and the others are learnt relative to it.
 
     Args:
-        prior: over persons. hand: kind of the measured hands, "hand" or "wrist".
-        neck: kind of the neck. known: of the person. What nobody knows is expected in proportion.
-        like: tells dtype and device.
+        prior: the prior over persons. hand: the kind of the measured hands, "hand" or "wrist".
+        neck: the kind of the neck. known: facts about the subject; other lengths are expected in
+            proportion.
+        like: a tensor of the dtype and on the device to work in.
 
     Attributes:
         names: of the lengths, as `LENGTHS` has them.
@@ -173,10 +174,10 @@ class BodyLengths:
         return (_TOGETHER * own[2:].amin()).clamp_min(0.0).sqrt()
 
     def init(self, batch_size: int, of_size: Float[Tensor, " B"]) -> Lengths:
-        """Return what is believed before the first frame, given the size of the torso.
+        """Return the prior over the lengths before the first frame, given the size of the torso.
 
         Args:
-            batch_size: B. of_size: variance of the log of that size.
+            batch_size: B. of_size: the variance of the log of that size.
         """
         own = (self.spread.square() - self.scale.square()).repeat(batch_size, 1)
         own[:, 2:] -= of_size[:, None]
@@ -186,7 +187,7 @@ class BodyLengths:
         return Lengths(torch.zeros_like(precision), precision)
 
     def metres(self, lengths: Lengths) -> Float[Tensor, "B 4"]:
-        """Return the lengths."""
+        """Return the lengths, metres."""
         return self.usual * lengths.mean.exp()
 
     def shown(
@@ -198,7 +199,8 @@ class BodyLengths:
         itself.
 
         Args:
-            lengths: given the size. size: of the torso. unsure: variance of its log.
+            lengths: the belief given the size. size: the size of the torso. unsure: the variance of its
+                log.
         """
         own = lengths.precision.reciprocal()
         own[:, self.surest] = 0.0
@@ -209,13 +211,16 @@ class BodyLengths:
         return Bones(self.names, metres - self.lower, metres[:, :, None] * logs * metres[:, None])
 
     def slack(self, lengths: Lengths) -> Float[Tensor, "B 2"]:
-        """Return the deviations of both bones of an arm, metres; none of the surest: it moves no pixel."""
+        """Return the standard deviations of both bones of an arm, metres; 0 of the surest length.
+
+        The surest length is that of the common scale, which moves no pixel.
+        """
         std = self.metres(lengths) * lengths.precision.rsqrt()
         rows = torch.arange(len(BODY_LENGTHS), device=std.device)
         return torch.where(rows == self.surest, 0.0, std)[:, :2]
 
     def torso(self, lengths: Lengths) -> TorsoLengths:
-        """Return the lengths of the torso with their deviations."""
+        """Return the lengths of the torso with their standard deviations."""
         metres = self.metres(lengths)[:, 2:]
         std = metres * lengths.precision[:, 2:].rsqrt()
         (width, height), (width_std, height_std) = metres.unbind(1), std.unbind(1)
@@ -231,8 +236,8 @@ class BodyLengths:
         """Return the lengths after a frame: one Newton step on their log-evidence.
 
         Args:
-            torso: what is seen of it. root: where it is, one hypothesis. evidence: of the arms, given
-                lengths in metres.
+            lengths: the belief before the frame. torso: the measured torso. root: one hypothesis about it.
+            evidence: maps lengths, metres, to the log-evidence of the arms.
         """
         slope, bend = self._slopes_of_arms(lengths, evidence)
         width, height = self._slopes_of_torso(lengths, torso, root)
@@ -247,7 +252,10 @@ class BodyLengths:
     def _slopes_of_arms(
         self, lengths: Lengths, evidence: Callable[[Tensor], Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """Return what arms say about the log-lengths of upper arm and forearm: slope and bend, [B, 2]."""
+        """Return slope and curvature of the arms' log-evidence over the log-lengths of both bones, [B, 2].
+
+        The curvature is the negative second derivative; both are central differences.
+        """
         nudges = lengths.mean.new_tensor(
             [[0, 0, 0, 0], [1, 0, 0, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0]]
         )
@@ -262,7 +270,7 @@ class BodyLengths:
     def _slopes_of_torso(
         self, lengths: Lengths, torso: Torso, root: Root
     ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-        """Return slope and bend of the evidence over the log-width and the log-height, [B, 1] each."""
+        """Return slope and curvature of the log-evidence over log-width and log-height, [B, 1] each."""
         size = self.metres(lengths) * root.size
         inward, wavering = (x[:, None] for x in inward_shares(torso, root.depth[:, 0]))
         width, height = size[:, 2:3], size[:, 3:]

@@ -1,11 +1,11 @@
 """Define the interface of the estimators: measured joints in, the states of both arms out."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchpose._core.checks import check_rate
@@ -20,6 +20,7 @@ from torchpose.upper_body._measurements import MeasuredJoints
 
 __all__ = [
     "ARMS",
+    "ArmGenerators",
     "ArmJoints",
     "Bones",
     "Estimates",
@@ -34,11 +35,16 @@ __all__ = [
     "in_double",
     "joints_of_arm",
     "mending_notes",
+    "repeat_last",
+    "repeat_reading",
     "require_cov",
 ]
 
 ArmJoints = dict[str, tuple[str, ...]]
 """For each arm, "left" and "right", those of `ARM_JOINTS` that are measured."""
+
+ArmGenerators = dict[str, Generators]
+"""For each arm, "left" and "right", the random generators of its filter."""
 
 
 class TrackerModel(NamedTuple):
@@ -47,13 +53,13 @@ class TrackerModel(NamedTuple):
     Attributes:
         owner: the module with which filters are kept between calls.
         prior: mixtures and noise. measurement_cov: R of the eight joints, [8, 2, 2], prior's pixels.
-        fps: frame rate, or None. smoothing: None, the number of later frames that an estimate may
+        fps: frames per second, or None. smoothing: None, the number of later frames that an estimate may
             use, or "full".
-        hand: kind of the measured hands, "hand" or "wrist"; None is the prior's.
-        middle: whether the middle of the shoulders is measured in place of the neck, and whether that is all
-            that is measured of them.
-        calibrated: whether covariances are recalibrated as the prior says.
-        steadied: whether what windows give is passed through filters of constant velocity.
+        hand: the kind of the measured hands, "hand" or "wrist"; None is the prior's.
+        middle: whether the middle of the shoulders is measured in place of the neck, and whether of the
+            shoulders their middle alone is measured.
+        calibrated: whether covariances are recalibrated by the noise of the prior.
+        steadied: whether the poses of windows pass filters of constant velocity.
     """
 
     owner: nn.Module
@@ -75,7 +81,7 @@ class TrackerModel(NamedTuple):
 def check_model(
     prior: UpperBodyPrior, camera: PinholeCamera | None, fps: float | None
 ) -> PinholeCamera:
-    """Return the camera, if what a tracker works with is all there.
+    """Return the camera, after checks of prior, camera and frame rate of a tracker.
 
     Raises:
         PriorError: no prior of the upper body. CameraError: no camera. InputError: a frame rate that is
@@ -96,12 +102,12 @@ def check_model(
 
 
 class ReadOut(NamedTuple):
-    """Poses, and where their bodies are.
+    """Poses, with the rotation and the place of the body.
 
     Attributes:
         joints: in the body's frame [B, T, 8, 3], metres. covs: [B, T, 8, 3, 3].
         angles: roll, pitch, yaw that turn the body's axes into the camera's [B, T, 3], radians.
-        place: of the body's centre in camera axes [B, T, 3], metres.
+        place: the body's centre in camera axes [B, T, 3], metres.
         uv: [B, T, 8, 2], pixels of the prior's camera. uv_covs: [B, T, 8, 2, 2].
     """
 
@@ -117,7 +123,7 @@ class Bones(NamedTuple):
     """Lengths of bones.
 
     Attributes:
-        names: of K lengths, as `torchpose.priors._arms.LENGTHS` has them.
+        names: the names of K lengths, as `torchpose.priors._arms.LENGTHS` has them.
         metres: [..., K]. covs: metres squared, [..., K, K].
     """
 
@@ -130,11 +136,11 @@ class Estimates(NamedTuple):
     """Holds the states of both arms in T frames.
 
     Attributes:
-        left, right: with covariances, float64; the first 21 dimensions are those of
-            `torchpose.priors._arm_state`.
+        left, right: the states of each arm with covariances, float64; the first 21 dimensions are those
+            of `torchpose.priors._arm_state`.
         view: the virtual camera in whose pixels the states are; None is the prior's camera.
-        reading: the poses themselves, of estimators that do not estimate states of arms apart.
-        bones: lengths [B, T, K], of estimators that learn them.
+        reading: the poses, by estimators that do not estimate the states of single arms; else None.
+        bones: the lengths of bones [B, T, K], by estimators that learn them; else None.
     """
 
     left: FilterOutput
@@ -145,7 +151,7 @@ class Estimates(NamedTuple):
 
 
 class MotionRatios(NamedTuple):
-    """q/r, 1/s^3, of the constant-velocity filters over joints, their pixels and the placement."""
+    """Ratios q/r, 1/s^3, of the constant-velocity filters over joints, their pixels and the placement."""
 
     joint: float
     pixel: float
@@ -163,9 +169,10 @@ class Estimator(ABC):
             weighted points, which can collapse onto one of them (`note_collapse`).
         calibration: the name under which a prior keeps its calibration of the covariances; None goes
             by the name of the method.
-        steadied_by: of the motion stage that frames need, None where they follow each other smoothly.
-        ahead: number of later frames that an estimate uses by itself.
-        knows_wrists: whether wrists and hands are two joints to it (`TrackerModel.hand`).
+        steadied_by: the ratios of the motion stage that the poses need; None where they follow each other
+            smoothly.
+        ahead: the number of later frames that an estimate uses by itself.
+        knows_wrists: whether it tells wrists from hands (`TrackerModel.hand`).
         reads_rays: whether pixels and joints in space are two readings (`on_their_rays`).
     """
 
@@ -178,48 +185,58 @@ class Estimator(ABC):
     reads_rays: bool = False
 
     def check(self) -> None:  # noqa: B027  # most estimators have nothing to refuse
-        """Raise what does not fit, before any work; estimators may leave it out."""
+        """Raise the errors of the options before any work; estimators may leave it out."""
 
     @abstractmethod
-    def init(self, batch_size: int, joints: ArmJoints, generators: dict[str, Generators]) -> Any:
+    def init(self, batch_size: int, joints: ArmJoints, arm_generators: ArmGenerators) -> Any:
         """Return the state before the first frame of B streams.
 
         Args:
-            batch_size: B. joints: that may be measured. generators: of each arm, for what draws.
+            batch_size: B. joints: the joints of each arm that may be measured.
+            arm_generators: the random generators of each arm (`generators_of_arms`), for methods that
+                draw.
 
         Returns:
             State of B streams, for `advance`.
         """
 
     @abstractmethod
-    def advance(self, state: Any, measured: MeasuredJoints) -> tuple[Any, Estimates]:
+    def advance(
+        self, state: Any, measured: MeasuredJoints, progress: bool = False
+    ) -> tuple[Any, Estimates]:
         """Return the next state and the estimates of T more frames, which later frames do not change.
 
         Args:
-            state: from `init` or the call before; it is not changed. measured: [B, T, ...].
+            state: the state from `init` or the previous call; it is not changed.
+            measured: the measurements, [B, T, ...]. progress: whether to show a progress bar.
 
         Returns:
             The next state, and `Estimates` with means [B, T, D].
         """
 
-    @abstractmethod
     def forward(
         self,
         measured: MeasuredJoints,
         joints: ArmJoints,
-        generators: dict[str, Generators],
-        lengths: Tensor | None = None,
+        arm_generators: ArmGenerators,
+        lengths: Int[Tensor, " B"] | None = None,
         progress: bool = False,
     ) -> Estimates:
-        """Return the estimates of whole sequences: those of `init` and `advance`, or smoothed ones.
+        """Return the estimates of whole sequences: `init`, then `advance` over all frames.
+
+        Estimators that smooth override it, and so may those that know a faster way to the same numbers.
 
         Args:
-            measured: [B, T, ...]. joints, generators: as in `init`. lengths: frames of each sequence,
-                [B]; past them the last estimate is repeated. progress: whether to show a bar.
+            measured: the measurements, [B, T, ...]. joints, arm_generators: as in `init`.
+            lengths: the number of frames of each sequence, [B]; past it the last estimate is repeated.
+            progress: whether to show a progress bar.
 
         Returns:
             `Estimates` with means [B, T, D].
         """
+        state = self.init(len(measured.uv), joints, arm_generators)
+        _, estimates = self.advance(state, measured, progress)
+        return repeat_last(estimates, lengths)
 
 
 ARMS = {"left": LEFT_ARM, "right": RIGHT_ARM}
@@ -229,10 +246,10 @@ _USUAL = ("hand", "head", "neck")
 
 
 def joints_of_arm(side: str, there: Sequence[bool]) -> tuple[str, ...]:
-    """Return hand, head and neck of an arm, and those of its other joints that are there.
+    """Return hand, head and neck of an arm, and those of its other joints that are measured.
 
     Args:
-        side: "left" or "right". there: whether each of `UPPER_BODY` is.
+        side: "left" or "right". there: whether each of `UPPER_BODY` is measured.
 
     >>> joints_of_arm("left", [True, True, False, True, False, False, False, True])
     ('hand', 'elbow', 'head', 'neck')
@@ -245,13 +262,13 @@ def arm_joints(there: Sequence[bool]) -> dict[str, tuple[str, ...]]:
     """Return `joints_of_arm` of both arms.
 
     Args:
-        there: whether each of `UPPER_BODY` is.
+        there: whether each of `UPPER_BODY` is measured.
     """
     return {side: joints_of_arm(side, there) for side in ARMS}
 
 
-def generators_of_arms(generator: Generators) -> dict[str, Generators]:
-    """Return a generator for each arm, so that neither's numbers depend on how many the other drew."""
+def generators_of_arms(generator: Generators) -> ArmGenerators:
+    """Return a generator for each arm, so that the draws of one do not depend on those of the other."""
     return dict(zip(ARMS, _pair(generator), strict=True))
 
 
@@ -268,6 +285,58 @@ def _pair(generator: Generators) -> tuple[Generators, Generators]:
     pairs = [_pair(g) for g in generator]
     lefts = [left for left, _ in pairs if isinstance(left, torch.Generator)]
     return lefts, [right for _, right in pairs if isinstance(right, torch.Generator)]
+
+
+def repeat_last(estimates: Estimates, lengths: Int[Tensor, " B"] | None) -> Estimates:
+    """Return the estimates with the last one of each sequence repeated past its length.
+
+    There the log-evidence is 0, no covariance counts as mended, and a failure does not count.
+
+    Args:
+        estimates: the estimates of T frames. lengths: the number of frames of each sequence, [B]; None
+            is T.
+    """
+    n_frames = estimates.left.mean.shape[1]
+    if lengths is None or bool((lengths >= n_frames).all()):
+        return estimates
+    lengths = lengths.to(estimates.left.mean.device)
+    view, reading, bones = estimates.view, estimates.reading, estimates.bones
+    return Estimates(
+        _repeat_output(estimates.left, lengths),
+        _repeat_output(estimates.right, lengths),
+        None if view is None else BodyView(*_held(view, lengths)),
+        None if reading is None else repeat_reading(reading, lengths),
+        None if bones is None else Bones(bones.names, *_held(bones[1:], lengths)),
+    )
+
+
+def repeat_reading(reading: ReadOut, lengths: Int[Tensor, " B"]) -> ReadOut:
+    """Return the poses with the last one of each sequence repeated past its length."""
+    return ReadOut(*_held(reading, lengths))
+
+
+def _repeat_output(out: FilterOutput, lengths: Int[Tensor, " B"]) -> FilterOutput:
+    mean, log_weights = _held((out.mean, out.log_weights), lengths)
+    frames = torch.arange(out.mean.shape[1], device=lengths.device)
+    inside = frames < lengths[:, None]
+    return FilterOutput(
+        mean,
+        log_weights,
+        torch.where(inside, out.log_evidence, torch.zeros_like(out.log_evidence)),
+        None if out.cov is None else _held((out.cov,), lengths)[0],
+        torch.where(out.failed_at < lengths, out.failed_at, -1),
+        None if out.mended is None else out.mended * inside,
+        None if out.jitter is None else out.jitter * inside,
+    )
+
+
+def _held(values: Iterable[Tensor], lengths: Int[Tensor, " B"]) -> list[Tensor]:
+    """Return values [B, T, ...] with those of the last frame of each sequence past its length."""
+    values = list(values)
+    frames = torch.arange(values[0].shape[1], device=values[0].device)
+    held = frames.minimum(lengths.to(frames)[:, None] - 1)
+    rows = torch.arange(len(held), device=held.device)[:, None]
+    return [value[rows, held] for value in values]
 
 
 def first_failure(left: FilterOutput, right: FilterOutput) -> Tensor:

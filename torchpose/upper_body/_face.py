@@ -1,4 +1,4 @@
-"""Tell from nose, eyes and ears which way a head faces, and where it is."""
+"""Estimate from nose, eyes and ears which way a head faces, and where it is."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.math._rotations import within_half_turn
-from torchpose.upper_body._root_grid import heavy_tail
+from torchpose.upper_body._torso import heavy_tail
 
 __all__ = ["FACE", "FacePoints", "face_evidence", "head_in_face", "measure_face"]
 
@@ -38,9 +38,9 @@ class FacePoints(NamedTuple):
     """Measured `FACE`.
 
     Attributes:
-        places: pixels, or the first two of K^-1 [u, v, 1], [..., 5, 2], 0 where missing.
+        places: pixels, or the first two coordinates of K^-1 [u, v, 1], [..., 5, 2], 0 where missing.
         confidence: [..., 5], 1 where a detector gives none, 0 where missing.
-        expected: which of them are among the keypoints at all, [5].
+        expected: which of the points are among the keypoints at all, [5].
     """
 
     places: Tensor
@@ -57,7 +57,8 @@ def measure_face(
     """Return nose, eyes and ears among the keypoints, in their pixels.
 
     Args:
-        keypoints, confidence, mask: as in `UpperBodyTracker.forward`. indices: of `FACE`, -1 if absent.
+        keypoints, confidence, mask: as in `UpperBodyTracker.forward`. indices: the places of `FACE` among
+            the keypoints, -1 if absent.
     """
     rows = [max(i, 0) for i in indices]
     expected = torch.tensor([i >= 0 for i in indices], device=keypoints.device)
@@ -78,23 +79,24 @@ def face_evidence(
     depth: Float[Tensor, " Z"],
     turn: Float[Tensor, " P"],
 ) -> Float[Tensor, "B Z P"]:
-    """Return what a face says about the turn of the shoulders at each depth, of mean one over turns.
+    """Return the log-likelihood ratio of the turn of the shoulders at each depth, of mean ratio 1 over turns.
 
-    It says nothing about the depth itself: at a small one any face is small, and a bad ear seems to fit.
+    It is normalised at each depth, and so no evidence about the depth itself: at a small one any face is
+    small, and a bad ear seems to fit.
 
     A head at angle h from the camera has its points at x_i = c + left_i cos h - forward_i sin h, for an
     unknown middle c; and a detector gives those that are visible at that angle more often than others.
     Heads are turned against shoulders by some 25 degrees, and now and then by any angle.
 
     Args:
-        face: rays. std: of a pixel over the focal length. depth: of the shoulders, metres.
-        turn: of the shoulders, at even steps round the circle.
+        face: the rays of the points. std: the standard deviation of a pixel over the focal length.
+        depth: the depths of the shoulders, metres. turn: their turns, at even steps round the circle.
     """
     places = _horizontal(face, std, depth.expand(len(face.places), -1), turn)
     at_angle = heavy_tail(places.squared) + _visibility(face, turn)[:, None]
     most = at_angle.amax(-1, keepdim=True)
-    said = ((at_angle - most).exp() @ _turned_necks(turn, turn).mT).log() + most
-    return said - torch.logsumexp(said, -1, keepdim=True) + math.log(len(turn))
+    logs = ((at_angle - most).exp() @ _turned_necks(turn, turn).mT).log() + most
+    return logs - torch.logsumexp(logs, -1, keepdim=True) + math.log(len(turn))
 
 
 def head_in_face(
@@ -104,17 +106,17 @@ def head_in_face(
     turn: Float[Tensor, " B"],
     angles: Float[Tensor, " P"],
 ) -> tuple[Float[Tensor, "B 3"], Bool[Tensor, " B"]]:
-    """Return where Kinect's head is above the middle of the ears, camera axes, and whether a face tells.
+    """Return the place of Kinect's head above the middle of the ears, and whether the face is visible.
 
-    It is the mean over the angles h of the head, weighed by all points (`face_evidence`).
+    It is the posterior mean over the angles h of the head, given all points (`face_evidence`), camera axes.
 
     Args:
-        face: rays. std: of a pixel over the focal length. depth, turn: of the shoulders.
-        angles: of heads that are tried, at even steps round the circle.
+        face: the rays of the points. std: the standard deviation of a pixel over the focal length.
+        depth, turn: those of the shoulders. angles: the angles of the head, at even steps round the circle.
     """
     places = _horizontal(face, std, depth[:, None], angles)
-    said = heavy_tail(places.squared)[:, 0] + _visibility(face, angles)
-    weight = torch.softmax(said + _turned_necks(turn, angles).log(), -1)
+    logs = heavy_tail(places.squared)[:, 0] + _visibility(face, angles)
+    weight = torch.softmax(logs + _turned_necks(turn, angles).log(), -1)
     across = (weight * places.middle[:, 0]).sum(-1)
     sure = face.confidence
     below = face.places[..., 1] * depth[:, None] - depth.new_tensor(_BELOW)
@@ -123,10 +125,11 @@ def head_in_face(
 
 
 class _Horizontal(NamedTuple):
-    """Points of a face along the image, for heads at angles, [B, Z, P] each.
+    """Fit of a face along the horizontal axis of the image, at each depth and angle, [B, Z, P] each.
 
     Attributes:
-        middle: of the ears, metres. squared: distance of all points from where they would be.
+        middle: the middle of the ears, metres. squared: the squared Mahalanobis distance of all points from
+            their expected places.
     """
 
     middle: Tensor
@@ -136,7 +139,7 @@ class _Horizontal(NamedTuple):
 def _turned_necks(
     shoulders: Float[Tensor, " S"], heads: Float[Tensor, " P"]
 ) -> Float[Tensor, "S P"]:
-    """Return how likely heads are turned so, by the turn of the shoulders."""
+    """Return the probability of each angle of the head given the turn of the shoulders."""
     off = within_half_turn(shoulders[:, None] - heads)
     near = torch.softmax(-0.5 * (off / _NECK_STD).square(), 1)
     return (1 - _ANYWHERE) * near + _ANYWHERE / len(heads)
@@ -145,7 +148,7 @@ def _turned_necks(
 def _horizontal(
     face: FacePoints, std: Tensor, depth: Float[Tensor, "B Z"], angles: Float[Tensor, " P"]
 ) -> _Horizontal:
-    """Return where the points of a face are to each other."""
+    """Return the fit of the points relative to each other, for an unknown middle of the ears."""
     left, forward = (angles.new_tensor(x) for x in (_LEFT, _FORWARD))
     expected = left * angles.cos()[:, None] - forward * angles.sin()[:, None]
     seen = face.places[..., None, None, :, 0] * depth[..., None, None]
@@ -159,7 +162,7 @@ def _horizontal(
 
 
 def _visibility(face: FacePoints, turn: Tensor) -> Float[Tensor, "B P"]:
-    """Return the log-probability of what a detector gives and does not give."""
+    """Return the log-probability of which points a detector gives and which it does not."""
     outward, hidden = torch.deg2rad(turn.new_tensor(_OUTWARD)), turn.new_tensor(_HIDDEN)
     visible = torch.sigmoid(((turn[:, None] - outward).cos() - hidden) / _SOFT)
     given = _IMAGINED + (_SEEN - _IMAGINED) * visible

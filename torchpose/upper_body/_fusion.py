@@ -55,7 +55,8 @@ def read_out(estimates: Estimates, matrix: Float[Tensor, "3 3"], order: Rotation
     """Return both arms lifted into the body's frame (BL 5) and joined; what they share is averaged.
 
     Args:
-        estimates: of both arms. matrix: K of the prior's camera. order: of roll, pitch and yaw.
+        estimates: the estimates of both arms. matrix: K of the prior's camera. order: the order of roll,
+            pitch and yaw.
     """
     if estimates.reading is not None:
         return estimates.reading
@@ -88,7 +89,7 @@ def read_out(estimates: Estimates, matrix: Float[Tensor, "3 3"], order: Rotation
 def _on_torso(
     left: FilterOutput, right: FilterOutput, matrix: Tensor, order: RotationOrder
 ) -> tuple[Float[Tensor, "B T 8 3"], Float[Tensor, "B T 8 3 3"]]:
-    """Return joints that were estimated in the axes of the torso, in those of the body.
+    """Return joints that were estimated in the axes of the torso, turned into those of the body.
 
     The states say where head, neck and shoulders are there (BL 5), which takes no covariances.
     """
@@ -119,7 +120,8 @@ def on_their_rays(
     Head, neck and shoulders stay, since the body hangs on them.
 
     Args:
-        reading: of windows. matrix: K of its pixels. order: of its angles. observed: what was measured.
+        reading: the poses of windows. matrix: K of the prior's camera. order: the order of the angles.
+        observed: which joints were measured.
     """
     rotation = euler_to_matrix(reading.angles, order)
     seen = project(reading.joints, matrix, rotation, reading.place)
@@ -140,8 +142,8 @@ def in_camera_axes(
     """Return the joints and their covariances turned into the camera's axes and put where they are.
 
     Args:
-        reading: in the body's frame. order: of its angles. place: of every body, metres, in place of
-            the estimated one.
+        reading: poses in the body's frame. order: the order of their angles. place: the place of every
+            body, metres, instead of the estimated one.
     """
     rotation = euler_to_matrix(reading.angles, order)[..., None, :, :]
     at = reading.place if place is None else place.to(reading.place).expand_as(reading.place)
@@ -160,8 +162,9 @@ def recalibrated(
     """Return s C + f I for each joint, as a prior's training persons showed; C if it does not say.
 
     Args:
-        covs: C, metres squared. noise: of a prior. mode: name of the window, or `calibration_mode`;
-            without a calibration of its own, a method over single poses has that of "pose".
+        covs: C, metres squared. noise: the noise of a prior. mode: the name of the window, or
+            `calibration_mode`; without a calibration of its own, a method over single poses has that of
+            "pose".
     """
     if f"calibration_scale_{mode}" not in noise and mode not in _OWN:
         mode = "pose"
@@ -174,7 +177,7 @@ def recalibrated(
 
 
 class MotionState(NamedTuple):
-    """States of the filters of joints in metres, in pixels, and of the body's placement."""
+    """States of the filters over joints in metres, their pixels, and the body's placement."""
 
     joints: ConstantVelocityState
     pixels: ConstantVelocityState
@@ -203,11 +206,12 @@ class MotionStage(nn.Module):
     def forward(
         self, reading: ReadOut, lengths: Int[Tensor, " B"] | None = None, lag: int | None = 0
     ) -> ReadOut:
-        """Return the steady reading.
+        """Return the poses with filtered or smoothed motion.
 
         Args:
-            reading: of whole sequences. lengths: [B]; frames past them are not used.
-            lag: number of later frames that each may use; None is all, 0 only filters.
+            reading: the poses of whole sequences. lengths: the number of frames of each, [B]; frames past
+                it are not used.
+            lag: the number of later frames that each may use; None is all, 0 only filters.
         """
         pairs = zip(self._filters(), _numbers(reading), strict=True)
         if lag == 0:
@@ -233,10 +237,11 @@ class MotionStage(nn.Module):
 
 
 def kept_stage(owner: nn.Module, ratios: MotionRatios, fps: float, like: Tensor) -> MotionStage:
-    """Return the stage of these ratios; made once for each owner.
+    """Return the motion stage of these ratios; made once for each owner.
 
     Args:
-        owner: with which it is kept. fps: frames per second. like: tells the device.
+        owner: the module with which the stage is kept. ratios: q/r of its filters. fps: frames per second.
+        like: a tensor on the device to work on.
     """
     return derived(
         owner, ("stage", *ratios), (like,), lambda: MotionStage(*ratios, fps).to(like.device)
@@ -247,7 +252,7 @@ def stage_lag(smoothing: int | str | None, ahead: int) -> int | None:
     """Return the number of later frames that a stage may use, None for all.
 
     Args:
-        smoothing: as in `TrackerModel`. ahead: later frames that the estimates use already.
+        smoothing: as in `TrackerModel`. ahead: the number of later frames that the estimates use already.
     """
     if smoothing is None:
         return 0

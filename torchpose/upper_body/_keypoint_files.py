@@ -16,7 +16,7 @@ from torchpose.io._keypoints import Keypoints
 from torchpose.priors._upper_body import load_prior
 from torchpose.skeleton._joint_sets import canonical_names
 from torchpose.skeleton._upper_body import NECK_KINDS
-from torchpose.upper_body._methods import METHODS, WINDOWS, method_options, options_of_before
+from torchpose.upper_body._methods import METHODS, WINDOWS, method_options, replace_window
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._tracker import UpperBodyTracker
 
@@ -98,7 +98,7 @@ class TrackSettings:
                 "both out",
                 file=sys.stderr,
             )
-            method, steady = options_of_before(method, self.window, steady)
+            method, steady = replace_window(method, self.window, steady)
         names = ("smoothing", "frame", "static_camera", "outliers")
         options = {name: getattr(self, name) for name in names}
         options |= {"method": method, "steady": steady}
@@ -135,8 +135,8 @@ class Prepared(NamedTuple):
     """Tracker, camera and joint names of a file, and what was assumed.
 
     Attributes:
-        tracker: for its camera, frame rate and neck. camera: of the tracker.
-        names: of the joints, as the tracker takes them. notes: what was assumed.
+        tracker: the tracker for the camera, frame rate and neck of the file. camera: its camera.
+        names: the names of the joints, as the tracker takes them. notes: the assumptions, in plain words.
     """
 
     tracker: UpperBodyTracker
@@ -160,11 +160,11 @@ class KeypointFileTracker:
     Trackers are kept by camera, frame rate and kind of neck, the last eight of them.
 
     Args:
-        settings: how to track. device: where, such as "cpu", "cuda" or "cuda:1".
-        options: of the method, beside those of the settings.
+        settings: the settings of tracking. device: the device to track on, such as "cpu", "cuda" or
+            "cuda:1". options: the options of the method, beside those of the settings.
 
     Attributes:
-        settings: as given. prior: that was loaded.
+        settings: as given. prior: the prior that was loaded.
 
     Raises:
         InputError, PriorError: settings that suit no recording, a device that cannot be used.
@@ -237,8 +237,8 @@ class KeypointFileTracker:
         """Return the poses of a file; `failed_at` names the frame in which the filter degenerated.
 
         Args:
-            keypoints: of the file. prepared: what `prepare` returned for it, if that was called.
-            progress: show a bar.
+            keypoints: the keypoints of the file. prepared: the result of `prepare` for it, if that was
+                called. progress: whether to show a progress bar.
 
         Raises:
             TorchposeError: keypoints that the settings do not suit.

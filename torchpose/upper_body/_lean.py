@@ -1,4 +1,4 @@
-"""Follow how far a torso leans to a side, as the line between its shoulders is seen to."""
+"""Follow the lean of a torso to a side, by the slope of the line between its shoulders in the image."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.skeleton._joint_sets import UPPER_BODY
-from torchpose.upper_body._root_grid import with_axes
+from torchpose.upper_body._torso import with_axes
 
 __all__ = ["lean_angle", "rolled", "seen_lean"]
 
@@ -34,8 +34,8 @@ def seen_lean(
     short, and keeps the line level where the shoulders are seen one behind the other.
 
     Args:
-        moments: of the frame before. rays: K^-1 [u, v, 1] of the joints. known: which are measured.
-        depth: of the body, metres. fps: frames per second.
+        moments: the moments after the frame before. rays: K^-1 [u, v, 1] of the joints. known: which
+            joints are measured. depth: the depth of the body, metres. fps: frames per second.
     """
     apart = (rays[:, _LEFT] - rays[:, _RIGHT]) * depth[:, None]
     dx, dy = apart[:, 0], apart[:, 1]
@@ -46,12 +46,12 @@ def seen_lean(
 
 
 def lean_angle(moments: Float[Tensor, "B 2"]) -> Float[Tensor, " B"]:
-    """Return the angle of a torso that has these moments, radians; a small one is that of a shoulder.
+    """Return the angle by which a torso leans, radians; small slopes are taken for a raised shoulder.
 
         x = atan2(m_2, m_1) / 2,   x^3 / (x^2 + x_0^2)
 
     Args:
-        moments: of `seen_lean`.
+        moments: the moments m of `seen_lean`.
     """
     seen = (moments != 0).any(1)
     first = torch.where(seen, moments[:, 0], torch.ones_like(moments[:, 0]))

@@ -19,8 +19,9 @@ class LimbNodes(NamedTuple):
     """Hypotheses about one limb.
 
     Attributes:
-        ends: of the limb, camera axes, [..., G, 3]. directions: unit vectors from its near end to it.
-        log_weight: log of the likelihood of the pixel times the node's share of the sphere of
+        ends: the far ends of the limb, camera axes, [..., G, 3]. directions: unit vectors from its near
+            end to them.
+        log_weight: the log of the likelihood of the pixel times the node's share of the sphere of
             directions, [..., G]. A sum over nodes, times a density over directions, is its integral.
     """
 
@@ -49,7 +50,7 @@ def nodes_on_ray(
     pixels up to their noise.
 
     Args:
-        start: near end of the limb, metres. ray: of the far end's pixel, of any length.
+        start: the near end of the limb, metres. ray: the ray of the far end's pixel, of any length.
         length: L. std: sigma, metres. n_nodes: G.
     """
     along = normalize(ray, dim=-1)
@@ -74,7 +75,7 @@ def nodes_anywhere(
     """Return nodes evenly over the sphere of directions, for a limb whose end is not measured.
 
     Args:
-        start: near end of the limb. length: L. n_nodes: G.
+        start: the near end of the limb, metres. length: L. n_nodes: G.
     """
     points = sphere_points(n_nodes).to(start)
     directions = points.expand(*start.shape[:-1], -1, -1)

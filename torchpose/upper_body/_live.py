@@ -7,9 +7,9 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchpose.upper_body._fusion import MotionState
-from torchpose.upper_body._measurements import Picked
+from torchpose.upper_body._picked import Picked
 from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
-from torchpose.upper_body._screening import ScreenState
+from torchpose.upper_body._screen_tracks import ScreenState
 
 __all__ = ["LivePose", "StreamState", "live_pose", "unseen_frames"]
 
@@ -18,11 +18,11 @@ class StreamState(NamedTuple):
     """State of `UpperBodyTracker.step` between two frames.
 
     Attributes:
-        estimator: state of the method's estimator.
-        motion: state of the motion stage; None before the first frame, and where there is no stage.
-        unseen: number of frames since any joint was measured, [B].
-        n_keypoints: J. picked: where the eight joints are among them, and what was assumed.
-        screen: state of the search for outliers; None where there is none.
+        estimator: the state of the method's estimator.
+        motion: the state of the motion stage; None before the first frame, and where there is no stage.
+        unseen: the number of frames since any joint was measured, [B].
+        n_keypoints: J. picked: the places of the eight joints among them, and the assumptions.
+        screen: state of the outlier screening; None without any.
     """
 
     estimator: Any
@@ -36,6 +36,9 @@ class StreamState(NamedTuple):
 class LivePose(NamedTuple):
     """Holds the poses of one frame of B streams, under the names that `PoseTrack` has for all frames.
 
+    A `PoseTrack` says with `failed_at` in which frame a filter degenerated; `failed` is here, as
+    `PoseTrack.failed` is there, whether it has by now.
+
     Attributes:
         joints2d: [B, 8, 2], pixels of the camera; joints in the order of `UPPER_BODY`.
         joints3d: [B, 8, 3], metres, in the tracker's frame.
@@ -44,7 +47,7 @@ class LivePose(NamedTuple):
         log_evidence: of the left and the right arm, [B, 2].
         effective_sample_size: of the particles or tracks of each arm, [B, 2]; see `PoseTrack`.
         unseen: seconds since any joint was measured, [B]; 0 where one is.
-        failed: [B], True where the filter degenerated: poses are NaN until the stream is begun anew.
+        failed: [B], True where the filter degenerated: poses are NaN until the stream is reinitialised.
         inlier_probability: that the keypoint of a joint is no outlier, [B, 8]; see `PoseTrack`.
         bone_lengths: [B, 4], metres. bone_covariance: [B, 4, 4]; see `PoseTrack`.
     """
@@ -67,17 +70,17 @@ def live_pose(track: PoseTrack, unseen: Tensor) -> LivePose:
     """Return the poses of a track of one frame.
 
     Args:
-        track: [B, 1, ...]. unseen: seconds since any joint was measured, [B].
+        track: the track of one frame, [B, 1, ...]. unseen: seconds since any joint was measured, [B].
     """
     fields = {name: getattr(track, name)[:, 0] for name in FRAME_FIELDS}
     return LivePose(**fields, unseen=unseen, failed=track.failed)
 
 
 def unseen_frames(before: Int[Tensor, " B"], seen: Bool[Tensor, "B T"]) -> Int[Tensor, " B"]:
-    """Return the number of frames since anything was seen, after T more.
+    """Return the number of frames since anything was measured, after T more.
 
     Args:
-        before: that number before them. seen: whether anything was seen in each.
+        before: that number before them. seen: whether anything was measured in each.
     """
     n_frames = seen.shape[1]
     frames = torch.arange(1, n_frames + 1, device=seen.device)

@@ -13,22 +13,23 @@ from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import map_pixel_covariance, map_pixels
 from torchpose.errors import InputError
 from torchpose.priors._upper_body import UpperBodyPrior
-from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
+from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import KINECT_NECK, NeckFraction
-from torchpose.skeleton._upper_body import ARM_JOINTS, upper_body_indices
-from torchpose.upper_body._face import FACE, FacePoints, measure_face
+from torchpose.skeleton._upper_body import ARM_JOINTS
+from torchpose.upper_body._face import FacePoints, measure_face
+from torchpose.upper_body._picked import Picked
+from torchpose.upper_body._picked import pick_joints as pick_joints  # for `torchpose.measurements`
 
 __all__ = [
     "MeasuredJoints",
-    "Picked",
     "append_blocks",
     "arm_measurements",
     "check_gaps",
+    "check_sequences",
     "in_prior_pixels",
     "joint_covariances",
     "known_covariances",
     "measure_joints",
-    "pick_joints",
     "pixel_indices",
     "pixels_per_metre",
     "place_measured_neck",
@@ -36,13 +37,10 @@ __all__ = [
 
 _DEFAULT_STD = 3.0  # pixels
 _LEAST_CONFIDENCE = 0.05
-_NECK_HEIGHT, _NECK_SPREAD = (
-    0.105,
-    0.035,
-)  # metres above the middle of the shoulders, without a head
-_LEFT, _HEAD, _NECK, _RIGHT = (
-    UPPER_BODY.index(name) for name in ("shoulder_left", "head", "neck", "shoulder_right")
-)
+# Metres of the neck above the middle of the shoulders where there is no head, and their spread.
+_NECK_HEIGHT, _NECK_SPREAD = 0.105, 0.035
+_HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
+_LEFT, _RIGHT = UPPER_BODY.index("shoulder_left"), UPPER_BODY.index("shoulder_right")
 
 
 class MiddlePoint(NamedTuple):
@@ -64,8 +62,9 @@ class MeasuredJoints(NamedTuple):
         uv: [B, T, 8, 2], zero where missing. mask: [B, T, 8], True where measured.
         cov: R of each joint, [8, 2, 2], or [B, T, 8, 2, 2] if it changes.
         face: pixels of nose, eyes and ears, None if none is among the keypoints.
-        middle: what the neck was put by (`place_measured_neck`); None where it was measured itself.
-        confidence: in the keypoints, [B, T, 8], 1 where missing; None where a detector gives none.
+        middle: the point by which the neck was put (`place_measured_neck`); None where the neck itself was
+            measured.
+        confidence: the confidence of the detector, [B, T, 8], 1 where missing; None where it gives none.
     """
 
     uv: Tensor
@@ -74,109 +73,6 @@ class MeasuredJoints(NamedTuple):
     face: FacePoints | None = None
     middle: MiddlePoint | None = None
     confidence: Tensor | None = None
-
-
-class Picked(NamedTuple):
-    """Places of the eight joints among the keypoints.
-
-    Attributes:
-        indices: of each, -1 if absent; with `middle`, that of the neck is the keypoint that lies in
-            the middle of the shoulders.
-        middle: whether the neck is to be put between that, or else the middle of the measured
-            shoulders, and the head (`place_measured_neck`).
-        notes: what was assumed about the neck. of_hands: about hands of another kind than the prior's,
-            by estimators that take one kind for the other.
-        hand: kind of the hands, "hand" or "wrist"; None where the names do not tell.
-        face: places of nose, eyes and ears (`FACE`) among the keypoints, -1 if absent.
-    """
-
-    indices: tuple[int, ...]
-    middle: bool
-    notes: tuple[str, ...]
-    hand: str | None = None
-    face: tuple[int, ...] = (-1,) * len(FACE)
-    of_hands: tuple[str, ...] = ()
-
-    @property
-    def wrists_for_hands(self) -> bool:
-        """Return whether wrists are measured where the prior has hands."""
-        return self.hand == "wrist" and bool(self.of_hands)
-
-    @property
-    def middle_alone(self) -> bool:
-        """Return whether the middle of the shoulders is all that is measured of them."""
-        return self.middle and min(self.indices[_LEFT], self.indices[_RIGHT]) < 0
-
-    @property
-    def there(self) -> list[bool]:
-        """Return which of the eight joints are among the keypoints."""
-        return [i >= 0 for i in self.indices]
-
-
-def pick_joints(
-    n_joints: int,
-    names: Sequence[str] | None,
-    neck: str | None,
-    wanted_neck: str | None,
-    wanted_hand: str | None,
-) -> Picked:
-    """Find the eight joints among the keypoints.
-
-    Args:
-        n_joints: number of keypoints. names: of them, None if they are the eight in order.
-        neck: kind of neck of the keypoints where the names do not tell; one of another kind than
-            `wanted_neck` is not measured as it is. wanted_neck, wanted_hand: the prior's kinds.
-
-    Raises:
-        InputError: names missing, or not as many as keypoints. SkeletonError: unknown names.
-    """
-    if names is None:
-        if n_joints != len(UPPER_BODY):
-            raise InputError(
-                f"names may be left out only for the {len(UPPER_BODY)} joints "
-                f"{', '.join(UPPER_BODY)}; got {n_joints} keypoints without names"
-            )
-        names = UPPER_BODY
-    if len(names) != n_joints:
-        raise InputError(
-            f"names must name each of the {n_joints} keypoints, got {len(names)} names"
-        )
-    found = upper_body_indices(names)
-    indices = list(found.indices)
-    kind = neck or found.neck
-    middle, notes = False, []
-    other = indices[_NECK] >= 0 and None not in (kind, wanted_neck) and kind != wanted_neck
-    if other or indices[_NECK] < 0:
-        indices[_NECK] = indices[_NECK] if kind == "mid-shoulder" else -1
-        shoulders = min(indices[_LEFT], indices[_RIGHT]) >= 0
-        middle = wanted_neck == "neck" and (shoulders or indices[_NECK] >= 0)
-        if not middle:
-            indices[_NECK] = -1
-        notes += _neck_notes(kind if other else None, wanted_neck, middle)
-    of_hands: tuple[str, ...] = ()
-    if found.hand is not None and wanted_hand is not None and found.hand != wanted_hand:
-        of_hands = (f"the keypoints' {found.hand}s stand for the prior's {wanted_hand}s",)
-    known = canonical_names(names)
-    face = tuple(known.index(name) if name in known else -1 for name in FACE)
-    return Picked(tuple(indices), middle, tuple(notes), found.hand, face, of_hands)
-
-
-def _neck_notes(kind: str | None, wanted: str | None, middle: bool) -> list[str]:
-    """Return what is done about a neck of another kind, or about one that is missing (None)."""
-    if middle:
-        own = (
-            "there is no neck among the keypoints"
-            if kind is None
-            else (f"the keypoints' neck ({kind}) is not the prior's ({wanted})")
-        )
-        share = f"{100 * KINECT_NECK.fraction:.0f} %"
-        return [
-            f"{own}: put {share} of the way from the middle of the shoulders to the head, and upright "
-            "above them where there is no head"
-        ]
-    if kind is None:
-        return []
-    return [f"the keypoints' neck ({kind}) is not the prior's ({wanted}): not measured"]
 
 
 def pixels_per_metre(prior: UpperBodyPrior) -> float:
@@ -197,9 +93,9 @@ def place_measured_neck(
     filter does not know.
 
     Args:
-        measured: whose neck is a keypoint in the middle of the shoulders; where that is missing, the
-            middle of two measured shoulders does. pixels_per_metre: at the body's usual distance.
-        neck: f and s.
+        measured: the joints, whose neck is a keypoint in the middle of the shoulders; where that is
+            missing, the middle of two measured shoulders does.
+        pixels_per_metre: the scale at the body's usual distance. neck: f and s.
     """
     uv, mask, cov = (x.clone() for x in measured[:3])
     point = MiddlePoint(
@@ -235,7 +131,7 @@ def place_measured_neck(
 def known_covariances(
     covariance: Float[Tensor, "B T J 2 2"], keypoints: Float[Tensor, "B T J 2"]
 ) -> Float[Tensor, "B T J 2 2"]:
-    """Return the covariances of the keypoints that are there, and the identity for the others."""
+    """Return the covariances of the keypoints that are measured, and the identity for the others."""
     check_shape("covariance", covariance, [*keypoints.shape, 2])
     eye = torch.eye(2).to(keypoints)
     there = keypoints.isfinite().all(-1)[..., None, None]
@@ -257,8 +153,8 @@ def measure_joints(
     Args:
         keypoints: NaN where missing. confidence: [B, T, J] in 0..1, or None: at 0 or NaN a keypoint is
             missing, and between, R is divided by it. mask: [B, T, J], False = ignore, or None.
-        indices: of the eight joints among the keypoints, -1 if absent. cov: R at full confidence.
-        own_cov: R of every single keypoint in place of that.
+        indices: the places of the eight joints among the keypoints, -1 if absent. cov: R at full
+            confidence. own_cov: R of every single keypoint instead.
 
     Raises:
         InputError: infinite values, or the confidence of a measured keypoint is outside 0..1.
@@ -304,8 +200,9 @@ def in_prior_pixels(
 
     Args:
         keypoints, confidence, mask, covariance: as in `UpperBodyTracker.forward`.
-        picked: where the joints are among them. prior, camera: whose pixels are wanted and given.
-        measurement_cov: R where `covariance` does not say, in the prior's pixels.
+        picked: the places of the joints among them. prior, camera: the prior, in whose pixels the result
+            is, and the camera of the keypoints.
+        measurement_cov: R without `covariance`, in the prior's pixels.
 
     Raises:
         ShapeError, InputError: as `measure_joints`. CovarianceError: a covariance that is none.
@@ -338,6 +235,21 @@ def _check_confidence(confidence: Tensor, measured: Bool[Tensor, "B T J"]) -> No
         )
 
 
+def check_sequences(keypoints: Tensor) -> Float[Tensor, "B T J 2"]:
+    """Return keypoints of whole sequences after checks of type and shape.
+
+    Raises:
+        InputError: integers, no sequence or no frame. ShapeError: another shape.
+    """
+    check_floating("keypoints", keypoints)
+    check_shape("keypoints", keypoints, ["B", "T", "J", 2])
+    if keypoints.shape[0] == 0 or keypoints.shape[1] == 0:
+        raise InputError(
+            f"keypoints must hold at least one sequence of one frame, got {list(keypoints.shape)}"
+        )
+    return keypoints
+
+
 def check_gaps(
     measured: Bool[Tensor, "B T 8"],
     lengths: Int[Tensor, " B"] | None,
@@ -358,6 +270,10 @@ def check_gaps(
     inside = torch.ones_like(frames, dtype=torch.bool)
     if lengths is not None:
         check_shape("lengths", lengths, [batch])
+        if lengths.is_floating_point() or bool(((lengths < 1) | (lengths > n_frames)).any()):
+            raise InputError(
+                f"lengths must be integers from 1 to {n_frames}, got {lengths.tolist()}"
+            )
         inside = frames < lengths.to(measured.device)[:, None]
     seen = measured.any(-1) & inside
     empty = torch.nonzero(~seen.any(1)).flatten().tolist()
@@ -387,9 +303,9 @@ def joint_covariances(
     """Return R of each of the eight joints in the prior's pixels.
 
     Args:
-        prior: whose pixels are meant, and whose noise is taken where none is stated.
-        std: of a keypoint, pixels of the camera: None, one number, or one for each of `ARM_JOINTS`.
-        matrix: K of that camera.
+        prior: the prior, in whose pixels the result is, and whose noise is taken where none is stated.
+        std: the standard deviation of a keypoint, pixels of the camera: None, one number, or one for each
+            of `ARM_JOINTS`. matrix: K of that camera.
 
     Raises:
         ShapeError, InputError: another number of deviations, or some that are not positive.

@@ -21,7 +21,8 @@ from torchpose.upper_body._articulated import ArticulatedFilter
 from torchpose.upper_body._estimator import Estimator
 from torchpose.upper_body._multiple_models import MultipleModelFilter
 from torchpose.upper_body._single_poses import PoseFilter, ProcessNoise
-from torchpose.upper_body._windows import WindowMixture, suitable_window
+from torchpose.upper_body._window_view import suitable_window
+from torchpose.upper_body._windows import WindowMixture
 
 __all__ = [
     "BONES",
@@ -31,13 +32,14 @@ __all__ = [
     "Chosen",
     "Method",
     "check_options",
+    "check_steady",
     "choose_method",
     "method_options",
     "noise_options",
-    "options_of_before",
     "options_of_window",
     "process_cov",
     "register_method",
+    "replace_window",
 ]
 
 WINDOWS = "window-mixture"
@@ -125,7 +127,7 @@ def process_cov(prior: UpperBodyPrior, side: str, method: str) -> Tensor:
     """Return Q of a method, per frame at the prior's own rate; see `ProcessNoise`.
 
     Args:
-        prior: whose noise is taken. side: "left" or "right". method: over single poses.
+        prior: the prior that brings the noise. side: "left" or "right". method: one over single poses.
 
     Raises:
         InputError: no such method, or one that has no process noise.
@@ -161,12 +163,31 @@ def check_options(method: str, options: Iterable[str]) -> None:
     refuse_unused(options, said, method, METHODS, method_options)
 
 
+def check_steady(steady: bool | None, estimator: Estimator, method: str) -> bool:
+    """Return whether the poses of an estimator pass the motion stage.
+
+    Args:
+        steady: as in `UpperBodyTracker`; None is wherever the estimator has ratios for it.
+        estimator: the estimator of the method. method: the name of the method.
+
+    Raises:
+        InputError: steady without ratios.
+    """
+    able = estimator.steadied_by is not None
+    if steady and not able:
+        raise InputError(
+            f"steady=True needs method {WINDOWS!r} and a prior that says how brisk its motions "
+            f"are, got method {method!r}; leave it out"
+        )
+    return able if steady is None else steady
+
+
 class Chosen(NamedTuple):
-    """The estimator that runs, and what is to be said about the choice.
+    """Choice of a method.
 
     Attributes:
-        method: one of `METHODS`. notes: in plain words.
-        free: whether nobody asked for it, or for what only some methods can do.
+        method: one of `METHODS`. notes: about the choice, in plain words.
+        free: whether the method follows from the joints: the caller named none, nor an option of one.
     """
 
     method: str
@@ -174,14 +195,14 @@ class Chosen(NamedTuple):
     free: bool = False
 
     def with_joints(self, there: Sequence[bool], wrists: bool) -> str:
-        """Return the method for these joints: that of bones where wrists stand for the prior's hands.
+        """Return the method for these joints: "articulated" where wrists stand for the prior's hands.
 
-        Other methods do not tell the two apart. So it is where both shoulders and an elbow are measured, and
-        the prior has no windows that suit.
+        Other methods take one for the other. It is "articulated" also where both shoulders and an elbow are
+        measured and the prior has no windows that suit.
 
         Args:
-            there: whether each of `UPPER_BODY` is measured. wrists: whether they stand for the prior's
-                hands.
+            there: whether each of `UPPER_BODY` is measured. wrists: whether wrists are measured in place
+                of the prior's hands.
         """
         seen = {name for name, known in zip(UPPER_BODY, there, strict=True) if known}
         whole = {"shoulder_left", "shoulder_right"} <= seen
@@ -245,7 +266,7 @@ def _default(
     options: Iterable[str],
     free: bool,
 ) -> Chosen:
-    """Return the choice where no method was named."""
+    """Return the choice of a method where none was named."""
     if set(method_options(BONES)) & set(options):  # of no other method
         return Chosen(BONES, ())
     poses = sorted(_POSE_OPTIONS & set(options))
@@ -266,7 +287,7 @@ def _default(
 
 
 def _missing(prior: UpperBodyPrior, smoothing: int | str | None, fps: float | None) -> str:
-    """Return why the prior has no window that suits."""
+    """Return the reason for which no window of the prior suits, for a note or an error."""
     name = "causal" if smoothing is None else "full"
     if name not in prior.windows:
         use = "filtering" if smoothing is None else "smoothing"
@@ -275,10 +296,10 @@ def _missing(prior: UpperBodyPrior, smoothing: int | str | None, fps: float | No
     return f"the prior's windows look {ahead} frames ahead, and smoothing may use {smoothing}"
 
 
-def options_of_before(
+def replace_window(
     method: str | None, window: bool, steady: bool | None
 ) -> tuple[str | None, bool | None]:
-    """Return the method and `steady` that the former argument `window` stands for.
+    """Return the method and `steady` that the deprecated argument `window` stands for.
 
     "mkf-fixed" stood for both, windows unless `window` was False; other methods took `window` and
     `steady` and did without.
@@ -296,11 +317,11 @@ def options_of_before(
 def options_of_window(
     method: str | None, window: bool, steady: bool | None
 ) -> tuple[str | None, bool | None]:
-    """Return `options_of_before`, and warn whoever made the tracker."""
+    """Return `replace_window`, with a `DeprecationWarning` for the caller of the tracker."""
     warnings.warn(
         f"window={window} is deprecated: method={WINDOWS!r} follows windows of motion, "
         f"{SINGLE_POSES!r} single poses, and without a method the tracker chooses",
         DeprecationWarning,
         stacklevel=3,
     )
-    return options_of_before(method, window, steady)
+    return replace_window(method, window, steady)

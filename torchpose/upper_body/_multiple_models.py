@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchpose.filters._base import Generators
 from torchpose.math._rotations import (
     RotationOrder,
     euler_to_matrix,
@@ -23,11 +22,13 @@ from torchpose.priors._arms import ArmPrior
 from torchpose.upper_body._articulated import ArticulatedFilter, ArticulatedState
 from torchpose.upper_body._articulated_poses import ELBOWS, HANDS
 from torchpose.upper_body._estimator import (
+    ArmGenerators,
     ArmJoints,
     Estimates,
     Estimator,
     ReadOut,
     TrackerModel,
+    repeat_last,
 )
 from torchpose.upper_body._fusion import (
     MotionStage,
@@ -57,14 +58,14 @@ class MultipleModelState(NamedTuple):
     """State of `MultipleModelFilter` between two frames.
 
     Attributes:
-        windows, articulated: of both models. motion: of the stage that steadies windows.
-        said: sum of what frames said for windows, and of their weights, [B, 2].
+        windows, articulated: the states of both models. motion: the state of the motion stage of windows.
+        ratios: the discounted sums of the log-likelihood ratios of windows and of their weights, [B, 2].
     """
 
     windows: WindowState
     articulated: ArticulatedState
     motion: MotionState | None
-    said: Tensor
+    ratios: Tensor
 
 
 class MultipleModelFilter(Estimator):
@@ -102,26 +103,26 @@ class MultipleModelFilter(Estimator):
         self.order: RotationOrder = model.prior.info.rotation_order  # type: ignore[assignment]
 
     def init(
-        self, batch_size: int, joints: ArmJoints, generators: dict[str, Generators]
+        self, batch_size: int, joints: ArmJoints, arm_generators: ArmGenerators
     ) -> MultipleModelState:
         """Return the state before the first frame; see `Estimator`."""
         return MultipleModelState(
-            self.windows.init(batch_size, joints, generators),
-            self.articulated.init(batch_size, joints, generators),
+            self.windows.init(batch_size, joints, arm_generators),
+            self.articulated.init(batch_size, joints, arm_generators),
             None,
             self.matrix.new_zeros(batch_size, 2),
         )
 
     def advance(
-        self, state: MultipleModelState, measured: MeasuredJoints
+        self, state: MultipleModelState, measured: MeasuredJoints, progress: bool = False
     ) -> tuple[MultipleModelState, Estimates]:
         """Return the next state and the estimates of T more frames; see `Estimator`."""
         windows, seen = self.windows.advance(state.windows, measured)
-        articulated, bodies = self.articulated.advance(state.articulated, measured)
+        articulated, bodies = self.articulated.advance(state.articulated, measured, progress)
         reading, motion = read_out(seen, self.matrix, self.order), state.motion
         if self._stage is not None:
             motion, reading = self._stage.advance(motion or self._stage.init(reading), reading)
-        sums = self._sums(state.said, _said(seen, bodies, measured))
+        sums = self._sums(state.ratios, _log_ratios(seen, bodies, measured))
         mixed = self._mixed(sums, reading, seen, bodies, measured)
         return MultipleModelState(windows, articulated, motion, sums[:, -1]), mixed
 
@@ -129,7 +130,7 @@ class MultipleModelFilter(Estimator):
         self,
         measured: MeasuredJoints,
         joints: ArmJoints,
-        generators: dict[str, Generators],
+        arm_generators: ArmGenerators,
         lengths: Tensor | None = None,
         progress: bool = False,
     ) -> Estimates:
@@ -137,36 +138,38 @@ class MultipleModelFilter(Estimator):
 
         With smoothing "full" the log-odds are those of the frames before and after.
         """
-        seen = self.windows.forward(measured, joints, generators, lengths)
-        bodies = self.articulated.forward(measured, joints, generators, lengths, progress)
+        if self.model.smoothing is None:
+            return super().forward(measured, joints, arm_generators, lengths, progress)
+        seen = self.windows.forward(measured, joints, arm_generators, lengths)
+        bodies = self.articulated.forward(measured, joints, arm_generators, lengths, progress)
         reading = read_out(seen, self.matrix, self.order)
         if self._stage is not None:
             lag = stage_lag(self.model.smoothing, self.windows.ahead)
             reading = self._stage(reading, lengths, lag)
-        said = _said(seen, bodies, measured)
+        ratios = _log_ratios(seen, bodies, measured)
         if lengths is not None:
-            frames = torch.arange(said.shape[1], device=said.device)
-            said = said * (frames < lengths.to(said.device)[:, None])[..., None]
-        none = said.new_zeros(len(said), 2)
-        sums = self._sums(none, said)
+            frames = torch.arange(ratios.shape[1], device=ratios.device)
+            ratios = ratios * (frames < lengths.to(ratios.device)[:, None])[..., None]
+        none = ratios.new_zeros(len(ratios), 2)
+        sums = self._sums(none, ratios)
         if self.model.smoothing == "full":
-            sums = sums + self._sums(none, said.flip(1)).flip(1) - said
-        return self._mixed(sums, reading, seen, bodies, measured)
+            sums = sums + self._sums(none, ratios.flip(1)).flip(1) - ratios
+        return repeat_last(self._mixed(sums, reading, seen, bodies, measured), lengths)
 
     @property
     def _stage(self) -> MotionStage | None:
-        """Return what steadies windows, None if nothing shall or their prior brings no ratios."""
+        """Return the motion stage of windows; None if it is switched off or the prior brings no ratios."""
         ratios, model = self.windows.steadied_by, self.model
         if ratios is None or not model.steadied:
             return None
         return kept_stage(model.owner, ratios, model.rate, model.measurement_cov)
 
     def _sums(
-        self, before: Float[Tensor, "B 2"], said: Float[Tensor, "B T 2"]
+        self, before: Float[Tensor, "B 2"], ratios: Float[Tensor, "B T 2"]
     ) -> Float[Tensor, "B T 2"]:
-        """Return the sums of what frames said and of their weights after each frame."""
+        """Return the discounted sums of the log-likelihood ratios and of their weights after each frame."""
         sums = []
-        for now in said.unbind(1):
+        for now in ratios.unbind(1):
             before = self.forget * before + now
             sums.append(before)
         return torch.stack(sums, 1)
@@ -179,11 +182,12 @@ class MultipleModelFilter(Estimator):
         bodies: Estimates,
         measured: MeasuredJoints,
     ) -> Estimates:
-        """Return the average of both models, with the evidence of the mixture.
+        """Return the mixture of both models, with its log-evidence.
 
         Args:
-            sums: of what frames said and of their weights. reading: of windows, steadied.
-            seen, bodies: what the two estimated. measured: the joints.
+            sums: the discounted sums of the log-likelihood ratios and of their weights.
+            reading: the poses of windows, after their motion stage.
+            seen, bodies: the estimates of windows and of bones. measured: the measurements.
         """
         if bodies.reading is None:
             raise RuntimeError("an articulated filter reads its poses itself")
@@ -191,8 +195,8 @@ class MultipleModelFilter(Estimator):
         if self.model.calibrated:
             noise, mode = self.model.prior.noise, str(self.windows.calibration)
             reading = reading._replace(covs=recalibrated(reading.covs, noise, mode))
-        mean_said = sums[..., 0] / sums[..., 1].clamp_min(1e-12)
-        share = torch.sigmoid(_FIRST + _SHARE * mean_said)
+        mean_ratio = sums[..., 0] / sums[..., 1].clamp_min(1e-12)
+        share = torch.sigmoid(_FIRST + _SHARE * mean_ratio)
         mixed = _averaged(share, reading, bodies.reading, self.order)
         if self.model.calibrated:
             trust = 1 - _BETWEEN * 4 * share * (1 - share)
@@ -205,8 +209,10 @@ class MultipleModelFilter(Estimator):
         return Estimates(arms[0], arms[1], None, mixed, bodies.bones)
 
 
-def _said(seen: Estimates, bodies: Estimates, measured: MeasuredJoints) -> Float[Tensor, "B T 2"]:
-    """Return by how much windows gave both arms a higher log-density, and one where any was measured."""
+def _log_ratios(
+    seen: Estimates, bodies: Estimates, measured: MeasuredJoints
+) -> Float[Tensor, "B T 2"]:
+    """Return the log-likelihood ratio of windows to bones for both arms, and 1 where a limb is measured."""
     ours, theirs = (x.left.log_evidence + x.right.log_evidence for x in (seen, bodies))
     some = measured.mask[..., _LIMBS].any(-1)
     apart = torch.where(some, (ours - theirs).nan_to_num(0.0), 0.0)
@@ -219,7 +225,7 @@ def _averaged(
     """Return two readings averaged in camera axes, with the moments of a mixture.
 
     Args:
-        share: of the first. order: of their angles.
+        share: the weight of the first. ours, theirs: the two readings. order: the order of their angles.
     """
     turns = [euler_to_matrix(reading.angles, order) for reading in (ours, theirs)]
     vectors = matrix_to_quaternion_vector(torch.stack(turns, -3))
@@ -238,7 +244,7 @@ def _averaged(
 def _moments(
     share: Float[Tensor, "B T"], ours: tuple[Tensor, Tensor], theirs: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """Return mean and covariance of a mixture of two, given theirs."""
+    """Return mean and covariance of a mixture of two components, given theirs and the first one's weight."""
     weight = share[..., None, None]
     mean = theirs[0].lerp(ours[0], weight)
     apart = ours[0] - theirs[0]

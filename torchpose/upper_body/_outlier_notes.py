@@ -1,4 +1,4 @@
-"""Say in words how many keypoints were outliers, and how often hands were exchanged."""
+"""Note the number of outliers among the keypoints, and of frames with exchanged hands."""
 
 import re
 from collections.abc import Iterable
@@ -21,8 +21,9 @@ def outlier_notes(
     """Return a note about outliers and exchanged hands; nothing where there were none.
 
     Args:
-        probability: that keypoints are no outliers. exchanged: whether left and right were, or in how
-            many frames. lengths: frames of each sequence, None for all.
+        probability: the probability that a keypoint is no outlier. exchanged: whether left and right were
+            exchanged, or the number of frames in which they were. lengths: the number of frames of each
+            sequence; None is all.
     """
     outliers = probability < 0.5
     if lengths is not None:
@@ -46,7 +47,7 @@ def without_outliers(notes: Iterable[str]) -> tuple[str, ...]:
 
 
 def exchanged_frames(notes: Iterable[str]) -> int:
-    """Return in how many frames `outlier_notes` says that hands were exchanged."""
+    """Return the number of frames with exchanged hands in the notes of `outlier_notes`."""
     found = (re.search(rf"{_EXCHANGED} (\d+) frame", note) for note in notes)
     return sum(int(match[1]) for match in found if match)
 

@@ -61,11 +61,11 @@ class BvhMotion(NamedTuple):
     """Skeleton and motion of T frames for a BVH file.
 
     Attributes:
-        lengths: of the bones that end in `ends` [7], centimetres.
-        position: of the neck, the root [T, 3], centimetres; x left, y up, z forward.
+        lengths: the lengths of the bones that end in `ends` [7], centimetres.
+        position: the place of the neck, the root [T, 3], centimetres; x left, y up, z forward.
         angles: about z, x and y, in this order, degrees: the root's, then those of the nodes in the
             order of the file, tips (zero) included [T, 11, 3].
-        ends: names of the joints at which the bones end.
+        ends: the names of the joints at which the bones end.
     """
 
     lengths: Tensor

@@ -34,12 +34,9 @@ FRAME_FIELDS = (
 )
 """What a `PoseTrack` holds for every frame."""
 
-_ADDED = (
-    "effective_sample_size",
-    "inlier_probability",
-    "bone_lengths",
-    "bone_covariance",
-)  # files of older releases have none
+# Files of older releases have none of these.
+_ADDED = ("effective_sample_size", "inlier_probability", "bone_lengths", "bone_covariance")
+# Kinds and sizes in a file, of several sequences behind that of the batch.
 _FIELDS = {
     "joints2d": ("f", "T 8 2"),
     "joints3d": ("f", "T 8 3"),
@@ -54,7 +51,7 @@ _FIELDS = {
     "lengths": ("i", ""),
     "failed_at": ("i", ""),
     "K": ("f", "3 3"),
-}  # kinds and sizes in a file, of several sequences behind that of the batch
+}
 
 
 @dataclass
@@ -213,13 +210,8 @@ class PoseTrack:
                 agree: other shapes or types, joints without a covariance, values out of range.
             CameraError: K is no camera matrix.
         """
-        required = (
-            *(key for key in _FIELDS if key not in _ADDED),
-            "names",
-            "frame",
-            "fps",
-            "notes",
-        )
+        always = [key for key in _FIELDS if key not in _ADDED]
+        required = (*always, "names", "frame", "fps", "notes")
         arrays = read_npz(path, required, ("first_frame", "method", "bone_names", *_ADDED))
         fields = {key: size for key, size in _FIELDS.items() if key in arrays}
         single = arrays["joints3d"].ndim == 3

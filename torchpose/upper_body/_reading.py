@@ -18,6 +18,7 @@ from torchpose.upper_body._estimator import (
     Estimator,
     first_failure,
     mending_notes,
+    repeat_reading,
 )
 from torchpose.upper_body._fusion import (
     MotionStage,
@@ -30,7 +31,9 @@ from torchpose.upper_body._fusion import (
     recalibrated,
 )
 from torchpose.upper_body._methods import METHODS
+from torchpose.upper_body._outlier_notes import outlier_notes
 from torchpose.upper_body._pose_track import PoseTrack
+from torchpose.upper_body._screening import Screened
 
 __all__ = ["PoseReader", "check_frame", "note_collapse"]
 
@@ -39,11 +42,12 @@ class PoseReader(NamedTuple):
     """Reader of poses out of the estimates of both arms.
 
     Attributes:
-        prior, camera: whose pixels the estimates and the results are in.
-        method, estimator: where the estimates come from.
-        stage: steadies the motion; None leaves it as it is.
-        lag: number of later frames that the stage may use, None for all.
+        prior, camera: the prior and the camera, in whose pixels the estimates and the results are.
+        method, estimator: the method, and its estimator that made the estimates.
+        stage: the motion stage; None leaves the motion as it is.
+        lag: the number of later frames that the stage may use; 0 only filters, None is all.
         frame, static_camera, calibrated, fps: as in `UpperBodyTracker`.
+        notes: what was assumed, in plain words.
     """
 
     prior: UpperBodyPrior
@@ -56,6 +60,7 @@ class PoseReader(NamedTuple):
     static_camera: bool
     calibrated: bool
     fps: float | None
+    notes: tuple[str, ...] = ()
 
     @property
     def order(self) -> RotationOrder:
@@ -63,66 +68,72 @@ class PoseReader(NamedTuple):
         order: RotationOrder = self.prior.info.rotation_order  # type: ignore[assignment]
         return order
 
-    def whole(self, estimates: Estimates, lengths: Int[Tensor, " B"] | None) -> ReadOut:
-        """Return the poses of whole sequences, steadied; frames from a failure on play no part.
+    def read(
+        self,
+        motion: MotionState | None,
+        estimates: Estimates,
+        found: Screened,
+        lengths: Int[Tensor, " B"] | None = None,
+    ) -> tuple[MotionState | None, PoseTrack]:
+        """Return the next state of the motion stage, and the poses of T more frames.
 
         Args:
-            estimates: of both arms, [B, T, ...]. lengths: frames of each sequence, [B].
+            motion: the state from the previous call; None before the first frame, and without a stage.
+            estimates: the estimates of both arms, [B, T, ...]. found: the measurements they were made from.
+            lengths: of whole sequences, the number of frames of each, [B]; past it the last pose is
+                repeated. None is T.
         """
-        reading = self._read_out(estimates)
+        matrix = self.prior.info.matrix.to(estimates.left.mean)
+        motion, reading = self._steadied(
+            motion, read_out(estimates, matrix, self.order), estimates, lengths
+        )
+        reading = self._placed(reading, matrix, found.measured.mask)
+        if lengths is None:
+            lengths = torch.full((len(reading.uv),), reading.uv.shape[1], device=reading.uv.device)
+        else:
+            reading = repeat_reading(reading, lengths)
+        notes = self.notes + outlier_notes(found.probability, found.exchanged, lengths)
+        return motion, self._track(reading, estimates, found, lengths, notes)
+
+    def _steadied(
+        self,
+        motion: MotionState | None,
+        reading: ReadOut,
+        estimates: Estimates,
+        lengths: Int[Tensor, " B"] | None,
+    ) -> tuple[MotionState | None, ReadOut]:
+        """Return the next state of the motion stage, and what it makes of the poses.
+
+        A stage that smooths takes whole sequences, of which frames from a failure on play no part.
+        """
         if self.stage is None:
-            return reading
+            return None, reading
+        if self.lag == 0:
+            return self.stage.advance(motion or self.stage.init(reading), reading)
         batch, n_frames = reading.uv.shape[:2]
         ends = torch.full((batch,), n_frames) if lengths is None else lengths
         ends = ends.to(reading.uv.device)
         failed_at = first_failure(estimates.left, estimates.right)
         ends = torch.where(failed_at >= 0, torch.minimum(ends, failed_at.clamp_min(1)), ends)
-        return self.stage(reading, ends, self.lag)
+        return None, self.stage(reading, ends, self.lag)
 
-    def more(
-        self, motion: MotionState | None, estimates: Estimates
-    ) -> tuple[MotionState | None, ReadOut]:
-        """Return the next state of the motion stage, and the poses of some more frames, steadied.
-
-        Args:
-            motion: from the call before, None before the first frame. estimates: [B, T, ...].
-        """
-        reading = self._read_out(estimates)
-        if self.stage is None:
-            return None, reading
-        return self.stage.advance(motion or self.stage.init(reading), reading)
-
-    def _read_out(self, estimates: Estimates) -> ReadOut:
-        return read_out(estimates, self.prior.info.matrix.to(estimates.left.mean), self.order)
-
-    def track(
+    def _track(
         self,
         reading: ReadOut,
         estimates: Estimates,
-        observed: Bool[Tensor, "B T 8"],
-        lengths: Int[Tensor, " B"] | None = None,
-        notes: tuple[str, ...] = (),
-        probability: Float[Tensor, "B T 8"] | None = None,
+        found: Screened,
+        lengths: Int[Tensor, " B"],
+        notes: tuple[str, ...],
     ) -> PoseTrack:
-        """Return the result.
-
-        Args:
-            reading: of the poses. estimates: that it was read from. observed: what was measured.
-            lengths: frames of each sequence, None for all. notes: what was assumed.
-            probability: that the keypoints are no outliers, None where nobody asked.
-        """
+        """Return the result, of poses in the axes that were asked for."""
         left, right = estimates.left, estimates.right
         matrix, own = (m.to(reading.uv) for m in (self.prior.info.matrix, self.camera.matrix))
-        reading = self._placed(reading, matrix, observed)
-        if lengths is None:
-            batch, n_frames = reading.uv.shape[:2]
-            lengths = torch.full((batch,), n_frames, device=reading.uv.device)
         return PoseTrack(
             joints2d=map_pixels(reading.uv, matrix, own),
             joints3d=reading.joints,
             covariance2d=map_pixel_covariance(reading.uv_covs, matrix, own),
             covariance3d=reading.covs,
-            observed=observed,
+            observed=found.measured.mask,
             log_evidence=torch.stack([left.log_evidence, right.log_evidence], -1),
             effective_sample_size=torch.stack(
                 [out.effective_sample_size.double() for out in (left, right)], -1
@@ -134,7 +145,7 @@ class PoseReader(NamedTuple):
             frame=self.frame,
             notes=(*notes, *mending_notes(left, right)),
             method=self.method,
-            inlier_probability=torch.empty(0) if probability is None else probability.to(matrix),
+            inlier_probability=found.probability.to(matrix),
             **_bone_fields(estimates.bones),
         )
 
@@ -165,7 +176,7 @@ def _bone_fields(bones: Bones | None) -> dict[str, Any]:
 
 
 def check_frame(frame: str, static_camera: bool) -> None:
-    """Raise unless the axes of the results are known, and the camera can stand still in them.
+    """Check the axes of the results, and that the camera can stand still in them.
 
     Raises:
         InputError: another frame, or a static camera in the axes of the body.
@@ -188,7 +199,7 @@ def note_collapse(track: PoseTrack) -> PoseTrack:
     still is a Gaussian.
 
     Args:
-        track: of any method; frames that failed or do not know their sample size are not counted.
+        track: a track of any method; frames that failed or have no sample size are not counted.
     """
     method = METHODS.get(track.method)
     if method is None or not method.particles:

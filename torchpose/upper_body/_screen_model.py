@@ -13,7 +13,8 @@ from torchpose.camera._projection import map_pixels
 from torchpose.priors._upper_body import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import OTHER_SIDE
-from torchpose.upper_body._measurements import Picked, pixels_per_metre
+from torchpose.upper_body._measurements import pixels_per_metre
+from torchpose.upper_body._picked import Picked
 
 __all__ = [
     "APART",
@@ -29,11 +30,12 @@ __all__ = [
 
 
 class _Kind(NamedTuple):
-    """What a joint of one kind can do.
+    """Place and motion of joints of one kind.
 
     Attributes:
-        below, spread: its place below the neck and the spread about it, metres.
-        speed: its usual speed. brisk: how much that changes at once where it is brisk, m/s.
+        below, spread: the mean place below the neck and the standard deviation about it, metres.
+        speed: the standard deviation of the velocity, m/s. brisk: that of its change in a frame in which
+            the joint is brisk, m/s.
     """
 
     below: float
@@ -82,18 +84,19 @@ class ScreenModel(NamedTuple):
 
     Attributes:
         dt: seconds between two frames. scale: pixels per metre of the prior's mean pose.
-        low, high: corners of the place where pixels are believed at all [2]. broad: variance of a joint
-            that may be anywhere in the image. start: log (1 - o) / (o u 2 pi), o the share of outliers
-            and u their density.
-        moving: makes (var x, cov x v, var v) of a frame ago those of now [3, 3]. drift, kept: seconds for
-            which a velocity moves a joint, and its share that is left.
-        agitation: what is added, at 1 pixel per metre [8, 3]. jump: variance of a brisk joint's place
-            beyond that [8]. speed: variance of a velocity [8].
-        log_scales: of the person, over `scale` [G]. usual: their log-probability [G]. memory: its share
-            that a frame leaves. below, spread: of each joint for each of them, pixels and squared [G, 8].
-        subsets: every choice of the joints that may be right [S, 8].
+        low, high: corners of the region outside of which every pixel is an outlier [2].
+        broad: the variance of a joint that may be anywhere in the image.
+        start: log (1 - o) / (o u 2 pi), o the share of outliers and u their density.
+        moving: the linear map of (var x, cov x v, var v) over one frame [3, 3].
+        drift, kept: the seconds for which a velocity moves a joint, and the share of it that is left.
+        agitation: the process noise of these moments, at 1 pixel per metre [8, 3].
+        jump: the further variance of the place of a brisk joint [8]. speed: the variance of a velocity [8].
+        log_scales: the logs of the person's scales over `scale` [G]. usual: their prior log-probability [G].
+        memory: the share of their log-weights that a frame keeps.
+        below, spread: the place of each joint below the neck at each scale, pixels, and its variance [G, 8].
+        subsets: all subsets of the joints that are present [S, 8].
         exchanges: for each way to exchange left and right, the joints to take [X, 8].
-        switching: log-probability of each way after each other one [X, X].
+        switching: the log-probability of each way after each other one [X, X].
     """
 
     dt: float
@@ -129,8 +132,8 @@ def kept_screen_model(
     """Return `screen_model`, the same one as long as it holds.
 
     Args:
-        owner: the module with which it is kept. prior, camera, fps: of the tracker.
-        picked: where the joints are among the keypoints. like: tells the device.
+        owner: the module with which the model is kept. prior, camera, fps: those of the tracker.
+        picked: the places of the joints among the keypoints. like: a tensor on the device to work on.
     """
     info, joints = prior.info, tuple(i >= 0 for i in picked.indices)
     joints = tuple(given or (picked.middle and i == _NECK) for i, given in enumerate(joints))
@@ -154,9 +157,10 @@ def screen_model(
     """Return the model for keypoints of a camera.
 
     Args:
-        prior: whose pixels are meant. camera: of the keypoints; without an image size the image is taken to
-            be twice as wide and high as its principal point is far from the origin. fps: frame rate.
-        joints: which of `UPPER_BODY` are among the keypoints. like: tells device and dtype.
+        prior: the prior, in whose pixels the model is. camera: the camera of the keypoints; without an image
+            size the image is taken to be twice as wide and high as its principal point is far from the
+            origin. fps: frames per second. joints: which of `UPPER_BODY` are among the keypoints.
+        like: a tensor of the dtype and on the device to work in.
     """
     own, wanted = camera.matrix.to(like), prior.info.matrix.to(like)
     corners = map_pixels(
@@ -199,7 +203,7 @@ def _image_size(camera: PinholeCamera) -> Float[Tensor, "2"]:
 
 
 def _subsets(present: tuple[bool, ...]) -> Float[Tensor, "S 8"]:
-    """Return every choice of the joints that are there."""
+    """Return all subsets of the joints that are present."""
     there = [i for i, given in enumerate(present) if given]
     rows = torch.arange(2 ** len(there))
     chosen = torch.zeros(len(rows), len(present))

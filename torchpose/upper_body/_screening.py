@@ -17,57 +17,40 @@ from torchpose.upper_body._measurements import MeasuredJoints
 from torchpose.upper_body._screen_model import (
     APART,
     BRISK,
-    CERTAIN,
     OUTLIERS,
     SLACK,
     TAKEOVER,
     ScreenModel,
 )
+from torchpose.upper_body._screen_tracks import (
+    DOUBTFUL,
+    TRACKS,
+    ScreenState,
+    in_order,
+    init_screen,
+    predict_tracks,
+    start_candidates,
+    take_over,
+    update_tracks,
+)
 
-__all__ = [
-    "ScreenState",
-    "Screened",
-    "advance_screen",
-    "init_screen",
-    "screen_joints",
-]
+__all__ = ["ScreenState", "Screened", "advance_screen", "screen_joints"]
 
 _LEFT, _RIGHT = UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")
-_TRACKS = ("position", "velocity", "cov", "evidence")
-_DOUBTFUL = 3.0  # of log phi: below that, a place does not go with the other joints
 # Of OpenPose's wrists and elbows, beside the truth: the confidence at which every second is an outlier,
 # and the step of confidence in which odds change by e.
 _EVEN, _STEEP = 0.25, 0.06
 _MOST = 30.0  # log-odds beyond which a joint tells the others no more
 
 
-class ScreenState(NamedTuple):
-    """State between two frames: for each joint a track, and a candidate for its place.
-
-    Attributes:
-        position, velocity: [B, 2, 8, 2], pixels and pixels per second.
-        cov: variance of a coordinate, its covariance with its velocity, and that one's [B, 2, 8, 3].
-        evidence: seconds for which each was seen, at most so many as count [B, 2, 8].
-        exchange: log-probability of each way to exchange left and right [B, X]. lasting: seconds for
-            which they have been exchanged [B]. scales: log-probability of the person's sizes [B, G].
-    """
-
-    position: Tensor
-    velocity: Tensor
-    cov: Tensor
-    evidence: Tensor
-    exchange: Tensor
-    lasting: Tensor
-    scales: Tensor
-
-
 class Screened(NamedTuple):
-    """Measurements that are probable.
+    """Measurements without outliers.
 
     Attributes:
-        measured: where improbable ones are missing, and exchanged ones exchanged back.
-        probability: that a joint's measurement is one of it [B, T, 8]; NaN where nothing was given.
-        exchanged: whether left and right hand were exchanged [B, T].
+        measured: the measurements; outliers are missing, and exchanged hands exchanged back.
+        probability: the probability that the measurement of a joint is no outlier, [B, T, 8]; NaN where
+            nothing was given.
+        exchanged: whether left and right hand were exchanged, [B, T].
     """
 
     measured: MeasuredJoints
@@ -88,25 +71,13 @@ def screen_joints(
     """Return the next state, and T more frames without outliers; without a model as they are.
 
     Args:
-        model: None takes everything as it is. state: None before the first frame.
-        measured: of T frames, in the prior's pixels.
+        model: the model of the screening; None takes everything as it is. state: None before the first
+            frame. measured: the measurements of T frames, in the prior's pixels.
     """
     if model is None:
         unknown = torch.full_like(measured.uv[..., 0], torch.nan)
         return None, Screened(measured, unknown, torch.zeros_like(measured.mask[..., 0]))
     return advance_screen(model, state or init_screen(model, len(measured.uv)), measured)
-
-
-def init_screen(model: ScreenModel, batch_size: int) -> ScreenState:
-    """Return the state before the first frame of B streams: joints may be anywhere in the image."""
-    like, n = model.low, batch_size
-    middle, cov = (model.low + model.high) / 2, like.new_tensor([model.broad, 0.0, 0.0])
-    exchange = like.new_full((n, len(model.exchanges)), -math.inf)
-    exchange[:, 0] = 0.0
-    return ScreenState(
-        middle.repeat(n, 2, 8, 1), like.new_zeros(n, 2, 8, 2), cov.repeat(n, 2, 8, 1),
-        like.new_zeros(n, 2, 8), exchange, like.new_zeros(n), model.usual.repeat(n, 1),
-    )  # fmt: skip
 
 
 def advance_screen(
@@ -122,7 +93,8 @@ def advance_screen(
     without where z does not go with the others, so that no outlier that stays draws it to its place.
 
     Args:
-        state: from `init_screen` or the call before. measured: of T frames, in the prior's pixels.
+        state: from `init_screen` or the previous call. measured: the measurements of T frames, in the
+            prior's pixels.
     """
     with torch.no_grad():
         state, probability, way = _run(model, state, measured)
@@ -160,7 +132,7 @@ def _step(
     """Return the next state, the inlier probabilities of a frame, and the way of exchange."""
     scale = model.scale * (state.scales.exp() @ model.log_scales).exp()
     square = scale.square()[:, None, None]
-    state = _predict(model, state, square)
+    state = predict_tracks(model, state, square)
     noise, jump = noise + SLACK**2 * square, square * model.jump
     if len(model.exchanges) > 1:
         track = state.position[:, :1], state.cov[:, :1]
@@ -179,25 +151,15 @@ def _step(
     changed = torch.stack([change, change / model.dt, change / model.dt**2], -1)
     body, scales = _beside_others(model, both.total[:, 0], z, known, noise, state.scales)
     state = state._replace(cov=state.cov + changed, scales=scales)
-    state, total = _take_over(model, state, both.total, body, known)
+    state, total = take_over(model, state, both.total, body, known)
     odds_now = torch.stack([total[:, 0] + body, total[:, 1]], 1)
     probability = odds_now.sigmoid() * known[:, None]
-    nowhere = (probability < 0.5) & (body < -_DOUBTFUL)[:, None]
-    state = _update(state, z, noise, torch.where(nowhere, 0.0, probability))
+    nowhere = (probability < 0.5) & (body < -DOUBTFUL)[:, None]
+    state = update_tracks(state, z, noise, torch.where(nowhere, 0.0, probability))
     new = known & (probability < 0.5).all(1) & (state.evidence[:, 1] <= 0)
     if bool(new.any()):
-        state = _started(model, state, z, noise, square[:, 0], new)
+        state = start_candidates(model, state, z, noise, square[:, 0], new)
     return state, probability[:, 0], way
-
-
-def _predict(model: ScreenModel, state: ScreenState, square: Float[Tensor, "B 1 1"]) -> ScreenState:
-    """Return the state a frame later: velocities persist for a while, and spreads grow."""
-    cov = state.cov @ model.moving + square[..., None] * model.agitation
-    return state._replace(
-        position=state.position + model.drift * state.velocity,
-        velocity=model.kept * state.velocity,
-        cov=cov * (model.broad / cov[..., :1]).clamp_max(1.0),
-    )
 
 
 def _log_odds(
@@ -246,7 +208,7 @@ def _exchange(
     none = torch.full_like(log_weights, -math.inf)
     none[:, 0] = 0.0
     state = state._replace(
-        **{name: _in_order(getattr(state, name), order, 2) for name in _TRACKS},
+        **{name: in_order(getattr(state, name), order, 2) for name in TRACKS},
         exchange=torch.where(turned[:, None], none, log_weights),
         lasting=torch.where(turned, 0.0, lasting),
     )
@@ -261,7 +223,7 @@ def _beside_others(
     noise: Float[Tensor, "B 8"],
     scales: Float[Tensor, "B G"],
 ) -> tuple[Float[Tensor, "B 8"], Float[Tensor, "B G"]]:
-    """Return how well each joint goes with the others, and the weights of the person's scales.
+    """Return the log-odds phi of each joint given the others, and the log-probability of each body scale.
 
     For every subset of the joints that may be right, all are spread about one neck, which may be
     anywhere: phi = exp(-1/2 sum_i |z_i - s m_i - n|^2 / (s^2 sd_i^2 + R_i)) at the best n. The
@@ -287,86 +249,10 @@ def _beside_others(
     return body, seen.log_softmax(-1)
 
 
-def _take_over(
-    model: ScreenModel, state: ScreenState, odds: Tensor, body: Tensor, known: Tensor
-) -> tuple[ScreenState, Float[Tensor, "B 2 8"]]:
-    """Return the state in which candidates whose evidence is larger are the tracks, and their odds.
-
-    Evidence is the time for which a track was seen, up to `TAKEOVER`. A place that does not go with the
-    other joints needs more of it, and may need more than there can be.
-    """
-    alive = state.evidence[:, 1] > 0
-    odds = torch.stack([odds[:, 0], odds[:, 1].where(alive, -math.inf)], 1)
-    right = odds[:, 0] + body > 0
-    again = ~right & (odds[:, 1] > 0)
-    change = torch.where(again, model.dt, torch.where(right, -TAKEOVER, -model.dt))
-    evidence = torch.stack([
-        (state.evidence[:, 0] + model.dt * (right & known)).clamp_max(TAKEOVER),
-        (state.evidence[:, 1] + change * known).clamp(0.0, 2 * TAKEOVER),
-    ], 1)  # fmt: skip
-    doubt = -(body + _DOUBTFUL).clamp_max(0.0) / (CERTAIN - _DOUBTFUL)
-    needed = evidence[:, 0] + TAKEOVER * doubt
-    taken = known & again & (evidence[:, 1] > needed)
-    state = state._replace(evidence=evidence)
-    if not bool(taken.any()):
-        return state, odds
-    order = torch.stack([taken, ~taken], 1).long()
-    tracks = {name: _in_order(getattr(state, name), order, 1) for name in _TRACKS}
-    return state._replace(**tracks), _in_order(odds, order, 1)
-
-
-def _update(
-    state: ScreenState, z: Tensor, noise: Tensor, weight: Float[Tensor, "B 2 8"]
-) -> ScreenState:
-    """Return both tracks after a pixel that is theirs with a probability: the moments of the mixture."""
-    pp, pv, vv = state.cov.unbind(-1)
-    total = pp + noise[:, None]
-    gain, turn = pp / total, pv / total
-    apart = z[:, None] - state.position
-    spread = weight * (1 - weight) * apart.square().sum(-1) / 2
-    cov = [
-        pp - weight * gain * pp + spread * gain.square(),
-        pv - weight * gain * pv + spread * gain * turn,
-        vv - weight * turn * pv + spread * turn.square(),
-    ]
-    return state._replace(
-        position=state.position + (weight * gain)[..., None] * apart,
-        velocity=state.velocity + (weight * turn)[..., None] * apart,
-        cov=torch.stack(cov, -1),
-    )
-
-
-def _started(
-    model: ScreenModel,
-    state: ScreenState,
-    z: Tensor,
-    noise: Tensor,
-    square: Tensor,
-    new: Bool[Tensor, "B 8"],
-) -> ScreenState:
-    """Return the state with a new candidate at the measured pixels of these joints."""
-    started = {
-        "position": z, "velocity": torch.zeros_like(z),
-        "cov": torch.stack([noise, torch.zeros_like(noise), square * model.speed], -1),
-        "evidence": torch.full_like(noise, model.dt),
-    }  # fmt: skip
-    changed = {}
-    for name, value in started.items():
-        track, candidate = getattr(state, name).unbind(1)
-        at = new.reshape(*new.shape, *[1] * (value.ndim - 2))
-        changed[name] = torch.stack([track, torch.where(at, value, candidate)], 1)
-    return state._replace(**changed)
-
-
-def _in_order(value: Tensor, order: Int[Tensor, "B #N 8"], dim: int) -> Tensor:
-    """Return tracks [B, 2, 8, ...] in another order: of track and candidate (1), or of the joints (2)."""
-    return value.gather(dim, order.reshape(*order.shape, *[1] * (value.ndim - 3)).expand_as(value))
-
-
 def _doubt(measured: MeasuredJoints) -> Float[Tensor, "B T 8"]:
-    """Return by how much the log-odds of an inlier are lower than usual for want of confidence c.
+    """Return the reduction of the log-odds of an inlier by a low confidence c of the detector.
 
-    Those of a keypoint that a detector is unsure of are (c - 0.25) / 0.06.
+    The log-odds are those of the share of outliers, but at most (c - 0.25) / 0.06.
     """
     if measured.confidence is None:
         return torch.zeros_like(measured.uv[..., 0])
@@ -375,7 +261,7 @@ def _doubt(measured: MeasuredJoints) -> Float[Tensor, "B T 8"]:
 
 
 def _largest_variance(cov: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch"]:
-    """Return the larger eigenvalue."""
+    """Return the larger eigenvalue of each covariance."""
     (a, b), (c, d) = (row.unbind(-1) for row in cov.unbind(-2))
     return (a + d) / 2 + (((a - d) / 2).square() + b * c).clamp_min(0.0).sqrt()
 

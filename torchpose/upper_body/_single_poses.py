@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchpose._core.module_state import derived
 from torchpose.errors import DegenerateFilterWarning, InputError
-from torchpose.filters._base import Generators, RecursiveFilter
+from torchpose.filters._base import RecursiveFilter
 from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._outputs import FilterOutput
 from torchpose.priors._arm_state import STATE_DIM
@@ -22,6 +22,7 @@ from torchpose.priors._upper_body import UpperBodyPrior, released_process_cov
 from torchpose.skeleton._upper_body import ARM_JOINTS
 from torchpose.upper_body._estimator import (
     ARMS,
+    ArmGenerators,
     ArmJoints,
     Estimates,
     Estimator,
@@ -70,7 +71,7 @@ class ProcessNoise(NamedTuple):
         `default_walk_cov`.
 
         Args:
-            prior: whose noise is taken. side: "left" or "right".
+            prior: the prior that brings the noise. side: "left" or "right".
 
         Returns:
             Q [21, 21], or its diagonal [21], in squares of pixels, metres and radians.
@@ -94,7 +95,7 @@ def default_process_cov(prior: UpperBodyPrior) -> Float[Tensor, " 21"]:
     same movement in metres is f / depth times as many pixels elsewhere.
 
     Args:
-        prior: whose camera, mean depth and frame rate are used.
+        prior: the prior; its camera, mean depth and frame rate are used.
     """
     depth = prior.left.moments()[0][2:15:3].mean().clamp_min(0.1)
     pixels = math.sqrt(prior.info.fx * prior.info.fy) / depth / (1550 / 4.5)
@@ -113,7 +114,7 @@ def default_walk_cov(prior: UpperBodyPrior, side: str) -> Float[Tensor, "21 21"]
     hardly any particle where the prior has bodies.
 
     Args:
-        prior: whose mixture and frame rate are used. side: "left" or "right".
+        prior: the prior; its mixture and frame rate are used. side: "left" or "right".
     """
     mixture = getattr(prior, side)
     within = torch.einsum("k,kij->ij", mixture.weights, mixture.covariances)
@@ -163,7 +164,7 @@ class PoseFilter:
         """Return the estimator of a tracker.
 
         Args:
-            model: of the tracker. options: among `options`.
+            model: the model of the tracker. options: some of `options`.
         """
         return SinglePoses(model, self, options)
 
@@ -177,9 +178,9 @@ class PoseFilter:
         """Return the caller's options, and for the others the noise and transition of the prior.
 
         Args:
-            prior: what it brings is scaled to the frame rate, and left out where a choice of the
-                caller has no use for it. side: "left" or "right". fps: frame rate. options: of the
-                caller.
+            prior: the prior, whose noise is scaled to the frame rate, and left out where an option of the
+                caller has no use for it. side: "left" or "right". fps: frames per second. options: the
+                options of the caller.
 
         Returns:
             Keyword arguments of the filter.
@@ -218,33 +219,34 @@ class PoseFilter:
 
 
 class PoseState(NamedTuple):
-    """States of the filters of both arms, by "left" and "right", and what stays the same.
+    """States of the filters of both arms, by "left" and "right", with their joints and generators.
 
     Attributes:
-        filters: states. joints: that each arm's filter measures. generators: of each arm.
+        filters: the state of each arm's filter. joints: the joints that each arm's filter measures.
+        generators: the random generators of each arm.
     """
 
     filters: dict[str, Any]
     joints: ArmJoints
-    generators: dict[str, Generators]
+    generators: ArmGenerators
 
 
 class SinglePoses(Estimator):
     """Estimator that follows single poses with a recursive filter of each arm.
 
     Args:
-        model: of the tracker. method: which filter, and what it takes from the prior.
-        options: of the method, from the user.
+        model: the model of the tracker. method: the filter, and what it takes from the prior.
+        options: the options of the method that the caller gave.
     """
 
     def __init__(self, model: TrackerModel, method: PoseFilter, options: Mapping[str, Any]) -> None:
         self.model, self.method, self.options = model, method, dict(options)
 
     def filter(self, side: str, joints: tuple[str, ...]) -> RecursiveFilter:
-        """Return the filter of an arm that measures these joints; the same one as long as it holds.
+        """Return the filter of an arm that measures these joints; made once for its prior, noise and options.
 
         Args:
-            side: "left" or "right". joints: of `ARM_JOINTS`.
+            side: "left" or "right". joints: some of `ARM_JOINTS`.
         """
         prior, cov = self.model.prior, self.model.measurement_cov
         tensors = [value for value in self.options.values() if isinstance(value, Tensor)]
@@ -273,29 +275,26 @@ class SinglePoses(Estimator):
         for side in ARMS:
             self.filter(side, ("hand", "head", "neck"))
 
-    def init(
-        self, batch_size: int, joints: ArmJoints, generators: dict[str, Generators]
-    ) -> PoseState:
+    def init(self, batch_size: int, joints: ArmJoints, arm_generators: ArmGenerators) -> PoseState:
         """Return the state before the first frame; see `Estimator`."""
         filters = {
-            side: self.filter(side, joints[side]).init(batch_size, generator=generators[side])
+            side: self.filter(side, joints[side]).init(batch_size, generator=arm_generators[side])
             for side in ARMS
         }
-        return PoseState(filters, joints, generators)
+        return PoseState(filters, joints, arm_generators)
 
-    def advance(self, state: PoseState, measured: MeasuredJoints) -> tuple[PoseState, Estimates]:
+    def advance(
+        self, state: PoseState, measured: MeasuredJoints, progress: bool = False
+    ) -> tuple[PoseState, Estimates]:
         """Return the next state and the estimates of T more frames; see `Estimator`."""
         filters, arms = {}, {}
         for side, arm in ARMS.items():
-            joints, model = state.joints[side], self.filter(side, state.joints[side])
-            z, mask, cov = arm_measurements(arm, joints, measured)
+            joints = state.joints[side]
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DegenerateFilterWarning)  # told by `failed`
-                filters[side], out = model.advance(
+                filters[side], out = self.filter(side, joints).advance(
                     state.filters[side],
-                    z,
-                    mask,
-                    cov,
+                    *arm_measurements(arm, joints, measured),
                     generator=state.generators[side],
                     return_cov=True,
                 )
@@ -306,24 +305,28 @@ class SinglePoses(Estimator):
         self,
         measured: MeasuredJoints,
         joints: ArmJoints,
-        generators: dict[str, Generators],
+        arm_generators: ArmGenerators,
         lengths: Tensor | None = None,
         progress: bool = False,
     ) -> Estimates:
-        """Return the estimates of whole sequences; see `Estimator`."""
-        lag, arms = self.model.smoothing, {}
+        """Return the estimates of whole sequences; see `Estimator`.
+
+        `RecursiveFilter.forward` is `init` and `advance` of the filter, and knows which of its
+        covariances the sequences share.
+        """
+        smoothing, arms = self.model.smoothing, {}
         for side, arm in ARMS.items():
             model = self.filter(side, joints[side])
             z, mask, cov = arm_measurements(arm, joints[side], measured)
-            if lag is not None:
-                later = None if lag == "full" else int(lag)
-                smooth = cast(MixtureKalmanFilter, model).smooth  # or another filter that smooths
-                out = smooth(z, mask, cov, lengths=lengths, lag=later, return_cov=True)
-            else:
+            if smoothing is None:
+                own = arm_generators[side]
                 out = model(
-                    z, mask, cov, generator=generators[side], lengths=lengths, return_cov=True,
-                    progress=progress,
-                )  # fmt: skip
+                    z, mask, cov, generator=own, lengths=lengths, return_cov=True, progress=progress
+                )
+            else:
+                lag = None if smoothing == "full" else int(smoothing)
+                smooth = cast(MixtureKalmanFilter, model).smooth  # or another filter that smooths
+                out = smooth(z, mask, cov, lengths=lengths, lag=lag, return_cov=True)
             arms[side] = in_double(out)
         return Estimates(arms["left"], arms["right"])
 

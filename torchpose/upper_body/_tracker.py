@@ -1,7 +1,7 @@
 """Track upper bodies: from 2D keypoints of head, neck and hands to 2D and 3D poses of eight joints."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -32,14 +32,19 @@ from torchpose.upper_body._fusion import kept_stage, stage_lag
 from torchpose.upper_body._live import LivePose, StreamState, live_pose, unseen_frames
 from torchpose.upper_body._measurements import (
     MeasuredJoints,
-    Picked,
     check_gaps,
+    check_sequences,
     in_prior_pixels,
     joint_covariances,
-    pick_joints,
 )
-from torchpose.upper_body._methods import METHODS, WINDOWS, choose_method, options_of_window
-from torchpose.upper_body._outlier_notes import outlier_notes
+from torchpose.upper_body._methods import (
+    METHODS,
+    check_steady,
+    choose_method,
+    options_of_window,
+)
+from torchpose.upper_body._options import MethodOptions
+from torchpose.upper_body._picked import Picked, pick_joints
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._reading import PoseReader, check_frame, note_collapse
 from torchpose.upper_body._screen_model import ScreenModel, kept_screen_model
@@ -78,7 +83,8 @@ class UpperBodyTracker(WideModule):
     A frame passes through five stages, each of which takes and returns values: the keypoints become
     `MeasuredJoints` in the prior's pixels, of which `screen_joints` leaves out outliers, an `Estimator`
     turns them into the `Estimates` of both arms, `read_out` joins these into a `ReadOut` of the body, which
-    `MotionStage` steadies, and that becomes a `PoseTrack`.
+    `MotionStage` steadies, and that becomes a `PoseTrack`. `forward` passes all frames on at once, `step`
+    and `advance` some at a time, with the state of each stage.
 
     Args:
         prior: from `load_prior` or `fit_upper_body_prior`.
@@ -109,7 +115,7 @@ class UpperBodyTracker(WideModule):
         max_gap: seconds over which nothing at all may be measured; None is no bound.
         outliers: look for keypoints that belong to no body, which count as missing, and for exchanged hands,
             which are exchanged back, frame by frame. False takes keypoints as they are.
-        **options: of the method (`torchpose.upper_body.method_options`), such as n_particles,
+        **options: the options of the method (`torchpose.upper_body.method_options`), such as n_particles,
             n_tracks, uniform_weight or transition.
 
     Raises:
@@ -144,7 +150,7 @@ class UpperBodyTracker(WideModule):
         neck: str | None = None,
         max_gap: float | None = 5.0,
         outliers: bool = True,
-        **options: Any,
+        **options: Unpack[MethodOptions],
     ) -> None:
         super().__init__()
         self.camera = check_model(prior, camera, fps)
@@ -165,19 +171,13 @@ class UpperBodyTracker(WideModule):
         self.outliers = outliers
         self.dtype = working_precision("dtype", options.get("dtype", torch.float64))
         register_given(self, "measurement_std", wide_or_parameter(measurement_std))
-        self.options = options
+        self.options: dict[str, Any] = {**options}
         self._unsteady = steady is False
-        for name, value in options.items():
+        for name, value in self.options.items():
             if isinstance(value, Tensor):
                 register_given(self, name, wide_or_parameter(value))
         estimator = self.estimator
-        can_steady = estimator.steadied_by is not None
-        self.steady = can_steady if steady is None else steady
-        if self.steady and not can_steady:
-            raise InputError(
-                f"steady=True needs method {WINDOWS!r} and a prior that says how brisk its motions "
-                f"are, got method {self.method!r}; leave it out"
-            )
+        self.steady = check_steady(steady, estimator, self.method)
         estimator.check()
 
     measurement_std: Tensor | None
@@ -206,7 +206,7 @@ class UpperBodyTracker(WideModule):
         return self._estimator_of(self.method)
 
     def _estimator_of(self, method: str, picked: Picked | None = None) -> Estimator:
-        """Return the estimator of a method for these keypoints; without any for the prior's joints."""
+        """Return the estimator of a method for these keypoints; without `picked` for the prior's joints."""
         make: Callable[..., Estimator] = METHODS[method]
         model = TrackerModel(
             self, self.prior, self.measurement_cov, self.fps, self.smoothing,
@@ -251,21 +251,18 @@ class UpperBodyTracker(WideModule):
         """
         refuse_export(*_NO_EXPORT)
         with one_run(self.measurement_cov.device):
-            keypoints = self._checked(keypoints)
+            keypoints = check_sequences(keypoints).to(self.measurement_cov)
             picked = self._pick(keypoints.shape[2], names)
             given = self._measure(keypoints, confidence, mask, covariance, picked)
             check_gaps(given.mask, lengths, self.max_gap, self.fps or 30.0)
             there = given.mask.flatten(0, 1).any(0).tolist()
-            joints = arm_joints(there)
-            method = self._chosen.with_joints(there, picked.wrists_for_hands)
+            reader = self._reader(there, picked)
             _, found = screen_joints(self._screen(picked), None, given)
-            estimator = self._estimator_of(method, picked)
             arms = generators_of_arms(generator)
-            estimates = estimator.forward(found.measured, joints, arms, lengths, progress)
-            notes = self._notes_of(method, estimator, picked) + outlier_notes(*found[1:], lengths)
-            reader, seen = self._reader(method, estimator), found.measured.mask
-            reading = reader.whole(estimates, lengths)
-            track = reader.track(reading, estimates, seen, lengths, notes, found.probability)
+            estimates = reader.estimator.forward(
+                found.measured, arm_joints(there), arms, lengths, progress
+            )
+            _, track = reader.read(None, estimates, found, lengths)
         return note_collapse(track.in_precision(self.dtype))
 
     def init(
@@ -301,11 +298,10 @@ class UpperBodyTracker(WideModule):
         check_count("batch_size", batch_size)
         n_keypoints = len(UPPER_BODY) if names is None else len(names)
         picked = self._pick(n_keypoints, names)
-        joints = arm_joints(picked.there)
-        method = self._chosen.with_joints(picked.there, picked.wrists_for_hands)
         with one_run(self.measurement_cov.device):
-            estimator = self._estimator_of(method, picked)
-            state = estimator.init(batch_size, joints, generators_of_arms(generator))
+            estimator = self._reader(picked.there, picked).estimator
+            joints, arms = arm_joints(picked.there), generators_of_arms(generator)
+            state = estimator.init(batch_size, joints, arms)
         unseen = torch.zeros(batch_size, dtype=torch.long, device=self.measurement_cov.device)
         return StreamState(state, None, unseen, n_keypoints, picked)
 
@@ -368,33 +364,18 @@ class UpperBodyTracker(WideModule):
         with one_run(self.measurement_cov.device):
             keypoints = keypoints.to(self.measurement_cov)
             given = self._measure(keypoints, confidence, mask, covariance, state.picked)
+            reader = self._reader(state.picked.there, state.picked)
             screen, found = screen_joints(self._screen(state.picked), state.screen, given)
-            method = self._chosen.with_joints(state.picked.there, state.picked.wrists_for_hands)
-            estimator = self._estimator_of(method, state.picked)
-            seen = found.measured.mask
-            own, estimates = estimator.advance(state.estimator, found.measured)
-            reader = self._reader(method, estimator)
-            motion, reading = reader.more(state.motion, estimates)
-            notes = self._notes_of(method, estimator, state.picked) + outlier_notes(*found[1:])
-            track = reader.track(reading, estimates, seen, None, notes, found.probability)
-        unseen = unseen_frames(state.unseen, seen.any(-1))
+            own, estimates = reader.estimator.advance(state.estimator, found.measured)
+            motion, track = reader.read(state.motion, estimates, found)
+        unseen = unseen_frames(state.unseen, found.measured.mask.any(-1))
         state = state._replace(estimator=own, motion=motion, unseen=unseen, screen=screen)
         return state, track.in_precision(self.dtype)
 
     def _notes_of(self, method: str, estimator: Estimator, picked: Picked) -> tuple[str, ...]:
-        """Return what is to be said about the choice of a method, and about the keypoints' joints."""
+        """Return the notes about the choice of the method and about the kinds of neck and hands."""
         chosen = self.notes if method == self.method else ()
         return chosen + picked.notes + (() if estimator.knows_wrists else picked.of_hands)
-
-    def _checked(self, keypoints: Tensor) -> Float[Tensor, "B T J 2"]:
-        """Return the keypoints of whole sequences, where and as wide as the tracker's own tensors."""
-        check_floating("keypoints", keypoints)
-        check_shape("keypoints", keypoints, ["B", "T", "J", 2])
-        if keypoints.shape[0] == 0 or keypoints.shape[1] == 0:
-            raise InputError(
-                f"keypoints must hold at least one sequence of one frame, got {list(keypoints.shape)}"
-            )
-        return keypoints.to(self.measurement_cov)
 
     def _pick(self, n_keypoints: int, names: Sequence[str] | None) -> Picked:
         info = self.prior.info
@@ -414,17 +395,23 @@ class UpperBodyTracker(WideModule):
         )  # fmt: skip
 
     def _screen(self, picked: Picked) -> ScreenModel | None:
-        """Return what finds outliers, unless keypoints are taken as they are."""
+        """Return the model of the outlier screening; None if keypoints are taken as they are."""
         given = (self.prior, self.camera, self.fps, picked, self.measurement_cov)
         return kept_screen_model(self, *given) if self.outliers else None
 
-    def _reader(self, method: str, estimator: Estimator) -> PoseReader:
-        """Return what makes poses of the estimates, as the settings ask for."""
+    def _reader(self, there: Sequence[bool], picked: Picked) -> PoseReader:
+        """Return the reader of poses, with the estimator of the method for these joints.
+
+        Args:
+            there: whether each of the eight joints is measured. picked: their places among the keypoints.
+        """
+        method = self._chosen.with_joints(there, picked.wrists_for_hands)
+        estimator = self._estimator_of(method, picked)
         stage, ratios, cov = None, estimator.steadied_by, self.measurement_cov
         if self.steady and ratios is not None:
             stage = kept_stage(self, ratios, self.fps or 30.0, cov)
         lag = stage_lag(self.smoothing, estimator.ahead)
         return PoseReader(
             self.prior, self.camera, method, estimator, stage, lag, self.frame,
-            self.static_camera, self.calibrated, self.fps,
+            self.static_camera, self.calibrated, self.fps, self._notes_of(method, estimator, picked),
         )  # fmt: skip

@@ -7,37 +7,28 @@ Mixtures over windows see the body through a virtual camera that follows it
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose._core.module_state import derived
-from torchpose.camera._virtual_camera import (
-    BodyView,
-    PathModel,
-    body_path,
-    memory_frames,
-    to_view,
-    view_body,
-    view_jacobian,
-)
+from torchpose.camera._virtual_camera import memory_frames
 from torchpose.errors import InputError
-from torchpose.filters._base import Generators
 from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._outputs import FilterOutput
 from torchpose.priors._arm_state import STATE_DIM
 from torchpose.priors._gaussian_mixture import GaussianMixture
-from torchpose.priors._upper_body import UpperBodyPrior
-from torchpose.priors._window import WindowLayout, WindowPrior, window_measurements
-from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.priors._window import WindowLayout, WindowPrior
 from torchpose.skeleton._upper_body import ARM_JOINTS
 from torchpose.upper_body._estimator import (
     ARMS,
+    ArmGenerators,
     ArmJoints,
     Estimates,
     Estimator,
     MotionRatios,
     TrackerModel,
     in_double,
+    repeat_last,
     require_cov,
 )
 from torchpose.upper_body._measurements import (
@@ -45,112 +36,20 @@ from torchpose.upper_body._measurements import (
     append_blocks,
     arm_measurements,
     pixel_indices,
-    pixels_per_metre,
 )
+from torchpose.upper_body._window_view import SeenInView, see_in_view, suitable_window
 
-__all__ = ["SeenInView", "WindowMixture", "WindowState", "see_in_view", "suitable_window"]
+__all__ = ["WindowMixture", "WindowState"]
 
 _N_LIMB = 2  # hand and elbow, the first of an arm, which may be before or behind the body
-_HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
-_HANDS = [UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")]
-
-
-class SeenInView(NamedTuple):
-    """Measurements for a filter over windows, in the pixels of a virtual camera.
-
-    Attributes:
-        measured: the eight joints of each frame.
-        hands: values and mask [B, T, 2 H] of the hands of each frame's window, for both arms.
-        view: the virtual camera of each frame.
-        log_scale: log of the area that a pixel of the camera has in the virtual one, [B, T, 8].
-    """
-
-    measured: MeasuredJoints
-    hands: dict[str, tuple[Tensor, Tensor]]
-    view: BodyView
-    log_scale: Tensor
-
-
-def suitable_window(
-    prior: UpperBodyPrior, smoothing: int | str | None, fps: float
-) -> tuple[str, WindowLayout] | None:
-    """Return the name of the window that suits the smoothing, and its lags at this frame rate.
-
-    It is None where the prior has none, or where it looks farther ahead than estimates may.
-
-    Args:
-        prior: with its windows. smoothing: None, the number of later frames that an estimate may
-            use, or "full". fps: frame rate.
-    """
-    name = "causal" if smoothing is None else "full"
-    if name not in prior.windows:
-        return None
-    layout = prior.windows[name].layout.at_rate(fps)
-    too_far = isinstance(smoothing, int) and smoothing < layout.ahead
-    return None if too_far else (name, layout)
-
-
-def see_in_view(
-    measured: MeasuredJoints,
-    prior: UpperBodyPrior,
-    layout: WindowLayout,
-    measurement_cov: Float[Tensor, "8 2 2"],
-    lengths: Int[Tensor, " B"] | None = None,
-    start: int = 0,
-) -> SeenInView:
-    """Return the measurements of windows in a virtual camera that follows the body, from a frame on.
-
-    Args:
-        measured: the eight joints in the prior's pixels. prior: what is expected. layout: of a
-            window, at the frame rate of the measurements.
-        measurement_cov: R of the eight joints where it is not told frame by frame.
-        lengths: frames of each sequence, [B]. start: first frame that is wanted; may be negative.
-    """
-    uv, mask, matrix = measured.uv, measured.mask, prior.info.matrix.to(measured.uv)
-    if lengths is not None:
-        frames = torch.arange(mask.shape[1], device=mask.device)
-        mask = mask & (frames < lengths.to(mask.device)[:, None])[..., None]
-    start = start % mask.shape[1]
-    model = _path_model(prior, measurement_cov, uv)
-    noise = None
-    if measured.cov.ndim > 3:
-        noise = _of_anchors(measured.cov)
-    else:
-        model = model._replace(variance=_of_anchors(measured.cov))
-    path = body_path(uv, mask, layout.lags, layout.ahead, layout.fps, model, start, noise)
-    neck, height = path.at(0)
-    apart = (uv[:, start:, _HANDS] - neck[:, :, None]).norm(dim=-1)
-    reach = torch.where(mask[:, start:, _HANDS], apart, torch.zeros_like(apart)).amax(-1)
-    view = view_body(neck, height, model, matrix, reach)
-    hands = {}
-    for side in ARMS:
-        values, known = window_measurements(uv, mask, layout, side, path, start)
-        hands[side] = to_view(values, view, matrix).flatten(-2), known.repeat_interleave(2, -1)
-    now = to_view(uv[:, start:], view, matrix)
-    now = torch.where(mask[:, start:, :, None], now, torch.zeros_like(now))
-    cov = measured.cov if measured.cov.ndim == 3 else measured.cov[:, start:]
-    log_scale = -view_jacobian(now, view, matrix).det().abs().log()
-    return SeenInView(MeasuredJoints(now, mask[:, start:], cov), hands, view, log_scale)
-
-
-def _path_model(prior: UpperBodyPrior, measurement_cov: Tensor, like: Tensor) -> PathModel:
-    """Return head and neck of the prior's mean pose, and their measurement noise."""
-    both = (prior.left.moments()[0] + prior.right.moments()[0]) / 2
-    head, neck = both[9:11].to(like), both[12:14].to(like)
-    return PathModel(neck, head - neck, _of_anchors(measurement_cov), pixels_per_metre(prior))
-
-
-def _of_anchors(cov: Float[Tensor, "*batch 8 2 2"]) -> Float[Tensor, "*batch 2"]:
-    """Return the variance of a coordinate of head and neck, pixels squared."""
-    return cov[..., [_HEAD, _NECK], :, :].diagonal(dim1=-2, dim2=-1).mean(-1)
 
 
 class WindowState(NamedTuple):
     """State of `WindowMixture` between two frames.
 
     Attributes:
-        recent: the eight joints of the last N frames in the prior's pixels, the latest last, with R of
-            each frame [B, N, 8, 2, 2]. joints: that each arm's filter measures.
+        recent: the eight joints of the last frames, at most N, in the prior's pixels, the latest last,
+            with R of each frame [B, N, 8, 2, 2]. joints: the joints that each arm's filter measures.
     """
 
     recent: MeasuredJoints
@@ -206,14 +105,14 @@ class WindowMixture(Estimator):
                 self._filter(side, joints)
 
     def init(
-        self, batch_size: int, joints: ArmJoints, generators: dict[str, Generators]
+        self, batch_size: int, joints: ArmJoints, arm_generators: ArmGenerators
     ) -> WindowState:
         """Return the state before the first frame; see `Estimator`."""
-        like, n_frames = self.model.measurement_cov, self._n_recent
+        like = self.model.measurement_cov
         recent = MeasuredJoints(
-            like.new_zeros(batch_size, n_frames, 8, 2),
-            torch.zeros(batch_size, n_frames, 8, dtype=torch.bool, device=like.device),
-            like.expand(batch_size, n_frames, -1, -1, -1),
+            like.new_zeros(batch_size, 0, 8, 2),
+            torch.zeros(batch_size, 0, 8, dtype=torch.bool, device=like.device),
+            like.new_zeros(batch_size, 0, 8, 2, 2),
         )
         return WindowState(recent, joints)
 
@@ -222,27 +121,28 @@ class WindowMixture(Estimator):
         return 1 + memory_frames(self.layout.lags, self.layout.fps)
 
     def advance(
-        self, state: WindowState, measured: MeasuredJoints
+        self, state: WindowState, measured: MeasuredJoints, progress: bool = False
     ) -> tuple[WindowState, Estimates]:
         """Return the next state and the estimates of T more frames; see `Estimator`."""
-        n_frames = measured.uv.shape[1]
         frames = _append(state.recent, measured)
-        seen = self._see(frames, None, -n_frames)
+        seen = self._see(frames, None, -measured.uv.shape[1])
         seen = seen._replace(measured=seen.measured._replace(cov=measured.cov))
-        uv, mask, covs = (x[:, n_frames:] for x in frames[:3])
-        recent = MeasuredJoints(uv, mask, covs)
-        return WindowState(recent, state.joints), self._estimate(seen, state.joints)
+        estimates = self._estimate(seen, state.joints, None, progress)
+        return WindowState(_last(frames, self._n_recent), state.joints), estimates
 
     def forward(
         self,
         measured: MeasuredJoints,
         joints: ArmJoints,
-        generators: dict[str, Generators],
+        arm_generators: ArmGenerators,
         lengths: Tensor | None = None,
         progress: bool = False,
     ) -> Estimates:
         """Return the estimates of whole sequences; see `Estimator`."""
-        return self._estimate(self._see(measured, lengths, 0), joints, lengths, progress)
+        if self.model.smoothing is None:
+            return super().forward(measured, joints, arm_generators, lengths, progress)
+        seen = self._see(measured, lengths, 0)
+        return repeat_last(self._estimate(seen, joints, lengths, progress), lengths)
 
     def _see(self, measured: MeasuredJoints, lengths: Tensor | None, start: int) -> SeenInView:
         model = self.model
@@ -275,37 +175,43 @@ class WindowMixture(Estimator):
     def _torso(
         self, seen: SeenInView, side: str, joints: tuple[str, ...], lengths: Tensor | None
     ) -> FilterOutput:
-        """Return the estimates of an arm from its torso and the hands of the window alone."""
+        """Return the estimates of an arm given its torso and the hands of the window alone."""
         torso = tuple(joint for joint in joints if joint not in ARM_JOINTS[:_N_LIMB])
         both, noise, _ = _window_inputs(seen, self.window, side, torso, self.model.measurement_cov)
         return self._filter(side, torso)(*both, noise, lengths=lengths)
 
     def _filter(self, side: str, joints: tuple[str, ...]) -> MixtureKalmanFilter:
-        """Return the filter of an arm; the same one as long as it holds."""
+        """Return the filter of an arm; made once for its prior, noise and settings."""
         window, cov = self.window, self.model.measurement_cov
         mixture: GaussianMixture = getattr(window, side)
+        settings = (*window.settings.items(), self.power, self.dtype)
         return derived(
             self.model.owner,
-            (
-                self.calibration,
-                side,
-                joints,
-                window.layout,
-                *window.settings.items(),
-                self.power,
-                self.dtype,
-            ),
+            (self.calibration, side, joints, window.layout, *settings),
             (*mixture.parameters_tuple(), cov),
             lambda: _window_filter(window, side, joints, cov, self.power, self.dtype),
         )
 
 
 def _append(frames: MeasuredJoints, new: MeasuredJoints) -> MeasuredJoints:
-    """Return the last frames, and the new ones after them."""
-    cov = new.cov.expand(*new.uv.shape[:2], *new.cov.shape[-3:])
-    pairs = zip(frames[:3], (new.uv, new.mask, cov), strict=True)
+    """Return the last frames, and the new ones after them; before the first frame the new ones alone."""
+    if frames.uv.shape[1] == 0:
+        return MeasuredJoints(*new[:3])
+    pairs = zip(frames[:3], (new.uv, new.mask, _cov_of_frames(new)), strict=True)
     uv, mask, covs = (torch.cat([old, latest], 1) for old, latest in pairs)
     return MeasuredJoints(uv, mask, covs)
+
+
+def _last(frames: MeasuredJoints, count: int) -> MeasuredJoints:
+    """Return the last frames, at most `count`, with R of each."""
+    return MeasuredJoints(
+        frames.uv[:, -count:], frames.mask[:, -count:], _cov_of_frames(frames)[:, -count:]
+    )
+
+
+def _cov_of_frames(measured: MeasuredJoints) -> Float[Tensor, "B T 8 2 2"]:
+    """Return R of each joint in each frame."""
+    return measured.cov.expand(*measured.uv.shape[:2], *measured.cov.shape[-3:])
 
 
 def _window_filter(
@@ -316,7 +222,7 @@ def _window_filter(
     likelihood_power: float,
     dtype: torch.dtype,
 ) -> MixtureKalmanFilter:
-    """Return fixed tracks over window states that measure these joints and all hands of the window."""
+    """Return the filter of fixed tracks over windows that measures these joints and a window's hands."""
     arm, layout = ARMS[side], window.layout
     blocks = [measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
     blocks += [_hand_cov(window, side, measurement_cov)] * layout.n_hands
@@ -336,7 +242,7 @@ def _window_filter(
 
 
 def _hand_cov(window: WindowPrior, side: str, measurement_cov: Tensor) -> Tensor:
-    """Return the noise of a hand of the window: that of a hand now, and what moving it here adds."""
+    """Return R of a hand of the window: that of a hand of this frame, and the spread that moving it adds."""
     own = measurement_cov[ARMS[side][0]]
     return own + window.settings["hand_std"] ** 2 * torch.eye(2, dtype=own.dtype, device=own.device)
 

@@ -59,10 +59,8 @@ class FileSource(VideoSource):
 
     def __init__(self, path: str | Path, fps: float | None = None) -> None:
         super().__init__(str(path))
-        self.path, self._wanted = (
-            require_file(path),
-            None if fps is None else check_rate("fps", fps),
-        )
+        self.path = require_file(path)
+        self._wanted = None if fps is None else check_rate("fps", fps)
         self._closed = True  # until there is something to close
         scan = self._scan()
         self._container, self._stream = open_container(self.path)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchpose._core.images import Image
@@ -35,8 +35,9 @@ class Measured(NamedTuple):
     Attributes:
         keypoints: pixels, NaN where missing [T, J, 2].
         covariance: [T, J, 2, 2]; None of a detector of keypoints.
-        size: of the face, of a detector about the width of the shoulders, NaN where there is none [T].
-        confidence: of a detector of keypoints, 0 to 1 [T, J], 0 where missing; else None.
+        size: the size of the face, by a detector about the width of the shoulders, pixels, NaN where there
+            is none [T].
+        confidence: 0 to 1 [T, J], 0 where missing, by a detector of keypoints; else None.
     """
 
     keypoints: Float[Tensor, "T J 2"]
@@ -46,11 +47,11 @@ class Measured(NamedTuple):
 
     @property
     def seen(self) -> Bool[Tensor, " T"]:
-        """Return in which frames anything was measured."""
+        """Return for each frame whether anything was measured in it."""
         return self.keypoints.isfinite().flatten(1).any(1)
 
     def frames(self, rows: slice) -> "Measured":
-        """Return some of the frames."""
+        """Return the measurements of some of the frames."""
         return Measured(*(None if x is None else x[rows] for x in self))  # type: ignore[arg-type]
 
 
@@ -75,7 +76,8 @@ def unmeasured(n_frames: int, n_joints: int, detected: bool = False) -> Measured
     """Return frames without measurements.
 
     Args:
-        detected: by a detector of keypoints, which gives confidences in place of covariances.
+        n_frames: T. n_joints: J.
+        detected: whether by a detector of keypoints, which gives confidences in place of covariances.
     """
     points = torch.full((n_frames, n_joints, 2), torch.nan, dtype=torch.float64)
     size = torch.full((n_frames,), torch.nan, dtype=torch.float64)
@@ -104,11 +106,12 @@ class PersonStreamState(NamedTuple):
 
 
 class TrackedBlock(NamedTuple):
-    """Holds the poses of one person in a block of frames.
+    """Holds the poses of one person in a part of a block of frames.
 
     Attributes:
-        start: first frame of the block in which the person is tracked.
-        poses: from that frame on, NaN after a long gap. measured: in these frames.
+        start: the first frame of the part, counted from that of the block.
+        poses: the poses from that frame on; NaN in the last of them if it ends a long gap.
+        measured: the measurements in these frames.
     """
 
     start: int
@@ -123,8 +126,8 @@ class PersonStream(nn.Module):
     those of the selected one.
 
     Args:
-        tracker: of poses. names: of the measured joints. seed: of methods that draw.
-        association: of the hands; None takes the hands as measured.
+        tracker: the tracker of poses. names: the names of the measured joints. seed: the seed of methods
+            that draw. association: selects the hypothesis; None takes the hands as measured.
 
     Reference:
         Burke & Lasenby, section 5.3.
@@ -160,7 +163,7 @@ class PersonStream(nn.Module):
         """Return the poses of the next frames.
 
         Args:
-            state: from `init` or the call before. measured: in these frames.
+            state: the state from `init` or the previous call. measured: the measurements in these frames.
             images: the frames, RGB; used with `association` only.
 
         Returns:
@@ -194,29 +197,60 @@ class PersonStream(nn.Module):
         block: Sequence[FrameMeasurements | FrameKeypoints],
         images: Sequence[Image],
         gap: int,
-    ) -> tuple[dict[int, PersonStreamState], dict[int, TrackedBlock]]:
+    ) -> tuple[dict[int, PersonStreamState], dict[int, list[TrackedBlock]]]:
         """Return the next states and the poses of all persons in a block of frames, by number.
 
+        The poses are the same however a recording is cut into blocks.
+
         Args:
-            states: of the persons before the block. block: measurements of each frame.
+            states: the states of the persons before the block. block: the measurements of each frame.
             images: the frames, RGB; used with `association` only.
-            gap: frames without measurements after which a person has neither pose nor state.
+            gap: the number of frames without measurements after which a person has neither pose nor
+                state; a subject who returns is reinitialised.
+
+        Returns:
+            The states of those who were seen within the last `gap` frames, and for each person the
+            parts of the block in which there is a state.
         """
         present = {number for frame in block for number in frame.person.tolist()}
         following, tracked = {}, {}
         for number in sorted(states.keys() | present):
-            measured, start = measured_of(block, number, len(self.names)), 0
-            state = states.get(number)
-            if state is None:
-                state, start = self.init(number), int(measured.seen.long().argmax())
-            rows, unseen = slice(start, None), state.unseen
-            measured = measured.frames(rows)
-            state, poses, chosen = self.advance(state, measured, images[rows])
-            poses = without_long_gaps(poses, measured.seen, unseen, gap)
-            tracked[number] = TrackedBlock(start, poses, chosen)
-            if state.unseen <= gap:
+            measured = measured_of(block, number, len(self.names))
+            state, parts = self._advance_parts(number, states.get(number), measured, images, gap)
+            if parts:
+                tracked[number] = parts
+            if state is not None:
                 following[number] = state
         return following, tracked
+
+    def _advance_parts(
+        self,
+        number: int,
+        state: PersonStreamState | None,
+        measured: Measured,
+        images: Sequence[Image],
+        gap: int,
+    ) -> tuple[PersonStreamState | None, list[TrackedBlock]]:
+        """Return the next state of one person, None after a long gap, and the parts before and after gaps."""
+        parts: list[TrackedBlock] = []
+        start, n_frames = 0, len(measured.seen)
+        while start < n_frames:
+            if state is None:
+                seen = torch.nonzero(measured.seen[start:]).flatten()
+                if not len(seen):
+                    break
+                state, start = self.init(number), start + int(seen[0])
+            before, rows = state.unseen, slice(start, None)
+            state, poses, chosen = self.advance(state, measured.frames(rows), images[rows])
+            gone = torch.nonzero(_frames_unseen(poses, before) > gap).flatten()
+            if len(gone):
+                end = int(gone[0]) + 1
+                state, poses, chosen = None, _first_frames(poses, end), chosen.frames(slice(end))
+                if not measured.seen[start + end - 1]:
+                    poses = _without_poses(poses, torch.arange(end) == end - 1)
+            parts.append(TrackedBlock(start, poses, chosen))
+            start += len(chosen.seen)
+        return state, parts
 
 
 def _batch(values: Tensor | None) -> Tensor | None:
@@ -264,13 +298,35 @@ def without_long_gaps(
     """Return the poses, NaN where nothing was seen for more than `gap` frames.
 
     Args:
-        unseen: number of frames without measurements before these.
+        poses: the poses of one sequence. seen: whether anything was measured in each frame.
+        unseen: the number of frames without measurements before these.
+        gap: the largest number of frames without measurements that has poses.
     """
+    away = _frames_since(seen, unseen) > gap
+    return _without_poses(poses, away) if bool(away.any()) else poses
+
+
+def _frames_since(seen: Bool[Tensor, " T"], unseen: int) -> Int[Tensor, " T"]:
+    """Return the number of frames since the last one that was seen, after each frame."""
     frames = torch.arange(len(seen))
     last = torch.where(seen, frames, torch.full_like(frames, -1 - unseen)).cummax(0).values
-    away = frames - last > gap
-    if not bool(away.any()):
-        return poses
+    return frames - last
+
+
+def _frames_unseen(poses: PoseTrack, unseen: int) -> Int[Tensor, " T"]:
+    """Return `PersonStreamState.unseen` after each frame: keypoints that are outliers do not count."""
+    return _frames_since(poses.observed[0].any(-1), unseen)
+
+
+def _first_frames(poses: PoseTrack, count: int) -> PoseTrack:
+    """Return the first frames of one sequence."""
+    cut = {name: getattr(poses, name)[:, :count] for name in FRAME_FIELDS}
+    failed_at = torch.where(poses.failed_at < count, poses.failed_at, -1)
+    return replace(poses, **cut, lengths=poses.lengths.clamp(max=count), failed_at=failed_at)
+
+
+def _without_poses(poses: PoseTrack, away: Bool[Tensor, " T"]) -> PoseTrack:
+    """Return the poses of one sequence, NaN in these frames."""
     changed = {}
     for name in ("joints2d", "joints3d", "covariance2d", "covariance3d"):
         value = getattr(poses, name).clone()

@@ -40,7 +40,7 @@ class PoseSpool:
     The files are deleted with the spool; poses that were read from it remain readable.
 
     Args:
-        folder: where the files are; None is the system's folder for temporary files.
+        folder: the folder of the files; None is the system's folder for temporary files.
 
     Raises:
         OutputError: the folder cannot be written to.
@@ -118,12 +118,13 @@ class TrackedPerson:
     """Holds the poses of one person of a video.
 
     Attributes:
-        number: in the order of appearance. first_frame: of the video, that of the first pose.
+        number: of the person, in the order of appearance. first_frame: the frame of the video that has the
+            first pose.
         track: poses as a batch of one; NaN where the person was absent for longer than `max_gap`.
         keypoints: measured [T, J, 2], pixels, NaN where missing, in the order of the
             measurer's `names`.
-        covariance: of these [T, J, 2, 2]; None of a detector of keypoints.
-        confidence: of a detector of keypoints [T, J], 0 to 1; else None.
+        covariance: of the keypoints [T, J, 2, 2]; None by a detector of keypoints.
+        confidence: 0 to 1 [T, J], by a detector of keypoints; else None.
     """
 
     number: int
@@ -153,9 +154,9 @@ class TrackedRecording:
     """Collects the tracked blocks of all persons (`PersonStream.advance_all`), and joins them at the end.
 
     Args:
-        tracker: of the poses. names: of the measured joints.
-        gap: frames without measurements after which a person has no pose.
-        folder: for temporary files.
+        tracker: the tracker of the poses. names: the names of the measured joints.
+        gap: the number of frames without measurements after which a person has no pose.
+        folder: the folder of temporary files; None is the system's.
     """
 
     def __init__(
@@ -169,17 +170,18 @@ class TrackedRecording:
         self.n_frames = 0
         self._people: dict[int, _Person] = {}
 
-    def append(self, tracked: Mapping[int, TrackedBlock], n_frames: int) -> None:
-        """Keep the next block.
+    def append(self, tracked: Mapping[int, Sequence[TrackedBlock]], n_frames: int) -> None:
+        """Keep the poses of the next block.
 
         Args:
-            tracked: by person. n_frames: of the block.
+            tracked: the parts of the block with poses, by person. n_frames: the length of the block.
 
         Raises:
             OutputError: the disk is full.
         """
-        for number, part in tracked.items():
-            self._keep(number, part)
+        for number, parts in tracked.items():
+            for part in parts:
+                self._keep(number, part)
         self.n_frames += n_frames
 
     def _keep(self, number: int, part: TrackedBlock) -> None:
@@ -205,7 +207,7 @@ class TrackedRecording:
         """Return the persons who were seen for half a second or longer, the longest seen first.
 
         Args:
-            smoother: of the whole recording; None keeps the filtered poses.
+            smoother: the smoother of whole recordings; None keeps the filtered poses.
         """
         least = _LEAST_SECONDS * (self.tracker.fps or 30.0)
         lasting = [person for person in self._people.values() if person.n_seen >= least]
@@ -234,7 +236,9 @@ def smoothed(
     """Return the smoothed poses of a person, from all measurements.
 
     Args:
-        names: of the measured joints. gap: frames after which there is no pose.
+        person: the person with all measurements. smoother: the smoother of whole recordings.
+        names: the names of the measured joints. gap: the number of frames without measurements after
+            which there is no pose.
     """
     with torch.no_grad():
         confidence, cov = (
@@ -248,7 +252,7 @@ def smoothed(
 
 
 def _joined(parts: Sequence[Tensor | None], count: int) -> Tensor | None:
-    """Return the first frames of some parts, None if these are not measured."""
+    """Return the first frames of the joined parts; None if these are not measured."""
     there = [part for part in parts if part is not None]
     return torch.cat(there)[:count] if there else None
 

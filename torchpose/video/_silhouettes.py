@@ -41,7 +41,8 @@ class SilhouetteView(NamedTuple):
     """Holds the mapping of a camera's images to silhouettes of a common size.
 
     Attributes:
-        camera: of the silhouettes, without distortion. size: (width, height) of a frame of the video.
+        camera: the camera of the silhouettes, without distortion. size: (width, height) of a frame of the
+            video.
         padding: columns at the right and rows below that the calibrated image has and the video lacks.
         inner: (width, height) of the image in the silhouette; the rest is empty.
         source: the camera as calibrated.

@@ -67,7 +67,7 @@ def frame_rate(times: Sequence[float], declared: float | None = None) -> Rate | 
     frames) and is one over the mean of those intervals; otherwise it is the average over all.
 
     Args:
-        times: of the frames, seconds, in any order.
+        times: the times of the frames, seconds, in any order.
         declared: rate by the file, taken if within half a percent of the one found.
 
     Returns:
@@ -200,10 +200,10 @@ class Scan(NamedTuple):
     """Holds the result of reading the packets without decoding them.
 
     Attributes:
-        frames: packets of video. rate: by their times, None without. declared: rate by the file,
-        None if it is not plausible. span: seconds from first to last frame. last: end of the last
-        packet of any stream, seconds on the file's clock. complete: whether the end was reached.
-        fault: the error that ended the file early, or nothing.
+        frames: the number of packets of video. rate: the rate by their times, None without times.
+        declared: the rate by the file, None if it is not plausible. span: the seconds from first to last
+            frame. last: the end of the last packet of any stream, seconds on the file's clock.
+        complete: whether the end was reached. fault: the error that ended the file early, or nothing.
     """
 
     frames: int

@@ -1,10 +1,10 @@
 """Track the poses of all persons in a video."""
 
 import sys
-from collections.abc import Callable, Iterable, Iterator
-from itertools import islice
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 import torch
@@ -19,32 +19,44 @@ from torchpose.errors import InputError
 from torchpose.measure._association import HandAssociation
 from torchpose.measure._detectors.load import check_detector, load_detector
 from torchpose.measure._detectors.protocol import KeypointDetector
-from torchpose.measure._face import FaceDetector, FaceTracks
+from torchpose.measure._face import FaceDetector
 from torchpose.measure._head import HeadNeck
 from torchpose.measure._keypoints import (
     LEAST_CONFIDENCE,
-    FrameKeypoints,
     KeypointMeasurer,
     KeypointState,
 )
 from torchpose.measure._upper_body import (
     HAND_TRACKERS,
     Candidates,
-    FrameMeasurements,
     MeasurerState,
     UpperBodyMeasurer,
 )
 from torchpose.priors._upper_body import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.upper_body._options import TrackerOptions
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._tracker import UpperBodyTracker
-from torchpose.video._person_stream import Measured, PersonStream, PersonStreamState
+from torchpose.video._measurers import (
+    Found,
+    MeasuredBlock,
+    Measurer,
+    SeenFrame,
+    look_ahead,
+    measure_blocks,
+    measurer_of,
+)
+from torchpose.video._person_stream import (
+    Measured,
+    PersonStream,
+    PersonStreamState,
+    TrackedBlock,
+)
 from torchpose.video._prefetch import prefetch
 from torchpose.video._recording import TrackedPerson, TrackedRecording
 
 __all__ = ["LivePerson", "TrackedPerson", "VideoState", "VideoTracker", "Watcher"]
 
-Found = FrameMeasurements | FrameKeypoints
 Watcher = Callable[[Image, Found, dict[int, PoseTrack]], None]
 """Is called with a frame, its measurements, and the poses of the persons in it by number."""
 
@@ -53,7 +65,12 @@ _BLOCK = 32  # frames of a recording that are filtered together
 
 
 class VideoState(NamedTuple):
-    """Holds the state of `VideoTracker.step`: of the measurer, of all streams, and the last poses."""
+    """Holds the state of `VideoTracker` between two frames.
+
+    Attributes:
+        measurer: the state of the measurer. streams: the states of the persons by number.
+        poses: the last poses of the persons in `streams`, but for those of filters that degenerated.
+    """
 
     measurer: MeasurerState | KeypointState
     streams: dict[int, PersonStreamState]
@@ -61,7 +78,14 @@ class VideoState(NamedTuple):
 
 
 class LivePerson(NamedTuple):
-    """Holds a person in one frame: number, pose (a track of one frame), and measurements."""
+    """Holds a person in one frame.
+
+    Attributes:
+        number: of the person, in the order of appearance.
+        pose: a track of one frame; `pose.failed` [1] says whether the filter degenerated, as in a
+            `PoseTrack` and a `LivePose`.
+        measured: the measurements in the frame.
+    """
 
     number: int
     pose: PoseTrack
@@ -76,10 +100,11 @@ class VideoTracker(nn.Module):
     attribute `names`, of J keypoints, that is called with an RGB image [H, W, 3] and returns keypoints
     [N, J, 2], pixels, and confidence [N, J], 0 to 1, of N persons.
 
-    `forward` tracks a recording, `init` and `step` a camera. A frame passes three stages, each of which
-    takes and returns values: the measurer gives `FrameMeasurements`, the streams of the persons
-    (`PersonStream.advance_all`) turn these into a `TrackedBlock` for each, by the `UpperBodyTracker`. A
-    recording's blocks are kept in files until it has ended (`TrackedRecording`).
+    `forward` tracks a recording, `init` and `step` a camera, `advance` some more frames of either. A frame
+    passes three stages, each of which takes and returns values: `Measurer.look` finds the faces,
+    `Measurer.step` measures the persons, and `PersonStream.advance_all` turns the measurements into poses
+    by the `UpperBodyTracker`. Of a recording the first two run ahead in threads, and the poses are kept in
+    files until it has ended (`TrackedRecording`).
 
     Args:
         prior: from `load_prior` or `fit_upper_body_prior`.
@@ -101,7 +126,7 @@ class VideoTracker(nn.Module):
         min_confidence: with a detector, of a keypoint, below which it is missing (default 0.3).
         max_gap: seconds without measurements after which a person has no pose; None is never.
         seed: of methods that draw; every person has a generator.
-        **options: to `UpperBodyTracker`, such as method, smoothing or frame.
+        **options: further options of `UpperBodyTracker`, such as method, smoothing or frame.
 
     Raises:
         InputError, CameraError, PriorError: as those.
@@ -133,7 +158,7 @@ class VideoTracker(nn.Module):
         min_confidence: float | None = None,
         max_gap: float | None = 5.0,
         seed: int = 0,
-        **options: Any,
+        **options: Unpack[TrackerOptions],
     ) -> None:
         super().__init__()
         if max_gap is not None and not max_gap > 0:
@@ -161,7 +186,7 @@ class VideoTracker(nn.Module):
         association = HandAssociation() if edges else None
         self.stream = PersonStream(tracker, self.measurer.names, seed, association)
         self.smoothing = smoothing
-        self._options = {"fps": fps, "max_gap": None, **options}
+        self._options: dict[str, Any] = {"fps": fps, "max_gap": None, **options}
         _ = self.smoother  # raises errors of the options before any work
         self.fps = float(fps)
         self.gap = sys.maxsize if max_gap is None else round(max_gap * fps)
@@ -201,14 +226,36 @@ class VideoTracker(nn.Module):
         Raises:
             InputError: another kind of image, or a tracker that smooths.
         """
+        state, tracked = self.advance(state, [image])
+        last = {number: tracked[number][-1] for number in state.streams}
+        return state, [LivePerson(n, part.poses, part.measured) for n, part in last.items()]
+
+    def advance(
+        self, state: VideoState, images: Iterable[Any] | Tensor
+    ) -> tuple[VideoState, dict[int, list[TrackedBlock]]]:
+        """Return the next state and the poses in some more frames: those of `step` for one after the other.
+
+        Args:
+            state: from `init` or the call before. images: as the frames of `forward`.
+
+        Returns:
+            The next state, and by number of each person the parts of these frames in which there are
+            poses, each with the place of its first frame (`start`).
+
+        Raises:
+            InputError: another kind of image, or a tracker that smooths.
+        """
         if self.smoother is not None:
             raise InputError("a camera is tracked frame by frame: expected smoothing=None")
-        image = as_image(image)
-        candidates = _candidates(state.poses) if self.candidates else None
-        measurer, measured = self._measure_frame(state.measurer, image, None, candidates)
-        streams, tracked = self.stream.advance_all(state.streams, [measured], [image], self.gap)
-        people = [LivePerson(n, tracked[n].poses, tracked[n].measured) for n in streams]
-        return VideoState(measurer, streams, {p.number: p.pose for p in people}), people
+        seen = look_ahead(self._measurer, state.measurer, _images(images))
+        tracked: dict[int, list[TrackedBlock]] = {}
+        place, last = 0, state
+        for after, block, poses in self._blocks(state, seen, _BLOCK):
+            for number, parts in poses.items():
+                placed = (part._replace(start=place + part.start) for part in parts)
+                tracked.setdefault(number, []).extend(placed)
+            place, last = place + len(block.images), after
+        return last, tracked
 
     def forward(
         self,
@@ -223,7 +270,7 @@ class VideoTracker(nn.Module):
         Args:
             frames: RGB, uint8, arrays [H, W, 3], or what has such an `image` (a `VideoSource`); or a
                 tensor [T, 3, H, W].
-            progress: whether to show a bar. n_frames: for the bar.
+            progress: whether to show a bar. n_frames: the number of frames, for the bar.
             folder: for temporary files, some 1.2 kB for every pose.
             watch: is called for every frame; frames are then filtered one by one, which is slower.
 
@@ -234,64 +281,59 @@ class VideoTracker(nn.Module):
             InputError: another kind of image. OutputError: the disk is full.
         """
         recording = TrackedRecording(self.tracker, self.stream.names, self.gap, folder)
-        size = _BLOCK if watch is None and not self.candidates else 1
-        streams: dict[int, PersonStreamState] = {}
-        last: dict[int, PoseTrack] = {}
-        measured = self._measure(frames, last)
-        if not self.candidates:
-            measured = prefetch(measured, size)  # while the block before is filtered
-        shown = iter(tqdm(measured, total=n_frames, disable=not progress, unit="frame"))
-        while block := list(islice(shown, size)):
-            images, found = zip(*block, strict=True)
-            streams, tracked = self.stream.advance_all(streams, found, images, self.gap)
-            recording.append(tracked, len(block))
-            last.clear()
-            last.update({n: part.poses for n, part in tracked.items() if _is_pose(part.poses)})
-            if watch is not None:
-                watch(images[-1], found[-1], dict(last))
+        start, size = self.init(), _BLOCK if watch is None else 1
+        ahead = prefetch(look_ahead(self._measurer, start.measurer, _images(frames)))
+        with (
+            closing(ahead) as seen,  # no thread reads on when the caller gets an error
+            closing(self._blocks(start, seen, size, ahead=True)) as blocks,
+            tqdm(total=n_frames, disable=not progress, unit="frame") as bar,
+        ):
+            for state, block, tracked in blocks:
+                recording.append(tracked, len(block.images))
+                bar.update(len(block.images))
+                if watch is not None:
+                    watch(block.images[-1], block.found[-1], dict(state.poses))
         return recording.finish(self.smoother)
 
-    def _measure(
-        self, frames: Iterable[Any] | Tensor, last: dict[int, PoseTrack]
-    ) -> Iterator[tuple[Image, Found]]:
-        """Yield frames and what is measured in them; faces are found ahead, in another thread.
+    @property
+    def _measurer(self) -> Measurer:
+        return measurer_of(self.measurer)
 
-        `last` holds the poses of the frame before, for candidates.
+    def _blocks(
+        self, state: VideoState, seen: Iterable[SeenFrame], size: int, ahead: bool = False
+    ) -> Generator[tuple[VideoState, MeasuredBlock, dict[int, list[TrackedBlock]]], None, None]:
+        """Yield the next state, the measurements and the poses of each block of frames.
+
+        With candidates every frame is a block, since it is measured with the poses of the one before.
+
+        Args:
+            state: the state before the frames. seen: the frames with their faces.
+            size: the number of frames of a block; the last one may be shorter.
+            ahead: whether frames are measured in another thread while the block before is filtered.
         """
-        state = self.measurer.init()
-        for image, tracks in prefetch(self._follow_faces(frames, state)):
-            with torch.no_grad():
-                candidates = _candidates(last) if self.candidates else None
-                state, measured = self._measure_frame(state, image, tracks, candidates)
-            yield image, measured
+        measurer = self._measurer
+        if self.candidates:
+            for frame in seen:
+                own, found = measurer.step(state.measurer, frame, _candidates(state.poses))
+                block = MeasuredBlock([frame.image], [found], own)
+                state, tracked = self._follow(state, block)
+                yield state, block, tracked
+            return
+        blocks = measure_blocks(measurer, state.measurer, seen, size)
+        with closing(prefetch(blocks, 1) if ahead else blocks) as measured:
+            for block in measured:
+                state, tracked = self._follow(state, block)
+                yield state, block, tracked
 
-    def _measure_frame(
-        self,
-        state: MeasurerState | KeypointState,
-        image: Image,
-        tracks: FaceTracks | None,
-        candidates: dict[int, Candidates] | None,
-    ) -> tuple[MeasurerState | KeypointState, Found]:
-        """Return the next state of the measurer, and what is measured in a frame."""
-        if isinstance(self.measurer, UpperBodyMeasurer) and isinstance(state, MeasurerState):
-            return self.measurer.step(state, image, tracks, candidates)
-        if isinstance(self.measurer, KeypointMeasurer) and isinstance(state, KeypointState):
-            return self.measurer.step(state, image)
-        raise InputError(
-            "expected a state of this tracker's init or step, got one of another tracker"
-        )
-
-    def _follow_faces(
-        self, frames: Iterable[Any] | Tensor, state: MeasurerState | KeypointState
-    ) -> Iterator[tuple[Image, FaceTracks | None]]:
-        """Yield frames and the faces in them, None with a detector of keypoints."""
-        tracks = state.faces if isinstance(state, MeasurerState) else None
-        for frame in frames:
-            image = as_image(getattr(frame, "image", frame))
-            if isinstance(self.measurer, UpperBodyMeasurer) and tracks is not None:
-                with torch.no_grad():
-                    tracks = self.measurer.follow_faces(tracks, image)
-            yield image, tracks
+    def _follow(
+        self, state: VideoState, block: MeasuredBlock
+    ) -> tuple[VideoState, dict[int, list[TrackedBlock]]]:
+        """Return the next state and the poses in a block of measured frames."""
+        images, found, own = block
+        streams, tracked = self.stream.advance_all(state.streams, found, images, self.gap)
+        last = {number: tracked[number][-1].poses for number in streams}
+        poses = {number: pose for number, pose in last.items() if _ends_in_pose(pose)}
+        return VideoState(own, streams, poses), tracked
 
 
 def _keypoint_measurer(
@@ -300,7 +342,7 @@ def _keypoint_measurer(
     max_persons: int | None,
     min_confidence: float | None,
 ) -> KeypointMeasurer:
-    """Return what measures by a detector, which is loaded if it is a file or the name of a factory."""
+    """Return the measurer of a detector, which is loaded if it is a file or the name of a factory."""
     if isinstance(detector, str | Path):
         name, loaded = str(detector), load_detector(detector, fps, max_persons)
     else:
@@ -332,13 +374,19 @@ def as_image(image: Any) -> Image:
     return np.asarray(image)
 
 
+def _images(frames: Iterable[Any] | Tensor) -> Iterator[Image]:
+    """Yield the images of frames, which may have more to them than their image."""
+    for frame in frames:
+        yield as_image(getattr(frame, "image", frame))
+
+
 def _candidates(poses: dict[int, PoseTrack]) -> dict[int, Candidates]:
-    """Return where the poses of a frame have the hands, by person."""
+    """Return the hands of the last poses with their covariances, by person."""
     return {
         n: Candidates(pose.joints2d[0, -1, _HANDS], pose.covariance2d[0, -1, _HANDS])
         for n, pose in poses.items()
     }
 
 
-def _is_pose(track: PoseTrack) -> bool:
-    return bool(track.joints3d.isfinite().all())
+def _ends_in_pose(track: PoseTrack) -> bool:
+    return bool(track.joints3d[:, -1].isfinite().all())

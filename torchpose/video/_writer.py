@@ -115,10 +115,8 @@ class VideoWriter:
         )
         options = {"crf": str(crf), "preset": preset} if encoder == "libx264" else {}
         stream: Any = self._container.add_stream(encoder, rate=self._rate, options=options)
-        stream.width, stream.height = (
-            self.size[0] + self._padding[1],
-            self.size[1] + self._padding[0],
-        )
+        stream.width = self.size[0] + self._padding[1]
+        stream.height = self.size[1] + self._padding[0]
         stream.pix_fmt = "yuv420p"
         context = stream.codec_context
         context.time_base = 1 / self._rate

@@ -1,0 +1,148 @@
+"""Follow the place of each joint in the image, and a candidate for it, through outliers."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchpose.upper_body._screen_model import CERTAIN, TAKEOVER, ScreenModel
+
+__all__ = [
+    "DOUBTFUL",
+    "TRACKS",
+    "ScreenState",
+    "in_order",
+    "init_screen",
+    "predict_tracks",
+    "start_candidates",
+    "take_over",
+    "update_tracks",
+]
+
+TRACKS = ("position", "velocity", "cov", "evidence")
+"""Fields of `ScreenState` that hold a track and a candidate of each joint."""
+
+DOUBTFUL = 3.0
+"""Log-odds phi below whose negative a place does not go with the other joints."""
+
+
+class ScreenState(NamedTuple):
+    """State between two frames: for each joint a track, and a candidate for its place.
+
+    Attributes:
+        position, velocity: [B, 2, 8, 2], pixels and pixels per second.
+        cov: variance of a coordinate, its covariance with its velocity, and that one's [B, 2, 8, 3].
+        evidence: seconds for which each was seen, at most so many as count [B, 2, 8].
+        exchange: log-probability of each way to exchange left and right [B, X]. lasting: seconds for
+            which they have been exchanged [B]. scales: log-probability of the person's sizes [B, G].
+    """
+
+    position: Tensor
+    velocity: Tensor
+    cov: Tensor
+    evidence: Tensor
+    exchange: Tensor
+    lasting: Tensor
+    scales: Tensor
+
+
+def init_screen(model: ScreenModel, batch_size: int) -> ScreenState:
+    """Return the state before the first frame of B streams: joints may be anywhere in the image."""
+    like, n = model.low, batch_size
+    middle, cov = (model.low + model.high) / 2, like.new_tensor([model.broad, 0.0, 0.0])
+    exchange = like.new_full((n, len(model.exchanges)), -math.inf)
+    exchange[:, 0] = 0.0
+    return ScreenState(
+        middle.repeat(n, 2, 8, 1), like.new_zeros(n, 2, 8, 2), cov.repeat(n, 2, 8, 1),
+        like.new_zeros(n, 2, 8), exchange, like.new_zeros(n), model.usual.repeat(n, 1),
+    )  # fmt: skip
+
+
+def predict_tracks(
+    model: ScreenModel, state: ScreenState, square: Float[Tensor, "B 1 1"]
+) -> ScreenState:
+    """Return the state a frame later: velocities persist for a while, and spreads grow."""
+    cov = state.cov @ model.moving + square[..., None] * model.agitation
+    return state._replace(
+        position=state.position + model.drift * state.velocity,
+        velocity=model.kept * state.velocity,
+        cov=cov * (model.broad / cov[..., :1]).clamp_max(1.0),
+    )
+
+
+def take_over(
+    model: ScreenModel, state: ScreenState, odds: Tensor, body: Tensor, known: Tensor
+) -> tuple[ScreenState, Float[Tensor, "B 2 8"]]:
+    """Return the state in which candidates with more evidence have become the tracks, and the log-odds.
+
+    Evidence is the time for which a track was seen, up to `TAKEOVER`. A place that does not go with the
+    other joints needs more of it, and may need more than there can be.
+    """
+    alive = state.evidence[:, 1] > 0
+    odds = torch.stack([odds[:, 0], odds[:, 1].where(alive, -math.inf)], 1)
+    right = odds[:, 0] + body > 0
+    again = ~right & (odds[:, 1] > 0)
+    change = torch.where(again, model.dt, torch.where(right, -TAKEOVER, -model.dt))
+    evidence = torch.stack([
+        (state.evidence[:, 0] + model.dt * (right & known)).clamp_max(TAKEOVER),
+        (state.evidence[:, 1] + change * known).clamp(0.0, 2 * TAKEOVER),
+    ], 1)  # fmt: skip
+    doubt = -(body + DOUBTFUL).clamp_max(0.0) / (CERTAIN - DOUBTFUL)
+    needed = evidence[:, 0] + TAKEOVER * doubt
+    taken = known & again & (evidence[:, 1] > needed)
+    state = state._replace(evidence=evidence)
+    if not bool(taken.any()):
+        return state, odds
+    order = torch.stack([taken, ~taken], 1).long()
+    tracks = {name: in_order(getattr(state, name), order, 1) for name in TRACKS}
+    return state._replace(**tracks), in_order(odds, order, 1)
+
+
+def update_tracks(
+    state: ScreenState, z: Tensor, noise: Tensor, weight: Float[Tensor, "B 2 8"]
+) -> ScreenState:
+    """Return both tracks after a pixel that is theirs with a probability: the moments of the mixture."""
+    pp, pv, vv = state.cov.unbind(-1)
+    total = pp + noise[:, None]
+    gain, turn = pp / total, pv / total
+    apart = z[:, None] - state.position
+    spread = weight * (1 - weight) * apart.square().sum(-1) / 2
+    cov = [
+        pp - weight * gain * pp + spread * gain.square(),
+        pv - weight * gain * pv + spread * gain * turn,
+        vv - weight * turn * pv + spread * turn.square(),
+    ]
+    return state._replace(
+        position=state.position + (weight * gain)[..., None] * apart,
+        velocity=state.velocity + (weight * turn)[..., None] * apart,
+        cov=torch.stack(cov, -1),
+    )
+
+
+def start_candidates(
+    model: ScreenModel,
+    state: ScreenState,
+    z: Tensor,
+    noise: Tensor,
+    square: Tensor,
+    new: Bool[Tensor, "B 8"],
+) -> ScreenState:
+    """Return the state with a new candidate at the measured pixels of these joints."""
+    started = {
+        "position": z, "velocity": torch.zeros_like(z),
+        "cov": torch.stack([noise, torch.zeros_like(noise), square * model.speed], -1),
+        "evidence": torch.full_like(noise, model.dt),
+    }  # fmt: skip
+    changed = {}
+    for name, value in started.items():
+        track, candidate = getattr(state, name).unbind(1)
+        at = new.reshape(*new.shape, *[1] * (value.ndim - 2))
+        changed[name] = torch.stack([track, torch.where(at, value, candidate)], 1)
+    return state._replace(**changed)
+
+
+def in_order(value: Tensor, order: Int[Tensor, "B #N 8"], dim: int) -> Tensor:
+    """Return tracks [B, 2, 8, ...] permuted along `dim`: track and candidate (1), or the joints (2)."""
+    return value.gather(dim, order.reshape(*order.shape, *[1] * (value.ndim - 3)).expand_as(value))

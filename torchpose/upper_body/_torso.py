@@ -1,0 +1,240 @@
+"""Tell how likely the joints of a torso are seen so, given its depth, size and turn."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Shaped
+from torch import Tensor
+
+from torchpose.skeleton._joint_sets import UPPER_BODY
+
+__all__ = [
+    "NECK_HEIGHT",
+    "Root",
+    "Torso",
+    "TorsoLengths",
+    "half_widths",
+    "heavy_tail",
+    "inward_shares",
+    "middle_of_shoulders",
+    "see_torso",
+    "shoulder_offsets",
+    "spine_places",
+    "torso_log_likelihood",
+    "torso_places",
+    "with_axes",
+]
+
+_TORSO = tuple(UPPER_BODY.index(n) for n in ("shoulder_left", "shoulder_right", "neck", "head"))
+NECK_HEIGHT = 0.105
+"""Metres of Kinect's neck above the middle of the shoulders."""
+
+# Standard deviation of each torso joint about its place in a stiff torso, metres: x and y.
+_STIFF = ((0.03, 0.035), (0.03, 0.035), (0.03, 0.035), (0.05, 0.035))
+# Shoulders of raised arms move in, by a share of half the width that differs from one to the next, and up.
+# As in UTD-MHAD (s1 to s6): from 0.165 m to 0.140.
+_INWARD, _INWARD_STD, _UPWARD_STD = 0.15, 0.2, 0.03
+_HANGING, _RAISED = -0.7, 0.2  # sines of the elevation from which, and to which, they do
+# Metres to the elbow and to the hand; the elevation does not have to be exact.
+_REACH = (0.27, 0.48)
+_NOT_RAISED = -1e3  # where no arm is seen
+
+_ARMS = tuple(
+    tuple(UPPER_BODY.index(f"{joint}_{side}") for joint in ("shoulder", "elbow", "hand"))
+    for side in ("left", "right")
+)
+_FREEDOM = 4.0  # of the heavy tails of detectors' points
+
+
+class TorsoLengths(NamedTuple):
+    """Lengths of a torso, metres.
+
+    Attributes:
+        width: the distance between the shoulders, [B]. height: the height of the head above the neck, [B].
+        width_std, height_std: their standard deviations, [B].
+        neck: the height of the neck above the middle of the shoulders.
+    """
+
+    width: Tensor
+    height: Tensor
+    width_std: Tensor
+    height_std: Tensor
+    neck: float = NECK_HEIGHT
+
+
+class Root(NamedTuple):
+    """Hypotheses about the torso, [B, M] each.
+
+    Attributes:
+        depth: of the middle of the shoulders, metres. turn: psi, radians. size: of the torso, as a factor
+            on `TorsoLengths`. log_weight: the log-weight of each hypothesis.
+        cell: its index in the flat grid of depths and turns.
+    """
+
+    depth: Tensor
+    turn: Tensor
+    size: Tensor
+    log_weight: Tensor
+    cell: Tensor
+
+
+class Torso(NamedTuple):
+    """Measured torso joints, as rays.
+
+    Attributes:
+        rays: K^-1 [u, v, 1] of both shoulders, neck and head, [B, 4, 3].
+        known: whether each is measured, [B, 4].
+        std: the standard deviation of a pixel over the focal length, [B, 4].
+        rise: the sine of each arm's elevation above its shoulder over the depth, 1 / m, [B, 2].
+    """
+
+    rays: Tensor
+    known: Tensor
+    std: Tensor
+    rise: Tensor
+
+    def raised(self, depth: Float[Tensor, "B *grid"]) -> Float[Tensor, "B *grid 2"]:
+        """Return the elevation of each arm on a scale from 0 (hanging) to 1 (raised)."""
+        rise = with_axes(self.rise, depth.ndim - 1)
+        return ((rise * depth[..., None] - _HANGING) / (_RAISED - _HANGING)).clamp(0.0, 1.0)
+
+
+def see_torso(
+    rays: Float[Tensor, "B 8 3"], known: Bool[Tensor, "B 8"], std: Float[Tensor, "B 8"]
+) -> Torso:
+    """Return the torso joints among the rays of all joints of `UPPER_BODY`."""
+    chosen = list(_TORSO)
+    rise = torch.stack([_rise(rays, known, *arm) for arm in _ARMS], 1)
+    return Torso(rays[:, chosen], known[:, chosen], std[:, chosen], rise)
+
+
+def _rise(rays: Tensor, known: Tensor, shoulder: int, elbow: int, hand: int) -> Float[Tensor, " B"]:
+    """Return the height of an elbow, or else of a hand, above its shoulder in the image, over its reach."""
+    end = torch.where(known[:, elbow], rays[:, elbow, 1], rays[:, hand, 1])
+    reach = torch.where(known[:, elbow], end.new_tensor(_REACH[0]), end.new_tensor(_REACH[1]))
+    there = known[:, shoulder] & (known[:, elbow] | known[:, hand])
+    return torch.where(there, (rays[:, shoulder, 1] - end) / reach, _NOT_RAISED)
+
+
+def half_widths(
+    width: Float[Tensor, " B"], raised: Float[Tensor, "B *grid 2"]
+) -> Float[Tensor, "B *grid 2"]:
+    """Return the distances of both shoulders from their middle, metres: less where an arm is raised."""
+    return with_axes(width, raised.ndim - 1) / 2 * (1 - _INWARD * raised)
+
+
+def inward_shares(torso: Torso, depth: Float[Tensor, " B"]) -> tuple[Tensor, Tensor]:
+    """Return the share by which raised arms narrow the shoulders, and its standard deviation, [B]."""
+    raised = torso.raised(depth)
+    return _INWARD * raised.mean(-1), _INWARD_STD / 2 * torch.linalg.vector_norm(raised, dim=-1)
+
+
+def shoulder_offsets(turn: Float[Tensor, "*batch"], half: Float[Tensor, "*batch 2"]) -> Tensor:
+    """Return left and right shoulder relative to the middle of both, camera axes, [..., 2, 3].
+
+        h_left (cos psi, 0, -sin psi),   -h_right (cos psi, 0, -sin psi)
+
+    Args:
+        turn: psi, radians. half: h of both shoulders, metres (`half_widths`).
+    """
+    level = torch.stack([turn.cos(), torch.zeros_like(turn), -turn.sin()], -1)
+    signed = half * half.new_tensor([1.0, -1.0])
+    return signed[..., None] * level[..., None, :]
+
+
+def torso_places(
+    turn: Float[Tensor, "B *grid"], half: Float[Tensor, "B *grid 2"], lengths: TorsoLengths
+) -> Float[Tensor, "B *grid 4 3"]:
+    """Return both shoulders, neck and head relative to the middle of the shoulders, camera axes.
+
+    Args:
+        turn: psi, radians. half: the distances of the shoulders from their middle (`half_widths`).
+        lengths: the lengths of the torso.
+    """
+    shoulders = shoulder_offsets(turn, half)
+    spine = with_axes(spine_places(lengths), turn.ndim - 1).expand_as(shoulders)
+    return torch.cat([shoulders, spine], -2)
+
+
+def spine_places(lengths: TorsoLengths) -> Float[Tensor, "B 2 3"]:
+    """Return neck and head relative to the middle of the shoulders, camera axes: upright above it."""
+    neck = torch.full_like(lengths.height, -lengths.neck)
+    up = torch.stack([neck, neck - lengths.height], 1)
+    level = torch.zeros_like(up)
+    return torch.stack([level, up, level], -1)
+
+
+def middle_of_shoulders(torso: Torso, root: Root, lengths: TorsoLengths) -> Float[Tensor, "B M 3"]:
+    """Return the middle of the shoulders given depth, turn and size; on the optical axis if unknown."""
+    depth = root.depth / root.size  # what is larger is as if nearer
+    u, v = _middles(torso, depth, root.turn, lengths)
+    return torch.stack([u.mean, v.mean, depth], -1) * root.size[..., None]
+
+
+def torso_log_likelihood(
+    torso: Torso, depth: Tensor, turn: Tensor, lengths: TorsoLengths
+) -> Float[Tensor, "B *grid"]:
+    """Return the log-likelihood of the torso's joints, whose middle may be anywhere in the image."""
+    count = with_axes(torso.known.sum(-1).to(depth), depth.ndim - 1)
+    total = torch.zeros_like(depth)
+    for value, precision, mean in _middles(torso, depth, turn, lengths):
+        off = (precision * (value - mean[..., None]).square()).sum(-1)
+        logs = torch.where(precision > 0, precision, 1.0).log().sum(-1)
+        mass = torch.where(count > 0, precision.sum(-1), 1.0)
+        total = total + heavy_tail(off) + 0.5 * (logs - mass.log())
+    return total + 2 * (count - 1).clamp_min(0) * depth.log()
+
+
+class _Middle(NamedTuple):
+    """Estimates of the middle of the shoulders along one axis of the image, one by each torso joint.
+
+    Attributes:
+        value: the estimate by each joint, metres, [..., 4]. precision: of each, 0 where it is not measured.
+        mean: the mean of all, weighted by their precisions, [...].
+    """
+
+    value: Tensor
+    precision: Tensor
+    mean: Tensor
+
+
+def _middles(torso: Torso, depth: Tensor, turn: Tensor, lengths: TorsoLengths) -> list[_Middle]:
+    """Return the middle of the shoulders along x and y, given depth and turn [B, ...]."""
+    rays, known, std = (with_axes(x, depth.ndim - 1) for x in torso[:3])
+    raised = torso.raised(depth)
+    place = torso_places(turn, half_widths(lengths.width, raised), lengths)
+    away = depth[..., None] + place[..., 2]
+    stiff = _stiffness(lengths, raised)
+    found = []
+    for axis in (0, 1):
+        value = rays[..., axis] * away - place[..., axis]
+        precision = known.to(depth) / (stiff[..., axis] + (std * away).square())
+        mean = (precision * value).sum(-1) / precision.sum(-1).clamp_min(1e-12)
+        found.append(_Middle(value, precision, mean))
+    return found
+
+
+def _stiffness(
+    lengths: TorsoLengths, raised: Float[Tensor, "B *grid 2"]
+) -> Float[Tensor, "B *grid 4 2"]:
+    """Return the variance of each torso joint about its place in x and y, metres squared."""
+    stiff = raised.new_tensor(_STIFF).square().expand(*raised.shape[:-1], 4, 2).clone()
+    sizes = (lengths.width, lengths.width_std, lengths.height_std)
+    width, width_std, height_std = (with_axes(x, raised.ndim - 2) for x in sizes)
+    stiff[..., :2, 0] += (width_std / 2).square()[..., None]
+    stiff[..., :2, 0] += (raised * _INWARD_STD * width[..., None] / 2).square()
+    stiff[..., :2, 1] += (raised * _UPWARD_STD).square()
+    stiff[..., 3, 1] += height_std.square()
+    return stiff
+
+
+def with_axes(values: Shaped[Tensor, "B *rest"], count: int) -> Tensor:
+    """Return values with `count` axes of one element inserted after that of the batch."""
+    return values[(slice(None),) + (None,) * count]
+
+
+def heavy_tail(squared: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Return the log-density of a Student distribution, up to a constant, by the squared distance."""
+    return -0.5 * (_FREEDOM + 1) * torch.log1p(squared / _FREEDOM)

@@ -1,0 +1,117 @@
+"""See measurements in a virtual camera that follows the body (`torchpose.camera._virtual_camera`)."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchpose.camera._virtual_camera import (
+    BodyView,
+    PathModel,
+    body_path,
+    to_view,
+    view_body,
+    view_jacobian,
+)
+from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._window import WindowLayout, window_measurements
+from torchpose.skeleton._joint_sets import UPPER_BODY
+from torchpose.upper_body._estimator import ARMS
+from torchpose.upper_body._measurements import MeasuredJoints, pixels_per_metre
+
+__all__ = ["SeenInView", "see_in_view", "suitable_window"]
+
+_HEAD, _NECK = UPPER_BODY.index("head"), UPPER_BODY.index("neck")
+_HANDS = [UPPER_BODY.index("hand_left"), UPPER_BODY.index("hand_right")]
+
+
+class SeenInView(NamedTuple):
+    """Measurements for a filter over windows, in the pixels of a virtual camera.
+
+    Attributes:
+        measured: the eight joints of each frame.
+        hands: values and mask [B, T, 2 H] of the hands of each frame's window, for both arms.
+        view: the virtual camera of each frame.
+        log_scale: the log of the area that a pixel of the camera has in the virtual one, [B, T, 8].
+    """
+
+    measured: MeasuredJoints
+    hands: dict[str, tuple[Tensor, Tensor]]
+    view: BodyView
+    log_scale: Tensor
+
+
+def suitable_window(
+    prior: UpperBodyPrior, smoothing: int | str | None, fps: float
+) -> tuple[str, WindowLayout] | None:
+    """Return the name of the window that suits the smoothing, and its lags at this frame rate.
+
+    It is None where the prior has none, or where it looks farther ahead than estimates may.
+
+    Args:
+        prior: the prior with its windows. smoothing: None, the number of later frames that an estimate
+            may use, or "full". fps: frames per second.
+    """
+    name = "causal" if smoothing is None else "full"
+    if name not in prior.windows:
+        return None
+    layout = prior.windows[name].layout.at_rate(fps)
+    too_far = isinstance(smoothing, int) and smoothing < layout.ahead
+    return None if too_far else (name, layout)
+
+
+def see_in_view(
+    measured: MeasuredJoints,
+    prior: UpperBodyPrior,
+    layout: WindowLayout,
+    measurement_cov: Float[Tensor, "8 2 2"],
+    lengths: Int[Tensor, " B"] | None = None,
+    start: int = 0,
+) -> SeenInView:
+    """Return the measurements of windows in a virtual camera that follows the body, from a frame on.
+
+    Args:
+        measured: the eight joints in the prior's pixels. prior: the prior, whose mean pose has the
+            expected head and neck. layout: the lags of a window, at the frame rate of the measurements.
+        measurement_cov: R of the eight joints, for where it does not change from frame to frame.
+        lengths: the number of frames of each sequence, [B]. start: the first frame that is wanted; may be
+            negative.
+    """
+    uv, mask, matrix = measured.uv, measured.mask, prior.info.matrix.to(measured.uv)
+    if lengths is not None:
+        frames = torch.arange(mask.shape[1], device=mask.device)
+        mask = mask & (frames < lengths.to(mask.device)[:, None])[..., None]
+    start = start % mask.shape[1]
+    model = _path_model(prior, measurement_cov, uv)
+    noise = None
+    if measured.cov.ndim > 3:
+        noise = _of_anchors(measured.cov)
+    else:
+        model = model._replace(variance=_of_anchors(measured.cov))
+    path = body_path(uv, mask, layout.lags, layout.ahead, layout.fps, model, start, noise)
+    neck, height = path.at(0)
+    apart = (uv[:, start:, _HANDS] - neck[:, :, None]).norm(dim=-1)
+    reach = torch.where(mask[:, start:, _HANDS], apart, torch.zeros_like(apart)).amax(-1)
+    view = view_body(neck, height, model, matrix, reach)
+    hands = {}
+    for side in ARMS:
+        values, known = window_measurements(uv, mask, layout, side, path, start)
+        hands[side] = to_view(values, view, matrix).flatten(-2), known.repeat_interleave(2, -1)
+    now = to_view(uv[:, start:], view, matrix)
+    now = torch.where(mask[:, start:, :, None], now, torch.zeros_like(now))
+    cov = measured.cov if measured.cov.ndim == 3 else measured.cov[:, start:]
+    log_scale = -view_jacobian(now, view, matrix).det().abs().log()
+    return SeenInView(MeasuredJoints(now, mask[:, start:], cov), hands, view, log_scale)
+
+
+def _path_model(prior: UpperBodyPrior, measurement_cov: Tensor, like: Tensor) -> PathModel:
+    """Return head and neck of the prior's mean pose, and their measurement noise."""
+    both = (prior.left.moments()[0] + prior.right.moments()[0]) / 2
+    head, neck = both[9:11].to(like), both[12:14].to(like)
+    return PathModel(neck, head - neck, _of_anchors(measurement_cov), pixels_per_metre(prior))
+
+
+def _of_anchors(cov: Float[Tensor, "*batch 8 2 2"]) -> Float[Tensor, "*batch 2"]:
+    """Return the variance of a coordinate of head and neck, pixels squared."""
+    return cov[..., [_HEAD, _NECK], :, :].diagonal(dim1=-2, dim2=-1).mean(-1)

@@ -1,0 +1,184 @@
+"""Measure the persons in the frames of a video: by faces and hands, or by a detector of keypoints.
+
+A frame passes two stages. `look` sees what depends on the images alone, the faces, so that it may run
+ahead in another thread. `step` measures the persons, and may use the hands of the last poses.
+"""
+
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import torch
+
+from torchpose._core.images import Image
+from torchpose.errors import InputError
+from torchpose.measure._face import FaceTracks
+from torchpose.measure._keypoints import FrameKeypoints, KeypointMeasurer, KeypointState
+from torchpose.measure._upper_body import (
+    Candidates,
+    FrameMeasurements,
+    MeasurerState,
+    UpperBodyMeasurer,
+)
+
+__all__ = [
+    "Found",
+    "MeasuredBlock",
+    "Measurer",
+    "SeenFrame",
+    "look_ahead",
+    "measure_blocks",
+    "measurer_of",
+]
+
+Found = FrameMeasurements | FrameKeypoints
+"""The measurements of all persons in a frame."""
+
+
+class SeenFrame(NamedTuple):
+    """Holds a frame, and the faces in it; None with a detector of keypoints."""
+
+    image: Image
+    faces: FaceTracks | None
+
+
+class MeasuredBlock(NamedTuple):
+    """Holds some frames, the measurements in each, and the state of the measurer after the last."""
+
+    images: list[Image]
+    found: list[Found]
+    state: Any
+
+
+@runtime_checkable
+class Measurer(Protocol):
+    """Protocol of the measurers of `VideoTracker`."""
+
+    def init(self) -> Any:
+        """Return the state before the first frame."""
+        ...
+
+    def look(self, faces: FaceTracks | None, image: Image) -> SeenFrame:
+        """Return the next frame with its faces, given those of the frame before."""
+        ...
+
+    def faces(self, state: Any) -> FaceTracks | None:
+        """Return the faces of the last frame; None where there are none to follow."""
+        ...
+
+    def step(
+        self, state: Any, frame: SeenFrame, candidates: Mapping[int, Candidates] | None = None
+    ) -> tuple[Any, Found]:
+        """Return the next state and the measurements of the next frame.
+
+        Args:
+            state: the state from `init` or after the frame before. frame: from `look`.
+            candidates: the hands of the last poses, by person.
+
+        Raises:
+            InputError: a state of another measurer.
+        """
+        ...
+
+
+def measurer_of(own: UpperBodyMeasurer | KeypointMeasurer) -> Measurer:
+    """Return a measurer of `torchpose.measure` with the interface of the video tracker."""
+    return FaceStage(own) if isinstance(own, UpperBodyMeasurer) else DetectorStage(own)
+
+
+class FaceStage(NamedTuple):
+    """Measures by faces and hands; `UpperBodyMeasurer` as a `Measurer`."""
+
+    own: UpperBodyMeasurer
+
+    def init(self) -> MeasurerState:
+        """Return the state before the first frame."""
+        return self.own.init()
+
+    def faces(self, state: MeasurerState) -> FaceTracks:
+        """Return the faces of the last frame."""
+        _check_state(state, MeasurerState)
+        return state.faces
+
+    @torch.no_grad()
+    def look(self, faces: FaceTracks | None, image: Image) -> SeenFrame:
+        """Return the next frame with its faces."""
+        if faces is None:
+            raise InputError("expected the faces of the frame before, got None")
+        return SeenFrame(image, self.own.follow_faces(faces, image))
+
+    @torch.no_grad()
+    def step(
+        self,
+        state: MeasurerState,
+        frame: SeenFrame,
+        candidates: Mapping[int, Candidates] | None = None,
+    ) -> tuple[MeasurerState, FrameMeasurements]:
+        """Return the next state and the measurements of the next frame."""
+        _check_state(state, MeasurerState)
+        return self.own.step(state, frame.image, frame.faces, candidates)
+
+
+class DetectorStage(NamedTuple):
+    """Measures by a detector of keypoints; `KeypointMeasurer` as a `Measurer`."""
+
+    own: KeypointMeasurer
+
+    def init(self) -> KeypointState:
+        """Return the state before the first frame."""
+        return self.own.init()
+
+    def faces(self, state: KeypointState) -> None:
+        """Return None: keypoints come without faces."""
+        _check_state(state, KeypointState)
+
+    def look(self, faces: FaceTracks | None, image: Image) -> SeenFrame:
+        """Return the next frame, without faces."""
+        return SeenFrame(image, faces)
+
+    @torch.no_grad()
+    def step(
+        self,
+        state: KeypointState,
+        frame: SeenFrame,
+        candidates: Mapping[int, Candidates] | None = None,
+    ) -> tuple[KeypointState, FrameKeypoints]:
+        """Return the next state and the measurements of the next frame."""
+        _check_state(state, KeypointState)
+        return self.own.step(state, frame.image)
+
+
+def _check_state(state: Any, kind: type) -> None:
+    if not isinstance(state, kind):
+        raise InputError(
+            "expected a state of this tracker's init or step, got one of another tracker"
+        )
+
+
+def look_ahead(measurer: Measurer, state: Any, images: Iterable[Image]) -> Iterator[SeenFrame]:
+    """Yield frames with their faces, which later frames and poses do not change."""
+    faces = measurer.faces(state)
+    for image in images:
+        frame = measurer.look(faces, image)
+        faces = frame.faces
+        yield frame
+
+
+def measure_blocks(
+    measurer: Measurer, state: Any, frames: Iterable[SeenFrame], size: int
+) -> Generator[MeasuredBlock, None, None]:
+    """Yield blocks of measured frames, which the poses before do not change.
+
+    Args:
+        measurer: measures the persons. state: its state before the frames. frames: from `look_ahead`.
+        size: the number of frames of a block; the last one may be shorter.
+    """
+    images, found = [], []
+    for frame in frames:
+        state, one = measurer.step(state, frame)
+        images.append(frame.image)
+        found.append(one)
+        if len(images) == size:
+            yield MeasuredBlock(images, found, state)
+            images, found = [], []
+    if images:
+        yield MeasuredBlock(images, found, state)
