@@ -20,6 +20,7 @@ from torchpose.measure._body_window import CELLS, pixels_to_cells
 from torchpose.measure._hand_likelihood import HandMeasurements, HandSettings
 from torchpose.measure._hand_network import HandNetwork, HandPlaces
 from torchpose.measure._hand_prior import HandPrior
+from torchpose.measure._torso import Elbows
 from torchpose.skeleton import UPPER_BODY
 from torchpose.video import open_video
 
@@ -49,24 +50,24 @@ _RENDERED = (
     ("merging hands", "short sleeves"), ("signing", "skin-coloured jumper"),
     ("performer", "short sleeves"),
 )  # fmt: skip
-_FIRST_SEED, _RENDERED_FRAMES, _DISTANCE = (
-    101,
-    160,
-    1.6,
-)  # no benchmark of video renders these seeds
-SEEN, UNSEEN = 0.6, 0.15  # MediaPipe's visibility of a hand that is seen, and of one that is not
-LOWEST, BELOW = (
-    0.985,
-    1.05,
-)  # of its height: to where a hand is in the image, from where on below it
+LABELLED = ("hand_left", "hand_right", "elbow_left", "elbow_right")
+"""Joints that have labels, in this order."""
+_FIRST_SEED = 101  # no benchmark of video renders these seeds
+_RENDERED_FRAMES, _DISTANCE = 160, 1.6
+SEEN, UNSEEN = (
+    0.6,
+    0.15,
+)  # MediaPipe's visibility of a joint that is visible, and of one that is not
+# Shares of the height of the image: down to the first a joint is in it, from the second on below it.
+LOWEST, BELOW = 0.985, 1.05
 BURN_IN = 15  # frames that are not scored
 
 
 class Labels(NamedTuple):
-    """Hands of a clip.
+    """Holds the positions of the `LABELLED` joints in a clip.
 
     Attributes:
-        centres: left and right, pixels [T, 2, 2]. seen: 1, 0 if not to be seen, -1 unknown [T, 2].
+        centres: pixels [T, 4, 2]. seen: 1 if visible, 0 if not visible, -1 if unknown [T, 4].
         nose: of the person, pixels [T, 2]. width: between the shoulders, pixels.
     """
 
@@ -90,8 +91,8 @@ class Windows(NamedTuple):
 
     Attributes:
         lab: bytes [T, 3, 160, 192]. maps: skin, both kinds of motion, image [T, 4, 80, 96].
-        faces: (x, y, size), B from the anchors [T, 3]. places: of the hands, cells [T, 2, 2].
-        seen: as in `Labels` [T, 2].
+        faces: (x, y, size), B from the anchors [T, 3]. places: of the joints, cells [T, 4, 2].
+        seen: as in `Labels` [T, 4].
     """
 
     lab: Tensor
@@ -107,9 +108,8 @@ class _Recorder(HandNetwork):
     def find(self, lab: Tensor, maps: Tensor, inside: Tensor, faces: Tensor) -> HandPlaces:
         """Return an even density of hands that are seen."""
         self.asked = lab, torch.cat([maps, inside[:, None]], 1), faces
-        return HandPlaces(
-            maps.new_zeros(len(maps), 2, *CELLS), maps.new_full((len(maps), 2), -20.0)
-        )
+        even, sure = maps.new_zeros(len(maps), 2, *CELLS), maps.new_full((len(maps), 2), -20.0)
+        return HandPlaces(even, sure, even, sure)
 
 
 def read_clips(data: Path) -> list[Clip]:
@@ -128,26 +128,27 @@ def read_clips(data: Path) -> list[Clip]:
 
 
 def _by_mediapipe(landmarks: Path, video: Path) -> Labels:
-    """Return hands at seven tenths of the way from wrist to index finger."""
+    """Return elbows, and hands at seven tenths of the way from wrist to index finger."""
     with np.load(landmarks) as file:
         names = [str(name) for name in file["names"]]
         joints = torch.from_numpy(file["joints2d"]).double()
         visible = torch.from_numpy(file["visibility"]).double()
     with open_video(video) as source:
         size = source.size
-    wrist, index, shoulder = (
+    wrist, index, elbow, shoulder = (
         [names.index(f"{side}_{joint}") for side in ("left", "right")]
-        for joint in ("wrist", "index", "shoulder")
+        for joint in ("wrist", "index", "elbow", "shoulder")
     )
-    centres = joints[:, wrist].lerp(joints[:, index], 0.7)
-    sure = torch.minimum(visible[:, wrist], visible[:, index])
+    hands = joints[:, wrist].lerp(joints[:, index], 0.7)
+    centres = torch.cat([hands, joints[:, elbow]], 1)
+    sure = torch.cat([torch.minimum(visible[:, wrist], visible[:, index]), visible[:, elbow]], 1)
     width = (joints[:, shoulder[0]] - joints[:, shoulder[1]]).norm(dim=-1).nanmedian()
     nose = joints[:, names.index("nose")]
     return Labels(centres, _seen(centres, sure, size), nose, float(width))
 
 
 def _seen(centres: Tensor, sure: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return whether hands are seen, not to be seen, or neither is sure."""
+    """Return whether joints are visible, not visible, or neither is certain."""
     x, y = centres.unbind(-1)
     inside = (x > 0) & (y > 0) & (x < size[0]) & (y < LOWEST * size[1])
     gone = (sure < UNSEEN) | (y > BELOW * size[1])
@@ -171,10 +172,10 @@ def render_clips(folder: Path) -> list[Clip]:
             joints[:, UPPER_BODY.index(joint)]
             for joint in ("shoulder_left", "shoulder_right", "head")
         )
-        hands = joints[:, [UPPER_BODY.index(f"hand_{side}") for side in ("left", "right")]]
-        seen = _seen(hands, torch.ones(hands.shape[:2]), size)
+        centres = joints[:, [UPPER_BODY.index(joint) for joint in LABELLED]]
+        seen = _seen(centres, torch.ones(centres.shape[:2]), size)
         width = float((left - right).norm(dim=-1).median())
-        clips.append(Clip(path.stem, look, path, Labels(hands, seen, head, width)))
+        clips.append(Clip(path.stem, look, path, Labels(centres, seen, head, width)))
     return clips
 
 
@@ -194,8 +195,16 @@ def measure(
             state, found = measurer.step(state, frame.image)
             row = _person(found.faces, clip.labels.nose[t])
             if row is not None:
-                hands = HandMeasurements(*(value[row] for value in found.hands))
+                hands = _of_person(found.hands, row)
                 yield t, row, hands, state.hands.anchors[row]
+
+
+def _of_person(hands: HandMeasurements, row: int) -> HandMeasurements:
+    """Return the measurements of one person."""
+    *own, elbows = hands
+    if elbows is not None:
+        elbows = Elbows(*(value[row] for value in elbows))
+    return HandMeasurements(*(value[row] for value in own), elbows)
 
 
 def _person(faces: Float[Tensor, "N 3"], nose: Float[Tensor, " 2"]) -> int | None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 from tqdm.auto import tqdm
 
@@ -16,8 +16,10 @@ from torchpose.measure._hand_network import COARSE, HandNetwork, HandNetworkInfo
 
 STEPS, BATCH, _RATE, _DECAY = 900, 16, 3e-3, 1e-2
 _BLUR = 0.9  # coarse cells: of a label
+_HANDS, _ELBOWS = slice(0, 2), slice(2, 4)  # of the labelled joints
+_SHARE_OF_ELBOWS = 2 / 3  # of the steps of the hands
 
-__all__ = ["STEPS", "fit"]
+__all__ = ["STEPS", "fit", "fit_elbows"]
 
 
 def fit(
@@ -27,31 +29,76 @@ def fit(
     seed: int = 0,
     progress: bool = True,
 ) -> HandNetwork:
-    """Return a network fitted to windows of persons, each person as often as any other.
+    """Return a network fitted to windows of persons, each person equally often.
+
+    The hands come first. The elbows are then found by the features that were learnt for the hands.
 
     Args:
-        clips: person and windows of each. info: of the network. steps: of AdamW, 16 windows each.
+        clips: person and windows of each. info: facts about the fit. steps: of AdamW, 16 windows each.
         seed: of weights, order and changes. progress: whether to show a bar.
     """
     torch.manual_seed(seed)
     network = HandNetwork(info).to(memory_format=torch.channels_last)
+    of_elbows = {*network.elbows.parameters(), network.elbows_gone}
+    of_hands = [p for p in network.parameters() if p not in of_elbows]
+
+    def hands(batch: Windows) -> Tensor:
+        features = network.features(batch.lab, avg_pool2d(batch.maps, 2), batch.faces)
+        return network.logits_of_hands(features)
+
+    _descend(hands, _HANDS, of_hands, clips, steps, progress)
+    return fit_elbows(network, clips, round(_SHARE_OF_ELBOWS * steps), progress)
+
+
+def fit_elbows(
+    network: HandNetwork, clips: Sequence[tuple[str, Windows]], steps: int, progress: bool = True
+) -> HandNetwork:
+    """Fit the layers of the elbows, and leave those of the hands as they are.
+
+    Args:
+        network: a network that was fitted to hands. clips, steps, progress: as in `fit`.
+    """
+    network.eval()
+    network.elbows.train()
+
+    def elbows(batch: Windows) -> Tensor:
+        with torch.no_grad():
+            features = network.features(batch.lab, avg_pool2d(batch.maps, 2), batch.faces)
+        return network.logits_of_elbows(features)
+
+    parameters = [*network.elbows.parameters(), network.elbows_gone]
+    _descend(elbows, _ELBOWS, parameters, clips, steps, progress)
+    return network.eval().requires_grad_(False)
+
+
+def _descend(
+    logits: Callable[[Windows], Tensor],
+    joints: slice,
+    parameters: Sequence[nn.Parameter],
+    clips: Sequence[tuple[str, Windows]],
+    steps: int,
+    progress: bool,
+) -> None:
+    """Fit parameters to the labels of some joints.
+
+    Args:
+        logits: of these joints in windows. joints: among the labelled ones.
+    """
     by_person: dict[str, list[Windows]] = {}
     for person, windows in clips:
         by_person.setdefault(person, []).append(windows)
     persons = list(by_person.values())
-    optimiser = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_DECAY)
+    optimiser = torch.optim.AdamW(parameters, lr=_RATE, weight_decay=_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=steps)
     for _ in tqdm(range(steps), disable=not progress, desc="fitting"):
         batch = _changed(_drawn(persons))
-        maps = avg_pool2d(batch.maps, 2)
         with torch.autocast("cpu", torch.bfloat16):
-            logits = network(batch.lab, maps, batch.faces)
-        loss = _loss(logits.float(), batch)
+            found = logits(batch)
+        loss = _loss(found.float(), batch.places[:, joints], batch.seen[:, joints])
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         schedule.step()
-    return network.eval().requires_grad_(False)
 
 
 def _drawn(persons: Sequence[Sequence[Windows]]) -> Windows:
@@ -72,9 +119,11 @@ def _changed(batch: Windows) -> Windows:
     return lit(bordered(bare_skin(exchanged(batch))))
 
 
-def _loss(logits: Float[Tensor, "N 2 cells"], batch: Windows) -> Tensor:
-    """Return the mean cross-entropy of hands that are seen in the window, or are not to be seen."""
-    at = batch.places / 2 - 0.25  # coarse cells
+def _loss(
+    logits: Float[Tensor, "N 2 cells"], places: Float[Tensor, "N 2 2"], labels: Tensor
+) -> Tensor:
+    """Return the mean cross-entropy of joints that are visible in the window, or not visible."""
+    at = places / 2 - 0.25  # coarse cells
     rows, columns = (torch.arange(n, dtype=at.dtype) for n in COARSE)
     across = -0.5 * ((columns - at[..., :1]) / _BLUR).square()
     down = -0.5 * ((rows - at[..., 1:]) / _BLUR).square()
@@ -84,5 +133,5 @@ def _loss(logits: Float[Tensor, "N 2 cells"], batch: Windows) -> Tensor:
     inside = ((at > -1) & (at < high)).all(-1)
     logs = torch.log_softmax(logits, -1)
     here, gone = -(target * logs[..., :-1]).sum(-1), -logs[..., -1]
-    seen, absent = (batch.seen == 1) & inside, batch.seen == 0
+    seen, absent = (labels == 1) & inside, labels == 0
     return (here[seen].sum() + gone[absent].sum()) / (seen.sum() + absent.sum()).clamp_min(1)

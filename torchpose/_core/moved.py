@@ -313,7 +313,7 @@ NAMES: dict[str, dict[str, str]] = {
         "measure._persons": "PersonRegister Persons",
         "measure._skin": "SkinModel SkinState rgb_to_lab",
         "measure._skin_mixture": "SkinMixtureState",
-        "measure._torso": "TorsoElbows clothes_likelihood elbows_from_torso",
+        "measure._torso": "Elbows clothes_likelihood elbows_from_torso",
         "measure._upper_body": "FrameMeasurements MEASURED MeasurerState",
         "video._silhouettes": "SilhouetteMeasurer fit_view read_silhouettes",
     },

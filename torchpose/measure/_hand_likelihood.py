@@ -14,6 +14,7 @@ from torchpose._core.images import Image
 from torchpose.errors import InputError
 from torchpose.measure._body_window import CELL, CELLS, EVIDENCE, cell_centres, halve
 from torchpose.measure._face import check_faces
+from torchpose.measure._torso import Elbows
 
 __all__ = ["HandLikelihood", "HandMeasurements", "HandSettings", "check_frame", "no_hands"]
 
@@ -166,6 +167,10 @@ class HandSettings:
         covariance_scale, covariance_floor: the reported covariance is the belief's times the scale,
             plus the floor (a standard deviation).
         least_mass, least_skin: below these a hand is not `seen`.
+        elbow_scale, elbow_floor: the covariance of elbows is the network's times the scale, plus the floor
+            (a standard deviation).
+        elbow_bias: added to a network's log-odds that an elbow is not visible.
+        elbow_reach: scale of the density of an elbow about its expected place, given the hand.
         beside_network: weight of all other cues beside a network's.
         exclusion_beside_network: takes the place of `exclusion` beside a network, which knows hands that
             are joined and tells left from right itself.
@@ -218,6 +223,10 @@ class HandSettings:
     covariance_floor: float = 0.05
     least_mass: float = 0.3
     least_skin: float = 0.15
+    elbow_scale: float = 2.0
+    elbow_floor: float = 0.2
+    elbow_bias: float = -2.0
+    elbow_reach: float = 0.6
     beside_network: float = 0.5
     exclusion_beside_network: float = 0.8
     gone_bias: float = -2.0
@@ -238,19 +247,22 @@ class HandMeasurements(NamedTuple):
         covariance: of the points, pixels squared.
         mass: probability that the hand is there.
         seen: False where a hand is lost, to be taken as missing.
+        elbows: the elbows, by a tracker with a network; else None.
     """
 
     points: Float[Tensor, "N 2 2"]
     covariance: Float[Tensor, "N 2 2 2"]
     mass: Float[Tensor, "N 2"]
     seen: Bool[Tensor, "N 2"]
+    elbows: Elbows | None = None
 
 
-def no_hands(faces: Float[Tensor, "0 3"]) -> HandMeasurements:
+def no_hands(faces: Float[Tensor, "0 3"], elbows: bool = False) -> HandMeasurements:
     """Return the measurements of a frame without persons, in the precision of `faces`."""
-    points = faces.new_zeros(0, 2, 2)
+    points, covariance = faces.new_zeros(0, 2, 2), faces.new_zeros(0, 2, 2, 2)
     mass = points[..., 0]
-    return HandMeasurements(points, faces.new_zeros(0, 2, 2, 2), mass, mass > 0)
+    nobody = Elbows(points, covariance, mass > 0) if elbows else None
+    return HandMeasurements(points, covariance, mass, mass > 0, nobody)
 
 
 def check_frame(

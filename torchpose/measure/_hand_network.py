@@ -55,19 +55,22 @@ class HandNetworkInfo:
             object.__setattr__(self, name, tuple(getattr(self, name)))
 
 
-_KIND = FileKind("torchpose-hands", 2, HandNetworkInfo)
+_KIND = FileKind("torchpose-hands", 3, HandNetworkInfo)
 
 
 class HandPlaces(NamedTuple):
-    """Holds what a network says about both hands of N persons.
+    """Holds the output of a network about both hands and both elbows of N persons.
 
     Attributes:
-        log_prob: of each cell, of a hand that is seen [N, 2, 80, 96].
-        gone: log-odds that the hand is not to be seen [N, 2].
+        log_prob: log-probability of each cell, given that the hand is visible [N, 2, 80, 96].
+        gone: log-odds that the hand is not visible [N, 2].
+        elbows, elbows_gone: the same for the elbows.
     """
 
     log_prob: Float[Tensor, "N 2 h w"]
     gone: Float[Tensor, "N 2"]
+    elbows: Float[Tensor, "N 2 h w"]
+    elbows_gone: Float[Tensor, "N 2"]
 
 
 def _layer(before: int, after: int, size: int = 3, stride: int = 1, apart: int = 1) -> nn.Module:
@@ -110,20 +113,34 @@ class HandNetwork(nn.Module):
         self.to_high = _layer(middle + high, high)
         self.places = nn.Conv2d(high, 2, 1)
         self.gone = nn.Parameter(torch.zeros(2))
+        self.elbows = nn.Sequential(_layer(2 * high, high), nn.Conv2d(high, 2, 1))
+        self.elbows_gone = nn.Parameter(torch.zeros(2))
 
     def forward(
         self,
         colours: Float[Tensor, "N 3 h w"],
         maps: Float[Tensor, "N 4 r c"],
         faces: Float[Tensor, "N 3"],
-    ) -> Float[Tensor, "N 2 cells"]:
-        """Return the logits of 40 x 48 cells, row by row, and of a hand that is not to be seen.
+    ) -> Float[Tensor, "N 4 cells"]:
+        """Return the logits of 40 x 48 cells, row by row, and of a joint that is not visible.
+
+        Both hands come first, then both elbows.
 
         Args:
             colours: of `relative_colours`, two pixels for a cell. maps: skin, difference from the last frame
                 and from the median, and the share inside the image, half a cell for each [N, 4, 40, 48].
             faces: (x, y, size) in B from the anchors.
         """
+        features = self.features(colours, maps, faces)
+        return torch.cat([self.logits_of_hands(features), self.logits_of_elbows(features)], 1)
+
+    def features(
+        self,
+        colours: Float[Tensor, "N 3 h w"],
+        maps: Float[Tensor, "N 4 r c"],
+        faces: Float[Tensor, "N 3"],
+    ) -> Float[Tensor, "N C r c"]:
+        """Return the features of every coarse cell: of its surroundings first, then of the cell itself."""
         inside = interpolate(maps[:, 3:], scale_factor=4.0) > 0.5
         colours = torch.where(inside, colours, -_MOST)  # its border goes on beyond the image
         seen = torch.cat([self.colours(colours), self.maps(maps), _where(faces)], 1)
@@ -132,8 +149,15 @@ class HandNetwork(nn.Module):
         low = self.low(middle)
         up = self.to_middle(torch.cat([interpolate(low, scale_factor=2.0), middle], 1))
         up = self.to_high(torch.cat([interpolate(up, scale_factor=2.0), high], 1))
-        places = self.places(up).flatten(2)
-        return torch.cat([places, self.gone[:, None].expand(len(places), -1, -1)], 2)
+        return torch.cat([up, high], 1)
+
+    def logits_of_hands(self, features: Float[Tensor, "N C r c"]) -> Float[Tensor, "N 2 cells"]:
+        """Return the logits of both hands."""
+        return _with_gone(self.places(features[:, : _WIDTHS[3]]), self.gone)
+
+    def logits_of_elbows(self, features: Float[Tensor, "N C r c"]) -> Float[Tensor, "N 2 cells"]:
+        """Return the logits of both elbows."""
+        return _with_gone(self.elbows(features), self.elbows_gone)
 
     def find(
         self,
@@ -154,7 +178,8 @@ class HandNetwork(nn.Module):
         places, gone = logits[..., :-1], logits[..., -1]
         here = torch.log_softmax(places, -1).unflatten(-1, COARSE)
         fine = interpolate(here, size=CELLS, mode="bilinear", align_corners=False) - math.log(4)
-        return HandPlaces(fine, gone - torch.logsumexp(places, -1))
+        gone = gone - torch.logsumexp(places, -1)
+        return HandPlaces(fine[:, :2], gone[:, :2], fine[:, 2:], gone[:, 2:])
 
     def save(self, path: str | Path) -> None:
         """Write the network as safetensors, in half precision; the file appears whole or not at all.
@@ -178,6 +203,13 @@ class HandNetwork(nn.Module):
             counts = {k: v for k, v in made.state_dict().items() if not v.ndim}  # of batches
             made.load_state_dict({k: v.float() for k, v in tensors.items()} | counts)
         return made.eval().requires_grad_(False)
+
+
+def _with_gone(
+    places: Float[Tensor, "N 2 r c"], gone: Float[Tensor, " 2"]
+) -> Float[Tensor, "N 2 cells"]:
+    """Return the logits of all cells, and of a joint that is not visible."""
+    return torch.cat([places.flatten(2), gone[:, None].expand(len(places), -1, -1)], 2)
 
 
 def relative_colours(

@@ -41,11 +41,13 @@ from torchpose.measure._hand_prior import HandPrior
 from torchpose.measure._head import FaceMemory, FaceMemoryState, head_part
 from torchpose.measure._persons import match_states, take_rows
 from torchpose.measure._skin import SkinModel, SkinState
+from torchpose.measure._torso import Elbows
 
 __all__ = ["HandState", "HandTracker"]
 
 _REACH = -5.2  # log density per B squared above which a hand may be in a place
 _FACE = (0.7, 0.9)  # half the width and height of a face with its surroundings, in B
+_FREEDOM = 4.0  # of the Student distribution of an elbow given the hand
 _NEAR = 4  # cells about a hand that belong to it
 _UNKNOWN, _SUREST = 0.5, 1e-3  # probability that a hand is gone: at first, and at the least
 
@@ -88,6 +90,7 @@ class HandTracker(nn.Module):
 
     With a network the log-likelihood is a sum of two, and a hand may be gone: hidden, or outside of the
     image. That is a state of its own, beside the places, with a probability that is filtered over time.
+    The network also finds the elbows, in each frame alone.
 
     Args:
         prior: of hands given the face.
@@ -172,7 +175,7 @@ class HandTracker(nn.Module):
         check_frame(frame, faces, identity, foreground)
         faces = faces.double()
         if not len(faces):
-            return self.init(), no_hands(faces)
+            return self.init(), no_hands(faces, elbows=self.network is not None)
         state, new = self._persons(state, faces, identity)
         state, faces = self._steady(state, faces)
         state = self._follow(state, faces)
@@ -190,7 +193,12 @@ class HandTracker(nn.Module):
         still = self.settings.still
         moves = still + (1 - still) * moving.clamp(0, 1)
         belief = self._filter(state, belief, rebirth, log_likelihood, moves, flow)
-        return self._measure(state._replace(belief=belief), means[:, 1], frame.shape)
+        state, hands = self._measure(state._replace(belief=belief), means[:, 1], frame.shape)
+        if found is not None:
+            expected_elbow = _expected_elbows(hands, elbow, state.anchors)
+            elbows = self._elbows(found, expected_elbow, state.anchors, frame.shape)
+            hands = hands._replace(elbows=elbows)
+        return state, hands
 
     def _persons(
         self, state: HandState, faces: Tensor, identity: Tensor
@@ -344,8 +352,7 @@ class HandTracker(nn.Module):
         unit = (anchors[:, 2] * CELL).square()[:, None, None, None]
         floor = (s.covariance_floor / CELL) ** 2 * torch.eye(2, dtype=unit.dtype)
         covariance = (s.covariance_scale * found.covariance + floor) * unit
-        high = points.new_tensor([shape[1] - 0.5, shape[0] - 0.5])
-        there = ((points >= -0.5) & (points <= high)).all(-1)
+        there = _in_frame(points, shape)
         cell = found.mode[..., 1] * CELLS[1] + found.mode[..., 0]
         here = skin.flatten(1).gather(1, cell)
         seen = there & (found.mass >= s.least_mass) & (here >= s.least_skin)
@@ -358,6 +365,46 @@ class HandTracker(nn.Module):
         shown = torch.where(there[..., None], points, torch.nan)
         state = state._replace(place=points, speed=speed, frames=state.frames + 1)
         return state, HandMeasurements(shown, covariance, found.mass, seen)
+
+    def _elbows(
+        self, found: HandPlaces, expected: Tensor, anchors: Tensor, shape: tuple[int, ...]
+    ) -> Elbows:
+        """Return the elbows in one frame, by the network and by where the hands let them be.
+
+        Args:
+            found: by the network. expected: elbows given the hands, in B from the anchors, NaN where
+                the hand is not measured [N, 2, 2].
+        """
+        s = self.settings
+        away = (cell_centres() - expected[:, :, None, None]).square().sum(-1) / s.elbow_reach**2
+        likely = torch.log1p(away.nan_to_num(0.0) / _FREEDOM) * (-0.5 * (_FREEDOM + 2))
+        belief = torch.softmax((found.elbows + likely.to(found.elbows)).flatten(2), 2)
+        peak = read_out(belief.view_as(found.elbows), smooth=1.5, within=5.0)
+        points = cells_to_pixels(peak.place, anchors)
+        unit = (anchors[:, 2] * CELL).square()[:, None, None, None]
+        floor = (s.elbow_floor / CELL) ** 2 * torch.eye(2, dtype=unit.dtype)
+        seen = _in_frame(points, shape) & (peak.mass >= s.least_mass)
+        seen = seen & (found.elbows_gone + s.elbow_bias < 0)
+        return Elbows(points, (s.elbow_scale * peak.covariance + floor) * unit, seen)
+
+
+def _expected_elbows(hands: HandMeasurements, elbow: Tensor, anchors: Tensor) -> Tensor:
+    """Return where elbows are expected given the hands, in B from the anchors, NaN without one [N, 2, 2].
+
+    Args:
+        hands: as measured. elbow: for a hand in each cell, in B from the anchors [N, 2, 2, r, c].
+    """
+    cells = pixels_to_cells(hands.points.nan_to_num(0.0), anchors).round().long()
+    column, row = (cells[..., i].clamp(0, CELLS[1 - i] - 1) for i in (0, 1))
+    index = (row * CELLS[1] + column)[:, :, None, None].expand(-1, -1, 2, 1)
+    place = elbow.flatten(3).gather(3, index)[..., 0]
+    return torch.where(hands.seen[..., None], place, torch.nan)
+
+
+def _in_frame(points: Float[Tensor, "N 2 2"], shape: tuple[int, ...]) -> Tensor:
+    """Return whether points are in a frame of this shape [N, 2]."""
+    high = points.new_tensor([shape[1] - 0.5, shape[0] - 0.5])
+    return ((points >= -0.5) & (points <= high)).all(-1)
 
 
 def _before_face(faces: Tensor, anchors: Tensor) -> Tensor:

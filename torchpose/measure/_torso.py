@@ -11,7 +11,7 @@ from torchpose.errors import InputError
 from torchpose.measure._face import check_faces
 from torchpose.measure._skin import SkinModel, SkinState
 
-__all__ = ["TorsoElbows", "clothes_likelihood", "elbows_from_torso"]
+__all__ = ["Elbows", "clothes_likelihood", "elbows_from_torso"]
 
 # Lengths in sizes of the face, heights from its centre.
 _ROWS = (1.5, 4.2)  # where elbows are searched for
@@ -26,13 +26,13 @@ _REACH = 2.6
 _FLOOR, _SLOPE, _BIAS = 2e-4, 1.5, 0.5
 
 
-class TorsoElbows(NamedTuple):
-    """Holds the elbows of N persons: left, right (the person's own), pixels of the map.
+class Elbows(NamedTuple):
+    """Holds the elbows of N persons: left, right (the person's own), pixels.
 
     Attributes:
         points: (x, y), NaN where unknown [N, 2, 2].
         covariance: pixels squared [N, 2, 2, 2].
-        seen: where the outline is plausible [N, 2].
+        seen: whether they are measured [N, 2].
     """
 
     points: Float[Tensor, "N 2 2"]
@@ -59,7 +59,7 @@ def clothes_likelihood(
 
 def elbows_from_torso(
     likelihood: Float[Tensor, "N H W"], faces: Float[Tensor, "N 3"], threshold: float = 0.4
-) -> TorsoElbows:
+) -> Elbows:
     """Return the elbows where the torso with the sleeves is widest.
 
     In every row below the shoulders the outline is followed from the face's axis to both sides. On
@@ -153,12 +153,10 @@ def _at_the_end(far: Tensor, searched: Tensor) -> Tensor:
     return far.argmax(2) >= last - 1
 
 
-def _elbows(
-    faces: Tensor, widest: Tensor, row: Tensor, spread: Tensor, seen: Tensor
-) -> TorsoElbows:
+def _elbows(faces: Tensor, widest: Tensor, row: Tensor, spread: Tensor, seen: Tensor) -> Elbows:
     x, y, size = faces[:, None].unbind(-1)
     sign = widest.new_tensor([1.0, -1.0])  # the person's left is at larger x
     points = torch.stack([x + sign * (widest - _INSET) * size, y + row * size], -1)
     points = torch.where(seen[..., None], points, torch.nan)
     variance = torch.stack([torch.full_like(spread, _STD[0] ** 2), spread + _STD[1] ** 2], -1)
-    return TorsoElbows(points, torch.diag_embed(variance * size[..., None].square()), seen)
+    return Elbows(points, torch.diag_embed(variance * size[..., None].square()), seen)

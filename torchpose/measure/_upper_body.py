@@ -22,7 +22,7 @@ from torchpose.measure._head import HeadNeck
 from torchpose.measure._mean_shift_hands import MeanShiftHandTracker
 from torchpose.measure._persons import PersonRegister, Persons, measure_by_scale, take_rows
 from torchpose.measure._skin import SkinState, rgb_to_lab
-from torchpose.measure._torso import TorsoElbows, clothes_likelihood, elbows_from_torso
+from torchpose.measure._torso import Elbows, clothes_likelihood, elbows_from_torso
 from torchpose.priors._upper_body import UpperBodyPrior
 
 __all__ = [
@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 MEASURED = ("head", "neck", "hand_left", "hand_right")
-"""Names and order of the measured joints; elbows follow if they are measured."""
+"""Names and order of the joints that are always measured; elbows follow if they are measured."""
 _ELBOWS = ("elbow_left", "elbow_right")
 HAND_TRACKERS = ("learnt", "grid", "mean-shift")
 """Names of the hand trackers, the default first."""
@@ -92,7 +92,8 @@ class UpperBodyMeasurer(nn.Module):
         hands: "learnt" (`HandTracker` with the network that comes along), "grid" (without it) or
             "mean-shift" (`MeanShiftHandTracker`, the paper's recipe).
         background: whether to detect the foreground, for a static camera.
-        elbows: whether to measure elbows, where the torso with its sleeves is widest.
+        elbows: whether to measure elbows: by the network, or without one where the torso with its sleeves
+            is widest. None measures them if hands are "learnt".
         face_detector: by default Haar's. max_persons: the largest faces are taken.
         head_neck: offsets of head and neck from the face.
 
@@ -109,7 +110,7 @@ class UpperBodyMeasurer(nn.Module):
         fps: float = 30.0,
         hands: str = "learnt",
         background: bool = False,
-        elbows: bool = False,
+        elbows: bool | None = None,
         face_detector: FaceDetector | None = None,
         max_persons: int | None = None,
         head_neck: HeadNeck | None = None,
@@ -122,13 +123,14 @@ class UpperBodyMeasurer(nn.Module):
         if not fps > 0:
             raise InputError(f"fps must be positive, got {fps}")
         self.fps, self.max_persons = float(fps), max_persons
-        self.names = MEASURED + _ELBOWS if elbows else MEASURED
+        learnt = hands == "learnt"
+        self.names = MEASURED + _ELBOWS if elbows or (elbows is None and learnt) else MEASURED
         self.face_tracker = FaceTracker(face_detector)
         self.head_neck = HeadNeck() if head_neck is None else head_neck
         self.register = PersonRegister(within=round(30 * fps))
         self.hand_tracker: HandTracker | MeanShiftHandTracker
         if hands != "mean-shift":
-            network = shipped_hand_network() if hands == "learnt" else None
+            network = shipped_hand_network() if learnt else None
             self.hand_tracker = HandTracker(HandPrior.from_prior(prior), fps=fps, network=network)
         else:
             self.hand_tracker = MeanShiftHandTracker()
@@ -203,7 +205,9 @@ class UpperBodyMeasurer(nn.Module):
             raise InputError("candidates need hands='learnt' or 'grid': mean shift takes none")
         parts = [self.head_neck(faces, face_cov), (_where_seen(hands), hands.covariance)]
         if len(self.names) > len(MEASURED):
-            found = self._elbows(image, faces, hand_state.skin)
+            found = hands.elbows
+            if found is None:
+                found = self._elbows(image, faces, hand_state.skin)
             parts.append((_where_seen(found), found.covariance))
         keypoints = torch.cat([points.to(faces) for points, _ in parts], 1)
         cov = torch.cat([own.to(faces) for _, own in parts], 1)
@@ -212,18 +216,18 @@ class UpperBodyMeasurer(nn.Module):
         measured = FrameMeasurements(number, keypoints, rounded_covariance(cov), faces, hands)
         return MeasurerState(tracks, persons, hand_state, state.frame + 1), measured
 
-    def _elbows(self, image: Image, faces: Tensor, skin: SkinState) -> TorsoElbows:
+    def _elbows(self, image: Image, faces: Tensor, skin: SkinState) -> Elbows:
         """Return the elbows from the clothes, in images scaled such that faces have one size.
 
         The scale of a person's image depends on that person's face alone.
         """
 
-        def measure(scale: float, rows: Tensor) -> TorsoElbows:
+        def measure(scale: float, rows: Tensor) -> Elbows:
             return self._elbows_at(image, scale, faces[rows], take_rows(skin, rows))
 
         return measure_by_scale((_TORSO_FACE / faces[:, 2]).clamp_max(1.0), measure)
 
-    def _elbows_at(self, image: Image, scale: float, faces: Tensor, skin: SkinState) -> TorsoElbows:
+    def _elbows_at(self, image: Image, scale: float, faces: Tensor, skin: SkinState) -> Elbows:
         """Return the elbows of persons in an image that is made smaller by this factor."""
         import cv2
 
@@ -234,9 +238,7 @@ class UpperBodyMeasurer(nn.Module):
         bins = model.bins(rgb_to_lab(pixels)).expand(len(faces), -1, -1)
         shrunk = torch.cat([(faces[:, :2] + 0.5) * scale - 0.5, faces[:, 2:] * scale], 1)
         found = elbows_from_torso(clothes_likelihood(model, skin, bins), shrunk)
-        return TorsoElbows(
-            (found.points + 0.5) / scale - 0.5, found.covariance / scale**2, found.seen
-        )
+        return Elbows((found.points + 0.5) / scale - 0.5, found.covariance / scale**2, found.seen)
 
     def _used(self, tracks: FaceTracks, scale: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the faces in use, pixels of the frame, with covariances, identities, frames unseen."""
@@ -263,7 +265,7 @@ def _expected(
     return Candidates(mean, torch.stack(cov) + moved if cov else size.new_zeros(0, 2, 2, 2))
 
 
-def _where_seen(found: HandMeasurements | TorsoElbows) -> Float[Tensor, "N 2 2"]:
+def _where_seen(found: HandMeasurements | Elbows) -> Float[Tensor, "N 2 2"]:
     return torch.where(found.seen[..., None], found.points, torch.nan)
 
 

@@ -113,7 +113,8 @@ class VideoTracker(nn.Module):
         hands: the hand tracker: "learnt" (default), "grid" (without its network) or "mean-shift", the
             paper's method.
         background: detect the foreground, for a static camera.
-        elbows: measure elbows, where the torso with its sleeves is widest.
+        elbows: measure elbows: by the network, or without one where the torso with its sleeves is widest.
+            None measures them if hands are "learnt".
         edges: correct swapped hands by the edges of the arms (`HandAssociation`); takes about twice
             the time of the poses.
         candidates: also reinitialise the hand tracker at the hands of the last pose; frames are then
@@ -148,7 +149,7 @@ class VideoTracker(nn.Module):
         fps: float = 30.0,
         hands: str = "learnt",
         background: bool = False,
-        elbows: bool = False,
+        elbows: bool | None = None,
         edges: bool = False,
         candidates: bool = False,
         face_detector: FaceDetector | None = None,
@@ -174,7 +175,8 @@ class VideoTracker(nn.Module):
             )
         else:
             _refuse_measurer(
-                hands=hands != HAND_TRACKERS[0], background=background, elbows=elbows, edges=edges,
+                hands=hands != HAND_TRACKERS[0], background=background, elbows=elbows is not None,
+                edges=edges,
                 candidates=candidates, face_detector=face_detector is not None,
                 head_neck=head_neck is not None,
             )  # fmt: skip
