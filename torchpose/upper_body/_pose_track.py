@@ -140,7 +140,7 @@ class PoseTrack:
         """Return one sequence, cut to its own length, as a batch of one.
 
         Args:
-            index: of the sequence; -1 is the last.
+            index: the index of the sequence; -1 is the last.
 
         Returns:
             Track with B = 1 and T = `lengths[index]`.
@@ -155,7 +155,7 @@ class PoseTrack:
         """Return the same poses with floating-point numbers of a dtype.
 
         Args:
-            dtype: such as torch.float32.
+            dtype: the floating-point type, such as torch.float32.
 
         Returns:
             Track with the same shapes; this one if it has the dtype.
@@ -175,7 +175,7 @@ class PoseTrack:
         bone_names, names, fps (NaN if unknown), K, frame, failed_at, lengths, notes, first_frame, method.
 
         Args:
-            path: of the .npz file, which is replaced.
+            path: the .npz file, which is replaced if there is one.
 
         Raises:
             OutputError: the file cannot be written.

@@ -276,8 +276,8 @@ class UpperBodyTracker(WideModule):
         """Begin to track live streams, frame by frame (`step`).
 
         Args:
-            batch_size: B, number of streams. names: of the keypoints, as in `forward`; any of them
-                may be missing in any frame. generator: as in `forward`; the state holds it.
+            batch_size: B, the number of streams. names: the names of the keypoints, as in `forward`; any
+                of them may be missing in any frame. generator: as in `forward`; the state holds it.
 
         Returns:
             `StreamState` before the first frame.
@@ -325,9 +325,10 @@ class UpperBodyTracker(WideModule):
         that were dropped are to be passed as missing (NaN), since a step is one frame at `fps`.
 
         Args:
-            state: from `init` or the step before; it is not changed, so a step may be repeated
-                (but a generator goes on). keypoints, confidence, mask, covariance: of one frame, as
-                in `forward`.
+            state: the state from `init` or the step before; it is not changed, so a step may be repeated
+                (but a generator goes on).
+            keypoints, confidence, mask, covariance: the measurements of one frame, as in `forward`,
+                without T.
 
         Returns:
             The next state, and the `LivePose` of this frame.
@@ -353,7 +354,8 @@ class UpperBodyTracker(WideModule):
         Long recordings are tracked so in bounded memory, and quicker than frame by frame.
 
         Args:
-            state: as in `step`. keypoints, confidence, mask, covariance: as in `forward`.
+            state: as in `step`. keypoints, confidence, mask, covariance: the measurements of these
+                frames, as in `forward`.
 
         Returns:
             The next state, and the poses of these frames.

@@ -69,7 +69,7 @@ class VideoState(NamedTuple):
 
     Attributes:
         measurer: the state of the measurer. streams: the states of the persons by number.
-        poses: the last poses of the persons in `streams`, but for those of filters that degenerated.
+        poses: the last poses of the persons in `streams`, without those of filters that degenerated.
     """
 
     measurer: MeasurerState | KeypointState
@@ -81,7 +81,7 @@ class LivePerson(NamedTuple):
     """Holds a person in one frame.
 
     Attributes:
-        number: of the person, in the order of appearance.
+        number: the number of the person, in the order of appearance.
         pose: a track of one frame; `pose.failed` [1] says whether the filter degenerated, as in a
             `PoseTrack` and a `LivePose`.
         measured: the measurements in the frame.
@@ -218,8 +218,8 @@ class VideoTracker(nn.Module):
         """Return the next state and the persons in one more frame of a camera.
 
         Args:
-            state: from `init` or the step before. image: RGB, uint8, an array [H, W, 3] or a tensor
-                [3, H, W].
+            state: the state from `init` or the step before. image: the frame, RGB, uint8, an array
+                [H, W, 3] or a tensor [3, H, W].
 
         Returns:
             The next state, and the persons seen within the last `max_gap`.
@@ -237,7 +237,7 @@ class VideoTracker(nn.Module):
         """Return the next state and the poses in some more frames: those of `step` for one after the other.
 
         Args:
-            state: from `init` or the call before. images: as the frames of `forward`.
+            state: the state from `init` or the call before. images: the frames, as in `forward`.
 
         Returns:
             The next state, and by number of each person the parts of these frames in which there are
