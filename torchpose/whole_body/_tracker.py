@@ -111,7 +111,7 @@ class BodyTracker(nn.Module):
         >>> standing = torch.zeros(36, dtype=torch.float64)
         >>> silhouettes = render(Body.of_height(BODY_15, 1.8), standing.expand(3, -1), camera, 60, 80)
         >>> tracker = torchpose.BodyTracker(camera, "sir", height=1.8, n_particles=50)
-        >>> poses = tracker(silhouettes, standing, torch.Generator().manual_seed(0))
+        >>> poses = tracker(silhouettes, standing, generator=torch.Generator().manual_seed(0))
         >>> poses.joints3d.shape
         torch.Size([3, 15, 3])
     """
