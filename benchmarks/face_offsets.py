@@ -9,7 +9,6 @@ mean score. MediaPipe's shoulders are higher than Kinect's, so theirs do not tel
     python -m benchmarks.face_offsets --data DIR
 """
 
-import argparse
 from pathlib import Path
 
 import av
@@ -18,7 +17,8 @@ import numpy as np
 import torch
 
 from benchmarks._asl import CLIPS, SIZE, read_clip
-from benchmarks._table_file import table_file
+from benchmarks._command import run_command
+from benchmarks._table_file import TableFile
 from torchpose.camera import PinholeCamera
 from torchpose.measure import HeadNeck
 from torchpose.measure._face import FaceTracker
@@ -36,26 +36,29 @@ BELOW = 0.25  # metres that hands have to be below the neck for a silhouette to 
 COLUMNS = ("crown above head", "narrowest below", "neck joint below", "shoulders below")
 
 
-def main() -> None:
-    """Print both tables."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder of the data sets")
-    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
-    parser.add_argument("--quick", action="store_true", help="one person, one clip, two offsets")
-    parser.add_argument("--threads", type=int, default=1, help="cores")
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
-    tables = [silhouettes(args.data / "utd_mhad_silhouettes", args.quick), elbows(args)]
+def main(
+    *, data: Path, out: TableFile | None = None, quick: bool = False, threads: int = 1
+) -> None:
+    """Print both tables.
+
+    Args:
+        data: folder of the data sets.
+        out: file for the same as Markdown, or a folder.
+        quick: one person, one clip, two offsets.
+        threads: cores.
+    """
+    torch.set_num_threads(threads)
+    tables = [silhouettes(data / "utd_mhad_silhouettes", quick), elbows(data / "video_asl", quick)]
     text = "\n\n".join(tables) + "\n"
     print(text, end="")
-    if args.out:
-        args.out.write_text(text, encoding="utf-8")
+    if out:
+        out.write_text(text, encoding="utf-8")
 
 
 def silhouettes(folder: Path, quick: bool) -> str:
-    """Crown, narrowest row, neck joint and shoulders of each person, metres from the head joint."""
+    """Return the table of crown, narrowest row, neck joint and shoulders, metres from the head joint."""
     by_person: dict[str, list[list[float]]] = {}
-    for path in sorted(folder.glob("s1_*.npz" if quick else "s*.npz"))[: 4 if quick else None]:
+    for path in sorted(folder.glob("s01_*.npz" if quick else "s*.npz"))[: 4 if quick else None]:
         by_person.setdefault(path.name[:3], []).extend(_heads(path))
     rows = {person: np.nanmedian(np.array(v), 0) for person, v in by_person.items() if v}
     rows["mean"] = np.mean(list(rows.values()), 0)
@@ -65,7 +68,7 @@ def silhouettes(folder: Path, quick: bool) -> str:
 
 
 def _heads(path: Path) -> list[list[float]]:
-    """Of each frame with hands down."""
+    """Return the four distances of each frame in which the hands are down."""
     with np.load(path) as file:
         joints, names, K = file["joints"], [str(n) for n in file["names"]], file["K"]
         masks = np.unpackbits(file["sil_packed"], axis=-1).reshape(file["sil_shape"])
@@ -92,7 +95,7 @@ def _heads(path: Path) -> list[list[float]]:
 def _crown_and_narrowest(
     mask: np.ndarray, head: np.ndarray, neck: float, scale: float
 ) -> tuple[int, int] | None:
-    """Rows of the top of the head, and of the narrowest part between head and neck."""
+    """Return the rows of the top of the head and of the narrowest part between head and neck, if seen."""
     u, v = (round(float(x)) for x in head)
     near, wide = int(0.16 * scale), int(0.35 * scale)
     if not wide < u < mask.shape[1] - wide:
@@ -105,10 +108,10 @@ def _crown_and_narrowest(
     return int(crown[0]), v + int(np.argmin(width[v:last]))
 
 
-def elbows(args: argparse.Namespace) -> str:
-    """Distances of inferred elbows and shoulders from MediaPipe's, for each pair of offsets."""
-    clips = CLIPS[:1] if args.quick else CLIPS
-    seen = {clip: _seen(args.data / "video_asl", clip) for clip in clips}
+def elbows(folder: Path, quick: bool) -> str:
+    """Return the table of inferred elbows and shoulders beside MediaPipe's, for each pair of offsets."""
+    clips = CLIPS[:1] if quick else CLIPS
+    seen = {clip: _seen(folder, clip) for clip in clips}
     prior = load_prior("kinect-upper-body")
     camera = PinholeCamera.from_image_size(*SIZE)
     tracker = UpperBodyTracker(prior, camera, fps=30.0, max_gap=None)
@@ -116,7 +119,7 @@ def elbows(args: argparse.Namespace) -> str:
         "| head (B) | neck (B) | elbow (px) | shoulder (px) | score |",
         "|---:|---:|---:|---:|---:|",
     ]
-    pairs = [(a, b) for a in HEADS for b in NECKS][: 2 if args.quick else None]
+    pairs = [(a, b) for a in HEADS for b in NECKS][: 2 if quick else None]
     for head, neck in pairs:
         offsets = FACE_OFFSETS._replace(head=head, neck=neck)
         row = np.mean([_errors(tracker, HeadNeck(offsets), *seen[clip]) for clip in clips], 0)
@@ -126,7 +129,7 @@ def elbows(args: argparse.Namespace) -> str:
 
 
 def _seen(folder: Path, clip: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Faces [T, 3] of a clip, and MediaPipe's hands [T, 2, 2] and elbows and shoulders [T, 4, 2]."""
+    """Return the faces [T, 3] of a clip, and MediaPipe's hands [T, 2, 2], elbows and shoulders [T, 4, 2]."""
     tracker = FaceTracker()
     state, faces = tracker.init(), []
     with av.open(str(folder / f"{clip}.mkv")) as video:
@@ -152,7 +155,7 @@ def _errors(
     hands: np.ndarray,
     arms: np.ndarray,
 ) -> tuple[float, float, float]:
-    """Elbow, shoulder and score of a clip."""
+    """Return the errors of elbow and shoulder, pixels, and the score of a clip."""
     n_frames = min(len(faces), len(hands))
     points, cov = head_neck(torch.from_numpy(faces[:n_frames]))
     hand_cov = HAND_STD**2 * torch.eye(2, dtype=torch.float64)
@@ -169,4 +172,4 @@ def _errors(
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

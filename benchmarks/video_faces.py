@@ -9,16 +9,16 @@ every other face in use is a false person. All frames count, the first ones with
     python -m benchmarks.video_faces --data DIR
 """
 
-import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
 import torch
 
-from benchmarks._table_file import table_file
+from benchmarks._command import OneOf, run_command
+from benchmarks._table_file import TableFile
 from benchmarks.hand_network.clips import PEOPLE, SIGNERS
 from torchpose._core.images import Image
 from torchpose.demo._rendering.scene import Scene, room
@@ -161,26 +161,34 @@ def follow(shown: list[Frame], fps: float) -> Found:
     return Found(found / len(shown), false / len(shown))
 
 
-def main() -> None:
-    """Print shares of frames and false persons, by change and by clip."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder of the data sets")
-    parser.add_argument("--out", type=table_file, help="file for the same as Markdown, or a folder")
-    parser.add_argument("--threads", type=int, default=1, help="cores")
-    parser.add_argument("--only", nargs="+", choices=[*CHANGES], help="these changes")
-    parser.add_argument("--quick", action="store_true", help="one short clip, three changes")
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
-    folders = ((args.data / "video_people", PEOPLE), (args.data / "video_asl", SIGNERS))
+def main(
+    *,
+    data: Path,
+    out: TableFile | None = None,
+    threads: int = 1,
+    only: Annotated[Sequence[str], OneOf(CHANGES)] | None = None,
+    quick: bool = False,
+) -> None:
+    """Print shares of frames and false persons, by change and by clip.
+
+    Args:
+        data: folder of the data sets.
+        out: file for the same as Markdown, or a folder.
+        threads: cores.
+        only: these changes.
+        quick: one short clip, three changes.
+    """
+    torch.set_num_threads(threads)
+    folders = ((data / "video_people", PEOPLE), (data / "video_asl", SIGNERS))
     clips = [next(folder.glob(f"{name}.m*")) for folder, names in folders for name in names]
-    changes = {name: CHANGES[name] for name in args.only or CHANGES}
+    changes = {name: CHANGES[name] for name in only or CHANGES}
     most = MOST
-    if args.quick:
+    if quick:
         clips, most, changes = clips[-3:-2], 20, dict(list(changes.items())[:3])
     report = make_report(clips, changes, most)
     print(report.summary())
-    if args.out:
-        args.out.write_text(report.to_markdown(), encoding="utf-8")
+    if out:
+        out.write_text(report.to_markdown(), encoding="utf-8")
 
 
 def make_report(clips: list[Path], changes: dict[str, Change | None], most: int) -> Report:
@@ -209,4 +217,4 @@ def make_report(clips: list[Path], changes: dict[str, Change | None], most: int)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

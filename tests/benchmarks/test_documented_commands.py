@@ -25,6 +25,7 @@ def documented():
     found = set()
     for page in PAGES:
         text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+        text = re.sub(r"(?<!`)`[^`]+`(?!`)", lambda code: code[0].replace("\n", " "), text)
         found.update(re.findall(r"python -m benchmarks\.(\w+(?:\.\w+)?)\b([^`\n#(;]*)", text))
     listed = (ROOT / "benchmarks" / "README.md").read_text(encoding="utf-8")
     speed = listed.index("| `python -m benchmarks.speed.`")

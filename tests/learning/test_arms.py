@@ -10,8 +10,9 @@ from torchpose.errors import InputError
 from torchpose.io import Recording
 from torchpose.learning._arms import arm_directions, fit_arm_prior
 from torchpose.math import euler_to_matrix
-from torchpose.skeleton import UPPER_BODY, mirror_pose
+from torchpose.skeleton import UPPER_BODY
 from torchpose.skeleton._torso import upright_axes
+from torchpose.skeleton._upper_body import mirror_pose
 
 
 def recording(joints, person):

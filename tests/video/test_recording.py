@@ -104,12 +104,22 @@ def test_poses_end_when_somebody_is_away_for_too_long_and_begin_anew(
     assert person.track.failed_at.tolist() == [-1]
 
 
-@pytest.mark.parametrize("size", [9, 32, 120])
-def test_blocks_give_what_single_frames_give(tracker, keypoints, size):
-    """Of two persons, one of whom leaves for too long twice, once within a block."""
+@pytest.fixture(scope="module")
+def two_persons(keypoints):
+    """Frames of two persons, one of whom leaves for too long twice, once within a block."""
     present = [[]] * 5 + [[0]] * 15 + [[1]] * 35 + [[0, 1]] * 20 + [[1]] * 22 + [[0]] * 16
-    found = frames(keypoints, present)
-    one_by_one, blocks = record(tracker, found, 1), record(tracker, found, size)
+    return frames(keypoints, present)
+
+
+@pytest.fixture(scope="module")
+def one_by_one(tracker, two_persons):
+    """Their poses, frame by frame."""
+    return record(tracker, two_persons, 1)
+
+
+@pytest.mark.parametrize("size", [9, 32, 120])
+def test_blocks_give_what_single_frames_give(tracker, two_persons, one_by_one, size):
+    blocks = record(tracker, two_persons, size)
     assert [p.number for p in blocks] == [p.number for p in one_by_one] == [1, 0]
     for alone, together in zip(one_by_one, blocks, strict=True):
         for name in (*FIELDS, "observed", "log_evidence", "failed_at"):

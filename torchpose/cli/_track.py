@@ -101,18 +101,19 @@ def run(
 ) -> int:
     """Track everybody in a video, or a person from 2D keypoints; write poses and what shows them.
 
-    A video may be a folder of images or the picture of a camera; keypoints are those of head, neck and
-    hands, or any others of the upper body, gaps and all. Writes poses.npz, poses.csv, poses.bvh and
-    pictures into a folder, of video also overlay.mp4 and report.html. With --detector the keypoints of
-    video are those of a model in ONNX, of MediaPipe, or of a Python object.
+    A video is a file, a folder of images or a camera. Keypoints are those of head, neck and hands, or any
+    others of the upper body, and may have gaps. Writes poses.npz, poses.csv, poses.bvh and pictures into
+    a folder, for a video also overlay.mp4 and report.html. With --detector the keypoints in a video are
+    found by a model in ONNX, by MediaPipe, or by a Python object.
 
     Args:
         input: a video file, a folder of images, or the number of a camera; or keypoints: .npz, .csv or a
             folder of OpenPose JSON files. Digits are a camera only if no such path exists.
         out: folder of the results.
-        settings: of `TrackSettings`. video: options of `VideoTracker`. method_options: of the method.
-        face_model: video: a face detector of MediaPipe (.tflite) in place of OpenCV's cascade; needs
-            mediapipe.
+        settings: the options of `TrackSettings`. video: the options of `VideoTracker`.
+        method_options: the options of the method.
+        face_model: video: find faces with a detector of MediaPipe (.tflite) in place of OpenCV's
+            cascade; needs mediapipe.
         overlay: video: write overlay.mp4 and report.html.
         pictures: draw pose_strip.png and joint_curves.png.
         given: the command.

@@ -111,24 +111,26 @@ def run(
         videos: a video or a folder of images per camera, in the order of the file, in step.
         out: folder of the results.
         camera_names: which cameras of the file the videos are of, if not all in order.
-        background: picture, folder of pictures or video of the empty scene per camera; without, what
-            stays in a video is its background, so the person has to move about.
-        ignore_still: with --background: what always looks the same in a video was moved since the scene
-            was empty, and is no person; not for somebody who stands still.
-        method: manifold-regularised (needs --manifold), annealed, plain, root hypotheses with Gaussian
-            limbs (needs --conditionals), or constrained to an action (needs --action) particle filter
-            (default what the file given is for, else apf).
-        tracker: arguments of `BodyTracker`.
-        initial_pose: a body.npz whose first pose the person begins with; without, it is found.
-        facing: where the person looks at first, in world axes; without, the first steps and the bend of
-            the knees tell, which one who walks backwards or stands straight gets wrong.
-        rows: height of the silhouettes.
-        sharpness: exponent of the likelihood; not for root (default 100, of the overlap that constrained
-            goes by 30; the papers have 1).
-        method_options: of the filter.
-        fps: rate at which all videos are read.
-        delays: frames by which each video began too early (default none).
-        seed: seed of the filter.
+        background: a picture, folder of pictures or video of the empty scene per camera; without it,
+            what stays in a video is its background, so the person has to move about.
+        ignore_still: with --background: take what always looks the same in a video for an object that was
+            moved since the scene was empty, and not for the person; not if the person stands still.
+        method: the particle filter: mrpf, regularised by a manifold (needs --manifold); apf, annealed;
+            sir, plain; root, hypotheses of the root with Gaussian limbs (needs --conditionals); or
+            constrained, to an action (needs --action). By default the one that suits the file given, else
+            apf.
+        tracker: the arguments of `BodyTracker`.
+        initial_pose: a body.npz whose first pose the person begins with; without it, that pose is found.
+        facing: the direction in which the person looks at first, in world axes; without it, the first
+            steps and the bend of the knees tell, which is wrong for a person who walks backwards or
+            stands straight.
+        rows: the height of the silhouettes, pixels.
+        sharpness: the exponent of the likelihood; not for root (default 100, for the overlap that
+            constrained uses 30; the papers have 1).
+        method_options: the options of the filter.
+        fps: the frame rate at which all videos are read.
+        delays: the number of frames by which each video began too early (default none).
+        seed: the seed of the filter.
         overlay: write a video per camera with the body drawn into it.
         pictures: write overlay.png.
         given: the command.

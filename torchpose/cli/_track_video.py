@@ -284,8 +284,8 @@ def _nobody(
     if detector is None:
         what = "face"
         wants = (
-            "The detector wants faces from the front, tilted little and at least 16 pixels high; keypoints of "
-            "another detector can be tracked instead (--detector)"
+            "The detector wants faces from the front, tilted little and at least 16 pixels high; "
+            "keypoints of another detector can be tracked instead (--detector)"
         )
     else:
         what = "person"

@@ -106,20 +106,22 @@ def run(
     Args:
         data: two folders or more, each with the recordings of a data set; or one folder with
             kinect_utd_mhad and mocap_berkeley_mhad, and for the second part also with burke_kinect,
-            kinect_laban, mocap_cmu_walk and mocap_cmu_actions. out: folder for the results.
-        seed: of priors, noise and made-up joints. progress: whether to show bars.
+            kinect_laban, mocap_cmu_walk and mocap_cmu_actions.
+        out: folder for the results.
+        seed: the seed of priors, noise and made-up joints. progress: whether to show bars.
         quick: small priors and few sequences, to see that all of it works.
-        part: "cross", "added" (motion capture for training) or "both".
-        tested: persons whom no prior of their own data set sees; of a data set of which none is named
-            the last quarter.
+        part: the part to run: "cross", "added" (motion capture for training) or "both".
+        tested: persons whom no prior of their own data set sees; by default the last quarter of a data
+            set.
         added: folders of motion capture for the second part, with shoulders, elbows, wrists and hips;
             without one there is no second part.
-        n_components: Gaussians per arm over poses; this and the next two as the recipe has them if
-            None.
-        window_components: Gaussians per arm over windows. window_samples: training windows.
-        mocap_share: frames of motion capture that are added, at most, as a multiple of the others'.
-        every: only each n-th sequence of a person is tracked. workers: processes.
-        fits: folder of fitted priors, to share them with other protocols; `out` if None.
+        n_components: the number of Gaussians per arm over poses; by default that of the recipe.
+        window_components: the number of Gaussians per arm over windows; by default that of the recipe.
+        window_samples: the number of training windows; by default that of the recipe.
+        mocap_share: the largest number of frames of motion capture that are added, as a multiple of the
+            others'.
+        every: track only each n-th sequence of a person. workers: the number of processes.
+        fits: the folder of fitted priors, to share them with other protocols; by default `out`.
         recipe: fits the priors.
 
     Raises:

@@ -67,18 +67,19 @@ def run(
         data: folders or files with recordings of two persons or more. Of one folder that holds
             kinect_utd_mhad that is taken, with burke_kinect and kinect_laban beside it as `more`.
         out: folder for the results.
-        seed: of priors and noise. progress: whether to show bars.
+        seed: the seed of priors and noise. progress: whether to show bars.
         quick: small priors, few subsets and a tenth of the sequences, to see that all of it works.
         more: folders or files with further training persons, for counts beyond the persons of `data`
             less one.
-        counts: numbers of training persons; where none is given 1, 2, 4 and so on up to all, and of
-            the published data sets 1, 2, 4, 7 and 9. n_subsets: fits for each number, at most one for each
-            person. n_own: persons for whom a prior of their own is fitted; 0 leaves that part out.
-        n_components: Gaussians per arm over poses; this and the next two as the recipe has them if
-            None.
-        window_components: Gaussians per arm over windows. window_samples: training windows.
-        every: only each n-th sequence of a person is tracked. workers: processes.
-        fits: folder of fitted priors, to share them with other protocols; `out` if None.
+        counts: the numbers of training persons; where none is given 1, 2, 4 and so on up to all, and for
+            the published data sets 1, 2, 4, 7 and 9.
+        n_subsets: the number of fits for each count, at most one for each person.
+        n_own: the number of persons for whom a prior of their own is fitted; 0 leaves that part out.
+        n_components: the number of Gaussians per arm over poses; by default that of the recipe.
+        window_components: the number of Gaussians per arm over windows; by default that of the recipe.
+        window_samples: the number of training windows; by default that of the recipe.
+        every: track only each n-th sequence of a person. workers: the number of processes.
+        fits: the folder of fitted priors, to share them with other protocols; by default `out`.
         compare: other recipes to draw beside `torchpose.learning._recipes.fit_kinect_prior`, each as
             NAME=module.function.
         recipes: names and functions, instead of all that.

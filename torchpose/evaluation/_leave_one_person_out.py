@@ -49,14 +49,14 @@ def run(
 
     Args:
         data: folders or files with recordings of two persons or more. out: folder for the results.
-        seed: of priors and noise. progress: whether to show bars.
+        seed: the seed of priors and noise. progress: whether to show bars.
         quick: small priors and a tenth of the sequences, to see that all of it works.
-        n_components: Gaussians per arm over poses; this and the next two as the recipe has them if
-            None.
-        window_components: Gaussians per arm over windows. window_samples: training windows.
-        calibration_folds: of the recipe; 0 leaves the covariances uncalibrated.
-        every: only each n-th sequence of a person is tracked. workers: processes.
-        fits: folder of fitted priors, to share them with other protocols; `out` if None.
+        n_components: the number of Gaussians per arm over poses; by default that of the recipe.
+        window_components: the number of Gaussians per arm over windows; by default that of the recipe.
+        window_samples: the number of training windows; by default that of the recipe.
+        calibration_folds: the number of folds of the calibration; 0 leaves covariances uncalibrated.
+        every: track only each n-th sequence of a person. workers: the number of processes.
+        fits: the folder of fitted priors, to share them with other protocols; by default `out`.
         recipe: fits the priors.
 
     Raises:

@@ -80,11 +80,12 @@ def run(
 
     Args:
         data: folders or files of recordings. out: folder for the results.
-        seed: of the noise, and of methods that draw. progress: whether to show bars.
-        prior: to be scored, a name or a file (default kinect-upper-body).
-        method: of the tracker (default that of torchpose track).
+        seed: the seed of the noise, and of methods that draw. progress: whether to show bars.
+        prior: the prior to score, a name or a file (default kinect-upper-body).
+        method: the method of the tracker (default that of torchpose track).
         joints: what the tracker is given: head, neck and hands, or all eight.
-        noise_std: of a keypoint, pixels (default 3). every: only each n-th recording of a person.
+        noise_std: the standard deviation of a keypoint, pixels (default 3).
+        every: use only each n-th recording of a person.
         seen: score also persons whom the prior, or the prior over arms that comes with the package, was
             fitted on; the report says so.
 

@@ -70,11 +70,14 @@ class ArticulatedFilter(Estimator):
        to those of later frames, of which 40 kB each are kept.
 
     Args:
-        model: of the tracker. arms: prior over arms, or its file; by default the one that comes with
-            the package. bone_lengths: of the person, metres, where they were measured: any of
-            upper_arm, forearm (to the measured hand or wrist), shoulder_width and head_height (above the
-            neck). height: of the person, metres. person: poses of the same person, or the file that
-            `PoseTrack.save` wrote: their last lengths. Lengths that are not known are expected in proportion.
+        model: the model of the tracker.
+        arms: the prior over arms, or its file; by default the one that comes with the package.
+        bone_lengths: the lengths that were measured on the person, metres: any of upper_arm, forearm (to
+            the measured hand or wrist), shoulder_width and head_height (above the neck). The others are
+            expected in proportion.
+        height: the height of the person, metres.
+        person: poses of the same person, or the file that `PoseTrack.save` wrote, of which the last
+            lengths are taken.
 
     Raises:
         InputError: arms of another kind, no such file, a length or height that nobody has, or poses

@@ -30,36 +30,40 @@ class TrackSettings:
     """Settings of tracking; every one is the option of `torchpose track` of that name.
 
     Args:
-        prior: a prior that comes with torchpose, or a .safetensors file.
-        method: name of the estimator; by default articulated if wrists are measured and the prior has hands,
-            else multiple-model if it brings windows that suit, else articulated or mkf-fixed.
-        camera: TOML file or four numbers fx,fy,cx,cy in pixels; without it K or the image size of the
-            input.
-        camera_name: which camera of a file with several.
-        measurement_std: standard deviation of a keypoint in pixels: one number, or five with commas for
-            hand, elbow, shoulder, head, neck; by default what the prior learnt, else 3.
-        smoothing: use this many later frames, or all of them ("full"), for each estimate; of
+        prior: the name of a prior that comes with torchpose, or a .safetensors file.
+        method: the name of an estimator; by default articulated if wrists are measured and the prior has
+            hands, else multiple-model if the prior has windows that suit, else articulated or mkf-fixed.
+        camera: the camera: a TOML file, or four numbers fx,fy,cx,cy in pixels; by default K or the image
+            size of the input.
+        camera_name: the name of the camera in a file that has several.
+        measurement_std: the standard deviation of a keypoint in pixels: one number, or five with commas
+            for hand, elbow, shoulder, head, neck; by default as the prior learnt it, else 3.
+        smoothing: use this many later frames, or all of them ("full"), for each estimate; only with
             articulated, window-mixture and mkf-fixed.
-        n_particles: particles of the pf methods (default 10000).
-        n_tracks: tracks of mkf-sampled and mkf-split.
-        arms: file of a prior over arms, of articulated; by default the one that comes with torchpose.
-        bone_lengths: of articulated, metres, as measured on the person, with commas: any of upper_arm=,
-            forearm= (to the measured hand or wrist), shoulder_width= and head_height= (above the neck).
-        height: of articulated, metres: of the person, if their bones were not measured.
-        person: of articulated: the .npz of a recording of the same person, whose lengths are taken.
-        frame: axes of the 3D poses: of the camera (default) or of the body.
+        n_particles: the number of particles of the pf methods (default 10000).
+        n_tracks: the number of tracks of mkf-sampled and mkf-split.
+        arms: articulated: the file of a prior over arms; by default the one that comes with torchpose.
+        bone_lengths: articulated: lengths measured on the person in metres, with commas: any of
+            upper_arm=, forearm= (to the measured hand or wrist), shoulder_width= and head_height= (above
+            the neck).
+        height: articulated: the height of the person in metres, if their bones were not measured.
+        person: articulated: the .npz of an earlier recording of the same person, whose bone lengths are
+            taken.
+        frame: the axes of the 3D poses: those of the camera (default) or of the body.
         static_camera: let the body turn in front of a camera that stays where it is.
         window: deprecated: false stands for the method mkf-fixed, true for window-mixture if the prior
-            brings windows that suit.
-        steady: take the jitter out of what windows give, by filters of constant velocity (default
-            true for window-mixture).
-        neck: kind of the keypoints' neck if their names do not tell: neck, low-neck, mid-shoulder.
+            has windows that suit.
+        steady: remove the jitter of poses from windows with filters of constant velocity (default true
+            for window-mixture).
+        neck: the kind of the keypoints' neck, if their names do not tell: neck, low-neck, mid-shoulder.
         nose_as_head: take a nose for the head where there is none.
-        fps: frames per second, if the input does not say or errs; a video file is resampled to it.
-        max_gap: longest stretch without any keypoint, in seconds, null for no bound (default 5); in
-            video, somebody who is away for longer has no pose until they come back.
-        outliers: leave out keypoints that belong to no body, and exchange hands back that are exchanged.
-        seed: of the methods that draw; every recording starts from it.
+        fps: the number of frames per second, if the input does not tell or is wrong; a video file is
+            resampled to it.
+        max_gap: the longest time without any keypoint in seconds, null for no bound (default 5); in a
+            video, a person who is away for longer has no pose until they return.
+        outliers: treat keypoints that belong to no body as missing, and exchange hands back that are
+            exchanged.
+        seed: the seed of methods that draw; every recording starts from it.
     """
 
     prior: str = "kinect-upper-body"

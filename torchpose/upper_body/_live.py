@@ -42,14 +42,15 @@ class LivePose(NamedTuple):
     Attributes:
         joints2d: [B, 8, 2], pixels of the camera; joints in the order of `UPPER_BODY`.
         joints3d: [B, 8, 3], metres, in the tracker's frame.
-        covariance2d: [B, 8, 2, 2]. covariance3d: [B, 8, 3, 3].
+        covariance2d: [B, 8, 2, 2], pixels squared. covariance3d: [B, 8, 3, 3], metres squared.
         observed: [B, 8], True where the joint was measured in this frame, by no outlier.
-        log_evidence: of the left and the right arm, [B, 2].
-        effective_sample_size: of the particles or tracks of each arm, [B, 2]; see `PoseTrack`.
-        unseen: seconds since any joint was measured, [B]; 0 where one is.
+        log_evidence: [B, 2], the increment of the left and of the right arm; see `PoseTrack`.
+        effective_sample_size: [B, 2], that of the particles or tracks of each arm; see `PoseTrack`.
+        unseen: [B], the time since any joint was measured, seconds; 0 where one is.
         failed: [B], True where the filter degenerated: poses are NaN until the stream is reinitialised.
-        inlier_probability: that the keypoint of a joint is no outlier, [B, 8]; see `PoseTrack`.
-        bone_lengths: [B, 4], metres. bone_covariance: [B, 4, 4]; see `PoseTrack`.
+        inlier_probability: [B, 8], the probability that the keypoint of a joint is no outlier; see
+            `PoseTrack`.
+        bone_lengths: [B, 4], metres. bone_covariance: [B, 4, 4], metres squared; see `PoseTrack`.
     """
 
     joints2d: Tensor

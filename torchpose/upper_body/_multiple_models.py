@@ -84,7 +84,8 @@ class MultipleModelFilter(Estimator):
     those of "articulated".
 
     Args:
-        model: of the tracker; its prior has a window that suits. arms: as in `ArticulatedFilter`.
+        model: the model of the tracker, whose prior has a window that suits.
+        arms: as in `ArticulatedFilter`.
 
     Raises:
         InputError: no window suits; as `ArticulatedFilter`.

@@ -61,33 +61,39 @@ class PoseTrack:
     Past the length of a sequence its last pose is repeated.
 
     Attributes:
-        joints2d: [B, T, 8, 2], pixels of the input's camera.
-        joints3d: [B, T, 8, 3], metres, in `frame`.
-        covariance2d: [B, T, 8, 2, 2], pixels squared. covariance3d: [B, T, 8, 3, 3], metres squared.
-        observed: [B, T, 8], True where the joint was measured, False where it was inferred: nothing was
-            given, or an outlier.
-        log_evidence: increments log p(z_t | z_1:t-1) of the left and of the right arm, [B, T, 2].
+        joints2d: [B, T, 8, 2], the joints in the image, pixels of the input's camera.
+        joints3d: [B, T, 8, 3], the joints in space, metres, in the axes of `frame`.
+        covariance2d: [B, T, 8, 2, 2], their covariances, pixels squared.
+        covariance3d: [B, T, 8, 3, 3], their covariances, metres squared.
+        observed: [B, T, 8], True where the joint was measured, False where it was inferred because no
+            keypoint was given or it was an outlier.
+        log_evidence: [B, T, 2], the increments log p(z_t | z_1:t-1) of the left and of the right arm.
             Both arms contain head and neck, so their sum is a score and not an evidence.
-        names: of the joints. fps: frames per second, or None. lengths: [B].
-        matrix: camera matrix K [3, 3] of the input.
-        frame: "camera" (x right, y down, z forward) or "body" (that of the prior's recordings).
+        lengths: [B], the number of frames of each sequence.
+        matrix: the camera matrix K [3, 3] of the input.
         failed_at: [B], the first frame that is NaN because the filter degenerated, -1 if none.
-        notes: what was assumed about camera, neck and hands, and whether covariances had to be
-            mended, in plain words.
-        method: the estimator that ran, one of `torchpose.upper_body.METHODS`; "unknown" in files of
+        names: the names of the joints. fps: the number of frames per second, or None.
+        frame: the axes of the joints: "camera" (x right, y down, z forward), or "body" for those of the
+            prior's recordings.
+        notes: the assumptions about camera, neck and hands, and whether covariances had to be mended,
+            in plain words.
+        first_frame: the frame of the video or recording that the first pose belongs to.
+        method: the name of the estimator that ran, one of `torchpose.upper_body.METHODS`; "unknown" in
+            files of older releases.
+        effective_sample_size: [B, T, 2], 1 / sum_j w_j^2 (BL 25) of the particles or tracks of the left
+            and of the right arm; NaN in files of older releases. If one particle has all the weight, the
+            estimate is not to be trusted; if one track has it, the filter is sure of a component.
+        inlier_probability: [B, T, 8], the probability that the keypoint of a joint is no outlier; below
+            1/2 it was treated as missing. NaN where no keypoint was given or screened, and in files of
             older releases.
-        first_frame: of the video or recording, that of the first pose.
-        effective_sample_size: 1 / sum_j w_j^2 (BL 25) of the particles or tracks of the left and of the
-            right arm, [B, T, 2]; NaN in files of older releases. One particle that has all the weight
-            is no estimate; one track that has it is a Gaussian, sure of its component.
-        inlier_probability: that the keypoint of a joint is no outlier, [B, T, 8]; below 1/2 it was taken
-            as missing. NaN where none was given or looked for, and in files of older releases.
-        bone_lengths: that were believed before each frame, in the order of `bone_names`, [B, T, 4], metres;
-            NaN of methods that learn none and in files of older releases. One camera does not tell a large
-            body from a near one, so their common scale is that of the prior or of what was given.
-        bone_covariance: of the lengths, [B, T, 4, 4], metres squared; most of it is the common scale.
-        bone_names: upper_arm, forearm (to the wrist) or forearm_to_hand, shoulder_width and head_height
-            (above Kinect's neck).
+        bone_lengths: [B, T, 4], the lengths of bones as estimated before each frame, metres, in the order
+            of `bone_names`; NaN for methods that learn none and in files of older releases. One camera
+            does not distinguish a large body from a near one, so their common scale is that of the prior
+            or of lengths that were given.
+        bone_covariance: [B, T, 4, 4], the covariance of these lengths, metres squared; most of it is the
+            uncertainty of their common scale.
+        bone_names: the names of these bones: upper_arm, forearm (to the wrist) or forearm_to_hand,
+            shoulder_width and head_height (above Kinect's neck).
     """
 
     joints2d: Tensor
@@ -134,7 +140,7 @@ class PoseTrack:
         """Return one sequence, cut to its own length, as a batch of one.
 
         Args:
-            index: of the sequence; -1 is the last.
+            index: the index of the sequence; -1 is the last.
 
         Returns:
             Track with B = 1 and T = `lengths[index]`.
@@ -149,7 +155,7 @@ class PoseTrack:
         """Return the same poses with floating-point numbers of a dtype.
 
         Args:
-            dtype: such as torch.float32.
+            dtype: the floating-point type, such as torch.float32.
 
         Returns:
             Track with the same shapes; this one if it has the dtype.
@@ -169,7 +175,7 @@ class PoseTrack:
         bone_names, names, fps (NaN if unknown), K, frame, failed_at, lengths, notes, first_frame, method.
 
         Args:
-            path: of the .npz file, which is replaced.
+            path: the .npz file, which is replaced if there is one.
 
         Raises:
             OutputError: the file cannot be written.

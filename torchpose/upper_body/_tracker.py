@@ -87,36 +87,40 @@ class UpperBodyTracker(WideModule):
     and `advance` some at a time, with the state of each stage.
 
     Args:
-        prior: from `load_prior` or `fit_upper_body_prior`.
-        camera: of the keypoints. One other than the prior's is mapped to it.
-        method: one of `METHODS`. By default "articulated" where wrists stand for the prior's hands, or an
-            option of bones is given, and neither `steady` nor an option of another method is; else
-            "multiple-model" where the prior has windows that suit, or "window-mixture" if `steady` or an
-            option of windows is given; else "articulated" where both shoulders and an elbow are measured,
-            and "mkf-fixed". The attribute `method` is the one for few joints, `PoseTrack.method` the one
-            that ran.
-        measurement_std: standard deviation of a keypoint in the camera's pixels, one number or one
-            for each of hand, elbow, shoulder, head, neck; by default what the prior brings, else 3.
-        fps: frame rate of the keypoints; by default that of the prior. Process noise is scaled.
-        smoothing: None, the number of later frames that an estimate may use, or "full"; only for
-            "articulated", "mkf-fixed" and "window-mixture", whose windows then look a few frames ahead.
-        frame: "camera" (axes of the camera) or "body" (of the prior's recordings).
-        static_camera: put the body, turned by the estimated rotation, in front of a camera that
-            stays at the prior's mean place, as the authors' released demo does.
+        prior: the prior over upper bodies, from `load_prior` or `fit_upper_body_prior`.
+        camera: the camera that took the keypoints; by default that of the prior. Keypoints of another
+            camera than the prior's are mapped to it.
+        method: the name of an estimator, one of `METHODS`. The default depends on what is measured:
+            "articulated" where wrists stand for the prior's hands, or an option of bones is given, and
+            neither `steady` nor an option of another method is; else "multiple-model" where the prior has
+            windows that suit, or "window-mixture" if `steady` or an option of windows is given; else
+            "articulated" where both shoulders and an elbow are measured, and "mkf-fixed". The attribute
+            `method` is the default for few joints; `PoseTrack.method` is the method that ran.
+        measurement_std: the standard deviation of a keypoint in pixels of the camera: one number, or one
+            for each of hand, elbow, shoulder, head and neck; by default as the prior learnt it, else 3.
+        fps: the frame rate of the keypoints, by which the process noise is scaled; by default that of
+            the prior.
+        smoothing: the number of later frames that an estimate may use, "full" for all of them, None for
+            none; only for "articulated", "mkf-fixed" and "window-mixture", whose windows then look a few
+            frames ahead.
+        frame: the axes of the 3D poses: "camera", or "body" for those of the prior's recordings.
+        static_camera: whether the body is put in front of a camera that stays at the prior's mean place,
+            turned by the estimated rotation, as the authors' released demo does.
         window: deprecated; False stands for method "mkf-fixed", True for "window-mixture" where the prior
             has windows that suit.
-        steady: pass what windows give through filters of constant velocity (`MotionStage`), which take
-            the jitter out; smoothers if `smoothing` is asked for. By default where there are windows;
-            False leaves it out, in "multiple-model" too.
-        calibrated: recalibrate `covariance3d` as the prior's training persons showed, if it says how.
-        neck: kind of neck of the keypoints, where their names do not tell it (see
+        steady: whether filters of constant velocity (`MotionStage`), or smoothers with `smoothing`, remove
+            the jitter of poses from windows; by default where a method has windows. False leaves them
+            out of "multiple-model" too.
+        calibrated: whether `covariance3d` is recalibrated by factors that the prior's training persons
+            showed, if the prior has them.
+        neck: the kind of neck of the keypoints, where their names do not tell it (see
             `torchpose.skeleton.NECK_KINDS`). A neck of another kind than the prior's is put where the
             prior has it, between the middle of the shoulders and the head, or else not measured.
-        max_gap: seconds over which nothing at all may be measured; None is no bound.
-        outliers: look for keypoints that belong to no body, which count as missing, and for exchanged hands,
-            which are exchanged back, frame by frame. False takes keypoints as they are.
-        **options: the options of the method (`torchpose.upper_body.method_options`), such as n_particles,
-            n_tracks, uniform_weight or transition.
+        max_gap: the longest time without any keypoint, seconds; None for no bound.
+        outliers: whether keypoints that belong to no body count as missing, and exchanged hands are
+            exchanged back, frame by frame. False takes keypoints as they are.
+        **options: the options of the method (`torchpose.upper_body.method_options`), such as
+            n_particles, n_tracks, uniform_weight or transition.
 
     Raises:
         InputError: an unknown method, or an option that the method does not use. CameraError: no
@@ -230,17 +234,18 @@ class UpperBodyTracker(WideModule):
         """Track a batch of sequences.
 
         Args:
-            keypoints: [B, T, J, 2], pixels of the camera; NaN = missing.
-            confidence: [B, T, J] in 0..1; 0 or NaN is missing, and the measurement covariance is
-                divided by what is between.
-            names: of the J joints, in any order and spelling that `torchpose.skeleton` knows; may be
-                left out if J = 8 and they are in the order of `UPPER_BODY`. Nose, eyes and ears tell
-                "articulated" where the body faces.
-            mask: [B, T, J], False = ignore the keypoint.
-            generator: for the methods that draw: one, or a list of one for each sequence.
-            lengths: [B], frames of each sequence. progress: whether to show a bar.
-            covariance: of every single keypoint, pixels squared, in place of `measurement_std`; that
-                of a missing keypoint is not looked at. Frames with the same covariances share work.
+            keypoints: [B, T, J, 2], pixels of the camera; NaN where one is missing.
+            confidence: [B, T, J], 0 to 1, by which the measurement covariance is divided; 0 or NaN
+                where a keypoint is missing.
+            names: the names of the J joints, in any order and spelling that `torchpose.skeleton` knows;
+                may be left out if J = 8 and they are in the order of `UPPER_BODY`. Nose, eyes and ears
+                tell "articulated" where the body faces.
+            mask: [B, T, J], False where the keypoint is to be ignored.
+            generator: the generator of methods that draw, or a list of one for each sequence.
+            lengths: [B], the number of frames of each sequence. progress: whether to show a bar.
+            covariance: [B, T, J, 2, 2], the covariance of each keypoint in pixels squared, in place of
+                `measurement_std`; that of a missing keypoint is ignored. Frames with the same
+                covariances share work.
 
         Returns:
             `PoseTrack`.
@@ -271,8 +276,8 @@ class UpperBodyTracker(WideModule):
         """Begin to track live streams, frame by frame (`step`).
 
         Args:
-            batch_size: B, number of streams. names: of the keypoints, as in `forward`; any of them
-                may be missing in any frame. generator: as in `forward`; the state holds it.
+            batch_size: B, the number of streams. names: the names of the keypoints, as in `forward`; any
+                of them may be missing in any frame. generator: as in `forward`; the state holds it.
 
         Returns:
             `StreamState` before the first frame.
@@ -320,9 +325,10 @@ class UpperBodyTracker(WideModule):
         that were dropped are to be passed as missing (NaN), since a step is one frame at `fps`.
 
         Args:
-            state: from `init` or the step before; it is not changed, so a step may be repeated
-                (but a generator goes on). keypoints, confidence, mask, covariance: of one frame, as
-                in `forward`.
+            state: the state from `init` or the step before; it is not changed, so a step may be repeated
+                (but a generator goes on).
+            keypoints, confidence, mask, covariance: the measurements of one frame, as in `forward`,
+                without T.
 
         Returns:
             The next state, and the `LivePose` of this frame.
@@ -348,7 +354,8 @@ class UpperBodyTracker(WideModule):
         Long recordings are tracked so in bounded memory, and quicker than frame by frame.
 
         Args:
-            state: as in `step`. keypoints, confidence, mask, covariance: as in `forward`.
+            state: as in `step`. keypoints, confidence, mask, covariance: the measurements of these
+                frames, as in `forward`.
 
         Returns:
             The next state, and the poses of these frames.

@@ -61,11 +61,11 @@ class LiveView:
     a stop as well (not under Windows).
 
     Args:
-        port: to listen on; 0 takes any that is free.
-        quality: of the JPEG pictures, 1 to 100.
+        port: the port of the server; 0 takes any that is free.
+        quality: the quality of the JPEG pictures, 1 to 100.
 
     Attributes:
-        url: of the page, while the block lasts.
+        url: the address of the page, while the block lasts.
 
     Raises:
         InputError: a port or quality that is out of range. OutputError: the port is taken.

@@ -118,13 +118,13 @@ class TrackedPerson:
     """Holds the poses of one person of a video.
 
     Attributes:
-        number: of the person, in the order of appearance. first_frame: the frame of the video that has the
-            first pose.
-        track: poses as a batch of one; NaN where the person was absent for longer than `max_gap`.
-        keypoints: measured [T, J, 2], pixels, NaN where missing, in the order of the
-            measurer's `names`.
-        covariance: of the keypoints [T, J, 2, 2]; None by a detector of keypoints.
-        confidence: 0 to 1 [T, J], by a detector of keypoints; else None.
+        number: the number of the person, in the order of appearance.
+        first_frame: the frame of the video that has the first pose.
+        track: the poses as a batch of one; NaN where the person was absent for longer than `max_gap`.
+        keypoints: [T, J, 2], the measurements, pixels, NaN where missing, in the order of the measurer's
+            `names`.
+        covariance: [T, J, 2, 2], the covariances of the keypoints, pixels squared; None with a detector.
+        confidence: [T, J], the confidences of a detector, 0 to 1; None without one.
     """
 
     number: int

@@ -69,7 +69,7 @@ class VideoState(NamedTuple):
 
     Attributes:
         measurer: the state of the measurer. streams: the states of the persons by number.
-        poses: the last poses of the persons in `streams`, but for those of filters that degenerated.
+        poses: the last poses of the persons in `streams`, without those of filters that degenerated.
     """
 
     measurer: MeasurerState | KeypointState
@@ -81,7 +81,7 @@ class LivePerson(NamedTuple):
     """Holds a person in one frame.
 
     Attributes:
-        number: of the person, in the order of appearance.
+        number: the number of the person, in the order of appearance.
         pose: a track of one frame; `pose.failed` [1] says whether the filter degenerated, as in a
             `PoseTrack` and a `LivePose`.
         measured: the measurements in the frame.
@@ -107,9 +107,9 @@ class VideoTracker(nn.Module):
     files until it has ended (`TrackedRecording`).
 
     Args:
-        prior: from `load_prior` or `fit_upper_body_prior`.
-        camera: of the video.
-        fps: frames per second. All frames are taken to be equally far apart.
+        prior: the prior over upper bodies, from `load_prior` or `fit_upper_body_prior`.
+        camera: the camera that took the video.
+        fps: the number of frames per second. All frames are taken to be equally far apart.
         hands: the hand tracker: "learnt" (default), "grid" (without its network) or "mean-shift", the
             paper's method.
         background: detect the foreground, for a static camera.
@@ -119,14 +119,15 @@ class VideoTracker(nn.Module):
             the time of the poses.
         candidates: also reinitialise the hand tracker at the hands of the last pose; frames are then
             measured and filtered in turn, which is slower.
-        face_detector: by default Haar's.
+        face_detector: the detector of faces; by default Haar's.
         max_persons: track only the N largest faces, or persons of a detector.
-        head_neck: offsets of head and neck from the face.
-        detector: of keypoints, in place of faces, skin and hands: a model in ONNX (.onnx), a pose
-            landmarker of MediaPipe (.task), or package:factory, which Python imports and calls.
-        min_confidence: with a detector, of a keypoint, below which it is missing (default 0.3).
-        max_gap: seconds without measurements after which a person has no pose; None is never.
-        seed: of methods that draw; every person has a generator.
+        head_neck: the offsets of head and neck from the face.
+        detector: find keypoints with a detector, in place of faces, skin and hands: a model in ONNX
+            (.onnx), a pose landmarker of MediaPipe (.task), or package:factory, which Python imports and
+            calls.
+        min_confidence: treat keypoints of a detector as missing below this confidence (default 0.3).
+        max_gap: the time without measurements after which a person has no pose, seconds; None for never.
+        seed: the seed of methods that draw; every person has a generator.
         **options: further options of `UpperBodyTracker`, such as method, smoothing or frame.
 
     Raises:
@@ -219,8 +220,8 @@ class VideoTracker(nn.Module):
         """Return the next state and the persons in one more frame of a camera.
 
         Args:
-            state: from `init` or the step before. image: RGB, uint8, an array [H, W, 3] or a tensor
-                [3, H, W].
+            state: the state from `init` or the step before. image: the frame, RGB, uint8, an array
+                [H, W, 3] or a tensor [3, H, W].
 
         Returns:
             The next state, and the persons seen within the last `max_gap`.
@@ -238,7 +239,7 @@ class VideoTracker(nn.Module):
         """Return the next state and the poses in some more frames: those of `step` for one after the other.
 
         Args:
-            state: from `init` or the call before. images: as the frames of `forward`.
+            state: the state from `init` or the call before. images: the frames, as in `forward`.
 
         Returns:
             The next state, and by number of each person the parts of these frames in which there are

@@ -51,20 +51,23 @@ class BodyTrack:
     that happened, `failed_at` the first of them.
 
     Attributes:
-        body: whose states they are.
-        state: [T, D], the estimates. state_std: [T, D], in the units of a step (`Body.difference`).
-        joints3d: [T, J, 3], joints of the estimates, metres, world axes.
-        covariance3d: [T, J, 3, 3], second moment of the particles' joints about them, metres squared;
-            with the Gaussians within particles, of a filter that has them.
-        log_evidence, effective_sample_size: [T]. coasting: [T], True where no camera saw the person.
+        body: the body of the person, to which the states belong.
+        state: [T, D], the estimates.
+        state_std: [T, D], their standard deviations, in the units of a step (`Body.difference`).
+        joints3d: [T, J, 3], the joints of the estimates, metres, world axes.
+        covariance3d: [T, J, 3, 3], the second moment of the particles' joints about them, metres squared;
+            filters with Gaussians within particles include these.
+        log_evidence: [T], the increments log p(z_t | z_1:t-1).
+        effective_sample_size: [T], 1 / sum_j w_j^2 of the particles.
+        coasting: [T], True where no camera saw the person.
         respread: [T], True where all particles had died and were spread about the last estimate.
-        fps: frames per second, or None. notes: what was assumed, in plain words.
-        first_frame: of the videos, that of the first pose.
-        details: what only some filters report, by name, [T, ...] each (`BodyFilterOutput.details`): of
-            `ConstrainedParticleFilter` "acceptance", "clamped", "actions" and so on.
-        action_names: of the columns of ``details["actions"]``.
-        method: the filter that ran, one of `torchpose.whole_body.METHODS`; "unknown" in files of older
-            releases.
+        fps: the number of frames per second, or None. notes: the assumptions, in plain words.
+        first_frame: the frame of the videos that the first pose belongs to.
+        details: what only some filters report, by name, [T, ...] each (`BodyFilterOutput.details`), such
+            as "acceptance", "clamped" and "actions" of `ConstrainedParticleFilter`.
+        action_names: the names of the columns of ``details["actions"]``.
+        method: the name of the filter that ran, one of `torchpose.whole_body.METHODS`; "unknown" in files
+            of older releases.
     """
 
     body: Body
@@ -109,7 +112,7 @@ class BodyTrack:
         `body_radii` and so on.
 
         Args:
-            path: of the file, which is replaced.
+            path: the file, which is replaced if there is one.
 
         Raises:
             OutputError: the file cannot be written.

@@ -72,26 +72,29 @@ class BodyTracker(nn.Module):
       needs `action`.
 
     Args:
-        cameras: of the silhouettes, undistorted: a `CameraRig`, or what makes one.
+        cameras: the cameras of the silhouettes, undistorted: a `CameraRig`, or what makes one.
         method: a name of `torchpose.whole_body.METHODS`; by default that of the model given, else "apf".
         body: the person's body, or a body.npz (`BodyTrack`) whose bone lengths and shape the person has;
             then the height is not used.
-        height: height of the person, metres.
-        manifold: poses of an action, by a name that `torchpose info` lists, or a file; in Python also the
-            model itself. The first pose is looked for with it by every method.
-        conditionals: rotations of limbs against each other and over time, by name, or a file.
-        action: postures of an action, or of several, by name, or a file.
-        n_particles: likelihoods of a frame, of all layers together; a hypothesis of "root" counts seven.
-        fps: frames per second; noise grows with the time between frames.
-        process_cov: variances of the diffusion per frame [D], or [D, D] without entries off the diagonal,
-            in squares of metres for the root and of sines of half angles for rotations; by default what
-            suits the method.
-        initial_cov: the same of the particles about the first pose; by default four times `process_cov`.
-        **options: of the method's filter (`torchpose.whole_body._methods.method_options`), such as sharpness,
-            limits, leg_swap or n_layers.
+        height: the height of the person, metres.
+        manifold: the poses of an action, by a name that `torchpose info` lists, or a file; in Python also
+            the model itself. Every method finds the first pose with it.
+        conditionals: the rotations of limbs relative to each other and over time, by name, or a file.
+        action: the postures of an action, or of several, by name, or a file.
+        n_particles: the number of likelihoods computed in a frame, all layers together; a hypothesis of
+            "root" counts seven.
+        fps: the number of frames per second; noise grows with the time between frames.
+        process_cov: the variances of the diffusion per frame [D], or [D, D] without entries off the
+            diagonal, in squares of metres for the root and of sines of half angles for rotations; by
+            default what suits the method.
+        initial_cov: the variances of the particles about the first pose, as `process_cov`; by default
+            four times those.
+        **options: the options of the method's filter (`torchpose.whole_body._methods.method_options`),
+            such as sharpness, limits, leg_swap or n_layers.
 
     Attributes:
-        filter: that runs. method: its name. upright: the body on which the first pose is looked for.
+        filter: the filter that runs. method: its name.
+        upright: the body with which the first pose is found.
 
     Raises:
         InputError: an unknown method, a model or an option that it does not use, too few particles.
@@ -108,7 +111,7 @@ class BodyTracker(nn.Module):
         >>> standing = torch.zeros(36, dtype=torch.float64)
         >>> silhouettes = render(Body.of_height(BODY_15, 1.8), standing.expand(3, -1), camera, 60, 80)
         >>> tracker = torchpose.BodyTracker(camera, "sir", height=1.8, n_particles=50)
-        >>> poses = tracker(silhouettes, standing, torch.Generator().manual_seed(0))
+        >>> poses = tracker(silhouettes, standing, generator=torch.Generator().manual_seed(0))
         >>> poses.joints3d.shape
         torch.Size([3, 15, 3])
     """
@@ -212,10 +215,11 @@ class BodyTracker(nn.Module):
                 holds those that the first pose is found in, and one more.
             initial_state: the pose before that frame [D], of `body`; found in half a second of frames
                 (`find_first_pose`) if None.
-            generator: of random numbers. lengths: [1], frames of the sequence, if they are fewer; past them
-                the last pose is repeated.
-            facing: [3], the world direction that the person looks in at first, if it is known.
-            n_frames: expected number of frames, for the bar. progress: whether to show one.
+            generator: the generator of random numbers.
+            lengths: [1], the number of frames of the sequence, if they are fewer; past them the last pose
+                is repeated.
+            facing: [3], the direction in which the person looks at first, world axes, if it is known.
+            n_frames: the expected number of frames, for the bar. progress: whether to show one.
 
         Returns:
             `BodyTrack`, from frame `first_frame`.
@@ -300,8 +304,8 @@ class BodyTracker(nn.Module):
         """Track one more frame: the same numbers as that frame of `forward`.
 
         Args:
-            state: from `init` or the step before; it is not changed (but a generator goes on).
-            silhouettes: of one frame, bool [C, H, W].
+            state: the state from `init` or the step before; it is not changed (but a generator goes on).
+            silhouettes: the silhouettes of one frame, bool [C, H, W].
 
         Returns:
             The next state, and the `BodyTrack` of this one frame.
