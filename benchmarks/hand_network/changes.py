@@ -23,7 +23,6 @@ _BELOW, _BESIDE = (0.6, 5.0), (1.2, 4.2)  # from the anchor to a new border of t
 _UNKNOWN_SKIN = 0.15
 _CLEAR = (0.55, 0.15)  # B about hands and face that stay as they are, and over how far that fades
 _SKIN = (0.6, 0.35, 0.35)  # deviation of the colour of bare skin from the face's
-_OTHER_SIDE = [1, 0, 3, 2]  # of the labelled joints
 _LEGS, _NECKS = 0.45, 0.3  # of bare skin; the rest lies anywhere
 
 
@@ -48,11 +47,16 @@ def mirrored(batch: Windows, which: Bool[Tensor, " N"]) -> Windows:
     faces = torch.where(
         which[:, None], batch.faces * batch.faces.new_tensor([-1.0, 1.0, 1.0]), batch.faces
     )
-    other = batch.places[:, _OTHER_SIDE] * batch.places.new_tensor([-1.0, 1.0])
+    other = _other_side(batch.places) * batch.places.new_tensor([-1.0, 1.0])
     other = other + batch.places.new_tensor([CELLS[1] - 1.0, 0.0])
     places = torch.where(which[:, None, None], other, batch.places)
-    seen = torch.where(which[:, None], batch.seen[:, _OTHER_SIDE], batch.seen)
+    seen = torch.where(which[:, None], _other_side(batch.seen), batch.seen)
     return Windows(images[0], images[1], faces, places, seen)
+
+
+def _other_side(values: Tensor) -> Tensor:
+    """Return values [N, J, ...] of left and right joints in turn, with left and right swapped."""
+    return values.unflatten(1, (-1, 2)).flip(2).flatten(1, 2)
 
 
 def exchanged(batch: Windows) -> Windows:

@@ -20,7 +20,6 @@ from torchpose.measure._body_window import CELLS, pixels_to_cells
 from torchpose.measure._hand_likelihood import HandMeasurements, HandSettings
 from torchpose.measure._hand_network import HandNetwork, HandPlaces
 from torchpose.measure._hand_prior import HandPrior
-from torchpose.measure._torso import Elbows
 from torchpose.skeleton import UPPER_BODY
 from torchpose.video import open_video
 
@@ -195,16 +194,8 @@ def measure(
             state, found = measurer.step(state, frame.image)
             row = _person(found.faces, clip.labels.nose[t])
             if row is not None:
-                hands = _of_person(found.hands, row)
+                hands = HandMeasurements(*(value[row] for value in found.hands))
                 yield t, row, hands, state.hands.anchors[row]
-
-
-def _of_person(hands: HandMeasurements, row: int) -> HandMeasurements:
-    """Return the measurements of one person."""
-    *own, elbows = hands
-    if elbows is not None:
-        elbows = Elbows(*(value[row] for value in elbows))
-    return HandMeasurements(*(value[row] for value in own), elbows)
 
 
 def _person(faces: Float[Tensor, "N 3"], nose: Float[Tensor, " 2"]) -> int | None:

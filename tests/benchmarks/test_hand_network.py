@@ -111,7 +111,7 @@ def test_the_loss_is_least_at_the_label():
     def loss(column, row):
         logits = torch.zeros(1, 2, 40 * 48 + 1)
         logits[0, :, row * 48 + column] = 5.0
-        return float(_loss(logits, batch))
+        return float(_loss(logits, batch.places, batch.seen))
 
     right = batch._replace(seen=torch.tensor([[1, -1]]))
     batch = right
@@ -119,11 +119,14 @@ def test_the_loss_is_least_at_the_label():
     batch = batch._replace(seen=torch.tensor([[0, 0]]))
     gone = torch.zeros(1, 2, 40 * 48 + 1)
     gone[..., -1] = 12.0
-    assert float(_loss(gone, batch)) < 0.05 < loss(3, 3)
+    assert float(_loss(gone, batch.places, batch.seen)) < 0.05 < loss(3, 3)
 
 
 def test_a_fit_is_a_network_that_is_ready_and_the_same_again():
-    clips = [("anna", windows(2)._replace(lab=torch.zeros(2, 3, 160, 192, dtype=torch.uint8)))]
+    hands = windows(2)
+    both = {name: torch.cat([getattr(hands, name)] * 2, 1) for name in ("places", "seen")}
+    own = hands._replace(lab=torch.zeros(2, 3, 160, 192, dtype=torch.uint8), **both)
+    clips = [("anna", own)]
     one, two = (fit(clips, steps=2, progress=False) for _ in range(2))
     assert not one.training
     lab, maps = clips[0][1].lab, torch.rand(2, 3, 160, 192)

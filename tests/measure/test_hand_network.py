@@ -7,7 +7,12 @@ import torchpose
 from tests.measure.test_hands import follow, scene
 from torchpose.errors import FileFormatError
 from torchpose.measure import HandTracker
-from torchpose.measure._body_window import CELLS, cell_centres
+from torchpose.measure._body_window import (
+    CELLS,
+    cell_centres,
+    cells_to_pixels,
+    pixels_to_cells,
+)
 from torchpose.measure._hand_likelihood import HandSettings
 from torchpose.measure._hand_network import (
     HandNetwork,
@@ -33,15 +38,26 @@ BIAS = HandSettings().gone_bias
 
 
 class Says(HandNetwork):
-    """Stands for a network after whose bias hands are gone with these log-odds; it says nothing of places."""
+    """Stands for a network after whose bias hands are gone with these log-odds; it says nothing of places.
 
-    def __init__(self, *gone):
+    Both elbows are at cells (x, y) with these weights, and gone without any.
+    """
+
+    def __init__(self, *gone, elbows=()):
         super().__init__()
         self.said = iter(odds - BIAS for odds in gone)
+        self.elbow = torch.full(CELLS, 1e-9)
+        for (x, y), weight in elbows:
+            self.elbow[y - 1 : y + 2, x - 1 : x + 2] = weight
+        self.elbow_gone = -9.0 if elbows else 9.0
 
     def find(self, lab, maps, inside, faces):
+        count = len(maps)
         return HandPlaces(
-            maps.new_zeros(len(maps), 2, *CELLS), torch.full((len(maps), 2), next(self.said))
+            maps.new_zeros(count, 2, *CELLS),
+            torch.full((count, 2), next(self.said)),
+            (self.elbow / self.elbow.sum()).log().expand(count, 2, -1, -1),
+            torch.full((count, 2), self.elbow_gone),
         )
 
 
@@ -57,11 +73,12 @@ def test_places_and_absence_are_one_distribution():
     lab, maps, inside, faces = windows(2)
     found = network.find(lab, maps, inside, faces)
     assert found.log_prob.shape == (2, 2, *CELLS) and found.gone.shape == (2, 2)
-    mass = found.log_prob.exp().sum((2, 3))
+    mass = torch.cat([found.log_prob, found.elbows], 1).exp().sum((2, 3))
     torch.testing.assert_close(mass, torch.ones_like(mass), atol=0.15, rtol=0)  # of resized maps
     every = torch.nn.functional.avg_pool2d(torch.cat([maps, inside[:, None]], 1), 4)
     share = torch.softmax(network(relative_colours(lab, faces), every, faces), -1)[..., -1]
-    torch.testing.assert_close(torch.sigmoid(found.gone), share, atol=1e-5, rtol=1e-5)
+    both = torch.cat([found.gone, found.elbows_gone], 1)
+    torch.testing.assert_close(torch.sigmoid(both), share, atol=1e-5, rtol=1e-5)
 
 
 @torch.inference_mode()
@@ -71,7 +88,8 @@ def test_only_places_tell_that_a_hand_is_there():
     every = torch.nn.functional.avg_pool2d(torch.cat([maps, inside[:, None]], 1), 4)
     logits = network(relative_colours(lab, faces), every, faces)
     evidence = torch.logsumexp(logits[..., :-1], -1)
-    constant = network.find(lab, maps, inside, faces).gone + evidence
+    found = network.find(lab, maps, inside, faces)
+    constant = torch.cat([found.gone, found.elbows_gone], 1) + evidence
     torch.testing.assert_close(constant, constant[:1].expand(3, -1), atol=1e-4, rtol=0)
     assert float(evidence.std()) > 0.1
 
@@ -157,6 +175,27 @@ def test_what_is_unsure_of_being_there_has_a_larger_covariance():
         dim1=-2, dim2=-1
     )
     assert bool((ratio > 1.2).all())
+
+
+def test_elbows_are_where_the_network_has_them():
+    cell = (60, 45)
+    _, (state, out) = tracked(Says(*[-5.0] * 3, elbows=[(cell, 1.0)]), frames=3)
+    place = cells_to_pixels(torch.tensor([[cell, cell]], dtype=torch.float64), state.anchors)
+    assert bool(out[-1].elbow_seen.all())
+    assert float((out[-1].elbows - place).norm(dim=-1).amax()) < 0.05 * PERSON[0][2]
+    _, (_, out) = tracked(Says(*[-5.0] * 3), frames=3)
+    assert not bool(out[-1].elbow_seen.any())
+
+
+def test_of_two_places_the_elbow_is_where_the_hand_lets_it_be():
+    """The farther place has half as much weight again, but no arm reaches from there to the hand."""
+    _, (state, out) = tracked(Says(*[-5.0] * 6, elbows=[((60, 40), 1.0)]), frames=6)
+    hand = pixels_to_cells(out[-1].points, state.anchors)[0, 0]
+    near, far = (int(hand[0]), int(hand[1]) - 10), (int(hand[0]), int(hand[1]) - 35)
+    network = Says(*[-5.0] * 6, elbows=[(near, 1.0), (far, 1.5)])
+    _, (state, out) = tracked(network, frames=6)
+    found = pixels_to_cells(out[-1].elbows, state.anchors)[0, 0]
+    assert float((found - torch.tensor(near)).norm()) < 3
 
 
 def test_without_a_network_no_hand_is_gone():

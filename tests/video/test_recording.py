@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
-from torchpose.measure._hand_likelihood import HandMeasurements
+from torchpose.measure._hand_likelihood import without_elbows
 from torchpose.measure._upper_body import MEASURED, FrameMeasurements, rounded_covariance
 from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import UpperBodyTracker
@@ -50,7 +50,7 @@ def frames(keypoints, present):
     for t, numbers in enumerate(present):
         person = torch.tensor(numbers, dtype=torch.long)
         points = keypoints[t].expand(len(numbers), -1, -1) + 5.0 * person[:, None, None]
-        nothing = HandMeasurements(
+        nothing = without_elbows(
             points[:, 2:],
             COV[:2].expand(len(numbers), -1, -1, -1),
             torch.ones(len(numbers), 2),

@@ -14,7 +14,6 @@ from torchpose._core.images import Image
 from torchpose.errors import InputError
 from torchpose.measure._body_window import CELL, CELLS, EVIDENCE, cell_centres, halve
 from torchpose.measure._face import check_faces
-from torchpose.measure._torso import Elbows
 
 __all__ = ["HandLikelihood", "HandMeasurements", "HandSettings", "check_frame", "no_hands"]
 
@@ -247,22 +246,36 @@ class HandMeasurements(NamedTuple):
         covariance: of the points, pixels squared.
         mass: probability that the hand is there.
         seen: False where a hand is lost, to be taken as missing.
-        elbows: the elbows, by a tracker with a network; else None.
+        elbows: the elbows, by a tracker with a network. elbow_covariance, elbow_seen: of these.
     """
 
     points: Float[Tensor, "N 2 2"]
     covariance: Float[Tensor, "N 2 2 2"]
     mass: Float[Tensor, "N 2"]
     seen: Bool[Tensor, "N 2"]
-    elbows: Elbows | None = None
+    elbows: Float[Tensor, "N 2 2"]
+    elbow_covariance: Float[Tensor, "N 2 2 2"]
+    elbow_seen: Bool[Tensor, "N 2"]
 
 
-def no_hands(faces: Float[Tensor, "0 3"], elbows: bool = False) -> HandMeasurements:
+def without_elbows(
+    points: Float[Tensor, "N 2 2"],
+    covariance: Float[Tensor, "N 2 2 2"],
+    mass: Float[Tensor, "N 2"],
+    seen: Bool[Tensor, "N 2"],
+) -> HandMeasurements:
+    """Return the measurements of hands without elbows, which are NaN and not seen."""
+    return HandMeasurements(
+        points, covariance, mass, seen,
+        torch.full_like(points, torch.nan), torch.zeros_like(covariance), torch.zeros_like(seen),
+    )  # fmt: skip
+
+
+def no_hands(faces: Float[Tensor, "0 3"]) -> HandMeasurements:
     """Return the measurements of a frame without persons, in the precision of `faces`."""
-    points, covariance = faces.new_zeros(0, 2, 2), faces.new_zeros(0, 2, 2, 2)
+    points = faces.new_zeros(0, 2, 2)
     mass = points[..., 0]
-    nobody = Elbows(points, covariance, mass > 0) if elbows else None
-    return HandMeasurements(points, covariance, mass, mass > 0, nobody)
+    return without_elbows(points, faces.new_zeros(0, 2, 2, 2), mass, mass > 0)
 
 
 def check_frame(

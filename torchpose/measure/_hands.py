@@ -35,6 +35,7 @@ from torchpose.measure._hand_likelihood import (
     HandSettings,
     check_frame,
     no_hands,
+    without_elbows,
 )
 from torchpose.measure._hand_network import HandNetwork, HandPlaces
 from torchpose.measure._hand_prior import HandPrior
@@ -175,7 +176,7 @@ class HandTracker(nn.Module):
         check_frame(frame, faces, identity, foreground)
         faces = faces.double()
         if not len(faces):
-            return self.init(), no_hands(faces, elbows=self.network is not None)
+            return self.init(), no_hands(faces)
         state, new = self._persons(state, faces, identity)
         state, faces = self._steady(state, faces)
         state = self._follow(state, faces)
@@ -197,7 +198,7 @@ class HandTracker(nn.Module):
         if found is not None:
             expected_elbow = _expected_elbows(hands, elbow, state.anchors)
             elbows = self._elbows(found, expected_elbow, state.anchors, frame.shape)
-            hands = hands._replace(elbows=elbows)
+            hands = HandMeasurements(*hands[:4], *elbows)
         return state, hands
 
     def _persons(
@@ -364,7 +365,7 @@ class HandTracker(nn.Module):
         speed = state.speed.lerp(step * s.velocity, 0.5)
         shown = torch.where(there[..., None], points, torch.nan)
         state = state._replace(place=points, speed=speed, frames=state.frames + 1)
-        return state, HandMeasurements(shown, covariance, found.mass, seen)
+        return state, without_elbows(shown, covariance, found.mass, seen)
 
     def _elbows(
         self, found: HandPlaces, expected: Tensor, anchors: Tensor, shape: tuple[int, ...]

@@ -52,10 +52,10 @@ class FaceOffsets(NamedTuple):
 
 # Silhouettes of eight persons and their Kinect skeletons put the head joint 0.47 of the way from the
 # crown to the narrowest part of the neck, and the neck joint 0.89 of it further down; faces of three
-# persons put crown and neck at -0.71 and 0.55 B. That gives a = -0.12 and b = 1.01. A near webcam that
-# looks up shortens the neck relative to the arms: the errors of elbows are then least at (-0.4, 1.1).
-# The values are between the two; benchmarks/face_offsets.py prints the errors.
-FACE_OFFSETS = FaceOffsets(-0.2, 1.1, (0.05, 0.08), (0.07, 0.12))
+# persons put crown and neck at -0.71 and 0.55 B. That gives a = -0.12 and b = 1.01. In webcam clips,
+# with elbows measured by persons' fits that left them out, elbows and shoulders are nearest to
+# MediaPipe's at b = 0.9 or less; 3D errors of rendered performers are least at 1.0.
+FACE_OFFSETS = FaceOffsets(-0.2, 0.95, (0.05, 0.08), (0.07, 0.12))
 
 
 class HeadNeck(nn.Module):
@@ -75,7 +75,7 @@ class HeadNeck(nn.Module):
         >>> import torch
         >>> points, covariance = HeadNeck()(torch.tensor([[320.0, 100.0, 80.0]]))
         >>> points[0].tolist()
-        [[320.0, 84.0], [320.0, 188.0]]
+        [[320.0, 84.0], [320.0, 176.0]]
     """
 
     def __init__(self, offsets: FaceOffsets = FACE_OFFSETS) -> None:

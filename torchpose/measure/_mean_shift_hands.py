@@ -13,7 +13,12 @@ from torchpose._core.images import Image
 from torchpose.errors import InputError
 from torchpose.math._gaussian import kalman_predict, kalman_update
 from torchpose.measure._body_window import ScaledFrame, scale_frame, scales_of_faces
-from torchpose.measure._hand_likelihood import HandMeasurements, check_frame, no_hands
+from torchpose.measure._hand_likelihood import (
+    HandMeasurements,
+    check_frame,
+    no_hands,
+    without_elbows,
+)
 from torchpose.measure._hand_prior import HandPrior
 from torchpose.measure._mean_shift import mean_shift
 from torchpose.measure._persons import match_states, measure_by_scale, take_rows
@@ -315,7 +320,7 @@ def _measurements(
     """Return the result of mean shift, with the sum of its covariance and the Kalman filter's."""
     points = torch.where(seen[..., None], centre, torch.nan)
     covariance = noise + torch.where(seen[..., None, None], state.cov[..., :2, :2], 0.0)
-    return HandMeasurements(points, covariance, average.clamp(0, 1), seen)
+    return without_elbows(points, covariance, average.clamp(0, 1), seen)
 
 
 def _squared_distance(points: Tensor, shape: Any) -> Tensor:

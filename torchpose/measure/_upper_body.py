@@ -123,14 +123,15 @@ class UpperBodyMeasurer(nn.Module):
         if not fps > 0:
             raise InputError(f"fps must be positive, got {fps}")
         self.fps, self.max_persons = float(fps), max_persons
-        learnt = hands == "learnt"
-        self.names = MEASURED + _ELBOWS if elbows or (elbows is None and learnt) else MEASURED
+        self.learnt = hands == "learnt"
+        measured = self.learnt if elbows is None else elbows
+        self.names = MEASURED + _ELBOWS if measured else MEASURED
         self.face_tracker = FaceTracker(face_detector)
         self.head_neck = HeadNeck() if head_neck is None else head_neck
         self.register = PersonRegister(within=round(30 * fps))
         self.hand_tracker: HandTracker | MeanShiftHandTracker
         if hands != "mean-shift":
-            network = shipped_hand_network() if learnt else None
+            network = shipped_hand_network() if self.learnt else None
             self.hand_tracker = HandTracker(HandPrior.from_prior(prior), fps=fps, network=network)
         else:
             self.hand_tracker = MeanShiftHandTracker()
@@ -205,8 +206,8 @@ class UpperBodyMeasurer(nn.Module):
             raise InputError("candidates need hands='learnt' or 'grid': mean shift takes none")
         parts = [self.head_neck(faces, face_cov), (_where_seen(hands), hands.covariance)]
         if len(self.names) > len(MEASURED):
-            found = hands.elbows
-            if found is None:
+            found = Elbows(*hands[4:])
+            if not self.learnt:
                 found = self._elbows(image, faces, hand_state.skin)
             parts.append((_where_seen(found), found.covariance))
         keypoints = torch.cat([points.to(faces) for points, _ in parts], 1)
