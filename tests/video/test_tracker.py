@@ -26,8 +26,27 @@ def rendered(*performances):
     )
 
 
-def test_somebody_who_leaves_and_comes_back_is_the_same_person(prior):
-    shown = rendered(performer(60, distance=1.6))
+@pytest.fixture(scope="module")
+def one_person():
+    """Two seconds of a performer."""
+    return rendered(performer(60, distance=1.6))
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """Two performers who walk past each other."""
+    from benchmarks._performances import crossing
+
+    return crossing(100, seconds=3.0)
+
+
+@pytest.fixture(scope="module")
+def two_persons(pair):
+    return rendered(*pair)
+
+
+def test_somebody_who_leaves_and_comes_back_is_the_same_person(prior, one_person):
+    shown = one_person
     nobody = [np.full_like(shown[0], 120)] * 80
     tracker = VideoTracker(prior, demo_camera(), max_gap=1.0)
     (person,) = tracker(shown[:30] + nobody + shown[30:])
@@ -40,12 +59,9 @@ def test_somebody_who_leaves_and_comes_back_is_the_same_person(prior):
     assert person.track.failed_at.tolist() == [-1]
 
 
-def test_two_who_cross_stay_who_they_are(prior):
-    from benchmarks._performances import crossing
-
-    pair = crossing(100, seconds=3.0)
+def test_two_who_cross_stay_who_they_are(prior, pair, two_persons):
     tracker = VideoTracker(prior, demo_camera())
-    people = tracker(rendered(*pair))
+    people = tracker(two_persons)
     assert len(people) == 2
     camera = demo_camera()
     heads = [camera(walker.joints[:, FACE])[:, :2] for walker in pair]
@@ -61,16 +77,14 @@ def test_two_who_cross_stay_who_they_are(prior):
     assert people[0].number != people[1].number
 
 
-def test_only_the_largest_face_is_followed_if_asked_for(prior):
-    from benchmarks._performances import crossing
-
+def test_only_the_largest_face_is_followed_if_asked_for(prior, two_persons):
     tracker = VideoTracker(prior, demo_camera(), max_persons=1)
-    people = tracker(rendered(*crossing(30)))
+    people = tracker(two_persons[:30])
     assert len(people) == 1
 
 
-def test_candidates_of_the_last_pose_reach_the_hands_live_and_offline(prior):
-    shown = rendered(performer(30, distance=1.6))
+def test_candidates_of_the_last_pose_reach_the_hands_live_and_offline(prior, one_person):
+    shown = one_person[:30]
     tracker = VideoTracker(prior, demo_camera(), candidates=True)
     asked = []
     step = tracker.measurer.hand_tracker.step
