@@ -9,21 +9,22 @@ below 0.15 or the hand is below the image. Four fits leave three persons out eac
 whose truth is exact, are in every fit. The second line fits the network that comes with torchpose, to
 everybody. FOLDER keeps rendered videos and fits: started again, the command goes on where it stopped.
 
-Columns: seen hands that are measured within a quarter of the shoulders' width; hands that are measured
-although they are not to be seen. The first 15 frames of a clip are not scored.
+Columns: visible hands, or elbows, that are measured within a quarter of the shoulder width; those that are
+measured although they are not visible. The first 15 frames of a clip are not scored.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
-from benchmarks._table_file import table_file
+from benchmarks._command import run_command
+from benchmarks._table_file import TableFile
 from benchmarks.hand_network.clips import (
     BURN_IN,
     FOLDS,
@@ -36,7 +37,8 @@ from benchmarks.hand_network.clips import (
     render_clips,
     windows_of,
 )
-from benchmarks.hand_network.training import STEPS, fit
+from benchmarks.hand_network.training import STEPS
+from benchmarks.hand_network.training import fit as fit_network
 from torchpose import load_prior
 from torchpose._core.files import check_output_folder
 from torchpose.evaluation import Report
@@ -49,12 +51,17 @@ _QUICK_STEPS = 3
 
 
 class Score(NamedTuple):
-    """Counts of hands: right ones of those that are seen, measured ones of those that are not to be seen."""
+    """Holds counts of hands, and the same of elbows.
 
-    right: int
-    seen: int
-    invented: int
-    gone: int
+    Attributes:
+        right, seen: right ones, of those that are visible. invented, gone: measured ones, of those that
+            are not visible.
+    """
+
+    right: Tensor
+    seen: Tensor
+    invented: Tensor
+    gone: Tensor
 
 
 def score(clip: Clip, network: HandNetwork | None) -> Score:
@@ -62,16 +69,19 @@ def score(clip: Clip, network: HandNetwork | None) -> Score:
     prior = HandPrior.from_prior(load_prior("kinect-upper-body"))
     with open_video(clip.path) as video:
         tracker = HandTracker(prior, fps=video.fps, network=network)
-    right = invented = 0
+    right, invented = torch.zeros(2), torch.zeros(2)
     labels = clip.labels
     for t, _, hands, _ in measure(clip, tracker):
         if t <= BURN_IN:
             continue
-        near = (hands.points - labels.centres[t]).norm(dim=-1) < labels.width / 4
-        right += int((near & hands.seen & (labels.seen[t] == 1)).sum())
-        invented += int((hands.seen & (labels.seen[t] == 0)).sum())
-    known = labels.seen[BURN_IN + 1 :]
-    return Score(right, int((known == 1).sum()), invented, int((known == 0).sum()))
+        points = torch.stack([hands.points, hands.elbows])
+        measured = torch.stack([hands.seen, hands.elbow_seen])
+        centres, seen = labels.centres[t].view(2, 2, 2), labels.seen[t].view(2, 2)
+        near = (points - centres).norm(dim=-1) < labels.width / 4
+        right += (near & measured & (seen == 1)).sum(1)
+        invented += (measured & (seen == 0)).sum(1)
+    known = labels.seen[BURN_IN + 1 :].unflatten(1, (2, 2))
+    return Score(right, (known == 1).sum((0, 2)), invented, (known == 0).sum((0, 2)))
 
 
 @cache
@@ -83,7 +93,8 @@ def cached_windows(clip: Clip) -> Windows:
 def fitted(clips: Sequence[Clip], path: Path, info: HandNetworkInfo, steps: int) -> HandNetwork:
     """Return the network of a file, or fit it and write the file."""
     if not path.is_file():
-        fit([(clip.person, cached_windows(clip)) for clip in clips], info, steps).save(path)
+        windows = [(clip.person, cached_windows(clip)) for clip in clips]
+        fit_network(windows, info, steps).save(path)
     return HandNetwork.load(path)
 
 
@@ -100,16 +111,21 @@ def facts(clips: Sequence[Clip], name: str, command: str) -> HandNetworkInfo:
 
 def add_table(report: Report, scores: dict[str, tuple[Score, Score]]) -> None:
     """Add the scores of all clips, without and with a network that knows nobody in them."""
-    columns = ("right, grid (%)", "right, learnt (%)", "invented, grid (%)", "invented, learnt (%)")
-    table = report.table("hands", "Hands of persons left out", columns, digits=(0, 0, 0, 0))
+    kinds = ("right", "invented")
+    columns = [f"{kind}, {tracker} (%)" for kind in kinds for tracker in ("grid", "learnt")]
+    columns += [f"elbows {kind} (%)" for kind in kinds]
+    title = "Hands and elbows of persons left out"
+    table = report.table("hands", title, columns, digits=(0,) * len(columns))
 
-    def share(part: int, whole: int) -> float:
-        return 100 * part / whole if whole else float("nan")
+    def shares(s: Score) -> tuple[list[float], list[float]]:
+        right, invented = 100 * s.right / s.seen, 100 * s.invented / s.gone
+        return right.tolist(), invented.tolist()
 
-    rows = {
-        name: [share(s.right, s.seen) for s in pair] + [share(s.invented, s.gone) for s in pair]
-        for name, pair in scores.items()
-    }
+    rows = {}
+    for name, pair in scores.items():
+        (right, invented), (own_right, own_invented) = (shares(s) for s in pair)
+        hands = [right[0], own_right[0], invented[0], own_invented[0]]
+        rows[name] = [*hands, own_right[1], own_invented[1]]
     for name, row in rows.items():
         table.add(name, row)
     for title, names in (("mean of strangers", PEOPLE), ("mean of signers", SIGNERS)):
@@ -118,31 +134,40 @@ def add_table(report: Report, scores: dict[str, tuple[Score, Score]]) -> None:
             table.add(title, values.nanmean(0))
 
 
-def main() -> None:
-    """Print the table, or fit the network that comes with torchpose."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder with the clips")
-    parser.add_argument("--out", type=Path, required=True, help="folder for what is kept")
-    parser.add_argument("--fit", type=Path, help="file for a network that knows everybody")
-    parser.add_argument("--table", type=table_file, help="file for the table, or a folder")
-    parser.add_argument("--threads", type=int, default=2, help="cores")
-    parser.add_argument("--quick", action="store_true", help="two clips and no fit worth its name")
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
-    out = check_output_folder(args.out)
-    clips = read_clips(args.data)
+def main(
+    *,
+    data: Path,
+    out: Path,
+    fit: Path | None = None,
+    table: TableFile | None = None,
+    threads: int = 2,
+    quick: bool = False,
+) -> None:
+    """Print the table, or fit the network that comes with torchpose.
+
+    Args:
+        data: folder with the clips.
+        out: folder for what is kept.
+        fit: file for a network that knows everybody.
+        table: file for the table, or a folder.
+        threads: cores.
+        quick: two clips and no fit worth its name.
+    """
+    torch.set_num_threads(threads)
+    check_output_folder(out)
+    clips = read_clips(data)
     rendered = render_clips(out)
     steps = STEPS
-    if args.quick:
+    if quick:
         chosen = ("akstheme_gesture", "milk")
         clips, rendered, steps = [c for c in clips if c.name in chosen], rendered[:1], _QUICK_STEPS
     labelled = [*clips, *rendered]
-    if args.fit is not None:
+    if fit is not None:
         command = (
             "python -m benchmarks.hand_network --data DIR --out FOLDER --fit hands.safetensors"
         )
         windows = [(clip.person, cached_windows(clip)) for clip in labelled]
-        fit(windows, facts(labelled, "hands", command), steps).save(args.fit)
+        fit_network(windows, facts(labelled, "hands", command), steps).save(fit)
         return
     scores = {}
     for number, persons in enumerate(FOLDS):
@@ -158,9 +183,9 @@ def main() -> None:
     add_table(report, scores)
     text = report["hands"].to_markdown()
     print(text)
-    if args.table is not None:
-        args.table.write_text(text + "\n")
+    if table is not None:
+        table.write_text(text + "\n")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

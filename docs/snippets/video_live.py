@@ -11,4 +11,4 @@ with open_video("clip.mp4") as video:  # open_video(0) is the first camera
 
 for number, pose, measured in people:
     print(number, pose.joints3d.shape, measured.keypoints.shape)
-# > 0 torch.Size([1, 1, 8, 3]) torch.Size([1, 4, 2])
+# > 0 torch.Size([1, 1, 8, 3]) torch.Size([1, 6, 2])

@@ -15,7 +15,6 @@ from torchpose.errors import InputError
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 OWN_PARSERS = {
     "mediapipe_landmarks.py",  # runs where torchpose is not installed
-    "hand_network/__main__.py",
 }
 
 
