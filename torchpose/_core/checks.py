@@ -50,7 +50,7 @@ def check_shape(name: str, tensor: Tensor, expected: Sequence[int | str | None])
     """Raise `ShapeError` unless `tensor` has the expected sizes.
 
     Args:
-        name: of the tensor, for the message.
+        name: the name of the tensor, for the message.
         tensor: the tensor to look at.
         expected: one entry per dimension; an int is a fixed size, a str or None is any size. A
             leading ``"..."`` stands for any number of leading dimensions.
@@ -170,7 +170,7 @@ def check_covariance(name: str, covariance: Tensor, tolerance: float = 1e-6) -> 
     """Raise `CovarianceError` unless every matrix is symmetric and positive definite.
 
     Args:
-        name: of the covariance, for the message.
+        name: the name of the covariance, for the message.
         covariance: [..., D, D].
         tolerance: largest asymmetry, relative to the largest entry of each matrix.
 

@@ -58,7 +58,7 @@ def check_estimates(
     """Check that each point is finite with a covariance, or lost.
 
     Args:
-        path: the file. name: of the values. values: NaN, as a whole, where there are none.
+        path: the file. name: the name of the values. values: NaN, as a whole, where there are none.
         covariance: finite, symmetric and positive semidefinite where there are values.
 
     Raises:

@@ -34,7 +34,7 @@ def register_given(module: nn.Module, name: str, value: Tensor | None) -> None:
     made in inference mode keeps what it derives as any other does.
 
     Args:
-        module: that registers it. name: of the entry. value: None is registered as an empty entry.
+        module: that registers it. name: the name of the entry. value: None is registered as an empty entry.
     """
     if isinstance(value, nn.Parameter):
         module.register_parameter(name, value)

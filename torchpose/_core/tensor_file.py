@@ -81,7 +81,7 @@ def write_tensors(
 
     Args:
         path: the file, *.safetensors by custom. kind: of the file. info: of `kind.info`.
-        tensors: by name, on any device.
+        tensors: the tensors by name, on any device.
 
     Raises:
         OutputError: the file cannot be written. PriorError: `info` holds what is not JSON.

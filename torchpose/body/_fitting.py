@@ -58,7 +58,7 @@ def fit_body(
         joints: [T, J, 3], metres, in the skeleton's order (`body_joints`); NaN in all frames where
             the set lacks a joint, whose bone then has the skeleton's proportion.
         radii: [L, 2], metres; a clothed adult's by default.
-        skeleton: of the body.
+        skeleton: the skeleton of the body.
         centres, frame: of the states, see `Body`.
         head_top: metres from the head joint to the top of the head, which tells where the tip
             "crown" goes: 0.11 where the joint is the head's centre (Kinect), 0 where it is its top
@@ -122,10 +122,10 @@ def fit_state(body: Body, joints: Float[Tensor, "T J 3"], steps: int = 4) -> Flo
     root's position and the rotations of all parts share out what constant bone lengths leave.
 
     Args:
-        body: of this person.
+        body: the body of this person.
         joints: [T, J, 3], metres, in the order of the body's joints; NaN in all frames for a joint
             that the set lacks: its part and those beyond it stay at rest.
-        steps: of Gauss-Newton; 0 for the closed form.
+        steps: the number of steps of Gauss-Newton; 0 for the closed form.
 
     Returns:
         [T, D], in the body's dtype.

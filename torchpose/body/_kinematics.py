@@ -74,7 +74,7 @@ class Body(nn.Module):
         frame: ``"parent"`` or ``"body"``.
         tips: [K, 3], this person's offsets of the tips, metres; by default the skeleton's, scaled
             with the body height.
-        dtype: of buffers and states.
+        dtype: the floating-point type of buffers and states.
 
     Attributes:
         skeleton, frame: as given. dim: D, the numbers in a state.
@@ -190,7 +190,7 @@ class Body(nn.Module):
         Args:
             skeleton: gives the proportions. height: metres.
             frame: "parent" or "body", see `Body`.
-            dtype: of buffers and states.
+            dtype: the floating-point type of buffers and states.
 
         Returns:
             `Body` with the skeleton's standard lengths and radii.

@@ -28,10 +28,10 @@ class Tip:
     """Describes a point of the body beyond its joints, fixed in a part's axes.
 
     Args:
-        name: of the tip.
+        name: the name of the tip.
         joint: name of the joint it is measured from.
         part: name of the part that carries it.
-        offset: from the joint, in the part's axes, as fractions of the body height.
+        offset: the offset from the joint, in the part's axes, as fractions of the body height.
     """
 
     name: str
@@ -45,9 +45,9 @@ class TaperedCylinder:
     """Describes a limb as the convex hull of two spheres.
 
     Args:
-        name: of the limb; ``left_`` and ``right_`` in front tell limbs of the two sides.
+        name: the name of the limb; ``left_`` and ``right_`` in front tell limbs of the two sides.
         start, end: names of joints or tips, the centres of the two spheres.
-        radii: of a clothed adult at start and end, as fractions of the body height.
+        radii: the radii of a clothed adult at start and end, as fractions of the body height.
     """
 
     name: str
@@ -64,8 +64,8 @@ class BodySkeleton:
     part turns about the joint where it meets its parent part.
 
     Args:
-        name: of the skeleton.
-        names: of the J joints.
+        name: the name of the skeleton.
+        names: the names of the J joints.
         parents: index of each joint's parent, -1 for the root.
         parts: names of the P rigid parts; the first one is the root part.
         part_of: index of the part that carries each joint's offset.
@@ -141,7 +141,7 @@ class BodySkeleton:
         """Return the index of a joint.
 
         Args:
-            name: of the joint, as in `names`.
+            name: the name of the joint, as in `names`.
 
         Returns:
             Index from 0 to J - 1.
@@ -157,7 +157,7 @@ class BodySkeleton:
         """Return the index of a part.
 
         Args:
-            name: of the part, as in `parts`.
+            name: the name of the part, as in `parts`.
 
         Returns:
             Index from 0 to P - 1.

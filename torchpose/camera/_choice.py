@@ -23,7 +23,7 @@ def resolve_camera(
     longer side.
 
     Args:
-        given: a TOML file or ``fx,fy,cx,cy``. name: of the camera in a file with several.
+        given: a TOML file or ``fx,fy,cx,cy``. name: the name of the camera in a file with several.
         size: (width, height) of the images, if known. matrix: K of the input, if known.
         source: the input, for messages.
 

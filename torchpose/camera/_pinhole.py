@@ -40,7 +40,7 @@ class PinholeCamera(nn.Module):
     Args:
         fx, fy: focal lengths, pixels. cx, cy: principal point, pixels.
         width, height: image size, pixels, if known.
-        name: of the camera.
+        name: the name of the camera.
         skew: K[0, 1], pixels; nearly always 0.
         distortions: OpenCV's k1, k2, p1, p2, ...; kept and saved, not applied by `forward`.
         rotation, translation: pose, x_camera = R(rotation) x_world + translation; a Rodrigues
@@ -105,7 +105,7 @@ class PinholeCamera(nn.Module):
         Args:
             matrix: K [3, 3] in pixels, up to scale: a tensor, an array or a nested list.
             width, height: image size, pixels, if known.
-            name: of the camera.
+            name: the name of the camera.
 
         Returns:
             Camera at the origin without distortions.
@@ -128,7 +128,7 @@ class PinholeCamera(nn.Module):
 
         Args:
             width, height: image size, pixels.
-            name: of the camera.
+            name: the name of the camera.
 
         Returns:
             Camera at the origin without distortions.
@@ -152,7 +152,7 @@ class PinholeCamera(nn.Module):
 
         Args:
             path: TOML file, see `load_cameras`.
-            name: of the camera, as in the file; may be left out where the file holds one camera.
+            name: the name of the camera, as in the file; may be left out where the file holds one camera.
 
         Returns:
             The camera.
@@ -173,7 +173,7 @@ class PinholeCamera(nn.Module):
         """Write this camera as TOML, atomically: an interrupted write leaves no partial file.
 
         Args:
-            path: of the file, which is replaced.
+            path: the file, which is replaced.
 
         Raises:
             OutputError: the file cannot be written.
@@ -220,7 +220,7 @@ def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
     `[metadata]` is passed over. Pose2Sim and Anipose write such files.
 
     Args:
-        path: of the file.
+        path: the file.
 
     Returns:
         Cameras by the name of their table, in the order of the file.
@@ -251,7 +251,7 @@ def save_cameras(cameras: Sequence[PinholeCamera], path: str | Path) -> None:
     Args:
         cameras: one or more, with different names; those without a name are called ``cam_01``, ...
             (a single one ``camera``).
-        path: of the file, which is replaced.
+        path: the file, which is replaced.
 
     Raises:
         InputError: no camera, or two with one name. OutputError: the file cannot be written.

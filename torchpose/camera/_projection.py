@@ -154,7 +154,7 @@ def check_intrinsics(name: str, K: Tensor) -> None:
     """Raise `CameraError` unless K is a camera matrix (BL 4).
 
     Args:
-        name: of the matrix, for the message.
+        name: the name of the matrix, for the message.
         K: [..., 3, 3]: finite, positive focal lengths, zeros below the diagonal, last row
             (0, 0, 1).
     """

@@ -45,7 +45,7 @@ class CameraRig(nn.Module):
         distortions [C, 14] in OpenCV's order.
 
     Attributes:
-        names: of the cameras ("cam_01", ... where they have no name).
+        names: the names of the cameras ("cam_01", ... where they have no name).
         sizes: (height, width) of every camera's image in pixels, or None where it is not known.
 
     Raises:
@@ -85,7 +85,7 @@ class CameraRig(nn.Module):
         """Read all cameras of a TOML file, in its order.
 
         Args:
-            path: of the file, see `load_cameras`.
+            path: the file, see `load_cameras`.
 
         Returns:
             Rig of all cameras, named as their tables.
@@ -149,7 +149,7 @@ class CameraRig(nn.Module):
         for v. Distortions do not depend on the size.
 
         Args:
-            height, width: of the other images, pixels.
+            height, width: the height and width of the other images, pixels.
 
         Returns:
             Rig with the same poses.
@@ -204,7 +204,7 @@ class CameraRig(nn.Module):
         """Check that images have the number and the size of this rig's cameras.
 
         Args:
-            name: of the images, for the message.
+            name: the name of the images, for the message.
             shape: [..., C, H, W].
 
         Raises:

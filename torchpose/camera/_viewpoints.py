@@ -52,7 +52,7 @@ class ViewRange:
         """Return limits of another width about the same middle.
 
         Args:
-            factor: of the width, 0 or more; 1 changes nothing.
+            factor: the factor by which the width is multiplied, 0 or more; 1 changes nothing.
 
         Returns:
             `ViewRange`, radians and metres.
@@ -88,7 +88,7 @@ def sample_viewpoints(
         n: number of viewpoints.
         view_range: the limits.
         generator: source of random numbers; its device is that of the result.
-        dtype: of the result.
+        dtype: the floating-point type of the result.
 
     Returns:
         `Viewpoints` with angles [n, 3] and translation [n, 3].

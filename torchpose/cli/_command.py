@@ -41,7 +41,7 @@ class Given(NamedTuple):
 
     Attributes:
         words: after the program, such as ("fit", "limbs"). values: of all options by key.
-        defaults: of the options.
+        defaults: the defaults of the options.
     """
 
     words: tuple[str, ...]

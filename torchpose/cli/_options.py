@@ -27,7 +27,7 @@ class Option(NamedTuple):
     """Describes one option of a command, or one of its positional arguments.
 
     Attributes:
-        name: of the parameter that it is read from. key: its name on the command line and in
+        name: the name of the parameter that it is read from. key: its name on the command line and in
             configuration files, with underscores.
         kind: type of its value; None is a value besides where that is the default.
         default: `REQUIRED` where there is none. text: what it is for, without the default.

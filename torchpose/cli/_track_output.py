@@ -36,7 +36,7 @@ class Job(NamedTuple):
 
     Attributes:
         input: as it was given. out: folder of the results. files: that the command reads.
-        settings: of the tracker. options: of its method. pictures: whether they are wanted.
+        settings: of the tracker. options: the options of its method. pictures: whether they are wanted.
     """
 
     input: str
@@ -78,7 +78,7 @@ def write_track(track: "PoseTrack", out: Path, suffix: str = "") -> list[Path]:
     """Write poses.npz, .csv and, if there is a pose in them, .bvh of one sequence; return their paths.
 
     Args:
-        track: of the sequence. out: folder.
+        track: the track of the sequence. out: folder.
         suffix: of the names, such as "_p02".
     """
     from torchpose.upper_body._pose_files import write_bvh, write_pose_csv

@@ -51,7 +51,7 @@ class Performance(NamedTuple):
         angles: of the joints.
         rotation, translation: [3, 3], [3]: joints = rotation body + translation.
         labels: the action, one word for each frame.
-        fps: frames per second. names: of the joints.
+        fps: frames per second. names: the names of the joints.
     """
 
     joints: Tensor
@@ -161,8 +161,8 @@ def performer_angles(
     Args:
         n_frames: T.
         fps: frames per second.
-        seed: of the sway, and of the amplitude of each movement (about 3 %).
-        dtype: of the result.
+        seed: the seed of the sway, and of the amplitude of each movement (about 3 %).
+        dtype: the floating-point type of the result.
     """
     if n_frames < 1 or not fps > 0:
         raise InputError(f"need n_frames >= 1 and fps > 0, got {n_frames} and {fps}")
@@ -212,7 +212,7 @@ def sway(
     """Return a slow sway: the sum of four sinusoids of random phase and frequency.
 
     Args:
-        clock: seconds [T]. shape: of what sways. amplitude: about its root mean square.
+        clock: seconds [T]. shape: the shape of what sways. amplitude: about its root mean square.
         band: lowest and highest frequency, Hz. generator: of phases and frequencies.
 
     Returns:
@@ -241,10 +241,10 @@ def performer(
     Args:
         n_frames: T; the performance repeats after 20 s.
         fps: frames per second.
-        seed: of the variation.
+        seed: the seed of the variation.
         size: bone lengths.
-        distance: of the neck from the camera, metres.
-        dtype: of the result.
+        distance: the distance of the neck from the camera, metres.
+        dtype: the floating-point type of the result.
 
     Returns:
         The performance in camera axes.
@@ -268,7 +268,7 @@ def stage(
     Args:
         angles: the movement, T frames. labels: a word for each frame. fps: frames per second.
         size: bone lengths.
-        distance: of the neck from the camera, metres.
+        distance: the distance of the neck from the camera, metres.
 
     Raises:
         InputError: too near for the camera to see the arms, or not a label for each frame.
@@ -316,7 +316,7 @@ def noisy_keypoints(
         joints: [T, 8, 3], camera axes, metres.
         camera: whose pixels; `demo_camera` by default.
         std_px: standard deviation of the Gaussian noise in u and v, independent per joint, frame.
-        seed: of the noise.
+        seed: the seed of the noise.
         gap: (name of a keypoint, start in s, length in s), where that one is missing; None = none.
         fps: frames per second, to place the gap.
 

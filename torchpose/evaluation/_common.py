@@ -109,7 +109,7 @@ def read_kept(path: Path, kind: Callable[..., Any], fields: tuple[str, ...]) -> 
     """Return a tuple of tensors that `keep` wrote, or None where there is none; damaged files are deleted.
 
     Args:
-        path: of the file. kind: named tuple to be made of the tensors. fields: their names, in its order.
+        path: the file. kind: named tuple to be made of the tensors. fields: their names, in its order.
     """
     if not path.is_file():
         return None
@@ -132,7 +132,7 @@ class Trials(NamedTuple):
     Attributes:
         truth3d: [B, T, 8, 3], camera axes, metres. truth2d: [B, T, 8, 2], pixels.
         keypoints: with noise, [B, T, M, 2]. lengths: [B]. fps: frame rate.
-        names: of the M measured joints.
+        names: the names of the M measured joints.
     """
 
     truth3d: Float[Tensor, "B T 8 3"]
@@ -166,10 +166,10 @@ def make_test_set(
 
     Args:
         poses: one tensor for each sequence, metres, centred, camera axes.
-        camera: of the test. fps: frame rate.
-        seed: of the noise, which is independent over joints, frames and coordinates.
+        camera: the camera of the test. fps: frame rate.
+        seed: the seed of the noise, which is independent over joints, frames and coordinates.
         noise_std: pixels. paths: translation of the whole body in each frame, metres.
-        names: of the measured joints; by default head, neck and hands.
+        names: the names of the measured joints; by default head, neck and hands.
 
     Raises:
         InputError: no sequences, or a missing joint.
@@ -229,11 +229,11 @@ def track(
     """Run `UpperBodyTracker` over a test set, some sequences at a time.
 
     Args:
-        prior: of the tracker. camera: of the test. mask: [B, T, M], False = hidden.
+        prior: of the tracker. camera: the camera of the test. mask: [B, T, M], False = hidden.
         chunk: sequences at a time. progress, label: of the bar. generator: for methods that draw.
         method: of the tracker; without one `own_method`, since the prior over arms that comes with the
             package was fitted to many a person who is scored.
-        options: of the tracker.
+        options: the options of the tracker.
     """
     method = method or own_method(prior, test.fps, options.get("smoothing"))
     tracker = UpperBodyTracker(

@@ -58,7 +58,7 @@ def learn_completion(
 
     Args:
         recordings: those without wrists, hips or one of the targets are passed over.
-        targets: of head, hand_left and hand_right.
+        targets: the targets of head, hand_left and hand_right.
 
     Raises:
         PriorError: fewer than 100 frames with all of them.
@@ -101,7 +101,7 @@ def complete(
 
     Args:
         recording: with shoulders, elbows, wrists and hip centre, in camera axes.
-        completion: from `learn_completion`. generator: of the residual, one for the whole
+        completion: the completion from `learn_completion`. generator: of the residual, one for the whole
             recording; None takes the mean.
 
     Raises:

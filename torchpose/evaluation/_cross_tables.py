@@ -22,7 +22,7 @@ class Crossed(NamedTuple):
     """Holds the settings of the comparison of data sets.
 
     Attributes:
-        persons: of each data set. tested: those that no prior saw.
+        persons: the persons of each data set. tested: those that no prior saw.
         wrists: whether wrists stand for hands. completed: data sets whose heads are made up.
         donors: those that heads and necks were learnt on.
     """
@@ -140,7 +140,7 @@ def plot_cross(report: Report, names: Sequence[str]) -> Any:
     """Draw bars of the error on the test persons of each data set, by training set.
 
     Args:
-        report: with the table of `add_cross`. names: of the data sets.
+        report: with the table of `add_cross`. names: the names of the data sets.
     """
     from matplotlib.patches import Patch
 

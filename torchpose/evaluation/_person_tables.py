@@ -150,7 +150,7 @@ def plot_curves(curves: Mapping[str, Mapping[str, Curve]], title: str) -> Any:
     which persons were drawn to train on; there is none where each person is tracked by one fit only.
 
     Args:
-        curves: by stage and recipe. title: above the picture.
+        curves: the curves by stage and recipe. title: above the picture.
     """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch

@@ -93,8 +93,8 @@ class Report(Mapping[str, Table]):
     """Tables by name, with settings, findings and pictures.
 
     Args:
-        name: of the protocol. settings: everything that the numbers depend on.
-        tables: by name; `report["errors"]` is one of them.
+        name: the name of the protocol. settings: everything that the numbers depend on.
+        tables: the tables by name; `report["errors"]` is one of them.
         findings: sentences computed from the numbers. pictures: files in the output folder.
     """
 

@@ -72,7 +72,7 @@ class ScoreSettings:
     """Holds the settings of tracking and scoring.
 
     Args:
-        seed: of the noise, and of the viewpoints of the likelihood. every: of the sequences of a
+        seed: the seed of the noise, and of the viewpoints of the likelihood. every: of the sequences of a
             person only each n-th is tracked. noise_std: pixels.
         unmeasured: joints among `MEASURED` that the tracker is not given, such as a head that was
             never recorded. unscored: joints whose errors are not counted, nor aligned on.
@@ -111,7 +111,7 @@ class Job:
 
     Args:
         label: for the bar. train: recordings of the fit. tests: recordings of each person by name.
-        settings: of the recipe. recipe: fits the prior. test: settings of the tracking.
+        settings: the settings of the recipe. recipe: fits the prior. test: settings of the tracking.
     """
 
     label: str
@@ -267,7 +267,7 @@ def log_likelihood(
     Every pose is seen from a random viewpoint of the prior's own, as its training poses were.
 
     Args:
-        poses: centred on the neck. seed: of the viewpoints.
+        poses: centred on the neck. seed: the seed of the viewpoints.
     """
     generator = torch.Generator().manual_seed(seed)
     views = sample_viewpoints(len(poses), ViewRange(**prior.info.views), generator)
@@ -292,7 +292,7 @@ def poses_to_score(
     Args:
         recordings: of a person. prior: that is to track them. train: its training recordings; None
             leaves necks of another kind where they are.
-        name: of the person, for errors.
+        name: the name of the person, for errors.
 
     Raises:
         PriorError: another kind of hand than the prior's. InputError: no complete frames.

@@ -134,7 +134,7 @@ class RecursiveFilter(WideModule, ABC):
         measurement_cov: R, [Z, Z] or its diagonal [Z].
         observed: the Z state indices that are measured (the rows of H in BL 15).
         dim: number of state dimensions D.
-        dtype: of means, particles and measurements; covariances are always float64.
+        dtype: the floating-point type of means, particles and measurements; covariances are always float64.
     """
 
     def __init__(
@@ -187,7 +187,7 @@ class RecursiveFilter(WideModule, ABC):
         """Filter one frame, given its checked measurements.
 
         Args:
-            state: of the B sequences, from `init` or the frame before.
+            state: the state of the B sequences, from `init` or the frame before.
             frame: checked measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z].
             generator: for filters that draw; one generator, or a list of one for each sequence.
             return_cov: whether to return the covariance as well.
@@ -385,7 +385,7 @@ class RecursiveFilter(WideModule, ABC):
         """Filter some more frames one by one, given checked measurements.
 
         Args:
-            state: of the B sequences, from `init` or the frames before.
+            state: the state of the B sequences, from `init` or the frames before.
             frames: checked measurements: z [B, T, Z], mask [B, T, Z], cov [Z, Z] or [B, T, Z, Z], lengths
                 [B].
             generator: for filters that draw; one generator, or a list of one for each sequence.

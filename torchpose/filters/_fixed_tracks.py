@@ -133,7 +133,7 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
         """Filter one frame, given its checked measurements (BL 34-41, 49).
 
         Args:
-            state: of the B sequences, from `init` or the frame before.
+            state: the state of the B sequences, from `init` or the frame before.
             frame: checked measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z].
             generator: for filters that draw; one generator, or a list of one for each sequence.
             return_cov: whether to return the covariance as well.
@@ -225,7 +225,7 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
         """Filter some more frames, given checked measurements; all at once if the filter has no memory.
 
         Args:
-            state: of the B sequences, from `init` or the frames before.
+            state: the state of the B sequences, from `init` or the frames before.
             frames: checked measurements: z [B, T, Z], mask [B, T, Z], cov [Z, Z] or [B, T, Z, Z], lengths
                 [B].
             generator: for filters that draw; one generator, or a list of one for each sequence.

@@ -157,7 +157,7 @@ def given_initial_cov(value: Tensor | None, covariances: Tensor) -> Tensor | Non
     """Return a checked initial covariance [D, D], [D] or [K, D, D] to be registered; None for None.
 
     Args:
-        covariances: of the K components, [K, D, D].
+        covariances: the covariances of the K components, [K, D, D].
     """
     if value is None:
         return None

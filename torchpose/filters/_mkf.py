@@ -83,7 +83,7 @@ class MixtureKalmanFilter(RecursiveFilter):
         burn_in: number of frames over which Q starts inflated and decays to itself geometrically (paper
             section 3.3, after BL 26). 0 is no burn-in, as it has to be for "ou", which has no Q.
         burn_in_scale: factor of Q in the first frame of the burn-in; 100 by default.
-        dtype: of means and measurements; covariances are always float64.
+        dtype: the floating-point type of means and measurements; covariances are always float64.
         n_tracks: see `SampledTrackFilter`, `SplitTrackFilter`.
         resample_threshold: see `SampledTrackFilter`.
         uniform_weight, likelihood_power, weighting, reset_below, medians: see `FixedTrackFilter`.
@@ -294,7 +294,7 @@ class MixtureKalmanFilter(RecursiveFilter):
         """Filter one frame, given its checked measurements; implemented for each kind of tracks.
 
         Args:
-            state: of the B sequences, from `init` or the frame before.
+            state: the state of the B sequences, from `init` or the frame before.
             frame: checked measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z].
             generator: for filters that draw; one generator, or a list of one for each sequence.
             return_cov: whether to return the covariance as well.

@@ -303,7 +303,7 @@ class BootstrapParticleFilter(RecursiveFilter):
         """Return the particles in the units of the state.
 
         Args:
-            state: from `init` or `step`.
+            state: the state from `init` or `step`.
 
         Returns:
             [B, N, D], pixels, metres and radians, float64.
@@ -317,7 +317,7 @@ class BootstrapParticleFilter(RecursiveFilter):
         """Filter one frame: resample if due, propose, weigh (BL 14, 23-26).
 
         Args:
-            state: of the B sequences, from `init` or the frame before.
+            state: the state of the B sequences, from `init` or the frame before.
             frame: checked measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z].
             generator: for filters that draw; one generator, or a list of one for each sequence.
             return_cov: whether to return the covariance as well.

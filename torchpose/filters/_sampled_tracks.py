@@ -95,7 +95,7 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
         """Filter one frame: draw indicators, filter, weigh (BL 47), and resample if needed (BL 25).
 
         Args:
-            state: of the B sequences, from `init` or the frame before.
+            state: the state of the B sequences, from `init` or the frame before.
             frame: checked measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z].
             generator: for filters that draw; one generator, or a list of one for each sequence.
             return_cov: whether to return the covariance as well.

@@ -81,7 +81,7 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         Only the measured block of the M K predicted covariances is formed before the selection.
 
         Args:
-            state: of the B sequences, from `init` or the frame before.
+            state: the state of the B sequences, from `init` or the frame before.
             frame: checked measurements of one frame: z [B, Z], mask [B, Z], cov [Z, Z] or [B, Z, Z].
             generator: for filters that draw; one generator, or a list of one for each sequence.
             return_cov: whether to return the covariance as well.

@@ -106,7 +106,7 @@ def make_transition(
 
     Args:
         kind: "paper", "stationary" or "ou".
-        means, covariances: of the prior's components, [K, D] and [K, D, D].
+        means, covariances: the means and covariances of the prior's components, [K, D] and [K, D, D].
         process_cov: Q [D, D]; not used by "ou".
         gamma: [K] or [], in [0, 1); only for "ou".
         subspace: number of principal directions, only for "ou".

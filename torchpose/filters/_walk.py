@@ -51,7 +51,7 @@ class MixtureWalk:
     Args:
         mixture: weights, means and covariances of the prior Phi.
         process_cov: Q [D, D], float64.
-        dtype: of points and densities, torch.float32 or torch.float64.
+        dtype: the floating-point type of points and densities, torch.float32 or torch.float64.
     """
 
     mean: Tensor

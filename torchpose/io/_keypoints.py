@@ -122,8 +122,8 @@ def write_keypoints(path: str | Path, keypoints: Keypoints) -> None:
     A ``.csv`` cannot hold the camera matrix.
 
     Args:
-        path: of the file, which is replaced; ends in .npz or .csv.
-        keypoints: of one person.
+        path: the file, which is replaced; ends in .npz or .csv.
+        keypoints: the keypoints of one person.
 
     Raises:
         InputError: another suffix. OutputError: the file cannot be written.

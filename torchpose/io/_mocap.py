@@ -67,7 +67,7 @@ def read_mocap(
 
     Args:
         paths: files or folders. fps: rate to resample to; None keeps that of each file.
-        actions: only these, if any are given. axes: of the files, if they are not what they say.
+        actions: only these, if any are given. axes: the axes of the files, if they are not what they say.
 
     Returns:
         Clips in the order of the files.

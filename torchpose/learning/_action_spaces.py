@@ -46,7 +46,7 @@ def fit_action_space(
         performances: [T_p, 36] each, degrees, of any lengths, one repetition of the action from
             its start to its end (`split_repetitions` cuts them out of recordings).
         n_dimensions: D; reduced, with a warning, if the postures span fewer.
-        name: of the action. fps: of the performances, for the record.
+        name: the name of the action. fps: the frame rate of the performances, for the record.
         n_postures: K; by default the median length. prominence: see `synchronise`.
         info: more facts; name, fps and what the fit finds are filled in.
 

@@ -72,7 +72,7 @@ def usable_samples(samples: Samples, name: str) -> Samples:
 
     Args:
         samples: states and weights.
-        name: of the samples, for a message, such as their block.
+        name: the name of the samples, for a message, such as their block.
 
     Raises:
         InputError: weights that are negative or not finite, states of positive weight that are not.

@@ -64,7 +64,7 @@ def median_gamma(poses: Float[Tensor, "T Q"], seed: int = 0) -> float:
     """Return gamma_x such that the kernel of two poses at the median distance is exp(-1/2)   (MR 22).
 
     Args:
-        poses: X. seed: of which frames are compared, where there are more than 2,000.
+        poses: X. seed: the seed of which frames are compared, where there are more than 2,000.
 
     Raises:
         InputError: more than half of all pairs are the same pose.

@@ -47,7 +47,7 @@ def fit_limb_conditionals(
         body: whose states they are, with ``frame="body"``. States of several persons come from
             `in_body_frame`: only centres and frame of the body count, not its size.
         sequences: states [T, D], one tensor per recording without gaps.
-        fps: of all sequences, frames per second.
+        fps: the frame rate of all sequences, frames per second.
         edges: names of the parts above and below.
         least_std: floor of the standard deviations of q_ij, as an eigenvalue of the covariance:
             joints tell no twist of a limb, whose variance would be zero.

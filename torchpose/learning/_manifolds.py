@@ -68,12 +68,12 @@ def fit_gplvm(
         steps: of ten iterations of the optimiser, at most; by default 40 with validation poses and
             3 without. Further ones make the back constraints follow the training poses so closely
             that other poses come back worse.
-        seed: of the frames whose distances are compared, where there are more than 2,000.
+        seed: the seed of the frames whose distances are compared, where there are more than 2,000.
         optimiser: "lbfgs" or "adam". learning_rate: None for the optimiser's own.
         tolerance: gain of the objective per number and step at which to stop.
         n_init: starts, see `principal_start`; the one with the lowest held-out error, or else
             the highest objective, is kept. By default 4 with validation poses and 1 without.
-        smoothness: of the back constraints, see `GPLVMFit`.
+        smoothness: the smoothness of the back constraints, see `GPLVMFit`.
         standardise: divide every column by its standard deviation, so that all weigh the same
             in the objective and in gamma_x; the published form does not.
         validation: poses of other trials. With them the fit stops after `patience` steps that

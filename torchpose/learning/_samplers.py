@@ -174,7 +174,7 @@ class _Drawn(_Blocks):
 
     Attributes:
         matrix: K, pixels. views, rotation_order: of the viewpoints. n_samples: how many states.
-        seed: of everything random. fresh: whether every epoch draws its own viewpoints.
+        seed: the seed of everything random. fresh: whether every epoch draws its own viewpoints.
     """
 
     matrix: Tensor

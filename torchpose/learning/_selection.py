@@ -98,14 +98,14 @@ def select_n_components(
         held_out: states of other persons, or one source for each of them; a person counts as much
             as their states weigh.
         candidates: numbers of components K.
-        seed: of every fit.
+        seed: the seed of every fit.
         rule: "best", or "one-standard-error" for the smallest K that is behind the best by no more
             than one standard error of that difference (persons differ in their level much more than
             in their differences, so errors of the level would let nearly any K pass).
         max_iter, tol: of every fit, see `fit_streamed`.
         share: of this process; all processes get the same result.
         progress: show a bar for every fit.
-        options: to `StreamedEM.start`.
+        options: the options of `StreamedEM.start`.
 
     Returns:
         The table, the choice and its mixture.

@@ -92,8 +92,8 @@ def stepwise_update(
 
     Args:
         em: the mixture; its parameters are replaced, its history is emptied.
-        state: of the step before.
-        statistics: of the blocks, summed over processes, made with `em` as it is.
+        state: the state of the step before.
+        statistics: the statistics of the blocks, summed over processes, made with `em` as it is.
         power: kappa in (1/2, 1]; the smaller, the sooner old blocks are forgotten.
         offset: t0 >= 1; the larger, the less the first blocks move the start.
 
@@ -140,7 +140,7 @@ def stepwise_pass(
     Args:
         em: the mixture.
         source: the states.
-        seed: of the order of the blocks.
+        seed: the seed of the order of the blocks.
         blocks_per_step: blocks of all processes together for one step.
         power, offset: of the step size, see `stepwise_update`.
         share: of this process.

@@ -94,7 +94,7 @@ class StreamedEM(MixtureFit):
                 dimension (relative to one unit, where they do not vary at all).
             init: "k-means++", "random" (means at states drawn at random), or the mixture to start
                 from, in units of the states.
-            dtype: of the products over the states; the mixture is float64.
+            dtype: the floating-point type of the products over the states; the mixture is float64.
 
         Raises:
             InputError: fewer usable samples or distinct poses than components, samples that are not
@@ -200,7 +200,7 @@ def fit_streamed(
         tol: change of the mean log-likelihood at which to stop; 0 never stops early.
         share: of this process; every process calls this function and gets the mixture.
         progress: show a bar.
-        options: to `StreamedEM.start`.
+        options: the options of `StreamedEM.start`.
 
     Returns:
         The mixture, with its `fit_report`.
@@ -342,7 +342,7 @@ class MixtureTask(NamedTuple):
 
     Attributes:
         source: of its training states. n_components: K. max_iter, tol: of the steps of EM; a
-            tolerance of 0 takes all of them. seed: of the start.
+            tolerance of 0 takes all of them. seed: the seed of the start.
     """
 
     source: SampleSource

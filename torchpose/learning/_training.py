@@ -118,7 +118,7 @@ def collect_poses(
     theirs (`learn_neck_offset`). Hands and wrists are not converted: mixed, they are refused.
 
     Args:
-        recordings: in camera axes.
+        recordings: the recordings, in camera axes.
         neck: kind of neck wanted; the highest kind among the recordings if None.
         centre: "neck" or "head": every pose is centred on that joint; "sequence": every recording
             on the mean of its neck.
@@ -222,7 +222,7 @@ def arm_sources(
     Args:
         poses: from `collect_poses`.
         matrix: K, pixels.
-        seed: of the viewpoints.
+        seed: the seed of the viewpoints.
         view_range: limits of the viewpoints.
         rotation_order: "zxy" (paper) or "zyx" (released priors).
         mirror: pool left arms and mirrored right arms; the right mixture is then to be the mirror
@@ -376,7 +376,7 @@ def seen_keypoints(
     Args:
         poses: body axes, metres. info: of the prior whose camera and viewpoints are taken.
         generator: of viewpoints and noise. view_share: of the width of the training views.
-        noise_std: of a keypoint, pixels.
+        noise_std: the standard deviation of a keypoint, pixels.
 
     Returns:
         The prior's pixels; elbows and shoulders are NaN, as is whatever is NaN in the poses.

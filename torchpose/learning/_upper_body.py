@@ -79,9 +79,9 @@ def fit_upper_body_prior(
     """Fit a prior to recorded 3D poses seen from random viewpoints (BL section 3.1).
 
     Args:
-        recordings: in camera axes (`torchpose.io.read_recordings`).
+        recordings: the recordings, in camera axes (`torchpose.io.read_recordings`).
         n_components: Gaussians per arm.
-        seed: of viewpoints and start.
+        seed: the seed of viewpoints and start.
         views: limits of the random viewpoints.
         camera: whose pixels the states are in; Kinect's (f = 525, 640 x 480) if None.
         rotation_order: "zxy" (paper) or "zyx" (released priors).
@@ -133,7 +133,7 @@ def prior_of_arms(
 
     Args:
         left, right: mixtures with their `fit_report`, if they were fitted. info: what they were
-            fitted on. seed: of the fit.
+            fitted on. seed: the seed of the fit.
     """
     info = replace(info, extra=info.extra | _fit_facts(left, seed))
     return UpperBodyPrior(left, mirror_mixture(left, info.cx) if right is None else right, info)
@@ -178,7 +178,7 @@ def increment_covs(
     Args:
         poses: centred on each recording's mean neck ("sequence"); steps of recordings at another rate
             than that of most frames count in proportion to the interval.
-        matrix: K, pixels. views, rotation_order: of the viewpoints. seed: of these.
+        matrix: K, pixels. views, rotation_order: of the viewpoints. seed: the seed of these.
         mirror: pool left arms and mirrored right ones.
 
     Returns:

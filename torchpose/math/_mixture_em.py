@@ -139,7 +139,7 @@ class MixtureFit(nn.Module):
         """Note the mean log-likelihood of the mixture, and whether it has settled.
 
         Args:
-            statistics: of all samples, made with the mixture as it is.
+            statistics: the statistics of all samples, made with the mixture as it is.
             tol: change of the mean log-likelihood below which the fit has converged, unless a
                 component was moved in the last step; 0 never converges.
 

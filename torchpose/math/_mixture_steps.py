@@ -242,7 +242,7 @@ def m_step(
     and covariance. So no weight is ever zero and the number of components stays.
 
     Args:
-        statistics: of all points.
+        statistics: the statistics of all points.
         floor: added to every covariance; zeros for none.
 
     Returns:

@@ -134,7 +134,7 @@ def rotate_gaussian(
         mean, covariance: mu [..., 3] and Sigma [..., 3, 3], in the space around C.
         centre: C. new_centre: C', of the space of the result. Quaternion vectors [..., 3]; no
             rotation by default.
-        directions: of the sigma points.
+        directions: the directions of the sigma points.
 
     Returns:
         mu' [..., 3] and Sigma' [..., 3, 3], symmetric. See the module for what happens at its edge.
@@ -166,7 +166,7 @@ def gaussian_rotate(
         rotation: q, a quaternion vector without a centre, [..., 3].
         centre: C. new_centre: C', of the space of the result. Quaternion vectors [..., 3]; no
             rotation by default.
-        directions: of the sigma points, see `rotate_gaussian`.
+        directions: the directions of the sigma points, see `rotate_gaussian`.
 
     Returns:
         mu' [..., 3] and Sigma' [..., 3, 3], symmetric.
@@ -196,7 +196,7 @@ def turn_gaussian(
     Args:
         mean: [..., 3]. covariance: [..., 3, 3].
         left: a. right: b. Quaternion vectors [..., 3], none for no rotation.
-        directions: of the sigma points.
+        directions: the directions of the sigma points.
     """
     quaternions = sigma_quaternions(mean, covariance, directions)
     if left is not None:

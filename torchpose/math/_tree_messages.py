@@ -103,7 +103,7 @@ def propagate(
 
     Args:
         mean: mu^obs [..., V, D]. covariance: S^obs [..., V, D, D].
-        tree: from `message_tree`.
+        tree: the tree from `message_tree`.
         transport: takes mean [..., E_l, D], covariance [..., E_l, D, D], the numbers of the edges
             [E_l] and whether the messages go up; returns the messages (DX 9-11) as mean and
             covariance. Down, the Gaussians given are of the nodes above and the messages are about
@@ -177,7 +177,7 @@ def tree_levels(parents: Sequence[int], names: Sequence[str]) -> tuple[tuple[int
 
     Args:
         parents: index of every node's parent, -1 for a root.
-        names: of the nodes, for the message.
+        names: the names of the nodes, for the message.
 
     Raises:
         SkeletonError: a parent outside the tree, or parents that form a cycle.

@@ -167,7 +167,7 @@ def calibration_error(curve: Coverage) -> Float[Tensor, " J"]:
     """Return the largest gap |share - nominal| over the levels, per joint (0.05 = 5 points).
 
     Args:
-        curve: from `reliability` or `coverage`, L levels and J joints.
+        curve: the curve from `reliability` or `coverage`, L levels and J joints.
 
     Returns:
         [J], 0 to 1 (0.05 = 5 points); NaN for a joint without counts.

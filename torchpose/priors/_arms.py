@@ -34,8 +34,8 @@ class ArmPriorInfo:
     """Holds facts about the fit of an `ArmPrior`.
 
     Attributes:
-        name: of the prior. persons: ids of the persons in the training recordings.
-        sources: data sets. licence: of the data. command: that made the prior.
+        name: the name of the prior. persons: ids of the persons in the training recordings.
+        sources: data sets. licence: the licence of the data. command: that made the prior.
         extra: anything else that JSON can hold.
     """
 

@@ -207,7 +207,7 @@ class GaussianMixture(nn.Module):
                 dimension (relative to one unit, where the data do not vary at all).
             init: "k-means++" or "random" (means at points drawn at random).
             progress: show a bar for every start.
-            dtype: of the products over the points; the mixture is float64.
+            dtype: the floating-point type of the products over the points; the mixture is float64.
 
         Returns:
             `GaussianMixture` in float64, with a `fit_report`.

@@ -60,12 +60,12 @@ class LimbInfo:
     """Holds facts about the fit of limb conditionals; fields that are not known are empty.
 
     Attributes:
-        name: of the conditionals.
+        name: the name of the conditionals.
         parts: names of all parts of the skeleton, the root first.
         fps: frames per second that the diffusion is for. fitted_fps: of the recordings.
         n_frames: that they were fitted on.
         persons: ids of the persons. actions: what they did. sources: recordings or data sets.
-        licence: of the data. command: that made it.
+        licence: the licence of the data. command: that made it.
         extra: anything else that JSON can hold.
     """
 
@@ -126,7 +126,7 @@ class LimbConditionals(nn.Module):
         diffusion: Sigma'_j per frame, [P, 3, 3], the root part's orientation in the world first.
         growth: g_j [P], by which it grows with the time t between frames as t^g: 1 for a random walk,
             as by default, 2 for limbs that swing on.
-        directions: of sigma points.
+        directions: the directions of sigma points.
 
     Attributes:
         info: as given. tree: a `MessageTree` over the P - 1 parts that are not the root.

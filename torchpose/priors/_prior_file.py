@@ -34,7 +34,7 @@ class PriorInfo:
     """Holds facts about the fit of a prior, and the conventions of its states.
 
     Attributes:
-        name: of the prior.
+        name: the name of the prior.
         rotation_order: "zxy" (paper) or "zyx" (released priors).
         fx, fy, cx, cy: camera matrix whose pixels the states are in.
         centre: joint that every pose was centred on ("neck", "head"), or "sequence" for the mean
@@ -44,7 +44,7 @@ class PriorInfo:
         fps: frame rate that process noise refers to.
         persons: ids of the persons in the training recordings.
         sources: recordings, data sets or files.
-        licence: of the data, as it allows the prior to be passed on.
+        licence: the licence of the data, as it allows the prior to be passed on.
         command: that made the prior.
         views: limits of the random viewpoints (`ViewRange` as a dict).
         transition: the transition its noise was learnt for, "paper" or "ou".

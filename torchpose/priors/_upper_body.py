@@ -186,7 +186,7 @@ class UpperBodyPrior(nn.Module):
         """Write the prior as safetensors, atomically: an interrupted write leaves no partial file.
 
         Args:
-            path: of the file, which is replaced.
+            path: the file, which is replaced.
 
         Raises:
             OutputError: the file cannot be written. CovarianceError: a mixture that `load` would

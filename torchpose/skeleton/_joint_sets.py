@@ -161,10 +161,10 @@ class Skeleton:
     """Describes a joint set and its kinematic tree.
 
     Args:
-        name: of the set.
+        name: the name of the set.
         joints: names in the order of the files.
         parents: index of each joint's parent, -1 for the root.
-        axes: of files that do not state them: ``camera``, ``kinect``, ``y-up`` or ``z-up``.
+        axes: the axes of files that do not state them: ``camera``, ``kinect``, ``y-up`` or ``z-up``.
         neck: kind of neck, or None if it must be measured or there is none.
         hand: ``"hand"``, ``"wrist"`` or None.
         turned: whether people face anywhere, so that files are turned towards the camera.

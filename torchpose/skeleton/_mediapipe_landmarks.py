@@ -73,7 +73,7 @@ def derive_joints(
     Args:
         points: [*batch, J, C], pixels (C = 2) or metres (C = 3), NaN where missing.
         visibility: [*batch, J], 0 to 1, or None.
-        names: of the J landmarks; those of `LANDMARKS` or a part of them.
+        names: the names of the J landmarks; those of `LANDMARKS` or a part of them.
 
     Returns:
         points [*batch, J + 4, C], visibility [*batch, J + 4] (the least of the landmarks that a joint

@@ -186,7 +186,7 @@ def place_neck(
 
     Args:
         joints: poses in the order of `UPPER_BODY`, metres.
-        offset: from `learn_neck_offset`.
+        offset: the offset from `learn_neck_offset`.
     """
     check_shape("joints", joints, ("...", 8, 3))
     middle, up, forward = _axes(joints)

@@ -80,7 +80,7 @@ class BodyLengths:
         like: a tensor of the dtype and on the device to work in.
 
     Attributes:
-        names: of the lengths, as `LENGTHS` has them.
+        names: the names of the lengths, as `LENGTHS` has them.
 
     Raises:
         InputError: an unknown name, a length or a height that nobody has, or poses without lengths.

@@ -132,7 +132,7 @@ class PoseFilter:
         filter: makes the filter of an arm from its mixture, `measurement_cov`, `observed` and
             options; a `RecursiveFilter`. If it has a `process_cov`, that is the prior's by default.
         settings: arguments that make it this method, and are no options of it.
-        defaults: of options, in place of the filter's own.
+        defaults: the defaults of options, in place of the filter's own.
         noise: how the process noise follows from what the prior brings.
         brought: which of the options "transition", "gamma" and "uniform_weight" the prior sets.
         smooths, particles: as in `Estimator`.

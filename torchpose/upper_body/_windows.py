@@ -63,9 +63,9 @@ class WindowMixture(Estimator):
     next show as jitter.
 
     Args:
-        model: of the tracker; its prior has a window that suits (`suitable_window`).
+        model: the model of the tracker; its prior has a window that suits (`suitable_window`).
         likelihood_power: exponent of the likelihood in the weights; by default that of the window.
-        dtype: of means and measurements; covariances are always float64.
+        dtype: the floating-point type of means and measurements; covariances are always float64.
 
     Attributes:
         of_limbs: whether `FilterOutput.log_evidence` is that of elbow and hand alone, given the torso.

@@ -157,7 +157,7 @@ def plot_errors_over_time(
     """Return the error of each joint over time, one line for each method (paper's Figures 5 and 11).
 
     Args:
-        errors: by method, [T, 8], from `torchpose.metrics.joint_errors`; NaN leaves a hole.
+        errors: the errors by method, [T, 8], from `torchpose.metrics.joint_errors`; NaN leaves a hole.
         fps: frames per second. show: names of the joints, one panel each; those in one row (the
             left and the right one, by default) share a scale.
         unit, scale: errors are multiplied by `scale` and called `unit`: ("cm", 100) for metres,
@@ -218,7 +218,7 @@ def plot_error_bars(
     The thin line on a bar runs from the first to the third quartile.
 
     Args:
-        errors: by method, [..., 8], from `torchpose.metrics.joint_errors`; NaN are left out.
+        errors: the errors by method, [..., 8], from `torchpose.metrics.joint_errors`; NaN are left out.
         unit, scale: as in `plot_errors_over_time`.
         title: above the picture.
 
@@ -261,7 +261,7 @@ def plot_pcp(curves: Mapping[str, PCP], by_limb: bool = False, title: str | None
     """Return the percentage of correct parts over the threshold (paper's Figures 4 and 13).
 
     Args:
-        curves: by method, from `torchpose.metrics.pcp`.
+        curves: the curves by method, from `torchpose.metrics.pcp`.
         by_limb: panels for upper arms and forearms beside the one for all four; the curves must
             then have the limbs of `torchpose.metrics.ARM_LIMBS`.
         title: above the picture.
@@ -310,8 +310,8 @@ def plot_reliability(
     A covariance is calibrated on the diagonal, too small (overconfident) below it, too large above it.
 
     Args:
-        curves: from `torchpose.metrics.reliability`, one or several by name.
-        names: of the joints, one panel each.
+        curves: the curves from `torchpose.metrics.reliability`, one or several by name.
+        names: the names of the joints, one panel each.
         tolerance: half width of the grey band about the diagonal (0.05 = 5 points).
         title: above the picture.
 

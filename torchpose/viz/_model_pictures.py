@@ -62,7 +62,7 @@ def plot_manifold(
     Args:
         manifold: of two latent dimensions or more; the others are held at zero.
         others: more poses by name, such as of a validation trial, drawn dashed.
-        body: whose states the poses are of. n_poses: that are shown of it.
+        body: whose states the poses are of. n_poses: the number of poses that are shown of it.
         resolution: points of the grey picture along either axis.
         title: above the picture; by default the manifold's name and size.
 

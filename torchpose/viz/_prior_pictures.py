@@ -76,7 +76,7 @@ def plot_prior_components(
     Args:
         prior: whose components are drawn.
         mixture: "pose", or the name of a window ("causal", "full").
-        n_shown: at most this many components of each arm. seed: of the draws.
+        n_shown: at most this many components of each arm. seed: the seed of the draws.
         title: above the picture; by default what is shown.
 
     Raises:
@@ -242,7 +242,7 @@ def plot_prior_samples(
 
     Args:
         prior: to draw from.
-        n_samples: bodies that are shown one by one. seed: of the draws.
+        n_samples: bodies that are shown one by one. seed: the seed of the draws.
         n_cloud: draws in the two large panels.
         title: above the picture; by default the prior's name.
 

@@ -52,10 +52,10 @@ def plot_rotations(
     (DX 2). Points on the far side are fainter.
 
     Args:
-        gaussians: by name, mean [3], covariance [3, 3] and centre [3] (or None) of each.
+        gaussians: the Gaussians by name, mean [3], covariance [3, 3] and centre [3] (or None) of each.
         direction: that is rotated, [3]; by default that of a hanging limb in its part's axes.
-        view: of the virtual camera, degrees: from the front to the person's left, and upwards.
-        draws: points of each cloud. generator: of the draws. title: above the panels.
+        view: the view of the virtual camera, degrees: from the front to the person's left, and upwards.
+        draws: points of each cloud. generator: the generator of the draws. title: above the panels.
 
     Returns:
         matplotlib `Figure`, a panel for each Gaussian.

@@ -74,7 +74,7 @@ def draw_skeleton(
         colors: of each joint; by default by side, for the 8 joints of the upper body.
         limbs: pairs of indices; a limb between two colours is grey.
         level: probability of the ellipses.
-        linewidth: of the limbs, points. alpha: opacity of everything.
+        linewidth: the line width of the limbs, points. alpha: opacity of everything.
 
     Raises:
         ShapeError: joints of another shape, or of another number than there are colours.

@@ -192,7 +192,7 @@ def save_figure(figure: Figure, path: str | Path, dpi: int = 150) -> Path:
 
     Args:
         figure: from a function of `torchpose.viz`, or any other.
-        path: of the file, which is replaced.
+        path: the file, which is replaced.
         dpi: dots per inch, of pixel formats.
 
     Returns:

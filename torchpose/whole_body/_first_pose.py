@@ -75,10 +75,10 @@ def find_first_pose(
     comes out turned round, and somebody who stands with straight legs by chance: give `facing` then.
 
     Args:
-        body: whose pose it is. silhouettes: of the first frames, half a second or so; bool.
+        body: whose pose it is. silhouettes: the silhouettes of the first frames, half a second or so; bool.
         cameras: the C cameras. prior: poses to start from, as `find_candidates`.
-        generator: of random numbers.
-        fps: of the frames. n_frames: that are looked at, evenly spread over those given.
+        generator: the generator of random numbers.
+        fps: the frame rate of the frames. n_frames: that are looked at, evenly spread over those given.
         n_particles: of the search in the first frame. n_tracking: likelihoods of a candidate and frame.
         n_headings, likelihood, limits, up: as `find_candidates`.
         facing: [3], the world direction that the person faces to within 60 degrees, if it is known;

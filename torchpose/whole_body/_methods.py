@@ -288,7 +288,7 @@ def make_filter(
     Args:
         method: a name of `METHODS`. body: in the frame of `learnt`. learnt: the model that the method
             needs. fps: frames per second. n_particles: likelihoods of a frame, of all layers or places
-            of the parts together. options: of the filter, before the usual ones.
+            of the parts together. options: the options of the filter, before the usual ones.
 
     Raises:
         InputError: an option that the filter does not use, or too few particles.

@@ -166,7 +166,7 @@ def find_pose(
         prior: poses to start from, as `find_candidates`; None is the rest pose.
         generator: one generator, or a list of one for each of B.
         n_particles: N, of all sectors together. n_layers: M; the search evaluates M N likelihoods.
-        n_headings: sectors of the circle. survival_rate: of a layer, above 0 to below 1.
+        n_headings: sectors of the circle. survival_rate: the survival rate of a layer, above 0 to below 1.
         likelihood: "bidirectional" or "overlap".
         limits: joint limits with `clamp(states)`, or None.
         up: [3], direction of the world's vertical; by `upward_direction` if None.
@@ -221,7 +221,7 @@ def find_candidates(
         generator: one generator, or a list of one for each of B.
         n_particles: N, of all sectors together. n_layers: M; the search evaluates M N likelihoods.
         n_headings: S, sectors of the circle; one of 120 degrees with `facing`.
-        survival_rate: of a layer.
+        survival_rate: the survival rate of a layer.
         likelihood: "bidirectional" or "overlap"; its exponents are solved from the survival rate.
         limits: joint limits with `clamp(states)`, or None.
         up: [3], direction of the world's vertical; by `upward_direction` if None.

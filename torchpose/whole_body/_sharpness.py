@@ -87,7 +87,7 @@ def fit_sharpness(
     Args:
         make_filter: sharpness -> filter. An annealed filter with solved exponents does not depend
             on its sharpness; let this set its survival rate instead, and give `values`.
-        sequences: of validation.
+        sequences: the validation sequences.
         values: exponents to try; by default 1 (the published form) to 1000 in equal ratios.
         n_values: number of exponents where `values` is None.
         seeds: runs per sequence, filtered as one batch.

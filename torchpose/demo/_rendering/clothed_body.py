@@ -66,7 +66,7 @@ class TrueShape:
         """Return a person drawn from a seed: factors exp(spread n), n standard normal.
 
         Args:
-            seed: of the person. spread: standard deviation of the logarithm.
+            seed: the seed of the person. spread: standard deviation of the logarithm.
         """
         generator = torch.Generator().manual_seed(seed)
         kinds = [row[0] for row in (*_LIMBS_OF_SIDES, *_LIMBS_OF_MIDDLE)]

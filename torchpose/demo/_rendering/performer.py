@@ -46,7 +46,7 @@ def render_performance(
     Args:
         performance: one, or several of the same length, in the axes of the camera.
         camera: its K and image size; its pose in the room is not used.
-        seed: of room, noise and flicker. scene: see `Scene`.
+        seed: the seed of room, noise and flicker. scene: see `Scene`.
         look: a name out of `LOOKS` or a `Look`, for each performer or for all. Performers beyond
             the first have the portrait mirrored and another complexion when names are given.
 
@@ -291,7 +291,7 @@ def render_video(
     Args:
         path: of the video, ending in .mp4; its folder must exist.
         performance, camera, seed, scene, look: see `render_performance`.
-        fps: of the file; by default the performance's own.
+        fps: the frame rate of the file; by default the performance's own.
         truth: of the file with the truth (.npz), by default truth.npz in the folder of the video:
             joints3d [T, 8, 3], joints2d [T, 8, 2], occluded [T, 8], names, labels, fps, K,
             image_size. Further performers go to truth_p02.npz and so on.

@@ -46,7 +46,7 @@ def room(width: int, height: int, scene: Scene, seed: int = 0) -> Array:
     """Return the background [height, width, 3], float32, 0 to 255.
 
     Args:
-        width, height: pixels. scene: see `Scene`. seed: of the places and shades of the furniture.
+        width, height: pixels. scene: see `Scene`. seed: the seed of the places and shades of the furniture.
     """
     import cv2
 
@@ -121,7 +121,7 @@ class Sensor:
     """Adds noise and flicker, the same in every run with one seed.
 
     Args:
-        width, height: pixels. scene: how much of them. seed: of the noise. fps: for the flicker.
+        width, height: pixels. scene: how much of them. seed: the seed of the noise. fps: for the flicker.
     """
 
     def __init__(self, width: int, height: int, scene: Scene, seed: int, fps: float) -> None:

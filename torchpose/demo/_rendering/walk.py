@@ -91,7 +91,7 @@ def walk(
     Args:
         seconds: length of the walk. fps: frames per second.
         height: metres; of it, the legs have more and trunk and arms less than average.
-        seed: of small differences from step to step. cadence: gait cycles (two steps) per second.
+        seed: the seed of small differences from step to step. cadence: gait cycles (two steps) per second.
         stray: degrees by which the path bends from its start to its end.
 
     Raises:
@@ -237,7 +237,7 @@ def empty_scene(camera: PinholeCamera, seed: int = 0) -> Array:
     """Return the empty room [H, W, 3], 0 to 255: a wall, a floor, a skirting board, plaster.
 
     Args:
-        camera: level, with the size of its image. seed: of the plaster and the light.
+        camera: level, with the size of its image. seed: the seed of the plaster and the light.
 
     Raises:
         InputError: a camera without a size.
@@ -266,7 +266,7 @@ def render_body_video(
 
     Args:
         folder: must exist. walk: of the person. cameras: with names and sizes, y up.
-        seed: of the shape of the body, the rooms and the sensors' noise.
+        seed: the seed of the shape of the body, the rooms and the sensors' noise.
 
     Returns:
         Paths of the videos and of the pictures.

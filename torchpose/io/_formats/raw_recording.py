@@ -46,7 +46,7 @@ class RawRecording:
         joints: [T, J, 3] in the axes and the unit of the file; NaN where missing.
         names: J names.
         fps: frames per second, None if unknown.
-        axes: of the file, None if it does not say.
+        axes: the axes of the file, None if it does not say.
         unit: metres per unit of the file, None if it does not say.
         person, action, source: as in `Recording`.
         weights: [T, J] in [0, 1], None if the file does not say.

@@ -88,7 +88,7 @@ def curate(recordings: Sequence[Recording], settings: CurationSettings = DEFAULT
     the camera, bones made alike, and mirrored copies added. Nothing is interpolated.
 
     Args:
-        recordings: in camera axes (`torchpose.io.read_recordings`); they are not changed.
+        recordings: the recordings, in camera axes (`torchpose.io.read_recordings`); they are not changed.
         settings: bounds and what to do.
 
     Returns:

@@ -62,7 +62,7 @@ class CurationReport(NamedTuple):
     Attributes:
         before, after: counts. drops: one per file, joint and reason. notes: what reading assumed and
             converted, with the number of recordings it concerns; what was changed on purpose.
-        settings: of the curation.
+        settings: the settings of the curation.
     """
 
     before: Size

@@ -213,7 +213,7 @@ def leave_one_person_out(recordings: Sequence[Recording]) -> Iterator[PersonSpli
     """Return one split per person, in the order of their ids, with that person as the test.
 
     Args:
-        recordings: of two persons or more.
+        recordings: the recordings of two persons or more.
 
     Returns:
         Iterator over `PersonSplit`, as many as there are persons.

@@ -74,7 +74,7 @@ def draw_sequences(
         sequences: complete poses, centred as the prior's are, body axes, metres.
         prior: whose camera and viewpoints are taken. n: how many. generator: of everything random.
         frames: of a piece at most; pieces begin where recordings do as often as not.
-        noise_std: of a keypoint, pixels. view_share: of the training views' width.
+        noise_std: the standard deviation of a keypoint, pixels. view_share: of the training views' width.
         body_size, bone_lengths: each piece has a body of its own (`augment_bodies`).
 
     Raises:

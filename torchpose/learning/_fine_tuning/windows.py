@@ -75,7 +75,7 @@ class TunableWindow(nn.Module):
         x = sum_j w_j (mu_j + G_j (z - H mu_j)),  w_j prop. to pi_j N(z; H mu_j, S_j)^tau.
 
     Args:
-        prior: to start from. name: of its window, "causal" or "full".
+        prior: to start from. name: the name of its window, "causal" or "full".
         mixtures: whether the mixtures are tuned as well as noise and power.
         error, evidence, departure: weights in the loss of the mean 3D error (in decimetres), of the
             log density of the true arm given its measurements (nats, both arms), and of

@@ -57,7 +57,7 @@ class ActionRecipe:
         evidence_rate: of a bank: frames per second that count as independent.
         gate_dimensions: of a bank: how many of the dimensions its gates look at, by default all; 25
             dimensions and 13 here tell actions apart best.
-        seed: of the trial of the gate, the matching that the share of accepted postures rests on.
+        seed: the seed of the trial of the gate, the matching that the share of accepted postures rests on.
     """
 
     n_dimensions: int = 13
@@ -76,9 +76,9 @@ class Performances:
     """Holds the performances of one action or several, and those of held-out persons.
 
     Attributes:
-        actions: in the order asked for. fps: of the postures. postures: "joints" or "body".
+        actions: in the order asked for. fps: the frame rate of the postures. postures: "joints" or "body".
         train, watched: single performances. left_out: repetitions that are too short.
-        recordings: of both.
+        recordings: the recordings of both.
     """
 
     actions: tuple[str, ...]
@@ -232,7 +232,7 @@ def fit_actions(performances: Performances, recipe: ActionRecipe) -> FittedActio
     """Fit every action, and test its gate on held-out persons.
 
     Args:
-        performances: of each action, and of held-out persons.
+        performances: the performances of each action, and of held-out persons.
         recipe: settings of the fits.
 
     Returns:

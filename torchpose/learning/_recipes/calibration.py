@@ -97,7 +97,7 @@ def track_held_out(
 
     Args:
         prior: fitted without these persons. poses: of everybody, centred as the prior's are.
-        persons: whose recordings are tracked. seed: of viewpoints, noise and what filters draw.
+        persons: whose recordings are tracked. seed: the seed of viewpoints, noise and what filters draw.
         drawn_pieces: pieces of recordings, of 60 frames at most, for the ways in `DRAWN`.
     """
     pieces = [

@@ -60,7 +60,7 @@ def choose_recordings(
             others.
         actions: names of actions, as the files give them; by default all.
         without: names of files, without their suffix, to leave out altogether.
-        axes: of all recordings: camera, kinect, y-up, z-up; by default what each file says.
+        axes: the axes of all recordings: camera, kinect, y-up, z-up; by default what each file says.
 
     Raises:
         InputError: unknown persons, actions or files, or nobody left to learn from. OverlapError: a

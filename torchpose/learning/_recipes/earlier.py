@@ -21,7 +21,7 @@ def fit_recipe_2(
     """Fit the recipe of the first shipped prior: windows without torso axes, bodies of less variety.
 
     Args:
-        recordings: in camera axes. settings: to `fit_kinect_prior`.
+        recordings: the recordings, in camera axes. settings: to `fit_kinect_prior`.
     """
     usual: RecipeSettings = {
         "body_size": 0.15,

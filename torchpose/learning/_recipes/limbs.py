@@ -41,7 +41,7 @@ class LimbStates:
     """Holds the recorded states of all persons, on one body with safe centres (DX 1), at one frame rate.
 
     Attributes:
-        body: whose frame and centres the states have. fps: of the states.
+        body: whose frame and centres the states have. fps: the frame rate of the states.
         train, watched: [T, D] for each recording, `watched` those of persons who are held out.
         fitted, held_out: the recordings.
     """

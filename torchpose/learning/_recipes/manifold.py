@@ -55,12 +55,12 @@ class ManifoldRecipe:
         latent_dim: dimensions d of the latent space.
         gamma_x: of (MR 22); by default from the median distance of the poses.
         optimiser: "lbfgs" or "adam". learning_rate: None for the optimiser's own.
-        steps: of ten iterations of the optimiser, at most.
+        steps: the largest number of steps, each of ten iterations of the optimiser.
         patience: steps without a better error on what is held out, after which it ends.
         start: which principal components to start from, 0 the first ones (`principal_start`).
-        smoothness: of the back constraints (`GPLVMFit`); 0 is the published form.
+        smoothness: the smoothness of the back constraints (`GPLVMFit`); 0 is the published form.
         standardise: let all columns weigh the same (`fit_gplvm`).
-        seed: of the frames that tell the scale of distances, gamma_x, where there are very many.
+        seed: the seed of the frames that tell the scale of distances, gamma_x, where there are very many.
 
     Raises:
         InputError: a setting that is not positive.
@@ -88,7 +88,7 @@ class ManifoldPoses:
     """Holds the poses to fit a manifold to, and held-out poses of other recordings.
 
     Attributes:
-        train, watched: [T, Q] for each recording. fps: of `watched`; `train` is thinned out.
+        train, watched: [T, Q] for each recording. fps: the frame rate of `watched`; `train` is thinned out.
         info: what they are of. fitted, held_out: the recordings.
     """
 

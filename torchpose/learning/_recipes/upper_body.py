@@ -163,7 +163,7 @@ class UpperBodyRecipe:
         """Collect the poses that are fitted, centred on the neck.
 
         Args:
-            recordings: in camera axes, metres.
+            recordings: the recordings, in camera axes, metres.
 
         Returns:
             `PoseSet` of all recordings, with one kind of neck.
@@ -180,7 +180,7 @@ class UpperBodyRecipe:
         "full.left" and "full.right".
 
         Args:
-            recordings: in camera axes, metres.
+            recordings: the recordings, in camera axes, metres.
 
         Returns:
             `MixtureTask` by name; each can be fitted in a process of its own.
@@ -326,7 +326,7 @@ class UpperBodyRecipe:
         of half the size to the others, in `info.extra["held_out"]`.
 
         Args:
-            prior: from `assemble`; it is changed. recordings: those that it was fitted on.
+            prior: the prior from `assemble`; it is changed. recordings: those that it was fitted on.
             progress: whether to show a bar.
 
         Returns:
@@ -345,7 +345,7 @@ class UpperBodyRecipe:
         """Return the errors on some persons, tracked with a fit of half the size to all others.
 
         Args:
-            recordings: of all persons.
+            recordings: the recordings of all persons.
             persons: ids (`Recording.person_id`) of those held out.
 
         Returns:
@@ -363,7 +363,7 @@ class UpperBodyRecipe:
         """Calibrate a prior by the errors on held-out persons.
 
         Args:
-            prior: from `assemble`; it is changed.
+            prior: the prior from `assemble`; it is changed.
             parts: what `hold_out` returned for each group of persons.
 
         Returns:
@@ -399,7 +399,7 @@ class UpperBodyRecipe:
         """Fit, assemble and calibrate a prior in this process.
 
         Args:
-            recordings: in camera axes (`torchpose.io.read_recordings`), metres.
+            recordings: the recordings, in camera axes (`torchpose.io.read_recordings`), metres.
             name, licence, command: for `PriorInfo`.
             progress: whether to show bars.
 
@@ -431,7 +431,7 @@ def fit_kinect_prior(
     """Fit the recipe of the shipped prior to recorded 3D poses: `UpperBodyRecipe.fit`.
 
     Args:
-        recordings: in camera axes (`torchpose.io.read_recordings`).
+        recordings: the recordings, in camera axes (`torchpose.io.read_recordings`).
         n_components, seed, views, **settings: of `UpperBodyRecipe`.
         name, licence, command: for `PriorInfo`. progress: whether to show bars.
 

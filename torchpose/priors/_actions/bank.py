@@ -177,7 +177,7 @@ class ActionBank(nn.Module):
 
         Args:
             postures: [..., 36], degrees. actions: [...], A for none. j: [...], matched postures.
-            width: of the gate, in sigma to either side; 2 as published.
+            width: the width of the gate, in sigma to either side; 2 as published.
 
         Returns:
             Bool [...].
@@ -206,7 +206,7 @@ class ActionBank(nn.Module):
 
         Args:
             postures: [..., 36], degrees. actions: [...], A for none. j: [...], matched postures.
-            width: of the gate, in sigma to either side.
+            width: the width of the gate, in sigma to either side.
             rounds: 0 clamps once and leaves the angles as they come out.
 
         Returns:
@@ -360,7 +360,7 @@ class ActionBank(nn.Module):
         """Write the bank as safetensors, atomically: an interrupted write leaves no partial file.
 
         Args:
-            path: of the file, which is replaced.
+            path: the file, which is replaced.
 
         Raises:
             OutputError: the file cannot be written.

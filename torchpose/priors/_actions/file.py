@@ -20,7 +20,7 @@ class ActionInfo:
     """Holds facts about the fit of an action space; fields that are not known are empty.
 
     Attributes:
-        name: of the action. fps: of the performances. limbs: that the postures are of.
+        name: the name of the action. fps: of the performances. limbs: that the postures are of.
         performances: how many there were. key_frames: indices of the key postures.
         explained: share of the variance of the postures that the D dimensions hold.
         persons: ids. sources: recordings or data sets. licence: of the data. command: that made it.
@@ -45,13 +45,13 @@ class BankInfo:
     """Holds facts about the actions of a bank, and the settings of its recognition.
 
     Attributes:
-        names: of the A actions. fps: of their performances. limbs: that the postures are of.
+        names: the names of the A actions. fps: of their performances. limbs: that the postures are of.
         persons: ids of all persons. stay: probability of doing the same thing a second later.
         spread: factor on the deviations of the training persons, for others. background: factor on
             the deviation of all training postures, for none of the actions. evidence_rate: frames
             per second that count as independent of each other. gate_dimensions: of the D, how many
             the gates look at; None for all.
-        licence: of the data. command: that made it. name: of the bank. sources: recordings or data
+        licence: of the data. command: that made it. name: the name of the bank. sources: recordings or data
             sets. extra: anything else that JSON can hold.
     """
 

@@ -66,7 +66,7 @@ def clamp_offset(
     """Return the offset z - g from a matched posture, moved to just within the gate.
 
     Args:
-        offset: [..., D]. std: sigma of the posture, [..., D]. width: of the gate, in sigma.
+        offset: [..., D]. std: sigma of the posture, [..., D]. width: the width of the gate, in sigma.
     """
     reach = _INSIDE * width * std
     return offset.clamp(-reach, reach)
@@ -83,7 +83,7 @@ def clamp_in_rounds(
 
     Args:
         postures: [..., 36]. inside: [...], those that stay. clamp: postures to the gate of a width.
-        width: of the gate. rounds: 0 clamps once.
+        width: the width of the gate. rounds: 0 clamps once.
     """
     if rounds < 0:
         raise InputError(f"rounds must be 0 or more, got {rounds}")

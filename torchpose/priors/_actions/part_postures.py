@@ -35,7 +35,7 @@ class PartPostures(nn.Module):
     """Postures of the states of one body.
 
     Args:
-        body: of the joints of `BODY_15`.
+        body: a body with the joints of `BODY_15`.
         dtype: to compute in; in float32 angles are right to a few hundredths of a degree.
 
     Raises:

@@ -14,7 +14,7 @@ class PolarLimb(NamedTuple):
     """Describes a bone whose direction is given in the axes of its parent limb.
 
     Attributes:
-        name: of the limb. parent: name of the limb that it hangs on, "" for the root.
+        name: the name of the limb. parent: name of the limb that it hangs on, "" for the root.
         start, end: names of the joints of `BODY_15` it runs between.
         straight: direction in the parent's axes at which the axes are carried on unturned.
         rest: direction in the parent's axes that stands for a joint that is not known.

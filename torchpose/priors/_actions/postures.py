@@ -119,7 +119,7 @@ def state_postures(body: Body, state: Float[Tensor, "*batch D"]) -> Float[Tensor
     """Return the relative angles, degrees, of the states of a body.
 
     Args:
-        body: of the joints of `BODY_15`.
+        body: a body with the joints of `BODY_15`.
         state: [..., D], metres and quaternion vectors.
 
     Returns:

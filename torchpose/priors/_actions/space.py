@@ -47,7 +47,7 @@ class ActionSpace(nn.Module):
     Args:
         mean: m, [36], degrees. basis: U, [36, D], orthonormal columns.
         performance: g, [K, D]. std: sigma, [K, D]. match_std: root of Delta, [D]. All in degrees.
-        variances: of the training postures along each axis, [D]. lost_variance: of all other
+        variances: the variances of the training postures along each axis, [D]. lost_variance: of all other
             directions together; degrees^2.
         info: facts about the fit.
 
@@ -269,7 +269,7 @@ class ActionSpace(nn.Module):
         """Draw the matched posture j of every z with probability proportional to N(z; g_j, Delta).
 
         Args:
-            z: [..., D]. generator: of the random numbers.
+            z: [..., D]. generator: the generator of the random numbers.
 
         Returns:
             Indices [...] from 0 to K - 1.
@@ -300,7 +300,7 @@ class ActionSpace(nn.Module):
         """Return whether z lies in the gate of posture j in all dimensions (AS 6).
 
         Args:
-            z: [..., D]. j: [...]. width: of the gate, in sigma to either side; 2 as published.
+            z: [..., D]. j: [...]. width: the width of the gate, in sigma to either side; 2 as published.
 
         Returns:
             Bool [...].
@@ -317,7 +317,7 @@ class ActionSpace(nn.Module):
         """Return the nearest point of the gate of posture j.
 
         Args:
-            z: [..., D], degrees. j: [...]. width: of the gate, in sigma to either side.
+            z: [..., D], degrees. j: [...]. width: the width of the gate, in sigma to either side.
 
         Returns:
             [..., D], degrees; z itself where it is inside.
@@ -344,7 +344,7 @@ class ActionSpace(nn.Module):
         to it.
 
         Args:
-            postures: [..., 36], degrees. j: [...]. width: of the gate.
+            postures: [..., 36], degrees. j: [...]. width: the width of the gate.
             rounds: 0 clamps once and leaves the angles as they come out, inside in any case.
 
         Returns:
@@ -370,7 +370,7 @@ class ActionSpace(nn.Module):
         without error, passes with probability erf(width / sqrt 2)^D: 0.55 for 2 sigma and D = 13.
 
         Args:
-            postures: [N, 36], degrees. width: of the gate. generator: for the matching.
+            postures: [N, 36], degrees. width: the width of the gate. generator: for the matching.
 
         Returns:
             `Acceptance`, three shares from 0 to 1.
@@ -394,7 +394,7 @@ class ActionSpace(nn.Module):
         """Write the action space as safetensors, atomically: an interrupted write leaves no partial file.
 
         Args:
-            path: of the file, which is replaced.
+            path: the file, which is replaced.
 
         Raises:
             OutputError: the file cannot be written.

@@ -32,7 +32,7 @@ class ManifoldInfo:
     """Holds facts about the fit of a manifold; fields that are not known are empty.
 
     Attributes:
-        name: of the manifold.
+        name: the name of the manifold.
         skeleton: joints of the body whose states the poses are of.
         columns: names of the columns of a pose, a part and an axis each.
         frame: "parent" or "body", what part rotations are relative to.
@@ -40,7 +40,7 @@ class ManifoldInfo:
         fps: frame rate that its standard deviations refer to.
         persons: ids of the persons. actions: what they did. sources: recordings or data sets.
         sequences: a name for each sequence, for pictures.
-        licence: of the data. command: that made it.
+        licence: the licence of the data. command: that made it.
         extra: anything else that JSON can hold.
     """
 

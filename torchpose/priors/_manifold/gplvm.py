@@ -405,7 +405,7 @@ class BackConstrainedGPLVM(nn.Module):
         """Write the manifold as safetensors, atomically: an interrupted write leaves no partial file.
 
         Args:
-            path: of the file, which is replaced.
+            path: the file, which is replaced.
 
         Raises:
             OutputError: the file cannot be written. PriorError: `info.extra` is not JSON.

@@ -101,9 +101,10 @@ class Prepared(NamedTuple):
     """Holds the tensors that follow from a fit and stay the same for every pose.
 
     Attributes:
-        latents: z of the training poses [T, d]. mean: of these poses [Q].
+        latents: z of the training poses [T, d]. mean: the mean of these poses [Q].
         pose_rows: of k_x [Q+2, T]. latent_rows: of k [d+2, T]; see `rbf_rows`.
-        factor: of K + sigma_z^2 I [T, T]. alpha: (K + sigma_z^2 I)^-1 X, times the scale [T, Q].
+        factor: Cholesky factor of K + sigma_z^2 I [T, T].
+        alpha: (K + sigma_z^2 I)^-1 X, times the scale [T, Q].
         offset: mean pose and the constant part of the kernel, beta_0 sum_t alpha_t [Q].
     """
 

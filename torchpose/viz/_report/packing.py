@@ -31,7 +31,7 @@ class ReportedTrack(Protocol):
         joints3d: [1, T, J, 3], metres, in `frame`. covariance3d: [1, T, J, 3, 3].
         observed: [1, T, J], True where the joint was measured.
         failed_at: [1], the first frame without a pose, -1 if there is none.
-        names: of the joints. fps: frames per second, or None. frame: "camera" or "body".
+        names: the names of the joints. fps: frames per second, or None. frame: "camera" or "body".
     """
 
     joints3d: Tensor

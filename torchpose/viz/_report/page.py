@@ -65,7 +65,7 @@ def write_report(
             empty list gives a page without persons. NaN poses are not drawn.
         overlay: video for the page, H.264; up to 64 MB it is embedded, a larger one is linked.
             Without it the page plays the skeleton alone.
-        title: of the page. facts: rows of a table, such as video, camera, method.
+        title: the title of the page. facts: rows of a table, such as video, camera, method.
         notes: assumptions and failures, one sentence each.
         first_frames: frame of the video with which each track begins; by default 0.
         n_frames: frames of the video; by default up to the end of the last track.

@@ -157,7 +157,7 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
         """Return the number of likelihoods that one particle costs in a frame: the number of layers.
 
         Args:
-            options: of the filter, as given to it.
+            options: the options of the filter, as given to it.
 
         Returns:
             Number of likelihoods for each particle and frame.
@@ -170,7 +170,7 @@ class AnnealedParticleFilter(SilhouetteParticleFilter):
         """Anneal from the resampled particles of the last frame.
 
         Args:
-            state: of the last frame, with resampled particles and the filter's memory of them.
+            state: the state of the last frame, with resampled particles and the filter's memory of them.
             frame: the observation of the frame.
             generator: one generator, or a list of one for each element.
 

@@ -120,7 +120,7 @@ class BodyFilterOutput(NamedTuple):
         """Return the track of one element of a batch.
 
         Args:
-            index: of the element, 0 to B - 1.
+            index: the index of the element, 0 to B - 1.
 
         Returns:
             `BodyFilterOutput` without the batch dimension.

@@ -173,7 +173,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         """Predict within the action (AS 3, 6), then weigh by the image (AS 7).
 
         Args:
-            state: of the last frame, with resampled particles and the filter's memory of them.
+            state: the state of the last frame, with resampled particles and the filter's memory of them.
             frame: the observation of the frame.
             generator: one generator, or a list of one for each element.
 
@@ -204,7 +204,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         """Warn of the frames in which all particles died, or the gate rejected every draw.
 
         Args:
-            track: of a batch, [B, T, ...].
+            track: the track of a batch, [B, T, ...].
         """
         super().warn(track)
         warn_of_frames(track.details["clamped"] == 1, _REJECTED)
@@ -218,7 +218,7 @@ class ConstrainedParticleFilter(SilhouetteParticleFilter):
         """Report the share of draws that the gate accepted, and when it was released.
 
         Args:
-            track: of one sequence, [T, ...]. first_frame: number of its first frame.
+            track: the track of one sequence, [T, ...]. first_frame: number of its first frame.
 
         Returns:
             Sentences, none if there is nothing to report.

@@ -50,7 +50,7 @@ class BodyFilterHooks(nn.Module, ABC):
         """Return weighted particles of the next frame from those of the last.
 
         Args:
-            state: of the last frame, with resampled particles and the filter's memory of them.
+            state: the state of the last frame, with resampled particles and the filter's memory of them.
             frame: the observation of the frame.
             generator: one generator, or a list of one for each element.
 
@@ -84,7 +84,7 @@ class BodyFilterHooks(nn.Module, ABC):
         """Return the memory of particles of which some have exchanged their legs; the same by default.
 
         Args:
-            memory: of the particles, as in the state.
+            memory: the memory of the particles, as in the state.
             swapped: [B, N], True where a particle has exchanged its legs.
 
         Returns:
@@ -103,7 +103,7 @@ class BodyFilterHooks(nn.Module, ABC):
 
         Args:
             particles: [B, N, D]. log_weights: normalised, [B, N]. mean: the estimate [B, D].
-            memory: of the particles, as in the state.
+            memory: the memory of the particles, as in the state.
 
         Returns:
             [B, D], metres for the root's position, sines of half angles for rotations.
@@ -127,7 +127,7 @@ class BodyFilterHooks(nn.Module, ABC):
         """Warn of the frames of a track in which the filter degenerated.
 
         Args:
-            track: of a batch, [B, T, ...].
+            track: the track of a batch, [B, T, ...].
         """
         warn_of_frames(track.respread, _DIED)
 
@@ -138,7 +138,7 @@ class BodyFilterHooks(nn.Module, ABC):
         """Return the number of likelihoods of whole bodies that one particle costs in a frame.
 
         Args:
-            options: of the filter, as given to it.
+            options: the options of the filter, as given to it.
 
         Returns:
             Number of likelihoods for each particle and frame.
@@ -175,7 +175,7 @@ class BodyFilterHooks(nn.Module, ABC):
         """Report what is notable about a track; nothing by default.
 
         Args:
-            track: of one sequence, [T, ...]. first_frame: number of its first frame.
+            track: the track of one sequence, [T, ...]. first_frame: number of its first frame.
 
         Returns:
             Sentences, none if there is nothing to report.

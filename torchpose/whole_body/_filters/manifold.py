@@ -141,7 +141,7 @@ class ManifoldParticleFilter(SilhouetteParticleFilter):
         """Take steps 3 to 7 of Algorithm 1: draw targets, propose, weigh by the manifold and the image.
 
         Args:
-            state: of the last frame, with resampled particles and the filter's memory of them.
+            state: the state of the last frame, with resampled particles and the filter's memory of them.
             frame: the observation of the frame.
             generator: one generator, or a list of one for each element.
 

@@ -198,7 +198,7 @@ def constant_velocity_std(
     Args:
         body: of D columns, which tells how rotations differ.
         sequences: states [T, D] of one sequence, or of several. Frames with NaN are passed over.
-        fps: of the sequences.
+        fps: the frame rate of the sequences.
         target_fps: of the frames to be tracked; None is the same rate. Where it is lower the model
             predicts over as many frames at a time; what is left, and higher rates, go by
             `rescale_std`.

@@ -190,7 +190,7 @@ class PostureGate(nn.Module):
         posture_body: body on which the performances of the action were put (`Body.convert`); the
             postures of states are then told on it too, so that where this person's shoulders and hips
             are makes no difference. The same body if None.
-        width: of the gate, deviations to either side.
+        width: the width of the gate, deviations to either side.
 
     Raises:
         SkeletonError: a body of other joints. InputError: not an action, or a width that is not positive.

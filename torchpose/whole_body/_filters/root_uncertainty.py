@@ -102,8 +102,8 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
             `part_log_likelihood`.
         camera_rule: "product" over the cameras, or "sum".
         observation_sharpness: exponent of the pixel weights of the sigma points; 1 as published.
-        least_std: of an observation in any direction, sines of half angles.
-        first_std: of every part at the start, and where all hypotheses died.
+        least_std: the least standard deviation of an observation in any direction, sines of half angles.
+        first_std: the standard deviation of every part at the start, and where all hypotheses died.
         weighting: "parts" (DX 12), or "body": the likelihood of the whole body at the posterior
             means, one more evaluation for each hypothesis.
         **options: as `SilhouetteParticleFilter`, but `estimate` is "map" by default, the means of the
@@ -164,7 +164,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         """Return the number of likelihoods that one hypothesis costs: its sigma points, and the whole body.
 
         Args:
-            options: of the filter, as given to it.
+            options: the options of the filter, as given to it.
 
         Returns:
             Number of likelihoods for each particle and frame.
@@ -208,7 +208,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         """Diffuse the roots, observe the parts, pass messages and weigh (DX 4-14).
 
         Args:
-            state: of the last frame, with resampled particles and the filter's memory of them.
+            state: the state of the last frame, with resampled particles and the filter's memory of them.
             frame: the observation of the frame.
             generator: one generator, or a list of one for each element.
 
@@ -241,7 +241,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
         x' = (w I + [v]_x) x + ... to first order, for the rotation (v, w) from one centre to the other.
 
         Args:
-            memory: of the particles, as in the state.
+            memory: the memory of the particles, as in the state.
             swapped: [B, N], True where a particle has exchanged its legs.
 
         Returns:
@@ -265,7 +265,7 @@ class RootUncertaintyTracker(SilhouetteParticleFilter):
 
         Args:
             particles: [B, N, D]. log_weights: normalised, [B, N]. mean: the estimate [B, D].
-            memory: of the particles, as in the state.
+            memory: the memory of the particles, as in the state.
 
         Returns:
             [B, D], metres for the root's position, sines of half angles for rotations.

@@ -227,7 +227,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         """Track one more frame: the same numbers as the same frame of `forward`.
 
         Args:
-            state: from `init`, `step` or `advance`. silhouettes: [B, C, H, W], bool.
+            state: the state from `init`, `step` or `advance`. silhouettes: [B, C, H, W], bool.
             cameras, generator: as in `forward`.
 
         Returns:
@@ -254,7 +254,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         """Track some more frames: the same numbers as `step` for one after the other.
 
         Args:
-            state: from `init`, `step` or `advance`. silhouettes: [B, T, C, H, W], bool.
+            state: the state from `init`, `step` or `advance`. silhouettes: [B, T, C, H, W], bool.
             cameras, generator: as in `forward`.
 
         Returns:
@@ -294,7 +294,7 @@ class SilhouetteParticleFilter(BodyFilterHooks):
         """Track one more frame, as `step`, of checked silhouettes; without warnings.
 
         Args:
-            state: of B elements, from `init` or the frame before.
+            state: the state of B elements, from `init` or the frame before.
             silhouettes: bool [B, C, H, W]. cameras: the C cameras.
             generator: one generator, or a list of one for each element.
 

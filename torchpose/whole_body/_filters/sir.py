@@ -60,7 +60,7 @@ class SIRParticleFilter(SilhouetteParticleFilter):
         """Diffuse the particles (MR 29), and weigh them by the image (MR 5).
 
         Args:
-            state: of the last frame, with resampled particles and the filter's memory of them.
+            state: the state of the last frame, with resampled particles and the filter's memory of them.
             frame: the observation of the frame.
             generator: one generator, or a list of one for each element.
 

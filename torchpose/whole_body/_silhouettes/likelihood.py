@@ -23,7 +23,7 @@ def bidirectional(counts: SilhouetteCounts) -> Float[Tensor, "*batch"]:
     over the cameras I. An empty model or an empty silhouette counts 1 in its term.
 
     Args:
-        counts: of C cameras, each [..., C].
+        counts: the counts of C cameras, each [..., C].
 
     Returns:
         [...], float64, in [-2, 0]; 0 if the silhouettes are equal.
@@ -48,7 +48,7 @@ def intersection_over_union(counts: SilhouetteCounts) -> Float[Tensor, "*batch"]
     with I_OV the pixels in both silhouettes and I_U those in either. Where both are empty it is 0.
 
     Args:
-        counts: of C cameras, each [..., C].
+        counts: the counts of C cameras, each [..., C].
 
     Returns:
         [...], float64, in [0, 1]; 1 if the silhouettes are equal. It is a weight: its logarithm
@@ -70,7 +70,7 @@ def silhouette_log_likelihood(
     """Return sharpness times the log-likelihood of the named kind.
 
     Args:
-        counts: of C cameras, each [..., C].
+        counts: the counts of C cameras, each [..., C].
         kind: "bidirectional" (MR 12), or "overlap": log of the intersection over union (AS 7),
             -inf without any overlap.
         sharpness: exponent of the likelihood, 0 or more; 1 is the published form.

@@ -341,7 +341,7 @@ def outline_rectangles(limbs: ProjectedLimbs, height: int, width: int) -> Outlin
 
     Args:
         limbs: both ends in every camera.
-        height, width: of the images, pixels.
+        height, width: the height and width of the images, pixels.
 
     Returns:
         `Outlines` with four edges and no discs.

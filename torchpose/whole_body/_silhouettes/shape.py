@@ -49,11 +49,11 @@ def fit_radii(
     particles. Lengths are not changed.
 
     Args:
-        body: of this person, with radii [L, 2].
+        body: the body of this person, with radii [L, 2].
         states: [T, D], of the frames, such as `fit_state` gives them.
         silhouettes: [T, C, H, W], True on the person.
         rig: the C cameras.
-        seed: of the search.
+        seed: the seed of the search.
         n_frames: most frames to use, evenly spaced ones; a few in different poses are enough.
         n_candidates, n_rounds: of the search.
 
