@@ -28,6 +28,7 @@ from benchmarks._table_file import TableFile
 from benchmarks.hand_network.clips import (
     BURN_IN,
     FOLDS,
+    LABELLED,
     PEOPLE,
     SIGNERS,
     Clip,
@@ -39,12 +40,13 @@ from benchmarks.hand_network.clips import (
 )
 from benchmarks.hand_network.training import STEPS
 from benchmarks.hand_network.training import fit as fit_network
-from torchpose import load_prior
+from torchpose import PinholeCamera, VideoTracker, load_prior
 from torchpose._core.files import check_output_folder
 from torchpose.evaluation import Report
 from torchpose.measure import HandTracker
 from torchpose.measure._hand_network import HandNetwork, HandNetworkInfo
 from torchpose.measure._hand_prior import HandPrior
+from torchpose.skeleton import UPPER_BODY
 from torchpose.video import open_video
 
 _QUICK_STEPS = 3
@@ -84,6 +86,29 @@ def score(clip: Clip, network: HandNetwork | None) -> Score:
     return Score(right, (known == 1).sum((0, 2)), invented, (known == 0).sum((0, 2)))
 
 
+def elbow_error(clip: Clip, network: HandNetwork, elbows: bool) -> float:
+    """Return the median distance of the poses' elbows from visible ones, in shoulder widths.
+
+    Args:
+        clip: with its labels. network: of the tracker. elbows: whether the tracker measures elbows.
+    """
+    labels = clip.labels
+    centres, seen = labels.centres[:, 2:], labels.seen[:, 2:]
+    with open_video(clip.path) as video:
+        camera = PinholeCamera.from_image_size(*video.size)
+        prior = load_prior("kinect-upper-body")
+        tracker = VideoTracker(prior, camera, fps=video.fps, elbows=elbows)
+        tracker.measurer.hand_tracker.network = network
+        people = tracker(video)
+    found = torch.full_like(centres, torch.nan)
+    if people:
+        rows = [UPPER_BODY.index(joint) for joint in LABELLED[2:]]
+        joints = people[0].track.joints2d[0, : len(found) - people[0].first_frame, rows]
+        found[people[0].first_frame :][: len(joints)] = joints
+    away = (found - centres).norm(dim=-1)[BURN_IN + 1 :] / labels.width
+    return float(away[seen[BURN_IN + 1 :] == 1].nanmedian())
+
+
 @cache
 def cached_windows(clip: Clip) -> Windows:
     """Return the windows of a clip, which are measured once and only if a fit needs them."""
@@ -109,13 +134,21 @@ def facts(clips: Sequence[Clip], name: str, command: str) -> HandNetworkInfo:
     )
 
 
-def add_table(report: Report, scores: dict[str, tuple[Score, Score]]) -> None:
-    """Add the scores of all clips, without and with a network that knows nobody in them."""
+def add_table(
+    report: Report, scores: dict[str, tuple[Score, Score]], errors: dict[str, list[float]]
+) -> None:
+    """Add the scores of all clips, without and with a network that knows nobody in them.
+
+    Args:
+        report: of the benchmark. scores: without and with the network. errors: of the poses' elbows,
+            not measured and measured, by clip.
+    """
     kinds = ("right", "invented")
     columns = [f"{kind}, {tracker} (%)" for kind in kinds for tracker in ("grid", "learnt")]
     columns += [f"elbows {kind} (%)" for kind in kinds]
+    columns += ["elbows of poses, inferred (widths)", "measured (widths)"]
     title = "Hands and elbows of persons left out"
-    table = report.table("hands", title, columns, digits=(0,) * len(columns))
+    table = report.table("hands", title, columns, digits=(0,) * (len(columns) - 2) + (2, 2))
 
     def shares(s: Score) -> tuple[list[float], list[float]]:
         right, invented = 100 * s.right / s.seen, 100 * s.invented / s.gone
@@ -125,7 +158,7 @@ def add_table(report: Report, scores: dict[str, tuple[Score, Score]]) -> None:
     for name, pair in scores.items():
         (right, invented), (own_right, own_invented) = (shares(s) for s in pair)
         hands = [right[0], own_right[0], invented[0], own_invented[0]]
-        rows[name] = [*hands, own_right[1], own_invented[1]]
+        rows[name] = [*hands, own_right[1], own_invented[1], *errors[name]]
     for name, row in rows.items():
         table.add(name, row)
     for title, names in (("mean of strangers", PEOPLE), ("mean of signers", SIGNERS)):
@@ -169,7 +202,7 @@ def main(
         windows = [(clip.person, cached_windows(clip)) for clip in labelled]
         fit_network(windows, facts(labelled, "hands", command), steps).save(fit)
         return
-    scores = {}
+    scores, errors = {}, {}
     for number, persons in enumerate(FOLDS):
         left_out = [clip for clip in clips if clip.person in persons]
         if not left_out:
@@ -179,8 +212,9 @@ def main(
         network = fitted(known, out / f"fold-{number}.safetensors", info, steps)
         for clip in left_out:
             scores[clip.name] = score(clip, None), score(clip, network)
+            errors[clip.name] = [elbow_error(clip, network, measured) for measured in (False, True)]
     report = Report("Hands of persons left out")
-    add_table(report, scores)
+    add_table(report, scores, errors)
     text = report["hands"].to_markdown()
     print(text)
     if table is not None:
