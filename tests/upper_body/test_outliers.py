@@ -33,6 +33,12 @@ def prior(small_windows_file):
 
 @pytest.fixture(scope="module")
 def tracker(prior):
+    """Keypoints are screened before any method sees them, so a quick one will do."""
+    return UpperBodyTracker(prior, demo_camera(), "window-mixture", max_gap=None)
+
+
+@pytest.fixture(scope="module")
+def usual_tracker(prior):
     return UpperBodyTracker(prior, demo_camera(), max_gap=None)
 
 
@@ -70,7 +76,7 @@ def test_clean_keypoints_are_tracked_bit_by_bit_as_without_a_search(prior, keypo
     unmeasured = [i for i in range(8) if i not in ROWS]
     assert bool(clean.inlier_probability[..., unmeasured].isnan().all())
     assert not any("outlier" in note or "exchanged" in note for note in clean.notes)
-    without = UpperBodyTracker(prior, demo_camera(), max_gap=None, outliers=False)
+    without = UpperBodyTracker(prior, demo_camera(), "window-mixture", max_gap=None, outliers=False)
     track = without(keypoints, names=NAMES)
     for name in ("joints2d", "joints3d", "covariance3d", "log_evidence", "observed"):
         assert torch.equal(getattr(track, name), getattr(clean, name))
@@ -170,7 +176,8 @@ def test_after_a_gap_any_place_is_plausible(tracker, keypoints):
     assert bool(track.observed[:, 45:, ROWS].all())
 
 
-def test_frames_one_by_one_and_streams_alone_are_the_same(tracker, keypoints):
+def test_frames_one_by_one_and_streams_alone_are_the_same(usual_tracker, keypoints):
+    tracker = usual_tracker
     generator = torch.Generator().manual_seed(1)
     wild = keypoints.clone()
     out = torch.rand(wild.shape[:3], generator=generator) < 0.1
@@ -200,12 +207,12 @@ def test_frames_past_the_end_are_not_counted(tracker, keypoints):
     assert tracker(wild, names=NAMES, lengths=torch.tensor([20, 21, 22])).notes == tracker.notes
 
 
-def test_gradients_flow_through_what_is_kept(tracker, keypoints):
+def test_gradients_flow_through_what_is_kept(usual_tracker, keypoints):
     wild = keypoints[:1, :40].clone()
     wild[:, 20, 2] = 3000.0
     wild[:, 25:27, 2:] = wild[:, 25:27, [3, 2]]
     wild.requires_grad_()
-    tracker(wild, names=NAMES).joints3d.sum().backward()
+    usual_tracker(wild, names=NAMES).joints3d.sum().backward()
     gradient = wild.grad.norm(dim=-1)[0]
     assert bool(wild.grad.isfinite().all()) and float(gradient[20, 2]) == 0
     assert bool((gradient[25:27] > 0).all()) and bool((gradient[20, [0, 1, 3]] > 0).all())

@@ -18,9 +18,19 @@ GAP = 20
 
 
 @pytest.fixture(scope="module")
-def tracker(small_windows_file):
-    prior = UpperBodyPrior.load(small_windows_file)
+def prior(small_windows_file):
+    return UpperBodyPrior.load(small_windows_file)
+
+
+@pytest.fixture(scope="module")
+def tracker(prior):
     return UpperBodyTracker(prior, demo_camera(), fps=30.0, max_gap=None)
+
+
+@pytest.fixture(scope="module")
+def quick_tracker(prior):
+    """Of one of the two methods that the other one averages."""
+    return UpperBodyTracker(prior, demo_camera(), "window-mixture", fps=30.0, max_gap=None)
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +40,11 @@ def keypoints():
 
 
 @pytest.fixture(scope="module")
-def tracked_alone(tracker, keypoints):
-    """What the tracker says of some frames by themselves: tracked_alone(first, last)."""
+def tracked_alone(keypoints):
+    """What a tracker says of some frames by themselves: tracked_alone(tracker, first, last)."""
 
     @functools.cache
-    def track(first, last):
+    def track(tracker, first, last):
         cov = COV.double().expand(1, last - first, -1, -1, -1)
         return tracker(keypoints[None, first:last], names=MEASURED, covariance=cov)
 
@@ -76,7 +86,7 @@ def test_one_person_is_tracked_as_from_keypoints(tracker, keypoints, tracked_alo
     found = frames(keypoints, [[0]] * 45)
     (person,) = record(tracker, found, size)
     assert (person.number, person.first_frame, len(person)) == (0, 0, 45)
-    whole = tracked_alone(0, 45)
+    whole = tracked_alone(tracker, 0, 45)
     for name in FIELDS:
         torch.testing.assert_close(
             getattr(person.track, name), getattr(whole, name), rtol=1e-9, atol=1e-9
@@ -86,18 +96,18 @@ def test_one_person_is_tracked_as_from_keypoints(tracker, keypoints, tracked_alo
 @pytest.mark.parametrize("size", [1, 9, 32])
 @pytest.mark.parametrize("n_before", [15, 30])
 def test_poses_end_when_somebody_is_away_for_too_long_and_begin_anew(
-    tracker, keypoints, tracked_alone, n_before, size
+    quick_tracker, keypoints, tracked_alone, n_before, size
 ):
     """With 15 frames before, somebody is away for too long and returns within one block of 32."""
     present = [[]] * 5 + [[0]] * n_before + [[]] * 35 + [[0]] * 20 + [[]] * 30
-    (person,) = record(tracker, frames(keypoints, present), size)
+    (person,) = record(quick_tracker, frames(keypoints, present), size)
     back = n_before + 35
     assert (person.first_frame, len(person)) == (5, back + 20)
     there = person.track.joints3d[0].isfinite().all(-1).all(-1)
     assert torch.nonzero(~there).flatten().tolist() == list(range(n_before + GAP, back))
     observed = person.track.observed[0]
     assert not observed[n_before:back].any() and observed[back:, 3:5].all()
-    anew = tracked_alone(5 + back, 25 + back)
+    anew = tracked_alone(quick_tracker, 5 + back, 25 + back)
     torch.testing.assert_close(
         person.track.joints3d[0, back:], anew.joints3d[0], rtol=1e-9, atol=1e-9
     )
