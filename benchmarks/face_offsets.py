@@ -28,7 +28,7 @@ from torchpose.priors import load_prior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import UpperBodyTracker
 
-HEADS, NECKS = (-0.4, -0.3, -0.2, -0.12, 0.0), (0.85, 1.0, 1.1, 1.2, 1.3)
+HEADS, NECKS = (-0.4, -0.3, -0.2, -0.12, 0.0), (0.85, 0.95, 1.0, 1.1, 1.2)
 HAND_STD = 8.0  # pixels
 HANDS = ("hand_left", "hand_right")
 INFERRED = ("elbow_left", "elbow_right", "shoulder_left", "shoulder_right")
