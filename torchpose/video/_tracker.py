@@ -176,7 +176,7 @@ class VideoTracker(nn.Module):
             )
         else:
             _refuse_measurer(
-                hands=hands != HAND_TRACKERS[0], background=background, elbows=elbows is not None,
+                hands=hands != HAND_TRACKERS[0], background=background, elbows=bool(elbows),
                 edges=edges,
                 candidates=candidates, face_detector=face_detector is not None,
                 head_neck=head_neck is not None,
