@@ -24,6 +24,7 @@ __all__ = [
     "Region",
     "check_faces",
     "nearest_pairs",
+    "scaled_back",
 ]
 
 _ROI = 1.1  # half the side of the region searched about a known face, in its sizes
@@ -137,7 +138,7 @@ class HaarFaceDetector:
         else:
             sizes = (round(smallest * scale), round(largest * scale))
             strict = self.min_neighbours + _STRICTER
-            found = _scaled_back(self._detect(_resized(part, scale), *sizes, strict), scale)
+            found = scaled_back(self._detect(_resized(part, scale), *sizes, strict), scale)
         return found + found.new_tensor([region.left, region.top, 0])
 
     def _detect(
@@ -168,7 +169,7 @@ def _resized(image: Image, scale: float) -> Image:
     return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=way), np.uint8)
 
 
-def _scaled_back(faces: Float[Tensor, "N 3"], scale: float) -> Float[Tensor, "N 3"]:
+def scaled_back(faces: Float[Tensor, "N 3"], scale: float) -> Float[Tensor, "N 3"]:
     """Return the faces of an image that was resized by this factor, in pixels of the original."""
     return torch.cat([(faces[:, :2] + 0.5) / scale - 0.5, faces[:, 2:] / scale], 1)
 
@@ -338,7 +339,7 @@ class FaceTracker(nn.Module):
         for turn in (-_TILT, _TILT):
             if not len(found):
                 found = _turned_search(self.detector, part, _whole(part, region, scale), turn)
-        return _scaled_back(found, scale) + found.new_tensor([region.left, region.top, 0])
+        return scaled_back(found, scale) + found.new_tensor([region.left, region.top, 0])
 
     def _predict(self, tracks: FaceTracks) -> FaceTracks:
         spread = (self.acceleration * tracks.mean[:, 2, None]).square().expand(-1, 6)

@@ -198,7 +198,9 @@ class HandTracker(nn.Module):
         if found is not None:
             expected_elbow = _expected_elbows(hands, elbow, state.anchors)
             elbows = self._elbows(found, expected_elbow, state.anchors, frame.shape)
-            hands = HandMeasurements(*hands[:4], *elbows)
+            hands = hands._replace(
+                elbows=elbows.points, elbow_covariance=elbows.covariance, elbow_seen=elbows.seen
+            )
         return state, hands
 
     def _persons(
@@ -370,7 +372,7 @@ class HandTracker(nn.Module):
     def _elbows(
         self, found: HandPlaces, expected: Tensor, anchors: Tensor, shape: tuple[int, ...]
     ) -> Elbows:
-        """Return the elbows in one frame, by the network and by where the hands let them be.
+        """Return the elbows in one frame, by the network and by the density of an elbow given its hand.
 
         Args:
             found: by the network. expected: elbows given the hands, in B from the anchors, NaN where

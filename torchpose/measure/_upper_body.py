@@ -13,7 +13,7 @@ from torchpose._core.checks import check_rgb
 from torchpose._core.images import Image
 from torchpose.errors import InputError
 from torchpose.measure._background import BackgroundModel
-from torchpose.measure._face import FaceDetector, FaceTracker, FaceTracks
+from torchpose.measure._face import FaceDetector, FaceTracker, FaceTracks, scaled_back
 from torchpose.measure._hand_likelihood import HandMeasurements
 from torchpose.measure._hand_network import shipped_hand_network
 from torchpose.measure._hand_prior import HandPrior
@@ -206,8 +206,9 @@ class UpperBodyMeasurer(nn.Module):
             raise InputError("candidates need hands='learnt' or 'grid': mean shift takes none")
         parts = [self.head_neck(faces, face_cov), (_where_seen(hands), hands.covariance)]
         if len(self.names) > len(MEASURED):
-            found = Elbows(*hands[4:])
-            if not self.learnt:
+            if self.learnt:
+                found = Elbows(hands.elbows, hands.elbow_covariance, hands.elbow_seen)
+            else:
                 found = self._elbows(image, faces, hand_state.skin)
             parts.append((_where_seen(found), found.covariance))
         keypoints = torch.cat([points.to(faces) for points, _ in parts], 1)
@@ -248,8 +249,7 @@ class UpperBodyMeasurer(nn.Module):
         if self.max_persons is not None and len(rows) > self.max_persons:
             largest = tracks.mean[rows, 2].argsort(descending=True)[: self.max_persons]
             rows = rows[largest.sort().values]
-        faces = tracks.mean[rows, :3]
-        faces = torch.cat([(faces[:, :2] + 0.5) / scale - 0.5, faces[:, 2:] / scale], 1)
+        faces = scaled_back(tracks.mean[rows, :3], scale)
         cov = tracks.cov[rows, :3, :3] / scale**2
         return faces, cov, tracks.identity[rows], tracks.unseen[rows]
 
