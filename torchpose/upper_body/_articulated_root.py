@@ -18,7 +18,7 @@ from torchpose.upper_body._articulated_torso import shoulder_places
 from torchpose.upper_body._body_lengths import BodyLengths
 from torchpose.upper_body._face import face_evidence
 from torchpose.upper_body._root_grid import RootGrid
-from torchpose.upper_body._torso import Root, Torso, middle_of_shoulders
+from torchpose.upper_body._torso import STIFF_SHOULDER, Root, Torso, middle_of_shoulders
 
 __all__ = ["RootStep", "Roots", "covs_of_roots"]
 
@@ -168,14 +168,26 @@ def _arm_input(
     flip = root.depth.new_tensor(SIDES)
     shoulder = shoulder_places(frame, root, middle, lengths[:, 2]) * flip[:, None]
     rays = torch.stack([frame.rays[:, ELBOWS], frame.rays[:, HANDS]], 2) * flip[:, None]
-    noise = frame.std[:, [SHOULDERS, ELBOWS, HANDS]].square()
-    noise = torch.where(frame.known[:, [SHOULDERS, ELBOWS, HANDS]], noise, 0.0)
-    std = torch.stack([noise[:, 0] + noise[:, 1], noise[:, 1] + noise[:, 2]], -1).sqrt()
+    std = _noise_along(frame, root)
     known = torch.stack([frame.known[:, ELBOWS], frame.known[:, HANDS]], -1)
     axes = upright_axes(root.turn)
     axes = torch.stack([axes, flip[1, :, None] * axes * flip[1]], 1)
     bones = lengths[:, None, None, :2].expand(*shoulder.shape[:3], 2)
     return ArmInput(shoulder, rays, known, std, axes, bones, slack)
+
+
+def _noise_along(frame: UprightFrame, root: Root) -> Float[Tensor, "B 2 2"]:
+    """Return the standard deviation of elbow and hand over the focal length, with their near ends'.
+
+    A shoulder that is not measured is as uncertain as its place in a stiff torso, and an elbow that is
+    not measured as uncertain as its shoulder.
+    """
+    joints = [SHOULDERS, ELBOWS, HANDS]
+    seen, known = frame.std[:, joints].square(), frame.known[:, joints]
+    stiff = (STIFF_SHOULDER / root.depth.mean(1)).square()[:, None]
+    shoulder = torch.where(known[:, 0], seen[:, 0], stiff)
+    elbow = torch.where(known[:, 1], seen[:, 1], shoulder)
+    return torch.stack([shoulder + seen[:, 1], elbow + seen[:, 2]], -1).sqrt()
 
 
 def _shares_of_mode(root: Root) -> Float[Tensor, "B M"]:

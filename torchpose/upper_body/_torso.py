@@ -12,6 +12,7 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 
 __all__ = [
     "NECK_HEIGHT",
+    "STIFF_SHOULDER",
     "Root",
     "Torso",
     "TorsoLengths",
@@ -31,7 +32,9 @@ _TORSO = tuple(UPPER_BODY.index(n) for n in ("shoulder_left", "shoulder_right", 
 NECK_HEIGHT = 0.105
 """Metres of Kinect's neck above the middle of the shoulders."""
 
-# Standard deviation of each torso joint about its place in a stiff torso, metres: x and y.
+STIFF_SHOULDER = 0.03
+"""Standard deviation of a shoulder about its place in a stiff torso, metres."""
+# Of each torso joint, x and y.
 _STIFF = ((0.03, 0.035), (0.03, 0.035), (0.03, 0.035), (0.05, 0.035))
 # Shoulders of raised arms move in, by a share of half the width that differs from one to the next, and up.
 # As in UTD-MHAD (s1 to s6): from 0.165 m to 0.140.
