@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import warnings
+from collections import defaultdict
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
@@ -79,6 +80,15 @@ def test_everything_else_is_private():
         if not any(part.startswith("_") for part in module.split("."))
     }
     assert open_modules == {"torchpose", "torchpose.cli", *rooms}
+
+
+def test_no_two_modules_share_a_file_name():
+    """Who searches for a file by its name finds one; only packages' own files repeat."""
+    homes = defaultdict(list)
+    for path in module_files(ROOT, ["torchpose"]).values():
+        homes[path.name].append(str(path.relative_to(ROOT)))
+    del homes["__init__.py"]
+    assert {name: paths for name, paths in homes.items() if len(paths) > 1} == {}
 
 
 def test_few_names_are_public():

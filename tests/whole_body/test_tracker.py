@@ -24,9 +24,9 @@ from torchpose.whole_body import (
     reweight,
     track_body,
 )
+from torchpose.whole_body._filter_table import BodyTrackerOptions, choose_method, method_options
 from torchpose.whole_body._filters.body_particles import BodyFilterOptions
 from torchpose.whole_body._following import all_see
-from torchpose.whole_body._methods import BodyTrackerOptions, choose_method, method_options
 
 
 @pytest.fixture(scope="module")

@@ -49,9 +49,9 @@ def main(arguments: list[str]) -> int:
 
 def command() -> Command:
     """Return the command, with the methods that are registered now."""
+    from torchpose.upper_body._estimator_table import METHODS
     from torchpose.upper_body._keypoint_files import TrackSettings
-    from torchpose.upper_body._methods import METHODS
-    from torchpose.video._tracker import VideoTracker
+    from torchpose.video._video_tracker import VideoTracker
 
     settings = [
         option._replace(text=f"{option.text}. There are {', '.join(METHODS)}")
@@ -77,7 +77,7 @@ def command() -> Command:
 
 def _method_options(leave_out: set[str]) -> tuple[Option, ...]:
     """Return the options of single methods that are no settings of all."""
-    from torchpose.upper_body._methods import METHODS, method_options
+    from torchpose.upper_body._estimator_table import METHODS, method_options
     from torchpose.upper_body._single_poses import PoseFilter
 
     having = {}

@@ -24,9 +24,9 @@ from torchpose.errors import FileFormatError, InputError, OutputError
 
 if TYPE_CHECKING:
     from torchpose.camera._pinhole import PinholeCamera
-    from torchpose.video._base import VideoSource
     from torchpose.video._recording import TrackedPerson
-    from torchpose.video._tracker import VideoTracker
+    from torchpose.video._source_interface import VideoSource
+    from torchpose.video._video_tracker import VideoTracker
 
 _OVERLAY = "overlay.mp4"
 _KEYPOINTS = "keypoints are expected as .npz, .csv or a folder of OpenPose JSON files"
@@ -42,7 +42,7 @@ def track_video(job: Job, options: dict[str, Any], face_model: str | None, overl
         overlay: whether the video and the page that show the poses are written.
     """
     from torchpose.camera._choice import resolve_camera
-    from torchpose.priors._upper_body import load_prior
+    from torchpose.priors._upper_body_prior import load_prior
 
     settings = job.settings
     _refuse_options(job, options["detector"], face_model)
@@ -124,7 +124,7 @@ def _tracker(
     fps: float,
 ) -> "VideoTracker":
     from torchpose.measure._mediapipe import MediaPipeFaceDetector
-    from torchpose.video._tracker import VideoTracker
+    from torchpose.video._video_tracker import VideoTracker
 
     faces = None if face_model is None else MediaPipeFaceDetector(face_model)
     of_keypoints = {name: getattr(job.settings, name) for name in ("neck", "measurement_std")}
@@ -149,7 +149,7 @@ def _track_camera(
     tracker: "VideoTracker", source: "VideoSource", out: Path, overlay: bool
 ) -> tuple[list["TrackedPerson"], int]:
     """Return everybody before a camera, shown on a page while it runs, until q, stop or Ctrl-C."""
-    from torchpose.video._live import LiveView
+    from torchpose.video._live_view import LiveView
     from torchpose.video._writer import VideoWriter
 
     with contextlib.ExitStack() as stack:

@@ -13,12 +13,12 @@ from torchpose.camera._choice import resolve_camera
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.errors import DegenerateFilterWarning, InputError
 from torchpose.io._keypoints import Keypoints
-from torchpose.priors._upper_body import load_prior
+from torchpose.priors._upper_body_prior import load_prior
 from torchpose.skeleton._joint_sets import canonical_names
 from torchpose.skeleton._upper_body import NECK_KINDS
-from torchpose.upper_body._methods import METHODS, WINDOWS, method_options, replace_window
+from torchpose.upper_body._estimator_table import METHODS, WINDOWS, method_options, replace_window
 from torchpose.upper_body._pose_track import PoseTrack
-from torchpose.upper_body._tracker import UpperBodyTracker
+from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 
 __all__ = ["KeypointFileTracker", "Prepared", "TrackSettings"]
 

@@ -40,7 +40,7 @@ from torchpose.upper_body._fusion import (
     recalibrated,
     stage_lag,
 )
-from torchpose.upper_body._measurements import MeasuredJoints
+from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._windows import WindowMixture, WindowState
 
 __all__ = ["MultipleModelFilter", "MultipleModelState"]

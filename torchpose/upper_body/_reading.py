@@ -11,7 +11,7 @@ from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import map_pixel_covariance, map_pixels
 from torchpose.errors import InputError
 from torchpose.math._rotations import RotationOrder
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.upper_body._estimator import (
     Bones,
     Estimates,
@@ -20,6 +20,7 @@ from torchpose.upper_body._estimator import (
     mending_notes,
     repeat_reading,
 )
+from torchpose.upper_body._estimator_table import METHODS
 from torchpose.upper_body._fusion import (
     MotionStage,
     MotionState,
@@ -30,7 +31,6 @@ from torchpose.upper_body._fusion import (
     read_out,
     recalibrated,
 )
-from torchpose.upper_body._methods import METHODS
 from torchpose.upper_body._outlier_notes import outlier_notes
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._screening import Screened
