@@ -1,5 +1,6 @@
 """The structure of the package: what its rooms show, and no circles of imports."""
 
+import ast
 import subprocess
 import sys
 import warnings
@@ -89,6 +90,16 @@ def test_no_two_modules_share_a_file_name():
         homes[path.name].append(str(path.relative_to(ROOT)))
     del homes["__init__.py"]
     assert {name: paths for name, paths in homes.items() if len(paths) > 1} == {}
+
+
+def test_no_two_modules_define_a_class_of_the_same_name():
+    """Those with an underscore are of one module alone."""
+    homes = defaultdict(list)
+    for module, path in module_files(ROOT, ["torchpose"]).items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                homes[node.name].append(module)
+    assert {name: modules for name, modules in homes.items() if len(modules) > 1} == {}
 
 
 def test_few_names_are_public():

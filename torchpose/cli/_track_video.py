@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from torchpose._core.terminal import show_progress
 from torchpose.cli._common import UntilInterrupted, pictures_possible, share_cores
 from torchpose.cli._track_output import (
-    Job,
+    TrackingJob,
     camera_text,
     report_failure,
     smoothing_text,
@@ -34,7 +34,9 @@ _KEYPOINTS = "keypoints are expected as .npz, .csv or a folder of OpenPose JSON 
 __all__ = ["track_video", "write_overlay", "write_people"]
 
 
-def track_video(job: Job, options: dict[str, Any], face_model: str | None, overlay: bool) -> int:
+def track_video(
+    job: TrackingJob, options: dict[str, Any], face_model: str | None, overlay: bool
+) -> int:
     """Track everybody, write and report, and return the exit code: 1 if there is nobody.
 
     Args:
@@ -98,7 +100,7 @@ def _open(where: str, fps: float | None) -> "VideoSource":
         raise FileFormatError(f"{error}; {_KEYPOINTS}") from error
 
 
-def _refuse_options(job: Job, detector: str | None, face_model: str | None) -> None:
+def _refuse_options(job: TrackingJob, detector: str | None, face_model: str | None) -> None:
     """Raise `InputError` for options that the measurer does not have."""
     given = {"--nose-as-head": job.settings.nose_as_head}
     if detector is None:
@@ -116,7 +118,7 @@ def _refuse_options(job: Job, detector: str | None, face_model: str | None) -> N
 
 
 def _tracker(
-    job: Job,
+    job: TrackingJob,
     options: dict[str, Any],
     face_model: str | None,
     prior: Any,

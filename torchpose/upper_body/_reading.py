@@ -23,7 +23,7 @@ from torchpose.upper_body._estimator import (
 from torchpose.upper_body._estimator_table import METHODS
 from torchpose.upper_body._fusion import (
     MotionStage,
-    MotionState,
+    MotionStageState,
     ReadOut,
     calibration_mode,
     in_camera_axes,
@@ -70,11 +70,11 @@ class PoseReader(NamedTuple):
 
     def read(
         self,
-        motion: MotionState | None,
+        motion: MotionStageState | None,
         estimates: Estimates,
         found: Screened,
         lengths: Int[Tensor, " B"] | None = None,
-    ) -> tuple[MotionState | None, PoseTrack]:
+    ) -> tuple[MotionStageState | None, PoseTrack]:
         """Return the next state of the motion stage, and the poses of T more frames.
 
         Args:
@@ -97,11 +97,11 @@ class PoseReader(NamedTuple):
 
     def _steadied(
         self,
-        motion: MotionState | None,
+        motion: MotionStageState | None,
         reading: ReadOut,
         estimates: Estimates,
         lengths: Int[Tensor, " B"] | None,
-    ) -> tuple[MotionState | None, ReadOut]:
+    ) -> tuple[MotionStageState | None, ReadOut]:
         """Return the next state of the motion stage, and what it makes of the poses.
 
         A stage that smooths takes whole sequences, of which frames from a failure on play no part.
