@@ -358,6 +358,9 @@ NAMES: dict[str, dict[str, str]] = {
     "torchpose.upper_body": {
         "upper_body._live_pose": "StreamState",
     },
+    "torchpose.upper_body._fusion": {
+        "upper_body._fusion": "MotionState=MotionStageState",
+    },
     "torchpose.video": {
         "_core.images": "Image",
         "video._camera": "CameraSource",

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.facade import set_up_facade
 from torchpose._core.module_state import derived
 from torchpose.camera._projection import (
     arm_in_body_frame,
@@ -273,3 +274,6 @@ def _with_numbers(reading: ReadOut, joints: Tensor, pixels: Tensor, placement: T
         angles=placement[..., :3],
         place=placement[..., 3:],
     )
+
+
+set_up_facade(__name__)
