@@ -13,7 +13,7 @@ from tqdm.auto import tqdm
 
 from benchmarks._upper_body import plain_prior
 from torchpose.evaluation import Report
-from torchpose.evaluation._common import (
+from torchpose.evaluation._trials import (
     CAMERA,
     MEASURED,
     Estimate,

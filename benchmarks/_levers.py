@@ -13,7 +13,7 @@ from tqdm.auto import tqdm
 from benchmarks._upper_body import MADE_WITH, data_folder, score, trials_of
 from benchmarks.engine import kept_prior, kept_runs, source_hash
 from torchpose.camera import ViewRange
-from torchpose.evaluation._common import CAMERA, MEASURED, Estimate, Trials, settings_hash
+from torchpose.evaluation._trials import CAMERA, MEASURED, Estimate, Trials, settings_hash
 from torchpose.filters import MixtureKalmanFilter
 from torchpose.io import Recording, read_recordings
 from torchpose.learning import TRAINING_VIEWS, UpperBodyRecipe
@@ -21,7 +21,7 @@ from torchpose.priors import GaussianMixture, UpperBodyPrior
 from torchpose.priors._window import WindowLayout, WindowPrior
 from torchpose.skeleton._upper_body import ARM_JOINTS
 from torchpose.upper_body import UpperBodyTracker, pixel_indices
-from torchpose.upper_body._methods import process_cov
+from torchpose.upper_body._estimator_table import process_cov
 
 FIT_PERSONS, SCORED_PERSONS = ("s1", "s2", "s4", "s5"), ("s3", "s6")
 MODES: dict[str, dict[str, Any]] = {"causal": {}, "full": {"smoothing": "full"}}

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from benchmarks._upper_body import Scores
 from torchpose.evaluation import Report
-from torchpose.evaluation._common import HANDS, Trials, add_picture
 from torchpose.evaluation._person_tables import SHORT_NAMES
+from torchpose.evaluation._trials import HANDS, Trials, add_picture
 from torchpose.metrics import jitter
-from torchpose.metrics._poses import share_below
+from torchpose.metrics._pose_errors import share_below
 from torchpose.priors import UpperBodyPrior
 
 MAIN, LAGGED, SMOOTHED = "MKF filtered", "MKF fixed lag", "MKF smoothed"

@@ -16,7 +16,7 @@ from torchpose._core.reading import read_npz
 from torchpose.errors import FileFormatError
 from torchpose.filters import MixtureKalmanFilter
 from torchpose.priors import GaussianMixture, UpperBodyPrior
-from torchpose.priors._upper_body import released_process_cov
+from torchpose.priors._upper_body_prior import released_process_cov
 
 NECK_BELOW_HEAD = 45.0
 FPS = 25.0

@@ -10,11 +10,11 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from benchmarks._upper_body import Scores
-from torchpose.evaluation._common import HANDS, Trials, add_picture
 from torchpose.evaluation._person_tables import SHORT_NAMES
 from torchpose.evaluation._report import Report, Table
+from torchpose.evaluation._trials import HANDS, Trials, add_picture
 from torchpose.metrics import jitter
-from torchpose.metrics._poses import share_below
+from torchpose.metrics._pose_errors import share_below
 from torchpose.priors import UpperBodyPrior
 
 SUMMARY = (

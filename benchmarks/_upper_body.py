@@ -14,7 +14,7 @@ from benchmarks import bones
 from benchmarks.engine import Experiment
 from torchpose.camera import PinholeCamera, project, sample_viewpoints
 from torchpose.errors import InputError
-from torchpose.evaluation._common import (
+from torchpose.evaluation._trials import (
     CAMERA,
     Estimate,
     Trials,
@@ -36,14 +36,14 @@ from torchpose.metrics import (
     reliability,
 )
 from torchpose.metrics._calibration import Coverage
-from torchpose.metrics._poses import PCP
+from torchpose.metrics._pose_errors import PCP
 from torchpose.priors import UpperBodyPrior
 from torchpose.skeleton._upper_body import mirror_pose
 from torchpose.upper_body._single_poses import default_process_cov
 
 MADE_WITH = (
     "torchpose/camera", "torchpose/filters", "torchpose/math", "torchpose/priors",
-    "torchpose/skeleton", "torchpose/upper_body", "torchpose/evaluation/_common.py",
+    "torchpose/skeleton", "torchpose/upper_body", "torchpose/evaluation/_trials.py",
 )  # fmt: skip
 """What the numbers of a tracker depend on beside its facts: files and folders of a checkout."""
 

@@ -34,7 +34,7 @@ from benchmarks.ub_one import split_recording
 from benchmarks.ub_people import TEST_PERSONS, mean_pose, people
 from torchpose._core.files import check_output_folder
 from torchpose.evaluation import Report
-from torchpose.evaluation._common import CAMERA, MEASURED, Estimate, Trials, cached_prior
+from torchpose.evaluation._trials import CAMERA, MEASURED, Estimate, Trials, cached_prior
 from torchpose.io import Recording
 from torchpose.learning import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior

@@ -23,7 +23,7 @@ from torchpose.camera import PinholeCamera
 from torchpose.measure import HeadNeck
 from torchpose.measure._face import FaceTracker
 from torchpose.measure._head import FACE_OFFSETS
-from torchpose.measure._upper_body import MEASURED, rounded_covariance
+from torchpose.measure._upper_body_measurer import MEASURED, rounded_covariance
 from torchpose.priors import load_prior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import UpperBodyTracker

@@ -24,7 +24,7 @@ from benchmarks._upper_body import MADE_WITH, data_folder, plain_prior, score
 from benchmarks.engine import Experiment, Grid, Results
 from benchmarks.speed._timing import machine_line, markdown_table
 from torchpose._core.files import atomic_path, check_output_folder
-from torchpose.evaluation._common import CAMERA, Trials, centred_on_neck, make_test_set, track
+from torchpose.evaluation._trials import CAMERA, Trials, centred_on_neck, make_test_set, track
 from torchpose.io import Recording, read_recordings
 from torchpose.learning import UpperBodyRecipe
 from torchpose.learning._fine_tuning import TunableKalman, draw_sequences, parameter_groups

@@ -21,7 +21,7 @@ from benchmarks._upper_body import score
 from benchmarks.ub_people import TEST_PERSONS, people, sway
 from torchpose.camera import PinholeCamera
 from torchpose.errors import OverlapError
-from torchpose.evaluation._common import CAMERA, Trials, centred_on_neck, make_test_set, track
+from torchpose.evaluation._trials import CAMERA, Trials, centred_on_neck, make_test_set, track
 from torchpose.priors import UpperBodyPrior, load_prior
 
 FOCAL, CENTRE = 525.0, (319.5, 239.5)  # of the test camera

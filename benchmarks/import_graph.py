@@ -1,20 +1,22 @@
 """Print the import graph between the rooms of torchpose: edges, circles, sizes, public names.
 
-    python -m benchmarks.import_graph                 # this checkout
-    python -m benchmarks.import_graph OTHER_CHECKOUT  # another one, for a comparison
+    python -m benchmarks.import_graph                    # this checkout
+    python -m benchmarks.import_graph --checkout FOLDER  # another one, for a comparison
 
 A room is a package or module directly in `torchpose`, or one of the programs beside it (`benchmarks`,
 `train`). Every import statement counts: those that run on import, inside a function, or for type
 checkers only.
-Nothing is imported: the files are parsed.
+No module of the checkout is imported: the files are parsed.
 """
 
 import ast
-import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
+
+from benchmarks._command import run_command
+from torchpose.errors import InputError
 
 __all__ = [
     "Room",
@@ -196,10 +198,15 @@ def rooms(root: Path) -> dict[str, Room]:
     return result
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Print the table of rooms, the circles and the sums."""
-    arguments = sys.argv[1:] if argv is None else argv
-    root = Path(arguments[0]) if arguments else _ROOT
+def main(*, checkout: Path | None = None) -> None:
+    """Print the table of rooms, the circles and the sums.
+
+    Args:
+        checkout: folder of a checkout; the one that this program is in, if it is left out.
+    """
+    root = _ROOT if checkout is None else checkout
+    if not (root / "torchpose").is_dir():
+        raise InputError(f"{root}: expected a checkout, with a folder torchpose")
     found = rooms(root)
     inside = {n: room for n, room in found.items() if n not in PROGRAMS}
     print(f"{'room':<12} {'files':>5} {'lines':>6} {'code':>6} {'public':>6}  imports")
@@ -219,8 +226,7 @@ def main(argv: list[str] | None = None) -> int:
         f"{sum(r.files for r in inside.values())} files, {sum(r.lines for r in inside.values())} lines, "
         f"{sum(r.code for r in inside.values())} of code, {len(distinct_names(root))} public names"
     )
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

@@ -22,7 +22,7 @@ from benchmarks._upper_body import Tracker, data_folder, score, trials_of, with_
 from benchmarks.ub_people import TEST_PERSONS, TRAIN_PERSONS
 from torchpose._core.files import check_output_folder
 from torchpose.evaluation import Report
-from torchpose.evaluation._common import CAMERA, Estimate, Trials, cached_prior
+from torchpose.evaluation._trials import CAMERA, Estimate, Trials, cached_prior
 from torchpose.evaluation._unseen import QUICK
 from torchpose.io import read_recordings
 from torchpose.learning import fit_kinect_prior

@@ -17,7 +17,7 @@ import torch
 from benchmarks._command import OneOf, run_command
 from benchmarks._upper_body import plain_prior, score, trials_of
 from benchmarks.ub_people import people
-from torchpose.evaluation._common import CAMERA, Trials, track
+from torchpose.evaluation._trials import CAMERA, Trials, track
 from torchpose.learning import UpperBodyRecipe
 from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import METHODS, PoseFilter, method_options

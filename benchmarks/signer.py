@@ -34,7 +34,7 @@ from benchmarks._upper_body import data_folder
 from torchpose._core.files import check_output_folder
 from torchpose._core.reading import read_npz
 from torchpose.evaluation import Report
-from torchpose.evaluation._common import add_picture
+from torchpose.evaluation._trials import add_picture
 from torchpose.filters import MixtureKalmanFilter
 from torchpose.priors import UpperBodyPrior
 

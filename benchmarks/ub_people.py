@@ -48,7 +48,7 @@ from benchmarks.engine import Grid
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
-from torchpose.evaluation._common import (
+from torchpose.evaluation._trials import (
     CAMERA,
     Estimate,
     Recipe,

@@ -24,8 +24,8 @@ from benchmarks.engine import Grid, describe
 from benchmarks.ub_people import people
 from torchpose._core.files import check_output_folder
 from torchpose.evaluation import Report
-from torchpose.evaluation._common import Estimate, Trials, cached_prior
 from torchpose.evaluation._person_tables import SHORT_NAMES
+from torchpose.evaluation._trials import Estimate, Trials, cached_prior
 from torchpose.evaluation._unseen import QUICK
 from torchpose.io import Recording
 from torchpose.learning import fit_kinect_prior

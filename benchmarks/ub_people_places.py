@@ -17,14 +17,14 @@ from benchmarks._command import run_command
 from benchmarks._upper_body import score
 from benchmarks.ub_people import people, sway
 from torchpose._core.files import check_output_folder
-from torchpose.evaluation._common import (
+from torchpose.evaluation._trials import (
     CAMERA,
     Trials,
     cached_prior,
     centred_on_neck,
     make_test_set,
 )
-from torchpose.evaluation._common import track as track_test
+from torchpose.evaluation._trials import track as track_test
 from torchpose.learning import fit_kinect_prior
 from torchpose.priors import UpperBodyPrior
 

@@ -33,7 +33,8 @@ from benchmarks._upper_body import score
 from benchmarks.ub_people import people, sway
 from torchpose.camera import project, sample_viewpoints
 from torchpose.evaluation import Report
-from torchpose.evaluation._common import (
+from torchpose.evaluation._person_tables import SHORT_NAMES
+from torchpose.evaluation._trials import (
     CAMERA,
     MEASURED,
     Estimate,
@@ -41,7 +42,6 @@ from torchpose.evaluation._common import (
     centred_on_neck,
     make_test_set,
 )
-from torchpose.evaluation._person_tables import SHORT_NAMES
 from torchpose.learning import TRAINING_VIEWS
 from torchpose.math import euler_to_matrix
 from torchpose.skeleton import UPPER_BODY

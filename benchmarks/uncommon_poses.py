@@ -15,7 +15,7 @@ from benchmarks.ub_people import people
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
-from torchpose.evaluation._common import Recipe, add_picture
+from torchpose.evaluation._person_recordings import POSE_CLASSES, by_person, pose_classes
 from torchpose.evaluation._person_tables import (
     add_pose_classes,
     class_error,
@@ -23,7 +23,7 @@ from torchpose.evaluation._person_tables import (
     plot_pose_classes,
     pooled,
 )
-from torchpose.evaluation._persons import POSE_CLASSES, by_person, pose_classes
+from torchpose.evaluation._trials import Recipe, add_picture
 from torchpose.evaluation._unseen import Job, ScoreSettings, fit_settings, run_jobs
 from torchpose.io import Recording
 from torchpose.learning import fit_kinect_prior

@@ -24,12 +24,12 @@ from torchpose._core.files import check_output_folder
 from torchpose.camera import PinholeCamera
 from torchpose.evaluation import Report
 from torchpose.metrics import pcp
-from torchpose.metrics._poses import ARM_LIMBS, PCP
+from torchpose.metrics._pose_errors import ARM_LIMBS, PCP
 from torchpose.priors import UpperBodyPrior, load_prior
 from torchpose.skeleton import UPPER_BODY
 from torchpose.upper_body import UpperBodyTracker
 from torchpose.video import VideoFrame, open_video
-from torchpose.video._tracker import VideoTracker
+from torchpose.video._video_tracker import VideoTracker
 
 HEAD = UPPER_BODY.index("head")
 TRUNK = (HEAD, UPPER_BODY.index("neck"))

@@ -277,7 +277,7 @@ def test_the_public_names_are_found():
     found = public()
     assert len(found) > 400
     assert {item.kind for item in found.values()} == {"function", "property", "class"}
-    for name in ("math._rotations.compose", "whole_body._tracker.BodyTracker.step"):
+    for name in ("math._rotations.compose", "whole_body._body_tracker.BodyTracker.step"):
         assert f"torchpose.{name}" in found
 
 

@@ -1,8 +1,10 @@
 """The structure of the package: what its rooms show, and no circles of imports."""
 
+import ast
 import subprocess
 import sys
 import warnings
+from collections import defaultdict
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
@@ -79,6 +81,25 @@ def test_everything_else_is_private():
         if not any(part.startswith("_") for part in module.split("."))
     }
     assert open_modules == {"torchpose", "torchpose.cli", *rooms}
+
+
+def test_no_two_modules_share_a_file_name():
+    """Who searches for a file by its name finds one; only packages' own files repeat."""
+    homes = defaultdict(list)
+    for path in module_files(ROOT, ["torchpose"]).values():
+        homes[path.name].append(str(path.relative_to(ROOT)))
+    del homes["__init__.py"]
+    assert {name: paths for name, paths in homes.items() if len(paths) > 1} == {}
+
+
+def test_no_two_modules_define_a_class_of_the_same_name():
+    """Those with an underscore are of one module alone."""
+    homes = defaultdict(list)
+    for module, path in module_files(ROOT, ["torchpose"]).items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                homes[node.name].append(module)
+    assert {name: modules for name, modules in homes.items() if len(modules) > 1} == {}
 
 
 def test_few_names_are_public():

@@ -35,13 +35,13 @@ if TYPE_CHECKING:
     from torchpose.priors._shipped import load_action as load_action
     from torchpose.priors._shipped import load_limb_conditionals as load_limb_conditionals
     from torchpose.priors._shipped import load_manifold as load_manifold
-    from torchpose.priors._upper_body import UpperBodyPrior as UpperBodyPrior
-    from torchpose.priors._upper_body import load_prior as load_prior
+    from torchpose.priors._upper_body_prior import UpperBodyPrior as UpperBodyPrior
+    from torchpose.priors._upper_body_prior import load_prior as load_prior
     from torchpose.upper_body._pose_track import PoseTrack as PoseTrack
-    from torchpose.upper_body._tracker import UpperBodyTracker as UpperBodyTracker
-    from torchpose.video._tracker import VideoTracker as VideoTracker
-    from torchpose.whole_body._poses import BodyTrack as BodyTrack
-    from torchpose.whole_body._tracker import BodyTracker as BodyTracker
+    from torchpose.upper_body._upper_body_tracker import UpperBodyTracker as UpperBodyTracker
+    from torchpose.video._video_tracker import VideoTracker as VideoTracker
+    from torchpose.whole_body._body_track import BodyTrack as BodyTrack
+    from torchpose.whole_body._body_tracker import BodyTracker as BodyTracker
 
     __version__: str
 
@@ -67,19 +67,19 @@ _PACKAGES = frozenset(
     ]
 )
 _HOMES = {
-    "BodyTrack": "whole_body._poses",
-    "BodyTracker": "whole_body._tracker",
+    "BodyTrack": "whole_body._body_track",
+    "BodyTracker": "whole_body._body_tracker",
     "GaussianMixture": "priors._gaussian_mixture",
     "PinholeCamera": "camera._pinhole",
     "PoseTrack": "upper_body._pose_track",
     "TorchposeError": "errors",
-    "UpperBodyPrior": "priors._upper_body",
-    "UpperBodyTracker": "upper_body._tracker",
-    "VideoTracker": "video._tracker",
+    "UpperBodyPrior": "priors._upper_body_prior",
+    "UpperBodyTracker": "upper_body._upper_body_tracker",
+    "VideoTracker": "video._video_tracker",
     "load_action": "priors._shipped",
     "load_limb_conditionals": "priors._shipped",
     "load_manifold": "priors._shipped",
-    "load_prior": "priors._upper_body",
+    "load_prior": "priors._upper_body_prior",
     "without_value_checks": "_core.value_checks",
 }
 

@@ -10,7 +10,7 @@ import torch
 from torchpose.learning._fit_files import write_action_files
 from torchpose.learning._recipes import ActionRecipe, Performances, fit_actions
 from torchpose.learning._recipes.actions import FittedActions, check_actions
-from torchpose.priors._actions.file import BankInfo
+from torchpose.priors._actions.action_file import BankInfo
 from train.body_fit import BodyData, BodyFit
 
 __all__ = ["ActionData", "ActionFit"]

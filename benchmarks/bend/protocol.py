@@ -48,7 +48,7 @@ from benchmarks.engine.tuning import SCALES
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
-from torchpose.evaluation._common import add_picture
+from torchpose.evaluation._trials import add_picture
 from torchpose.io import read_mocap
 from torchpose.io._mocap import MocapClip, select_persons
 

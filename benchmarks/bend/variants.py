@@ -16,7 +16,7 @@ from torchpose.body import BODY_15, Body, centres_of, fit_body, fit_state
 from torchpose.io._mocap import MocapClip
 from torchpose.learning._action_spaces import fit_synchronised
 from torchpose.priors import ActionBank, ActionSpace, posture_angles, state_postures
-from torchpose.priors._actions.file import ActionInfo, Synchronised
+from torchpose.priors._actions.action_file import ActionInfo, Synchronised
 from torchpose.priors._actions.gate import Acceptance
 from torchpose.priors._actions.polar_limbs import LIMBS_12
 from torchpose.whole_body import ConstrainedParticleFilter, constant_velocity_std

@@ -15,7 +15,7 @@ from torchpose.body import Body, fit_body, fit_state
 from torchpose.camera import CameraRig
 from torchpose.demo._rendering.clothed_body import TrueShape
 from torchpose.errors import InputError
-from torchpose.evaluation._common import settings_hash
+from torchpose.evaluation._trials import settings_hash
 from torchpose.io._mocap import MocapClip
 from torchpose.metrics import joint_errors
 from torchpose.whole_body import count_pixels

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.bones.views import recordings
-from torchpose.learning._arms import fit_arm_prior
+from torchpose.learning._arm_prior_fit import fit_arm_prior
 from torchpose.priors._arms import ArmPrior
 
 SETS = {

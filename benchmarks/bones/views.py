@@ -13,11 +13,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 import torchpose
-from torchpose.evaluation._common import CAMERA, centred_on_neck, make_test_set
+from torchpose.evaluation._trials import CAMERA, centred_on_neck, make_test_set
 from torchpose.io import Recording, read_recordings
 from torchpose.skeleton import UPPER_BODY
 from torchpose.skeleton._joint_sets import canonical_names
-from torchpose.upper_body._face import FACE
+from torchpose.upper_body._face_points import FACE
 
 _SEVEN = ("wrist_left", "elbow_left", "shoulder_left", "neck", "shoulder_right", "elbow_right",
           "wrist_right")  # fmt: skip

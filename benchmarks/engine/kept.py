@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from torchpose.errors import TorchposeError
-from torchpose.evaluation._common import keep, read_kept, settings_hash
+from torchpose.evaluation._trials import keep, read_kept, settings_hash
 from torchpose.priors import UpperBodyPrior
 
 _CHECKOUT = Path(__file__).parents[2]

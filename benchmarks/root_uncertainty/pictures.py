@@ -20,7 +20,7 @@ from benchmarks.root_uncertainty.walkers import METHODS, Budget, Walker, make_fi
 from torchpose.body import Body, Limbs, fit_state
 from torchpose.camera import CameraRig
 from torchpose.evaluation import Report
-from torchpose.evaluation._common import add_picture
+from torchpose.evaluation._trials import add_picture
 from torchpose.math._unscented import sigma_points
 from torchpose.viz._style import (
     INK,

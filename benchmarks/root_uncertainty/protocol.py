@@ -53,7 +53,7 @@ from benchmarks.silhouette.protocol import WALKERS
 from torchpose._core.files import check_output_folder
 from torchpose.errors import DegenerateFilterWarning, InputError
 from torchpose.evaluation import Report
-from torchpose.evaluation._common import add_picture
+from torchpose.evaluation._trials import add_picture
 from torchpose.io import read_mocap
 from torchpose.io._mocap import MocapClip
 

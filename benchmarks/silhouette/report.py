@@ -27,7 +27,7 @@ from benchmarks.engine import (
 from benchmarks.engine.statistics import Cell
 from benchmarks.silhouette.filters import SilhouettePerson, label_of
 from torchpose.evaluation import Report
-from torchpose.evaluation._common import add_picture
+from torchpose.evaluation._trials import add_picture
 
 _WHOLE, _ARMS = part_error(), part_error("arms")
 

@@ -15,7 +15,7 @@ from torchpose.cli._evaluate import build
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", *(ROOT / "docs").rglob("*.md")]
-OTHERS = {"import_graph", "speed", "speed.NAME"} | {
+OTHERS = {"speed", "speed.NAME"} | {
     name.removesuffix(".py").removesuffix("/__main__").replace("/", ".") for name in OWN_PARSERS
 }
 

@@ -6,7 +6,7 @@ import torch
 from benchmarks import outliers
 from tests.data import data_dir_or_skip
 from torchpose.demo import performer
-from torchpose.evaluation._common import CAMERA, make_test_set
+from torchpose.evaluation._trials import CAMERA, make_test_set
 
 
 @pytest.fixture(scope="module")

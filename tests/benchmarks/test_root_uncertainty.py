@@ -44,7 +44,7 @@ from tests.benchmarks.walkers import write_walkers
 from torchpose.cli._evaluate import build
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
-from torchpose.evaluation._common import settings_hash
+from torchpose.evaluation._trials import settings_hash
 from torchpose.io import read_mocap
 from torchpose.math import quaternion_vector_to_matrix
 from torchpose.whole_body import AnnealedParticleFilter, RootUncertaintyTracker

@@ -25,7 +25,7 @@ def shipped(files, tmp_path, monkeypatch):
     weights.mkdir()
     prior = (files / "prior.safetensors").read_bytes()
     (weights / "kinect-upper-body.safetensors").write_bytes(prior)
-    monkeypatch.setattr("torchpose.priors._upper_body.WEIGHTS", weights)
+    monkeypatch.setattr("torchpose.priors._upper_body_prior.WEIGHTS", weights)
 
 
 def test_demo_beats_the_mean_pose(torchpose, shipped, tmp_path):

@@ -12,7 +12,7 @@ from torchpose.camera import PinholeCamera
 from torchpose.io import write_keypoints
 from torchpose.learning import fit_action_space, fit_gplvm, fit_limb_conditionals
 from torchpose.priors import ActionBank, ManifoldInfo
-from torchpose.priors._actions.file import ActionInfo
+from torchpose.priors._actions.action_file import ActionInfo
 from torchpose.priors._limb_conditionals import in_body_frame
 from torchpose.whole_body import BodyTrack
 

@@ -26,7 +26,7 @@ from torchpose.learning import ActionRecipe, ManifoldRecipe, UpperBodyRecipe
 from torchpose.upper_body import METHODS, method_options, register_method
 from torchpose.upper_body._keypoint_files import TrackSettings
 from torchpose.upper_body._windows import WindowMixture
-from torchpose.whole_body import _methods as body_methods
+from torchpose.whole_body import _filter_table as body_methods
 
 COMMAND_OF = {
     "track": track.command,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from torchpose.evaluation import Report
-from torchpose.evaluation._common import add_picture
+from torchpose.evaluation._trials import add_picture
 from torchpose.io._results import ResultsFolder
 from torchpose.upper_body import PoseTrack
 from torchpose.video import VideoWriter

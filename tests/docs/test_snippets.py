@@ -50,7 +50,7 @@ def folder(tmp_path, monkeypatch):
 def methods():
     """Take back what a snippet registers."""
     from torchpose.upper_body import METHODS
-    from torchpose.whole_body._methods import METHODS as BODY_METHODS
+    from torchpose.whole_body._filter_table import METHODS as BODY_METHODS
 
     before = [(table, dict(table)) for table in (METHODS, BODY_METHODS)]
     yield

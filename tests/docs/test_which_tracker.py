@@ -10,9 +10,9 @@ import torchpose
 from torchpose.demo import KEYPOINT_NAMES, noisy_keypoints, performer
 from torchpose.errors import InputError
 from torchpose.upper_body import METHODS, UpperBodyTracker, method_options
+from torchpose.whole_body._filter_table import METHODS as BODY_METHODS
+from torchpose.whole_body._filter_table import method_options as body_options
 from torchpose.whole_body._filters.body_particles import BodyFilterOptions
-from torchpose.whole_body._methods import METHODS as BODY_METHODS
-from torchpose.whole_body._methods import method_options as body_options
 
 PAGE = (Path(__file__).parents[2] / "docs" / "which-tracker.md").read_text("utf-8")
 

@@ -12,8 +12,8 @@ from tests.evaluation.recordings import poses, small_recipe, write_people
 from torchpose.camera import PinholeCamera
 from torchpose.errors import InputError
 from torchpose.evaluation import Report
-from torchpose.evaluation import _common as common
-from torchpose.evaluation._common import (
+from torchpose.evaluation import _trials as common
+from torchpose.evaluation._trials import (
     TEST_ANGLES,
     TEST_TRANSLATION,
     Estimate,

@@ -18,11 +18,11 @@ from torchpose.errors import InputError, OutputError
 from torchpose.evaluation import _cross_dataset as cross_dataset
 from torchpose.evaluation import _learning_curve as learning_curve
 from torchpose.evaluation import _leave_one_person_out as leave_one_person_out
-from torchpose.evaluation import _persons as persons_module
+from torchpose.evaluation import _person_recordings as persons_module
 from torchpose.evaluation import _unseen as unseen
 from torchpose.evaluation._learning_curve import cyclic_subsets, halves
+from torchpose.evaluation._person_recordings import POSE_CLASSES
 from torchpose.evaluation._person_tables import mean_error
-from torchpose.evaluation._persons import POSE_CLASSES
 from torchpose.io import read_recordings
 from torchpose.skeleton import SKELETONS
 

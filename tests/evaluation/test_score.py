@@ -12,7 +12,7 @@ from torchpose.camera import PinholeCamera
 from torchpose.cli import _evaluate as evaluate
 from torchpose.errors import InputError, OverlapError
 from torchpose.evaluation import _score as score
-from torchpose.evaluation._common import CAMERA, MEASURED, make_test_set, track
+from torchpose.evaluation._trials import CAMERA, MEASURED, make_test_set, track
 from torchpose.evaluation._unseen import poses_to_score
 from torchpose.io import read_recordings
 from torchpose.metrics import align

@@ -8,11 +8,11 @@ import torch
 from tests.evaluation.recordings import poses, small_recipe, write_one, write_people
 from torchpose.camera import ViewRange, sample_viewpoints
 from torchpose.errors import InputError, OverlapError, PriorError
-from torchpose.evaluation import _persons as persons_module
+from torchpose.evaluation import _person_recordings as persons_module
 from torchpose.evaluation import _unseen as unseen
-from torchpose.evaluation._common import CAMERA, centred_on_neck, make_test_set, track
 from torchpose.evaluation._completion import with_wrists
 from torchpose.evaluation._person_tables import mean_error, pooled
+from torchpose.evaluation._trials import CAMERA, centred_on_neck, make_test_set, track
 from torchpose.io import read_recordings
 from torchpose.metrics import joint_errors_3d
 from torchpose.priors._arm_state import arm_states

@@ -15,7 +15,7 @@ from torchpose import metrics
 from torchpose.camera import CameraRig, PinholeCamera
 from torchpose.filters import BootstrapParticleFilter, MixtureKalmanFilter
 from torchpose.metrics._calibration import chi2_cdf, chi2_quantile, mahalanobis_squared
-from torchpose.metrics._poses import limb_hits, share_below
+from torchpose.metrics._pose_errors import limb_hits, share_below
 from torchpose.priors import GaussianMixture
 from torchpose.upper_body import UpperBodyTracker
 

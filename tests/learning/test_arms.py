@@ -8,7 +8,7 @@ import torch
 from torchpose.demo import performer
 from torchpose.errors import InputError
 from torchpose.io import Recording
-from torchpose.learning._arms import arm_directions, fit_arm_prior
+from torchpose.learning._arm_prior_fit import arm_directions, fit_arm_prior
 from torchpose.math import euler_to_matrix
 from torchpose.skeleton import UPPER_BODY
 from torchpose.skeleton._torso import upright_axes

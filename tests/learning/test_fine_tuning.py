@@ -22,7 +22,7 @@ from torchpose.learning._fine_tuning import (
 from torchpose.learning._recipes import UpperBodyRecipe
 from torchpose.metrics import joint_errors_3d
 from torchpose.priors import UpperBodyPrior
-from torchpose.priors._upper_body import released_process_cov
+from torchpose.priors._upper_body_prior import released_process_cov
 from torchpose.upper_body import UpperBodyTracker
 
 RECIPE = UpperBodyRecipe(

@@ -6,7 +6,7 @@ import torch
 from torchpose.camera import ViewRange
 from torchpose.io import Recording
 from torchpose.learning._training import collect_poses
-from torchpose.learning._upper_body import increment_covs
+from torchpose.learning._upper_body_prior_fit import increment_covs
 from torchpose.skeleton import UPPER_BODY
 
 F, CX, CY, DEPTH = 500.0, 320.0, 240.0, 2.0

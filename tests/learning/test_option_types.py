@@ -8,11 +8,11 @@ import pytest
 from torchpose.learning import UpperBodyRecipe
 from torchpose.learning._recipes.settings import RecipeSettings
 from torchpose.learning._streamed_em import StartOptions, StreamedEM
-from torchpose.learning._upper_body import MixtureFitOptions
+from torchpose.learning._upper_body_prior_fit import MixtureFitOptions
 from torchpose.priors import GaussianMixture
 from torchpose.priors._facts import FitFacts, ManifoldFacts
 from torchpose.priors._limb_conditionals import LimbInfo
-from torchpose.priors._manifold.file import ManifoldInfo
+from torchpose.priors._manifold.manifold_file import ManifoldInfo
 
 
 def names(function):

@@ -12,7 +12,7 @@ from torchpose.errors import InputError, ShapeError
 from torchpose.measure import UpperBodyMeasurer
 from torchpose.measure._face import FaceTracker
 from torchpose.measure._skin import SkinModel, SkinState
-from torchpose.measure._torso import _supported, clothes_likelihood, elbows_from_torso
+from torchpose.measure._torso_elbows import _supported, clothes_likelihood, elbows_from_torso
 
 cv2 = pytest.importorskip("cv2")
 

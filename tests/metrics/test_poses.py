@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from torchpose import metrics
 from torchpose.errors import InputError, MissingDependencyError, ShapeError
 from torchpose.metrics._calibration import chi2_cdf, chi2_quantile
-from torchpose.metrics._poses import share_below
+from torchpose.metrics._pose_errors import share_below
 
 
 def normal(*shape: int, seed: int = 0) -> torch.Tensor:

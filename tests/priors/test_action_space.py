@@ -14,7 +14,7 @@ from torchpose.learning import fit_action_space
 from torchpose.learning._action_spaces import fit_synchronised
 from torchpose.learning._performances import repetition_axis, split_repetitions
 from torchpose.priors import ActionSpace
-from torchpose.priors._actions.file import ActionInfo
+from torchpose.priors._actions.action_file import ActionInfo
 from torchpose.priors._actions.gate import match_postures
 from torchpose.priors._actions.polar_limbs import LIMBS_12
 from torchpose.priors._actions.postures import normalise_postures, posture_angles, state_postures

@@ -24,7 +24,7 @@ from torchpose.learning._model_card import model_card, write_model_card
 from torchpose.learning._samplers import all_samples
 from torchpose.learning._training import arm_sources, collect_poses
 from torchpose.priors import GaussianMixture, UpperBodyPrior, known_priors, load_prior
-from torchpose.priors import _upper_body as module
+from torchpose.priors import _upper_body_prior as module
 from torchpose.priors._prior_file import PriorInfo
 
 

@@ -15,7 +15,7 @@ from torchpose.priors import UpperBodyPrior
 from torchpose.priors._window import WindowLayout, WindowPrior
 from torchpose.skeleton._torso import in_torso_axes
 from torchpose.upper_body import UpperBodyTracker
-from torchpose.upper_body._measurements import in_prior_pixels
+from torchpose.upper_body._measured_joints import in_prior_pixels
 from torchpose.upper_body._picked import pick_joints
 
 NAMES = list(KEYPOINT_NAMES)

@@ -5,7 +5,7 @@ import torch
 from tests.priors.poses import poses
 from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.metrics import joint_errors_3d
-from torchpose.metrics._poses import ALIGN_JOINTS
+from torchpose.metrics._pose_errors import ALIGN_JOINTS
 from torchpose.skeleton._torso import TORSO, in_torso_axes, onto_torso
 
 TURN = rotvec_to_matrix(torch.tensor([0.3, -0.5, 0.2], dtype=torch.float64))

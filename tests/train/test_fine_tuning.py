@@ -17,7 +17,7 @@ from tests.priors.poses import poses
 from torchpose.io import read_recordings
 from torchpose.learning._recipes import UpperBodyRecipe
 from torchpose.priors import UpperBodyPrior, load_prior
-from torchpose.priors._upper_body import released_process_cov
+from torchpose.priors._upper_body_prior import released_process_cov
 from torchpose.skeleton import UPPER_BODY
 from train.cli import main
 from train.fine_tuning import FineTuning

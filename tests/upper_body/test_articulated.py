@@ -17,7 +17,7 @@ from torchpose.upper_body._arm_chain import Arms
 from torchpose.upper_body._articulated import ArticulatedFilter
 from torchpose.upper_body._articulated_poses import _trust
 from torchpose.upper_body._estimator import TrackerModel
-from torchpose.upper_body._torso import half_widths, see_torso
+from torchpose.upper_body._torso_likelihood import half_widths, see_torso
 
 CAMERA = torchpose.PinholeCamera(525.0, 525.0, 319.5, 239.5)
 ROW = {name: i for i, name in enumerate(UPPER_BODY)}

@@ -10,7 +10,7 @@ from torchpose.camera import PinholeCamera, project
 from torchpose.camera._projection import backproject
 from torchpose.demo import performer
 from torchpose.priors import load_prior
-from torchpose.priors._upper_body import released_process_cov
+from torchpose.priors._upper_body_prior import released_process_cov
 from torchpose.skeleton import LEFT_ARM, RIGHT_ARM, UPPER_BODY
 from torchpose.upper_body import PoseTrack, UpperBodyTracker
 from torchpose.upper_body._reading import note_collapse

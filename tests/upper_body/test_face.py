@@ -9,7 +9,7 @@ import torchpose
 from tests.upper_body.test_articulated import CAMERA, PRIOR, ROW, body, pixels
 from torchpose.math import euler_to_matrix
 from torchpose.skeleton import UPPER_BODY
-from torchpose.upper_body._face import FACE, FacePoints, face_evidence, head_in_face
+from torchpose.upper_body._face_points import FACE, FacePoints, face_evidence, head_in_face
 
 TURNS = torch.deg2rad(torch.arange(-180.0, 180.0, 15.0, dtype=torch.float64))
 DEPTH = torch.tensor([1.5, 2.5], dtype=torch.float64)

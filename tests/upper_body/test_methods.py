@@ -22,7 +22,7 @@ from torchpose.upper_body import (
     register_method,
 )
 from torchpose.upper_body._estimator import arm_joints
-from torchpose.upper_body._measurements import in_prior_pixels
+from torchpose.upper_body._measured_joints import in_prior_pixels
 from torchpose.upper_body._picked import pick_joints
 
 NAMES = list(KEYPOINT_NAMES)

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from torchpose.priors import UpperBodyPrior, load_prior
-from torchpose.priors._upper_body import released_process_cov
+from torchpose.priors._upper_body_prior import released_process_cov
 from torchpose.upper_body import METHODS, PoseFilter, UpperBodyTracker
-from torchpose.upper_body._methods import process_cov
+from torchpose.upper_body._estimator_table import process_cov
 
 FACTORS = {
     name: method.noise.factor for name, method in METHODS.items() if isinstance(method, PoseFilter)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchpose.upper_body._root_grid import RootGrid
-from torchpose.upper_body._torso import TorsoLengths, see_torso, torso_places
+from torchpose.upper_body._torso_likelihood import TorsoLengths, see_torso, torso_places
 
 LIKE = torch.zeros((), dtype=torch.float64)
 STD = 2.0 / 525.0

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from torchpose.errors import InputError, OutputError
-from torchpose.video._live import LiveView
+from torchpose.video._live_view import LiveView
 
 PATIENCE = 5.0
 

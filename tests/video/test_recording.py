@@ -7,7 +7,7 @@ import torch
 
 from torchpose.demo import KEYPOINT_NAMES, demo_camera, noisy_keypoints, performer
 from torchpose.measure._hand_likelihood import without_elbows
-from torchpose.measure._upper_body import MEASURED, FrameMeasurements, rounded_covariance
+from torchpose.measure._upper_body_measurer import MEASURED, FrameMeasurements, rounded_covariance
 from torchpose.priors import UpperBodyPrior
 from torchpose.upper_body import UpperBodyTracker
 from torchpose.video._person_stream import PersonStream

@@ -42,6 +42,22 @@ def test_what_is_saved_is_loaded(tmp_path, frame):
     assert after.body.frame == frame
 
 
+def test_failures_are_told_as_in_a_pose_track():
+    track = poses()
+    assert (track.failed_at.tolist(), track.failed.tolist()) == (-1, False)
+    track.respread[2:] = True
+    at, failed = track.failed_at, track.failed
+    assert (at.shape, at.dtype, at.tolist()) == ((), torch.int64, 2)
+    assert (failed.shape, failed.dtype, failed.tolist()) == ((), torch.bool, True)
+    # as a number, which it was
+    assert (
+        f"{at:03d}" == "002"
+        and at == 2
+        and track.joints3d[at:].shape[0] == 2
+        and [5, 6, 7][at] == 7
+    )
+
+
 def test_details_are_saved_by_their_names(tmp_path):
     before = poses()
     before.details = {"actions": torch.rand(4, 3), "released": torch.tensor([True, False] * 2)}

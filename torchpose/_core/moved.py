@@ -41,8 +41,8 @@ MODULES = {
     "body.shape": "whole_body._silhouettes.shape",
     "body.silhouette": "whole_body._silhouettes.rendering",
     "body.silhouette_likelihood": "whole_body._silhouettes.likelihood",
-    "body_poses": "whole_body._poses",
-    "body_tracking": "whole_body._tracker",
+    "body_poses": "whole_body._body_track",
+    "body_tracking": "whole_body._body_tracker",
     "body_view": "camera._virtual_camera",
     "calibration": "metrics._calibration",
     "camera_rig": "camera._rig",
@@ -52,6 +52,7 @@ MODULES = {
     "collapse": "upper_body._reading",
     "curation": "learning._curation",
     "filters.annealed": "whole_body._filters.annealed",
+    "filters.base": "filters._recursive_filter",
     "filters.body_frames": "whole_body._filters.body_frames",
     "filters.body_particles": "whole_body._filters.body_particles",
     "filters.constrained": "whole_body._filters.constrained",
@@ -64,7 +65,7 @@ MODULES = {
     "filters.joint_spread": "whole_body._filters.body_particles",
     "filters.leg_swap": "whole_body._filters.legs",
     "filters.limb_observations": "whole_body._filters.limb_observations",
-    "filters.manifold": "whole_body._filters.manifold",
+    "filters.manifold": "whole_body._filters.manifold_regularised",
     "filters.mending": "filters._outputs",
     "filters.particle_options": "filters._particle",
     "filters.pose_search": "whole_body._pose_search",
@@ -107,8 +108,10 @@ MODULES = {
     "measure.head_neck": "measure._head",
     "measure.motion": "measure._background",
     "measure.silhouettes": "video._silhouettes",
-    "measurements": "upper_body._measurements",
-    "methods": "upper_body._methods",
+    "measure.torso": "measure._torso_elbows",
+    "measure.upper_body": "measure._upper_body_measurer",
+    "measurements": "upper_body._measured_joints",
+    "methods": "upper_body._estimator_table",
     "metric_arguments": "_core.arguments",
     "module_state": "_core.module_state",
     "person_stream": "video._person_stream",
@@ -116,7 +119,7 @@ MODULES = {
     "pose_track": "upper_body._pose_track",
     "priors.action_bank": "priors._actions.bank",
     "priors.action_chain": "priors._actions.stack",
-    "priors.action_file": "priors._actions.file",
+    "priors.action_file": "priors._actions.action_file",
     "priors.action_fit": "learning._action_spaces",
     "priors.action_gate": "priors._actions.gate",
     "priors.action_recognition": "learning._action_spaces",
@@ -133,8 +136,8 @@ MODULES = {
     "priors.gplvm_kernel": "priors._manifold.prediction",
     "priors.gplvm_noise": "learning._manifolds",
     "priors.gplvm_prediction": "priors._manifold.prediction",
-    "priors.increments": "learning._upper_body",
-    "priors.manifold_file": "priors._manifold.file",
+    "priors.increments": "learning._upper_body_prior_fit",
+    "priors.manifold_file": "priors._manifold.manifold_file",
     "priors.model_card": "learning._model_card",
     "priors.neck": "skeleton._torso",
     "priors.part_postures": "priors._actions.part_postures",
@@ -153,10 +156,13 @@ MODULES = {
     "priors.synchronisation": "learning._performances",
     "priors.tensor_file": "_core.tensor_file",
     "priors.training": "learning._training",
+    "priors.upper_body": "priors._upper_body_prior",
     "priors.usable_samples": "learning._blocks",
     "process_noise": "upper_body._single_poses",
     "projection": "camera._projection",
     "protocols": "evaluation",
+    "protocols.common": "evaluation._trials",
+    "protocols.persons": "evaluation._person_recordings",
     "read_out": "upper_body._fusion",
     "recipes": "learning._recipes",
     "recording": "video._recording",
@@ -165,16 +171,18 @@ MODULES = {
     "report": "viz._report",
     "rotation_gaussians": "math._rotation_gaussians",
     "rotations": "math._rotations",
-    "streaming": "upper_body._live",
+    "streaming": "upper_body._live_pose",
     "torchmetrics_adapters": "metrics._torchmetrics_adapters",
     "torso": "skeleton._torso",
-    "tracking": "upper_body._tracker",
+    "tracking": "upper_body._upper_body_tracker",
     "unscented": "math._unscented",
     "value_checks": "_core.value_checks",
+    "video.base": "video._source_interface",
     "video.body_overlay": "video._overlay",
+    "video.live": "video._live_view",
     "video.pen": "video._overlay",
     "video.probe": "video._timing",
-    "video_tracker": "video._tracker",
+    "video_tracker": "video._video_tracker",
     "viewpoints": "camera._viewpoints",
     "viz.action_picture": "viz._model_pictures",
     "viz.manifold_picture": "viz._model_pictures",
@@ -227,7 +235,7 @@ LABORATORY = frozenset(
 
 NAMES: dict[str, dict[str, str]] = {
     "torchpose": {
-        "whole_body._poses": "BodyPoses=BodyTrack",
+        "whole_body._body_track": "BodyPoses=BodyTrack",
     },
     "torchpose.body": {
         "body._fitting": "joint_errors=fit_errors",
@@ -313,13 +321,13 @@ NAMES: dict[str, dict[str, str]] = {
         "measure._persons": "PersonRegister Persons",
         "measure._skin": "SkinModel SkinState rgb_to_lab",
         "measure._skin_mixture": "SkinMixtureState",
-        "measure._torso": "Elbows clothes_likelihood elbows_from_torso",
-        "measure._upper_body": "FrameMeasurements MEASURED MeasurerState",
+        "measure._torso_elbows": "Elbows clothes_likelihood elbows_from_torso",
+        "measure._upper_body_measurer": "FrameMeasurements MEASURED MeasurerState",
         "video._silhouettes": "SilhouetteMeasurer fit_view read_silhouettes",
     },
     "torchpose.metrics": {
         "metrics._calibration": "Coverage chi2_cdf chi2_quantile mahalanobis_squared",
-        "metrics._poses": (
+        "metrics._pose_errors": (
             "ALIGN_JOINTS ARM_LIMBS Alignment ErrorSummary PCP RigidMotion limb_hits share_below"
         ),
     },
@@ -330,7 +338,7 @@ NAMES: dict[str, dict[str, str]] = {
         "math._mixture_em": (
             "FitReport MixtureParameters SufficientStatistics e_step expectation_maximisation m_step"
         ),
-        "priors._actions.file": "ActionInfo",
+        "priors._actions.action_file": "ActionInfo",
         "priors._arm_state": "arm_state arm_states mirror_arm_state mirror_mixture",
         "priors._prior_file": "PriorInfo",
         "skeleton._torso": (
@@ -348,7 +356,10 @@ NAMES: dict[str, dict[str, str]] = {
         ),
     },
     "torchpose.upper_body": {
-        "upper_body._live": "StreamState",
+        "upper_body._live_pose": "StreamState",
+    },
+    "torchpose.upper_body._fusion": {
+        "upper_body._fusion": "MotionState=MotionStageState",
     },
     "torchpose.video": {
         "_core.images": "Image",
@@ -375,14 +386,14 @@ NAMES: dict[str, dict[str, str]] = {
         ),
         "whole_body._silhouettes.shape": "fit_radii",
     },
+    "torchpose.whole_body._body_track": {
+        "whole_body._body_track": "BodyPoses=BodyTrack",
+    },
+    "torchpose.whole_body._body_tracker": {
+        "whole_body._following": "track_body",
+    },
     "torchpose.whole_body._filters.body_particles": {
         "whole_body._filters.body_particles": "BodyTrack=BodyFilterOutput",
-    },
-    "torchpose.whole_body._poses": {
-        "whole_body._poses": "BodyPoses=BodyTrack",
-    },
-    "torchpose.whole_body._tracker": {
-        "whole_body._following": "track_body",
     },
 }
 """Names that a package or module had: present home (without `torchpose.`) to the names in it.

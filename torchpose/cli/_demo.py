@@ -50,7 +50,7 @@ def run(
         given: the command.
     """
     from torchpose.cli._track_output import track_results
-    from torchpose.priors._upper_body import load_prior
+    from torchpose.priors._upper_body_prior import load_prior
 
     seconds = _SECONDS[input] if seconds is None else seconds
     most = _MOST_SECONDS[input]

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from torchpose.demo._performer import Performance
     from torchpose.io._keypoints import Keypoints
     from torchpose.io._results import ResultsFolder
-    from torchpose.priors._upper_body import UpperBodyPrior
+    from torchpose.priors._upper_body_prior import UpperBodyPrior
     from torchpose.upper_body._pose_track import PoseTrack
 
 __all__ = [
@@ -61,7 +61,7 @@ def score(track: "PoseTrack", truth: "Tensor") -> Scores:
     """Return the errors and the coverage of a track of true joints [T, 8, 3] before `demo_camera`."""
     from torchpose.demo._performer import demo_camera
     from torchpose.metrics._calibration import coverage
-    from torchpose.metrics._poses import align, joint_errors_2d, joint_errors_3d
+    from torchpose.metrics._pose_errors import align, joint_errors_2d, joint_errors_3d
 
     points = demo_camera()(truth)[..., :2]
     points3d, covariance, _ = align(track.joints3d[0], truth, covariance=track.covariance3d[0])
@@ -75,7 +75,7 @@ def score(track: "PoseTrack", truth: "Tensor") -> Scores:
 
 def score_mean_pose(prior: "UpperBodyPrior", truth: "Tensor") -> Scores:
     """Return the errors of the mean pose of the prior, which does not move."""
-    from torchpose.metrics._poses import joint_errors_3d
+    from torchpose.metrics._pose_errors import joint_errors_3d
 
     return Scores(joint_errors_3d(prior.mean_pose().expand_as(truth), truth))
 
@@ -199,7 +199,7 @@ def perform(seconds: float, seed: int) -> tuple["Performance", "Keypoints", slic
 def track_clip(prior: "UpperBodyPrior", clip: "Keypoints", smoothing: str | None) -> "PoseTrack":
     """Return the poses from the keypoints, by the tracker's default method."""
     from torchpose.camera._pinhole import PinholeCamera
-    from torchpose.upper_body._tracker import UpperBodyTracker
+    from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 
     camera = PinholeCamera.from_matrix(clip.K)
     tracker = UpperBodyTracker(prior, camera, fps=clip.fps, smoothing=smoothing, neck=clip.neck)

@@ -14,10 +14,10 @@ from torchpose.cli._track_video import write_overlay, write_people
 if TYPE_CHECKING:
     from torchpose.demo._performer import Performance
     from torchpose.io._results import ResultsFolder
-    from torchpose.priors._upper_body import UpperBodyPrior
+    from torchpose.priors._upper_body_prior import UpperBodyPrior
     from torchpose.upper_body._pose_track import PoseTrack
     from torchpose.video._recording import TrackedPerson
-    from torchpose.video._tracker import VideoTracker
+    from torchpose.video._video_tracker import VideoTracker
 
 __all__ = ["demo_video"]
 
@@ -31,7 +31,7 @@ def demo_video(
     """Render, track, score and draw; return exit code 1 if the mean pose is not beaten."""
     from torchpose.demo._performer import demo_camera, performer
     from torchpose.video._source import open_video
-    from torchpose.video._tracker import VideoTracker
+    from torchpose.video._video_tracker import VideoTracker
 
     share_cores()
     performance = performer(round(seconds * _FPS), _FPS, seed, distance=_DISTANCE)
@@ -82,7 +82,7 @@ def _render(clip: Path, performance: "Performance", seed: int) -> None:
 
 def _smoothed(tracker: "VideoTracker", person: "TrackedPerson") -> "PoseTrack":
     """Return the poses from the same measurements, all frames together."""
-    from torchpose.upper_body._tracker import UpperBodyTracker
+    from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
     from torchpose.video._recording import smoothed
 
     smoother = UpperBodyTracker(

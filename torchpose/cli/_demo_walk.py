@@ -30,7 +30,7 @@ def demo_walk(folder: str, seconds: float, seed: int, pictures: bool) -> int:
     """Render, track by `torchpose track-body`, score; return exit code 1 if standing still is not beaten."""
     from torchpose.cli import _track_body as track_body
     from torchpose.demo._rendering.walk import walk
-    from torchpose.whole_body._poses import BodyTrack
+    from torchpose.whole_body._body_track import BodyTrack
 
     print(_SAID.format(height=_HEIGHT))
     walker, out = walk(seconds, _FPS, _HEIGHT, seed), Path(folder)

@@ -14,7 +14,7 @@ from torchpose.io._formats.axes import Axes
 
 if TYPE_CHECKING:
     from torchpose.io._recordings import Recording
-    from torchpose.priors._upper_body import UpperBodyPrior
+    from torchpose.priors._upper_body_prior import UpperBodyPrior
 
 _EXAMPLES = """
 torchpose fit recordings/ --out prior.safetensors
@@ -132,7 +132,7 @@ def _fit_mixtures(
     words: dict[str, Any],
 ) -> "UpperBodyPrior":
     """Return a prior of mixtures over single poses alone."""
-    from torchpose.learning._upper_body import fit_upper_body_prior
+    from torchpose.learning._upper_body_prior_fit import fit_upper_body_prior
 
     return fit_upper_body_prior(
         recordings, recipe["n_components"], recipe["seed"], neck=recipe["neck"], n_samples=samples,
@@ -145,7 +145,7 @@ def _renew_noise(
 ) -> "UpperBodyPrior":
     """Return the prior of an earlier version with process noise and calibration learnt anew."""
     from torchpose.learning._recipes.earlier import renew_noise
-    from torchpose.priors._upper_body import load_prior
+    from torchpose.priors._upper_body_prior import load_prior
 
     return renew_noise(
         load_prior(before), recordings, calibration_folds=recipe["calibration_folds"],

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchpose.io._keypoints import Keypoints
-    from torchpose.priors._upper_body import UpperBodyPrior
+    from torchpose.priors._upper_body_prior import UpperBodyPrior
 
 _EXAMPLES = """
 torchpose info
@@ -48,7 +48,7 @@ def _installation() -> str:
 
     import torchpose
     from torchpose.priors._shipped import KINDS, known_models
-    from torchpose.priors._upper_body import known_priors
+    from torchpose.priors._upper_body_prior import known_priors
 
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     return _table(
@@ -64,7 +64,7 @@ def _installation() -> str:
 
 
 def _describe(what: str) -> str:
-    from torchpose.priors._upper_body import known_priors, load_prior
+    from torchpose.priors._upper_body_prior import known_priors, load_prior
 
     path = Path(what)
     files = _models_of(what) or (

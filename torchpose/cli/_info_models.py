@@ -122,7 +122,7 @@ DESCRIBED: dict[str, Callable[[Path], Facts]] = {
 def describe_body_poses(path: Path) -> Facts:
     """Return the facts about poses of a whole body, from `torchpose track-body`."""
     from torchpose.cli._track_body_output import action_text
-    from torchpose.whole_body._poses import BodyTrack
+    from torchpose.whole_body._body_track import BodyTrack
 
     poses = BodyTrack.load(path)
     spread = poses.covariance3d.diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(0).sqrt().mean(0)

@@ -10,7 +10,7 @@ from torchpose.cli._command import Command, Given
 from torchpose.cli._common import pictures_possible
 from torchpose.cli._options import Option, options_of, options_of_methods
 from torchpose.cli._track_output import (
-    Job,
+    TrackingJob,
     camera_text,
     report_failure,
     smoothing_text,
@@ -49,9 +49,9 @@ def main(arguments: list[str]) -> int:
 
 def command() -> Command:
     """Return the command, with the methods that are registered now."""
+    from torchpose.upper_body._estimator_table import METHODS
     from torchpose.upper_body._keypoint_files import TrackSettings
-    from torchpose.upper_body._methods import METHODS
-    from torchpose.video._tracker import VideoTracker
+    from torchpose.video._video_tracker import VideoTracker
 
     settings = [
         option._replace(text=f"{option.text}. There are {', '.join(METHODS)}")
@@ -77,7 +77,7 @@ def command() -> Command:
 
 def _method_options(leave_out: set[str]) -> tuple[Option, ...]:
     """Return the options of single methods that are no settings of all."""
-    from torchpose.upper_body._methods import METHODS, method_options
+    from torchpose.upper_body._estimator_table import METHODS, method_options
     from torchpose.upper_body._single_poses import PoseFilter
 
     having = {}
@@ -129,7 +129,7 @@ def run(
         if settings[option] is not None:
             check_positive(f"--{option.replace('_', '-')}", settings[option])
     options = {name: value for name, value in method_options.items() if value is not None}
-    job = Job(input, out, given.files(), TrackSettings(**settings), options, pictures)
+    job = TrackingJob(input, out, given.files(), TrackSettings(**settings), options, pictures)
     if is_video(input):
         from torchpose.cli._track_video import track_video
 
@@ -137,7 +137,7 @@ def run(
     return track_keypoints(job)
 
 
-def track_keypoints(job: Job) -> int:
+def track_keypoints(job: TrackingJob) -> int:
     """Track keypoints, write and report, and return the exit code; every check comes before any work."""
     from torchpose.io._keypoints import read_keypoints
     from torchpose.upper_body._keypoint_files import KeypointFileTracker

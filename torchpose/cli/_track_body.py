@@ -25,8 +25,8 @@ from torchpose.errors import CameraError, DegenerateFilterWarning, InputError, N
 
 if TYPE_CHECKING:
     from torchpose.camera._pinhole import PinholeCamera
-    from torchpose.whole_body._poses import BodyTrack
-    from torchpose.whole_body._tracker import BodyTracker
+    from torchpose.whole_body._body_track import BodyTrack
+    from torchpose.whole_body._body_tracker import BodyTracker
 
 _EXAMPLES = """
 torchpose track-body cameras.toml cam1.mp4 cam2.mp4 cam3.mp4 --out result
@@ -52,8 +52,8 @@ def main(arguments: list[str]) -> int:
 
 def command() -> Command:
     """Return the command, with the filters that are registered now."""
-    from torchpose.whole_body._methods import METHODS
-    from torchpose.whole_body._tracker import BodyTracker
+    from torchpose.whole_body._body_tracker import BodyTracker
+    from torchpose.whole_body._filter_table import METHODS
 
     return Command(
         "track-body",
@@ -70,7 +70,7 @@ def command() -> Command:
 
 def _method_options() -> tuple[Option, ...]:
     """Return the options of single filters; the sharpness is the command's own, with its usual values."""
-    from torchpose.whole_body._methods import METHODS, method_options
+    from torchpose.whole_body._filter_table import METHODS, method_options
 
     having = {
         name: [one for one in options_of(method.filter) if one.name in method_options(name)]
@@ -212,7 +212,7 @@ def _models(
     initial_pose: str | None,
 ) -> dict[str, Any]:
     """Return the models that the options name; refuse options that do not go together."""
-    from torchpose.whole_body._methods import LEARNT, METHODS, check_options, choose_method
+    from torchpose.whole_body._filter_table import LEARNT, METHODS, check_options, choose_method
 
     given = {kind: tracker[kind] for kind in LEARNT if tracker[kind]}
     chosen = choose_method(method, given)
@@ -225,7 +225,7 @@ def _models(
 def _tracker(
     recordings: Recordings, method: str | None, arguments: dict[str, Any], options: dict[str, Any]
 ) -> "BodyTracker":
-    from torchpose.whole_body._tracker import BodyTracker
+    from torchpose.whole_body._body_tracker import BodyTracker
 
     return BodyTracker(recordings.rig, method, fps=recordings.fps, **arguments, **options)
 
@@ -241,7 +241,7 @@ def _track(
     import torch
 
     from torchpose.body._fitting import fit_state
-    from torchpose.whole_body._poses import BodyTrack
+    from torchpose.whole_body._body_track import BodyTrack
 
     start = None
     frames = recordings.silhouettes()

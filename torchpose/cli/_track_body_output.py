@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from torchpose.camera._rig import CameraRig
     from torchpose.cli._command import Given
     from torchpose.io._results import ResultsFolder
-    from torchpose.video._base import VideoSource
     from torchpose.video._silhouettes import SilhouetteMeasurer, SilhouetteView
-    from torchpose.whole_body._poses import BodyTrack
-    from torchpose.whole_body._tracker import BodyTracker
+    from torchpose.video._source_interface import VideoSource
+    from torchpose.whole_body._body_track import BodyTrack
+    from torchpose.whole_body._body_tracker import BodyTracker
 
 __all__ = [
     "Recordings",

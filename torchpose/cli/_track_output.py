@@ -18,7 +18,7 @@ _VIDEO = ("overlay.mp4", "report.html")
 _OWN = r"poses(_p\d\d+)?\.(npz|csv|bvh)|overlay\.mp4|report\.html|(pose_strip|joint_curves)\.png"
 
 __all__ = [
-    "Job",
+    "TrackingJob",
     "camera_text",
     "percent",
     "report_failure",
@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 
-class Job(NamedTuple):
+class TrackingJob(NamedTuple):
     """Holds the input, the settings and the output folder of one run of tracking.
 
     Attributes:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from torchpose._core.terminal import show_progress
 from torchpose.cli._common import UntilInterrupted, pictures_possible, share_cores
 from torchpose.cli._track_output import (
-    Job,
+    TrackingJob,
     camera_text,
     report_failure,
     smoothing_text,
@@ -24,9 +24,9 @@ from torchpose.errors import FileFormatError, InputError, OutputError
 
 if TYPE_CHECKING:
     from torchpose.camera._pinhole import PinholeCamera
-    from torchpose.video._base import VideoSource
     from torchpose.video._recording import TrackedPerson
-    from torchpose.video._tracker import VideoTracker
+    from torchpose.video._source_interface import VideoSource
+    from torchpose.video._video_tracker import VideoTracker
 
 _OVERLAY = "overlay.mp4"
 _KEYPOINTS = "keypoints are expected as .npz, .csv or a folder of OpenPose JSON files"
@@ -34,7 +34,9 @@ _KEYPOINTS = "keypoints are expected as .npz, .csv or a folder of OpenPose JSON 
 __all__ = ["track_video", "write_overlay", "write_people"]
 
 
-def track_video(job: Job, options: dict[str, Any], face_model: str | None, overlay: bool) -> int:
+def track_video(
+    job: TrackingJob, options: dict[str, Any], face_model: str | None, overlay: bool
+) -> int:
     """Track everybody, write and report, and return the exit code: 1 if there is nobody.
 
     Args:
@@ -42,7 +44,7 @@ def track_video(job: Job, options: dict[str, Any], face_model: str | None, overl
         overlay: whether the video and the page that show the poses are written.
     """
     from torchpose.camera._choice import resolve_camera
-    from torchpose.priors._upper_body import load_prior
+    from torchpose.priors._upper_body_prior import load_prior
 
     settings = job.settings
     _refuse_options(job, options["detector"], face_model)
@@ -98,7 +100,7 @@ def _open(where: str, fps: float | None) -> "VideoSource":
         raise FileFormatError(f"{error}; {_KEYPOINTS}") from error
 
 
-def _refuse_options(job: Job, detector: str | None, face_model: str | None) -> None:
+def _refuse_options(job: TrackingJob, detector: str | None, face_model: str | None) -> None:
     """Raise `InputError` for options that the measurer does not have."""
     given = {"--nose-as-head": job.settings.nose_as_head}
     if detector is None:
@@ -116,7 +118,7 @@ def _refuse_options(job: Job, detector: str | None, face_model: str | None) -> N
 
 
 def _tracker(
-    job: Job,
+    job: TrackingJob,
     options: dict[str, Any],
     face_model: str | None,
     prior: Any,
@@ -124,7 +126,7 @@ def _tracker(
     fps: float,
 ) -> "VideoTracker":
     from torchpose.measure._mediapipe import MediaPipeFaceDetector
-    from torchpose.video._tracker import VideoTracker
+    from torchpose.video._video_tracker import VideoTracker
 
     faces = None if face_model is None else MediaPipeFaceDetector(face_model)
     of_keypoints = {name: getattr(job.settings, name) for name in ("neck", "measurement_std")}
@@ -149,7 +151,7 @@ def _track_camera(
     tracker: "VideoTracker", source: "VideoSource", out: Path, overlay: bool
 ) -> tuple[list["TrackedPerson"], int]:
     """Return everybody before a camera, shown on a page while it runs, until q, stop or Ctrl-C."""
-    from torchpose.video._live import LiveView
+    from torchpose.video._live_view import LiveView
     from torchpose.video._writer import VideoWriter
 
     with contextlib.ExitStack() as stack:

@@ -22,7 +22,6 @@ import torch
 
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
-from torchpose.evaluation._common import Recipe, draw_picture
 from torchpose.evaluation._completion import (
     Completion,
     complete,
@@ -31,8 +30,9 @@ from torchpose.evaluation._completion import (
     with_wrists,
 )
 from torchpose.evaluation._cross_tables import Crossed, add_added, add_cross, plot_cross
-from torchpose.evaluation._persons import by_person
+from torchpose.evaluation._person_recordings import by_person
 from torchpose.evaluation._report import Report
+from torchpose.evaluation._trials import Recipe, draw_picture
 from torchpose.evaluation._unseen import Job, ScoreSettings, fit_settings, run_jobs
 from torchpose.io._recordings import Recording, read_recordings
 from torchpose.learning._recipes.upper_body import fit_kinect_prior

@@ -5,13 +5,13 @@ from typing import Any, NamedTuple
 
 import torch
 
+from torchpose.evaluation._person_recordings import spread
 from torchpose.evaluation._person_tables import (
     SHORT_NAMES,
     add_pose_classes,
     mean_error,
     pooled,
 )
-from torchpose.evaluation._persons import spread
 from torchpose.evaluation._report import Report
 from torchpose.evaluation._unseen import Scored
 

@@ -19,7 +19,7 @@ import torch
 
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
-from torchpose.evaluation._common import Recipe, draw_picture
+from torchpose.evaluation._person_recordings import by_person, renamed, spread
 from torchpose.evaluation._person_tables import (
     Curve,
     add_pose_classes,
@@ -27,8 +27,8 @@ from torchpose.evaluation._person_tables import (
     plot_curves,
     pooled,
 )
-from torchpose.evaluation._persons import by_person, renamed, spread
 from torchpose.evaluation._report import Report
+from torchpose.evaluation._trials import Recipe, draw_picture
 from torchpose.evaluation._unseen import Job, Scored, ScoreSettings, fit_settings, run_jobs
 from torchpose.io._recordings import Recording, read_recordings
 from torchpose.learning._recipes.upper_body import fit_kinect_prior

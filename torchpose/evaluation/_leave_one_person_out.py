@@ -12,7 +12,7 @@ import torch
 
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError
-from torchpose.evaluation._common import Recipe, draw_picture
+from torchpose.evaluation._person_recordings import POSE_CLASSES, by_person, spread
 from torchpose.evaluation._person_tables import (
     add_persons,
     add_pose_classes,
@@ -20,8 +20,8 @@ from torchpose.evaluation._person_tables import (
     plot_persons,
     pooled,
 )
-from torchpose.evaluation._persons import POSE_CLASSES, by_person, spread
 from torchpose.evaluation._report import Report
+from torchpose.evaluation._trials import Recipe, draw_picture
 from torchpose.evaluation._unseen import Job, Scored, ScoreSettings, fit_settings, run_jobs
 from torchpose.io._recordings import read_recordings
 from torchpose.learning._recipes.upper_body import fit_kinect_prior

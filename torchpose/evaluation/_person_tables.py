@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from torchpose.evaluation._persons import POSE_CLASSES, spread
+from torchpose.evaluation._person_recordings import POSE_CLASSES, spread
 from torchpose.evaluation._report import Report, Table
 from torchpose.evaluation._unseen import Scored
 from torchpose.skeleton._joint_sets import UPPER_BODY

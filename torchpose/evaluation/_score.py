@@ -18,14 +18,7 @@ from tqdm.auto import tqdm
 from torchpose._core.checks import check_count
 from torchpose._core.files import check_output_folder
 from torchpose.errors import InputError, OverlapError
-from torchpose.evaluation._common import (
-    CAMERA,
-    MEASURED,
-    Trials,
-    draw_picture,
-    make_test_set,
-    track,
-)
+from torchpose.evaluation._person_recordings import by_person, pose_classes, spread
 from torchpose.evaluation._person_tables import (
     add_persons,
     add_pose_classes,
@@ -33,8 +26,15 @@ from torchpose.evaluation._person_tables import (
     plot_persons,
     pooled,
 )
-from torchpose.evaluation._persons import by_person, pose_classes, spread
 from torchpose.evaluation._report import Report
+from torchpose.evaluation._trials import (
+    CAMERA,
+    MEASURED,
+    Trials,
+    draw_picture,
+    make_test_set,
+    track,
+)
 from torchpose.evaluation._unseen import (
     LEVELS,
     Scored,
@@ -43,11 +43,11 @@ from torchpose.evaluation._unseen import (
     poses_to_score,
 )
 from torchpose.io._recordings import Recording, read_recordings
-from torchpose.metrics._poses import ALIGN_JOINTS, align, joint_errors
+from torchpose.metrics._pose_errors import ALIGN_JOINTS, align, joint_errors
 from torchpose.priors._arms import shipped_arm_prior
-from torchpose.priors._upper_body import UpperBodyPrior, load_prior
+from torchpose.priors._upper_body_prior import UpperBodyPrior, load_prior
 from torchpose.skeleton._joint_sets import UPPER_BODY
-from torchpose.upper_body._methods import METHODS, choose_method, method_options
+from torchpose.upper_body._estimator_table import METHODS, choose_method, method_options
 
 __all__ = ["run"]
 

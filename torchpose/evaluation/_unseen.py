@@ -19,7 +19,8 @@ from tqdm.auto import tqdm
 
 from torchpose.camera._viewpoints import ViewRange, sample_viewpoints
 from torchpose.errors import InputError, PriorError
-from torchpose.evaluation._common import (
+from torchpose.evaluation._person_recordings import LEAST_FRAMES, complete_pieces, pose_classes
+from torchpose.evaluation._trials import (
     CAMERA,
     MEASURED,
     Estimate,
@@ -33,13 +34,12 @@ from torchpose.evaluation._common import (
     settings_hash,
     track,
 )
-from torchpose.evaluation._persons import LEAST_FRAMES, complete_pieces, pose_classes
 from torchpose.io._recordings import Recording
 from torchpose.learning._recipes.upper_body import fit_kinect_prior
 from torchpose.metrics._calibration import chi2_quantile, mahalanobis_squared
-from torchpose.metrics._poses import ALIGN_JOINTS, align, joint_errors
+from torchpose.metrics._pose_errors import ALIGN_JOINTS, align, joint_errors
 from torchpose.priors._arm_state import arm_states
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import NeckOffset, learn_neck_offset, place_neck
 

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torchpose._core.checks import check_positive, check_shape
 from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.module_state import derived
-from torchpose.filters._base import check_lag
 from torchpose.filters._measurements import check_lengths
+from torchpose.filters._recursive_filter import check_lag
 from torchpose.math._gaussian import kalman_gain, safe_cholesky, symmetrise
 
 __all__ = ["ConstantVelocityFilter", "ConstantVelocityState"]

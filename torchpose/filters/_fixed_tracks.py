@@ -10,7 +10,6 @@ from torch import Tensor
 from torchpose._core.checks import check_choice
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
-from torchpose.filters._base import Generators
 from torchpose.filters._columns import run_columns, suits_columns
 from torchpose.filters._gain_graph import find_history
 from torchpose.filters._measurements import Measurements
@@ -18,6 +17,7 @@ from torchpose.filters._memoryless import frame_log_likelihood, run_memoryless, 
 from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
 from torchpose.filters._outputs import FilterOutput, StepOutput
 from torchpose.filters._recompute import wants_gradient
+from torchpose.filters._recursive_filter import Generators
 from torchpose.filters._shared_gains import run_for_gradients, run_shared
 from torchpose.filters._smoothing import smooth_fixed_tracks
 from torchpose.filters._track_steps import run_steps, step_estimate

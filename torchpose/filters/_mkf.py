@@ -16,7 +16,6 @@ from torchpose._core.checks import check_choice, check_count
 from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.module_state import derived, register_given, wide_or_parameter
 from torchpose.errors import InputError
-from torchpose.filters._base import Generators, RecursiveFilter, require_state
 from torchpose.filters._measurements import (
     Measurements,
     as_covariance,
@@ -24,6 +23,7 @@ from torchpose.filters._measurements import (
     given_initial_cov,
 )
 from torchpose.filters._outputs import StepOutput
+from torchpose.filters._recursive_filter import Generators, RecursiveFilter, require_state
 from torchpose.filters._transition import (
     BURN_IN_SCALE,
     Transition,

@@ -13,13 +13,6 @@ from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.module_state import derived, register_given, wide_or_parameter
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
-from torchpose.filters._base import (
-    Generators,
-    RecursiveFilter,
-    require_state,
-    standard_normal,
-    uniform,
-)
 from torchpose.filters._measurements import (
     Measurements,
     as_covariance,
@@ -27,6 +20,13 @@ from torchpose.filters._measurements import (
     given_initial_cov,
 )
 from torchpose.filters._outputs import Mending, StepOutput, effective_sample_size, mending
+from torchpose.filters._recursive_filter import (
+    Generators,
+    RecursiveFilter,
+    require_state,
+    standard_normal,
+    uniform,
+)
 from torchpose.filters._resampling import RESAMPLING, resample
 from torchpose.filters._transition import (
     BURN_IN_SCALE,

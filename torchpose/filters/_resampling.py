@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpose._core.checks import check_choice, check_positive, check_shape
 from torchpose.errors import InputError
-from torchpose.filters._base import Generators, uniform
+from torchpose.filters._recursive_filter import Generators, uniform
 
 __all__ = [
     "LEAST_SURVIVORS",

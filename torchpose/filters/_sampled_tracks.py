@@ -9,10 +9,10 @@ from torchpose._core.checks import check_count
 from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
-from torchpose.filters._base import Generators, uniform
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
 from torchpose.filters._outputs import StepOutput, effective_sample_size, mending
+from torchpose.filters._recursive_filter import Generators, uniform
 from torchpose.filters._resampling import systematic
 from torchpose.filters._weights import estimate_of, normalise
 from torchpose.math._gaussian import kalman_predict, mended_update

@@ -6,10 +6,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpose.filters._base import Generators, require_state
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
 from torchpose.filters._outputs import StepOutput, mending
+from torchpose.filters._recursive_filter import Generators, require_state
 from torchpose.filters._weights import estimate_of, normalise
 from torchpose.math._gaussian import kalman_correct, kalman_gain, symmetrise
 from torchpose.priors._gaussian_mixture import GaussianMixture

@@ -4,7 +4,7 @@ from torchpose._core.facade import set_up_facade
 from torchpose.learning._action_spaces import fit_action_space
 from torchpose.learning._curation.curate import CurationSettings, curate
 from torchpose.learning._curation.splits import leave_one_person_out, split_persons
-from torchpose.learning._limb_conditionals import fit_limb_conditionals
+from torchpose.learning._limb_conditionals_fit import fit_limb_conditionals
 from torchpose.learning._manifolds import fit_gplvm, fit_gplvm_noise
 from torchpose.learning._performances import repetition_axis, split_repetitions
 from torchpose.learning._recipes.actions import ActionRecipe, fit_actions
@@ -12,7 +12,7 @@ from torchpose.learning._recipes.limbs import fit_limbs
 from torchpose.learning._recipes.manifold import ManifoldRecipe
 from torchpose.learning._recipes.upper_body import UpperBodyRecipe, fit_kinect_prior
 from torchpose.learning._training import TRAINING_VIEWS
-from torchpose.learning._upper_body import fit_upper_body_prior
+from torchpose.learning._upper_body_prior_fit import fit_upper_body_prior
 
 __all__ = [
     "TRAINING_VIEWS",

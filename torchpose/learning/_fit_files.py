@@ -13,7 +13,7 @@ from torchpose.learning._model_card import MODES, BodyModel, body_card, model_ca
 from torchpose.learning._recipes.actions import FittedActions
 from torchpose.learning._recipes.limbs import LimbStates, fit_limbs, summary
 from torchpose.learning._recipes.manifold import ManifoldFitting
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 
 __all__ = [
     "check_fit_file",

@@ -13,8 +13,8 @@ from torch import Tensor
 from torchpose._core.checks import check_rate
 from torchpose.errors import InputError
 from torchpose.learning._gplvm_fit import GPLVMFit, best_fit, median_gamma
-from torchpose.priors._manifold.file import ManifoldInfo
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM, MotionNoise, join_sequences
+from torchpose.priors._manifold.manifold_file import ManifoldInfo
 
 __all__ = [
     "FitTarget",

@@ -13,7 +13,7 @@ from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.space import ActionSpace
 from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import WindowPrior
 
 __all__ = [

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchpose._core.checks import check_finite, check_shape
 from torchpose.errors import InputError
-from torchpose.priors._actions.file import Synchronised
+from torchpose.priors._actions.action_file import Synchronised
 
 __all__ = [
     "LEAST_FRAMES",

@@ -7,7 +7,7 @@ from torchpose.measure._head import HeadNeck
 from torchpose.measure._mean_shift_hands import MeanShiftHandTracker
 from torchpose.measure._mediapipe import MediaPipeFaceDetector, MediaPipePose
 from torchpose.measure._skin_mixture import SkinMixtureModel
-from torchpose.measure._upper_body import UpperBodyMeasurer
+from torchpose.measure._upper_body_measurer import UpperBodyMeasurer
 
 __all__ = [
     "FaceDetector",

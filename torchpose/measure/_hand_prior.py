@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchpose._core.checks import check_shape
 from torchpose.errors import InputError
 from torchpose.priors._gaussian_mixture import GaussianMixture
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 
 __all__ = ["FACE_HEIGHT", "HandPrior"]
 

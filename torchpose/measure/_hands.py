@@ -42,7 +42,7 @@ from torchpose.measure._hand_prior import HandPrior
 from torchpose.measure._head import FaceMemory, FaceMemoryState, head_part
 from torchpose.measure._persons import match_states, take_rows
 from torchpose.measure._skin import SkinModel, SkinState
-from torchpose.measure._torso import Elbows
+from torchpose.measure._torso_elbows import Elbows
 
 __all__ = ["HandState", "HandTracker"]
 

@@ -7,7 +7,7 @@ from torchpose.metrics._calibration import (
     predictive_log_likelihood,
     reliability,
 )
-from torchpose.metrics._poses import (
+from torchpose.metrics._pose_errors import (
     align,
     jitter,
     joint_errors,

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchpose.errors import MissingDependencyError, ShapeError
 from torchpose.metrics._calibration import coverage
-from torchpose.metrics._poses import (
+from torchpose.metrics._pose_errors import (
     ALIGN_JOINTS,
     ARM_LIMBS,
     PCP_THRESHOLDS,

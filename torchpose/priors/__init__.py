@@ -6,15 +6,15 @@ from torchpose.priors._actions.postures import posture_angles, posture_to_state,
 from torchpose.priors._actions.space import ActionSpace
 from torchpose.priors._gaussian_mixture import ConditionedMixture, GaussianMixture
 from torchpose.priors._limb_conditionals import in_body_frame
-from torchpose.priors._manifold.file import ManifoldInfo
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
+from torchpose.priors._manifold.manifold_file import ManifoldInfo
 from torchpose.priors._shipped import (
     known_models,
     load_action,
     load_limb_conditionals,
     load_manifold,
 )
-from torchpose.priors._upper_body import UpperBodyPrior, known_priors, load_prior
+from torchpose.priors._upper_body_prior import UpperBodyPrior, known_priors, load_prior
 
 __all__ = [
     "ActionBank",

@@ -2,13 +2,13 @@
 
 from torchpose._core.facade import set_up_facade
 from torchpose.upper_body._estimator import Estimates, Estimator
-from torchpose.upper_body._live import LivePose
-from torchpose.upper_body._measurements import arm_measurements, pixel_indices
-from torchpose.upper_body._methods import METHODS, method_options, register_method
+from torchpose.upper_body._estimator_table import METHODS, method_options, register_method
+from torchpose.upper_body._live_pose import LivePose
+from torchpose.upper_body._measured_joints import arm_measurements, pixel_indices
 from torchpose.upper_body._pose_files import write_bvh
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._single_poses import PoseFilter, ProcessNoise
-from torchpose.upper_body._tracker import UpperBodyTracker
+from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 
 __all__ = [
     "METHODS",

@@ -38,7 +38,7 @@ from torchpose.upper_body._estimator import (
     repeat_last,
 )
 from torchpose.upper_body._lean import lean_angle, rolled, seen_lean
-from torchpose.upper_body._measurements import MeasuredJoints
+from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._root_grid import RootGrid
 

@@ -12,10 +12,10 @@ from torch import Tensor
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._arm_chain import ArmState
 from torchpose.upper_body._body_lengths import Lengths
-from torchpose.upper_body._face import FacePoints
+from torchpose.upper_body._face_points import FacePoints
 from torchpose.upper_body._lean import rolled
-from torchpose.upper_body._measurements import MeasuredJoints
-from torchpose.upper_body._torso import Torso, see_torso
+from torchpose.upper_body._measured_joints import MeasuredJoints
+from torchpose.upper_body._torso_likelihood import Torso, see_torso
 
 __all__ = ["ArticulatedState", "RayFrame", "UprightFrame", "frames_as_rays", "with_middle"]
 

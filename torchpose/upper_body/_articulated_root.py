@@ -16,9 +16,14 @@ from torchpose.upper_body._articulated_frame import ArticulatedState, UprightFra
 from torchpose.upper_body._articulated_poses import ELBOWS, HANDS, SHOULDERS, SIDES, bones_of
 from torchpose.upper_body._articulated_torso import shoulder_places
 from torchpose.upper_body._body_lengths import BodyLengths
-from torchpose.upper_body._face import face_evidence
+from torchpose.upper_body._face_points import face_evidence
 from torchpose.upper_body._root_grid import RootGrid
-from torchpose.upper_body._torso import STIFF_SHOULDER, Root, Torso, middle_of_shoulders
+from torchpose.upper_body._torso_likelihood import (
+    STIFF_SHOULDER,
+    Root,
+    Torso,
+    middle_of_shoulders,
+)
 
 __all__ = ["RootStep", "Roots", "covs_of_roots"]
 

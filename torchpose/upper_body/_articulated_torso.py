@@ -10,8 +10,8 @@ from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import KINECT_NECK
 from torchpose.upper_body._articulated_frame import UprightFrame
 from torchpose.upper_body._articulated_poses import SHOULDERS
-from torchpose.upper_body._face import head_in_face
-from torchpose.upper_body._torso import (
+from torchpose.upper_body._face_points import head_in_face
+from torchpose.upper_body._torso_likelihood import (
     Root,
     TorsoLengths,
     half_widths,

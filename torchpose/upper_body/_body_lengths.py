@@ -15,7 +15,13 @@ from torchpose.errors import InputError
 from torchpose.priors._arms import LENGTHS, ArmPrior
 from torchpose.upper_body._estimator import Bones
 from torchpose.upper_body._pose_track import PoseTrack
-from torchpose.upper_body._torso import NECK_HEIGHT, Root, Torso, TorsoLengths, inward_shares
+from torchpose.upper_body._torso_likelihood import (
+    NECK_HEIGHT,
+    Root,
+    Torso,
+    TorsoLengths,
+    inward_shares,
+)
 
 __all__ = ["BODY_LENGTHS", "BodyLengths", "KnownBody", "Lengths"]
 

@@ -12,11 +12,11 @@ from torchpose._core.checks import check_rate
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._virtual_camera import BodyView
 from torchpose.errors import CameraError, PriorError
-from torchpose.filters._base import Generators
 from torchpose.filters._outputs import FilterOutput, StepOutput
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.filters._recursive_filter import Generators
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._upper_body import ARM_JOINTS, LEFT_ARM, RIGHT_ARM
-from torchpose.upper_body._measurements import MeasuredJoints
+from torchpose.upper_body._measured_joints import MeasuredJoints
 
 __all__ = [
     "ARMS",

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from torchpose._core.facade import set_up_facade
 from torchpose._core.module_state import derived
 from torchpose.camera._projection import (
     arm_in_body_frame,
@@ -30,7 +31,7 @@ from torchpose.upper_body._estimator import Estimates, MotionRatios, ReadOut, re
 
 __all__ = [
     "MotionStage",
-    "MotionState",
+    "MotionStageState",
     "calibration_mode",
     "in_camera_axes",
     "kept_stage",
@@ -176,8 +177,8 @@ def recalibrated(
     return covs * scale.to(covs)[:, None, None] + floor.to(covs)[:, None, None] * eye
 
 
-class MotionState(NamedTuple):
-    """States of the filters over joints in metres, their pixels, and the body's placement."""
+class MotionStageState(NamedTuple):
+    """State of a `MotionStage`: of its filters over joints, their pixels and the body's placement."""
 
     joints: ConstantVelocityState
     pixels: ConstantVelocityState
@@ -220,17 +221,19 @@ class MotionStage(nn.Module):
             reading, *(model.smooth_frames(values, lengths, lag) for model, values in pairs)
         )
 
-    def init(self, reading: ReadOut) -> MotionState:
+    def init(self, reading: ReadOut) -> MotionStageState:
         """Return the state before the first frame, that of `reading` [B, T, ...]."""
         pairs = zip(self._filters(), _numbers(reading), strict=True)
-        return MotionState(*(model.init(values[:, 0]) for model, values in pairs))
+        return MotionStageState(*(model.init(values[:, 0]) for model, values in pairs))
 
-    def advance(self, state: MotionState, reading: ReadOut) -> tuple[MotionState, ReadOut]:
+    def advance(
+        self, state: MotionStageState, reading: ReadOut
+    ) -> tuple[MotionStageState, ReadOut]:
         """Return the next state and some more frames [B, T, ...]: the numbers of `forward` with lag 0."""
         triples = zip(self._filters(), state, _numbers(reading), strict=True)
         advanced = [model.advance(own, values) for model, own, values in triples]
         steady = _with_numbers(reading, *(values for _, values in advanced))
-        return MotionState(*(own for own, _ in advanced)), steady
+        return MotionStageState(*(own for own, _ in advanced)), steady
 
     def _filters(self) -> tuple[ConstantVelocityFilter, ...]:
         return self.joints, self.pixels, self.placement
@@ -271,3 +274,6 @@ def _with_numbers(reading: ReadOut, joints: Tensor, pixels: Tensor, placement: T
         angles=placement[..., :3],
         place=placement[..., 3:],
     )
+
+
+set_up_facade(__name__)

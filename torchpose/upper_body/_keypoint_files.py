@@ -13,14 +13,14 @@ from torchpose.camera._choice import resolve_camera
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.errors import DegenerateFilterWarning, InputError
 from torchpose.io._keypoints import Keypoints
-from torchpose.priors._upper_body import load_prior
+from torchpose.priors._upper_body_prior import load_prior
 from torchpose.skeleton._joint_sets import canonical_names
 from torchpose.skeleton._upper_body import NECK_KINDS
-from torchpose.upper_body._methods import METHODS, WINDOWS, method_options, replace_window
+from torchpose.upper_body._estimator_table import METHODS, WINDOWS, method_options, replace_window
 from torchpose.upper_body._pose_track import PoseTrack
-from torchpose.upper_body._tracker import UpperBodyTracker
+from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 
-__all__ = ["KeypointFileTracker", "Prepared", "TrackSettings"]
+__all__ = ["KeypointFileTracker", "PreparedTracker", "TrackSettings"]
 
 _KEPT_TRACKERS = 8
 
@@ -135,7 +135,7 @@ def _lengths_of(text: str) -> dict[str, float]:
         ) from error
 
 
-class Prepared(NamedTuple):
+class PreparedTracker(NamedTuple):
     """Tracker, camera and joint names of a file, and what was assumed.
 
     Attributes:
@@ -207,7 +207,7 @@ class KeypointFileTracker:
         if settings.camera:
             resolve_camera(settings.camera, settings.camera_name, None, None, settings.camera)
 
-    def prepare(self, keypoints: Keypoints) -> Prepared:
+    def prepare(self, keypoints: Keypoints) -> PreparedTracker:
         """Return the tracker of a file, and what was assumed.
 
         Raises:
@@ -233,10 +233,10 @@ class KeypointFileTracker:
             _kind_of_neck(settings.neck, keypoints),
         )
         notes += tuple(keypoints.notes) + more
-        return Prepared(self._tracker(key, camera), camera, names, notes)
+        return PreparedTracker(self._tracker(key, camera), camera, names, notes)
 
     def track(
-        self, keypoints: Keypoints, prepared: Prepared | None = None, progress: bool = False
+        self, keypoints: Keypoints, prepared: PreparedTracker | None = None, progress: bool = False
     ) -> PoseTrack:
         """Return the poses of a file; `failed_at` names the frame in which the filter degenerated.
 

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.skeleton._joint_sets import UPPER_BODY
-from torchpose.upper_body._torso import with_axes
+from torchpose.upper_body._torso_likelihood import with_axes
 
 __all__ = ["lean_angle", "rolled", "seen_lean"]
 

@@ -32,7 +32,7 @@ from torchpose.upper_body._estimator import (
 )
 from torchpose.upper_body._fusion import (
     MotionStage,
-    MotionState,
+    MotionStageState,
     in_camera_axes,
     kept_stage,
     on_their_rays,
@@ -40,7 +40,7 @@ from torchpose.upper_body._fusion import (
     recalibrated,
     stage_lag,
 )
-from torchpose.upper_body._measurements import MeasuredJoints
+from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._windows import WindowMixture, WindowState
 
 __all__ = ["MultipleModelFilter", "MultipleModelState"]
@@ -64,7 +64,7 @@ class MultipleModelState(NamedTuple):
 
     windows: WindowState
     articulated: ArticulatedState
-    motion: MotionState | None
+    motion: MotionStageState | None
     ratios: Tensor
 
 

@@ -7,7 +7,7 @@ from torchpose.errors import InputError
 from torchpose.skeleton._joint_sets import UPPER_BODY, canonical_names
 from torchpose.skeleton._torso import KINECT_NECK
 from torchpose.skeleton._upper_body import upper_body_indices
-from torchpose.upper_body._face import FACE
+from torchpose.upper_body._face_points import FACE
 
 __all__ = ["Picked", "pick_joints"]
 

@@ -11,7 +11,7 @@ from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import map_pixel_covariance, map_pixels
 from torchpose.errors import InputError
 from torchpose.math._rotations import RotationOrder
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.upper_body._estimator import (
     Bones,
     Estimates,
@@ -20,9 +20,10 @@ from torchpose.upper_body._estimator import (
     mending_notes,
     repeat_reading,
 )
+from torchpose.upper_body._estimator_table import METHODS
 from torchpose.upper_body._fusion import (
     MotionStage,
-    MotionState,
+    MotionStageState,
     ReadOut,
     calibration_mode,
     in_camera_axes,
@@ -30,7 +31,6 @@ from torchpose.upper_body._fusion import (
     read_out,
     recalibrated,
 )
-from torchpose.upper_body._methods import METHODS
 from torchpose.upper_body._outlier_notes import outlier_notes
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._screening import Screened
@@ -70,11 +70,11 @@ class PoseReader(NamedTuple):
 
     def read(
         self,
-        motion: MotionState | None,
+        motion: MotionStageState | None,
         estimates: Estimates,
         found: Screened,
         lengths: Int[Tensor, " B"] | None = None,
-    ) -> tuple[MotionState | None, PoseTrack]:
+    ) -> tuple[MotionStageState | None, PoseTrack]:
         """Return the next state of the motion stage, and the poses of T more frames.
 
         Args:
@@ -97,11 +97,11 @@ class PoseReader(NamedTuple):
 
     def _steadied(
         self,
-        motion: MotionState | None,
+        motion: MotionStageState | None,
         reading: ReadOut,
         estimates: Estimates,
         lengths: Int[Tensor, " B"] | None,
-    ) -> tuple[MotionState | None, ReadOut]:
+    ) -> tuple[MotionStageState | None, ReadOut]:
         """Return the next state of the motion stage, and what it makes of the poses.
 
         A stage that smooths takes whole sequences, of which frames from a failure on play no part.

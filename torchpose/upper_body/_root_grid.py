@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchpose.upper_body._torso import Root, Torso, TorsoLengths, torso_log_likelihood
+from torchpose.upper_body._torso_likelihood import Root, Torso, TorsoLengths, torso_log_likelihood
 
 __all__ = ["Moments", "RootGrid"]
 

@@ -10,10 +10,10 @@ from torch import Tensor, nn
 from torchpose._core.module_state import derived
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import map_pixels
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._upper_body import OTHER_SIDE
-from torchpose.upper_body._measurements import pixels_per_metre
+from torchpose.upper_body._measured_joints import pixels_per_metre
 from torchpose.upper_body._picked import Picked
 
 __all__ = [

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose.skeleton._joint_sets import UPPER_BODY
-from torchpose.upper_body._measurements import MeasuredJoints
+from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._screen_model import (
     APART,
     BRISK,

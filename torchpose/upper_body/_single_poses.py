@@ -13,12 +13,12 @@ from torch import Tensor
 
 from torchpose._core.module_state import derived
 from torchpose.errors import DegenerateFilterWarning, InputError
-from torchpose.filters._base import RecursiveFilter
 from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._outputs import FilterOutput
+from torchpose.filters._recursive_filter import RecursiveFilter
 from torchpose.priors._arm_state import STATE_DIM
 from torchpose.priors._gaussian_mixture import GaussianMixture
-from torchpose.priors._upper_body import UpperBodyPrior, released_process_cov
+from torchpose.priors._upper_body_prior import UpperBodyPrior, released_process_cov
 from torchpose.skeleton._upper_body import ARM_JOINTS
 from torchpose.upper_body._estimator import (
     ARMS,
@@ -30,7 +30,7 @@ from torchpose.upper_body._estimator import (
     in_double,
     require_cov,
 )
-from torchpose.upper_body._measurements import MeasuredJoints, arm_measurements, pixel_indices
+from torchpose.upper_body._measured_joints import MeasuredJoints, arm_measurements, pixel_indices
 
 __all__ = [
     "PoseFilter",

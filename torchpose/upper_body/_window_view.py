@@ -14,11 +14,11 @@ from torchpose.camera._virtual_camera import (
     view_body,
     view_jacobian,
 )
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import WindowLayout, window_measurements
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._estimator import ARMS
-from torchpose.upper_body._measurements import MeasuredJoints, pixels_per_metre
+from torchpose.upper_body._measured_joints import MeasuredJoints, pixels_per_metre
 
 __all__ = ["SeenInView", "see_in_view", "suitable_window"]
 

@@ -31,7 +31,7 @@ from torchpose.upper_body._estimator import (
     repeat_last,
     require_cov,
 )
-from torchpose.upper_body._measurements import (
+from torchpose.upper_body._measured_joints import (
     MeasuredJoints,
     append_blocks,
     arm_measurements,

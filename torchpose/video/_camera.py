@@ -6,7 +6,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from torchpose._core.checks import check_rate
 from torchpose.errors import FileFormatError, InputError
-from torchpose.video._base import VideoFrame, VideoSource
+from torchpose.video._source_interface import VideoFrame, VideoSource
 
 __all__ = ["CameraSource", "Capture"]
 

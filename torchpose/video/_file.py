@@ -12,7 +12,7 @@ from torchpose._core.checks import check_rate
 from torchpose._core.images import Image
 from torchpose._core.reading import require_file
 from torchpose.errors import FileFormatError
-from torchpose.video._base import VideoFrame, VideoSource
+from torchpose.video._source_interface import VideoFrame, VideoSource
 from torchpose.video._timing import (
     Rate,
     Scan,

@@ -11,7 +11,7 @@ import numpy as np
 from torchpose._core.checks import check_rate
 from torchpose._core.images import Image
 from torchpose.errors import FileFormatError, InputError
-from torchpose.video._base import VideoFrame, VideoSource
+from torchpose.video._source_interface import VideoFrame, VideoSource
 
 __all__ = ["FolderSource", "find_images", "natural_key"]
 

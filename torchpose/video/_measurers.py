@@ -12,8 +12,8 @@ import torch
 from torchpose._core.images import Image
 from torchpose.errors import InputError
 from torchpose.measure._face import FaceTracks
-from torchpose.measure._keypoints import FrameKeypoints, KeypointMeasurer, KeypointState
-from torchpose.measure._upper_body import (
+from torchpose.measure._keypoint_measurer import FrameKeypoints, KeypointMeasurer, KeypointState
+from torchpose.measure._upper_body_measurer import (
     Candidates,
     FrameMeasurements,
     MeasurerState,

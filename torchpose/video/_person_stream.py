@@ -12,11 +12,11 @@ from torch import Tensor, nn
 from torchpose._core.images import Image
 from torchpose.errors import InputError
 from torchpose.measure._association import AssociationState, HandAssociation
-from torchpose.measure._keypoints import FrameKeypoints
-from torchpose.measure._upper_body import FrameMeasurements
-from torchpose.upper_body._live import StreamState
+from torchpose.measure._keypoint_measurer import FrameKeypoints
+from torchpose.measure._upper_body_measurer import FrameMeasurements
+from torchpose.upper_body._live_pose import StreamState
 from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
-from torchpose.upper_body._tracker import UpperBodyTracker
+from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 
 __all__ = [
     "Measured",

@@ -21,7 +21,7 @@ from torchpose.upper_body._outlier_notes import (
 )
 from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
 from torchpose.upper_body._reading import note_collapse
-from torchpose.upper_body._tracker import UpperBodyTracker
+from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 from torchpose.video._person_stream import (
     Measured,
     TrackedBlock,

@@ -18,7 +18,7 @@ from torchpose.camera._projection import intrinsics
 from torchpose.camera._rig import scale_matrix, undistortion_maps
 from torchpose.errors import CameraError, InputError
 from torchpose.measure._brightness_background import BrightnessBackground, PixelKind
-from torchpose.video._base import VideoFrame, VideoSource
+from torchpose.video._source_interface import VideoFrame, VideoSource
 
 __all__ = [
     "SilhouetteMeasurer",

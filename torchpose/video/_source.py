@@ -4,10 +4,10 @@ import os
 from pathlib import Path
 
 from torchpose.errors import InputError
-from torchpose.video._base import VideoFrame, VideoSource
 from torchpose.video._camera import CameraSource
 from torchpose.video._file import FileSource
 from torchpose.video._images import FolderSource
+from torchpose.video._source_interface import VideoFrame, VideoSource
 
 __all__ = ["VideoFrame", "VideoSource", "open_video"]
 

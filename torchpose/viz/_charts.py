@@ -13,7 +13,7 @@ from torch import Tensor
 from torchpose._core.checks import check_shape
 from torchpose.errors import InputError
 from torchpose.metrics._calibration import Coverage, chi2_quantile
-from torchpose.metrics._poses import PCP
+from torchpose.metrics._pose_errors import PCP
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.viz._style import (
     INK,

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from torchpose.body._kinematics import Body
-    from torchpose.priors._actions.file import Synchronised
+    from torchpose.priors._actions.action_file import Synchronised
     from torchpose.priors._actions.space import ActionSpace
     from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
 else:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
-    from torchpose.priors._upper_body import UpperBodyPrior
+    from torchpose.priors._upper_body_prior import UpperBodyPrior
 else:
     Axes = Figure = SubFigure = UpperBodyPrior = Any
 

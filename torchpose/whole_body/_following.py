@@ -12,11 +12,11 @@ from torchpose._core.former_arguments import takes_former_arguments
 from torchpose.body._kinematics import Body
 from torchpose.camera._rig import Cameras
 from torchpose.errors import InputError
-from torchpose.filters._base import Generators
+from torchpose.filters._recursive_filter import Generators
+from torchpose.whole_body._body_track import BodyTrack
 from torchpose.whole_body._filters.body_frames import check_observation
 from torchpose.whole_body._filters.body_particles import BodyFilterState, stack_outputs
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
-from torchpose.whole_body._poses import BodyTrack
 
 __all__ = ["all_see", "follow", "track_body"]
 

@@ -11,7 +11,7 @@ from tests.whole_body.filters.walking_body import HEIGHT, WIDTH, rig
 from torchpose.body import JointLimits
 from torchpose.errors import DegenerateFilterWarning, InputError, SkeletonError
 from torchpose.priors import ActionBank, ActionSpace
-from torchpose.priors._actions.file import ActionInfo
+from torchpose.priors._actions.action_file import ActionInfo
 from torchpose.priors._actions.postures import state_postures
 from torchpose.whole_body import (
     ConstrainedParticleFilter,

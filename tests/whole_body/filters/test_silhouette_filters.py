@@ -25,7 +25,7 @@ from torchpose.whole_body import (
     motion_std,
 )
 from torchpose.whole_body._filters.annealed import anneal
-from torchpose.whole_body._filters.manifold import MANIFOLD_PROPOSALS, MANIFOLD_WEIGHTS
+from torchpose.whole_body._filters.manifold_regularised import MANIFOLD_PROPOSALS, MANIFOLD_WEIGHTS
 from torchpose.whole_body._sharpness import ValidationSequence, log_grid, mean_joint_error
 
 WIDE = torch.float64

@@ -196,7 +196,7 @@ class Part(NamedTuple):
     brush: Brush
 
 
-class View:
+class Projection:
     """Projects points of camera axes into the image.
 
     Args:
@@ -236,7 +236,7 @@ def body_parts(pose: Pose, worn: Wardrobe, K: NDArray) -> list[Part]:
     Args:
         pose: camera axes, metres. worn: clothes and skin. K: camera matrix [3, 3].
     """
-    view = View(K)
+    view = Projection(K)
     parts = [*_legs(pose, worn, view), _torso(pose, worn, view), _neck(pose, worn, view)]
     parts += [_head(pose, worn, view), *_arm(0, pose, worn, view), *_arm(1, pose, worn, view)]
     return parts
@@ -247,7 +247,7 @@ def body_parts(pose: Pose, worn: Wardrobe, K: NDArray) -> list[Part]:
 _HIPS = np.array([0.0, 0.41, 0.0])  # the joint that the torso turns about
 
 
-def _legs(pose: Pose, worn: Wardrobe, view: View) -> list[Part]:
+def _legs(pose: Pose, worn: Wardrobe, view: Projection) -> list[Part]:
     hips = pose.on_torso(_HIPS)
     colour = np.asarray(worn.look.trousers, np.float32)
     depth = max(float(hips[2]), float(pose.neck[2])) + 0.06
@@ -260,7 +260,7 @@ def _legs(pose: Pose, worn: Wardrobe, view: View) -> list[Part]:
     return legs
 
 
-def _torso(pose: Pose, worn: Wardrobe, view: View) -> Part:
+def _torso(pose: Pose, worn: Wardrobe, view: Projection) -> Part:
     sides = []
     for sign, joint in ((1.0, 2), (-1.0, 5)):
         x, y, _ = (pose.joints[joint] - pose.neck) @ pose.torso
@@ -294,7 +294,7 @@ def _rounded(outline: Points) -> Points:
     return outline
 
 
-def _neck(pose: Pose, worn: Wardrobe, view: View) -> Part:
+def _neck(pose: Pose, worn: Wardrobe, view: Projection) -> Part:
     import cv2
 
     face = _face(pose)
@@ -314,7 +314,7 @@ def _face(pose: Pose) -> Points:
     return pose.joints[3] + pose.head @ np.array(FACE_FROM_HEAD)
 
 
-def _head(pose: Pose, worn: Wardrobe, view: View) -> Part:
+def _head(pose: Pose, worn: Wardrobe, view: Projection) -> Part:
     place, axes = view.plane(_face(pose), pose.head[:, :2])
     depth = float(min(pose.joints[3, 2], pose.neck[2] + 0.02))
     return Part("head", depth, Picture(worn.portrait.head, place, axes))
@@ -326,7 +326,7 @@ _SLEEVE, _BARE = (0.041, 0.034), (0.037, 0.026)  # radii at elbow and wrist
 _UPPER, _THIN = (0.053, 0.043), (0.048, 0.038)  # at shoulder and elbow
 
 
-def _arm(side: int, pose: Pose, worn: Wardrobe, view: View) -> list[Part]:
+def _arm(side: int, pose: Pose, worn: Wardrobe, view: Projection) -> list[Part]:
     shoulder, elbow, wrist, hand = pose.arm(side)
     name = ("left", "right")[side]
     cloth = np.asarray(worn.look.clothes, np.float32)
@@ -350,7 +350,7 @@ def _arm(side: int, pose: Pose, worn: Wardrobe, view: View) -> list[Part]:
     return parts
 
 
-def _hand(pose: Pose, side: int, worn: Wardrobe, view: View) -> Picture:
+def _hand(pose: Pose, side: int, worn: Wardrobe, view: Projection) -> Picture:
     shoulder, elbow, wrist, hand = pose.arm(side)
     fingers = (hand - wrist) / max(float(np.linalg.norm(hand - wrist)), 1e-6)
     # Between palm up and palm down the thumb lies in the plane of the arm, on the shoulder's side;

@@ -10,10 +10,10 @@ from torch import Tensor, nn
 from torchpose.camera._projection import lift
 from torchpose.math._mixture_steps import MixtureParameters
 from torchpose.math._rotations import euler_to_matrix
-from torchpose.metrics._poses import ALIGN_JOINTS, procrustes
+from torchpose.metrics._pose_errors import ALIGN_JOINTS, procrustes
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._prior_file import PriorInfo
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import WindowPrior
 from torchpose.upper_body._estimator import ARMS
 

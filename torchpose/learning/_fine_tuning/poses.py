@@ -25,12 +25,12 @@ from torchpose.learning._fine_tuning.parameters import (
 )
 from torchpose.learning._training import seen_keypoints
 from torchpose.priors._gaussian_mixture import GaussianMixture
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import augment_bodies
 from torchpose.skeleton._upper_body import ARM_JOINTS
 from torchpose.upper_body._estimator import ARMS
-from torchpose.upper_body._measurements import pixel_indices
-from torchpose.upper_body._methods import noise_options
+from torchpose.upper_body._estimator_table import noise_options
+from torchpose.upper_body._measured_joints import pixel_indices
 
 __all__ = ["SequenceBatch", "TunableKalman", "draw_sequences"]
 

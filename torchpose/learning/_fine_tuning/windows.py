@@ -24,11 +24,11 @@ from torchpose.learning._fine_tuning.parameters import (
 from torchpose.learning._samplers import WindowSource
 from torchpose.math._mixture_steps import MixtureParameters
 from torchpose.priors._arm_state import STATE_DIM
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import WindowPrior
 from torchpose.skeleton._upper_body import ARM_JOINTS
 from torchpose.upper_body._estimator import ARMS
-from torchpose.upper_body._measurements import joint_covariances, pixel_indices
+from torchpose.upper_body._measured_joints import joint_covariances, pixel_indices
 
 __all__ = ["TunableWindow", "WindowBatch", "draw_windows"]
 

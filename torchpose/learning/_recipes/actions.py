@@ -32,8 +32,8 @@ from torchpose.learning._recipes.choosing import (
     recording_name,
     state_of,
 )
+from torchpose.priors._actions.action_file import ActionInfo, BankInfo
 from torchpose.priors._actions.bank import ActionBank
-from torchpose.priors._actions.file import ActionInfo, BankInfo
 from torchpose.priors._actions.postures import posture_angles, state_postures
 from torchpose.priors._actions.space import ActionSpace
 

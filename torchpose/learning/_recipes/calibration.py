@@ -11,12 +11,12 @@ from torch.nn.utils.rnn import pad_sequence
 from torchpose.errors import InputError
 from torchpose.learning._training import PoseSet, seen_keypoints
 from torchpose.metrics._calibration import chi2_quantile
-from torchpose.metrics._poses import align
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.metrics._pose_errors import align
+from torchpose.priors._upper_body_prior import UpperBodyPrior
+from torchpose.upper_body._estimator_table import METHODS
 from torchpose.upper_body._fusion import calibration_mode
-from torchpose.upper_body._methods import METHODS
 from torchpose.upper_body._single_poses import PoseFilter
-from torchpose.upper_body._tracker import UpperBodyTracker
+from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 
 __all__ = [
     "DRAWN",

@@ -9,7 +9,7 @@ from torchpose.errors import InputError
 from torchpose.learning._recipes.settings import RecipeSettings
 from torchpose.learning._recipes.upper_body import VERSION, UpperBodyRecipe, fit_kinect_prior
 from torchpose.learning._training import RecordingLike
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import WindowLayout
 
 __all__ = ["fit_recipe_2", "renew_noise"]

@@ -16,7 +16,7 @@ from torchpose.body._kinematics import Body, centres_of
 from torchpose.errors import InputError
 from torchpose.io._formats.axes import Axes
 from torchpose.io._recordings import Recording
-from torchpose.learning._limb_conditionals import (
+from torchpose.learning._limb_conditionals_fit import (
     edge_rotations,
     fit_limb_conditionals,
     frame_rotations,

@@ -34,8 +34,8 @@ from torchpose.learning._recipes.choosing import (
     recording_name,
     state_of,
 )
-from torchpose.priors._manifold.file import ManifoldInfo
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
+from torchpose.priors._manifold.manifold_file import ManifoldInfo
 
 __all__ = [
     "ManifoldFitting",

@@ -36,11 +36,11 @@ from torchpose.learning._training import (
     collect_poses,
     short_paths,
 )
-from torchpose.learning._upper_body import KINECT_CAMERA, increment_covs, prior_of_arms
+from torchpose.learning._upper_body_prior_fit import KINECT_CAMERA, increment_covs, prior_of_arms
 from torchpose.priors._arm_state import check_rotation_order
 from torchpose.priors._gaussian_mixture import GaussianMixture
 from torchpose.priors._prior_file import PriorInfo
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.priors._window import WindowLayout, WindowPrior
 
 __all__ = ["VERSION", "UpperBodyRecipe", "fit_kinect_prior"]

@@ -23,7 +23,7 @@ _OVERLAP = 0.65  # of two boxes, intersection over union, from which on they are
 _MOST_BOXES = 100  # of a frame, by score, that are compared
 
 
-class Scored(NamedTuple):
+class ScoredPersons(NamedTuple):
     """Holds persons with boxes (left, top, right, bottom) [N, 4], scores [N], and keypoints [N, J, 3]."""
 
     boxes: Tensor
@@ -41,7 +41,7 @@ def decode_rtmo(dets: Float[Tensor, "1 N 5"], keypoints: Float[Tensor, "1 N J 3"
     Reference:
         Lu et al., RTMO, CVPR 2024.
     """
-    return _persons(Scored(dets[0, :, :4], dets[0, :, 4], keypoints[0]))
+    return _persons(ScoredPersons(dets[0, :, :4], dets[0, :, 4], keypoints[0]))
 
 
 def decode_yolo(rows: Float[Tensor, "N C"]) -> Detections:
@@ -53,7 +53,7 @@ def decode_yolo(rows: Float[Tensor, "N C"]) -> Detections:
     """
     middle, half = rows[:, :2], rows[:, 2:4] / 2
     boxes = torch.cat([middle - half, middle + half], 1)
-    return _persons(Scored(boxes, rows[:, 4], rows[:, 5:].unflatten(1, (-1, 3))))
+    return _persons(ScoredPersons(boxes, rows[:, 4], rows[:, 5:].unflatten(1, (-1, 3))))
 
 
 def decode_yolo_suppressed(rows: Float[Tensor, "N C"]) -> Detections:
@@ -63,7 +63,7 @@ def decode_yolo_suppressed(rows: Float[Tensor, "N C"]) -> Detections:
         rows: box (left, top, right, bottom), score, class, and u, v and confidence of each keypoint,
             C = 6 + 3 J, pixels of the model's input.
     """
-    return _persons(Scored(rows[:, :4], rows[:, 4], rows[:, 6:].unflatten(1, (-1, 3))))
+    return _persons(ScoredPersons(rows[:, :4], rows[:, 4], rows[:, 6:].unflatten(1, (-1, 3))))
 
 
 def decode_movenet_multi(out: Float[Tensor, "1 N C"], size: tuple[int, int]) -> Detections:
@@ -77,10 +77,10 @@ def decode_movenet_multi(out: Float[Tensor, "1 N C"], size: tuple[int, int]) -> 
     sides = rows.new_tensor([*size, 1.0])
     keypoints = rows[:, :-5].unflatten(1, (-1, 3))[..., [1, 0, 2]] * sides
     boxes = rows[:, [-4, -5, -2, -3]] * rows.new_tensor([*size, *size])
-    return _persons(Scored(boxes, rows[:, -1], keypoints))
+    return _persons(ScoredPersons(boxes, rows[:, -1], keypoints))
 
 
-def _persons(found: Scored) -> Detections:
+def _persons(found: ScoredPersons) -> Detections:
     """Return the keypoints of the persons who score enough, each once, the surest first."""
     chosen = torch.nonzero(found.scores >= LEAST_SCORE).flatten()
     order = found.scores[chosen].argsort(descending=True)[:_MOST_BOXES]

@@ -13,7 +13,7 @@ from torchpose._core.estimates import check_number_range
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import read_tensors, write_tensors
 from torchpose.errors import FileFormatError, InputError
-from torchpose.priors._actions.file import BANK_FILE, BankInfo
+from torchpose.priors._actions.action_file import BANK_FILE, BankInfo
 from torchpose.priors._actions.gate import (
     CLAMP_ROUNDS,
     GATE_WIDTH,

@@ -14,7 +14,7 @@ from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import read_tensors, write_tensors
 from torchpose.errors import InputError, PriorError
-from torchpose.priors._actions.file import SPACE_FILE, ActionInfo
+from torchpose.priors._actions.action_file import SPACE_FILE, ActionInfo
 from torchpose.priors._actions.gate import (
     CLAMP_ROUNDS,
     GATE_WIDTH,

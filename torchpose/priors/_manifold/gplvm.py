@@ -23,7 +23,12 @@ from torchpose._core.moved import moved_function
 from torchpose._core.reading import reading
 from torchpose.errors import FileFormatError, InputError, ShapeError
 from torchpose.priors._manifold import prediction as gplvm_prediction
-from torchpose.priors._manifold.file import TENSORS, ManifoldInfo, read_manifold, write_manifold
+from torchpose.priors._manifold.manifold_file import (
+    TENSORS,
+    ManifoldInfo,
+    read_manifold,
+    write_manifold,
+)
 from torchpose.priors._manifold.prediction import Fitted, KernelParameters, Prepared
 
 __all__ = ["LEAST_FRAMES", "BackConstrainedGPLVM", "MotionNoise", "join_sequences", "no_noise"]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchpose._core.checks import check_count
 from torchpose.errors import InputError
-from torchpose.filters._base import Generators
+from torchpose.filters._recursive_filter import Generators
 from torchpose.filters._resampling import (
     LEAST_SURVIVORS,
     check_survival_rate,

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchpose._core.checks import check_shape
 from torchpose.errors import InputError, ShapeError
-from torchpose.filters._base import Generators, check_generators
+from torchpose.filters._recursive_filter import Generators, check_generators
 from torchpose.whole_body._silhouettes.likelihood import silhouette_log_likelihood
 from torchpose.whole_body._silhouettes.rendering import (
     PreparedSilhouettes,

@@ -12,8 +12,8 @@ from torch import Tensor
 from torchpose._core.facade import set_up_facade
 from torchpose.body._kinematics import Body
 from torchpose.errors import DegenerateFilterWarning
-from torchpose.filters._base import Generators
 from torchpose.filters._outputs import effective_sample_size
+from torchpose.filters._recursive_filter import Generators
 from torchpose.filters._resampling import resample
 from torchpose.whole_body._filters.body_frames import Likelihood
 

@@ -10,7 +10,7 @@ from torchpose._core.checks import check_choice
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BODY_15
 from torchpose.errors import InputError
-from torchpose.filters._base import Generators, standard_normal
+from torchpose.filters._recursive_filter import Generators, standard_normal
 from torchpose.math._rotations import within_unit_ball
 from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.gate import GATE_WIDTH

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from torchpose.filters._base import Generators
+from torchpose.filters._recursive_filter import Generators
 from torchpose.whole_body._filters.body_frames import Frame
 from torchpose.whole_body._filters.body_particles import (
     BodyFilterOutput,

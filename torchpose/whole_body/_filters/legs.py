@@ -9,7 +9,7 @@ from torch import Tensor
 from torchpose.body._kinematics import Body
 from torchpose.body._skeleton import BodySkeleton
 from torchpose.errors import InputError, SkeletonError
-from torchpose.filters._base import Generators, uniform
+from torchpose.filters._recursive_filter import Generators, uniform
 from torchpose.math._rotations import compose, conjugate
 
 __all__ = [

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from torchpose.body._kinematics import Body
 from torchpose.errors import InputError, SkeletonError
-from torchpose.filters._base import Generators, uniform
+from torchpose.filters._recursive_filter import Generators, uniform
 from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.gate import GATE_WIDTH, check_gate_width, match_postures
 from torchpose.priors._actions.part_postures import PartPostures

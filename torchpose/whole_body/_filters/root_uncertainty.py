@@ -16,7 +16,7 @@ from torch.nn.functional import pad
 from torchpose._core.checks import check_choice, check_shape
 from torchpose.body._kinematics import Body
 from torchpose.errors import InputError
-from torchpose.filters._base import Generators, standard_normal
+from torchpose.filters._recursive_filter import Generators, standard_normal
 from torchpose.filters._resampling import (
     LEAST_SURVIVORS,
     check_survival_rate,

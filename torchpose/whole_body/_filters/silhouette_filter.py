@@ -23,9 +23,9 @@ from torchpose._core.checks import (
 from torchpose._core.former_arguments import rename_former_hook, takes_former_arguments
 from torchpose._core.moved import warn_of_former
 from torchpose.errors import InputError
-from torchpose.filters._base import Generators, standard_normal
 from torchpose.filters._measurements import check_lengths
 from torchpose.filters._outputs import effective_sample_size
+from torchpose.filters._recursive_filter import Generators, standard_normal
 from torchpose.filters._resampling import RESAMPLING
 from torchpose.whole_body._filters.body_frames import (
     Likelihood,

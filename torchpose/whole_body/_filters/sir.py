@@ -4,7 +4,7 @@ from typing import Unpack
 
 import torch
 
-from torchpose.filters._base import Generators
+from torchpose.filters._recursive_filter import Generators
 from torchpose.filters._resampling import check_survival_rate, survival_exponent
 from torchpose.whole_body._filters.body_frames import Frame
 from torchpose.whole_body._filters.body_particles import (

@@ -23,11 +23,8 @@ from torchpose.priors._actions.bank import ActionBank
 from torchpose.priors._actions.space import ActionSpace
 from torchpose.priors._limb_conditionals import LimbConditionals
 from torchpose.priors._manifold.gplvm import BackConstrainedGPLVM
-from torchpose.whole_body._filters.body_particles import BodyFilterState
-from torchpose.whole_body._filters.motion import std_of_covariance
-from torchpose.whole_body._first_pose import find_first_pose
-from torchpose.whole_body._following import all_see, follow
-from torchpose.whole_body._methods import (
+from torchpose.whole_body._body_track import BodyTrack, load_body, repeat_last
+from torchpose.whole_body._filter_table import (
     LEARNT,
     METHODS,
     BodyTrackerOptions,
@@ -35,7 +32,10 @@ from torchpose.whole_body._methods import (
     make_filter,
     rebased,
 )
-from torchpose.whole_body._poses import BodyTrack, load_body, repeat_last
+from torchpose.whole_body._filters.body_particles import BodyFilterState
+from torchpose.whole_body._filters.motion import std_of_covariance
+from torchpose.whole_body._first_pose import find_first_pose
+from torchpose.whole_body._following import all_see, follow
 
 __all__ = ["BodyStream", "BodyTracker"]
 
@@ -89,7 +89,7 @@ class BodyTracker(nn.Module):
             default what suits the method.
         initial_cov: the variances of the particles about the first pose, as `process_cov`; by default
             four times those.
-        **options: the options of the method's filter (`torchpose.whole_body._methods.method_options`),
+        **options: the options of the method's filter (`torchpose.whole_body._filter_table.method_options`),
             such as sharpness, limits, leg_swap or n_layers.
 
     Attributes:

@@ -87,7 +87,7 @@ def elbows_from_torso(
 
     Example:
         >>> import torch
-        >>> from torchpose.measure._torso import elbows_from_torso
+        >>> from torchpose.measure._torso_elbows import elbows_from_torso
         >>> body = torch.zeros(1, 120, 160)
         >>> for v in range(35, 80):  # sleeves go out to a point at row 60
         ...     half = 36 - abs(v - 60) // 2

@@ -12,11 +12,11 @@ from torchpose._core.checks import check_covariance, check_finite, check_floatin
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import map_pixel_covariance, map_pixels
 from torchpose.errors import InputError
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import KINECT_NECK, NeckFraction
 from torchpose.skeleton._upper_body import ARM_JOINTS
-from torchpose.upper_body._face import FacePoints, measure_face
+from torchpose.upper_body._face_points import FacePoints, measure_face
 from torchpose.upper_body._picked import Picked
 from torchpose.upper_body._picked import pick_joints as pick_joints  # for `torchpose.measurements`
 

@@ -22,14 +22,14 @@ from torchpose.camera._pinhole import PinholeCamera
 from torchpose.camera._projection import project
 from torchpose.errors import InputError, TorchposeError
 from torchpose.evaluation._report import RESULTS, Report
-from torchpose.filters._base import Generators
+from torchpose.filters._recursive_filter import Generators
 from torchpose.io._recordings import Recording
 from torchpose.io._results import replace_own
 from torchpose.math._rotations import euler_to_matrix
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
-from torchpose.upper_body._methods import choose_method
-from torchpose.upper_body._tracker import UpperBodyTracker
+from torchpose.upper_body._estimator_table import choose_method
+from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 
 __all__ = [
     "CAMERA",

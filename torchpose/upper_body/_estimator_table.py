@@ -15,7 +15,7 @@ from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._particle import BootstrapParticleFilter
 from torchpose.filters._sampled_tracks import SampledTrackFilter
 from torchpose.filters._split_tracks import SplitTrackFilter
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._articulated import ArticulatedFilter
 from torchpose.upper_body._estimator import Estimator

@@ -22,7 +22,7 @@ from torchpose.priors._shipped import load_action, load_limb_conditionals, load_
 from torchpose.whole_body._filters.annealed import AnnealedParticleFilter
 from torchpose.whole_body._filters.body_particles import BodyFilterOptions, WeightingOptions
 from torchpose.whole_body._filters.constrained import ConstrainedParticleFilter
-from torchpose.whole_body._filters.manifold import ManifoldParticleFilter
+from torchpose.whole_body._filters.manifold_regularised import ManifoldParticleFilter
 from torchpose.whole_body._filters.root_uncertainty import RootUncertaintyTracker
 from torchpose.whole_body._filters.silhouette_filter import SilhouetteParticleFilter
 from torchpose.whole_body._filters.sir import SIRParticleFilter

@@ -21,22 +21,22 @@ from torchpose.measure._detectors.load import check_detector, load_detector
 from torchpose.measure._detectors.protocol import KeypointDetector
 from torchpose.measure._face import FaceDetector
 from torchpose.measure._head import HeadNeck
-from torchpose.measure._keypoints import (
+from torchpose.measure._keypoint_measurer import (
     LEAST_CONFIDENCE,
     KeypointMeasurer,
     KeypointState,
 )
-from torchpose.measure._upper_body import (
+from torchpose.measure._upper_body_measurer import (
     HAND_TRACKERS,
     Candidates,
     MeasurerState,
     UpperBodyMeasurer,
 )
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
-from torchpose.upper_body._options import TrackerOptions
 from torchpose.upper_body._pose_track import PoseTrack
-from torchpose.upper_body._tracker import UpperBodyTracker
+from torchpose.upper_body._tracker_options import TrackerOptions
+from torchpose.upper_body._upper_body_tracker import UpperBodyTracker
 from torchpose.video._measurers import (
     Found,
     MeasuredBlock,

@@ -18,8 +18,8 @@ from torchpose._core.module_state import (
 )
 from torchpose.camera._pinhole import PinholeCamera
 from torchpose.errors import InputError
-from torchpose.filters._base import Generators
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.filters._recursive_filter import Generators
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._estimator import (
     Estimator,
@@ -28,27 +28,27 @@ from torchpose.upper_body._estimator import (
     check_model,
     generators_of_arms,
 )
+from torchpose.upper_body._estimator_table import (
+    METHODS,
+    check_steady,
+    choose_method,
+    options_of_window,
+)
 from torchpose.upper_body._fusion import kept_stage, stage_lag
-from torchpose.upper_body._live import LivePose, StreamState, live_pose, unseen_frames
-from torchpose.upper_body._measurements import (
+from torchpose.upper_body._live_pose import LivePose, StreamState, live_pose, unseen_frames
+from torchpose.upper_body._measured_joints import (
     MeasuredJoints,
     check_gaps,
     check_sequences,
     in_prior_pixels,
     joint_covariances,
 )
-from torchpose.upper_body._methods import (
-    METHODS,
-    check_steady,
-    choose_method,
-    options_of_window,
-)
-from torchpose.upper_body._options import MethodOptions
 from torchpose.upper_body._picked import Picked, pick_joints
 from torchpose.upper_body._pose_track import PoseTrack
 from torchpose.upper_body._reading import PoseReader, check_frame, note_collapse
 from torchpose.upper_body._screen_model import ScreenModel, kept_screen_model
 from torchpose.upper_body._screening import screen_joints
+from torchpose.upper_body._tracker_options import MethodOptions
 
 __all__ = ["UpperBodyTracker"]
 

@@ -6,6 +6,7 @@ from typing import Any, Self
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchpose._core.estimates import check_estimates, frame_facts, to_tensor
@@ -46,9 +47,10 @@ _HEIGHTS = (0.3, 5.0)  # metres; between them is everybody, and what is no perso
 class BodyTrack:
     """Holds the poses of one person in T frames; J joints and states of D numbers, as their body has.
 
-    Named as in `torchpose.PoseTrack`, without the dimension of a batch. A filter over bodies that fails goes
-    on with particles drawn anew, so there is a pose in every frame: `respread` tells the frames in which
-    that happened, `failed_at` the first of them.
+    Named as in `torchpose.PoseTrack`, without the dimension of a batch: what is [B, T, ...] there is [T, ...]
+    here, and what is [B] there is a tensor without a dimension. A filter over bodies that fails goes on with
+    particles drawn anew, so there is a pose in every frame: `respread` tells the frames in which that
+    happened, `failed_at` the first of them. Past the length of a sequence its last pose is repeated.
 
     Attributes:
         body: the body of the person, to which the states belong.
@@ -95,14 +97,14 @@ class BodyTrack:
         return self.body.skeleton.names
 
     @property
-    def failed_at(self) -> int:
-        """Return the first frame in which all particles had died, -1 if there is none."""
-        return int(first_true(self.respread))
+    def failed_at(self) -> Int[Tensor, ""]:
+        """Return the first frame in which all particles had died, -1 if none, as `PoseTrack.failed_at`."""
+        return first_true(self.respread)
 
     @property
-    def failed(self) -> bool:
-        """Return whether the filter failed, in any frame."""
-        return bool(self.respread.any())
+    def failed(self) -> Bool[Tensor, ""]:
+        """Return whether the filter failed, in any frame, as `PoseTrack.failed`."""
+        return self.failed_at >= 0
 
     def save(self, path: str | Path) -> None:
         """Write the poses as .npz, atomically: an interrupted write leaves no partial file.

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.math._rotations import within_half_turn
-from torchpose.upper_body._torso import heavy_tail
+from torchpose.upper_body._torso_likelihood import heavy_tail
 
 __all__ = ["FACE", "FacePoints", "face_evidence", "head_in_face", "measure_face"]
 

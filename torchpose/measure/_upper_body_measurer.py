@@ -22,8 +22,8 @@ from torchpose.measure._head import HeadNeck
 from torchpose.measure._mean_shift_hands import MeanShiftHandTracker
 from torchpose.measure._persons import PersonRegister, Persons, measure_by_scale, take_rows
 from torchpose.measure._skin import SkinState, rgb_to_lab
-from torchpose.measure._torso import Elbows, clothes_likelihood, elbows_from_torso
-from torchpose.priors._upper_body import UpperBodyPrior
+from torchpose.measure._torso_elbows import Elbows, clothes_likelihood, elbows_from_torso
+from torchpose.priors._upper_body_prior import UpperBodyPrior
 
 __all__ = [
     "HAND_TRACKERS",

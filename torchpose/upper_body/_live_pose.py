@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from torchpose.upper_body._fusion import MotionState
+from torchpose.upper_body._fusion import MotionStageState
 from torchpose.upper_body._picked import Picked
 from torchpose.upper_body._pose_track import FRAME_FIELDS, PoseTrack
 from torchpose.upper_body._screen_tracks import ScreenState
@@ -26,7 +26,7 @@ class StreamState(NamedTuple):
     """
 
     estimator: Any
-    motion: MotionState | None
+    motion: MotionStageState | None
     unseen: Int[Tensor, " B"]
     n_keypoints: int
     picked: Picked

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchpose._core.checks import check_choice, check_shape
 from torchpose.errors import PriorError
-from torchpose.filters._base import Generators, standard_normal
+from torchpose.filters._recursive_filter import Generators, standard_normal
 from torchpose.whole_body._filters.body_frames import Frame
 from torchpose.whole_body._filters.body_particles import (
     BodyFilterOptions,
