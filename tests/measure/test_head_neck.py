@@ -3,8 +3,9 @@
 import pytest
 import torch
 
+from torchpose import load_prior
 from torchpose.errors import InputError
-from torchpose.measure import HeadNeck
+from torchpose.measure import HeadNeck, UpperBodyMeasurer
 from torchpose.measure._head import FACE_OFFSETS
 
 
@@ -32,6 +33,20 @@ def test_everything_scales_with_the_face():
     torch.testing.assert_close(2 * (points[:1] - centre[:1]), points[1:] - centre[1:])
     torch.testing.assert_close(4 * cov[0], cov[1])
     assert HeadNeck()(faces[:0])[0].shape == (0, 2, 2)
+
+
+@pytest.mark.parametrize(
+    ("options", "neck"),
+    [
+        ({}, 0.95),
+        ({"elbows": False}, 1.1),
+        ({"hands": "grid"}, 1.1),
+        ({"hands": "mean-shift"}, 1.1),
+    ],
+)
+def test_neck_is_lower_where_no_network_measures_elbows(options, neck):
+    measurer = UpperBodyMeasurer(load_prior("kinect-upper-body-small"), **options)
+    assert float(measurer.head_neck.offset[1, 1]) == pytest.approx(neck)
 
 
 def test_bad_offsets_are_refused():

@@ -18,7 +18,7 @@ from torchpose.measure._hand_likelihood import HandMeasurements
 from torchpose.measure._hand_network import shipped_hand_network
 from torchpose.measure._hand_prior import HandPrior
 from torchpose.measure._hands import HandTracker
-from torchpose.measure._head import HeadNeck
+from torchpose.measure._head import FACE_OFFSETS, WITHOUT_ELBOWS, HeadNeck
 from torchpose.measure._mean_shift_hands import MeanShiftHandTracker
 from torchpose.measure._persons import PersonRegister, Persons, measure_by_scale, take_rows
 from torchpose.measure._skin import SkinState, rgb_to_lab
@@ -95,7 +95,8 @@ class UpperBodyMeasurer(nn.Module):
         elbows: whether to measure elbows: by the network, or without one where the torso with its sleeves
             is widest. None measures them if hands are "learnt".
         face_detector: by default Haar's. max_persons: the largest faces are taken.
-        head_neck: offsets of head and neck from the face.
+        head_neck: offsets of head and neck from the face; by default the neck is higher if a network
+            measures elbows.
 
     Raises:
         InputError: settings out of range.
@@ -127,7 +128,8 @@ class UpperBodyMeasurer(nn.Module):
         measured = self.learnt if elbows is None else elbows
         self.names = MEASURED + _ELBOWS if measured else MEASURED
         self.face_tracker = FaceTracker(face_detector)
-        self.head_neck = HeadNeck() if head_neck is None else head_neck
+        offsets = FACE_OFFSETS if self.learnt and measured else WITHOUT_ELBOWS
+        self.head_neck = HeadNeck(offsets) if head_neck is None else head_neck
         self.register = PersonRegister(within=round(30 * fps))
         self.hand_tracker: HandTracker | MeanShiftHandTracker
         if hands != "mean-shift":

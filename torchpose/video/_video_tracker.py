@@ -121,7 +121,7 @@ class VideoTracker(nn.Module):
             measured and filtered in turn, which is slower.
         face_detector: the detector of faces; by default Haar's.
         max_persons: track only the N largest faces, or persons of a detector.
-        head_neck: the offsets of head and neck from the face.
+        head_neck: the offsets of head and neck from the face; see `UpperBodyMeasurer`.
         detector: find keypoints with a detector, in place of faces, skin and hands: a model in ONNX
             (.onnx), a pose landmarker of MediaPipe (.task), or package:factory, which Python imports and
             calls.
