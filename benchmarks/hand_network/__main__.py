@@ -1,6 +1,6 @@
 """Hands in video of persons that the network was not fitted to, beside what knows no persons.
 
-    python -m benchmarks.hand_network --data DIR --out FOLDER [--table FILE]
+    python -m benchmarks.hand_network --data DIR --out FOLDER [--table FILE] [--pictures FOLDER]
     python -m benchmarks.hand_network --data DIR --out FOLDER --fit FILE.safetensors
 
 The labels are MediaPipe's, as good as these are: a hand is seven tenths of the way from wrist to index
@@ -32,12 +32,14 @@ from benchmarks.hand_network.clips import (
     PEOPLE,
     SIGNERS,
     Clip,
+    Labels,
     Windows,
     measure,
     read_clips,
     render_clips,
     windows_of,
 )
+from benchmarks.hand_network.failures import Found, draw_failures
 from benchmarks.hand_network.training import STEPS
 from benchmarks.hand_network.training import fit as fit_network
 from torchpose import PinholeCamera, VideoTracker, load_prior
@@ -66,24 +68,30 @@ class Score(NamedTuple):
     gone: Tensor
 
 
-def score(clip: Clip, network: HandNetwork | None) -> Score:
-    """Return the counts of a clip, by a tracker with a network, or without (None)."""
+def found_by(clip: Clip, network: HandNetwork | None) -> Found:
+    """Return what a tracker with a network, or without (None), measures in a clip."""
     prior = HandPrior.from_prior(load_prior("kinect-upper-body"))
     with open_video(clip.path) as video:
-        tracker = HandTracker(prior, fps=video.fps, network=network)
-    right, invented = torch.zeros(2), torch.zeros(2)
-    labels = clip.labels
-    for t, _, hands, _ in measure(clip, tracker):
-        if t <= BURN_IN:
-            continue
-        points = torch.stack([hands.points, hands.elbows])
-        measured = torch.stack([hands.seen, hands.elbow_seen])
-        centres, seen = labels.centres[t].view(2, 2, 2), labels.seen[t].view(2, 2)
-        near = (points - centres).norm(dim=-1) < labels.width / 4
-        right += (near & measured & (seen == 1)).sum(1)
-        invented += (measured & (seen == 0)).sum(1)
-    known = labels.seen[BURN_IN + 1 :].unflatten(1, (2, 2))
-    return Score(right, (known == 1).sum((0, 2)), invented, (known == 0).sum((0, 2)))
+        tracker, size = HandTracker(prior, fps=video.fps, network=network), video.size
+    n_frames = len(clip.labels.nose)
+    points = torch.full((n_frames, 2, 2, 2), torch.nan, dtype=torch.float64)
+    measured = torch.zeros(n_frames, 2, 2, dtype=torch.bool)
+    faces = torch.full((n_frames, 3), torch.nan, dtype=torch.float64)
+    for t, _, hands, anchor in measure(clip, tracker):
+        points[t] = torch.stack([hands.points, hands.elbows])
+        measured[t] = torch.stack([hands.seen, hands.elbow_seen])
+        faces[t] = anchor
+    return Found(points, measured, faces, size)
+
+
+def score(labels: Labels, found: Found) -> Score:
+    """Return the counts of a clip."""
+    away = (found.points - labels.centres.unflatten(1, (2, 2))).norm(dim=-1)
+    seen = labels.seen.unflatten(1, (2, 2))[BURN_IN + 1 :]
+    near, measured = (away < labels.width / 4)[BURN_IN + 1 :], found.measured[BURN_IN + 1 :]
+    right, invented = near & measured & (seen == 1), measured & (seen == 0)
+    counts = (right, seen == 1, invented, seen == 0)
+    return Score(*(count.sum((0, 2)) for count in counts))
 
 
 def elbow_error(clip: Clip, network: HandNetwork, elbows: bool) -> float:
@@ -135,7 +143,7 @@ def facts(clips: Sequence[Clip], name: str, command: str) -> HandNetworkInfo:
 
 
 def add_table(
-    report: Report, scores: dict[str, tuple[Score, Score]], errors: dict[str, list[float]]
+    report: Report, scores: dict[str, tuple[Score, ...]], errors: dict[str, list[float]]
 ) -> None:
     """Add the scores of all clips, without and with a network that knows nobody in them.
 
@@ -173,6 +181,7 @@ def main(
     out: Path,
     fit: Path | None = None,
     table: TableFile | None = None,
+    pictures: Path | None = None,
     threads: int = 2,
     quick: bool = False,
 ) -> None:
@@ -183,6 +192,7 @@ def main(
         out: folder for what is kept.
         fit: file for a network that knows everybody.
         table: file for the table, or a folder.
+        pictures: folder for drawings of the hands that are wrong.
         threads: cores.
         quick: two clips and no fit worth its name.
     """
@@ -202,7 +212,9 @@ def main(
         windows = [(clip.person, cached_windows(clip)) for clip in labelled]
         fit_network(windows, facts(labelled, "hands", command), steps).save(fit)
         return
-    scores, errors = {}, {}
+    found: dict[str, tuple[Found, Labels]] = {}
+    scores: dict[str, tuple[Score, ...]] = {}
+    errors: dict[str, list[float]] = {}
     for number, persons in enumerate(FOLDS):
         left_out = [clip for clip in clips if clip.person in persons]
         if not left_out:
@@ -211,7 +223,9 @@ def main(
         info = facts(known, f"without {', '.join(persons)}", "")
         network = fitted(known, out / f"fold-{number}.safetensors", info, steps)
         for clip in left_out:
-            scores[clip.name] = score(clip, None), score(clip, network)
+            found[clip.name] = found_by(clip, network), clip.labels
+            both = found_by(clip, None), found[clip.name][0]
+            scores[clip.name] = tuple(score(clip.labels, measured) for measured in both)
             errors[clip.name] = [elbow_error(clip, network, measured) for measured in (False, True)]
     report = Report("Hands of persons left out")
     add_table(report, scores, errors)
@@ -219,6 +233,9 @@ def main(
     print(text)
     if table is not None:
         table.write_text(text + "\n")
+    if pictures is not None:
+        for kind, count, path in draw_failures(pictures, found):
+            print(f"{kind}: {count} hands, {path}")
 
 
 if __name__ == "__main__":

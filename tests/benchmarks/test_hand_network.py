@@ -5,7 +5,8 @@ import torch
 
 pytest.importorskip("cv2")
 from benchmarks.hand_network.changes import bare_skin, bordered, exchanged, lit, mirrored, moved
-from benchmarks.hand_network.clips import FOLDS, PEOPLE, SIGNERS, Windows
+from benchmarks.hand_network.clips import BURN_IN, FOLDS, PEOPLE, SIGNERS, Labels, Windows
+from benchmarks.hand_network.failures import Found, draw_failures, failures
 from benchmarks.hand_network.training import _loss, fit
 from torchpose.measure._body_window import CELL, CELLS, cell_centres
 from torchpose.measure._hand_network import HandPlaces
@@ -138,3 +139,27 @@ def test_a_fit_is_a_network_that_is_ready_and_the_same_again():
 def test_every_person_is_left_out_once():
     left_out = [person for fold in FOLDS for person in fold]
     assert sorted(left_out) == sorted({*PEOPLE.values(), *SIGNERS.values()})
+
+
+def test_failures_are_named_and_drawn(tmp_path):
+    n_frames = BURN_IN + 7
+    left, right, face = (100.0, 300.0), (300.0, 300.0), (200.0, 100.0, 60.0)
+    centres = torch.tensor([[left, right, left, right]], dtype=torch.float64).repeat(n_frames, 1, 1)
+    seen = torch.ones(n_frames, 4, dtype=torch.long)
+    points = centres.unflatten(1, (2, 2)).clone()
+    measured = torch.ones(n_frames, 2, 2, dtype=torch.bool)
+    first = BURN_IN + 1
+    measured[first, 0, 0] = False
+    points[first + 1, 0, 0] = torch.tensor(right)
+    points[first + 2, 0, 0] = torch.tensor(face[:2])
+    points[first + 3, 0, 0] += 100
+    seen[first + 4, 1], seen[first + 5, 0] = 0, -1
+    points[first + 5, 0, 0] += 100
+    faces = torch.tensor([face], dtype=torch.float64).repeat(n_frames, 1)
+    found = Found(points, measured, faces, (640, 480))
+    labels = Labels(centres, seen, centres[:, 0], 120.0)
+    kinds = ["missed", "at the other hand", "on the face", "elsewhere", "invented"]
+    assert list(failures(found, labels)) == [(first + i, kind) for i, kind in enumerate(kinds)]
+    drawn = list(draw_failures(tmp_path / "sheets", {"clip": (found, labels)}))
+    assert [(kind, count) for kind, count, _ in drawn] == [(kind, 1) for kind in sorted(kinds)]
+    assert all(path.is_file() for *_, path in drawn)
