@@ -64,18 +64,24 @@ def poses_of(
         )
 
 
-def lifted(view: View, lengths: Float[Tensor, "2 2"], depth: float) -> Chains:
+def lifted(
+    view: View, lengths: Float[Tensor, "2 2"], depth: float, true_signs: bool = False
+) -> Chains:
     """Return arms in front of the image plane through the shoulders, at one depth.
 
     Args:
         view: what is seen. lengths: of upper arm and forearm, left and right. depth: of the body.
+        true_signs: whether bones point away from the camera where the truth does, which nothing that is
+            seen tells.
     """
     matrix = view.camera.matrix
     focal = torch.stack([matrix[0, 0], matrix[1, 1]])
     flat = view.keypoints[:, arm_rows(view.names)] / focal * depth
     bones = flat.diff(dim=2)
     away = (lengths.square() - bones.square().sum(-1)).clamp_min(0).sqrt()
-    whole = torch.cat([bones, -away[..., None]], -1)
+    behind = view.truth.diff(dim=2)[..., 2] > 0
+    away = torch.where(behind & true_signs, away, -away)
+    whole = torch.cat([bones, away[..., None]], -1)
     return Chains(whole[:, :, 0], whole[:, :, 1])
 
 
@@ -120,6 +126,7 @@ def lifts(mean: Float[Tensor, "2 2"]) -> dict[str, Callable[[View], Chains]]:
 
     return {
         "lift, own lengths and depth": lambda v: lifted(v, true_lengths(v), v.far),
+        "lift, own lengths, depth and signs": lambda v: lifted(v, true_lengths(v), v.far, True),
         "lift, others' lengths, own depth": lambda v: lifted(v, mean, v.far),
         "hanging arms": mean_arm,
     }

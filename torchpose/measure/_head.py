@@ -57,8 +57,9 @@ class FaceOffsets(NamedTuple):
 # with elbows measured by persons' fits that left them out, elbows and shoulders are nearest to
 # MediaPipe's at b = 0.9 or less; 3D errors of rendered performers are least at 1.0.
 FACE_OFFSETS = FaceOffsets(-0.2, 0.95, (0.05, 0.08), (0.07, 0.12))
-# Where no network measures elbows, rendered performers are 5.9 cm off in place of 6.7.
-WITHOUT_ELBOWS = FACE_OFFSETS._replace(neck=1.1)
+# Where no network measures elbows, a lower neck is better on signers and rendered performers, and worse
+# on other people in close-ups.
+WITHOUT_ELBOWS = FACE_OFFSETS._replace(neck=1.0)
 
 
 class HeadNeck(nn.Module):
