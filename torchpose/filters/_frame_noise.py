@@ -24,7 +24,7 @@ from torchpose.filters._recompute import wants_gradient
 from torchpose.math._gaussian import LOG_2PI, mended_cholesky, spare_columns
 from torchpose.math._geometric_median import geometric_median, median_columns
 
-__all__ = ["OwnFrames", "condition_own", "own_moments"]
+__all__ = ["OwnFrames", "condition_own", "own_moments", "own_noise"]
 
 
 class _Parts(NamedTuple):
@@ -63,9 +63,8 @@ def condition_own(
         z: 0 where missing. mask: True where measured. noise: R.
     """
     parts = _parts(model)
-    both = (mask[:, :, None] & mask[:, None, :])[:, None]
-    eye = torch.eye(z.shape[-1], dtype=noise.dtype, device=noise.device)
-    factor, jitter = mended_cholesky(torch.where(both, parts.block + noise[:, None], eye))
+    noise, both = own_noise(noise, mask)
+    factor, jitter = mended_cholesky(torch.addcmul(noise[:, None], parts.block, both[:, None]))
     log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     log_norm = -0.5 * LOG_2PI * mask.sum(-1, keepdim=True).to(log_det) - log_det
     factor = factor.to(model.dtype)
@@ -73,6 +72,15 @@ def condition_own(
     white = torch.linalg.solve_triangular(factor, residual[..., None], upper=False)[..., 0]
     log_likelihood = log_norm.to(model.dtype) - 0.5 * white.square().sum(-1)
     return OwnFrames(factor, white, log_likelihood, jitter, mask)
+
+
+def own_noise(
+    noise: Float[Tensor, "*batch Z Z"], mask: Bool[Tensor, "*batch Z"]
+) -> tuple[Float[Tensor, "*batch Z Z"], Float[Tensor, "*batch Z Z"]]:
+    """Return R' and b of S = R' + b C: b is 1 between measured dimensions; R' that of the identity elsewhere."""
+    both = mask[..., :, None] & mask[..., None, :]
+    eye = torch.eye(noise.shape[-1], dtype=noise.dtype, device=noise.device)
+    return torch.where(both, noise, eye), both.to(noise)
 
 
 def own_moments(
