@@ -9,6 +9,7 @@ with L L^T = H P H^T + R. The corner of A is then minus the squared innovation, 
 missing dimension has no row of H, and that of the identity in R: it changes nothing, exactly.
 """
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -28,8 +29,8 @@ from torchpose.math._gaussian import LOG_2PI, mended_cholesky, symmetrise
 
 __all__ = ["run_own_histories"]
 
-_STATE_NUMBERS = 1 << 18  # of tracks at a time: 2 MB, which stay in the cache
-_SPAN_NUMBERS = 1 << 18  # of their means over a span of frames
+_STATE_NUMBERS = 300_000  # of tracks at a time: 2.4 MB, which stay in the cache
+_SPAN_NUMBERS = 1 << 20  # of their means over a span of frames
 _COV_NUMBERS = 1 << 21  # of their covariances, where these are asked for
 _LONGEST_SPAN = 64
 
@@ -76,7 +77,8 @@ def run_own_histories(
     marginal = frame_log_likelihood(model, rule, frames)
     results = _empty_results(model, frames, return_cov)
     width = diagonal_moves(model, diagonal, model.burn_in).factor.shape[-1]
-    at_a_time = max(1, _STATE_NUMBERS // (model.n_tracks * width**2))
+    n_chunks = math.ceil(batch * model.n_tracks * width**2 / _STATE_NUMBERS)
+    at_a_time = math.ceil(batch / n_chunks)
     bar = tqdm(total=batch * n_frames, disable=not progress, unit="frame")
     for start in range(0, batch, at_a_time):
         chunk = slice(start, min(start + at_a_time, batch))
@@ -132,6 +134,7 @@ def _spans(
     width = diagonal_moves(model, diagonal, model.burn_in).factor.shape[-1]
     state = diagonal.basis.new_zeros(batch, model.n_tracks, width, width)
     state[..., : model.dim, : model.dim] = diagonal.start
+    before = torch.empty_like(state)
     rows = diagonal.rows.expand(batch, -1, -1, -1).flatten(0, 1)
     length = _SPAN_NUMBERS // (batch * model.n_tracks * width)
     if return_cov:
@@ -141,10 +144,10 @@ def _spans(
         span = slice(start, min(start + length, n_frames))
         moves = [diagonal_moves(model, diagonal, t) for t in range(span.start, span.stop)]
         problem = _problem(model, frames, span)
-        before = state.clone()
+        before.copy_(state)
         tracks = _filter_span(state, rows, moves, problem, return_cov, mend=False)
         if tracks is None:
-            state = before
+            state.copy_(before)
             tracks = _filter_span(state, rows, moves, problem, return_cov, mend=True)
             assert tracks is not None
         yield span, tracks
