@@ -83,7 +83,7 @@ def run_own_histories(
     for start in range(0, batch, at_a_time):
         chunk = slice(start, min(start + at_a_time, batch))
         carried = model.init(chunk.stop - chunk.start).log_weights
-        taken = _some(frames, chunk)
+        taken = frames.some(chunk)
         for span, tracks in _spans(model, diagonal, taken, return_cov):
             likelihood = tracks.log_likelihood.to(model.dtype)
             own = None if marginal is None else marginal[chunk, span].transpose(0, 1)
@@ -102,12 +102,6 @@ def run_own_histories(
     results.log_evidence.masked_fill_(~frames.mask.any(-1), 0)
     found, work = results[:4], Mending(results.mended, results.jitter)
     return finish_output(*found, frames.lengths, work)
-
-
-def _some(frames: Measurements, chunk: slice) -> Measurements:
-    """Return the measurements of some sequences."""
-    cov = frames.cov if frames.cov.ndim == 2 else frames.cov[chunk]
-    return Measurements(frames.z[chunk], frames.mask[chunk], cov, frames.lengths[chunk])
 
 
 def _empty_results(

@@ -4,16 +4,30 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from tqdm.auto import tqdm
 
 from torchpose._core.checks import check_count
 from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
+from torchpose.filters._joint_tracks import (
+    TRACK_NUMBERS,
+    correct_joint,
+    joint_chunks,
+    joint_estimate,
+    joint_model,
+    joint_problem,
+    joint_state,
+    joined,
+    predict_joint,
+    stacked,
+)
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
-from torchpose.filters._outputs import StepOutput, effective_sample_size, mending
+from torchpose.filters._outputs import FilterOutput, StepOutput, effective_sample_size, mending
+from torchpose.filters._recompute import wants_gradient
 from torchpose.filters._recursive_filter import Generators, uniform
-from torchpose.filters._resampling import systematic
+from torchpose.filters._resampling import systematic, systematic_from, systematic_start
 from torchpose.filters._weights import estimate_of, normalise
 from torchpose.math._gaussian import kalman_predict, mended_update
 from torchpose.priors._gaussian_mixture import GaussianMixture
@@ -124,6 +138,75 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
             MKFState(*carried, group, state.time + 1),
             StepOutput(estimate, log_weights, log_evidence, total, *mending(estimate, jitter)),
         )
+
+    def filter_frames(
+        self, frames: Measurements, generator: Generators, return_cov: bool, progress: bool
+    ) -> FilterOutput:
+        """Filter whole sequences, given checked measurements, some sequences at a time.
+
+        Args:
+            frames: checked measurements: z [B, T, Z], mask [B, T, Z], cov [Z, Z] or [B, T, Z, Z], lengths
+                [B].
+            generator: for filters that draw; one generator, or a list of one for each sequence.
+            return_cov: whether to return covariances as well.
+            progress: whether to show a progress bar.
+
+        Returns:
+            `FilterOutput` with means [B, T, D].
+        """
+        if not values_visible() or wants_gradient(frames.z, frames.cov, *self.sources):
+            return super().filter_frames(frames, generator, return_cov, progress)
+        batch, n_frames = frames.z.shape[:2]
+        first = self._draw_components(batch, generator)
+        # In the order in which single frames draw, so that numbers are theirs.
+        draws = [self._draw_frame(batch, generator) for _ in range(n_frames)]
+        parts = []
+        with tqdm(total=batch * n_frames, disable=not progress, unit="frame") as bar:
+            for chunk in joint_chunks(self, batch, TRACK_NUMBERS):
+                own = [(drawn[chunk], u[chunk]) for drawn, u in draws]
+                parts.append(self._filter_chunk(frames.some(chunk), first[chunk], own, return_cov))
+                bar.update(len(parts[-1].mean) * n_frames)
+        return joined(parts, frames.lengths)
+
+    def _draw_frame(self, batch: int, generator: Generators) -> tuple[Tensor, Tensor]:
+        """Draw what one frame needs: components [B, M], and where resampling starts [B, 1]."""
+        drawn = self._draw_components(batch, generator)
+        return drawn, systematic_start(drawn, generator)
+
+    def _filter_chunk(
+        self,
+        frames: Measurements,
+        first: Tensor,
+        draws: list[tuple[Tensor, Tensor]],
+        return_cov: bool,
+    ) -> FilterOutput:
+        """Filter some sequences whose random numbers are drawn, as `filter_frame` does."""
+        log_weights = normalise(torch.zeros(first.shape, dtype=self.dtype, device=first.device))
+        state, steps = joint_state(self.means.to(torch.float64)[first], self.start_cov[first]), []
+        for t, (drawn, u) in enumerate(draws):
+            frame = frames.frame(t)
+            state = predict_joint(joint_model(self, t), state, drawn)
+            problem = joint_problem(frame)
+            log_likelihood, jitter = correct_joint(state, problem, self.observed, self.dim)
+            joint = log_weights + log_likelihood.to(self.dtype)
+            log_evidence = torch.logsumexp(joint, -1)
+            log_weights = joint - log_evidence[:, None]
+            steps.append(joint_estimate(state, log_weights, log_evidence, jitter, self.dim, return_cov))
+            needed = effective_sample_size(log_weights) < self.resample_threshold * self.n_tracks
+            if bool(needed.any()):
+                log_weights, state = self._resampled(log_weights, state, needed, u)
+        return stacked(steps, frames)
+
+    def _resampled(
+        self, log_weights: Tensor, state: Tensor, needed: Tensor, u: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return tracks with equal weights for the elements that need it."""
+        own = torch.arange(log_weights.numel(), device=state.device).view_as(log_weights)
+        taken = systematic_from(log_weights, u) + own[:, :1]
+        index = torch.where(needed[:, None], taken, own)
+        equal = normalise(torch.zeros_like(log_weights))
+        state = state.flatten(0, 1).index_select(0, index.flatten()).view_as(state)
+        return torch.where(needed[:, None], equal, log_weights), state
 
     def _draw_components(self, batch: int, generator: Generators) -> Tensor:
         cumulative = self.log_prior.exp().cumsum(0)
