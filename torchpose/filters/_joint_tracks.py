@@ -5,7 +5,8 @@ a step is two products of that width, the rows of the measured dimensions, and o
 
 A <- [F, 0; 0, 1] A [F, 0; 0, 1]^T + [N, b; b^T, 0],   W = L^-1 [H P, H x - z],   A <- A - W^T W,
 
-with L L^T = H P H^T + R; the last column of W is minus the whitened innovation. c is not used.
+with L L^T = H P H^T + R; the last column of W is minus the whitened innovation. c is not used. The measured
+dimensions come first, so that H P is a slice.
 """
 
 from collections.abc import Sequence
@@ -35,19 +36,18 @@ __all__ = [
     "TRACK_NUMBERS",
     "JointModel",
     "JointProblem",
-    "correct_joint",
+    "JointTracks",
     "joined",
     "joint_chunks",
     "joint_estimate",
     "joint_model",
-    "joint_problem",
-    "joint_state",
-    "predict_joint",
+    "joint_order",
+    "joint_problems",
     "stacked",
 ]
 
-TRACK_NUMBERS = 300_000
-"""Numbers in the tracks that are stepped at a time: 2.4 MB, which stay in the cache."""
+TRACK_NUMBERS = 1 << 18
+"""Numbers in the tracks that are stepped at a time: 2 MB, which stay in the cache."""
 
 
 class JointModel(NamedTuple):
@@ -80,11 +80,22 @@ def joint_chunks(model: MixtureKalmanFilter, batch: int, numbers: int) -> list[s
     return [slice(*pair) for pair in zip(edges, edges[1:], strict=False)]
 
 
+def joint_order(model: MixtureKalmanFilter) -> tuple[Tensor, Tensor]:
+    """Return the dimensions of the state with the measured ones first, and the way back."""
+    first = torch.zeros(model.dim, dtype=torch.long, device=model.observed.device)
+    first[model.observed] = torch.arange(len(model.observed), 0, -1, device=first.device)
+    order = first.argsort(descending=True, stable=True)
+    return order, order.argsort()
+
+
 def joint_model(model: MixtureKalmanFilter, time: int) -> JointModel:
     """Return the prediction into a frame, kept after the burn-in."""
 
     def make() -> JointModel:
+        order = joint_order(model)[0]
         matrix, offset, noise = model.transition(time)
+        offset = offset[:, order]
+        matrix, noise = (part[:, order[:, None], order] for part in (matrix, noise))
         spare = spare_columns(model.dim) - 1
         joint = pad(torch.cat([noise, offset[..., None]], -1), (0, spare, 0, spare + 1))
         joint[:, model.dim, : model.dim] = offset
@@ -95,84 +106,120 @@ def joint_model(model: MixtureKalmanFilter, time: int) -> JointModel:
     return make() if time < model.burn_in else derived(model, "joint", model.sources, make)
 
 
-def joint_state(
-    mean: Float[Tensor, "*batch D"], cov: Float[Tensor, "*batch D D"]
-) -> Float[Tensor, "*batch E E"]:
-    """Return tracks as joint matrices."""
-    spare = spare_columns(mean.shape[-1])
-    joint = pad(torch.cat([cov, mean[..., None]], -1), (0, spare - 1, 0, spare))
-    joint[..., mean.shape[-1], : mean.shape[-1]] = mean
-    return joint
+def joint_problems(frames: Measurements) -> list[JointProblem]:
+    """Return what is measured in every frame, for `JointTracks.correct`."""
+    complete = bool(frames.mask.all())
+    noise = frames.cov[None, None] if frames.cov.ndim == 2 else frames.cov
+    noise, both = own_noise(noise.to(torch.float64), frames.mask)
+    count = -0.5 * LOG_2PI * frames.mask.sum(-1, keepdim=True).to(noise)
+    parts = frames.z[:, :, None].to(noise), noise[:, :, None], both[:, :, None]
+    mask = frames.mask[:, :, None, :, None].to(noise)
+    return [
+        JointProblem(z, r, None if complete else b, seen, n)
+        for z, r, b, seen, n in zip(
+            *(part.unbind(1) for part in (*parts, mask, count)), strict=True
+        )
+    ]
 
 
-def joint_problem(frame: Measurements) -> JointProblem:
-    """Return what is measured in a frame, for `correct_joint`."""
-    noise, both = own_noise(frame.cov.to(torch.float64), frame.mask)
-    return JointProblem(
-        frame.z[:, None].to(noise),
-        noise[:, None],
-        None if bool(frame.mask.all()) else both[:, None],
-        frame.mask[:, None, :, None].to(noise),
-        -0.5 * LOG_2PI * frame.mask.sum(-1, keepdim=True).to(noise),
-    )
-
-
-def predict_joint(
-    model: JointModel, state: Float[Tensor, "B M E E"], component: Int[Tensor, "B M"]
-) -> Float[Tensor, "B M E E"]:
-    """Return tracks after the prediction by a component each (BL 34, 37)."""
-    chosen = component.flatten()
-    matrix = model.matrix.index_select(0, chosen)
-    moved = torch.bmm(matrix, state.flatten(0, 1))
-    return model.noise.index_select(0, chosen).baddbmm_(moved, matrix.mT).view_as(state)
-
-
-def correct_joint(
-    state: Float[Tensor, "B M E E"], problem: JointProblem, observed: Int[Tensor, " Z"], dim: int
-) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B M"] | None]:
-    """Update tracks in place by a measurement (BL 38-41).
+class JointTracks:
+    """Steps M tracks of B elements in memory that is used again: fresh pages cost as much as the products.
 
     Args:
-        state: the predicted tracks. observed: measured state dimensions. dim: D.
+        model: the filter. mean: [B, M, D]. cov: [B, M, D, D].
 
-    Returns:
-        The log-likelihood of every track, and the jitter of its covariance, as `mended_cholesky`.
+    Attributes:
+        state: the tracks [B, M, E, E]. dim: D.
     """
-    joint = state.index_select(-2, observed)
-    innovation = joint.index_select(-1, observed)
-    if problem.both is None:
-        innovation += problem.noise
-    else:
-        innovation = torch.addcmul(problem.noise, problem.both, innovation)
-        joint *= problem.mask
-    joint[..., dim] -= problem.z
-    factor, jitter = mended_cholesky(innovation)
-    white = torch.linalg.solve_triangular(factor, joint, upper=False)
-    flat = white.flatten(0, 1)
-    state.flatten(0, 1).baddbmm_(flat.mT, flat, alpha=-1)
-    log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    squared = white[..., dim].square().sum(-1)
-    return torch.add(problem.log_norm - log_det, squared, alpha=-0.5), jitter
+
+    def __init__(
+        self,
+        model: MixtureKalmanFilter,
+        mean: Float[Tensor, "B M D"],
+        cov: Float[Tensor, "B M D D"],
+    ) -> None:
+        order, self._back = joint_order(model)
+        mean, cov = mean[..., order], cov[..., order[:, None], order]
+        self.dim, self.n_observed = model.dim, len(model.observed)
+        width = self.dim + spare_columns(self.dim)
+        self.state = cov.new_zeros(*mean.shape[:-1], width, width)
+        self.state[..., : self.dim, : self.dim] = cov
+        self.state[..., : self.dim, self.dim] = mean
+        self.state[..., self.dim, : self.dim] = mean
+        self._other, self._matrix, self._moved = (torch.empty_like(self.state) for _ in range(3))
+
+    @property
+    def mean(self) -> Float[Tensor, "B M D"]:
+        """Return the means, in the order of the filter's state."""
+        return self.state[..., self.dim].index_select(-1, self._back)
+
+    @property
+    def cov(self) -> Float[Tensor, "B M D D"]:
+        """Return the covariances, in the order of the filter's state."""
+        return self.state[..., self._back[:, None], self._back]
+
+    def take(self, parent: Int[Tensor, "B M"]) -> None:
+        """Replace the tracks of every element by some of them, of which some may be taken again."""
+        batch, n_tracks = self.state.shape[:2]
+        index = parent + n_tracks * torch.arange(batch, device=parent.device)[:, None]
+        torch.index_select(
+            self.state.flatten(0, 1), 0, index.flatten(), out=self._other.flatten(0, 1)
+        )
+        self.state, self._other = self._other, self.state
+
+    def predict(self, model: JointModel, component: Int[Tensor, "B M"]) -> None:
+        """Predict the tracks by a component each (BL 34, 37)."""
+        chosen, matrix, moved = component.flatten(), self._matrix.flatten(0, 1), self._moved
+        predicted, moved = self._other.flatten(0, 1), moved.flatten(0, 1)
+        torch.index_select(model.matrix, 0, chosen, out=matrix)
+        torch.bmm(matrix, self.state.flatten(0, 1), out=moved)
+        torch.index_select(model.noise, 0, chosen, out=predicted)
+        predicted.baddbmm_(moved, matrix.mT)
+        self.state, self._other = self._other, self.state
+
+    def correct(
+        self, problem: JointProblem
+    ) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B M"] | None]:
+        """Update the tracks by a measurement (BL 38-41).
+
+        Returns:
+            The log-likelihood of every track, and the jitter of its covariance, as `mended_cholesky`.
+        """
+        n_obs = self.n_observed
+        joint, block = self.state[..., :n_obs, :], self.state[..., :n_obs, :n_obs]
+        if problem.both is None:
+            innovation = block + problem.noise
+            joint = joint.clone(memory_format=torch.contiguous_format)
+        else:
+            innovation = torch.addcmul(problem.noise, problem.both, block)
+            joint = joint * problem.mask
+        joint[..., self.dim] -= problem.z
+        factor, jitter = mended_cholesky(innovation)
+        white = torch.linalg.solve_triangular(factor, joint, upper=False)
+        flat = white.flatten(0, 1)
+        self.state.flatten(0, 1).baddbmm_(flat.mT, flat, alpha=-1)
+        log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        squared = white[..., self.dim].square().sum(-1)
+        return torch.add(problem.log_norm - log_det, squared, alpha=-0.5), jitter
 
 
 def joint_estimate(
-    state: Float[Tensor, "B M E E"],
+    tracks: JointTracks,
     log_weights: Float[Tensor, "B M"],
     log_evidence: Float[Tensor, " B"],
     jitter: Tensor | None,
-    dim: int,
     return_cov: bool,
 ) -> StepOutput:
     """Return the estimate of a frame (BL 48); without covariances its mean is that of the tracks [B, M, D].
 
     Args:
-        log_evidence: also where nothing is measured. jitter: of `correct_joint`. dim: D.
+        log_evidence: also where nothing is measured. jitter: of `JointTracks.correct`.
     """
-    mean = state[..., :dim, dim].to(log_weights)
+    mean = tracks.mean.to(log_weights)
     work = (None, None) if jitter is None else mending(log_weights, jitter)
     if not return_cov:
         return StepOutput(mean, log_weights, log_evidence, None, *work)
-    estimate, total = estimate_of(log_weights, mean, state[..., :dim, :dim])
+    estimate, total = estimate_of(log_weights, mean, tracks.cov)
     total = None if total is None else symmetrise(total)
     return StepOutput(estimate, log_weights, log_evidence, total, *work)
 

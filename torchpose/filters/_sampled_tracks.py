@@ -12,14 +12,12 @@ from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
 from torchpose.filters._joint_tracks import (
     TRACK_NUMBERS,
-    correct_joint,
+    JointTracks,
     joint_chunks,
     joint_estimate,
     joint_model,
-    joint_problem,
-    joint_state,
+    joint_problems,
     joined,
-    predict_joint,
     stacked,
 )
 from torchpose.filters._measurements import Measurements
@@ -182,31 +180,22 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
     ) -> FilterOutput:
         """Filter some sequences whose random numbers are drawn, as `filter_frame` does."""
         log_weights = normalise(torch.zeros(first.shape, dtype=self.dtype, device=first.device))
-        state, steps = joint_state(self.means.to(torch.float64)[first], self.start_cov[first]), []
-        for t, (drawn, u) in enumerate(draws):
-            frame = frames.frame(t)
-            state = predict_joint(joint_model(self, t), state, drawn)
-            problem = joint_problem(frame)
-            log_likelihood, jitter = correct_joint(state, problem, self.observed, self.dim)
+        equal, least = log_weights, self.resample_threshold * self.n_tracks
+        tracks, steps = JointTracks(self, self.means[first], self.start_cov[first]), []
+        problems = joint_problems(frames)
+        for t, (problem, (drawn, u)) in enumerate(zip(problems, draws, strict=True)):
+            tracks.predict(joint_model(self, t), drawn)
+            log_likelihood, jitter = tracks.correct(problem)
             joint = log_weights + log_likelihood.to(self.dtype)
             log_evidence = torch.logsumexp(joint, -1)
             log_weights = joint - log_evidence[:, None]
-            steps.append(joint_estimate(state, log_weights, log_evidence, jitter, self.dim, return_cov))
-            needed = effective_sample_size(log_weights) < self.resample_threshold * self.n_tracks
+            steps.append(joint_estimate(tracks, log_weights, log_evidence, jitter, return_cov))
+            needed = effective_sample_size(log_weights) < least
             if bool(needed.any()):
-                log_weights, state = self._resampled(log_weights, state, needed, u)
+                own = torch.arange(self.n_tracks, device=u.device)
+                tracks.take(torch.where(needed[:, None], systematic_from(log_weights, u), own))
+                log_weights = torch.where(needed[:, None], equal, log_weights)
         return stacked(steps, frames)
-
-    def _resampled(
-        self, log_weights: Tensor, state: Tensor, needed: Tensor, u: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return tracks with equal weights for the elements that need it."""
-        own = torch.arange(log_weights.numel(), device=state.device).view_as(log_weights)
-        taken = systematic_from(log_weights, u) + own[:, :1]
-        index = torch.where(needed[:, None], taken, own)
-        equal = normalise(torch.zeros_like(log_weights))
-        state = state.flatten(0, 1).index_select(0, index.flatten()).view_as(state)
-        return torch.where(needed[:, None], equal, log_weights), state
 
     def _draw_components(self, batch: int, generator: Generators) -> Tensor:
         cumulative = self.log_prior.exp().cumsum(0)
