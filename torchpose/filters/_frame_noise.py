@@ -24,10 +24,17 @@ from torchpose.filters._recompute import wants_gradient
 from torchpose.math._gaussian import LOG_2PI, mended_cholesky, spare_columns
 from torchpose.math._geometric_median import geometric_median, median_columns
 
-__all__ = ["OwnFrames", "condition_own", "own_moments", "own_noise"]
+__all__ = [
+    "MeasuredParts",
+    "OwnFrames",
+    "condition_own",
+    "measured_parts",
+    "own_moments",
+    "own_noise",
+]
 
 
-class _Parts(NamedTuple):
+class MeasuredParts(NamedTuple):
     """Holds what no R changes: H mu [K, Z], A = H Sigma [K, Z, D] and C = H Sigma H^T [K, Z, Z]."""
 
     centre: Tensor
@@ -62,7 +69,7 @@ def condition_own(
     Args:
         z: 0 where missing. mask: True where measured. noise: R.
     """
-    parts = _parts(model)
+    parts = measured_parts(model)
     noise, both = own_noise(noise, mask)
     factor, jitter = mended_cholesky(torch.addcmul(noise[:, None], parts.block, both[:, None]))
     log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
@@ -75,9 +82,9 @@ def condition_own(
 
 
 def own_noise(
-    noise: Float[Tensor, "*batch Z Z"], mask: Bool[Tensor, "*batch Z"]
-) -> tuple[Float[Tensor, "*batch Z Z"], Float[Tensor, "*batch Z Z"]]:
-    """Return R' and b of S = R' + b C: b is 1 between measured dimensions; R' that of the identity elsewhere."""
+    noise: Float[Tensor, "... Z Z"], mask: Bool[Tensor, "... Z"]
+) -> tuple[Float[Tensor, "... Z Z"], Float[Tensor, "... Z Z"]]:
+    """Return R' and b of S = R' + b C: b is 1 where both are measured; R' is the identity elsewhere."""
     both = mask[..., :, None] & mask[..., None, :]
     eye = torch.eye(noise.shape[-1], dtype=noise.dtype, device=noise.device)
     return torch.where(both, noise, eye), both.to(noise)
@@ -96,7 +103,7 @@ def own_moments(
         frames: from `condition_own`. log_weights: of the components, normalised.
         medians: first of three dimensions each, points that are estimated by their geometric median.
     """
-    weights, parts = log_weights.exp(), _parts(model)
+    weights, parts = log_weights.exp(), measured_parts(model)
     rows, centres = parts.rows.to(model.dtype), model.means.to(model.dtype)
     solved = torch.linalg.solve_triangular(frames.factor.mT, frames.white[..., None], upper=True)
     gained = (weights[..., None] * solved[..., 0]).flatten(1)
@@ -110,12 +117,14 @@ def own_moments(
     return mean - off, None if total is None else total + off[:, :, None] * off[:, None]
 
 
-def _parts(model: MixtureKalmanFilter) -> _Parts:
+def measured_parts(model: MixtureKalmanFilter) -> MeasuredParts:
     """Return what no R changes, kept while the mixture stays as it is."""
 
-    def make() -> _Parts:
+    def make() -> MeasuredParts:
         rows = model.covariances.index_select(-2, model.observed)
-        return _Parts(model.means[:, model.observed], rows, rows.index_select(-1, model.observed))
+        return MeasuredParts(
+            model.means[:, model.observed], rows, rows.index_select(-1, model.observed)
+        )
 
     return derived(model, "measured parts", (model.means, model.covariances), make)
 
@@ -129,7 +138,7 @@ def _covariance(
     model: MixtureKalmanFilter, frames: OwnFrames, weights: Tensor, solved: Tensor, mean: Tensor
 ) -> Float[Tensor, "N D D"]:
     """Return sum_j w_j (Sigma_j + (m_j - m)(m_j - m)^T) - sum_j w_j W_j^T W_j."""
-    rows = _parts(model).rows.to(model.dtype)
+    rows = measured_parts(model).rows.to(model.dtype)
     apart = model.means.to(model.dtype) - mean[:, None] + _moved(solved, rows)
     apart = apart * weights[..., None].sqrt()
     prior = weights @ model.covariances.to(model.dtype).flatten(1)
@@ -167,7 +176,7 @@ def _median_offset(
     columns: Tensor,
 ) -> Float[Tensor, "N D"]:
     """Return what the means exceed the geometric medians by, 0 in all but these columns."""
-    rows = _parts(model).rows[..., columns].to(model.dtype)
+    rows = measured_parts(model).rows[..., columns].to(model.dtype)
     means = model.means[:, columns].to(model.dtype) + _moved(solved, rows)
     seen = rows * frames.mask[:, None, :, None]
     white = torch.linalg.solve_triangular(frames.factor, seen, upper=False)

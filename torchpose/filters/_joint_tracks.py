@@ -9,6 +9,7 @@ with L L^T = H P H^T + R; the last column of W is minus the whitened innovation.
 dimensions come first, so that H P is a slice.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -51,7 +52,7 @@ TRACK_NUMBERS = 1 << 18
 
 
 class JointModel(NamedTuple):
-    """Holds the prediction by every component: `matrix` [F, 0; 0, 1] and `noise` [N, b; b^T, 0], [K, E, E]."""
+    """Holds the prediction by every component: [F, 0; 0, 1] and [N, b; b^T, 0], both [K, E, E]."""
 
     matrix: Tensor
     noise: Tensor
@@ -72,12 +73,17 @@ class JointProblem(NamedTuple):
     log_norm: Tensor
 
 
-def joint_chunks(model: MixtureKalmanFilter, batch: int, numbers: int) -> list[slice]:
-    """Return equal shares of a batch whose tracks are about so many numbers each."""
+def joint_chunks(model: MixtureKalmanFilter, batch: int, numbers: int = 0) -> list[slice]:
+    """Return equal shares of a batch, of which the tracks stay in the cache.
+
+    Args:
+        numbers: of an element, beside those of its tracks.
+    """
     width = model.dim + spare_columns(model.dim)
-    count = max(1, min(batch, round(batch * model.n_tracks * width**2 / numbers)))
+    each = max(model.n_tracks * width**2, numbers)
+    count = max(1, min(batch, round(batch * each / TRACK_NUMBERS)))
     edges = [round(batch * i / count) for i in range(count + 1)]
-    return [slice(*pair) for pair in zip(edges, edges[1:], strict=False)]
+    return [slice(*pair) for pair in itertools.pairwise(edges)]
 
 
 def joint_order(model: MixtureKalmanFilter) -> tuple[Tensor, Tensor]:
@@ -162,6 +168,12 @@ class JointTracks:
         """Replace the tracks of every element by some of them, of which some may be taken again."""
         batch, n_tracks = self.state.shape[:2]
         index = parent + n_tracks * torch.arange(batch, device=parent.device)[:, None]
+        if parent.shape[1] != n_tracks:
+            self.state = self.state.flatten(0, 1)[index]
+            self._other, self._matrix, self._moved = (
+                torch.empty_like(self.state) for _ in range(3)
+            )
+            return
         torch.index_select(
             self.state.flatten(0, 1), 0, index.flatten(), out=self._other.flatten(0, 1)
         )
@@ -207,16 +219,17 @@ def joint_estimate(
     tracks: JointTracks,
     log_weights: Float[Tensor, "B M"],
     log_evidence: Float[Tensor, " B"],
-    jitter: Tensor | None,
+    jitters: Sequence[Tensor | None],
     return_cov: bool,
 ) -> StepOutput:
     """Return the estimate of a frame (BL 48); without covariances its mean is that of the tracks [B, M, D].
 
     Args:
-        log_evidence: also where nothing is measured. jitter: of `JointTracks.correct`.
+        log_evidence: also where nothing is measured. jitters: of its covariances.
     """
     mean = tracks.mean.to(log_weights)
-    work = (None, None) if jitter is None else mending(log_weights, jitter)
+    mended = any(jitter is not None for jitter in jitters)
+    work = mending(log_weights, *jitters) if mended else (None, None)
     if not return_cov:
         return StepOutput(mean, log_weights, log_evidence, None, *work)
     estimate, total = estimate_of(log_weights, mean, tracks.cov)
@@ -244,7 +257,9 @@ def stacked(steps: Sequence[StepOutput], frames: Measurements) -> FilterOutput:
 
 def joined(parts: Sequence[FilterOutput], lengths: Tensor) -> FilterOutput:
     """Join what `stacked` returned for the shares of a batch, and finish it."""
-    mean, log_weights, evidence = (torch.cat([part[i] for part in parts]) for i in range(3))
+    mean = torch.cat([part.mean for part in parts])
+    log_weights = torch.cat([part.log_weights for part in parts])
+    evidence = torch.cat([part.log_evidence for part in parts])
     covs = [part.cov for part in parts if part.cov is not None]
     mended = torch.cat([part.mended for part in parts if part.mended is not None])
     jitter = torch.cat([part.jitter for part in parts if part.jitter is not None])

@@ -16,7 +16,7 @@ from tqdm.auto import tqdm
 
 from torchpose._core.module_state import derived, outside_inference
 from torchpose._core.value_checks import values_visible
-from torchpose.filters._frame_noise import condition_own, own_moments
+from torchpose.filters._frame_noise import condition_own, measured_parts, own_moments
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
 from torchpose.filters._outputs import FilterOutput, Mending, StepOutput, finish_output, mending
@@ -66,6 +66,7 @@ def run_memoryless(
     batch, n_frames, _ = frames.z.shape
     learning = wants_gradient(frames.z, frames.cov, model.log_prior, model.means, model.covariances)
     parts: list[list[tuple[Tensor, Tensor]]] = [[], [], [], [], [], []]
+    measured_parts(model)  # shared by groups too, and not computed anew
     # a bar that shows nothing would still keep torch.compile out
     bar = tqdm(total=batch * n_frames, unit="frame") if progress else None
     for group in _groups(frames, _RECOMPUTED_FRAMES if learning else _SHARED_FRAMES):

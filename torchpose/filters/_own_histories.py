@@ -36,7 +36,7 @@ _LONGEST_SPAN = 64
 
 
 class _Results(NamedTuple):
-    """Holds what is written chunk by chunk: [B, T, D], [B, T, M], [B, T], [B, T, D, D], and mending [B, T]."""
+    """Holds what is written chunk by chunk, for B sequences of T frames; as `FilterOutput`."""
 
     mean: Tensor
     log_weights: Tensor
@@ -47,9 +47,10 @@ class _Results(NamedTuple):
 
 
 class _Span(NamedTuple):
-    """Holds tracks over T frames: y and minus the squared innovation [T, B, M, D + 1], log-likelihoods [T, B, M].
+    """Holds tracks over T frames.
 
     Attributes:
+        column: y and minus the squared innovation [T, B, M, D + 1]. log_likelihood: [T, B, M].
         cov: in the coordinates of y [T, B, M, D, D], or None. work: of every frame.
     """
 
@@ -104,9 +105,7 @@ def run_own_histories(
     return finish_output(*found, frames.lengths, work)
 
 
-def _empty_results(
-    model: MixtureKalmanFilter, frames: Measurements, return_cov: bool
-) -> _Results:
+def _empty_results(model: MixtureKalmanFilter, frames: Measurements, return_cov: bool) -> _Results:
     size = frames.z.shape[:2]
     kind = {"dtype": model.dtype, "device": frames.z.device}
     mended = torch.zeros(size, dtype=torch.long, device=frames.z.device)

@@ -49,15 +49,7 @@ def systematic(
     Reference:
         Kitagawa (1996), Monte Carlo filter and smoother, doi:10.2307/1390750.
     """
-    u = systematic_start(log_weights, generator)
-    return systematic_from(log_weights, u, n_samples)
-
-
-def systematic_start(
-    log_weights: Float[Tensor, "B N"], generator: Generators = None
-) -> Float[Tensor, "B 1"]:
-    """Draw the numbers u of `systematic`, of which nothing but their count depends on the weights."""
-    return _uniform(log_weights, 1, generator)
+    return systematic_from(log_weights, _uniform(log_weights, 1, generator), n_samples)
 
 
 def systematic_from(

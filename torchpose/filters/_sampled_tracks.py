@@ -11,13 +11,12 @@ from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
 from torchpose.filters._joint_tracks import (
-    TRACK_NUMBERS,
     JointTracks,
+    joined,
     joint_chunks,
     joint_estimate,
     joint_model,
     joint_problems,
-    joined,
     stacked,
 )
 from torchpose.filters._measurements import Measurements
@@ -25,7 +24,7 @@ from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
 from torchpose.filters._outputs import FilterOutput, StepOutput, effective_sample_size, mending
 from torchpose.filters._recompute import wants_gradient
 from torchpose.filters._recursive_filter import Generators, uniform
-from torchpose.filters._resampling import systematic, systematic_from, systematic_start
+from torchpose.filters._resampling import systematic, systematic_from
 from torchpose.filters._weights import estimate_of, normalise
 from torchpose.math._gaussian import kalman_predict, mended_update
 from torchpose.priors._gaussian_mixture import GaussianMixture
@@ -160,7 +159,7 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
         draws = [self._draw_frame(batch, generator) for _ in range(n_frames)]
         parts = []
         with tqdm(total=batch * n_frames, disable=not progress, unit="frame") as bar:
-            for chunk in joint_chunks(self, batch, TRACK_NUMBERS):
+            for chunk in joint_chunks(self, batch):
                 own = [(drawn[chunk], u[chunk]) for drawn, u in draws]
                 parts.append(self._filter_chunk(frames.some(chunk), first[chunk], own, return_cov))
                 bar.update(len(parts[-1].mean) * n_frames)
@@ -169,7 +168,8 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
     def _draw_frame(self, batch: int, generator: Generators) -> tuple[Tensor, Tensor]:
         """Draw what one frame needs: components [B, M], and where resampling starts [B, 1]."""
         drawn = self._draw_components(batch, generator)
-        return drawn, systematic_start(drawn, generator)
+        like = torch.empty(0, dtype=torch.float64, device=drawn.device)
+        return drawn, uniform(batch, (1,), generator, like)
 
     def _filter_chunk(
         self,
@@ -189,7 +189,7 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
             joint = log_weights + log_likelihood.to(self.dtype)
             log_evidence = torch.logsumexp(joint, -1)
             log_weights = joint - log_evidence[:, None]
-            steps.append(joint_estimate(tracks, log_weights, log_evidence, jitter, return_cov))
+            steps.append(joint_estimate(tracks, log_weights, log_evidence, [jitter], return_cov))
             needed = effective_sample_size(log_weights) < least
             if bool(needed.any()):
                 own = torch.arange(self.n_tracks, device=u.device)
