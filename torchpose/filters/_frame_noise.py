@@ -60,6 +60,7 @@ class OwnFrames(NamedTuple):
 
 def condition_own(
     model: MixtureKalmanFilter,
+    parts: MeasuredParts,
     z: Float[Tensor, "N Z"],
     mask: Bool[Tensor, "N Z"],
     noise: Float[Tensor, "N Z Z"],
@@ -67,9 +68,8 @@ def condition_own(
     """Return the innovations and likelihoods of all components for frames with an R of their own.
 
     Args:
-        z: 0 where missing. mask: True where measured. noise: R.
+        parts: from `measured_parts`. z: 0 where missing. mask: True where measured. noise: R.
     """
-    parts = measured_parts(model)
     noise, both = own_noise(noise, mask)
     factor, jitter = mended_cholesky(torch.addcmul(noise[:, None], parts.block, both[:, None]))
     log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
@@ -92,6 +92,7 @@ def own_noise(
 
 def own_moments(
     model: MixtureKalmanFilter,
+    parts: MeasuredParts,
     frames: OwnFrames,
     log_weights: Float[Tensor, "N K"],
     medians: Tensor,
@@ -100,20 +101,21 @@ def own_moments(
     """Return the estimates of the mixture (BL 48) and, on request, their covariances.
 
     Args:
-        frames: from `condition_own`. log_weights: of the components, normalised.
+        parts: from `measured_parts`. frames: from `condition_own`. log_weights: normalised.
         medians: first of three dimensions each, points that are estimated by their geometric median.
     """
-    weights, parts = log_weights.exp(), measured_parts(model)
+    weights = log_weights.exp()
     rows, centres = parts.rows.to(model.dtype), model.means.to(model.dtype)
     solved = torch.linalg.solve_triangular(frames.factor.mT, frames.white[..., None], upper=True)
     gained = (weights[..., None] * solved[..., 0]).flatten(1)
     mean = weights @ centres + gained @ rows.flatten(0, 1)
     total = None
     if return_cov:
-        total = _covariance(model, frames, weights, solved[..., 0], mean)
+        total = _covariance(model, rows, frames, weights, solved[..., 0], mean)
     if not len(medians):
         return mean, total
-    off = _median_offset(model, frames, weights, solved[..., 0], mean, median_columns(medians))
+    columns = median_columns(medians)
+    off = _median_offset(model, rows, frames, weights, solved[..., 0], mean, columns)
     return mean - off, None if total is None else total + off[:, :, None] * off[:, None]
 
 
@@ -135,10 +137,14 @@ def _moved(solved: Float[Tensor, "N K Z"], rows: Float[Tensor, "K Z C"]) -> Floa
 
 
 def _covariance(
-    model: MixtureKalmanFilter, frames: OwnFrames, weights: Tensor, solved: Tensor, mean: Tensor
+    model: MixtureKalmanFilter,
+    rows: Tensor,
+    frames: OwnFrames,
+    weights: Tensor,
+    solved: Tensor,
+    mean: Tensor,
 ) -> Float[Tensor, "N D D"]:
     """Return sum_j w_j (Sigma_j + (m_j - m)(m_j - m)^T) - sum_j w_j W_j^T W_j."""
-    rows = measured_parts(model).rows.to(model.dtype)
     apart = model.means.to(model.dtype) - mean[:, None] + _moved(solved, rows)
     apart = apart * weights[..., None].sqrt()
     prior = weights @ model.covariances.to(model.dtype).flatten(1)
@@ -169,6 +175,7 @@ def _explained(
 
 def _median_offset(
     model: MixtureKalmanFilter,
+    rows: Tensor,
     frames: OwnFrames,
     weights: Tensor,
     solved: Tensor,
@@ -176,7 +183,7 @@ def _median_offset(
     columns: Tensor,
 ) -> Float[Tensor, "N D"]:
     """Return what the means exceed the geometric medians by, 0 in all but these columns."""
-    rows = measured_parts(model).rows[..., columns].to(model.dtype)
+    rows = rows[..., columns]
     means = model.means[:, columns].to(model.dtype) + _moved(solved, rows)
     seen = rows * frames.mask[:, None, :, None]
     white = torch.linalg.solve_triangular(frames.factor, seen, upper=False)

@@ -16,7 +16,12 @@ from tqdm.auto import tqdm
 
 from torchpose._core.module_state import derived, outside_inference
 from torchpose._core.value_checks import values_visible
-from torchpose.filters._frame_noise import condition_own, measured_parts, own_moments
+from torchpose.filters._frame_noise import (
+    MeasuredParts,
+    condition_own,
+    measured_parts,
+    own_moments,
+)
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
 from torchpose.filters._outputs import FilterOutput, Mending, StepOutput, finish_output, mending
@@ -66,13 +71,13 @@ def run_memoryless(
     batch, n_frames, _ = frames.z.shape
     learning = wants_gradient(frames.z, frames.cov, model.log_prior, model.means, model.covariances)
     parts: list[list[tuple[Tensor, Tensor]]] = [[], [], [], [], [], []]
-    measured_parts(model)  # shared by groups too, and not computed anew
+    shared = measured_parts(model)
     # a bar that shows nothing would still keep torch.compile out
     bar = tqdm(total=batch * n_frames, unit="frame") if progress else None
     for group in _groups(frames, _RECOMPUTED_FRAMES if learning else _SHARED_FRAMES):
-        # Gains that groups share are not among what a gradient computes anew for one of them.
+        # Gains and parts that groups share are not among what a gradient computes anew for one of them.
         gain = _gain(model, group) if group.shares_gain else None
-        arguments = model, rule, medians, group, gain, return_cov
+        arguments = model, rule, medians, group, gain, shared, return_cov
         values = recomputed(_estimate, *arguments) if learning else _estimate(*arguments)
         for part, value in zip(parts, values, strict=True):
             if value is not None:
@@ -95,11 +100,12 @@ def _estimate(
     medians: Tensor,
     group: "_Group",
     gain: tuple[Gain, Tensor] | None,
+    shared: MeasuredParts,
     return_cov: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor]:
     """Return estimates, log-weights, log-evidence, covariances and mending of a group of frames."""
     if gain is None:
-        own = condition_own(model, group.z, group.mask, group.noise)
+        own = condition_own(model, shared, group.z, group.mask, group.noise)
         log_likelihood, jitter = own.log_likelihood, own.jitter
     else:
         means, log_likelihood, jitter = _condition(model, group, gain[0])
@@ -107,7 +113,7 @@ def _estimate(
     measured = group.mask.any(-1)
     evidence = torch.where(measured, evidence, torch.zeros_like(evidence))
     if gain is None:
-        mean, total = own_moments(model, own, log_weights, medians, return_cov)
+        mean, total = own_moments(model, shared, own, log_weights, medians, return_cov)
     else:
         mean, total = estimate_of(log_weights, means, gain[1] if return_cov else None)
         if len(medians):
@@ -128,7 +134,8 @@ def step_memoryless(
     frames = frame.as_sequences()
     if not values_visible():
         (group,) = _groups(frames, len(frame.z))
-        return later, StepOutput(*_estimate(model, rule, medians, group, None, return_cov))
+        shared = measured_parts(model)
+        return later, StepOutput(*_estimate(model, rule, medians, group, None, shared, return_cov))
     out = run_memoryless(model, rule, medians, frames, return_cov)
     values = out.mean, out.log_weights, out.log_evidence, out.cov, out.mended, out.jitter
     first = (None if value is None else value[:, 0] for value in values)
@@ -186,7 +193,8 @@ def _groups_of_own(z: Tensor, mask: Tensor, noise: Tensor) -> Iterator[_Group]:
 def _log_likelihood(model: MixtureKalmanFilter, group: _Group) -> Float[Tensor, "N M"]:
     if group.shares_gain:
         return _condition(model, group, _gain(model, group)[0])[1]
-    return condition_own(model, group.z, group.mask, group.noise).log_likelihood
+    shared = measured_parts(model)
+    return condition_own(model, shared, group.z, group.mask, group.noise).log_likelihood
 
 
 def _condition(
