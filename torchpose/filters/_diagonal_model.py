@@ -23,7 +23,7 @@ from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._transition import inflation
 from torchpose.math._gaussian import mended_cholesky, safe_cholesky, spare_columns, symmetrise
 
-__all__ = ["DiagonalModel", "Moves", "diagonal_model", "diagonal_moves"]
+__all__ = ["DiagonalModel", "DiagonalMoves", "diagonal_model", "diagonal_moves"]
 
 
 class DiagonalModel(NamedTuple):
@@ -40,7 +40,7 @@ class DiagonalModel(NamedTuple):
     size: Tensor | None
 
 
-class Moves(NamedTuple):
+class DiagonalMoves(NamedTuple):
     """Holds a prediction of [P, y; y^T, 0] as the elementwise product with `factor`, plus `noise`.
 
     Both are [K, E, E], filled up by zeros from D + 1 to E; `factor` is [f f^T, f; f^T, 0].
@@ -55,7 +55,7 @@ def diagonal_model(model: MixtureKalmanFilter) -> DiagonalModel | None:
     return derived(model, "diagonal model", model.sources, lambda: _make_model(model))
 
 
-def diagonal_moves(model: MixtureKalmanFilter, diagonal: DiagonalModel, time: int) -> Moves:
+def diagonal_moves(model: MixtureKalmanFilter, diagonal: DiagonalModel, time: int) -> DiagonalMoves:
     """Return the prediction into a frame, with the inflated Q of the burn-in."""
     if time < model.burn_in:
         inflated = inflation(time, model.burn_in, model.burn_in_scale)
@@ -90,14 +90,16 @@ def _make_model(model: MixtureKalmanFilter) -> DiagonalModel | None:
     return DiagonalModel(basis, basis[:, model.observed], white, size)
 
 
-def _make_moves(model: MixtureKalmanFilter, diagonal: DiagonalModel, inflated: float) -> Moves:
+def _make_moves(
+    model: MixtureKalmanFilter, diagonal: DiagonalModel, inflated: float
+) -> DiagonalMoves:
     rate, noise = _rate_and_noise(model, diagonal.size, inflated)
     dim = model.dim
     joint = pad(rate, (0, 1), value=1.0)
     factor = joint[:, :, None] * joint[:, None, :]
     factor[:, dim, dim] = 0
     spare = spare_columns(dim)
-    return Moves(
+    return DiagonalMoves(
         pad(factor, (0, spare - 1, 0, spare - 1)).contiguous(),
         pad(noise, (0, spare, 0, spare)).contiguous(),
     )

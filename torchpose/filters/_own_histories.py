@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchpose.filters._diagonal_model import DiagonalModel, Moves, diagonal_moves
+from torchpose.filters._diagonal_model import DiagonalModel, DiagonalMoves, diagonal_moves
 from torchpose.filters._frame_noise import own_noise
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._memoryless import frame_log_likelihood
@@ -181,7 +181,7 @@ def _problem(model: MixtureKalmanFilter, frames: Measurements, span: slice) -> _
 def _filter_span(
     state: Float[Tensor, "B M E E"],
     rows: Float[Tensor, "BM Z D"],
-    moves: list[Moves],
+    moves: list[DiagonalMoves],
     problem: _Problem,
     return_cov: bool,
     mend: bool,
