@@ -38,7 +38,8 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
 
     A candidate is track i continued by component j, of weight w_i pi_j N(z_t | i, j). In the first
     frame there is one track for each component. Without pruning (M = K^(T+1)) this is the exact
-    posterior.
+    posterior. Where nothing is measured, candidates that differ in the order of their components alone have
+    equal weights; rounding decides which of them stay.
 
     Args:
         gmm, process_cov, measurement_cov, observed, initial_cov, transition, gamma, subspace, burn_in,
