@@ -11,11 +11,13 @@ from torchpose._core.checks import check_choice
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
 from torchpose.filters._columns import run_columns, suits_columns
-from torchpose.filters._gain_graph import find_history
+from torchpose.filters._diagonal_model import diagonal_model
+from torchpose.filters._gain_graph import find_history, shares_gains
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._memoryless import frame_log_likelihood, run_memoryless, step_memoryless
 from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
 from torchpose.filters._outputs import FilterOutput, StepOutput
+from torchpose.filters._own_histories import run_own_histories
 from torchpose.filters._recompute import wants_gradient
 from torchpose.filters._recursive_filter import Generators
 from torchpose.filters._shared_gains import run_for_gradients, run_shared
@@ -184,8 +186,8 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
     ) -> FilterOutput:
         """Filter whole sequences, given checked measurements, in the fastest way that gives these numbers.
 
-        The plain recursion is left to noise that changes in each frame, to burn-in, and to gradients of
-        model or noise.
+        The plain recursion is left to gradients of model or noise, and to burn-in where all sequences
+        share their gains.
 
         Args:
             frames: checked measurements: z [B, T, Z], mask [B, T, Z], cov [Z, Z] or [B, T, Z, Z], lengths
@@ -200,13 +202,18 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
         if self._way != "tracked":
             return super().filter_frames(frames, generator, return_cov, progress)
         rule, given = self.weight_rule, (frames, return_cov, progress)
-        model_learns = wants_gradient(frames.cov, *self.sources)
-        if model_learns or frames.cov.ndim == 4 or self.burn_in > 0:
+        z_learns = wants_gradient(frames.z)
+        if wants_gradient(frames.cov, *self.sources):
             return run_steps(self, rule, *given)
-        history = find_history(self, frames)
+        history = None
+        if frames.cov.ndim == 2 and self.burn_in == 0 and (z_learns or shares_gains(frames)):
+            history = find_history(self, frames)
         if history is None:
-            return run_steps(self, rule, *given)
-        if wants_gradient(frames.z):
+            diagonal = None if z_learns or _is_one_history(frames) else diagonal_model(self)
+            if diagonal is None:
+                return run_steps(self, rule, *given)
+            return run_own_histories(self, diagonal, rule, *given)
+        if z_learns:
             return run_for_gradients(self, rule, frames, history, return_cov, progress)
         shared = all(len(edges) == 1 for edges in history.edges)
         if shared and not return_cov and suits_columns(rule, len(frames.z)):
@@ -277,6 +284,13 @@ class FixedTrackFilter(MixtureKalmanFilter, tracks="fixed"):
             return smoothed
         alone = run_memoryless(self, rule, self.medians, frames, return_cov)
         return FilterOutput(*self._choose_unseen(alone, smoothed))  # type: ignore[arg-type]
+
+
+def _is_one_history(frames: Measurements) -> bool:
+    """Return whether several sequences share all their gains."""
+    if frames.cov.ndim == 4 or len(frames.z) == 1:
+        return False
+    return bool((frames.mask == frames.mask[:1]).all())
 
 
 def _check_weighting(

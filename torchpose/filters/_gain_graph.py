@@ -21,10 +21,22 @@ from torchpose.filters._outputs import Mending
 from torchpose.filters._transition import Transition
 from torchpose.math._gaussian import kalman_gain, symmetrise
 
-__all__ = ["BlockModel", "Edge", "GainGraph", "History", "find_history", "mending_of_edges"]
+__all__ = [
+    "BlockModel",
+    "Edge",
+    "GainGraph",
+    "History",
+    "find_history",
+    "mending_of_edges",
+    "shares_gains",
+]
 
 _SETTLED = 4e-13
 _MOST_EDGES = 1024
+_SETTLING = 32  # frames until gains are constant, as a rule
+_COST_OF_STEP = (
+    4  # to make a step of the graph, beside filtering a frame of one sequence without it
+)
 
 
 class Edge(NamedTuple):
@@ -196,6 +208,17 @@ class History(NamedTuple):
     edges: list[list[Edge]]
     steady: list[int]
     group: Tensor
+
+
+def shares_gains(frames: Measurements) -> bool:
+    """Return whether the graph is likely to need few steps for these masks, beside all that are filtered.
+
+    After a change of the measured dimensions it takes some frames until the gains are constant again.
+    """
+    patterns = torch.unique(_patterns(frames), dim=0)
+    changes = int((patterns[:, 1:] != patterns[:, :-1]).sum())
+    made = min(patterns.numel(), _SETTLING * changes)
+    return _COST_OF_STEP * made <= frames.mask[..., 0].numel()
 
 
 def find_history(model: MixtureKalmanFilter, frames: Measurements) -> History | None:

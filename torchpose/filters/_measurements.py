@@ -45,6 +45,11 @@ class Measurements(NamedTuple):
         cov = self.cov if self.cov.ndim == 2 else self.cov[:, t]
         return Measurements(self.z[:, t], self.mask[:, t], cov, self.lengths)
 
+    def some(self, chunk: slice) -> "Measurements":
+        """Return the measurements of some sequences."""
+        cov = self.cov if self.cov.ndim == 2 else self.cov[chunk]
+        return Measurements(self.z[chunk], self.mask[chunk], cov, self.lengths[chunk])
+
     def as_sequences(self) -> "Measurements":
         """Return the measurements of one frame as sequences of a single frame."""
         cov = self.cov if self.cov.ndim == 2 else self.cov[:, None]

@@ -16,6 +16,12 @@ from tqdm.auto import tqdm
 
 from torchpose._core.module_state import derived, outside_inference
 from torchpose._core.value_checks import values_visible
+from torchpose.filters._frame_noise import (
+    MeasuredParts,
+    condition_own,
+    measured_parts,
+    own_moments,
+)
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
 from torchpose.filters._outputs import FilterOutput, Mending, StepOutput, finish_output, mending
@@ -28,7 +34,7 @@ __all__ = ["frame_log_likelihood", "run_memoryless", "step_memoryless"]
 
 _SHARED_FRAMES = 1024  # at a time, where they share their gains
 _PATTERNS = 24  # of measured dimensions and noise whose gains are kept; about 4 MB each
-_OWN_FRAMES = 32  # at a time, where each has gains of its own
+_OWN_FRAMES = 8  # at a time, where each has gains of its own
 _RECOMPUTED_FRAMES = 64  # at a time, where gradients compute them again
 _LEAST_SHARE = 2  # frames to a noise, on average, below which sharing does not pay
 
@@ -43,7 +49,7 @@ def frame_log_likelihood(
     if not rule.by_frame:
         return None
     groups = _groups(frames, _SHARED_FRAMES)
-    found = [(group.rows, _condition(model, group, _gain(model, group))[1]) for group in groups]
+    found = [(group.rows, _log_likelihood(model, group)) for group in groups]
     return _in_order(found).unflatten(0, frames.z.shape[:2])
 
 
@@ -65,12 +71,13 @@ def run_memoryless(
     batch, n_frames, _ = frames.z.shape
     learning = wants_gradient(frames.z, frames.cov, model.log_prior, model.means, model.covariances)
     parts: list[list[tuple[Tensor, Tensor]]] = [[], [], [], [], [], []]
+    shared = measured_parts(model)
     # a bar that shows nothing would still keep torch.compile out
     bar = tqdm(total=batch * n_frames, unit="frame") if progress else None
     for group in _groups(frames, _RECOMPUTED_FRAMES if learning else _SHARED_FRAMES):
-        # Gains that groups share are not among what a gradient computes anew for one of them.
+        # Gains and parts that groups share are not among what a gradient computes anew for one of them.
         gain = _gain(model, group) if group.shares_gain else None
-        arguments = model, rule, medians, group, gain, return_cov
+        arguments = model, rule, medians, group, gain, shared, return_cov
         values = recomputed(_estimate, *arguments) if learning else _estimate(*arguments)
         for part, value in zip(parts, values, strict=True):
             if value is not None:
@@ -93,17 +100,24 @@ def _estimate(
     medians: Tensor,
     group: "_Group",
     gain: tuple[Gain, Tensor] | None,
+    shared: MeasuredParts,
     return_cov: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor]:
     """Return estimates, log-weights, log-evidence, covariances and mending of a group of frames."""
-    gain = gain or _gain(model, group)
-    means, log_likelihood, cov, jitter = _condition(model, group, gain)
+    if gain is None:
+        own = condition_own(model, shared, group.z, group.mask, group.noise)
+        log_likelihood, jitter = own.log_likelihood, own.jitter
+    else:
+        means, log_likelihood, jitter = _condition(model, group, gain[0])
     log_weights, evidence = frame_weights(rule, log_likelihood, log_likelihood)
-    measured = group.mask.any(-1).squeeze(-1)
+    measured = group.mask.any(-1)
     evidence = torch.where(measured, evidence, torch.zeros_like(evidence))
-    mean, total = estimate_of(log_weights, means, cov if return_cov else None)
-    if len(medians):
-        mean, total = median_estimate(log_weights, means, cov, mean, total, medians)
+    if gain is None:
+        mean, total = own_moments(model, shared, own, log_weights, medians, return_cov)
+    else:
+        mean, total = estimate_of(log_weights, means, gain[1] if return_cov else None)
+        if len(medians):
+            mean, total = median_estimate(log_weights, means, gain[1], mean, total, medians)
     return mean, log_weights, evidence, total, *mending(mean, jitter)
 
 
@@ -120,7 +134,8 @@ def step_memoryless(
     frames = frame.as_sequences()
     if not values_visible():
         (group,) = _groups(frames, len(frame.z))
-        return later, StepOutput(*_estimate(model, rule, medians, group, None, return_cov))
+        shared = measured_parts(model)
+        return later, StepOutput(*_estimate(model, rule, medians, group, None, shared, return_cov))
     out = run_memoryless(model, rule, medians, frames, return_cov)
     values = out.mean, out.log_weights, out.log_evidence, out.cov, out.mended, out.jitter
     first = (None if value is None else value[:, 0] for value in values)
@@ -132,7 +147,7 @@ class _Group(NamedTuple):
 
     Attributes:
         rows: which of the B T frames [N]. z: [N, Z].
-        mask, noise: [Z] and [Z, Z] for all of them, or [N, 1, Z] and [N, 1, Z, Z].
+        mask, noise: [Z] and [Z, Z] for all of them, or [N, Z] and [N, Z, Z].
     """
 
     rows: Tensor
@@ -151,8 +166,8 @@ def _groups(frames: Measurements, at_a_time: int) -> Iterator[_Group]:
     z, mask = frames.z.flatten(0, 1), frames.mask.flatten(0, 1)
     noise = None if frames.cov.ndim == 2 else frames.cov.flatten(0, 1)
     if not values_visible():
-        each = frames.cov if noise is None else noise[:, None]
-        yield _Group(torch.arange(len(z), device=z.device), z, mask[:, None], each)
+        each = frames.cov.expand(len(z), -1, -1) if noise is None else noise
+        yield _Group(torch.arange(len(z), device=z.device), z, mask, each)
         return
     settings = mask if noise is None else torch.cat([mask.to(noise), noise.flatten(1)], 1)
     if noise is not None and noise.requires_grad:
@@ -172,31 +187,31 @@ def _groups(frames: Measurements, at_a_time: int) -> Iterator[_Group]:
 def _groups_of_own(z: Tensor, mask: Tensor, noise: Tensor) -> Iterator[_Group]:
     """Yield frames that have gains of their own, some at a time."""
     for rows in torch.arange(len(z), device=z.device).split(_OWN_FRAMES):
-        yield _Group(rows, z[rows], mask[rows][:, None], noise[rows][:, None])
+        yield _Group(rows, z[rows], mask[rows], noise[rows])
+
+
+def _log_likelihood(model: MixtureKalmanFilter, group: _Group) -> Float[Tensor, "N M"]:
+    if group.shares_gain:
+        return _condition(model, group, _gain(model, group)[0])[1]
+    shared = measured_parts(model)
+    return condition_own(model, shared, group.z, group.mask, group.noise).log_likelihood
 
 
 def _condition(
-    model: MixtureKalmanFilter, group: _Group, gain_and_cov: tuple[Gain, Tensor]
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """Return every component given a frame: means [N, M, D], log-likelihoods [N, M], covs, jitter."""
-    gain, cov = gain_and_cov
+    model: MixtureKalmanFilter, group: _Group, gain: Gain
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return every component given a frame: means [N, M, D], log-likelihoods [N, M], and jitter."""
     centres = model.means.to(model.dtype)
     residual = (group.z[:, None] - centres[:, model.observed]) * group.mask
-    if group.shares_gain:
-        white = torch.linalg.solve_triangular(gain.factor, residual.permute(1, 2, 0), upper=False)
-        means = (centres[:, None] + white.mT @ gain.white).transpose(0, 1)
-        log_likelihood = (gain.log_norm[:, None] - 0.5 * white.square().sum(1)).mT
-        jitter = None if gain.jitter is None else gain.jitter.expand(len(group.rows), -1)
-        return means, log_likelihood, cov, jitter
-    white = torch.linalg.solve_triangular(gain.factor, residual[..., None], upper=False)
-    means = centres + (gain.white.mT @ white)[..., 0]
-    return means, gain.log_norm - 0.5 * white.square().sum((-2, -1)), cov, gain.jitter
+    white = torch.linalg.solve_triangular(gain.factor, residual.permute(1, 2, 0), upper=False)
+    means = (centres[:, None] + white.mT @ gain.white).transpose(0, 1)
+    log_likelihood = (gain.log_norm[:, None] - 0.5 * white.square().sum(1)).mT
+    jitter = None if gain.jitter is None else gain.jitter.expand(len(group.rows), -1)
+    return means, log_likelihood, jitter
 
 
 def _gain(model: MixtureKalmanFilter, group: _Group) -> tuple[Gain, Tensor]:
-    """Return gain and covariance of every component; those that frames share are kept for later."""
-    if not group.shares_gain:
-        return _make_gain(model, group)
+    """Return gain and covariance of every component for frames that share them, kept for later."""
     sources = (model.means, model.covariances)
     kept = derived(model, f"frame gains {model.dtype}", sources, _FrameGains)
     found = kept.get(group.noise, group.mask)

@@ -49,8 +49,14 @@ def systematic(
     Reference:
         Kitagawa (1996), Monte Carlo filter and smoother, doi:10.2307/1390750.
     """
+    return systematic_from(log_weights, _uniform(log_weights, 1, generator), n_samples)
+
+
+def systematic_from(
+    log_weights: Float[Tensor, "B N"], u: Float[Tensor, "B 1"], n_samples: int | None = None
+) -> Int[Tensor, "B n"]:
+    """Return the ancestors of `systematic` for numbers u that were drawn before."""
     n = log_weights.shape[1] if n_samples is None else n_samples
-    u = _uniform(log_weights, 1, generator)
     return _search(_weights(log_weights), (_steps(log_weights, n) + u) / n)
 
 

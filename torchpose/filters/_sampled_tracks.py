@@ -4,16 +4,27 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from tqdm.auto import tqdm
 
 from torchpose._core.checks import check_count
 from torchpose._core.former_arguments import takes_former_arguments
 from torchpose._core.value_checks import values_visible
 from torchpose.errors import InputError
+from torchpose.filters._joint_tracks import (
+    JointTracks,
+    joined,
+    joint_chunks,
+    joint_estimate,
+    joint_model,
+    joint_problems,
+    stacked,
+)
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
-from torchpose.filters._outputs import StepOutput, effective_sample_size, mending
+from torchpose.filters._outputs import FilterOutput, StepOutput, effective_sample_size, mending
+from torchpose.filters._recompute import wants_gradient
 from torchpose.filters._recursive_filter import Generators, uniform
-from torchpose.filters._resampling import systematic
+from torchpose.filters._resampling import systematic, systematic_from
 from torchpose.filters._weights import estimate_of, normalise
 from torchpose.math._gaussian import kalman_predict, mended_update
 from torchpose.priors._gaussian_mixture import GaussianMixture
@@ -124,6 +135,67 @@ class SampledTrackFilter(MixtureKalmanFilter, tracks="sampled"):
             MKFState(*carried, group, state.time + 1),
             StepOutput(estimate, log_weights, log_evidence, total, *mending(estimate, jitter)),
         )
+
+    def filter_frames(
+        self, frames: Measurements, generator: Generators, return_cov: bool, progress: bool
+    ) -> FilterOutput:
+        """Filter whole sequences, given checked measurements, some sequences at a time.
+
+        Args:
+            frames: checked measurements: z [B, T, Z], mask [B, T, Z], cov [Z, Z] or [B, T, Z, Z], lengths
+                [B].
+            generator: for filters that draw; one generator, or a list of one for each sequence.
+            return_cov: whether to return covariances as well.
+            progress: whether to show a progress bar.
+
+        Returns:
+            `FilterOutput` with means [B, T, D].
+        """
+        if not values_visible() or wants_gradient(frames.z, frames.cov, *self.sources):
+            return super().filter_frames(frames, generator, return_cov, progress)
+        batch, n_frames = frames.z.shape[:2]
+        first = self._draw_components(batch, generator)
+        # In the order in which single frames draw, so that numbers are theirs.
+        draws = [self._draw_frame(batch, generator) for _ in range(n_frames)]
+        parts = []
+        with tqdm(total=batch * n_frames, disable=not progress, unit="frame") as bar:
+            for chunk in joint_chunks(self, batch):
+                own = [(drawn[chunk], u[chunk]) for drawn, u in draws]
+                parts.append(self._filter_chunk(frames.some(chunk), first[chunk], own, return_cov))
+                bar.update(len(parts[-1].mean) * n_frames)
+        return joined(parts, frames.lengths)
+
+    def _draw_frame(self, batch: int, generator: Generators) -> tuple[Tensor, Tensor]:
+        """Draw what one frame needs: components [B, M], and where resampling starts [B, 1]."""
+        drawn = self._draw_components(batch, generator)
+        like = torch.empty(0, dtype=torch.float64, device=drawn.device)
+        return drawn, uniform(batch, (1,), generator, like)
+
+    def _filter_chunk(
+        self,
+        frames: Measurements,
+        first: Tensor,
+        draws: list[tuple[Tensor, Tensor]],
+        return_cov: bool,
+    ) -> FilterOutput:
+        """Filter some sequences whose random numbers are drawn, as `filter_frame` does."""
+        log_weights = normalise(torch.zeros(first.shape, dtype=self.dtype, device=first.device))
+        equal, least = log_weights, self.resample_threshold * self.n_tracks
+        tracks, steps = JointTracks(self, self.means[first], self.start_cov[first]), []
+        problems = joint_problems(frames)
+        for t, (problem, (drawn, u)) in enumerate(zip(problems, draws, strict=True)):
+            tracks.predict(joint_model(self, t), drawn)
+            log_likelihood, jitter = tracks.correct(problem)
+            joint = log_weights + log_likelihood.to(self.dtype)
+            log_evidence = torch.logsumexp(joint, -1)
+            log_weights = joint - log_evidence[:, None]
+            steps.append(joint_estimate(tracks, log_weights, log_evidence, [jitter], return_cov))
+            needed = effective_sample_size(log_weights) < least
+            if bool(needed.any()):
+                own = torch.arange(self.n_tracks, device=u.device)
+                tracks.take(torch.where(needed[:, None], systematic_from(log_weights, u), own))
+                log_weights = torch.where(needed[:, None], equal, log_weights)
+        return stacked(steps, frames)
 
     def _draw_components(self, batch: int, generator: Generators) -> Tensor:
         cumulative = self.log_prior.exp().cumsum(0)

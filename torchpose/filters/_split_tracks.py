@@ -5,16 +5,32 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm.auto import tqdm
 
+from torchpose._core.value_checks import values_visible
+from torchpose.filters._joint_tracks import (
+    JointProblem,
+    JointTracks,
+    joined,
+    joint_chunks,
+    joint_estimate,
+    joint_model,
+    joint_problems,
+    stacked,
+)
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._mkf import MixtureKalmanFilter, MKFState
-from torchpose.filters._outputs import StepOutput, mending
+from torchpose.filters._outputs import FilterOutput, StepOutput, mending
+from torchpose.filters._recompute import wants_gradient
 from torchpose.filters._recursive_filter import Generators, require_state
+from torchpose.filters._split_candidates import block_numbers, candidate_log_likelihood
 from torchpose.filters._weights import estimate_of, normalise
 from torchpose.math._gaussian import kalman_correct, kalman_gain, symmetrise
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
 __all__ = ["SplitTrackFilter"]
+
+_MOST_SHARED = 1 << 22  # numbers, 32 MB, of the product that all frames share
 
 
 class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
@@ -22,7 +38,8 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
 
     A candidate is track i continued by component j, of weight w_i pi_j N(z_t | i, j). In the first
     frame there is one track for each component. Without pruning (M = K^(T+1)) this is the exact
-    posterior.
+    posterior. Where nothing is measured, candidates that differ in the order of their components alone have
+    equal weights; rounding decides which of them stay.
 
     Args:
         gmm, process_cov, measurement_cov, observed, initial_cov, transition, gamma, subspace, burn_in,
@@ -89,21 +106,14 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         Returns:
             The next state, and a `StepOutput` with the mean [B, D].
         """
+        if self._in_place(frame):
+            return self._filter_in_place(state, frame, return_cov)
         wide = torch.float64
         track_cov = state.cov[state.group]
         mean = state.mean.to(wide)
         log_joint, choice_jitter = self._candidate_weights(state, mean, track_cov, frame)
-        flat = log_joint.flatten(1)
-        log_evidence = torch.logsumexp(flat, -1)
-        # The first frames may have fewer candidates than tracks: the rest stays empty, at weight zero.
-        spare = max(0, self.n_tracks - flat.shape[1])
-        padded = torch.nn.functional.pad(flat, (0, spare), value=-torch.inf)
-        kept, chosen = padded.topk(self.n_tracks, dim=1)
-        chosen = torch.where(chosen < flat.shape[1], chosen, torch.zeros_like(chosen))
-        log_weights = normalise(kept).to(self.dtype)
+        log_weights, log_evidence, parent, component = self._select(log_joint)
         log_evidence = torch.where(frame.mask.any(-1), log_evidence, torch.zeros_like(log_evidence))
-        n_components = self.means.shape[0]
-        parent, component = chosen // n_components, chosen % n_components
         mean, cov, jitter = self._continue(state.time, mean, track_cov, parent, component, frame)
         mean = mean.to(self.dtype)
         estimate, total = estimate_of(log_weights, mean, cov if return_cov else None)
@@ -112,6 +122,105 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         work = mending(estimate, choice_jitter, jitter)
         log_evidence = log_evidence.to(self.dtype)
         return new_state, StepOutput(estimate, log_weights, log_evidence, total, *work)
+
+    def filter_frames(
+        self, frames: Measurements, generator: Generators, return_cov: bool, progress: bool
+    ) -> FilterOutput:
+        """Filter whole sequences, given checked measurements, some sequences at a time.
+
+        Args:
+            frames: checked measurements: z [B, T, Z], mask [B, T, Z], cov [Z, Z] or [B, T, Z, Z], lengths
+                [B].
+            generator: for filters that draw; one generator, or a list of one for each sequence.
+            return_cov: whether to return covariances as well.
+            progress: whether to show a progress bar.
+
+        Returns:
+            `FilterOutput` with means [B, T, D].
+        """
+        if not self._in_place(frames):
+            return super().filter_frames(frames, generator, return_cov, progress)
+        batch, n_frames = frames.z.shape[:2]
+        parts = []
+        with tqdm(total=batch * n_frames, disable=not progress, unit="frame") as bar:
+            for chunk in joint_chunks(self, batch, block_numbers(self)[0]):
+                parts.append(self._filter_chunk(frames.some(chunk), return_cov))
+                bar.update(len(parts[-1].mean) * n_frames)
+        return joined(parts, frames.lengths)
+
+    def _in_place(self, frames: Measurements) -> bool:
+        """Return whether tracks may be stepped in place: no gradient, and a product that fits into memory."""
+        learning = wants_gradient(frames.z, frames.cov, *self.sources)
+        return values_visible() and not learning and block_numbers(self)[1] <= _MOST_SHARED
+
+    def _filter_chunk(self, frames: Measurements, return_cov: bool) -> FilterOutput:
+        """Filter some sequences as `filter_frame` does."""
+        state, steps = self.init(len(frames.z)), []
+        tracks, log_weights = (
+            JointTracks(self, state.mean, state.cov[state.group]),
+            state.log_weights,
+        )
+        for t, problem in enumerate(joint_problems(frames)):
+            log_weights, step = self._step(
+                tracks, log_weights, problem, frames.frame(t), t, return_cov
+            )
+            steps.append(step)
+        return stacked(steps, frames)
+
+    def _filter_in_place(
+        self, state: MKFState, frame: Measurements, return_cov: bool
+    ) -> tuple[MKFState, StepOutput]:
+        """Filter one frame by the same operations as whole sequences, so that equal weights fall alike."""
+        tracks = JointTracks(self, state.mean, state.cov[state.group])
+        frames = frame.as_sequences()
+        (problem,) = joint_problems(frames)
+        log_weights, step = self._step(
+            tracks, state.log_weights, problem, frame, state.time, return_cov
+        )
+        out = stacked([step], frames)
+        values = out.mean, out.log_weights, out.log_evidence, out.cov, out.mended, out.jitter
+        group = torch.arange(len(log_weights), device=log_weights.device)
+        mean, cov = tracks.mean.to(self.dtype), symmetrise(tracks.cov)
+        first = (None if value is None else value[:, 0] for value in values)
+        new_state = MKFState(log_weights, mean, cov, group, state.time + 1)
+        return new_state, StepOutput(*first)  # type: ignore[arg-type]
+
+    def _step(
+        self,
+        tracks: JointTracks,
+        log_weights: Tensor,
+        problem: JointProblem,
+        frame: Measurements,
+        time: int,
+        return_cov: bool,
+    ) -> tuple[Tensor, StepOutput]:
+        """Step the tracks in place, and return their log-weights and the estimate."""
+        log_likelihood = candidate_log_likelihood(self, tracks, problem, time)
+        log_joint = log_weights.to(log_likelihood)[..., None] + self.log_prior + log_likelihood
+        jitter = None
+        if not bool(torch.isfinite(log_likelihood).all()):  # a block is to be mended, or lost
+            group = torch.arange(len(log_weights), device=log_weights.device)
+            state = MKFState(log_weights, tracks.mean, tracks.cov, group, time)
+            log_joint, jitter = self._candidate_weights(state, state.mean, state.cov, frame)
+        log_weights, log_evidence, parent, component = self._select(log_joint)
+        tracks.take(parent)
+        tracks.predict(joint_model(self, time), component)
+        jitters = [jitter, tracks.correct(problem)[1]]
+        log_evidence = log_evidence.to(self.dtype)
+        return log_weights, joint_estimate(tracks, log_weights, log_evidence, jitters, return_cov)
+
+    def _select(self, log_joint: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return log-weights of the M likeliest candidates, log-evidence, and their tracks and components."""
+        flat = log_joint.flatten(1)
+        log_evidence = torch.logsumexp(flat, -1)
+        # The first frames may have fewer candidates than tracks: the rest stays empty, at weight zero.
+        spare = max(0, self.n_tracks - flat.shape[1])
+        padded = torch.nn.functional.pad(flat, (0, spare), value=-torch.inf)
+        kept, chosen = padded.topk(self.n_tracks, dim=1)
+        chosen = torch.where(chosen < flat.shape[1], chosen, torch.zeros_like(chosen))
+        n_components = self.means.shape[0]
+        log_weights = normalise(kept).to(self.dtype)
+        return log_weights, log_evidence, chosen // n_components, chosen % n_components
 
     def _candidate_weights(
         self, state: MKFState, mean: Tensor, cov: Tensor, frame: Measurements

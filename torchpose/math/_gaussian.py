@@ -28,6 +28,7 @@ __all__ = [
     "mixture_moments",
     "product",
     "safe_cholesky",
+    "spare_columns",
     "symmetrise",
 ]
 
@@ -244,7 +245,7 @@ def kalman_predict(
         Mean [..., D] and covariance [..., D, D] of the prediction.
     """
     dim = cov.shape[-1]
-    right = _multiply(cov, pad(transition, (0, 0, 0, _spare(dim))).mT)
+    right = _multiply(cov, pad(transition, (0, 0, 0, spare_columns(dim))).mT)
     if right.shape[:-2] == mean.shape[:-1]:  # one product, F [P F^T, x]
         both = _multiply(transition, _with_column(right, dim, mean))
         moved = both[..., dim]
@@ -300,7 +301,7 @@ def _log_norm(factor: Tensor, count: Tensor | int) -> Tensor:
     return -0.5 * LOG_2PI * count - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
-def _spare(columns: int) -> int:
+def spare_columns(columns: int) -> int:
     """Return the number of columns, at least one, to add so that the width is a multiple of `_LANES`."""
     return _LANES - columns % _LANES
 
@@ -319,7 +320,7 @@ def _beside(cross: Tensor, residual: Tensor) -> Tensor:
         # not torch.broadcast_shapes, whose first call imports a computer algebra system
         batch = torch.broadcast_tensors(cross[..., 0, 0], residual[..., 0])[0].shape
         cross, residual = cross.expand(*batch, -1, -1), residual.expand(*batch, -1)
-    return _with_column(pad(cross, (0, _spare(dim))), dim, residual)
+    return _with_column(pad(cross, (0, spare_columns(dim))), dim, residual)
 
 
 def _with_column(matrix: Tensor, index: int, column: Tensor) -> Tensor:

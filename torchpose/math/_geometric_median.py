@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-__all__ = ["geometric_median", "median_estimate"]
+__all__ = ["geometric_median", "median_columns", "median_estimate"]
 
 _STEPS = 5
 _LEAST = 1e-18  # of a squared distance, where a mean has no spread and is hit
@@ -40,6 +40,11 @@ def geometric_median(
     return start + x
 
 
+def median_columns(points: Int[Tensor, " P"]) -> Int[Tensor, " 3*P"]:
+    """Return the three dimensions of each point, given the first of them."""
+    return (points[:, None] + torch.arange(3, device=points.device)).flatten()
+
+
 def median_estimate(
     log_weights: Float[Tensor, "N M"],
     means: Float[Tensor, "N M D"],
@@ -54,7 +59,7 @@ def median_estimate(
         log_weights, means, covs: of the mixture. mean, total: its mean and covariance.
         points: first of the three dimensions of each point.
     """
-    columns = (points[:, None] + torch.arange(3, device=points.device)).flatten()
+    columns = median_columns(points)
     spread = covs.diagonal(dim1=-2, dim2=-1)[..., columns].unflatten(-1, (-1, 3)).sum(-1)
     found = geometric_median(
         log_weights.exp(),

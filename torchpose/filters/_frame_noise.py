@@ -1,0 +1,194 @@
+"""Condition the mixture on frames that have measurement noise or gaps of their own.
+
+Another R changes only the small covariance of the measured dimensions. What does not depend on it is
+made once for a mixture, with H the rows of the identity for what is measured:
+
+A_j = H Sigma_j,  C_j = H Sigma_j H^T,  S_j = C_j + R = L_j L_j^T,  v_j = L_j^-1 (z - H mu_j).
+
+Likelihoods need S_j alone, means m_j = mu_j + A_j^T S_j^-1 (z - H mu_j), and their weighted mean is one
+product with all A_j. Posterior covariances Sigma_j - W_j^T W_j, W_j = L_j^-1 A_j, are not formed: a
+weighted sum of them is sum_j w_j Sigma_j less one product of the W_j, and a median needs traces.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchpose._core.module_state import derived
+from torchpose._core.value_checks import values_visible
+from torchpose.filters._mkf import MixtureKalmanFilter
+from torchpose.filters._recompute import wants_gradient
+from torchpose.math._gaussian import LOG_2PI, mended_cholesky, spare_columns
+from torchpose.math._geometric_median import geometric_median, median_columns
+
+__all__ = [
+    "MeasuredParts",
+    "OwnFrames",
+    "condition_own",
+    "measured_parts",
+    "own_moments",
+    "own_noise",
+]
+
+
+class MeasuredParts(NamedTuple):
+    """Holds what no R changes: H mu [K, Z], A = H Sigma [K, Z, D] and C = H Sigma H^T [K, Z, Z]."""
+
+    centre: Tensor
+    rows: Tensor
+    block: Tensor
+
+
+class OwnFrames(NamedTuple):
+    """Holds the components given N frames each.
+
+    Attributes:
+        factor: L [N, K, Z, Z]; a missing measurement has the row and column of the identity.
+        white: v [N, K, Z], 0 where missing. log_likelihood: [N, K].
+        jitter: of the S [N, K], or None; see `mended_cholesky`. mask: [N, Z], True where measured.
+    """
+
+    factor: Tensor
+    white: Tensor
+    log_likelihood: Tensor
+    jitter: Tensor | None
+    mask: Tensor
+
+
+def condition_own(
+    model: MixtureKalmanFilter,
+    parts: MeasuredParts,
+    z: Float[Tensor, "N Z"],
+    mask: Bool[Tensor, "N Z"],
+    noise: Float[Tensor, "N Z Z"],
+) -> OwnFrames:
+    """Return the innovations and likelihoods of all components for frames with an R of their own.
+
+    Args:
+        parts: from `measured_parts`. z: 0 where missing. mask: True where measured. noise: R.
+    """
+    noise, both = own_noise(noise, mask)
+    factor, jitter = mended_cholesky(torch.addcmul(noise[:, None], parts.block, both[:, None]))
+    log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    log_norm = -0.5 * LOG_2PI * mask.sum(-1, keepdim=True).to(log_det) - log_det
+    factor = factor.to(model.dtype)
+    residual = (z[:, None] - parts.centre.to(model.dtype)) * mask[:, None]
+    white = torch.linalg.solve_triangular(factor, residual[..., None], upper=False)[..., 0]
+    log_likelihood = log_norm.to(model.dtype) - 0.5 * white.square().sum(-1)
+    return OwnFrames(factor, white, log_likelihood, jitter, mask)
+
+
+def own_noise(
+    noise: Float[Tensor, "... Z Z"], mask: Bool[Tensor, "... Z"]
+) -> tuple[Float[Tensor, "... Z Z"], Float[Tensor, "... Z Z"]]:
+    """Return R' and b of S = R' + b C: b is 1 where both are measured; R' is the identity elsewhere."""
+    both = mask[..., :, None] & mask[..., None, :]
+    eye = torch.eye(noise.shape[-1], dtype=noise.dtype, device=noise.device)
+    return torch.where(both, noise, eye), both.to(noise)
+
+
+def own_moments(
+    model: MixtureKalmanFilter,
+    parts: MeasuredParts,
+    frames: OwnFrames,
+    log_weights: Float[Tensor, "N K"],
+    medians: Tensor,
+    return_cov: bool,
+) -> tuple[Float[Tensor, "N D"], Float[Tensor, "N D D"] | None]:
+    """Return the estimates of the mixture (BL 48) and, on request, their covariances.
+
+    Args:
+        parts: from `measured_parts`. frames: from `condition_own`. log_weights: normalised.
+        medians: first of three dimensions each, points that are estimated by their geometric median.
+    """
+    weights = log_weights.exp()
+    rows, centres = parts.rows.to(model.dtype), model.means.to(model.dtype)
+    solved = torch.linalg.solve_triangular(frames.factor.mT, frames.white[..., None], upper=True)
+    gained = (weights[..., None] * solved[..., 0]).flatten(1)
+    mean = weights @ centres + gained @ rows.flatten(0, 1)
+    total = None
+    if return_cov:
+        total = _covariance(model, rows, frames, weights, solved[..., 0], mean)
+    if not len(medians):
+        return mean, total
+    columns = median_columns(medians)
+    off = _median_offset(model, rows, frames, weights, solved[..., 0], mean, columns)
+    return mean - off, None if total is None else total + off[:, :, None] * off[:, None]
+
+
+def measured_parts(model: MixtureKalmanFilter) -> MeasuredParts:
+    """Return what no R changes, kept while the mixture stays as it is."""
+
+    def make() -> MeasuredParts:
+        rows = model.covariances.index_select(-2, model.observed)
+        return MeasuredParts(
+            model.means[:, model.observed], rows, rows.index_select(-1, model.observed)
+        )
+
+    return derived(model, "measured parts", (model.means, model.covariances), make)
+
+
+def _moved(solved: Float[Tensor, "N K Z"], rows: Float[Tensor, "K Z C"]) -> Float[Tensor, "N K C"]:
+    """Return A_j^T S_j^-1 (z - H mu_j), the move of every mean, in some columns of A."""
+    return torch.bmm(solved.transpose(0, 1), rows).transpose(0, 1)
+
+
+def _covariance(
+    model: MixtureKalmanFilter,
+    rows: Tensor,
+    frames: OwnFrames,
+    weights: Tensor,
+    solved: Tensor,
+    mean: Tensor,
+) -> Float[Tensor, "N D D"]:
+    """Return sum_j w_j (Sigma_j + (m_j - m)(m_j - m)^T) - sum_j w_j W_j^T W_j."""
+    apart = model.means.to(model.dtype) - mean[:, None] + _moved(solved, rows)
+    apart = apart * weights[..., None].sqrt()
+    prior = weights @ model.covariances.to(model.dtype).flatten(1)
+    explained = _explained(frames.factor, rows, weights, frames.mask)
+    return prior.unflatten(-1, rows.shape[-1:] * 2) + apart.mT @ apart - explained
+
+
+def _explained(
+    factor: Float[Tensor, "N K Z Z"], rows: Float[Tensor, "K Z D"], weights: Tensor, mask: Tensor
+) -> Float[Tensor, "N D D"]:
+    """Return sum_j w_j W_j^T W_j, what the measurements take off the covariances."""
+    shares = weights.sqrt()[..., None, None] * mask[:, None, :, None]
+    if not values_visible() or wants_gradient(factor, rows, weights):
+        white = torch.linalg.solve_triangular(factor, rows * shares, upper=False).flatten(1, 2)
+        return white.mT @ white
+    # One frame at a time stays in the cache, in memory that is used again.
+    dim = rows.shape[-1]
+    rows = pad(rows, (0, spare_columns(dim)))
+    white = torch.empty_like(rows).flatten(0, 1)
+    explained = rows.new_empty(len(factor), *rows.shape[-1:] * 2)
+    eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
+    for own, share, total in zip(factor, shares, explained, strict=True):
+        inverse = torch.linalg.solve_triangular(own, share.mT * eye, upper=False)
+        torch.bmm(inverse, rows, out=white.view_as(rows))
+        torch.mm(white.T, white, out=total)
+    return explained[:, :dim, :dim]
+
+
+def _median_offset(
+    model: MixtureKalmanFilter,
+    rows: Tensor,
+    frames: OwnFrames,
+    weights: Tensor,
+    solved: Tensor,
+    mean: Tensor,
+    columns: Tensor,
+) -> Float[Tensor, "N D"]:
+    """Return what the means exceed the geometric medians by, 0 in all but these columns."""
+    rows = rows[..., columns]
+    means = model.means[:, columns].to(model.dtype) + _moved(solved, rows)
+    seen = rows * frames.mask[:, None, :, None]
+    white = torch.linalg.solve_triangular(frames.factor, seen, upper=False)
+    prior = model.covariances.diagonal(dim1=-2, dim2=-1)[:, columns].to(model.dtype)
+    spread = (prior - white.square().sum(-2)).unflatten(-1, (-1, 3)).sum(-1)
+    points, start = (x.unflatten(-1, (-1, 3)) for x in (means, mean[:, columns]))
+    found = geometric_median(weights, points, spread, start).flatten(-2)
+    return torch.zeros_like(mean).index_copy(-1, columns, mean[:, columns] - found)

@@ -1,0 +1,267 @@
+"""Step tracks that may change their component in every frame, mean and covariance as one matrix.
+
+A track is A = [P, x; x^T, c], filled up by zeros to a width that products are fast at. Under component k
+a step is two products of that width, the rows of the measured dimensions, and one product of rank Z,
+
+A <- [F, 0; 0, 1] A [F, 0; 0, 1]^T + [N, b; b^T, 0],   W = L^-1 [H P, H x - z],   A <- A - W^T W,
+
+with L L^T = H P H^T + R; the last column of W is minus the whitened innovation. c is not used. The measured
+dimensions come first, so that H P is a slice.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchpose._core.module_state import derived
+from torchpose.filters._frame_noise import own_noise
+from torchpose.filters._measurements import Measurements
+from torchpose.filters._mkf import MixtureKalmanFilter
+from torchpose.filters._outputs import (
+    FilterOutput,
+    Mending,
+    StepOutput,
+    finish_output,
+    mending,
+    stacked_mending,
+)
+from torchpose.filters._weights import estimate_of
+from torchpose.math._gaussian import LOG_2PI, mended_cholesky, spare_columns, symmetrise
+
+__all__ = [
+    "TRACK_NUMBERS",
+    "JointModel",
+    "JointProblem",
+    "JointTracks",
+    "joined",
+    "joint_chunks",
+    "joint_estimate",
+    "joint_model",
+    "joint_order",
+    "joint_problems",
+    "stacked",
+]
+
+TRACK_NUMBERS = 1 << 18
+"""Numbers in the tracks that are stepped at a time: 2 MB, which stay in the cache."""
+
+
+class JointModel(NamedTuple):
+    """Holds the prediction by every component: [F, 0; 0, 1] and [N, b; b^T, 0], both [K, E, E]."""
+
+    matrix: Tensor
+    noise: Tensor
+
+
+class JointProblem(NamedTuple):
+    """Holds what is measured in one frame by B elements.
+
+    Attributes:
+        z: [B, 1, Z], 0 where missing. noise, both: of `own_noise` [B, 1, Z, Z]; `both` is None where
+            nothing is missing. mask: [B, 1, Z, 1]. log_norm: constant of the likelihood [B, 1].
+    """
+
+    z: Tensor
+    noise: Tensor
+    both: Tensor | None
+    mask: Tensor
+    log_norm: Tensor
+
+
+def joint_chunks(model: MixtureKalmanFilter, batch: int, numbers: int = 0) -> list[slice]:
+    """Return equal shares of a batch, of which the tracks stay in the cache.
+
+    Args:
+        numbers: of an element, beside those of its tracks.
+    """
+    width = model.dim + spare_columns(model.dim)
+    each = max(model.n_tracks * width**2, numbers)
+    count = max(1, min(batch, round(batch * each / TRACK_NUMBERS)))
+    edges = [round(batch * i / count) for i in range(count + 1)]
+    return [slice(*pair) for pair in itertools.pairwise(edges)]
+
+
+def joint_order(model: MixtureKalmanFilter) -> tuple[Tensor, Tensor]:
+    """Return the dimensions of the state with the measured ones first, and the way back."""
+    first = torch.zeros(model.dim, dtype=torch.long, device=model.observed.device)
+    first[model.observed] = torch.arange(len(model.observed), 0, -1, device=first.device)
+    order = first.argsort(descending=True, stable=True)
+    return order, order.argsort()
+
+
+def joint_model(model: MixtureKalmanFilter, time: int) -> JointModel:
+    """Return the prediction into a frame, kept after the burn-in."""
+
+    def make() -> JointModel:
+        order = joint_order(model)[0]
+        matrix, offset, noise = model.transition(time)
+        offset = offset[:, order]
+        matrix, noise = (part[:, order[:, None], order] for part in (matrix, noise))
+        spare = spare_columns(model.dim) - 1
+        joint = pad(torch.cat([noise, offset[..., None]], -1), (0, spare, 0, spare + 1))
+        joint[:, model.dim, : model.dim] = offset
+        square = pad(matrix, (0, spare + 1, 0, spare + 1))
+        square[:, model.dim, model.dim] = 1
+        return JointModel(square, joint)
+
+    return make() if time < model.burn_in else derived(model, "joint", model.sources, make)
+
+
+def joint_problems(frames: Measurements) -> list[JointProblem]:
+    """Return what is measured in every frame, for `JointTracks.correct`."""
+    complete = bool(frames.mask.all())
+    noise = frames.cov[None, None] if frames.cov.ndim == 2 else frames.cov
+    noise, both = own_noise(noise.to(torch.float64), frames.mask)
+    count = -0.5 * LOG_2PI * frames.mask.sum(-1, keepdim=True).to(noise)
+    parts = frames.z[:, :, None].to(noise), noise[:, :, None], both[:, :, None]
+    mask = frames.mask[:, :, None, :, None].to(noise)
+    return [
+        JointProblem(z, r, None if complete else b, seen, n)
+        for z, r, b, seen, n in zip(
+            *(part.unbind(1) for part in (*parts, mask, count)), strict=True
+        )
+    ]
+
+
+class JointTracks:
+    """Steps M tracks of B elements in memory that is used again: fresh pages cost as much as the products.
+
+    Args:
+        model: the filter. mean: [B, M, D]. cov: [B, M, D, D].
+
+    Attributes:
+        state: the tracks [B, M, E, E]. dim: D.
+    """
+
+    def __init__(
+        self,
+        model: MixtureKalmanFilter,
+        mean: Float[Tensor, "B M D"],
+        cov: Float[Tensor, "B M D D"],
+    ) -> None:
+        order, self._back = joint_order(model)
+        mean, cov = mean[..., order], cov[..., order[:, None], order]
+        self.dim, self.n_observed = model.dim, len(model.observed)
+        width = self.dim + spare_columns(self.dim)
+        self.state = cov.new_zeros(*mean.shape[:-1], width, width)
+        self.state[..., : self.dim, : self.dim] = cov
+        self.state[..., : self.dim, self.dim] = mean
+        self.state[..., self.dim, : self.dim] = mean
+        self._other, self._matrix, self._moved = (torch.empty_like(self.state) for _ in range(3))
+
+    @property
+    def mean(self) -> Float[Tensor, "B M D"]:
+        """Return the means, in the order of the filter's state."""
+        return self.state[..., self.dim].index_select(-1, self._back)
+
+    @property
+    def cov(self) -> Float[Tensor, "B M D D"]:
+        """Return the covariances, in the order of the filter's state."""
+        return self.state[..., self._back[:, None], self._back]
+
+    def take(self, parent: Int[Tensor, "B M"]) -> None:
+        """Replace the tracks of every element by some of them, of which some may be taken again."""
+        batch, n_tracks = self.state.shape[:2]
+        index = parent + n_tracks * torch.arange(batch, device=parent.device)[:, None]
+        if parent.shape[1] != n_tracks:
+            self.state = self.state.flatten(0, 1)[index]
+            self._other, self._matrix, self._moved = (
+                torch.empty_like(self.state) for _ in range(3)
+            )
+            return
+        torch.index_select(
+            self.state.flatten(0, 1), 0, index.flatten(), out=self._other.flatten(0, 1)
+        )
+        self.state, self._other = self._other, self.state
+
+    def predict(self, model: JointModel, component: Int[Tensor, "B M"]) -> None:
+        """Predict the tracks by a component each (BL 34, 37)."""
+        chosen, matrix, moved = component.flatten(), self._matrix.flatten(0, 1), self._moved
+        predicted, moved = self._other.flatten(0, 1), moved.flatten(0, 1)
+        torch.index_select(model.matrix, 0, chosen, out=matrix)
+        torch.bmm(matrix, self.state.flatten(0, 1), out=moved)
+        torch.index_select(model.noise, 0, chosen, out=predicted)
+        predicted.baddbmm_(moved, matrix.mT)
+        self.state, self._other = self._other, self.state
+
+    def correct(
+        self, problem: JointProblem
+    ) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B M"] | None]:
+        """Update the tracks by a measurement (BL 38-41).
+
+        Returns:
+            The log-likelihood of every track, and the jitter of its covariance, as `mended_cholesky`.
+        """
+        n_obs = self.n_observed
+        joint, block = self.state[..., :n_obs, :], self.state[..., :n_obs, :n_obs]
+        if problem.both is None:
+            innovation = block + problem.noise
+            joint = joint.clone(memory_format=torch.contiguous_format)
+        else:
+            innovation = torch.addcmul(problem.noise, problem.both, block)
+            joint = joint * problem.mask
+        joint[..., self.dim] -= problem.z
+        factor, jitter = mended_cholesky(innovation)
+        white = torch.linalg.solve_triangular(factor, joint, upper=False)
+        flat = white.flatten(0, 1)
+        self.state.flatten(0, 1).baddbmm_(flat.mT, flat, alpha=-1)
+        log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        squared = white[..., self.dim].square().sum(-1)
+        return torch.add(problem.log_norm - log_det, squared, alpha=-0.5), jitter
+
+
+def joint_estimate(
+    tracks: JointTracks,
+    log_weights: Float[Tensor, "B M"],
+    log_evidence: Float[Tensor, " B"],
+    jitters: Sequence[Tensor | None],
+    return_cov: bool,
+) -> StepOutput:
+    """Return the estimate of a frame (BL 48); without covariances its mean is that of the tracks [B, M, D].
+
+    Args:
+        log_evidence: also where nothing is measured. jitters: of its covariances.
+    """
+    mean = tracks.mean.to(log_weights)
+    mended = any(jitter is not None for jitter in jitters)
+    work = mending(log_weights, *jitters) if mended else (None, None)
+    if not return_cov:
+        return StepOutput(mean, log_weights, log_evidence, None, *work)
+    estimate, total = estimate_of(log_weights, mean, tracks.cov)
+    total = None if total is None else symmetrise(total)
+    return StepOutput(estimate, log_weights, log_evidence, total, *work)
+
+
+def stacked(steps: Sequence[StepOutput], frames: Measurements) -> FilterOutput:
+    """Stack the frames of some sequences, and average the means of tracks, all at once."""
+    log_weights = torch.stack([step.log_weights for step in steps], 1)
+    mean = torch.stack([step.mean for step in steps], 1)
+    if mean.ndim == 4:
+        mean = (log_weights.exp()[..., None, :] @ mean)[..., 0, :]
+    evidence = torch.stack([step.log_evidence for step in steps], 1)
+    evidence = torch.where(frames.mask.any(-1), evidence, torch.zeros_like(evidence))
+    covs = [step.cov for step in steps if step.cov is not None]
+    none = mending(evidence)
+    work = stacked_mending([
+        none if s.mended is None or s.jitter is None else Mending(s.mended, s.jitter) for s in steps
+    ])  # fmt: skip
+    return FilterOutput(
+        mean, log_weights, evidence, torch.stack(covs, 1) if covs else None, none.mended, *work
+    )
+
+
+def joined(parts: Sequence[FilterOutput], lengths: Tensor) -> FilterOutput:
+    """Join what `stacked` returned for the shares of a batch, and finish it."""
+    mean = torch.cat([part.mean for part in parts])
+    log_weights = torch.cat([part.log_weights for part in parts])
+    evidence = torch.cat([part.log_evidence for part in parts])
+    covs = [part.cov for part in parts if part.cov is not None]
+    mended = torch.cat([part.mended for part in parts if part.mended is not None])
+    jitter = torch.cat([part.jitter for part in parts if part.jitter is not None])
+    cov = torch.cat(covs) if covs else None
+    return finish_output(mean, log_weights, evidence, cov, lengths, Mending(mended, jitter))
