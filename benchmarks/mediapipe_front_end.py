@@ -35,7 +35,7 @@ MODES: dict[str, dict[str, Any]] = {"filtered": {}, "smoothed": {"smoothing": "f
 GAPS = (10, 20, 30)
 SIGNERS = (("again", "brother", "help"), ("bird", "milk"), ("book", "learn"))
 HEADS, NECKS = (0.8, 0.9, 1.0, 1.1), (0.2, 0.27, 0.34)
-_QUICK_FRAMES = 50  # of the clip of a quick run
+_QUICK_FRAMES = 36  # of the clip of a quick run
 
 
 def begun(clip: Clip) -> Clip:

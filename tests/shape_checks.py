@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence, Set
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -77,8 +78,8 @@ def checked(function: Any) -> Any:
     if not inspect.isfunction(function) or hasattr(function, "__wrapped__"):
         return function
     check = _check_of(function)
-    told, named, returns = check.told, check.named, check.returns
-    plain, passed = check.plain, check.passed
+    looked_at, named, returns = check.looked_at, check.named, check.returns
+    plain, passed, most = check.plain, check.passed, len(check.looked_at)
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
@@ -86,19 +87,19 @@ def checked(function: Any) -> Any:
         returned = function(*args, **kwargs)
         # Nearly all calls end here, millions in a run: no call is made that can be left out.
         try:
-            if len(args) > len(told):
+            if len(args) > most:
                 raise TypeError("more values than are told apart")
             facts: list[Hashable] = [len(args), *map(type, args), type(returned), *kwargs]
-            for value, is_told in zip(args, told, strict=False):
-                if not is_told:
-                    _add_facts((value,), facts, plain)
-            for name, value in kwargs.items():
+            values = [*compress(args, looked_at)]
+            for name in kwargs:
                 if name in named:
-                    facts.append(type(value))
+                    facts.append(type(kwargs[name]))
                 else:
-                    _add_facts((value,), facts, plain)
+                    values.append(kwargs[name])
             if not returns:
-                _add_facts((returned,), facts, plain)
+                values.append(returned)
+            if values:
+                _add_facts(values, facts, plain)
             key = tuple(facts)
             if key in passed:
                 return returned
@@ -129,9 +130,9 @@ class _Check:
         code, hints = function.__code__, function.__annotations__
         names = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
         self.named = {name for name in names if _told_by_type(hints.get(name))}
-        self.told = [name in self.named for name in names[: code.co_argcount]]
+        self.looked_at = [name not in self.named for name in names[: code.co_argcount]]
         if code.co_flags & inspect.CO_VARARGS:
-            self.told += [False] * _MOST_ITEMS
+            self.looked_at += [True] * _MOST_ITEMS
         self.returns = _told_by_type(hints.get("return"))
         self.plain = _PLAIN if _may_have_literals(function) else _PLAIN_AND_WORDS
         self.call: Callable | None = None
@@ -209,18 +210,22 @@ def _add_facts(values: Iterable[Any], facts: list[Hashable], plain: set[type]) -
         if kind is Tensor:
             facts.append(value.dtype)
             facts.append(value.shape)
-        elif kind not in plain:
+        elif kind in plain:
+            pass
+        elif kind is bool or kind is str:  # a word of a Literal
+            facts.append(value)
+        elif isinstance(value, _SEQUENCES) and len(value) <= _MOST_ITEMS:
+            facts.append(len(value))
+            _add_facts(value, facts, plain)
+        else:
             _add_more(value, kind, facts, plain)
 
 
 def _add_more(value: Any, kind: type, facts: list[Hashable], plain: set[type]) -> None:
-    """Append what counts of a value beside its type."""
-    if isinstance(value, _SEQUENCES) and len(value) <= _MOST_ITEMS:
-        facts.append(len(value))
-        _add_facts(value, facts, plain)
-    elif isinstance(value, _ARRAYS):
+    """Append what counts of a value of a rarer type, beside that type."""
+    if isinstance(value, _ARRAYS):
         facts += value.dtype, value.shape
-    elif kind is bool or kind is str or isinstance(value, type):  # bools and words of a Literal
+    elif isinstance(value, type):
         facts.append(value)
     elif kind is dict and len(value) <= _MOST_ITEMS:
         facts.append(len(value))

@@ -34,14 +34,10 @@ def test_import_loads_nothing_heavy():
     assert not loaded & {*HEAVY, "torch", "numpy"}
 
 
-def test_modules_load_no_optional_package():
-    modules = ("camera", "errors", "filters", "metrics", "priors", "skeleton", "upper_body")
-    lines = "\n".join(f"torchpose.{name}" for name in modules)
-    loaded = loaded_after(f"import torchpose\n{lines}")
-    assert {f"torchpose.{name}" for name in modules} <= loaded
-    assert not loaded & set(HEAVY)
-
-
+ROOMS = tuple(
+    f"torchpose.{name}"
+    for name in ("camera", "errors", "filters", "metrics", "priors", "skeleton", "upper_body")
+)
 FILTERS = """
 import torch
 from torchpose.filters import BootstrapParticleFilter, MixtureKalmanFilter
@@ -60,9 +56,20 @@ BootstrapParticleFilter(gmm, torch.ones(2), torch.ones(2), [0, 1], n_particles=9
 """
 
 
-def test_no_filter_loads_a_computer_algebra_system_on_its_way():
+@pytest.fixture(scope="module")
+def loaded():
+    """What is loaded after most rooms were, and filters have run."""
+    return loaded_after("import torchpose\n" + "\n".join(ROOMS) + FILTERS)
+
+
+def test_modules_load_no_optional_package(loaded):
+    assert set(ROOMS) <= loaded
+    assert not loaded & set(HEAVY)
+
+
+def test_no_filter_loads_a_computer_algebra_system_on_its_way(loaded):
     """torch.broadcast_shapes does, which takes a second in the middle of a track."""
-    assert "sympy" not in loaded_after(FILTERS)
+    assert "sympy" not in loaded
 
 
 @pytest.mark.parametrize("name", [*torchpose.__all__, *sorted(torchpose._PACKAGES)])

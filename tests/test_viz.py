@@ -31,6 +31,15 @@ def scene() -> SimpleNamespace:
 
 @pytest.fixture(scope="module")
 def pictures(scene) -> dict[str, object]:
+    """One picture of each kind, drawn in few pixels."""
+    made = make_pictures(scene)
+    for figure in made.values():
+        figure.set_dpi(30)
+        figure.canvas.draw()
+    return made
+
+
+def make_pictures(scene) -> dict[str, object]:
     errors = {
         "tracker": metrics.joint_errors_3d(scene.joints, scene.truth),
         "mean pose": metrics.joint_errors_3d(
@@ -69,8 +78,6 @@ def pictures(scene) -> dict[str, object]:
 
 def test_every_picture_can_be_drawn_and_is_not_blank(pictures) -> None:
     for name, figure in pictures.items():
-        figure.set_dpi(30)
-        figure.canvas.draw()
         pixels = np.asarray(figure.canvas.buffer_rgba())[..., :3]
         inked = (pixels < 250).any(-1).mean()
         assert 0.005 < inked < 0.9, name
@@ -82,8 +89,6 @@ def test_labels_carry_units_and_legends_stay_out_of_the_data(pictures) -> None:
     assert figure.axes[0].get_ylabel() == "error (cm)"
     assert figure.axes[-1].get_xlabel() == "time (s)"
     for figure in pictures.values():
-        figure.set_dpi(30)
-        figure.canvas.draw()
         for legend in figure.legends:
             box = legend.get_window_extent()
             assert not any(box.overlaps(ax.get_window_extent()) for ax in figure.axes)

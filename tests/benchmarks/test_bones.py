@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from benchmarks.bones import errors, lifted, mhad_views, openpose_views, true_lengths
-from tests.data import data_dir_or_skip
+from tests.data import data_dir_or_skip, few_recordings
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +30,11 @@ def test_errors_of_the_truth_are_none(data):
 
 
 def test_quick_run_prints_every_method(run_here, data, tmp_path):
-    pictures = tmp_path / "pictures"
-    options = ("--data", str(data), "--out", str(tmp_path), "--pictures", str(pictures))
+    few, pictures = tmp_path / "data", tmp_path / "pictures"
+    few_recordings("kinect_utd_mhad", few, 2, ("s07", "s08"))
+    for name in ("mocap_berkeley_mhad", "multicam_pose2sim", "video_people", "video_asl"):
+        (few / name).symlink_to(data / name)
+    options = ("--data", str(few), "--out", str(tmp_path), "--pictures", str(pictures))
     printed = run_here("bones.__main__", "--quick", *options)
     assert len(list(pictures.glob("*.png"))) == 8
     for title in ("MHAD, seven joints", "Webcams, MediaPipe's 2D against its own 3D landmarks",

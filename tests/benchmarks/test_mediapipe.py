@@ -33,7 +33,7 @@ def test_joints_from_video(run_here, tmp_path):
     written, pictures = tmp_path / "joints.md", tmp_path / "joints"
     data = data_dir_or_skip("video_asl").parent
     options = ("--data", str(data), "--out", str(written), "--pictures", str(pictures))
-    run_here("video_asl_joints", "--quick", *options)
+    run_here("video_asl_joints", "--quick", "--prior", "kinect-upper-body-small", *options)
     text = written.read_text()
     means = rows(text, "Mean 2D distance")
     elbows = {name: float(row[2].split()[0]) for name, row in means.items()}

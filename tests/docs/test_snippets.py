@@ -20,12 +20,12 @@ PAGES = sorted((ROOT / "docs").rglob("*.md"))
 
 @pytest.fixture(scope="session")
 def clip(tmp_path_factory):
-    """One second of a rendered performer."""
+    """Two thirds of a second of a rendered performer; who is seen for half a second counts."""
     from torchpose.demo import demo_camera, performer
     from torchpose.demo._rendering import render_video
 
     path = tmp_path_factory.mktemp("clip") / "clip.mp4"
-    render_video(path, performer(30, 30.0, 0), demo_camera())
+    render_video(path, performer(20, 30.0, 0), demo_camera())
     return path
 
 

@@ -71,11 +71,12 @@ def check_equal(poses, track, fields=FIELDS):
 
 @pytest.mark.parametrize("uncertain", [False, True])
 @pytest.mark.parametrize("method", METHODS)
-def test_steps_are_the_frames_of_forward(prior, keypoints, method, uncertain):
+def test_steps_are_the_frames_of_forward(prior, keypoints, few, method, uncertain):
     options = {"n_particles": 100} if "n_particles" in method_options(method) else {}
     tracker = UpperBodyTracker(prior, demo_camera(), method=method, max_gap=None, **options)
     confidence = mask = None
     if uncertain:
+        keypoints = few
         g = torch.Generator().manual_seed(3)
         confidence = torch.rand(keypoints.shape[:3], generator=g, dtype=torch.float64)
         mask = torch.rand(keypoints.shape[:3], generator=g) < 0.9

@@ -32,7 +32,7 @@ from torchpose.upper_body import METHODS, PoseTrack, UpperBodyTracker
 from torchpose.upper_body._single_poses import default_process_cov
 
 NAMES = list(KEYPOINT_NAMES)
-N_FRAMES = 150
+N_FRAMES = 120
 
 
 @pytest.fixture(scope="module")
@@ -117,10 +117,10 @@ def test_lengths_that_no_sequence_has_are_refused(prior, scene, lengths):
 
 
 def test_names_may_come_in_any_order_and_subset(prior, scene, plain):
-    keypoints = scene[1][:70]
+    keypoints = scene[1][:40]
     tracker = UpperBodyTracker(prior, demo_camera())
-    expected = plain.joints3d[:, :70]
-    eight = torch.full((1, 70, 8, 2), float("nan"), dtype=torch.float64)
+    expected = plain.joints3d[:, :40]
+    eight = torch.full((1, 40, 8, 2), float("nan"), dtype=torch.float64)
     eight[0][:, [UPPER_BODY.index(n) for n in NAMES]] = keypoints
     torch.testing.assert_close(tracker(eight).joints3d, expected)
     order = [2, 0, 3, 1]
@@ -142,7 +142,7 @@ def test_elbows_are_measured_where_they_are_given(prior, scene):
 
 
 def test_another_camera_is_mapped_to_the_priors(prior, scene):
-    keypoints = scene[1][:60]
+    keypoints = scene[1][:40]
     near = demo_camera()
     other = PinholeCamera(1000.0, 990.0, 640.0, 360.0)
     moved = map_pixels(keypoints, near.matrix, other.matrix)
@@ -224,10 +224,10 @@ def test_covariances_grow_in_the_gap(prior, scene):
 
 
 def test_frames_and_the_static_camera(prior, scene, plain):
-    truth, keypoints = (x[:70] for x in scene)
+    truth, keypoints = (x[:50] for x in scene)
     body = UpperBodyTracker(prior, demo_camera(), frame="body")(keypoints[None], names=NAMES)
     still = UpperBodyTracker(prior, demo_camera(), static_camera=True)(keypoints[None], names=NAMES)
-    camera = plain.joints3d[0, :70]
+    camera = plain.joints3d[0, :50]
     assert abs(float(body.joints3d[0, :, 4].norm(dim=-1).mean())) < 0.1  # centred on the neck
     for other in (body, still):
         a, b = mean_error(other, truth), float(joint_errors_3d(camera, truth).mean())
@@ -395,7 +395,7 @@ def test_a_neck_between_the_shoulders_is_put_where_the_prior_has_it(prior, scene
 
 
 def test_shoulders_stand_for_a_neck_that_is_not_there(prior, scene):
-    truth, keypoints = (x[:50] for x in scene)
+    truth, keypoints = (x[:30] for x in scene)
     eye, zeros = torch.eye(3).double(), torch.zeros(3).double()
     shoulders = project(truth, demo_camera().matrix, eye, zeros)[:, [2, 5], :2]
     wide = torch.cat([keypoints, shoulders], 1)[None]

@@ -70,8 +70,6 @@ def test_poses_are_those_of_the_keypoint_tracker(prior, smoothing):
     assert person.covariance is None
     torch.testing.assert_close(person.confidence, detector.sure[FIRST:, 0].double())
     same(person.track, whole(UpperBodyTracker(prior, CAMERA, **options), detector))
-    again = tracker(FRAMES)[0]
-    assert torch.equal(again.track.joints3d, person.track.joints3d)
 
 
 def test_a_camera_gives_the_poses_of_a_recording(prior):
@@ -140,6 +138,8 @@ def test_several_persons_have_poses_of_their_own(prior):
         same(person.track, whole(reference, detector, person.number))
     found, poses = shown[-1]
     assert found.person.tolist() == [0, 1] and sorted(poses) == [0, 1] and found.faces is None
+    for person, again in zip(people, tracker(FRAMES), strict=True):
+        assert torch.equal(again.track.joints3d, person.track.joints3d)
 
 
 def test_wrists_choose_the_method_as_in_files(prior):

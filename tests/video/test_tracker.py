@@ -48,7 +48,7 @@ def two_persons(pair):
 def test_somebody_who_leaves_and_comes_back_is_the_same_person(prior, one_person):
     shown = one_person
     nobody = [np.full_like(shown[0], 120)] * 80
-    tracker = VideoTracker(prior, demo_camera(), max_gap=1.0)
+    tracker = VideoTracker(prior, demo_camera(), method="mkf-fixed", max_gap=1.0)
     (person,) = tracker(shown[:30] + nobody + shown[30:])
     there = person.track.joints3d[0].isfinite().all(-1).all(-1)
     away = torch.nonzero(~there).flatten() + person.first_frame
@@ -60,7 +60,7 @@ def test_somebody_who_leaves_and_comes_back_is_the_same_person(prior, one_person
 
 
 def test_two_who_cross_stay_who_they_are(prior, pair, two_persons):
-    tracker = VideoTracker(prior, demo_camera())
+    tracker = VideoTracker(prior, demo_camera(), method="mkf-fixed")
     people = tracker(two_persons)
     assert len(people) == 2
     camera = demo_camera()
@@ -78,14 +78,14 @@ def test_two_who_cross_stay_who_they_are(prior, pair, two_persons):
 
 
 def test_only_the_largest_face_is_followed_if_asked_for(prior, two_persons):
-    tracker = VideoTracker(prior, demo_camera(), max_persons=1)
+    tracker = VideoTracker(prior, demo_camera(), method="mkf-fixed", max_persons=1)
     people = tracker(two_persons[:30])
     assert len(people) == 1
 
 
 def test_candidates_of_the_last_pose_reach_the_hands_live_and_offline(prior, one_person):
     shown = one_person[:30]
-    tracker = VideoTracker(prior, demo_camera(), candidates=True)
+    tracker = VideoTracker(prior, demo_camera(), method="mkf-fixed", candidates=True)
     asked = []
     step = tracker.measurer.hand_tracker.step
 

@@ -84,8 +84,12 @@ class _Entry(NamedTuple):
     value: Any
 
 
+class _Kept(dict[Hashable, _Entry]):
+    """Holds derived values by their names; a class of its own, which shape checks need not look into."""
+
+
 # Outside the modules: not part of their state, and neither copied nor pickled with them.
-_KEPT: "WeakKeyDictionary[nn.Module, dict[Hashable, _Entry]]" = WeakKeyDictionary()
+_KEPT: "WeakKeyDictionary[nn.Module, _Kept]" = WeakKeyDictionary()
 
 
 class _Graphs(threading.local):
@@ -93,7 +97,7 @@ class _Graphs(threading.local):
 
     def __init__(self) -> None:
         self.depth = 0
-        self.kept: dict[Hashable, _Entry] = {}
+        self.kept = _Kept()
         self.traced: dict[Hashable, tuple[tuple[Tensor, ...], Any]] = {}
 
 
@@ -146,7 +150,7 @@ def derived(
         if not _GRAPHS.depth:
             return make()
         return _kept_in(_GRAPHS.kept, (id(module), name), given, make)
-    return _kept_in(_KEPT.setdefault(module, {}), name, given, lambda: _without_graph(make))
+    return _kept_in(_KEPT.setdefault(module, _Kept()), name, given, lambda: _without_graph(make))
 
 
 def _without_graph(make: Callable[[], T]) -> T:
@@ -165,9 +169,7 @@ def outside_inference() -> Iterator[None]:
         yield
 
 
-def _kept_in(
-    kept: dict[Hashable, _Entry], key: Hashable, given: tuple[Tensor, ...], make: Callable[[], T]
-) -> T:
+def _kept_in(kept: _Kept, key: Hashable, given: tuple[Tensor, ...], make: Callable[[], T]) -> T:
     entry = kept.get(key)
     same = entry is not None and len(entry.marks) == len(given)
     if entry is None or not (

@@ -29,10 +29,18 @@ from torchpose.learning._blocks import (
     usable_samples,
 )
 from torchpose.learning._samplers import Samples, SampleSource, cached
-from torchpose.math._gaussian import symmetrise
-from torchpose.math._mixture_em import MixtureFit, run_fit, whitening
+from torchpose.math._mixture_em import MixtureFit, map_mixture, run_fit, whitening
 from torchpose.math._mixture_start import STARTS, floor_variances, start_mixture
-from torchpose.math._mixture_steps import MixtureParameters, SufficientStatistics, e_step
+from torchpose.math._mixture_steps import (
+    MixtureParameters,
+    SufficientStatistics,
+    e_step,
+    feature_sums,
+    moments,
+    natural_parameters,
+    product_places,
+    upper_triangle,
+)
 from torchpose.priors._gaussian_mixture import GaussianMixture
 
 __all__ = [
@@ -256,7 +264,6 @@ def _check_enough(source: SampleSource, states: Tensor, n_components: int) -> No
 
 
 _FLOOR = 1e-6  # of the variance of each dimension, as in expectation-maximisation
-_ROWS = 1024  # states at a time, whose squares are 17 MB
 
 
 class ColumnsSource:
@@ -315,26 +322,36 @@ def complete_mixture(
         raise InputError(
             f"the mixture must be over the {len(columns)} dimensions that decide, got {mixture.dim}"
         )
-    columns = list(columns)
-    first = usable_block(source, 0, 0).states
-    shift, scale = first.mean(0), first.std(0).clamp_min(1e-9)
-    k, dim = mixture.n_components, source.dim
-    count = torch.zeros(k, dtype=torch.float64)
-    total, squares = torch.zeros(k, dim).double(), torch.zeros(k, dim * dim).double()
+    order = [*columns, *(i for i in range(source.dim) if i not in columns)]
+    first = usable_block(source, 0, 0).states.double()
+    floor = _FLOOR * first.std(0).clamp_min(1e-9).square()
+    # the factor is triangular: of whitened states the first dimensions alone decide, as of states
+    shift, _, factor = whitening(first[:, order], None, floor[order])
+    theta = _theta_of_first(mixture, shift, factor)
+    total = SufficientStatistics.zeros(mixture.n_components, source.dim)
     for index in range(source.n_blocks):
-        samples = usable_block(source, index, 0)
-        for states, weight in zip(*(value.split(_ROWS) for value in samples), strict=True):
-            share = mixture.component_log_prob(states[:, columns]).softmax(1) * weight[:, None]
-            unit = (states - shift) / scale
-            count += share.sum(0)
-            total += share.T @ unit
-            squares += share.T @ (unit[:, :, None] * unit[:, None]).flatten(1)
-    count = count.clamp_min(1e-9)
-    means = total / count[:, None]
-    covs = squares.unflatten(1, (dim, dim)) / count[:, None, None]
-    covs = symmetrise(covs - means[:, :, None] * means[:, None])
-    covs = covs + _FLOOR * torch.eye(dim, dtype=torch.float64)
-    return GaussianMixture(mixture.weights, means * scale + shift, covs * scale * scale[:, None])
+        states, weight = (values.double() for values in usable_block(source, index, 0))
+        white = torch.linalg.solve_triangular(factor, (states[:, order] - shift).T, upper=False)
+        total = total.merge(feature_sums(white.T, theta, weight))
+    _, means, covs = moments(total.table, source.dim)
+    whole = map_mixture(MixtureParameters(mixture.weights, means, covs), factor)
+    back = torch.tensor(order).argsort()
+    covs = whole.covariances[:, back][:, :, back] + torch.diag(floor)
+    return GaussianMixture(mixture.weights, (whole.means + shift)[:, back], covs)
+
+
+def _theta_of_first(mixture: GaussianMixture, shift: Tensor, factor: Tensor) -> Tensor:
+    """Return the natural parameters [K, F] of a mixture over the first of whitened dimensions."""
+    n, dim = mixture.dim, len(shift)
+    weights, means, covs = (
+        x.double() for x in (mixture.weights, mixture.means, mixture.covariances)
+    )
+    inverse = torch.linalg.inv(factor[:n, :n])
+    white = map_mixture(MixtureParameters(weights, means - shift[:n], covs), inverse)
+    products = product_places(*upper_triangle(n, shift.device), dim)
+    theta = shift.new_zeros(len(weights), 1 + dim + dim * (dim + 1) // 2)
+    theta[:, [*range(1 + n), *products]] = natural_parameters(white)
+    return theta
 
 
 class MixtureTask(NamedTuple):

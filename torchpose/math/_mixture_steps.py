@@ -25,8 +25,11 @@ __all__ = [
     "SufficientStatistics",
     "cyclic_order",
     "e_step",
+    "feature_sums",
     "m_step",
+    "moments",
     "natural_parameters",
+    "product_places",
     "upper_triangle",
 ]
 
@@ -73,9 +76,13 @@ def cyclic_order(dim: int, device: torch.device) -> Int[Tensor, " F"]:
     i = torch.arange(dim, device=device)
     left = i.repeat(dim // 2 + 1)[: dim * (dim + 1) // 2]
     right = (left + torch.arange(len(left), device=device) // dim) % dim
-    low, high = torch.minimum(left, right), torch.maximum(left, right)
-    place = low * dim - low * (low - 1) // 2 + high - low
-    return torch.cat([torch.arange(1 + dim, device=device), 1 + dim + place])
+    return torch.cat([torch.arange(1 + dim, device=device), product_places(left, right, dim)])
+
+
+def product_places(i: Int[Tensor, " P"], j: Int[Tensor, " P"], dim: int) -> Int[Tensor, " P"]:
+    """Return the positions of products x_i x_j, in either order, in [1, x_i, x_i x_j (i <= j)]."""
+    low, high = torch.minimum(i, j), torch.maximum(i, j)
+    return 1 + dim + low * dim - low * (low - 1) // 2 + high - low
 
 
 POINTS = 1008  # at a time and core: 253 features are 2 MB; a power of two is 10 % slower
@@ -191,7 +198,20 @@ def e_step(
     Returns:
         The statistics of `m_step`.
     """
-    theta = natural_parameters(parameters)
+    return feature_sums(x, natural_parameters(parameters), sample_weight)
+
+
+def feature_sums(
+    x: Float[Tensor, "N D"],
+    theta: Float[Tensor, "K F"],
+    sample_weight: Float[Tensor, " N"] | None = None,
+) -> SufficientStatistics:
+    """Run the expectation step of a mixture whose terms are theta_k . phi(x), without a graph.
+
+    Args:
+        x, sample_weight: as for `e_step`. theta: `natural_parameters`, or others with zeros for what the
+            responsibilities do not depend on.
+    """
     order = cyclic_order(x.shape[1], x.device)
     # powers of two, 2^(theta . phi(x) / log 2), take a third of the time that those of e take
     powers = _pad_components((theta[:, order] / LOG_2).to(x.dtype))
@@ -248,22 +268,27 @@ def m_step(
     Returns:
         The mixture and how many components were moved.
     """
-    table = statistics.table
-    n_components, dim = len(table), floor.shape[-1]
-    count = table[:, 0]
-    safe = count.clamp_min(torch.finfo(table.dtype).tiny)
-    means = table[:, 1 : 1 + dim] / safe.unsqueeze(-1)
-    rows, columns = upper_triangle(dim, table.device)
-    spread = table.new_zeros(n_components, dim, dim)
-    spread[:, rows, columns] = table[:, 1 + dim :] / safe.unsqueeze(-1)
-    spread[:, columns, rows] = spread[:, rows, columns]
-    spread = spread - means.unsqueeze(-1) * means.unsqueeze(-2)
+    count, means, spread = moments(statistics.table, floor.shape[-1])
     lost = _collapsed(count, spread, floor)
     moved = int(lost.sum())
     state = MixtureParameters(count / statistics.weight, means, spread + floor)
     for index in lost.nonzero().flatten().tolist():
         state, lost = _split_largest(state, index, lost)
     return state._replace(weights=state.weights / state.weights.sum()), moved
+
+
+def moments(
+    table: Float[Tensor, "K F"], dim: int
+) -> tuple[Float[Tensor, " K"], Float[Tensor, "K D"], Float[Tensor, "K D D"]]:
+    """Return n_k, mu_k and the covariance S_k / n_k - mu_k mu_k' of each component (BL 54-56)."""
+    count = table[:, 0]
+    safe = count.clamp_min(torch.finfo(table.dtype).tiny)
+    means = table[:, 1 : 1 + dim] / safe.unsqueeze(-1)
+    rows, columns = upper_triangle(dim, table.device)
+    spread = table.new_zeros(len(table), dim, dim)
+    spread[:, rows, columns] = table[:, 1 + dim :] / safe.unsqueeze(-1)
+    spread[:, columns, rows] = spread[:, rows, columns]
+    return count, means, spread - means.unsqueeze(-1) * means.unsqueeze(-2)
 
 
 def _collapsed(count: Tensor, spread: Tensor, floor: Tensor) -> Tensor:
