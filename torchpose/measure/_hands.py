@@ -98,6 +98,7 @@ class HandTracker(nn.Module):
         settings: constants. fps: frames per second of the video.
         network: that tells hands from what looks alike; None leaves it to colours, motion and shape, and
             takes every hand to be somewhere.
+        elbows: whether the network also finds the elbows.
 
     Raises:
         InputError: a frame rate that is not positive.
@@ -123,13 +124,14 @@ class HandTracker(nn.Module):
         settings: HandSettings | None = None,
         fps: float = 30.0,
         network: HandNetwork | None = None,
+        elbows: bool = True,
     ) -> None:
         super().__init__()
         if not (math.isfinite(fps) and fps > 0):
             raise InputError(f"fps must be positive, got {fps}")
         self.prior, self.settings, self.fps = prior, settings or HandSettings(), fps
         s, rate = self.settings, 30.0 / fps
-        self.rate, self.network = rate, network
+        self.rate, self.network, self.elbows = rate, network, elbows
         self.skin = SkinModel(
             s.skin_slope, s.skin_bias, s.skin_decay**rate, s.skin_floor, s.clothes_share
         )
@@ -195,7 +197,7 @@ class HandTracker(nn.Module):
         moves = still + (1 - still) * moving.clamp(0, 1)
         belief = self._filter(state, belief, rebirth, log_likelihood, moves, flow)
         state, hands = self._measure(state._replace(belief=belief), means[:, 1], frame.shape)
-        if found is not None:
+        if found is not None and self.elbows:
             expected_elbow = _expected_elbows(hands, elbow, state.anchors)
             elbows = self._elbows(found, expected_elbow, state.anchors, frame.shape)
             hands = hands._replace(
@@ -279,7 +281,8 @@ class HandTracker(nn.Module):
         means = self.likelihood.means(maps)
         found = None
         if self.network is not None:
-            found = self.network.find(lab, maps, inside, faces_in_window(faces, state.anchors))
+            near = faces_in_window(faces, state.anchors)
+            found = self.network.find(lab, maps, inside, near, self.elbows)
         return state._replace(skin=learnt, memory=memory, motion=motion), means, flow, found
 
     def _gone(

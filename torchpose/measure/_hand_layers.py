@@ -1,0 +1,145 @@
+"""Build the layers of the hand network, and fold their normalisation away where nothing is learnt."""
+
+from copy import deepcopy
+from typing import TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import conv2d, conv_transpose2d, interpolate
+
+from torchpose._core.module_state import derived
+
+__all__ = ["Layer", "UpwardLayer", "for_inference"]
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+class Layer(nn.Sequential):
+    """Applies a convolution, the normalisation of batches, and a rectifier.
+
+    Args:
+        before, after: channels. size: of the kernel. stride: cells to one. apart: dilation of the kernel.
+    """
+
+    def __init__(
+        self, before: int, after: int, size: int = 3, stride: int = 1, apart: int = 1
+    ) -> None:
+        padding = apart * (size // 2)
+        super().__init__(
+            nn.Conv2d(before, after, size, stride, padding, dilation=apart, bias=False),
+            nn.BatchNorm2d(after),
+            nn.ReLU(inplace=True),
+        )
+
+
+class UpwardLayer(Layer):
+    """Applies a layer to maps of cells twice as wide, and to maps of these cells.
+
+    Args:
+        coarse, fine: channels of the two. after: channels of the result.
+    """
+
+    def __init__(self, coarse: int, fine: int, after: int) -> None:
+        super().__init__(coarse + fine, after)
+        self.coarse = coarse
+
+    def forward(
+        self, coarse: Float[Tensor, "N A h w"], fine: Float[Tensor, "N B r c"]
+    ) -> Float[Tensor, "N C r c"]:
+        """Return the maps of these cells."""
+        up = interpolate(coarse, scale_factor=2.0)
+        return super().forward(torch.cat([up, fine], 1))  # type: ignore[no-any-return]
+
+
+def for_inference(network: Network) -> Network:
+    """Return the network, or a quicker one with the same results where it cannot learn from them.
+
+    It is kept until a tensor of the network changes.
+    """
+    if network.training or torch.is_grad_enabled():
+        return network
+    return derived(network, "for inference", _tensors(network), lambda: _folded(network))
+
+
+def _tensors(module: nn.Module) -> tuple[Tensor | None, ...]:
+    """Return all parameters and buffers; those of `nn.Module` take four times as long."""
+    own = (*module._parameters.values(), *module._buffers.values())
+    return sum((_tensors(child) for child in module._modules.values() if child), own)
+
+
+def _folded(network: Network) -> Network:
+    """Return a copy whose layers have their normalisation in the convolution.
+
+    Its maps keep the channels of a cell together, which convolutions on a CPU read fastest.
+    """
+    copy = deepcopy(network).requires_grad_(False).to(memory_format=torch.channels_last)
+    _fold_children(copy)
+    return copy
+
+
+def _fold_children(module: nn.Module) -> None:
+    for name, child in module.named_children():
+        if isinstance(child, UpwardLayer):
+            setattr(module, name, _FoldedUpwardLayer(child))
+        elif isinstance(child, Layer):
+            setattr(module, name, _FoldedLayer(child))
+        else:
+            _fold_children(child)
+
+
+def _folded_weights(layer: Layer) -> tuple[Tensor, Tensor]:
+    """Return the kernel and bias of a layer's convolution with its normalisation."""
+    conv, norm = layer[0], layer[1]
+    scale = norm.weight * (norm.running_var + norm.eps).rsqrt()
+    return conv.weight * scale[:, None, None, None], norm.bias - norm.running_mean * scale
+
+
+class _FoldedLayer(nn.Module):
+    """Does what a `Layer` does in inference."""
+
+    def __init__(self, layer: Layer) -> None:
+        super().__init__()
+        conv = layer[0]
+        weight, bias = _folded_weights(layer)
+        self.register_buffer("weight", weight.contiguous(memory_format=torch.channels_last))
+        self.register_buffer("bias", bias)
+        self.steps = conv.stride, conv.padding, conv.dilation
+
+    weight: Tensor
+    bias: Tensor
+
+    def forward(self, maps: Float[Tensor, "N A h w"]) -> Float[Tensor, "N C r c"]:
+        """Return the maps of the layer."""
+        return conv2d(maps, self.weight, self.bias, *self.steps).relu_()
+
+
+class _FoldedUpwardLayer(nn.Module):
+    """Does what an `UpwardLayer` does in inference.
+
+    A wide cell covers two by two cells, so the sums of the kernel's weights over these are applied to it
+    once: less than half the products, and no repeated maps.
+    """
+
+    def __init__(self, layer: UpwardLayer) -> None:
+        super().__init__()
+        weight, bias = _folded_weights(layer)
+        coarse, fine = weight.split([layer.coarse, weight.shape[1] - layer.coarse], 1)
+        sums = conv_transpose2d(
+            coarse.flip(2, 3).flatten(0, 1)[:, None], coarse.new_ones(1, 1, 2, 2)
+        )
+        up = sums.view(*coarse.shape[:2], 4, 4).transpose(0, 1)
+        self.register_buffer("up", up.contiguous(memory_format=torch.channels_last))
+        self.register_buffer("weight", fine.contiguous(memory_format=torch.channels_last))
+        self.register_buffer("bias", bias)
+
+    up: Tensor
+    weight: Tensor
+    bias: Tensor
+
+    def forward(
+        self, coarse: Float[Tensor, "N A h w"], fine: Float[Tensor, "N B r c"]
+    ) -> Float[Tensor, "N C r c"]:
+        """Return the maps of these cells."""
+        above = conv_transpose2d(coarse, self.up, stride=2, padding=1)
+        return conv2d(fine, self.weight, self.bias, padding=1).add_(above).relu_()
