@@ -292,20 +292,30 @@ def gaussian_matrix(
     """
     if shift is None:
         return _still_matrix(size, sigma)
-    return _gaussian(size, sigma, shift[..., None, None])
+    return _gaussian(size, sigma, shift[..., None])
 
 
 @cache
 def _still_matrix(size: int, sigma: float) -> Tensor:
     """Return `gaussian_matrix` without a shift, cached."""
-    return _gaussian(size, sigma, torch.zeros(()))
+    return _gaussian(size, sigma, torch.zeros(1))
 
 
 def _gaussian(size: int, sigma: float, shift: Tensor) -> Tensor:
-    place = torch.arange(size, device=shift.device, dtype=shift.dtype)
-    exponent = -0.5 * ((place[:, None] - place - shift) / sigma).square()
+    """Return `gaussian_matrix`, whose entries depend on the distance from the diagonal alone."""
+    away, index = _diagonals(size)
+    exponent = -0.5 * ((away.to(shift) - shift) / sigma).square()
     weight = exponent.clamp_(min=-40).exp_()  # nothing so small that the processor becomes slow
+    rows = weight.reshape(-1, 2 * size - 1)  # of more dimensions, `index_select` is slow
+    weight = rows.index_select(1, index).view(*shift.shape[:-1], size, size)
     return weight / weight.sum(-2, keepdim=True).clamp_min(1e-6)
+
+
+@cache
+def _diagonals(size: int) -> tuple[Tensor, Tensor]:
+    """Return the distance of each diagonal from the middle one, and the diagonal of each entry, row by row."""
+    place = torch.arange(size)
+    return torch.arange(1 - size, size), (place[:, None] - place + size - 1).flatten()
 
 
 _FACE_PIXELS = 19.0  # size of a face: a window on a hand is then some 15 pixels wide
