@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.nn.functional import interpolate
 
 from torchpose._core.images import Image
 from torchpose.errors import InputError
@@ -264,7 +265,7 @@ class HandTracker(nn.Module):
             state.skin,
             bins,
             faces_in_evidence(faces, state.anchors),
-            hands.repeat_interleave(EVIDENCE, 1).repeat_interleave(EVIDENCE, 2),
+            interpolate(hands[:, None], scale_factor=float(EVIDENCE))[:, 0],
             inside > 0.5,
         )
         skin = self.skin.find(learnt, bins)
@@ -382,8 +383,10 @@ class HandTracker(nn.Module):
                 the hand is not measured [N, 2, 2].
         """
         s = self.settings
-        away = (cell_centres() - expected[:, :, None, None]).square().sum(-1) / s.elbow_reach**2
-        likely = torch.log1p(away.nan_to_num(0.0) / _FREEDOM) * (-0.5 * (_FREEDOM + 2))
+        x, y = (c - expected[:, :, i, None] for i, c in enumerate(_axes()))
+        away = x.square()[:, :, None] + y.square()[..., None]
+        away = away.div_(s.elbow_reach**2).nan_to_num_(0.0).div_(_FREEDOM)
+        likely = away.log1p_().mul_(-0.5 * (_FREEDOM + 2))
         belief = torch.softmax((found.elbows + likely.to(found.elbows)).flatten(2), 2)
         peak = read_out(belief.view_as(found.elbows), smooth=1.5, within=5.0)
         points = cells_to_pixels(peak.place, anchors)
@@ -415,11 +418,17 @@ def _in_frame(points: Float[Tensor, "N 2 2"], shape: tuple[int, ...]) -> Tensor:
 
 def _before_face(faces: Tensor, anchors: Tensor) -> Tensor:
     """Return a map that is one on the face and zero away from it [N, r, c]."""
-    at = faces_in_window(faces, anchors)
-    offset = (cell_centres() - at[:, None, None, :2]) / (at[:, 2:] * at.new_tensor(_FACE))[
-        :, None, None
-    ]
-    return torch.sigmoid(6 * (1 - offset.square().sum(-1)))
+    at, (x, y) = faces_in_window(faces, anchors), _axes()
+    across = ((x - at[:, :1]) / (at[:, 2:] * _FACE[0])).square()
+    down = ((y - at[:, 1:2]) / (at[:, 2:] * _FACE[1])).square()
+    return torch.sigmoid(6 * (1 - (across[:, None] + down[:, :, None])))
+
+
+@cache
+def _axes() -> tuple[Float[Tensor, " c"], Float[Tensor, " r"]]:
+    """Return the places of the columns and rows of cells, in B from the anchor."""
+    places = cell_centres()
+    return places[0, :, 0].contiguous(), places[:, 0, 1].contiguous()
 
 
 def _hands_near(belief: Tensor) -> Tensor:
