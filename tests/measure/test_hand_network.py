@@ -135,7 +135,7 @@ def test_colours_are_relative_to_the_face():
     torch.testing.assert_close(inside, torch.zeros_like(inside), atol=1e-4, rtol=0)
 
 
-@torch.inference_mode()
+@torch.no_grad()
 def test_a_file_gives_the_same_network(tmp_path):
     info = HandNetworkInfo("own", ("a", "b"), ("anna",), "MIT", "fit")
     network = HandNetwork(info).half().float().eval()  # as a file holds it

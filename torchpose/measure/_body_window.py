@@ -137,17 +137,17 @@ def cut_colours(
     """
     import cv2
 
-    labs, smooth, parts = [], [], []
-    size = (CELLS[1] * EVIDENCE, CELLS[0] * EVIDENCE)
-    for window in cut_windows(frame, anchors):
-        small = cv2.resize(window, size, interpolation=cv2.INTER_AREA)
+    height, width = CELLS[0] * EVIDENCE, CELLS[1] * EVIDENCE
+    labs = np.empty((len(anchors), 3, height, width), np.uint8)
+    smooth = np.empty(labs.shape, np.float32)
+    parts = np.empty((*labs.shape[:2], *(side.stop - side.start for side in part)), np.uint8)
+    for n, window in enumerate(cut_windows(frame, anchors)):
+        small = cv2.resize(window, (width, height), interpolation=cv2.INTER_AREA)
         lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB)
-        fine = cv2.cvtColor(window[part], cv2.COLOR_RGB2LAB)
-        soft = cv2.GaussianBlur(lab.astype(np.float32), (0, 0), 0.8)
-        labs.append(cv2.split(lab))
-        smooth.append(cv2.split(soft))
-        parts.append(cv2.split(fine))
-    return tuple(torch.from_numpy(np.array(x)) for x in (labs, smooth, parts))  # type: ignore[return-value]
+        cv2.split(lab, [*labs[n]])
+        cv2.split(cv2.GaussianBlur(lab.astype(np.float32), (0, 0), 0.8), [*smooth[n]])
+        cv2.split(cv2.cvtColor(window[part], cv2.COLOR_RGB2LAB), [*parts[n]])
+    return torch.from_numpy(labs), torch.from_numpy(smooth), torch.from_numpy(parts)
 
 
 def cut_mask(mask: Image, anchors: Float[Tensor, "N 3"]) -> Float[Tensor, "N h w"]:

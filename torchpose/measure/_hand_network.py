@@ -175,9 +175,10 @@ class HandNetwork(nn.Module):
         every = torch.cat([_coarse(maps), _coarse(inside[:, None])], 1)
         logits = for_inference(self)(relative_colours(lab, faces), every, faces, elbows)
         places, gone = logits[..., :-1], logits[..., -1]
-        here = torch.log_softmax(places, -1).unflatten(-1, COARSE)
-        fine = interpolate(here, size=CELLS, mode="bilinear", align_corners=False) - math.log(4)
-        gone = gone - torch.logsumexp(places, -1)
+        total = torch.logsumexp(places, -1, keepdim=True)
+        here = (places - (total + math.log(4))).unflatten(-1, COARSE)  # four cells share one
+        fine = interpolate(here, size=CELLS, mode="bilinear", align_corners=False)
+        gone = gone - total[..., 0]
         return HandPlaces(fine[:, :2], gone[:, :2], fine[:, 2:], gone[:, 2:])
 
     def save(self, path: str | Path) -> None:
