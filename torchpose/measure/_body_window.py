@@ -26,6 +26,7 @@ __all__ = [
     "COLOURS",
     "EVIDENCE",
     "ScaledFrame",
+    "cell_axes",
     "cell_centres",
     "cells_to_pixels",
     "cut_colours",
@@ -34,7 +35,6 @@ __all__ = [
     "faces_in_evidence",
     "faces_in_window",
     "follow_faces",
-    "gaussian_matrix",
     "halve",
     "inside_image",
     "move_maps",
@@ -228,6 +228,13 @@ def cell_centres(per_cell: int = 1) -> Float[Tensor, "h w 2"]:
     return torch.stack(torch.broadcast_tensors(x, y[:, None]), -1).contiguous()
 
 
+@cache
+def cell_axes() -> tuple[Float[Tensor, " c"], Float[Tensor, " r"]]:
+    """Return the places of the columns and rows of cells, in B from the anchor."""
+    places = cell_centres()
+    return places[0, :, 0].contiguous(), places[:, 0, 1].contiguous()
+
+
 def pixels_to_cells(
     points: Float[Tensor, "N K 2"], anchors: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N K 2"]:
@@ -278,44 +285,6 @@ def move_maps(
     return torch.nn.functional.grid_sample(
         maps, grid, mode="bilinear", padding_mode=padding, align_corners=False
     )
-
-
-def gaussian_matrix(
-    size: int, sigma: float, shift: Float[Tensor, "*batch"] | None = None
-) -> Float[Tensor, "*batch size size"]:
-    """Return the matrix G that blurs a row of `size` cells and shifts it by `shift` cells: out = G in.
-
-    Two of them blur a map: G_y map G_x^T. Every column sums to one, so no mass is lost at the border.
-
-    >>> gaussian_matrix(3, 0.5)[:, 1]
-    tensor([0.1065, 0.7870, 0.1065])
-    """
-    if shift is None:
-        return _still_matrix(size, sigma)
-    return _gaussian(size, sigma, shift[..., None])
-
-
-@cache
-def _still_matrix(size: int, sigma: float) -> Tensor:
-    """Return `gaussian_matrix` without a shift, cached."""
-    return _gaussian(size, sigma, torch.zeros(1))
-
-
-def _gaussian(size: int, sigma: float, shift: Tensor) -> Tensor:
-    """Return `gaussian_matrix`, whose entries depend on the distance from the diagonal alone."""
-    away, index = _diagonals(size)
-    exponent = -0.5 * ((away.to(shift) - shift) / sigma).square()
-    weight = exponent.clamp_(min=-40).exp_()  # nothing so small that the processor becomes slow
-    rows = weight.reshape(-1, 2 * size - 1)  # of more dimensions, `index_select` is slow
-    weight = rows.index_select(1, index).view(*shift.shape[:-1], size, size)
-    return weight / weight.sum(-2, keepdim=True).clamp_min(1e-6)
-
-
-@cache
-def _diagonals(size: int) -> tuple[Tensor, Tensor]:
-    """Return the distance of each diagonal from the middle one, and the diagonal of each entry, row by row."""
-    place = torch.arange(size)
-    return torch.arange(1 - size, size), (place[:, None] - place + size - 1).flatten()
 
 
 _FACE_PIXELS = 19.0  # size of a face: a window on a hand is then some 15 pixels wide

@@ -8,11 +8,17 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchpose.measure._body_window import gaussian_matrix
-
 _LEAST = 1e-12  # belief in a cell: denormal numbers are slow
 
-__all__ = ["GridEstimate", "blur", "exclude", "gaussian_bump", "predict", "read_out"]
+__all__ = [
+    "GridEstimate",
+    "blur",
+    "exclude",
+    "gaussian_bump",
+    "gaussian_matrix",
+    "predict",
+    "read_out",
+]
 
 
 class GridEstimate(NamedTuple):
@@ -195,3 +201,41 @@ def _disc(radius: float) -> tuple[Float[Tensor, "3 d"], Bool[Tensor, "d d"]]:
     away = torch.arange(-reach, reach + 1, dtype=torch.float64)
     disc = away.square() + away.square()[:, None] < radius * radius
     return torch.stack([torch.ones_like(away), away, away.square()]), disc
+
+
+def gaussian_matrix(
+    size: int, sigma: float, shift: Float[Tensor, "*batch"] | None = None
+) -> Float[Tensor, "*batch size size"]:
+    """Return the matrix G that blurs a row of `size` cells and shifts it by `shift` cells: out = G in.
+
+    Two of them blur a map: G_y map G_x^T. Every column sums to one, so no mass is lost at the border.
+
+    >>> gaussian_matrix(3, 0.5)[:, 1]
+    tensor([0.1065, 0.7870, 0.1065])
+    """
+    if shift is None:
+        return _still_matrix(size, sigma)
+    return _gaussian(size, sigma, shift[..., None])
+
+
+@cache
+def _still_matrix(size: int, sigma: float) -> Tensor:
+    """Return `gaussian_matrix` without a shift, cached."""
+    return _gaussian(size, sigma, torch.zeros(1))
+
+
+def _gaussian(size: int, sigma: float, shift: Tensor) -> Tensor:
+    """Return `gaussian_matrix`, whose entries depend on the distance from the diagonal alone."""
+    away, index = _diagonals(size)
+    exponent = -0.5 * ((away.to(shift) - shift) / sigma).square()
+    weight = exponent.clamp_(min=-40).exp_()  # nothing so small that the processor becomes slow
+    rows = weight.reshape(-1, 2 * size - 1)  # of more dimensions, `index_select` is slow
+    weight = rows.index_select(1, index).view(*shift.shape[:-1], size, size)
+    return weight / weight.sum(-2, keepdim=True).clamp_min(1e-6)
+
+
+@cache
+def _diagonals(size: int) -> tuple[Tensor, Tensor]:
+    """Return how far each diagonal is from the middle one, and the diagonal of each entry, row by row."""
+    place = torch.arange(size)
+    return torch.arange(1 - size, size), (place[:, None] - place + size - 1).flatten()

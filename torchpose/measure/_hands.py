@@ -17,6 +17,7 @@ from torchpose.measure._body_window import (
     CELLS,
     COLOURS,
     EVIDENCE,
+    cell_axes,
     cell_centres,
     cells_to_pixels,
     cut_colours,
@@ -30,6 +31,7 @@ from torchpose.measure._body_window import (
     place_windows,
 )
 from torchpose.measure._grid_filter import exclude, gaussian_bump, predict, read_out
+from torchpose.measure._hand_elbows import expected_elbows, find_elbows, in_frame
 from torchpose.measure._hand_likelihood import (
     HandLikelihood,
     HandMeasurements,
@@ -43,13 +45,11 @@ from torchpose.measure._hand_prior import HandPrior
 from torchpose.measure._head import FaceMemory, FaceMemoryState, head_part
 from torchpose.measure._persons import match_states, take_rows
 from torchpose.measure._skin import SkinModel, SkinState
-from torchpose.measure._torso_elbows import Elbows
 
 __all__ = ["HandState", "HandTracker"]
 
 _REACH = -5.2  # log density per B squared above which a hand may be in a place
 _FACE = (0.7, 0.9)  # half the width and height of a face with its surroundings, in B
-_FREEDOM = 4.0  # of the Student distribution of an elbow given the hand
 _NEAR = 4  # cells about a hand that belong to it
 _UNKNOWN, _SUREST = 0.5, 1e-3  # probability that a hand is gone: at first, and at the least
 
@@ -199,8 +199,8 @@ class HandTracker(nn.Module):
         belief = self._filter(state, belief, rebirth, log_likelihood, moves, flow)
         state, hands = self._measure(state._replace(belief=belief), means[:, 1], frame.shape)
         if found is not None and self.elbows:
-            expected_elbow = _expected_elbows(hands, elbow, state.anchors)
-            elbows = self._elbows(found, expected_elbow, state.anchors, frame.shape)
+            expected_elbow = expected_elbows(hands, elbow, state.anchors)
+            elbows = find_elbows(found, expected_elbow, state.anchors, frame.shape, self.settings)
             hands = hands._replace(
                 elbows=elbows.points, elbow_covariance=elbows.covariance, elbow_seen=elbows.seen
             )
@@ -359,7 +359,7 @@ class HandTracker(nn.Module):
         unit = (anchors[:, 2] * CELL).square()[:, None, None, None]
         floor = (s.covariance_floor / CELL) ** 2 * torch.eye(2, dtype=unit.dtype)
         covariance = (s.covariance_scale * found.covariance + floor) * unit
-        there = _in_frame(points, shape)
+        there = in_frame(points, shape)
         cell = found.mode[..., 1] * CELLS[1] + found.mode[..., 0]
         here = skin.flatten(1).gather(1, cell)
         seen = there & (found.mass >= s.least_mass) & (here >= s.least_skin)
@@ -373,62 +373,13 @@ class HandTracker(nn.Module):
         state = state._replace(place=points, speed=speed, frames=state.frames + 1)
         return state, without_elbows(shown, covariance, found.mass, seen)
 
-    def _elbows(
-        self, found: HandPlaces, expected: Tensor, anchors: Tensor, shape: tuple[int, ...]
-    ) -> Elbows:
-        """Return the elbows in one frame, by the network and by the density of an elbow given its hand.
-
-        Args:
-            found: by the network. expected: elbows given the hands, in B from the anchors, NaN where
-                the hand is not measured [N, 2, 2].
-        """
-        s = self.settings
-        x, y = (c - expected[:, :, i, None] for i, c in enumerate(_axes()))
-        away = x.square()[:, :, None] + y.square()[..., None]
-        away = away.div_(s.elbow_reach**2).nan_to_num_(0.0).div_(_FREEDOM)
-        likely = away.log1p_().mul_(-0.5 * (_FREEDOM + 2))
-        belief = torch.softmax((found.elbows + likely.to(found.elbows)).flatten(2), 2)
-        peak = read_out(belief.view_as(found.elbows), smooth=1.5, within=5.0)
-        points = cells_to_pixels(peak.place, anchors)
-        unit = (anchors[:, 2] * CELL).square()[:, None, None, None]
-        floor = (s.elbow_floor / CELL) ** 2 * torch.eye(2, dtype=unit.dtype)
-        seen = _in_frame(points, shape) & (peak.mass >= s.least_mass)
-        seen = seen & (found.elbows_gone + s.elbow_bias < 0)
-        return Elbows(points, (s.elbow_scale * peak.covariance + floor) * unit, seen)
-
-
-def _expected_elbows(hands: HandMeasurements, elbow: Tensor, anchors: Tensor) -> Tensor:
-    """Return where elbows are expected given the hands, in B from the anchors, NaN without one [N, 2, 2].
-
-    Args:
-        hands: as measured. elbow: for a hand in each cell, in B from the anchors [N, 2, 2, r, c].
-    """
-    cells = pixels_to_cells(hands.points.nan_to_num(0.0), anchors).round().long()
-    column, row = (cells[..., i].clamp(0, CELLS[1 - i] - 1) for i in (0, 1))
-    index = (row * CELLS[1] + column)[:, :, None, None].expand(-1, -1, 2, 1)
-    place = elbow.flatten(3).gather(3, index)[..., 0]
-    return torch.where(hands.seen[..., None], place, torch.nan)
-
-
-def _in_frame(points: Float[Tensor, "N 2 2"], shape: tuple[int, ...]) -> Tensor:
-    """Return whether points are in a frame of this shape [N, 2]."""
-    high = points.new_tensor([shape[1] - 0.5, shape[0] - 0.5])
-    return ((points >= -0.5) & (points <= high)).all(-1)
-
 
 def _before_face(faces: Tensor, anchors: Tensor) -> Tensor:
     """Return a map that is one on the face and zero away from it [N, r, c]."""
-    at, (x, y) = faces_in_window(faces, anchors), _axes()
+    at, (x, y) = faces_in_window(faces, anchors), cell_axes()
     across = ((x - at[:, :1]) / (at[:, 2:] * _FACE[0])).square()
     down = ((y - at[:, 1:2]) / (at[:, 2:] * _FACE[1])).square()
     return torch.sigmoid(6 * (1 - (across[:, None] + down[:, :, None])))
-
-
-@cache
-def _axes() -> tuple[Float[Tensor, " c"], Float[Tensor, " r"]]:
-    """Return the places of the columns and rows of cells, in B from the anchor."""
-    places = cell_centres()
-    return places[0, :, 0].contiguous(), places[:, 0, 1].contiguous()
 
 
 def _hands_near(belief: Tensor) -> Tensor:
