@@ -33,6 +33,11 @@ class Layer(nn.Sequential):
             nn.ReLU(inplace=True),
         )
 
+    @property
+    def convolution(self) -> nn.Conv2d:
+        """Return the convolution."""
+        return cast(nn.Conv2d, self[0])
+
 
 class UpwardLayer(Layer):
     """Applies a layer to maps of cells twice as wide, and to maps of these cells.
@@ -45,7 +50,7 @@ class UpwardLayer(Layer):
         super().__init__(coarse + fine, after)
         self.coarse = coarse
 
-    def forward(
+    def forward(  # type: ignore[override]
         self, coarse: Float[Tensor, "N A h w"], fine: Float[Tensor, "N B r c"]
     ) -> Float[Tensor, "N C r c"]:
         """Return the maps of these cells."""
@@ -109,9 +114,10 @@ def _fold_children(module: nn.Module) -> None:
 
 def _folded_weights(layer: Layer) -> tuple[Tensor, Tensor]:
     """Return the kernel and bias of a layer's convolution with its normalisation."""
-    conv, norm = layer[0], layer[1]
-    scale = norm.weight * (norm.running_var + norm.eps).rsqrt()
-    return conv.weight * scale[:, None, None, None], norm.bias - norm.running_mean * scale
+    norm = cast(nn.BatchNorm2d, layer[1])
+    mean, variance = cast(Tensor, norm.running_mean), cast(Tensor, norm.running_var)
+    scale = norm.weight * (variance + norm.eps).rsqrt()
+    return layer.convolution.weight * scale[:, None, None, None], norm.bias - mean * scale
 
 
 class _FoldedLayer(nn.Module):
@@ -119,18 +125,20 @@ class _FoldedLayer(nn.Module):
 
     def __init__(self, layer: Layer) -> None:
         super().__init__()
-        conv = layer[0]
+        conv = layer.convolution
         weight, bias = _folded_weights(layer)
         self.register_buffer("weight", weight.contiguous(memory_format=torch.channels_last))
         self.register_buffer("bias", bias)
-        self.steps = conv.stride, conv.padding, conv.dilation
+        self.stride, self.apart = conv.stride, conv.dilation
+        self.padding = cast(tuple[int, ...], conv.padding)
 
     weight: Tensor
     bias: Tensor
 
     def forward(self, maps: Float[Tensor, "N A h w"]) -> Float[Tensor, "N C r c"]:
         """Return the maps of the layer."""
-        return conv2d(maps, self.weight, self.bias, *self.steps).relu_()
+        found = conv2d(maps, self.weight, self.bias, self.stride, self.padding, self.apart)
+        return found.relu_()
 
 
 class _FoldedUpwardLayer(nn.Module):
