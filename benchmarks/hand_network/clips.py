@@ -104,7 +104,9 @@ class Windows(NamedTuple):
 class _Recorder(HandNetwork):
     """Keeps what a network is asked, and says nothing."""
 
-    def find(self, lab: Tensor, maps: Tensor, inside: Tensor, faces: Tensor) -> HandPlaces:
+    def find(
+        self, lab: Tensor, maps: Tensor, inside: Tensor, faces: Tensor, elbows: bool = True
+    ) -> HandPlaces:
         """Return an even density of hands that are seen."""
         self.asked = lab, torch.cat([maps, inside[:, None]], 1), faces
         even, sure = maps.new_zeros(len(maps), 2, *CELLS), maps.new_full((len(maps), 2), -20.0)

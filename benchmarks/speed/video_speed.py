@@ -147,7 +147,10 @@ def stages(report: Report, clip: Path, n_frames: int) -> None:
         ("- skin", hands.skin, "find"),
         ("- face memory", hands.memory, "step"),
         ("- motion and optical flow", hands.motion, "step"),
+        ("- likelihood", hands.likelihood, "means"),
         ("- likelihood", hands.likelihood, "forward"),
+        ("- network", hands.network, "find"),
+        ("- beliefs over cells", hands, "_filter"),
         ("who is who", measurer.register, "step"),
         ("head and neck", measurer.head_neck, "forward"),
         ("poses, 32 frames at a time", tracker.tracker, "advance"),
@@ -161,7 +164,10 @@ def stages(report: Report, clip: Path, n_frames: int) -> None:
         for _ in source:
             pass
     spent["decoding"] = time.thread_time() - start
-    order = dict.fromkeys(["decoding", *(name for name, _, _ in parts)])
+    listed = sum(value for name, value in spent.items() if name.startswith("-"))
+    spent["- not listed"] = spent.get("hands: all", 0.0) - listed
+    order = list(dict.fromkeys(["decoding", *(name for name, _, _ in parts)]))
+    order.insert(order.index("who is who"), "- not listed")
     rows = [(name, f"{1e3 * spent.get(name, 0.0) / n_frames:.2f}") for name in order]
     total = sum(value for name, value in spent.items() if not name.startswith("-"))
     rows.append(("sum", f"{1e3 * total / n_frames:.2f}"))

@@ -13,12 +13,12 @@ from torchpose.measure._body_window import (
     cells_to_pixels,
     cut_windows,
     follow_faces,
-    gaussian_matrix,
     inside_image,
     move_maps,
     pixels_to_cells,
     place_windows,
 )
+from torchpose.measure._grid_filter import gaussian_matrix
 
 pytest.importorskip("cv2")
 FACES = torch.tensor([[317.3, 118.9, 77.4], [60.0, 400.0, 31.0], [900.0, 300.0, 410.0]])

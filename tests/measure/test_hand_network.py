@@ -1,18 +1,21 @@
 """The network that tells hands in a window, and hands that are gone."""
 
+from copy import deepcopy
+
 import pytest
 import torch
 
 import torchpose
 from tests.measure.test_hands import follow, scene
 from torchpose.errors import FileFormatError
-from torchpose.measure import HandTracker
+from torchpose.measure import HandTracker, UpperBodyMeasurer
 from torchpose.measure._body_window import (
     CELLS,
     cell_centres,
     cells_to_pixels,
     pixels_to_cells,
 )
+from torchpose.measure._hand_layers import for_inference
 from torchpose.measure._hand_likelihood import HandSettings
 from torchpose.measure._hand_network import (
     HandNetwork,
@@ -34,7 +37,15 @@ def windows(count=1, seed=0):
     return lab, maps, torch.ones(count, 160, 192), FACE.expand(count, -1)
 
 
+def inputs(count=1):
+    """Return what the network itself takes: relative colours, maps of coarse cells, faces."""
+    lab, maps, inside, faces = windows(count)
+    every = torch.nn.functional.avg_pool2d(torch.cat([maps, inside[:, None]], 1), 4)
+    return relative_colours(lab, faces), every, faces
+
+
 BIAS = HandSettings().gone_bias
+CLOSE = {"rtol": 1e-5, "atol": 1e-5}
 
 
 class Says(HandNetwork):
@@ -51,7 +62,7 @@ class Says(HandNetwork):
             self.elbow[y - 1 : y + 2, x - 1 : x + 2] = weight
         self.elbow_gone = -9.0 if elbows else 9.0
 
-    def find(self, lab, maps, inside, faces):
+    def find(self, lab, maps, inside, faces, elbows=True):
         count = len(maps)
         return HandPlaces(
             maps.new_zeros(count, 2, *CELLS),
@@ -70,13 +81,11 @@ def tracked(network, fps=30.0, frames=12):
 @torch.inference_mode()
 def test_places_and_absence_are_one_distribution():
     network = shipped_hand_network()
-    lab, maps, inside, faces = windows(2)
-    found = network.find(lab, maps, inside, faces)
+    found = network.find(*windows(2))
     assert found.log_prob.shape == (2, 2, *CELLS) and found.gone.shape == (2, 2)
     mass = torch.cat([found.log_prob, found.elbows], 1).exp().sum((2, 3))
     torch.testing.assert_close(mass, torch.ones_like(mass), atol=0.15, rtol=0)  # of resized maps
-    every = torch.nn.functional.avg_pool2d(torch.cat([maps, inside[:, None]], 1), 4)
-    share = torch.softmax(network(relative_colours(lab, faces), every, faces), -1)[..., -1]
+    share = torch.softmax(network(*inputs(2)), -1)[..., -1]
     both = torch.cat([found.gone, found.elbows_gone], 1)
     torch.testing.assert_close(torch.sigmoid(both), share, atol=1e-5, rtol=1e-5)
 
@@ -84,11 +93,9 @@ def test_places_and_absence_are_one_distribution():
 @torch.inference_mode()
 def test_only_places_tell_that_a_hand_is_there():
     network = shipped_hand_network()
-    lab, maps, inside, faces = windows(3)
-    every = torch.nn.functional.avg_pool2d(torch.cat([maps, inside[:, None]], 1), 4)
-    logits = network(relative_colours(lab, faces), every, faces)
+    logits = network(*inputs(3))
     evidence = torch.logsumexp(logits[..., :-1], -1)
-    found = network.find(lab, maps, inside, faces)
+    found = network.find(*windows(3))
     constant = torch.cat([found.gone, found.elbows_gone], 1) + evidence
     torch.testing.assert_close(constant, constant[:1].expand(3, -1), atol=1e-4, rtol=0)
     assert float(evidence.std()) > 0.1
@@ -128,7 +135,7 @@ def test_colours_are_relative_to_the_face():
     torch.testing.assert_close(inside, torch.zeros_like(inside), atol=1e-4, rtol=0)
 
 
-@torch.inference_mode()
+@torch.no_grad()
 def test_a_file_gives_the_same_network(tmp_path):
     info = HandNetworkInfo("own", ("a", "b"), ("anna",), "MIT", "fit")
     network = HandNetwork(info).half().float().eval()  # as a file holds it
@@ -196,6 +203,49 @@ def test_of_two_places_the_elbow_is_where_the_hand_lets_it_be():
     _, (state, out) = tracked(network, frames=6)
     found = pixels_to_cells(out[-1].elbows, state.anchors)[0, 0]
     assert float((found - torch.tensor(near)).norm()) < 3
+
+
+@torch.inference_mode()
+def test_elbows_that_are_not_asked_for_are_not_computed():
+    network = shipped_hand_network()
+    both, hands = network.find(*windows(2)), network.find(*windows(2), elbows=False)
+    assert hands.elbows.shape == (2, 0, *CELLS) and hands.elbows_gone.shape == (2, 0)
+    torch.testing.assert_close(hands.log_prob, both.log_prob, rtol=0, atol=0)
+    torch.testing.assert_close(hands.gone, both.gone, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("elbows", [False, True])
+def test_a_measurer_computes_the_elbows_that_it_returns(monkeypatch, elbows):
+    asked = []
+
+    def count(network, features):
+        asked.append(features)
+        return logits_of_elbows(network, features)
+
+    logits_of_elbows = HandNetwork.logits_of_elbows
+    monkeypatch.setattr(HandNetwork, "logits_of_elbows", count)
+    prior = torchpose.load_prior("kinect-upper-body")
+    measurer = UpperBodyMeasurer(prior, elbows=elbows)
+    _, out = follow(measurer.hand_tracker, [scene(0), scene(1)], PERSON)
+    assert len(asked) == (2 if elbows else 0)
+    assert bool(out[-1].elbows.isnan().all()) != elbows
+
+
+@torch.no_grad()
+def test_what_is_kept_for_inference_follows_the_parameters():
+    network = deepcopy(shipped_hand_network())
+    before = network.find(*windows())
+    network.places.weight.mul_(2)
+    network.low[0][1].running_var.mul_(0.5)
+    torch.testing.assert_close(network(*inputs()), for_inference(network)(*inputs()), **CLOSE)
+    assert not torch.equal(before.log_prob, network.find(*windows()).log_prob)
+    assert for_inference(network.train()) is network
+
+
+def test_what_learns_is_not_folded():
+    network = deepcopy(shipped_hand_network()).requires_grad_(True)
+    network.find(*windows()).log_prob.sum().backward()
+    assert network.colours[0][0].weight.grad is not None
 
 
 def test_without_a_network_no_hand_is_gone():

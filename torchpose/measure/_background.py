@@ -314,10 +314,11 @@ class Motion(nn.Module):
             The next state; difference from the last frame and from the median [N, 160, 192], 0 to 1;
             flow from this frame back to the last one, in cells [N, 80, 96, 2].
         """
-        new = (state.frames == 0)[:, None, None, None]
-        last = torch.where(new, small, state.last)
-        median = torch.where(new, small, state.median)
-        median = median + (small - median).clamp(-self.limit, self.limit)
+        new, last, median = state.frames == 0, state.last, state.median
+        if bool(new.any()):
+            new = new[:, None, None, None]
+            last, median = torch.where(new, small, last), torch.where(new, small, median)
+        median = (small - median).clamp_(-self.limit, self.limit).add_(median)
         moving = self._difference(small, last, *_DIFFERENCE)
         unusual = self._difference(small, median, *_UNUSUAL)
         flow, cells = state.flow, small.new_zeros(len(small), *CELLS, 2)
@@ -326,7 +327,8 @@ class Motion(nn.Module):
         return MotionState(small, median, grey, flow, state.frames + 1), moving, unusual, cells
 
     def _difference(self, small: Tensor, other: Tensor, noise: float, most: float) -> Tensor:
-        weighted = (small - other).abs_().mul_(self.channel_weights[:, None, None]).sum(1)
+        away = (small - other).abs_().flatten(2)
+        weighted = (self.channel_weights @ away).view(-1, *small.shape[2:])
         return weighted.sub_(noise).div_(most).clamp_(0, 1)
 
 
@@ -348,14 +350,13 @@ def dense_flow(
     import cv2
 
     method = _method()
-    flow = torch.zeros_like(start)
-    cells = start.new_zeros(len(grey), *CELLS, 2)
+    flow = np.zeros(start.shape, np.float32)
+    cells = np.zeros((len(grey), *CELLS, 2), np.float32)
     for n in torch.nonzero(known)[:, 0].tolist():
-        found = method.calc(grey[n].numpy(), before[n].numpy(), start[n].numpy().copy())
-        flow[n] = torch.from_numpy(np.ascontiguousarray(found))
-        small = cv2.resize(found, CELLS[::-1], interpolation=cv2.INTER_AREA)
-        cells[n] = torch.from_numpy(small) / EVIDENCE
-    return flow, cells
+        flow[n] = start[n].numpy()
+        method.calc(grey[n].numpy(), before[n].numpy(), flow[n])
+        cv2.resize(flow[n], CELLS[::-1], dst=cells[n], interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(flow), torch.from_numpy(cells).div_(EVIDENCE)
 
 
 @cache

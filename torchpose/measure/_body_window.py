@@ -26,6 +26,7 @@ __all__ = [
     "COLOURS",
     "EVIDENCE",
     "ScaledFrame",
+    "cell_axes",
     "cell_centres",
     "cells_to_pixels",
     "cut_colours",
@@ -34,7 +35,6 @@ __all__ = [
     "faces_in_evidence",
     "faces_in_window",
     "follow_faces",
-    "gaussian_matrix",
     "halve",
     "inside_image",
     "move_maps",
@@ -137,17 +137,17 @@ def cut_colours(
     """
     import cv2
 
-    labs, smooth, parts = [], [], []
-    size = (CELLS[1] * EVIDENCE, CELLS[0] * EVIDENCE)
-    for window in cut_windows(frame, anchors):
-        small = cv2.resize(window, size, interpolation=cv2.INTER_AREA)
+    height, width = CELLS[0] * EVIDENCE, CELLS[1] * EVIDENCE
+    labs = np.empty((len(anchors), 3, height, width), np.uint8)
+    smooth = np.empty(labs.shape, np.float32)
+    parts = np.empty((*labs.shape[:2], *(side.stop - side.start for side in part)), np.uint8)
+    for n, window in enumerate(cut_windows(frame, anchors)):
+        small = cv2.resize(window, (width, height), interpolation=cv2.INTER_AREA)
         lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB)
-        fine = cv2.cvtColor(window[part], cv2.COLOR_RGB2LAB)
-        soft = cv2.GaussianBlur(lab.astype(np.float32), (0, 0), 0.8)
-        labs.append(cv2.split(lab))
-        smooth.append(cv2.split(soft))
-        parts.append(cv2.split(fine))
-    return tuple(torch.from_numpy(np.array(x)) for x in (labs, smooth, parts))  # type: ignore[return-value]
+        cv2.split(lab, [*labs[n]])
+        cv2.split(cv2.GaussianBlur(lab.astype(np.float32), (0, 0), 0.8), [*smooth[n]])
+        cv2.split(cv2.cvtColor(window[part], cv2.COLOR_RGB2LAB), [*parts[n]])
+    return torch.from_numpy(labs), torch.from_numpy(smooth), torch.from_numpy(parts)
 
 
 def cut_mask(mask: Image, anchors: Float[Tensor, "N 3"]) -> Float[Tensor, "N h w"]:
@@ -228,6 +228,13 @@ def cell_centres(per_cell: int = 1) -> Float[Tensor, "h w 2"]:
     return torch.stack(torch.broadcast_tensors(x, y[:, None]), -1).contiguous()
 
 
+@cache
+def cell_axes() -> tuple[Float[Tensor, " c"], Float[Tensor, " r"]]:
+    """Return the places of the columns and rows of cells, in B from the anchor."""
+    places = cell_centres()
+    return places[0, :, 0].contiguous(), places[:, 0, 1].contiguous()
+
+
 def pixels_to_cells(
     points: Float[Tensor, "N K 2"], anchors: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N K 2"]:
@@ -278,34 +285,6 @@ def move_maps(
     return torch.nn.functional.grid_sample(
         maps, grid, mode="bilinear", padding_mode=padding, align_corners=False
     )
-
-
-def gaussian_matrix(
-    size: int, sigma: float, shift: Float[Tensor, "*batch"] | None = None
-) -> Float[Tensor, "*batch size size"]:
-    """Return the matrix G that blurs a row of `size` cells and shifts it by `shift` cells: out = G in.
-
-    Two of them blur a map: G_y map G_x^T. Every column sums to one, so no mass is lost at the border.
-
-    >>> gaussian_matrix(3, 0.5)[:, 1]
-    tensor([0.1065, 0.7870, 0.1065])
-    """
-    if shift is None:
-        return _still_matrix(size, sigma)
-    return _gaussian(size, sigma, shift[..., None, None])
-
-
-@cache
-def _still_matrix(size: int, sigma: float) -> Tensor:
-    """Return `gaussian_matrix` without a shift, cached."""
-    return _gaussian(size, sigma, torch.zeros(()))
-
-
-def _gaussian(size: int, sigma: float, shift: Tensor) -> Tensor:
-    place = torch.arange(size, device=shift.device, dtype=shift.dtype)
-    exponent = -0.5 * ((place[:, None] - place - shift) / sigma).square()
-    weight = exponent.clamp_(min=-40).exp_()  # nothing so small that the processor becomes slow
-    return weight / weight.sum(-2, keepdim=True).clamp_min(1e-6)
 
 
 _FACE_PIXELS = 19.0  # size of a face: a window on a hand is then some 15 pixels wide

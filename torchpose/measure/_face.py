@@ -424,6 +424,8 @@ def _region(face: list[float], shape: tuple[int, ...]) -> Region:
 
 def _on_somebody(faces: Float[Tensor, "N 3"], known: Bool[Tensor, " N"]) -> Bool[Tensor, " N"]:
     """Return which faces are far smaller than a known one on whose head or chest they are."""
+    if len(faces) < 2:  # none is smaller than itself
+        return torch.zeros_like(known)
     size = faces[known, 2]
     x, y = ((faces[:, None, :2] - faces[known, :2]) / size[:, None]).unbind(-1)
     near = (x.abs() < _BESIDE) & (y > -_ABOVE) & (y < _BELOW)
@@ -455,6 +457,8 @@ def nearest_pairs(distance: Float[Tensor, "n N"]) -> Int[Tensor, " n"]:
 
 def _without_doubles(found: Tensor, gate: float) -> Tensor:
     """Return the detections without repetitions, which overlapping regions give."""
+    if len(found) < 2:
+        return found
     near = torch.cdist(found, found) <= gate * found[:, 2]
     earlier = torch.tril(near, -1).any(1)
     return found[~earlier]

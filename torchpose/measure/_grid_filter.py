@@ -5,14 +5,20 @@ from functools import cache
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
-
-from torchpose.measure._body_window import gaussian_matrix
 
 _LEAST = 1e-12  # belief in a cell: denormal numbers are slow
 
-__all__ = ["GridEstimate", "blur", "exclude", "gaussian_bump", "predict", "read_out"]
+__all__ = [
+    "GridEstimate",
+    "blur",
+    "exclude",
+    "gaussian_bump",
+    "gaussian_matrix",
+    "predict",
+    "read_out",
+]
 
 
 class GridEstimate(NamedTuple):
@@ -83,20 +89,27 @@ def predict(
             motion in the frame, 0 to 1.
         near, far, flow_blur, rest: standard deviations, cells. near_share: s. flow_share: f. jump: j.
     """
-    out = near_share * blur(belief, near, speed) + (1 - near_share) * blur(belief, far)
+    out = blur(belief, near, speed).lerp_(blur(belief, far), 1 - near_share)
     if flow is not None and flow_share > 0:
-        out = (1 - flow_share) * out + flow_share * _carry(blur(belief, flow_blur), flow)
-    out = (1 - jump) * out + jump * rebirth
-    m = moves[:, None, None, None]
-    return m * out + (1 - m) * blur(belief, rest)
+        out = out.lerp_(_carry(blur(belief, flow_blur), flow), flow_share)
+    out = out.lerp_(rebirth, jump)
+    return blur(belief, rest).lerp_(out, moves[:, None, None, None])
 
 
-def _carry(belief: Tensor, flow: Tensor) -> Tensor:
-    height, width = belief.shape[-2:]
-    x, y = torch.arange(width, device=flow.device), torch.arange(height, device=flow.device)
-    place = torch.stack(torch.broadcast_tensors(x, y[:, None]), -1) + flow
-    grid = (2 * place + 1) / place.new_tensor([width, height]) - 1
+def _carry(belief: Float[Tensor, "N 2 h w"], flow: Float[Tensor, "N h w 2"]) -> Tensor:
+    """Return the belief at the places that the content of each cell comes from."""
+    start, scale = _whole_grid(belief.shape[-2], belief.shape[-1])
+    grid = torch.addcmul(start.to(flow), scale.to(flow), flow)
     return torch.nn.functional.grid_sample(belief, grid, align_corners=False)
+
+
+@cache
+def _whole_grid(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Return the places of all cells as `grid_sample` takes them, and how far apart these are [h, w, 2]."""
+    x, y = (2 * torch.arange(n) + 1 for n in (width, height))
+    start = torch.stack(torch.broadcast_tensors(x / width - 1, (y / height - 1)[:, None]), -1)
+    scale = torch.tensor([2 / width, 2 / height]).expand_as(start)
+    return start.contiguous(), scale.contiguous()
 
 
 def exclude(
@@ -120,14 +133,15 @@ def exclude(
         rounds: of messages from each hand to the other.
     """
     base = (base / base.sum((2, 3), keepdim=True).clamp_min(1e-30)).clamp_min_(_LEAST)
-    message = [torch.ones_like(base[:, 0]), torch.ones_like(base[:, 0])]
+    hands = list(base.unbind(1))
+    belief = list(hands)
     for turn in range(2 * rounds):  # one hand after the other: both at once would oscillate
         k = turn % 2
-        other = base[:, 1 - k] * message[1 - k]
-        taken, wrong = _occupied(other, k, radius, soft)
-        message[k] = (1 + math.expm1(-exclusion) * taken) * (1 + math.expm1(-crossing) * wrong)
-    belief = base * torch.stack(message, 1)
-    return (belief / belief.sum((2, 3), keepdim=True)).clamp_min_(_LEAST)
+        taken, wrong = _occupied(belief[1 - k], k, radius, soft)
+        free = taken.mul_(math.expm1(-exclusion)).add_(1)
+        belief[k] = hands[k] * free.mul_(wrong.mul_(math.expm1(-crossing)).add_(1))
+    both = torch.stack(belief, 1)
+    return both.div_(both.sum((2, 3), keepdim=True)).clamp_min_(_LEAST)
 
 
 def _occupied(
@@ -135,9 +149,9 @@ def _occupied(
 ) -> tuple[Float[Tensor, "N h w"], Float[Tensor, "N 1 w"]]:
     """Return taken_l and wrong_l of `exclude`."""
     columns = other.sum(1, keepdim=True)
-    scale = 1.2 * 2 * math.pi * radius * radius / columns.sum(2, keepdim=True)
-    near = (blur(other, radius) * scale).clamp_(0, 1)
-    wrong = columns @ _side_matrix(other.shape[2], soft, hand) / columns.sum(2, keepdim=True)
+    total = columns.sum(2, keepdim=True)
+    near = blur(other, radius).mul_(1.2 * 2 * math.pi * radius * radius / total).clamp_(0, 1)
+    wrong = (columns @ _side_matrix(other.shape[2], soft, hand)).div_(total)
     return near, wrong
 
 
@@ -158,19 +172,70 @@ def read_out(belief: Float[Tensor, "N 2 h w"], smooth: float, within: float) -> 
     n, hands, height, width = belief.shape
     best = blur(belief, smooth).flatten(2).argmax(2)
     mode = torch.stack([best % width, best // width], 2)
-    powers_x, powers_y = _powers(width), _powers(height)
-    dx, dy = powers_x[1] - mode[..., :1], powers_y[1] - mode[..., 1:]
-    inside = dx.square()[:, :, None] + dy.square()[..., None] < within * within
-    moments = (powers_y @ (belief * inside).double() @ powers_x.mT).flatten(2)
+    powers, disc = _disc(within)
+    (columns, inside_x), (rows, inside_y) = (
+        _within_row(mode[..., i, None] + powers[1].long(), size)
+        for i, size in enumerate((width, height))
+    )
+    index = rows[..., None] * width + columns[..., None, :]
+    near = belief.flatten(2).gather(2, index.flatten(2)).view(index.shape).double()
+    near = near * (disc & inside_y[..., None] & inside_x[..., None, :])
+    moments = (powers @ near @ powers.mT).flatten(2)
     mass, mx, xx, my, xy, _, yy, *_ = moments.unbind(2)
     mx, my = mx / mass, my / mass
     xx, xy, yy = xx / mass - mx * mx, xy / mass - mx * my, yy / mass - my * my
     covariance = torch.stack([xx, xy, xy, yy], 2).view(n, hands, 2, 2)
-    return GridEstimate(torch.stack([mx, my], 2), covariance, mass, mode)
+    return GridEstimate(mode + torch.stack([mx, my], 2), covariance, mass, mode)
+
+
+def _within_row(places: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Return the nearest of `size` cells, and whether it is the place itself."""
+    nearest = places.clamp(0, size - 1)
+    return nearest, nearest == places
 
 
 @cache
-def _powers(size: int) -> Tensor:
-    """Return 1, x and x squared of every cell."""
-    place = torch.arange(size, dtype=torch.float64)
-    return torch.stack([torch.ones_like(place), place, place.square()])
+def _disc(radius: float) -> tuple[Float[Tensor, "3 d"], Bool[Tensor, "d d"]]:
+    """Return 1, x and x squared of every cell of a row about the middle, and the cells within the radius."""
+    reach = math.ceil(radius)
+    away = torch.arange(-reach, reach + 1, dtype=torch.float64)
+    disc = away.square() + away.square()[:, None] < radius * radius
+    return torch.stack([torch.ones_like(away), away, away.square()]), disc
+
+
+def gaussian_matrix(
+    size: int, sigma: float, shift: Float[Tensor, "*batch"] | None = None
+) -> Float[Tensor, "*batch size size"]:
+    """Return the matrix G that blurs a row of `size` cells and shifts it by `shift` cells: out = G in.
+
+    Two of them blur a map: G_y map G_x^T. Every column sums to one, so no mass is lost at the border.
+
+    >>> gaussian_matrix(3, 0.5)[:, 1]
+    tensor([0.1065, 0.7870, 0.1065])
+    """
+    if shift is None:
+        return _still_matrix(size, sigma)
+    return _gaussian(size, sigma, shift[..., None])
+
+
+@cache
+def _still_matrix(size: int, sigma: float) -> Tensor:
+    """Return `gaussian_matrix` without a shift, cached."""
+    return _gaussian(size, sigma, torch.zeros(1))
+
+
+def _gaussian(size: int, sigma: float, shift: Tensor) -> Tensor:
+    """Return `gaussian_matrix`, whose entries depend on the distance from the diagonal alone."""
+    away, index = _diagonals(size)
+    exponent = -0.5 * ((away.to(shift) - shift) / sigma).square()
+    weight = exponent.clamp_(min=-40).exp_()  # nothing so small that the processor becomes slow
+    rows = weight.reshape(-1, 2 * size - 1)  # of more dimensions, `index_select` is slow
+    weight = rows.index_select(1, index).view(*shift.shape[:-1], size, size)
+    return weight / weight.sum(-2, keepdim=True).clamp_min(1e-6)
+
+
+@cache
+def _diagonals(size: int) -> tuple[Tensor, Tensor]:
+    """Return how far each diagonal is from the middle one, and the diagonal of each entry, row by row."""
+    place = torch.arange(size)
+    return torch.arange(1 - size, size), (place[:, None] - place + size - 1).flatten()

@@ -18,6 +18,9 @@ from torchpose.measure._face import check_faces
 __all__ = ["HandLikelihood", "HandMeasurements", "HandSettings", "check_frame", "no_hands"]
 
 
+_ACROSS = torch.tensor([-1.0, 1.0])[:, None, None]  # turns (y, x) into the vector across
+
+
 class HandLikelihood(nn.Module):
     """Computes the log-likelihood of a hand at every cell from skin, motion, and the shape of a hand.
 
@@ -100,28 +103,46 @@ class HandLikelihood(nn.Module):
         common = torch.tensordot(self.cues, means.movedim(1, 0), 1)[:, None]
         if not len(self.shape_weights):
             return common.expand(-1, 2, -1, -1)
-        places, middle, half = _grid()
-        to_elbow = elbow.movedim(2, -1) - places
-        along = to_elbow / (to_elbow.square().sum(-1, keepdim=True).sqrt_() + 1e-3)
-        across = along.flip(-1) * along.new_tensor([-1.0, 1.0])
-        along, across = along / half, across / half
-        start = (places - middle) / half
-        a, b = (self.shape_offsets[:, i].view(-1, 1, 1, 1) for i in (0, 1))
-        grid = start + a * along[:, :, None] + b * across[:, :, None]
-        n, hands, points = grid.shape[:3]
+        places, start, half = _grid()
+        to_elbow = elbow - places
+        along = to_elbow / (to_elbow.square().sum(2, keepdim=True).sqrt_() + 1e-3)
+        across = along.flip(2) * _ACROSS.to(along)
+        grid = self._shape_places(along / half, across / half, start)
+        n, count = len(grid), len(self.shape_weights)
         found = nn.functional.grid_sample(
-            means[:, :1] - self.unknown, grid.flatten(1, 3), align_corners=False
-        ).view(n, hands, points, -1)
-        found = torch.einsum("p,nkpc->nkc", self.shape_weights, found + self.unknown)
-        return common + found.view(n, hands, *CELLS)
+            means[:, :1] - self.unknown, grid.flatten(2, 4), align_corners=False
+        )
+        total = self.unknown * self.shape_weights.sum()
+        shape = self.shape_weights @ found.view(n, count, -1) + total
+        return common + shape.view(n, 2, *CELLS)
+
+    def _shape_places(
+        self, along: Float[Tensor, "N 2 2 r c"], across: Float[Tensor, "N 2 2 r c"], start: Tensor
+    ) -> Float[Tensor, "N P 2 r c 2"]:
+        """Return the places about every cell and hand whose skin tells the shape, in halves of the window."""
+        offsets = self.shape_offsets.tolist()
+        grid = along.new_empty(len(along), len(offsets), 2, *CELLS, 2)
+        for point, (forward, aside) in enumerate(offsets):
+            place = start
+            if forward:
+                place = torch.add(place, along, alpha=forward)
+            if aside:
+                place = torch.add(place, across, alpha=aside)
+            grid[:, point] = place.movedim(2, -1)
+        return grid
 
 
 @cache
 def _grid() -> tuple[Tensor, Tensor, Tensor]:
-    """Return the places of the cells, the middle of the window, and half its width and height, in B."""
+    """Return the places of the cells [2, r, c], in B and in halves of the window from its middle, and these.
+
+    The first dimension is x and y: operations on pairs in the last one are slow.
+    """
     places = cell_centres()
     half = (places[-1, -1] - places[0, 0] + CELL) / 2
-    return places, (places[-1, -1] + places[0, 0]) / 2, half
+    start = (places - (places[-1, -1] + places[0, 0]) / 2) / half
+    planes = places.movedim(-1, 0).contiguous(), start.movedim(-1, 0).contiguous()
+    return *planes, half[:, None, None]
 
 
 def _palm_matrix(cells: int, palm: float) -> Tensor:

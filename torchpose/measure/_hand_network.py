@@ -13,9 +13,11 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate
 
+from torchpose._core.module_state import outside_inference
 from torchpose._core.reading import reading
 from torchpose._core.tensor_file import FileKind, read_tensors, write_tensors
 from torchpose.measure._body_window import CELLS, EVIDENCE, cell_centres
+from torchpose.measure._hand_layers import Layer, UpwardLayer, for_inference
 
 __all__ = ["COARSE", "HandNetwork", "HandNetworkInfo", "HandPlaces", "shipped_hand_network"]
 
@@ -64,21 +66,13 @@ class HandPlaces(NamedTuple):
     Attributes:
         log_prob: log-probability of each cell, given that the hand is visible [N, 2, 80, 96].
         gone: log-odds that the hand is not visible [N, 2].
-        elbows, elbows_gone: the same for the elbows.
+        elbows, elbows_gone: the same for the elbows; of no joints where these were not asked for.
     """
 
     log_prob: Float[Tensor, "N 2 h w"]
     gone: Float[Tensor, "N 2"]
-    elbows: Float[Tensor, "N 2 h w"]
-    elbows_gone: Float[Tensor, "N 2"]
-
-
-def _layer(before: int, after: int, size: int = 3, stride: int = 1, apart: int = 1) -> nn.Module:
-    return nn.Sequential(
-        nn.Conv2d(before, after, size, stride, apart * (size // 2), dilation=apart, bias=False),
-        nn.BatchNorm2d(after),
-        nn.ReLU(inplace=True),
-    )
+    elbows: Float[Tensor, "N E h w"]
+    elbows_gone: Float[Tensor, "N E"]
 
 
 class HandNetwork(nn.Module):
@@ -99,21 +93,21 @@ class HandNetwork(nn.Module):
         super().__init__()
         stem, fine, side, high, middle, low = _WIDTHS
         self.info = info or HandNetworkInfo()
-        self.colours = nn.Sequential(_layer(_COLOURS, stem, 5, 2), _layer(stem, fine, 3, 2))
-        self.maps = _layer(_MAPS, side)
-        self.high = nn.Sequential(_layer(fine + side + _PLACES, high), _layer(high, high))
-        self.middle = nn.Sequential(_layer(high, middle, 3, 2), _layer(middle, middle))
+        self.colours = nn.Sequential(Layer(_COLOURS, stem, 5, 2), Layer(stem, fine, 3, 2))
+        self.maps = Layer(_MAPS, side)
+        self.high = nn.Sequential(Layer(fine + side + _PLACES, high), Layer(high, high))
+        self.middle = nn.Sequential(Layer(high, middle, 3, 2), Layer(middle, middle))
         self.low = nn.Sequential(
-            _layer(middle, low, 3, 2),
+            Layer(middle, low, 3, 2),
             nn.Dropout2d(0.1),
-            _layer(low, low),
-            _layer(low, low, 3, 1, 2),
+            Layer(low, low),
+            Layer(low, low, 3, 1, 2),
         )
-        self.to_middle = _layer(low + middle, middle)
-        self.to_high = _layer(middle + high, high)
+        self.to_middle = UpwardLayer(low, middle, middle)
+        self.to_high = UpwardLayer(middle, high, high)
         self.places = nn.Conv2d(high, 2, 1)
         self.gone = nn.Parameter(torch.zeros(2))
-        self.elbows = nn.Sequential(_layer(2 * high, high), nn.Conv2d(high, 2, 1))
+        self.elbows = nn.Sequential(Layer(2 * high, high), nn.Conv2d(high, 2, 1))
         self.elbows_gone = nn.Parameter(torch.zeros(2))
 
     def forward(
@@ -121,7 +115,8 @@ class HandNetwork(nn.Module):
         colours: Float[Tensor, "N 3 h w"],
         maps: Float[Tensor, "N 4 r c"],
         faces: Float[Tensor, "N 3"],
-    ) -> Float[Tensor, "N 4 cells"]:
+        elbows: bool = True,
+    ) -> Float[Tensor, "N J cells"]:
         """Return the logits of 40 x 48 cells, row by row, and of a joint that is not visible.
 
         Both hands come first, then both elbows.
@@ -129,9 +124,11 @@ class HandNetwork(nn.Module):
         Args:
             colours: of `relative_colours`, two pixels for a cell. maps: skin, difference from the last frame
                 and from the median, and the share inside the image, half a cell for each [N, 4, 40, 48].
-            faces: (x, y, size) in B from the anchors.
+            faces: (x, y, size) in B from the anchors. elbows: whether to look for these.
         """
         features = self.features(colours, maps, faces)
+        if not elbows:
+            return self.logits_of_hands(features)
         return torch.cat([self.logits_of_hands(features), self.logits_of_elbows(features)], 1)
 
     def features(
@@ -141,14 +138,15 @@ class HandNetwork(nn.Module):
         faces: Float[Tensor, "N 3"],
     ) -> Float[Tensor, "N C r c"]:
         """Return the features of every coarse cell: of its surroundings first, then of the cell itself."""
-        inside = interpolate(maps[:, 3:], scale_factor=4.0) > 0.5
-        colours = torch.where(inside, colours, -_MOST)  # its border goes on beyond the image
+        inside = maps[:, 3:] > 0.5
+        if not bool(inside.all()):  # the border of an image goes on beyond it
+            beyond = interpolate(inside.to(colours), scale_factor=4.0) == 0
+            colours = colours.masked_fill(beyond, -_MOST)
         seen = torch.cat([self.colours(colours), self.maps(maps), _where(faces)], 1)
         high = self.high(seen)
         middle = self.middle(high)
         low = self.low(middle)
-        up = self.to_middle(torch.cat([interpolate(low, scale_factor=2.0), middle], 1))
-        up = self.to_high(torch.cat([interpolate(up, scale_factor=2.0), high], 1))
+        up = self.to_high(self.to_middle(low, middle), high)
         return torch.cat([up, high], 1)
 
     def logits_of_hands(self, features: Float[Tensor, "N C r c"]) -> Float[Tensor, "N 2 cells"]:
@@ -165,20 +163,22 @@ class HandNetwork(nn.Module):
         maps: Float[Tensor, "N 3 h w"],
         inside: Float[Tensor, "N h w"],
         faces: Float[Tensor, "N 3"],
+        elbows: bool = True,
     ) -> HandPlaces:
         """Return the places of the hands in windows of persons.
 
         Args:
             lab: bytes, two pixels for a cell [N, 3, 160, 192]. maps: skin, difference from the last frame and
                 from the median [N, 3, 160, 192]. inside: share of each pixel in the image.
-            faces: (x, y, size) in B from the anchors.
+            faces: (x, y, size) in B from the anchors. elbows: whether to look for these.
         """
-        every = avg_pool2d(torch.cat([maps, inside[:, None]], 1), 2 * EVIDENCE)
-        logits = self(relative_colours(lab, faces), every, faces)
+        every = torch.cat([_coarse(maps), _coarse(inside[:, None])], 1)
+        logits = for_inference(self)(relative_colours(lab, faces), every, faces, elbows)
         places, gone = logits[..., :-1], logits[..., -1]
-        here = torch.log_softmax(places, -1).unflatten(-1, COARSE)
-        fine = interpolate(here, size=CELLS, mode="bilinear", align_corners=False) - math.log(4)
-        gone = gone - torch.logsumexp(places, -1)
+        total = torch.logsumexp(places, -1, keepdim=True)
+        here = (places - (total + math.log(4))).unflatten(-1, COARSE)  # four cells share one
+        fine = interpolate(here, size=CELLS, mode="bilinear", align_corners=False)
+        gone = gone - total[..., 0]
         return HandPlaces(fine[:, :2], gone[:, :2], fine[:, 2:], gone[:, 2:])
 
     def save(self, path: str | Path) -> None:
@@ -198,7 +198,7 @@ class HandNetwork(nn.Module):
             InputError: no such file. FileFormatError: truncated, foreign, damaged, or newer.
         """
         info, tensors = read_tensors(path, _KIND)
-        with reading(path, "a network of hands"):
+        with reading(path, "a network of hands"), outside_inference():
             made = cls(info)
             counts = {k: v for k, v in made.state_dict().items() if not v.ndim}  # of batches
             made.load_state_dict({k: v.float() for k, v in tensors.items()} | counts)
@@ -220,20 +220,34 @@ def relative_colours(
     Args:
         lab: bytes, two pixels for a cell. faces: (x, y, size) in B from the anchors.
     """
-    away = (cell_centres(EVIDENCE) - faces[:, None, None, :2]) / faces[:, 2:, None, None]
-    face = ((away / away.new_tensor(_FACE)).square().sum(-1) < 1).float()[:, None]
+    size = faces[:, 2:]
+    centres = cell_centres(EVIDENCE).to(faces)
+    across = ((centres[0, :, 0] - faces[:, :1]) / size / _FACE[0]).square()
+    down = ((centres[:, 0, 1] - faces[:, 1:2]) / size / _FACE[1]).square()
+    face = (across[:, None] + down[:, :, None] < 1).float()
     colours = lab.float()
-    mean = (colours * face).sum((2, 3)) / face.sum((2, 3)).clamp_min(1.0)
+    total = (colours.flatten(2) @ face.flatten(1)[..., None])[..., 0]
+    mean = total / face.sum((1, 2))[:, None].clamp_min(1.0)
     spread = colours.new_tensor(_SPREAD)[:, None, None]
-    return ((colours - mean[..., None, None]) / spread).clamp(-_MOST, _MOST)
+    return colours.sub_(mean[..., None, None]).div_(spread).clamp_(-_MOST, _MOST)
+
+
+def _coarse(maps: Float[Tensor, "N C h w"]) -> Float[Tensor, "N C r c"]:
+    """Return the means of maps over the coarse cells."""
+    return avg_pool2d(maps.unflatten(2, (COARSE[0], -1)).mean(3), (1, 2 * EVIDENCE))
 
 
 def _where(faces: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3 r c"]:
     """Return the place of every coarse cell relative to the face, and how near to it that is."""
-    centres = avg_pool2d(cell_centres().movedim(-1, 0)[None], 2)
-    away = (centres - faces[:, :2, None, None]) / faces[:, 2:, None, None]
+    away = (_coarse_centres() - faces[:, :2, None, None]) / faces[:, 2:, None, None]
     near = (-away.square().sum(1, keepdim=True)).exp()
     return torch.cat([_FAR * away, near], 1)
+
+
+@cache
+def _coarse_centres() -> Float[Tensor, "1 2 r c"]:
+    """Return the places (x, y) of the coarse cells, in B from the anchor."""
+    return avg_pool2d(cell_centres().movedim(-1, 0)[None], 2)
 
 
 @cache

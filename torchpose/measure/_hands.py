@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.nn.functional import interpolate
 
 from torchpose._core.images import Image
 from torchpose.errors import InputError
@@ -16,6 +17,7 @@ from torchpose.measure._body_window import (
     CELLS,
     COLOURS,
     EVIDENCE,
+    cell_axes,
     cell_centres,
     cells_to_pixels,
     cut_colours,
@@ -29,6 +31,7 @@ from torchpose.measure._body_window import (
     place_windows,
 )
 from torchpose.measure._grid_filter import exclude, gaussian_bump, predict, read_out
+from torchpose.measure._hand_elbows import expected_elbows, find_elbows, in_frame
 from torchpose.measure._hand_likelihood import (
     HandLikelihood,
     HandMeasurements,
@@ -42,13 +45,11 @@ from torchpose.measure._hand_prior import HandPrior
 from torchpose.measure._head import FaceMemory, FaceMemoryState, head_part
 from torchpose.measure._persons import match_states, take_rows
 from torchpose.measure._skin import SkinModel, SkinState
-from torchpose.measure._torso_elbows import Elbows
 
 __all__ = ["HandState", "HandTracker"]
 
 _REACH = -5.2  # log density per B squared above which a hand may be in a place
 _FACE = (0.7, 0.9)  # half the width and height of a face with its surroundings, in B
-_FREEDOM = 4.0  # of the Student distribution of an elbow given the hand
 _NEAR = 4  # cells about a hand that belong to it
 _UNKNOWN, _SUREST = 0.5, 1e-3  # probability that a hand is gone: at first, and at the least
 
@@ -98,6 +99,7 @@ class HandTracker(nn.Module):
         settings: constants. fps: frames per second of the video.
         network: that tells hands from what looks alike; None leaves it to colours, motion and shape, and
             takes every hand to be somewhere.
+        elbows: whether the network also finds the elbows.
 
     Raises:
         InputError: a frame rate that is not positive.
@@ -123,13 +125,14 @@ class HandTracker(nn.Module):
         settings: HandSettings | None = None,
         fps: float = 30.0,
         network: HandNetwork | None = None,
+        elbows: bool = True,
     ) -> None:
         super().__init__()
         if not (math.isfinite(fps) and fps > 0):
             raise InputError(f"fps must be positive, got {fps}")
         self.prior, self.settings, self.fps = prior, settings or HandSettings(), fps
         s, rate = self.settings, 30.0 / fps
-        self.rate, self.network = rate, network
+        self.rate, self.network, self.elbows = rate, network, elbows
         self.skin = SkinModel(
             s.skin_slope, s.skin_bias, s.skin_decay**rate, s.skin_floor, s.clothes_share
         )
@@ -195,9 +198,9 @@ class HandTracker(nn.Module):
         moves = still + (1 - still) * moving.clamp(0, 1)
         belief = self._filter(state, belief, rebirth, log_likelihood, moves, flow)
         state, hands = self._measure(state._replace(belief=belief), means[:, 1], frame.shape)
-        if found is not None:
-            expected_elbow = _expected_elbows(hands, elbow, state.anchors)
-            elbows = self._elbows(found, expected_elbow, state.anchors, frame.shape)
+        if found is not None and self.elbows:
+            expected_elbow = expected_elbows(hands, elbow, state.anchors)
+            elbows = find_elbows(found, expected_elbow, state.anchors, frame.shape, self.settings)
             hands = hands._replace(
                 elbows=elbows.points, elbow_covariance=elbows.covariance, elbow_seen=elbows.seen
             )
@@ -262,7 +265,7 @@ class HandTracker(nn.Module):
             state.skin,
             bins,
             faces_in_evidence(faces, state.anchors),
-            hands.repeat_interleave(EVIDENCE, 1).repeat_interleave(EVIDENCE, 2),
+            interpolate(hands[:, None], scale_factor=float(EVIDENCE))[:, 0],
             inside > 0.5,
         )
         skin = self.skin.find(learnt, bins)
@@ -279,7 +282,8 @@ class HandTracker(nn.Module):
         means = self.likelihood.means(maps)
         found = None
         if self.network is not None:
-            found = self.network.find(lab, maps, inside, faces_in_window(faces, state.anchors))
+            near = faces_in_window(faces, state.anchors)
+            found = self.network.find(lab, maps, inside, near, self.elbows)
         return state._replace(skin=learnt, memory=memory, motion=motion), means, flow, found
 
     def _gone(
@@ -355,7 +359,7 @@ class HandTracker(nn.Module):
         unit = (anchors[:, 2] * CELL).square()[:, None, None, None]
         floor = (s.covariance_floor / CELL) ** 2 * torch.eye(2, dtype=unit.dtype)
         covariance = (s.covariance_scale * found.covariance + floor) * unit
-        there = _in_frame(points, shape)
+        there = in_frame(points, shape)
         cell = found.mode[..., 1] * CELLS[1] + found.mode[..., 0]
         here = skin.flatten(1).gather(1, cell)
         seen = there & (found.mass >= s.least_mass) & (here >= s.least_skin)
@@ -369,54 +373,13 @@ class HandTracker(nn.Module):
         state = state._replace(place=points, speed=speed, frames=state.frames + 1)
         return state, without_elbows(shown, covariance, found.mass, seen)
 
-    def _elbows(
-        self, found: HandPlaces, expected: Tensor, anchors: Tensor, shape: tuple[int, ...]
-    ) -> Elbows:
-        """Return the elbows in one frame, by the network and by the density of an elbow given its hand.
-
-        Args:
-            found: by the network. expected: elbows given the hands, in B from the anchors, NaN where
-                the hand is not measured [N, 2, 2].
-        """
-        s = self.settings
-        away = (cell_centres() - expected[:, :, None, None]).square().sum(-1) / s.elbow_reach**2
-        likely = torch.log1p(away.nan_to_num(0.0) / _FREEDOM) * (-0.5 * (_FREEDOM + 2))
-        belief = torch.softmax((found.elbows + likely.to(found.elbows)).flatten(2), 2)
-        peak = read_out(belief.view_as(found.elbows), smooth=1.5, within=5.0)
-        points = cells_to_pixels(peak.place, anchors)
-        unit = (anchors[:, 2] * CELL).square()[:, None, None, None]
-        floor = (s.elbow_floor / CELL) ** 2 * torch.eye(2, dtype=unit.dtype)
-        seen = _in_frame(points, shape) & (peak.mass >= s.least_mass)
-        seen = seen & (found.elbows_gone + s.elbow_bias < 0)
-        return Elbows(points, (s.elbow_scale * peak.covariance + floor) * unit, seen)
-
-
-def _expected_elbows(hands: HandMeasurements, elbow: Tensor, anchors: Tensor) -> Tensor:
-    """Return where elbows are expected given the hands, in B from the anchors, NaN without one [N, 2, 2].
-
-    Args:
-        hands: as measured. elbow: for a hand in each cell, in B from the anchors [N, 2, 2, r, c].
-    """
-    cells = pixels_to_cells(hands.points.nan_to_num(0.0), anchors).round().long()
-    column, row = (cells[..., i].clamp(0, CELLS[1 - i] - 1) for i in (0, 1))
-    index = (row * CELLS[1] + column)[:, :, None, None].expand(-1, -1, 2, 1)
-    place = elbow.flatten(3).gather(3, index)[..., 0]
-    return torch.where(hands.seen[..., None], place, torch.nan)
-
-
-def _in_frame(points: Float[Tensor, "N 2 2"], shape: tuple[int, ...]) -> Tensor:
-    """Return whether points are in a frame of this shape [N, 2]."""
-    high = points.new_tensor([shape[1] - 0.5, shape[0] - 0.5])
-    return ((points >= -0.5) & (points <= high)).all(-1)
-
 
 def _before_face(faces: Tensor, anchors: Tensor) -> Tensor:
     """Return a map that is one on the face and zero away from it [N, r, c]."""
-    at = faces_in_window(faces, anchors)
-    offset = (cell_centres() - at[:, None, None, :2]) / (at[:, 2:] * at.new_tensor(_FACE))[
-        :, None, None
-    ]
-    return torch.sigmoid(6 * (1 - offset.square().sum(-1)))
+    at, (x, y) = faces_in_window(faces, anchors), cell_axes()
+    across = ((x - at[:, :1]) / (at[:, 2:] * _FACE[0])).square()
+    down = ((y - at[:, 1:2]) / (at[:, 2:] * _FACE[1])).square()
+    return torch.sigmoid(6 * (1 - (across[:, None] + down[:, :, None])))
 
 
 def _hands_near(belief: Tensor) -> Tensor:

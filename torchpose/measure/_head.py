@@ -25,7 +25,8 @@ __all__ = [
 _ROWS, _COLUMNS = 104, 72  # of the remembered patch: head and neck
 _HALF_WIDTH, _TOP, _HEIGHT = 1.0, -1.0, 2.6  # of the patch, in B from the face's centre
 _SEARCH = 8  # pixels of the patch to each side
-_MODEL, _INNER = (slice(4, 58), slice(2, 70)), (slice(12, 50), slice(10, 62))
+_MODEL, _INNER = (slice(4, 58), slice(2, 70)), (slice(12, 50, 2), slice(10, 62, 2))
+_WHOLE = (slice(None), slice(None))
 _EYES = (slice(14, 56, 2), slice(18, 56, 2))
 _BLUR = 13  # pixels of the patch: about a third of a face, half a hand
 _LEAST_MATCH = 0.6
@@ -215,12 +216,14 @@ class FaceMemory(nn.Module):
         if not self.remember:
             return state, _to_window(head_mask().expand(len(at), -1, -1), at)
         near = lab.to(at)
-        patch = _sample(near, at)
         if self.align:
-            shift = _best_shift(state.mean[:, 0], patch[:, 0]).masked_fill_(new[:, None], 0)
+            inner = _sample(near[:, :1], at, _INNER)[:, 0]
+            shift = _best_shift(state.mean[:, 0], inner).masked_fill_(new[:, None], 0)
             at = torch.cat([at[:, :2] + shift * self.pixel * at[:, 2:], at[:, 2:]], 1)
-            patch = _sample(near, at)
-        mean = torch.where(new[:, None, None, None], patch, state.mean)
+        patch = _sample(near, at)
+        mean = state.mean
+        if bool(new.any()):
+            mean = torch.where(new[:, None, None, None], patch, mean)
         error = patch - mean
         difference = (error.abs() * self.channel_weights).sum(1)
         difference = self.blur_rows @ difference @ self.blur_columns
@@ -273,52 +276,78 @@ def _patch_places() -> Tensor:
     return torch.stack(torch.broadcast_tensors(x, y[:, None]), -1).contiguous()
 
 
-def _sample(part: Tensor, at: Tensor) -> Tensor:
-    """Return the patch of head and neck from `head_part` of a map."""
-    places, middle, half = _part_grid()
-    centre = (at[:, None, None, :2] - middle) / half
-    grid = places * at[:, 2, None, None, None] + centre
+def _sample(part: Tensor, at: Tensor, places: tuple[slice, slice] = _WHOLE) -> Tensor:
+    """Return the patch of head and neck, or some of its pixels, from `head_part` of a map."""
+    (x, y), middle, half = _part_grid()
+    across, down = ((at[:, :2] - middle) / half)[..., None].unbind(1)
+    x = x[places[1]] * at[:, 2:] + across
+    y = y[places[0]] * at[:, 2:] + down
+    grid = _pairs(x, y)
     return nn.functional.grid_sample(part, grid, padding_mode="border", align_corners=False)
 
 
+def _pairs(x: Float[Tensor, "N w"], y: Float[Tensor, "N h"]) -> Float[Tensor, "N h w 2"]:
+    """Return the places with these coordinates of columns and rows."""
+    grid = x.new_empty(len(x), y.shape[1], x.shape[1], 2)
+    grid[..., 0], grid[..., 1] = x[:, None], y[:, :, None]
+    return grid
+
+
 @cache
-def _part_grid() -> tuple[Tensor, Tensor, Tensor]:
-    """Return the places of the patch in halves of `head_part`, its middle, and its half width and height."""
+def _part_grid() -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
+    """Return the columns and rows of the patch in halves of `head_part`, its middle, and these halves."""
     part = cell_centres()[_PART_ROWS, _PART_COLUMNS]
     half = (part[-1, -1] - part[0, 0] + CELL) / 2
-    return _patch_places() / half, (part[-1, -1] + part[0, 0]) / 2, half
+    places = _patch_places() / half
+    columns, rows = places[0, :, 0].contiguous(), places[:, 0, 1].contiguous()
+    return (columns, rows), (part[-1, -1] + part[0, 0]) / 2, half
 
 
-def _best_shift(model: Tensor, patch: Tensor) -> Tensor:
+def _best_shift(model: Tensor, inner: Tensor) -> Tensor:
     """Return the shift of the face from the middle of its patch [N, 2], in pixels of it.
 
     By normalised correlation at every shift, over every second pixel.
+
+    Args:
+        model: the remembered lightness. inner: lightness of the pixels `_INNER` of the patch.
     """
-    model = model[:, _MODEL[0], _MODEL[1]].contiguous()
-    inner = patch[:, _INNER[0], _INNER[1]][:, ::2, ::2]
+    model = model[:, _MODEL[0], _MODEL[1]]
+    model = model - model.mean((1, 2), keepdim=True)  # so that squares lose no digits
     (n, height, width), shifts = inner.shape, 2 * _SEARCH + 1
     per_model, per_row, _ = model.stride()
     windows = model.as_strided(
-        (n, shifts, shifts, height, width), (per_model, per_row, 1, 2 * per_row, 2)
-    ).reshape(n, shifts * shifts, height * width)
-    windows = windows - windows.mean(2, keepdim=True)
-    inner = inner.reshape(n, -1, 1) - inner.mean((1, 2), keepdim=True)
-    norm = windows.square().sum(2) * inner.square().sum(1)
-    score, best = ((windows @ inner)[..., 0] * norm.clamp_min(1.0).rsqrt()).max(1)
+        (n, height, width, shifts, shifts), (per_model, 2 * per_row, 2, per_row, 1)
+    ).reshape(n, height * width, shifts * shifts)
+    inner = (inner - inner.mean((1, 2), keepdim=True)).view(n, 1, -1)
+    rows, columns = _every_second(height), _every_second(width).mT
+    mean, power = rows @ model @ columns, rows @ model.square() @ columns
+    variance = (power - mean.square()).flatten(1)
+    norm = variance * (height * width) * inner.square().sum(2)
+    score, best = ((inner @ windows)[:, 0] * norm.clamp_min(1.0).rsqrt()).max(1)
     shift = _SEARCH - torch.stack([best % shifts, best // shifts], 1)
     return torch.where((score > _LEAST_MATCH)[:, None], shift, 0)
 
 
+@cache
+def _every_second(size: int) -> Tensor:
+    """Return the matrix of means over `size` places, every second one, from each shift."""
+    shift = torch.arange(2 * _SEARCH + 1)[:, None]
+    away = torch.arange(2 * _SEARCH + 2 * size)[None] - shift
+    return ((away >= 0) & (away < 2 * size) & (away % 2 == 0)).float() / size
+
+
 def _to_window(patch: Tensor, at: Tensor) -> Tensor:
-    places, middle, half = _window_grid()
-    size = at[:, 2:]
-    grid = (places - (at[:, :2] / half)[:, None, None]) / size[:, None, None] - middle / half
+    (x, y), middle, half = _window_grid()
+    across, down = (at[:, :2] / half)[..., None].unbind(1)
+    (left, top), size = middle / half, at[:, 2:]
+    grid = _pairs((x - across) / size - left, (y - down) / size - top)
     return nn.functional.grid_sample(patch[:, None], grid, align_corners=False)[:, 0]
 
 
 @cache
-def _window_grid() -> tuple[Tensor, Tensor, Tensor]:
-    """Return the places of `head_part` in halves of the patch, its middle, and its half width and height."""
+def _window_grid() -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
+    """Return the columns and rows of `head_part` in halves of the patch, its middle, and these halves."""
     half = torch.tensor([_HALF_WIDTH, _HEIGHT / 2])
     places = cell_centres(EVIDENCE)[head_part(EVIDENCE)] / half
-    return places, torch.tensor([0.0, _TOP + _HEIGHT / 2]), half
+    columns, rows = places[0, :, 0].contiguous(), places[:, 0, 1].contiguous()
+    return (columns, rows), torch.tensor([0.0, _TOP + _HEIGHT / 2]), half

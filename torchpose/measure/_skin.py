@@ -219,12 +219,14 @@ class SkinModel(nn.Module):
         self, bins: Tensor, faces: Tensor, hands: Tensor | None, valid: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the colours of the face and of hands in front of it [B, 2, C], clothes and far [B, C]."""
-        label = _labels(faces, bins.shape[1:])
+        face, clothes, far = _regions(faces, bins.shape[1:])
         if hands is not None:
-            label = label + (label == 1) * (hands >= _HAND_IN_FACE)
-            label = label.masked_fill_((label == 3) & (hands >= _HAND_ELSEWHERE), 0.0)
+            clothes &= hands < _HAND_ELSEWHERE
+        label = face.byte() + 3 * clothes.byte() + 4 * far.byte()
+        if hands is not None:
+            label += face & (hands >= _HAND_IN_FACE)
         if valid is not None:
-            label = label * valid
+            label *= valid
         counts = self._counts(bins, label)
         return counts[:, 1:3], counts[:, 3], counts[:, 4]
 
@@ -238,10 +240,16 @@ class SkinModel(nn.Module):
 
     def _smoothed(self, counts: Tensor) -> Tensor:
         """Return the shares of the colours [B, 3, 8, 32, 32], each axis smoothed by a product with a band."""
-        smooth = counts.view(-1, *BINS) @ self.smooth2
-        smooth = self.smooth1 @ smooth
-        smooth = (self.smooth0 @ smooth.flatten(2)).view(*counts.shape[:2], *BINS)
+        smooth = counts.view(-1, BINS[2]) @ self.smooth2
+        smooth = _each(self.smooth1, smooth.view(-1, BINS[1], BINS[2]))
+        smooth = _each(self.smooth0, smooth.view(-1, BINS[0], BINS[1] * BINS[2]))
+        smooth = smooth.view(*counts.shape[:2], *BINS)
         return smooth / smooth.sum((2, 3, 4), keepdim=True).clamp_min(1e-6)
+
+
+def _each(matrix: Float[Tensor, "r r"], values: Float[Tensor, "N r c"]) -> Float[Tensor, "N r c"]:
+    """Return the product of a matrix with each of the others; `@` would copy these."""
+    return matrix.expand(len(values), -1, -1).bmm(values)
 
 
 def _band(size: int, kernel: tuple[float, ...]) -> Tensor:
@@ -253,17 +261,14 @@ def _band(size: int, kernel: tuple[float, ...]) -> Tensor:
     )
 
 
-def _labels(faces: Tensor, shape: torch.Size) -> Float[Tensor, "B H W"]:
-    """Return 1 in the middle of the face, 3 on the clothes, 4 far from the person, else 0.
-
-    All four are rectangles, so the labels are a product of two thin matrices.
-    """
+def _regions(
+    faces: Float[Tensor, "B 3"], shape: torch.Size
+) -> tuple[Bool[Tensor, "B H W"], Bool[Tensor, "B H W"], Bool[Tensor, "B H W"]]:
+    """Return masks of the middle of the face, of the clothes, and of what is far from the person."""
     height, width = shape
     x, y, size = (column[:, None] for column in faces.unbind(1))
-    across = ((torch.arange(width, device=faces.device) - x) / size).abs()
-    down = (torch.arange(height, device=faces.device) - y) / size
-    above, aside = down < _FAR[1], across > _FAR[0]
-    rows = [(down > FACE_PATCH[1]) & (down < FACE_PATCH[2]), down > _CLOTHES[1], above, ~above]
-    columns = [across < FACE_PATCH[0], across < _CLOTHES[0], torch.ones_like(aside), aside]
-    values = faces.new_tensor([1.0, 3.0, 4.0, 4.0])
-    return torch.stack(rows, 2).to(faces) @ (torch.stack(columns, 1) * values[:, None])
+    across = ((torch.arange(width, device=faces.device) - x) / size).abs()[:, None]
+    down = ((torch.arange(height, device=faces.device) - y) / size)[:, :, None]
+    face = (down > FACE_PATCH[1]) & (down < FACE_PATCH[2]) & (across < FACE_PATCH[0])
+    clothes = (down > _CLOTHES[1]) & (across < _CLOTHES[0])
+    return face, clothes, (down < _FAR[1]) | (across > _FAR[0])

@@ -134,7 +134,9 @@ class UpperBodyMeasurer(nn.Module):
         self.hand_tracker: HandTracker | MeanShiftHandTracker
         if hands != "mean-shift":
             network = shipped_hand_network() if self.learnt else None
-            self.hand_tracker = HandTracker(HandPrior.from_prior(prior), fps=fps, network=network)
+            self.hand_tracker = HandTracker(
+                HandPrior.from_prior(prior), fps=fps, network=network, elbows=measured
+            )
         else:
             self.hand_tracker = MeanShiftHandTracker()
         self.background = BackgroundModel() if background else None
