@@ -31,6 +31,7 @@ from torchpose.priors._gaussian_mixture import GaussianMixture
 __all__ = ["SplitTrackFilter"]
 
 _MOST_SHARED = 1 << 22  # numbers, 32 MB, of the product that all frames share
+_RANKS = 1e9  # per nat: log-weights that are nearer are equal
 
 
 class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
@@ -39,7 +40,7 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
     A candidate is track i continued by component j, of weight w_i pi_j N(z_t | i, j). In the first
     frame there is one track for each component. Without pruning (M = K^(T+1)) this is the exact
     posterior. Where nothing is measured, candidates that differ in the order of their components alone have
-    equal weights; rounding decides which of them stay.
+    equal weights, of which the first ones stay.
 
     Args:
         gmm, process_cov, measurement_cov, observed, initial_cov, transition, gamma, subspace, burn_in,
@@ -210,13 +211,19 @@ class SplitTrackFilter(MixtureKalmanFilter, tracks="split"):
         return log_weights, joint_estimate(tracks, log_weights, log_evidence, jitters, return_cov)
 
     def _select(self, log_joint: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return log-weights of the M likeliest candidates, log-evidence, and their tracks and components."""
+        """Return log-weights of the M likeliest candidates, log-evidence, and their tracks and components.
+
+        Without measurements, i continued by j is as likely as j continued by i. Of such the first ones
+        are taken, not those that rounding prefers.
+        """
         flat = log_joint.flatten(1)
         log_evidence = torch.logsumexp(flat, -1)
         # The first frames may have fewer candidates than tracks: the rest stays empty, at weight zero.
         spare = max(0, self.n_tracks - flat.shape[1])
         padded = torch.nn.functional.pad(flat, (0, spare), value=-torch.inf)
-        kept, chosen = padded.topk(self.n_tracks, dim=1)
+        ranks = (padded * _RANKS).round()
+        chosen = ranks.sort(dim=1, descending=True, stable=True).indices[:, : self.n_tracks]
+        kept = padded.gather(1, chosen)
         chosen = torch.where(chosen < flat.shape[1], chosen, torch.zeros_like(chosen))
         n_components = self.means.shape[0]
         log_weights = normalise(kept).to(self.dtype)
