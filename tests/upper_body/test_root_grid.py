@@ -35,7 +35,7 @@ def seen(depth, size=1.0, turn=0.0):
 
 
 def test_larger_torsos_look_like_nearer_ones(grid):
-    evidence = grid.evidence(seen(2.0), lengths())
+    evidence = grid.likelihood(seen(2.0), lengths()).log()
     assert evidence.shape == (1, len(grid.log_size), len(grid.depth), len(grid.turn))
     shift = round(float(grid.log_size.diff()[0] / grid.depth.log().diff()[0]))
     torch.testing.assert_close(evidence[:, 1:, shift:], evidence[:, :-1, :-shift])
@@ -56,7 +56,7 @@ def test_what_else_tells_the_depth_adds_up_against_the_usual_size(grid):
     torso, true = seen(2.0), 2.5
     belief = grid.init(1, torch.tensor(0.12, dtype=torch.float64))
     for _ in range(60):
-        believed = grid.predict(belief).log() + grid.evidence(torso, lengths())
+        believed = grid.predict(belief) * grid.likelihood(torso, lengths())
         root = grid.best(believed, 10)
         said = -0.5 * ((root.depth / true).log() / 0.2).square()
         belief = grid.belief(believed, root, said, torch.tensor([True]))

@@ -5,12 +5,14 @@ Lasenby, "Single camera pose estimation using Bayesian filtering and Kinect moti
 function is differentiable, takes any dtype and broadcasts over leading dimensions."""
 
 from collections.abc import Callable
+from functools import cache
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchpose._core.checks import check_shape
+from torchpose._core.module_state import outside_inference
 from torchpose.errors import CameraError
 from torchpose.math._rotations import RotationOrder, euler_to_matrix
 from torchpose.math._unscented import unscented_transform
@@ -160,6 +162,26 @@ def check_intrinsics(name: str, K: Tensor) -> None:
     """
     if K.ndim < 2 or tuple(K.shape[-2:]) != (3, 3):
         raise CameraError(f"{name} must have shape [3, 3], got {list(K.shape)}")
+    least, most = _bounds(K.dtype, K.device)
+    if not bool(((least <= K) & (most >= K)).all()):
+        _refuse_intrinsics(name, K)
+
+
+@cache
+def _bounds(
+    dtype: torch.dtype, device: torch.device
+) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"]]:
+    """Return the least and the largest value of each entry of a camera matrix."""
+    low, high = -_LARGEST, _LARGEST
+    least = [[_SHORTEST, low, low], [0.0, _SHORTEST, low], [0.0, 0.0, 1.0]]
+    most = [[high, high, high], [0.0, high, high], [0.0, 0.0, 1.0]]
+    with outside_inference():
+        both = torch.tensor([least, most], dtype=dtype, device=device)
+        return both[0], both[1]
+
+
+def _refuse_intrinsics(name: str, K: Tensor) -> None:
+    """Raise a `CameraError` that says why K is no camera matrix."""
     if not bool((K.abs() <= _LARGEST).all()):
         raise CameraError(
             f"{name} must be finite and at most {_LARGEST:g}, got {K.tolist()!s:.200}"
@@ -169,12 +191,10 @@ def check_intrinsics(name: str, K: Tensor) -> None:
         raise CameraError(
             f"{name} needs positive focal lengths in pixels, got fx={fx.tolist()}, fy={fy.tolist()}"
         )
-    last = torch.tensor([0.0, 0.0, 1.0], dtype=K.dtype, device=K.device)
-    if bool((K[..., 1, 0] != 0).any()) or bool((K[..., 2, :] != last).any()):
-        raise CameraError(
-            f"{name} must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; "
-            "divide by the last entry, and give the rotation apart"
-        )
+    raise CameraError(
+        f"{name} must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; "
+        "divide by the last entry, and give the rotation apart"
+    )
 
 
 def intrinsics(K: Float[Tensor, "... 3 3"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

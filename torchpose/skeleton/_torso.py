@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchpose._core.checks import check_shape
 from torchpose.errors import PriorError
-from torchpose.math._rotations import euler_to_matrix, procrustes
+from torchpose.math._rotations import procrustes
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
 __all__ = [
@@ -58,8 +58,9 @@ def upright_axes(turn: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
     Args:
         turn: of the shoulders about the vertical, radians: (cos, 0, -sin) points to the left one.
     """
-    level = torch.zeros_like(turn)
-    return euler_to_matrix(torch.stack([level, level, turn], -1), "zxy").mT
+    cos, sin, zero = turn.cos(), turn.sin(), torch.zeros_like(turn)
+    rows = [cos, zero, -sin, zero, torch.ones_like(turn), zero, sin, zero, cos]
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
 def onto_torso(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -11,13 +12,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
+from torchpose._core.module_state import outside_inference
 from torchpose.priors._arms import ArmPrior
 from torchpose.priors._gaussian_mixture import LOG_2PI
-from torchpose.upper_body._limb_nodes import nodes_anywhere, nodes_on_ray
+from torchpose.upper_body._limb_nodes import nodes_anywhere, nodes_on_ray, sphere_points
 
-__all__ = ["ArmChain", "ArmInput", "ArmState", "Arms", "DirectionDensity"]
+__all__ = ["ArmChain", "ArmInput", "ArmState", "Arms", "DirectionDensity", "mirrored"]
 
-_SLACK = 0.018  # metres: joints of recordings are not the ends of stiff bones
 _ANGLES = 17  # of a bone whose end is measured
 _AROUND = 150  # directions of one whose end is not
 _BOTH = 68  # of each of two such bones
@@ -31,25 +32,24 @@ _ROWS = 2048  # directions at a time, so that intermediate results stay in the c
 
 
 class ArmInput(NamedTuple):
-    """Measurements of both arms, the right one mirrored; shapes [B, 2, M] for M hypotheses of the root.
+    """Measurements of both arms, the right one mirrored, in upright axes, given M hypotheses of the root.
 
     Attributes:
-        shoulder: camera axes, metres, [B, 2, M, 3]. rays: the rays of elbow and hand, [B, 2, 2, 3].
+        shoulder: metres, [B, 2, M, 3]. rays: the rays of elbow and hand, [B, 2, M, 2, 3].
         known: whether elbow and hand are measured, [B, 2, 2].
-        std: the standard deviation of a pixel over the focal length, of elbow and hand with their near
-            ends, [B, 2, 2].
-        axes: the rotation from camera to upright axes, [B, 2, M, 3, 3].
+        patterns: the pairs of these that there are, for elbow and hand of any arm.
+        variance: the variance across the rays of elbow and hand, metres squared, [B, 2, M, 2].
+        axes: the rotation from camera to upright axes, [B, M, 3, 3].
         lengths: the lengths of both bones, metres, [B, 2, M, 2].
-        slack: the standard deviation of the ends of both bones for want of their lengths, metres, [B, 2].
     """
 
     shoulder: Tensor
     rays: Tensor
     known: Tensor
-    std: Tensor
+    patterns: Sequence[tuple[bool, bool]]
+    variance: Tensor
     axes: Tensor
     lengths: Tensor
-    slack: Tensor
 
 
 class Arms(NamedTuple):
@@ -74,7 +74,7 @@ class Arms(NamedTuple):
     def mean_directions(self) -> Float[Tensor, "B 2 M 6"]:
         """Return the mean directions given each hypothesis of the root; not of unit length."""
         weight = torch.softmax(self.log_weight + self.log_prior, -1)
-        return (weight[..., None] * self.directions).sum(-2)
+        return (weight[..., None, :] @ self.directions)[..., 0, :]
 
 
 class ArmState(NamedTuple):
@@ -96,51 +96,60 @@ class ArmState(NamedTuple):
 
 
 class DirectionDensity:
-    """Log-density of an `ArmPrior`; what does not depend on the directions is computed once."""
+    """Log-density of an `ArmPrior`; what does not depend on the directions is computed once.
+
+    That of each component is a quadratic polynomial of the six coordinates, so one product gives all.
+    """
 
     def __init__(self, prior: ArmPrior, device: torch.device | None = None) -> None:
         parts = (*prior.directions.parameters_tuple(), prior.log_mass)
         weights, means, covariances, log_mass = (part.to(device).double() for part in parts)
-        k, dim = means.shape
+        dim = means.shape[-1]
         factor = torch.linalg.cholesky(covariances)
-        eye = torch.eye(dim, dtype=factor.dtype, device=factor.device).expand(k, dim, dim)
-        inverse = torch.linalg.solve_triangular(factor, eye, upper=False)
-        self.rows = inverse.transpose(0, 1).reshape(dim * k, dim).mT.contiguous().float()
-        self.shift = (inverse @ means[..., None])[..., 0].mT.reshape(-1).float()
+        precision = torch.cholesky_inverse(factor)
+        pulled = (precision @ means[..., None])[..., 0]
         logs = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         constant = weights.log() - 0.5 * dim * LOG_2PI - logs - log_mass
-        self.constant = (constant + math.log1p(-prior.broad)).float()
+        constant = constant - 0.5 * (means * pulled).sum(-1)
+        self._constant = constant + math.log1p(-prior.broad)
+        self._pairs = torch.triu_indices(dim, dim, device=device)
+        first, second = self._pairs
+        twice = torch.where(first == second, 0.5, 1.0)  # either order of two coordinates counts
+        squares = -twice * precision[:, first, second]
+        self._slopes = torch.cat([pulled, squares], 1).mT.contiguous()
         self.broad = math.log(prior.broad) - 2 * math.log(4 * math.pi)
-        self.size = dim, k
         apart = (weights[:, None] * weights).clamp_min(_LEAST)
         tied = prior.together.to(device).double() / apart
         self.together = pad(tied, (0, 1, 0, 1), value=1.0)  # the broad part is tied to nothing
 
     def __call__(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
-        """Return log p(d_u, d_f), computed in float32, which unit vectors and spreads of 0.1 rad allow."""
-        flat = directions.reshape(-1, 6).float()
-        parts = [self._known(rows) for rows in flat.split(_ROWS)]
+        """Return log p(d_u, d_f)."""
+        parts = [self._known(rows) for rows in directions.reshape(-1, 6).split(_ROWS)]
         known = torch.cat(parts).to(directions.dtype)
         return torch.logaddexp(known, known.new_tensor(self.broad)).view(directions.shape[:-1])
 
     def shares(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch K"]:
         """Return the posterior of each component, the broad one last."""
-        logs = self._logs(directions.reshape(-1, 6).float())
-        logs = pad(logs, (0, 1), value=self.broad)
+        logs = pad(self._logs(directions.reshape(-1, 6)), (0, 1), value=self.broad)
         return torch.softmax(logs, -1).to(directions.dtype).view(*directions.shape[:-1], -1)
 
     def _logs(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, "N K"]:
-        """Return the log-density of each component of the mixture, times its weight."""
-        off = torch.addmm(self.shift, rows, self.rows, beta=-1).square()
-        squared = off.view(len(rows), *self.size).sum(1)
-        return self.constant - 0.5 * squared
+        """Return the log-density of each component of the mixture, times its weight.
+
+        Its terms cancel, some of a thousand to a few: they are float64.
+        """
+        columns = rows.double().mT.contiguous()
+        first, second = self._pairs
+        terms = torch.cat([columns, columns[first] * columns[second]])
+        return torch.addmm(self._constant, terms.mT, self._slopes)
 
     def _known(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, " N"]:
-        """Return the log-density of the mixture, without its broad part."""
+        """Return the log-density of the mixture, without its broad part; exponentials are float32."""
         logs = self._logs(rows)
         most = logs.amax(-1, keepdim=True).detach()
         # exp of what is far below is slow where it is denormal, and adds nothing
-        return (logs - most).clamp_min(_NOTHING).exp().sum(-1).log() + most[:, 0]
+        near = (logs - most).float().clamp_min(_NOTHING).exp()
+        return near.sum(-1).log() + most[:, 0]
 
 
 class ArmChain:
@@ -171,62 +180,48 @@ class ArmChain:
         both = min(around, _BOTH)
         sizes = {(True, True): (angles, angles), (True, False): (angles, around),
                  (False, True): (around, angles), (False, False): (both, both)}  # fmt: skip
-        known = arm.known[..., None, :]
-        patterns = {
-            (upper, lower): (known[..., 0] == upper) & (known[..., 1] == lower)
-            for upper in (True, False)
-            for lower in (True, False)
-        }
-        there = {ends: here for ends, here in patterns.items() if bool(here.any())}
-        found = {
-            (upper, lower): self._weighed(arm, upper, lower, sizes[upper, lower], count)
-            for upper, lower in there
-        }
-        first, *others = found
-        arms = found[first]
+        first, *others = arm.patterns
+        arms = self._weighed(arm, first, sizes[first], count)
         for ends in others:
-            arms = _where(there[ends], found[ends], arms)
+            elbow, hand = (arm.known[..., i] == seen for i, seen in enumerate(ends))
+            found = self._weighed(arm, ends, sizes[ends], count)
+            arms = _where((elbow & hand)[..., None], found, arms)
         return arms
 
     def _weighed(
-        self, arm: ArmInput, upper: bool, lower: bool, sizes: tuple[int, int], count: int
+        self, arm: ArmInput, ends: tuple[bool, bool], sizes: tuple[int, int], count: int
     ) -> Arms:
         """Return the `count` hypotheses of largest weight, of arms whose elbow and hand are measured so."""
-        lengths, noise = arm.lengths, self._noise(arm)
-        start = arm.shoulder
-        ray = arm.rays[:, :, None, 0].expand_as(start)
-        first = (
-            nodes_on_ray(start, ray, lengths[..., 0], noise[..., 0], sizes[0])
-            if upper
-            else nodes_anywhere(start, lengths[..., 0], sizes[0])
-        )
-        start = first.ends
-        ray = arm.rays[:, :, None, None, 1].expand_as(start)
-        if not upper:  # the elbow is known as well as its directions are dense
-            grain = math.sqrt(4 * math.pi / sizes[0] / 12) * lengths[..., 0]
-            noise = (noise.square() + grain.square()[..., None]).sqrt()
-        length, std = (x[..., 1, None].expand(start.shape[:-1]) for x in (lengths, noise))
-        second = (
-            nodes_on_ray(start, ray, length, std, sizes[1])
-            if lower
-            else nodes_anywhere(start, length, sizes[1])
-        )
-        bones = first.directions[..., None, :].expand_as(second.directions), second.directions
-        directions = torch.cat([bone.flatten(-3, -2) @ arm.axes.mT for bone in bones], -1)
-        weight = (first.log_weight[..., None] + second.log_weight).flatten(-2)
+        elbow, hand = ends
+        lengths, variance = arm.lengths, arm.variance
+        if elbow:
+            upper = nodes_on_ray(
+                arm.shoulder,
+                arm.rays[..., 0, :],
+                lengths[..., 0],
+                variance[..., 0].sqrt(),
+                sizes[0],
+            )
+        else:  # the elbow is known as well as its directions are dense
+            upper = nodes_anywhere(arm.shoulder, lengths[..., 0], _sphere(arm.axes, sizes[0]))
+            grain = (4 * math.pi / sizes[0] / 12) * lengths[..., :1].square()
+            variance = variance + grain
+        start, length = upper.ends, lengths[..., 1, None]
+        if hand:
+            std = variance[..., 1, None].sqrt()
+            lower = nodes_on_ray(start, arm.rays[..., None, 1, :], length, std, sizes[1])
+        else:
+            lower = nodes_anywhere(start, length, _sphere(arm.axes, sizes[1])[..., None, :, :])
+        shape = *start.shape[:-1], sizes[1], 3
+        bones = upper.directions[..., None, :], lower.directions
+        directions = torch.cat([bone.expand(shape) for bone in bones], -1).flatten(-3, -2)
+        weight = (upper.log_weight[..., None] + lower.log_weight).flatten(-2)
         prior = self.density(directions)
         if weight.shape[-1] <= count:
             return Arms(directions, weight, prior)
         rows = (weight + prior).topk(count, -1).indices
         chosen = directions.gather(-2, rows[..., None].expand(*rows.shape, 6))
         return Arms(chosen, weight.gather(-1, rows), prior.gather(-1, rows))
-
-    @staticmethod
-    def _noise(arm: ArmInput) -> Float[Tensor, "B 2 M 2"]:
-        """Return the standard deviation across the rays of elbow and hand, metres."""
-        depth = arm.shoulder[..., 2:].clamp_min(0.1)
-        slack = arm.slack.square()[:, None, None] + _SLACK**2
-        return ((arm.std[:, :, None] * depth).square() + slack).sqrt()
 
     def evidence_of_both(self, arms: Arms) -> Float[Tensor, "B M"]:
         """Return the log of the prior predictive density of the measurements of both arms together.
@@ -301,9 +296,12 @@ class ArmChain:
     def _walk(self, before: Tensor, after: Tensor) -> Float[Tensor, "B 2 N M"]:
         """Return the density t_4(x'; x, s^2) of all pairs of directions of two frames."""
         scale = self.step**2
-        alike = before @ after.mT  # of two pairs of unit vectors: 2 where they agree
-        near = 1 / (1 + (2 - alike).clamp_min(0.0) / (2 * scale))
-        return 6 / (16 * math.pi**2 * scale**2) * near.square().square()
+        most = 6 / (16 * math.pi**2 * scale**2)
+        unit = most**-0.25
+        # of two pairs of unit vectors the product is 2 where they agree
+        alike = (before * (-unit / (2 * scale))) @ after.mT
+        far = (alike + unit * (1 + 1 / scale)).clamp_min(unit)
+        return far.square().pow(-2)
 
     @staticmethod
     def mean_directions(state: ArmState, seen: Bool[Tensor, "B 2"]) -> Float[Tensor, "B 2 2 3"]:
@@ -313,7 +311,7 @@ class ArmChain:
             state: the posterior. seen: whether elbow and hand are measured; if so the means have unit
                 length.
         """
-        mean = (state.weight[..., None] * state.directions).sum(-2).unflatten(-1, (2, 3))
+        mean = (state.weight[..., None, :] @ state.directions)[..., 0, :].unflatten(-1, (2, 3))
         return torch.where(seen[..., None, None], normalize(mean, dim=-1), mean)
 
 
@@ -322,6 +320,35 @@ def _belief(arms: Arms, prior: Tensor, predicted: Float[Tensor, "B 2 N"]) -> Arm
     evidence = torch.logsumexp(log_weight, -1)
     weight = (log_weight - evidence[..., None]).exp()
     return ArmState(arms.directions[:, :, 0], weight, evidence, prior, predicted)
+
+
+def _sphere(axes: Float[Tensor, "B M 3 3"], n_points: int) -> Float[Tensor, "B 2 M G 3"]:
+    """Return directions spread evenly, those of right arms mirrored, in upright axes."""
+    points = _both_spheres(n_points, axes.dtype, axes.device)
+    return mirrored(points @ axes.mT[:, None])
+
+
+@cache
+def _both_spheres(
+    n_points: int, dtype: torch.dtype, device: torch.device
+) -> Float[Tensor, "2 1 G 3"]:
+    """Return directions spread evenly for left arms, and their mirror images."""
+    with outside_inference():
+        points = sphere_points(n_points).to(device, dtype)
+        return mirrored(points.expand(1, 2, 1, -1, -1))[0]
+
+
+def mirrored(vectors: Float[Tensor, "B 2 *batch 3"]) -> Float[Tensor, "B 2 *batch 3"]:
+    """Return vectors of both arms, with those of the right one mirrored."""
+    flip = _signs(vectors.dtype, vectors.device)
+    return vectors * flip.view(2, *[1] * (vectors.ndim - 3), 3)
+
+
+@cache
+def _signs(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "2 3"]:
+    """Return the signs of the axes by which right arms are mirrored."""
+    with outside_inference():
+        return torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]], dtype=dtype, device=device)
 
 
 def _where(here: Bool[Tensor, "B 2 1"], new: Arms, old: Arms) -> Arms:

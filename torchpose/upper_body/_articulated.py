@@ -7,7 +7,7 @@ lengths of bones are learnt on the way (`BodyLengths`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -18,17 +18,23 @@ from tqdm.auto import tqdm
 from torchpose._core.module_state import derived
 from torchpose.errors import InputError
 from torchpose.priors._arms import ArmPrior, shipped_arm_prior
+from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._arm_chain import ArmChain, ArmState, DirectionDensity
 from torchpose.upper_body._articulated_frame import (
     ArticulatedState,
+    Facts,
     RayFrame,
-    frames_as_rays,
+    as_rays,
+    facts_of,
+    split,
+    together,
+    upright,
     with_middle,
 )
 from torchpose.upper_body._articulated_poses import FramePose, SeenBody, estimates_of, pose_of
-from torchpose.upper_body._articulated_root import RootStep, covs_of_roots
-from torchpose.upper_body._articulated_torso import torso_joints
-from torchpose.upper_body._body_lengths import BodyLengths, KnownBody
+from torchpose.upper_body._articulated_root import Roots, RootStep, covs_of_roots
+from torchpose.upper_body._articulated_torso import shoulder_places, torso_joints
+from torchpose.upper_body._body_lengths import BodyLengths, KnownBody, Lengths, Sizes
 from torchpose.upper_body._estimator import (
     ArmGenerators,
     ArmJoints,
@@ -37,21 +43,47 @@ from torchpose.upper_body._estimator import (
     TrackerModel,
     repeat_last,
 )
-from torchpose.upper_body._lean import lean_angle, rolled, seen_lean
+from torchpose.upper_body._lean import lean_angle, roll, seen_lean
 from torchpose.upper_body._measured_joints import MeasuredJoints
 from torchpose.upper_body._pose_track import PoseTrack
-from torchpose.upper_body._root_grid import RootGrid
+from torchpose.upper_body._root_grid import Moments, RootGrid
+from torchpose.upper_body._torso_likelihood import Root
 
 __all__ = ["ArticulatedFilter", "ArticulatedState"]
 
 _SHARE = 0.2  # seconds over which frames say the same about the torso and about lengths
+_AT_ONCE = 32  # frames whose poses are read together
+
+
+class _Seen(NamedTuple):
+    """What poses are read from: of one frame, or of T frames of B sequences [B T, ...].
+
+    Attributes:
+        frame, facts: the measurements, and what holds for them. tilt: the roll of the tilted axes, [B, 3, 3].
+        sizes: the lengths of the bones. lengths: the belief that they are of.
+        before, after: the moments of the torso before and after the frame.
+        roots: the hypotheses about the root. root: their mean. middle: the middle of the shoulders given
+            that, [B, 1, 3]. shoulders: their places, [B, 2, 1, 3].
+    """
+
+    frame: RayFrame
+    facts: Facts
+    tilt: Tensor
+    sizes: Sizes
+    lengths: Lengths
+    before: Moments
+    after: Moments
+    roots: Roots
+    root: Root
+    middle: Tensor
+    shoulders: Tensor
 
 
 class _Step(NamedTuple):
-    """Result of a frame: the next state, the body but for its arms, and the posterior of the arms."""
+    """Result of a frame: the next state, what its pose is read from, and the posterior of the arms."""
 
     state: ArticulatedState
-    body: SeenBody
+    seen: _Seen
     arms: ArmState
 
 
@@ -144,11 +176,16 @@ class ArticulatedFilter(Estimator):
         self, state: ArticulatedState, measured: MeasuredJoints, progress: bool = False
     ) -> tuple[ArticulatedState, Estimates]:
         """Return the next state and the estimates of T more frames; see `Estimator`."""
-        poses = []
+        poses, waiting = [], []
         for step in self._steps(state, measured, progress):
             state = step.state
-            poses.append(self._pose(step.body, step.arms))
-        return state, estimates_of(poses, self.matrix, self.lengths.names)
+            waiting.append((step.seen, step.arms))
+            if len(waiting) == _AT_ONCE:
+                poses.append(self._poses(waiting))
+                waiting = []
+        if waiting:
+            poses.append(self._poses(waiting))
+        return state, self._estimates(poses, len(measured.uv))
 
     def forward(
         self,
@@ -163,15 +200,13 @@ class ArticulatedFilter(Estimator):
         if smoothing is None:
             return super().forward(measured, joints, arm_generators, lengths, progress)
         state = self.init(len(measured.uv), joints, arm_generators)
-        steps = list(self._steps(state, measured, progress))
+        steps = self._steps(state, measured, progress)
+        seen, arms = zip(*((step.seen, step.arms) for step in steps), strict=True)
         lag = int(smoothing) if isinstance(smoothing, int) else None
-        smoothed = self.chain.smoothed([step.arms for step in steps], lengths, lag)
-        poses = [self._pose(step.body, arms) for step, arms in zip(steps, smoothed, strict=True)]
-        return repeat_last(estimates_of(poses, self.matrix, self.lengths.names), lengths)
-
-    def _pose(self, body: SeenBody, belief: ArmState) -> FramePose:
-        """Return the estimate of a frame."""
-        return pose_of(body, belief, self.matrix, self.model.calibrated)
+        found = list(zip(seen, self.chain.smoothed(arms, lengths, lag), strict=True))
+        parts = (found[i : i + _AT_ONCE] for i in range(0, len(found), _AT_ONCE))
+        poses = [self._poses(part) for part in parts]
+        return repeat_last(self._estimates(poses, len(measured.uv)), lengths)
 
     def _steps(
         self, state: ArticulatedState, measured: MeasuredJoints, progress: bool = False
@@ -179,50 +214,88 @@ class ArticulatedFilter(Estimator):
         """Yield the result of each frame."""
         if self.middle_alone:
             measured = with_middle(measured)
-        frames = frames_as_rays(measured, self.matrix)
-        for frame in tqdm(frames, disable=not progress, desc="frames"):
-            step = self._step(state, frame)
-            state = step.state
+        frames = zip(split(as_rays(measured, self.matrix)), facts_of(measured), strict=True)
+        before, sizes = self.grid.moments(state.root), self.lengths.sizes(state.lengths)
+        for frame, facts in tqdm([*frames], disable=not progress, desc="frames"):
+            step = self._step(state, frame, facts, before, sizes)
+            if step.state.lengths is not state.lengths:
+                sizes = self.lengths.sizes(step.state.lengths)
+            state, before = step.state, step.seen.after
             yield step
 
-    def _step(self, state: ArticulatedState, frame: RayFrame) -> _Step:
-        """Return the result of a frame, computed in tilted axes, in which the torso is upright."""
-        before = self.grid.moments(state.root)
-        moments = seen_lean(state.lean, frame.rays, frame.known, before.depth, self.model.rate)
-        lean = lean_angle(moments)
-        tilted = state._replace(middle=rolled(state.middle, -lean))
-        upright = frame.upright(lean)
+    def _step(
+        self, state: ArticulatedState, frame: RayFrame, facts: Facts, before: Moments, sizes: Sizes
+    ) -> _Step:
+        """Return the result of a frame, computed in tilted axes, in which the torso is upright.
+
+        Args:
+            state: the state before the frame. frame: its measurements. facts: what holds for them.
+            before, sizes: the moments of the torso and the lengths of the bones in that state.
+        """
+        moments = state.lean
+        if facts.leaning:
+            moments = seen_lean(
+                moments,
+                frame.rays[:, : len(UPPER_BODY)],
+                frame.known,
+                before.depth,
+                self.model.rate,
+            )
+        tilt = roll(lean_angle(moments))
+        last = (state.middle[:, None] @ tilt)[:, 0]
+        tilted = upright(frame, facts, tilt)
         # the torso: one hypothesis of the root, the mean of those near the likeliest
-        lengths, slack = self.lengths.metres(state.lengths), self.lengths.slack(state.lengths)
-        roots = self.root.weigh(tilted, upright, lengths, slack)
+        belief, roots = self.root.weigh(state, tilted, last, sizes)
         root = roots.mean
-        middle = self.root.middle(tilted, upright.torso, root)
+        middle = self.root.middle(tilted.torso, root, last, sizes)
+        shoulders = shoulder_places(tilted, root, middle, sizes.torso.width)
         # the arms, given the torso
-        arms = self.root.arms(upright, root, middle, lengths, slack)
+        arms = self.root.arms(tilted, root, shoulders, sizes)
         posterior = (
             self.chain.start(arms) if state.arms is None else self.chain.update(state.arms, arms)
         )
         # the lengths of the bones, given both
         learnt = state.lengths
         if state.frame % self.stride == 0:
-            evidence = partial(self.root.evidence_of_lengths, upright, root, middle)
-            learnt = self.lengths.learn(learnt, upright.torso, root, evidence)
-        torso = self.lengths.torso(state.lengths)
+            evidence = partial(self.root.evidence_of_lengths, tilted, root, shoulders)
+            learnt = self.lengths.learn(learnt, tilted.torso, root, evidence)
+        seen = _Seen(
+            frame, facts, tilt, sizes, state.lengths, before, self.grid.moments(belief),
+            roots, root, middle, shoulders,
+        )  # fmt: skip
+        middle = (middle @ tilt.mT)[:, 0]
+        after = ArticulatedState(belief, learnt, posterior, middle, moments, state.frame + 1)
+        return _Step(after, seen, posterior)
+
+    def _poses(self, found: Sequence[tuple[_Seen, ArmState]]) -> FramePose:
+        """Return the estimates of T frames of all B sequences at once, [B T, ...]."""
+        seen, arms = together(found)
+        frame = upright(seen.frame, seen.facts, seen.tilt)
+        torso, turn = seen.sizes.torso, self.grid.turn
         body = SeenBody(
-            joints=torso_joints(upright, root, middle, torso, self.grid.turn, self.neck_between),
-            known=frame.known,
-            exact=frame.exact,
-            lengths=lengths,
-            bones=self.lengths.shown(state.lengths, before.size, before.of_size),
-            scale=self.lengths.scale.expand(len(middle)),
-            others=covs_of_roots(upright, roots, lengths),
-            far=self.grid.moments(roots.belief).of_depth,
-            turn=root.turn[:, 0],
-            lean=lean,
+            joints=torso_joints(
+                frame,
+                seen.root,
+                seen.middle,
+                seen.shoulders[:, :, 0],
+                torso,
+                turn,
+                self.neck_between,
+            ),
+            known=seen.frame.known,
+            exact=seen.frame.exact,
+            lengths=seen.sizes.metres,
+            bones=self.lengths.shown(seen.lengths, seen.before.size, seen.before.of_size),
+            scale=self.lengths.scale.expand(len(seen.tilt)),
+            others=covs_of_roots(seen.roots, seen.sizes.metres),
+            far=seen.after.of_depth,
+            turn=seen.root.turn[:, 0],
+            tilt=seen.tilt,
         )
-        last = rolled(middle[:, 0], lean)
-        after = ArticulatedState(roots.belief, learnt, posterior, last, moments, state.frame + 1)
-        return _Step(after, body, posterior)
+        return pose_of(body, arms, self.matrix, self.model.calibrated)
+
+    def _estimates(self, poses: Sequence[FramePose], batch_size: int) -> Estimates:
+        return estimates_of(poses, batch_size, self.matrix, self.lengths.names)
 
 
 def _kept(owner: nn.Module, path: str | Path | None, like: Tensor) -> ArmPrior:

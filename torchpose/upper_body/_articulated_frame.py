@@ -3,23 +3,47 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._arm_chain import ArmState
 from torchpose.upper_body._body_lengths import Lengths
 from torchpose.upper_body._face_points import FacePoints
-from torchpose.upper_body._lean import rolled
 from torchpose.upper_body._measured_joints import MeasuredJoints
-from torchpose.upper_body._torso_likelihood import Torso, see_torso
+from torchpose.upper_body._torso_likelihood import NOT_RAISED, REACH, STIFF_SHOULDER, Torso
 
-__all__ = ["ArticulatedState", "RayFrame", "UprightFrame", "frames_as_rays", "with_middle"]
+__all__ = [
+    "ELBOWS",
+    "HANDS",
+    "SHOULDERS",
+    "ArticulatedState",
+    "Facts",
+    "RayFrame",
+    "UprightFrame",
+    "as_rays",
+    "facts_of",
+    "split",
+    "together",
+    "upright",
+    "with_middle",
+]
 
 _NECK = UPPER_BODY.index("neck")
+SHOULDERS, ELBOWS, HANDS = (
+    [UPPER_BODY.index(f"{joint}_{side}") for side in ("left", "right")]
+    for joint in ("shoulder", "elbow", "hand")
+)
+# Of the rays of a frame: all joints, then those of the torso, then elbow and hand of each arm.
+_ROWS = (
+    *range(len(UPPER_BODY)), *SHOULDERS, _NECK, UPPER_BODY.index("head"),
+    *(row for pair in zip(ELBOWS, HANDS, strict=True) for row in pair),
+)  # fmt: skip
+_TORSO, _LIMBS, _LIFTS = slice(8, 12), slice(12, 16), slice(16, 18)
+_ENDS = ((False, False), (False, True), (True, False), (True, True))  # measured: elbow, hand
 
 
 class ArticulatedState(NamedTuple):
@@ -44,73 +68,172 @@ class ArticulatedState(NamedTuple):
 
 
 class RayFrame(NamedTuple):
-    """Measurements of one frame as rays.
+    """Measurements of one frame as rays, or of T frames [B, T, ...] until they are split.
 
     Attributes:
-        rays: K^-1 [u, v, 1] of the eight joints, [B, 8, 3]. known: whether each is measured, [B, 8].
+        rays: K^-1 [u, v, 1] of the joints in `_ROWS`; then, for both arms, the way from the end that is
+            measured to the shoulder over its reach, [.., 0]; then nose, eyes and ears, [.., 0].
+            [B, 18 or 23, 3].
+        known: whether each of the eight joints is measured, [B, 8].
         std: the standard deviation of a pixel over the focal length, [B, 8].
         exact: whether every keypoint has full confidence, [B].
-        face: the rays of nose, eyes and ears; None if there are none.
+        torso, torso_std: known and std of the torso's joints, [B, 4]. lifted: whether the elevation of
+            each arm is seen, [B, 2].
+        limbs: whether elbow and hand of both arms are measured, [B, 2, 2]. own, stiff: the variance along
+            the rays of elbow and hand, which is own + stiff / depth^2 (`_noise_along`), [B, 2, 2] each.
+        extrapolates: whether the evidence of hypotheses about the root is extrapolated to the depths
+            beyond them, [B]. It is where hands are the only limbs, since elbows are sharper than a trend. A
+            torso of one joint has no size in the image, and arms alone are a poor witness of how far it is.
+        face: the confidence of nose, eyes and ears, [B, 5]; None if there are none.
     """
 
     rays: Tensor
     known: Tensor
     std: Tensor
     exact: Tensor
-    face: FacePoints | None
+    torso: Tensor
+    torso_std: Tensor
+    lifted: Tensor
+    limbs: Tensor
+    own: Tensor
+    stiff: Tensor
+    extrapolates: Tensor
+    face: Tensor | None
 
-    def upright(self, lean: Float[Tensor, " B"]) -> UprightFrame:
-        """Return the frame in tilted axes, of a camera that is rolled by the lean of the torso."""
-        rays, face = rolled(self.rays, -lean), self.face
-        if face is not None:
-            face = face._replace(places=rolled(face.places, -lean))
-        torso = see_torso(rays, self.known, self.std)
-        return UprightFrame(rays, self.known, self.std, self.exact, face, torso)
+
+class Facts(NamedTuple):
+    """What holds for some frames, known without a look at their values.
+
+    Attributes:
+        patterns: the pairs of whether elbow and hand are measured that there are among all arms.
+        sided: whether any shoulder is measured. leaning: whether both of anybody are.
+        expected: which of nose, eyes and ears are among the keypoints at all, [5]; None without any.
+    """
+
+    patterns: list[tuple[bool, bool]]
+    sided: bool
+    leaning: bool
+    expected: Tensor | None
 
 
 class UprightFrame(NamedTuple):
-    """One frame in axes in which the torso is upright: as `RayFrame`, and the rays of the torso."""
+    """One frame in axes in which the torso is upright, of a camera that is rolled by its lean.
+
+    Attributes:
+        rays: of the eight joints, [B, 8, 3]. limbs: of elbow and hand of both arms, [B, 2, 2, 3].
+        torso: the rays of the torso. face: nose, eyes and ears, or None.
+        given: the measurements. facts: what holds for them.
+    """
 
     rays: Tensor
-    known: Tensor
-    std: Tensor
-    exact: Tensor
-    face: FacePoints | None
+    limbs: Tensor
     torso: Torso
+    face: FacePoints | None
+    given: RayFrame
+    facts: Facts
 
 
-def frames_as_rays(measured: MeasuredJoints, matrix: Float[Tensor, "3 3"]) -> list[RayFrame]:
-    """Return the measurements of each of T frames as rays.
+def upright(frame: RayFrame, facts: Facts, tilt: Float[Tensor, "B 3 3"]) -> UprightFrame:
+    """Return a frame in tilted axes, of a camera that is rolled by the lean of the torso (`roll`)."""
+    rows = frame.rays @ tilt  # from the right: turned back
+    rise = torch.where(frame.lifted, rows[:, _LIFTS, 1], NOT_RAISED)
+    torso = Torso(rows[:, _TORSO], frame.torso, frame.torso_std, rise, facts.sided)
+    face = None
+    if frame.face is not None and facts.expected is not None:
+        face = FacePoints(rows[:, _LIFTS.stop :, :2], frame.face, facts.expected)
+    limbs = rows[:, _LIMBS].unflatten(1, (2, 2))
+    return UprightFrame(rows[:, :8], limbs, torso, face, frame, facts)
+
+
+def as_rays(measured: MeasuredJoints, matrix: Float[Tensor, "3 3"]) -> RayFrame:
+    """Return the measurements of T frames as rays, [B, T, ...].
 
     Args:
         measured: the measurements, [B, T, ...]. matrix: K of the prior's camera.
     """
     focal = (matrix[0, 0] * matrix[1, 1]).sqrt()
-    uv = measured.uv
+    uv, known = measured.uv, measured.mask
     ones = torch.ones_like(uv[..., :1])
     rays = torch.cat([uv, ones], -1) @ torch.linalg.inv(matrix).mT
     variance = measured.cov.diagonal(dim1=-2, dim2=-1).mean(-1)
-    std = (variance.sqrt() / focal).expand(uv.shape[:3])
+    std = (variance.sqrt() / focal).expand(known.shape)
     sure = measured.confidence
-    exact = measured.mask.any(-1) if sure is None else (sure >= 1).all(-1)
-    parts = zip(
-        rays.unbind(1), measured.mask.unbind(1), std.unbind(1), exact.unbind(1), strict=True
-    )
-    faces = _faces_as_rays(measured, matrix)
-    return [RayFrame(*part, face) for part, face in zip(parts, faces, strict=True)]
-
-
-def _faces_as_rays(
-    measured: MeasuredJoints, matrix: Float[Tensor, "3 3"]
-) -> Sequence[FacePoints | None]:
-    """Return nose, eyes and ears in each frame as rays."""
+    exact = known.any(-1) if sure is None else (sure >= 1).all(-1)
+    lifts, lifted = _lifts(rays, known)
+    rows = [rays[..., list(_ROWS), :], lifts]
     face = measured.face
-    if face is None:
-        return [None] * measured.uv.shape[1]
-    focal, centre = matrix.diagonal()[:2], matrix[:2, 2]
-    places = (face.places - centre) / focal
-    parts = zip(places.unbind(1), face.confidence.unbind(1), strict=True)
-    return [FacePoints(*part, face.expected) for part in parts]
+    if face is not None:
+        places = (face.places - matrix[:2, 2]) / matrix.diagonal()[:2]
+        rows.append(torch.nn.functional.pad(places, (0, 1)))
+    limbs = known[..., list(_ROWS[_LIMBS])].unflatten(-1, (2, 2))
+    torso, torso_std = (x[..., list(_ROWS[_TORSO])] for x in (known, std))
+    return RayFrame(
+        torch.cat(rows, -2), known, std, exact, torso, torso_std, lifted, limbs,
+        *_noise_along(std, known), (torso.sum(-1) > 1) & ~limbs[..., 0].any(-1),
+        None if face is None else face.confidence,
+    )  # fmt: skip
+
+
+def facts_of(measured: MeasuredJoints) -> list[Facts]:
+    """Return what holds for each of T frames; values are looked at once for all of them."""
+    known = measured.mask
+    limbs = known[..., list(_ROWS[_LIMBS])].unflatten(-1, (2, 2))
+    code = 2 * limbs[..., 0].long() + limbs[..., 1]
+    there = (code[..., None] == torch.arange(4, device=code.device)).any(2).any(0)
+    shoulders = known[..., SHOULDERS]
+    sides = torch.stack([shoulders.any(-1), shoulders.all(-1)], -1).any(0)
+    expected = None if measured.face is None else measured.face.expected
+    return [
+        Facts([ends for ends, here in zip(_ENDS, row, strict=True) if here], some, both, expected)
+        for row, (some, both) in zip(there.tolist(), sides.tolist(), strict=True)
+    ]
+
+
+def split(frames: RayFrame) -> list[RayFrame]:
+    """Return each of T frames by itself."""
+    n_frames = frames.known.shape[1]
+    parts = ([None] * n_frames if part is None else part.unbind(1) for part in frames)
+    return [RayFrame(*row) for row in zip(*parts, strict=True)]
+
+
+def together(frames: Sequence[Any]) -> Any:
+    """Return values of T frames [B, ...] as those of B T frames; of facts what holds for any of them."""
+    first = frames[0]
+    if isinstance(first, Tensor):
+        return first if len(frames) == 1 else torch.stack([*frames], 1).flatten(0, 1)
+    if isinstance(first, Facts):
+        return first._replace(sided=any(facts.sided for facts in frames))
+    if not isinstance(first, tuple):
+        return first
+    parts = [together(values) for values in zip(*frames, strict=True)]
+    return type(first)(*parts) if hasattr(first, "_fields") else tuple(parts)
+
+
+def _lifts(
+    rays: Float[Tensor, "B T 8 3"], known: Bool[Tensor, "B T 8"]
+) -> tuple[Float[Tensor, "B T 2 3"], Bool[Tensor, "B T 2"]]:
+    """Return the way from elbow, or else hand, to the shoulder over its reach, and whether it is seen."""
+    elbow = known[..., ELBOWS]
+    end = torch.where(elbow[..., None], rays[..., ELBOWS, :], rays[..., HANDS, :])
+    reach = torch.where(elbow, rays.new_tensor(REACH[0]), rays.new_tensor(REACH[1]))
+    lifts = (rays[..., SHOULDERS, :] - end) / reach[..., None]
+    return lifts, known[..., SHOULDERS] & (elbow | known[..., HANDS])
+
+
+def _noise_along(
+    std: Float[Tensor, "B T 8"], known: Bool[Tensor, "B T 8"]
+) -> tuple[Float[Tensor, "B T 2 2"], Float[Tensor, "B T 2 2"]]:
+    """Return the variance of elbow and hand over the focal length squared, with their near ends'.
+
+    A shoulder that is not measured is as uncertain as its place in a stiff torso at its depth, and an
+    elbow that is not measured as uncertain as its shoulder. What depends on the depth is the second.
+    """
+    shoulder, elbow, hand = (std[..., rows].square() for rows in (SHOULDERS, ELBOWS, HANDS))
+    known_shoulder, known_elbow = known[..., SHOULDERS], known[..., ELBOWS]
+    near = torch.where(known_shoulder, shoulder, 0.0)
+    stiff = torch.where(known_shoulder, 0.0, std.new_tensor(STIFF_SHOULDER**2))
+    own = torch.stack([near + elbow, torch.where(known_elbow, elbow, near) + hand], -1)
+    return own, torch.stack([stiff, torch.where(known_elbow, 0.0, stiff)], -1)
 
 
 def with_middle(measured: MeasuredJoints) -> MeasuredJoints:

@@ -1,28 +1,25 @@
-"""Read estimates of articulated bodies, frame by frame, as the `Estimates` of the tracker."""
+"""Read estimates of articulated bodies, some frames at a time, as the `Estimates` of the tracker."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchpose._core.module_state import outside_inference
 from torchpose.camera._projection import project
 from torchpose.filters._outputs import FilterOutput
-from torchpose.math._rotations import euler_to_matrix
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import upright_axes
-from torchpose.upper_body._arm_chain import ArmChain, ArmState
+from torchpose.upper_body._arm_chain import ArmChain, ArmState, mirrored
+from torchpose.upper_body._articulated_frame import ELBOWS, HANDS, SHOULDERS
 from torchpose.upper_body._estimator import Bones, Estimates, ReadOut
-from torchpose.upper_body._lean import rolled
 
 __all__ = [
-    "ELBOWS",
-    "HANDS",
-    "SHOULDERS",
-    "SIDES",
     "FramePose",
     "SeenBody",
     "bones_of",
@@ -31,12 +28,6 @@ __all__ = [
 ]
 
 _NECK = UPPER_BODY.index("neck")
-SHOULDERS, ELBOWS, HANDS = (
-    [UPPER_BODY.index(f"{joint}_{side}") for side in ("left", "right")]
-    for joint in ("shoulder", "elbow", "hand")
-)
-SIDES = ((1.0, 1.0, 1.0), (-1.0, 1.0, 1.0))
-"""Signs of the axes by which right arms are mirrored."""
 _STD = 0.03  # metres: of every joint in space
 # Factors on the covariances of arms that are seen whole, and of those of which the hand is seen alone, at
 # full confidence: as four sets needed that were in no fit (at the median 0.45 to 0.51 and 0.31 to 0.74).
@@ -57,7 +48,7 @@ class SeenBody(NamedTuple):
         others: the covariances of both elbows, then both hands, over the hypotheses of the root
             (`covs_of_roots`), [B, 4, 3, 3].
         far: the variance of the log of the depth, [B].
-        turn, lean: the turn of the shoulders and the roll of the tilted axes, radians, [B].
+        turn: the turn of the shoulders, radians, [B]. tilt: the roll of the tilted axes, [B, 3, 3].
     """
 
     joints: Tensor
@@ -69,7 +60,7 @@ class SeenBody(NamedTuple):
     others: Tensor
     far: Tensor
     turn: Tensor
-    lean: Tensor
+    tilt: Tensor
 
 
 class FramePose(NamedTuple):
@@ -77,7 +68,7 @@ class FramePose(NamedTuple):
 
     Attributes:
         joints: camera axes, metres, [B, 8, 3]. covs: [B, 8, 3, 3].
-        turn, lean: of the shoulders, radians, [B].
+        turn: of the shoulders, radians, [B]. tilt: of the torso about the optical axis, [B, 3, 3].
         log_evidence: the log-evidence of both arms, [B, 2].
         log_weights: the log-weights of their hypotheses, [B, 2, N].
         bones, bone_covs: the lengths of bones, [B, 4], and their covariances, [B, 4, 4].
@@ -86,7 +77,7 @@ class FramePose(NamedTuple):
     joints: Tensor
     covs: Tensor
     turn: Tensor
-    lean: Tensor
+    tilt: Tensor
     log_evidence: Tensor
     log_weights: Tensor
     bones: Tensor
@@ -104,8 +95,8 @@ def bones_of(
         directions: the directions of left and mirrored right arms, upright axes.
         axes: the rotation from camera to upright axes. lengths: the lengths of the bones, metres.
     """
-    flip = directions.new_tensor(SIDES)[:, None, None]
-    return directions.unflatten(-1, (2, 3)) * flip @ axes * lengths[:, None, None, :2, None]
+    bones = mirrored(directions.unflatten(-1, (2, 3))) @ axes
+    return bones * lengths[:, None, None, :2, None]
 
 
 def pose_of(
@@ -124,22 +115,34 @@ def pose_of(
     axes = upright_axes(body.turn)[:, None, None]
     known = body.known[:, [ELBOWS, HANDS]]
     mean = ArmChain.mean_directions(belief, known.all(1)).flatten(2)[:, :, None]
-    joints = body.joints.clone()
-    arms = joints[:, SHOULDERS, None] + bones_of(mean, axes, body.lengths)[:, :, 0].cumsum(-2)
-    joints[:, ELBOWS], joints[:, HANDS] = arms.unbind(2)
-    covs = _covs(body, belief, joints)
+    shoulders = body.joints[:, SHOULDERS]
+    arms = bones_of(mean, axes, body.lengths).cumsum(-2)
+    ends = bones_of(belief.directions, axes, body.lengths).cumsum(-2)
+    off = (ends - arms).transpose(2, 3)
+    spread = (belief.weight[:, :, None, :, None] * off).mT @ off
+    limbs = (shoulders[:, :, None] + arms[:, :, 0]).transpose(1, 2).flatten(1, 2)
+    joints = body.joints.index_copy(1, _limb_rows(limbs.device), limbs)
+    covs = _covs(body, joints, spread.transpose(1, 2).flatten(1, 2))
     if calibrated:
-        trust = _trust(body.known, body.exact).to(covs)[..., None, None]
-        covs[:, ELBOWS], covs[:, HANDS] = trust * covs[:, ELBOWS], trust * covs[:, HANDS]
-    area = 2 * body.joints[:, SHOULDERS, 2].mean(1).log() - matrix.diagonal()[:2].log().sum()
+        trust = torch.ones_like(joints[..., 0])
+        both = _trust(body.known, body.exact).to(trust).repeat(1, 2)
+        covs = trust.index_copy(1, _limb_rows(covs.device), both)[..., None, None] * covs
+    area = 2 * shoulders[..., 2].mean(1).log() - matrix.diagonal()[:2].log().sum()
     evidence = belief.log_evidence + known.sum(1).to(area) * area[:, None]
     evidence = torch.where(known.any(1), evidence, 0.0)
-    covs = rolled(rolled(covs, body.lean).mT, body.lean)
+    tilt = body.tilt[:, None]
     weight = belief.weight.clamp_min(1e-30).log()
     return FramePose(
-        rolled(joints, body.lean), covs, body.turn, body.lean, evidence, weight,
+        joints @ body.tilt.mT, tilt @ covs @ tilt.mT, body.turn, body.tilt, evidence, weight,
         body.bones.metres, body.bones.covs,
     )  # fmt: skip
+
+
+@cache
+def _limb_rows(device: torch.device) -> Int[Tensor, "4"]:
+    """Return the rows of both elbows and both hands."""
+    with outside_inference():
+        return torch.tensor([*ELBOWS, *HANDS], device=device)
 
 
 def _trust(known: Bool[Tensor, "B 8"], exact: Bool[Tensor, " B"]) -> Float[Tensor, "B 2"]:
@@ -151,40 +154,47 @@ def _trust(known: Bool[Tensor, "B 8"], exact: Bool[Tensor, " B"]) -> Float[Tenso
     return torch.where(exact[:, None], trust, one)
 
 
-def _covs(body: SeenBody, belief: ArmState, joints: Tensor) -> Float[Tensor, "B 8 3 3"]:
-    """Return the covariances of the joints: posterior spread, stiffness of the torso, and common scale."""
-    covs = torch.eye(3).to(joints).mul(_STD**2).expand(*joints.shape, 3).clone()
-    axes = upright_axes(body.turn)[:, None, None]
-    ends = bones_of(belief.directions, axes, body.lengths).cumsum(-2)
-    for limb, rows in enumerate((ELBOWS, HANDS)):
-        off = ends[..., limb, :] - (joints[:, rows] - joints[:, SHOULDERS])[:, :, None]
-        covs[:, rows] += (belief.weight[..., None] * off).mT @ off
-        covs[:, rows] += body.others[:, 2 * limb : 2 * limb + 2]
+def _covs(
+    body: SeenBody, joints: Float[Tensor, "B 8 3"], spread: Float[Tensor, "B 4 3 3"]
+) -> Float[Tensor, "B 8 3 3"]:
+    """Return the covariances of the joints: posterior spread, stiffness of the torso, and common scale.
+
+    Args:
+        body: the body but for its arms. joints: all of its joints. spread: that of both elbows, then both
+            hands, over the posterior.
+    """
     apart = joints - joints[:, _NECK, None]
-    scale = body.scale.square()[:, None, None, None]
-    covs = covs + scale * apart[..., :, None] * apart[..., None, :]
-    inferred = ~body.known[:, SHOULDERS]  # seen hands are as far from them as the body is away
-    across = apart[:, HANDS] * apart.new_tensor([1.0, 1.0, 0.0]) * inferred[..., None]
-    covs[:, HANDS] += body.far[:, None, None, None] * across[..., :, None] * across[..., None, :]
-    return covs
+    outer = apart[..., :, None] * apart[..., None, :]
+    still = _STD**2 * torch.eye(3, dtype=joints.dtype, device=joints.device)
+    covs = still + body.scale.square()[:, None, None, None] * outer
+    # seen hands are as far from shoulders that are not as the body is away
+    inferred = body.far[:, None] * ~body.known[:, SHOULDERS]
+    flat = torch.nn.functional.pad(outer[:, HANDS, :2, :2], (0, 1, 0, 1))
+    limbs = spread + body.others
+    limbs = torch.cat([limbs[:, :2], limbs[:, 2:] + inferred[..., None, None] * flat], 1)
+    return covs.index_add(1, _limb_rows(joints.device), limbs)
 
 
 def estimates_of(
     poses: Sequence[FramePose],
+    batch_size: int,
     matrix: Float[Tensor, "3 3"],
     names: tuple[str, ...],
 ) -> Estimates:
     """Return the estimates of both arms and the poses they were made from.
 
     Args:
-        poses: the pose of each frame. matrix: K of the prior's camera. names: the names of the bone
-            lengths.
+        poses: the poses of some frames of all B sequences at a time, [B T', ...]. batch_size: B.
+        matrix: K of the prior's camera. names: the names of the bone lengths.
     """
-    stacked = FramePose(*(torch.stack(values, 1) for values in zip(*poses, strict=True)))
+    stacked = FramePose(*(
+        torch.cat([value.unflatten(0, (batch_size, -1)) for value in values], 1)
+        for values in zip(*poses, strict=True)
+    ))  # fmt: skip
     neck = stacked.joints[:, :, _NECK]
-    level = torch.zeros_like(stacked.turn)
-    angles = torch.stack([stacked.lean, level, stacked.turn], -1)
-    back = euler_to_matrix(angles).mT  # the same in either order
+    lean = torch.atan2(stacked.tilt[..., 1, 0], stacked.tilt[..., 0, 0])
+    angles = torch.stack([lean, torch.zeros_like(lean), stacked.turn], -1)
+    back = upright_axes(stacked.turn) @ stacked.tilt.mT
     joints = (stacked.joints - neck[:, :, None]) @ back.mT
     covs = back[:, :, None] @ stacked.covs @ back.mT[:, :, None]
     uv = project(joints, matrix, back.mT, neck)[..., :2]

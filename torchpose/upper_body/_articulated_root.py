@@ -6,29 +6,25 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.math._rotations import within_half_turn
 from torchpose.skeleton._torso import upright_axes
-from torchpose.upper_body._arm_chain import ArmChain, ArmInput, Arms
+from torchpose.upper_body._arm_chain import ArmChain, ArmInput, Arms, mirrored
 from torchpose.upper_body._articulated_frame import ArticulatedState, UprightFrame
-from torchpose.upper_body._articulated_poses import ELBOWS, HANDS, SHOULDERS, SIDES, bones_of
+from torchpose.upper_body._articulated_poses import bones_of
 from torchpose.upper_body._articulated_torso import shoulder_places
-from torchpose.upper_body._body_lengths import BodyLengths
+from torchpose.upper_body._body_lengths import BodyLengths, Sizes
 from torchpose.upper_body._face_points import face_evidence
 from torchpose.upper_body._root_grid import RootGrid
-from torchpose.upper_body._torso_likelihood import (
-    STIFF_SHOULDER,
-    Root,
-    Torso,
-    middle_of_shoulders,
-)
+from torchpose.upper_body._torso_likelihood import Root, Torso, middle_of_shoulders
 
 __all__ = ["RootStep", "Roots", "covs_of_roots"]
 
 _ROOTS = 10  # hypotheses of the root that arms are weighed for
 _COARSE_ANGLES, _COARSE_AROUND = 11, 24  # of limbs, while roots are weighed
+_SLACK = 0.018  # metres: joints of recordings are not the ends of stiff bones
 _MODE = math.radians(45.0)  # turns farther than that from the likeliest are another mode
 
 
@@ -36,16 +32,16 @@ class Roots(NamedTuple):
     """Hypotheses about depth, turn and size of the torso in a frame.
 
     Attributes:
-        belief: the posterior over the grid, [B, S, Z, P]. root: the M likeliest hypotheses.
-        near: the share of each in the estimate, [B, M]. arms: the hypotheses about the arms given each.
-        middle: the middle of the shoulders given each, [B, M, 3].
+        root: the M likeliest hypotheses. near: the share of each in the estimate, [B, M].
+        middle: the middle of the shoulders given each, [B, M, 3]. shoulders: their places, [B, 2, M, 3].
+        directions: the mean directions of both arms given each, [B, 2, M, 6].
     """
 
-    belief: Tensor
     root: Root
     near: Tensor
-    arms: Arms
     middle: Tensor
+    shoulders: Tensor
+    directions: Tensor
 
     @property
     def mean(self) -> Root:
@@ -74,87 +70,78 @@ class RootStep(NamedTuple):
     stride: int
 
     def weigh(
-        self, state: ArticulatedState, frame: UprightFrame, lengths: Tensor, slack: Tensor
-    ) -> Roots:
+        self, state: ArticulatedState, frame: UprightFrame, last: Tensor, sizes: Sizes
+    ) -> tuple[Float[Tensor, "B S Z P"], Roots]:
         """Return the posterior over the grid and the likeliest hypotheses.
 
         Args:
             state: the state before the frame. frame: the measurements, in tilted axes.
-            lengths: the lengths of the bones, metres, [B, 4]. slack: standard deviations of the ends of
-                both bones of an arm for want of their lengths, metres, [B, 2].
+            last: the middle of the shoulders in the frame before, in the same axes, [B, 3].
+            sizes: the lengths of the bones.
         """
         power = 1.0 if state.arms is None else 1 / self.stride
-        size = self.lengths.torso(state.lengths)
-        believed = self.grid.predict(state.root).log()
-        believed = believed + power * self.grid.evidence(frame.torso, size)
+        likelihood = self.grid.likelihood(frame.torso, sizes.torso, power)
+        believed = self.grid.predict(state.root) * likelihood
         if frame.face is not None:
-            std = frame.std.amin(1)
+            std = frame.given.std.amin(1)
             of_face = face_evidence(frame.face, std, self.grid.depth, self.grid.turn)
-            believed = believed + of_face[:, None]
+            believed = believed * of_face[:, None].exp()
         root = self.grid.best(believed, _ROOTS)
-        middle = self.middle(state, frame.torso, root)
-        arms = self.coarse_arms(frame, root, middle, lengths, slack)
-        seen = frame.known[:, [ELBOWS, HANDS]].sum((1, 2)).to(root.depth)
+        middle = self.middle(frame.torso, root, last, sizes)
+        shoulders = shoulder_places(frame, root, middle, sizes.torso.width)
+        arms = self._coarse(_arm_input(frame, root, shoulders, sizes.metres, sizes.slack))
+        seen = frame.given.limbs.sum((1, 2)).to(root.depth)
         evidence = power * (
             self.chain.evidence_of_both(arms) + 2 * seen[:, None] * root.depth.log()
         )
-        belief = self.grid.belief(believed, root, evidence, _extrapolates(frame))
+        belief = self.grid.belief(believed, root, evidence, frame.given.extrapolates)
         root = root._replace(log_weight=root.log_weight + evidence)
-        return Roots(belief, root, _shares_of_mode(root), arms, middle)
+        return belief, Roots(root, _shares_of_mode(root), middle, shoulders, arms.mean_directions)
 
-    def middle(self, state: ArticulatedState, torso: Torso, root: Root) -> Float[Tensor, "B M 3"]:
+    def middle(
+        self, torso: Torso, root: Root, last: Float[Tensor, "B 3"], sizes: Sizes
+    ) -> Float[Tensor, "B M 3"]:
         """Return the middle of the shoulders; on its last ray where no joint of the torso is measured."""
-        size = self.lengths.torso(state.lengths)
-        found = middle_of_shoulders(torso, root, size)
-        before = (state.middle / state.middle[:, 2:])[:, None] * root.depth[..., None]
+        found = middle_of_shoulders(torso, root, sizes.torso)
+        before = (last / last[:, 2:])[:, None] * root.depth[..., None]
         return torch.where(torso.known.any(1)[:, None, None], found, before)
 
     def arms(
-        self,
-        frame: UprightFrame,
-        root: Root,
-        middle: Float[Tensor, "B M 3"],
-        lengths: Float[Tensor, "B 4"],
-        slack: Float[Tensor, "B 2"],
+        self, frame: UprightFrame, root: Root, shoulders: Float[Tensor, "B 2 M 3"], sizes: Sizes
     ) -> Arms:
         """Return the hypotheses about both arms for each hypothesis of the root."""
-        return self.chain.hypotheses(_arm_input(frame, root, middle, lengths, slack))
-
-    def coarse_arms(
-        self,
-        frame: UprightFrame,
-        root: Root,
-        middle: Float[Tensor, "B M 3"],
-        lengths: Float[Tensor, "B 4"],
-        slack: Float[Tensor, "B 2"],
-    ) -> Arms:
-        """Return fewer hypotheses about both arms, enough to compare roots and lengths by."""
-        arm = _arm_input(frame, root, middle, lengths, slack)
-        return self.chain.hypotheses(arm, angles=_COARSE_ANGLES, around=_COARSE_AROUND)
+        return self.chain.hypotheses(_arm_input(frame, root, shoulders, sizes.metres, sizes.slack))
 
     def evidence_of_lengths(
         self,
         frame: UprightFrame,
         root: Root,
-        middle: Float[Tensor, "B 1 3"],
-        lengths: Float[Tensor, "B 4"],
-    ) -> Float[Tensor, " B"]:
-        """Return the log-evidence of both arms under bones of these lengths, metres."""
-        stiff = torch.zeros_like(lengths[:, :2])
-        arms = self.coarse_arms(frame, root, middle, lengths, stiff)
-        return arms.log_evidence.sum((1, 2))
+        shoulders: Float[Tensor, "B 2 1 3"],
+        lengths: Float[Tensor, "B N 4"],
+    ) -> Float[Tensor, "B N"]:
+        """Return the log-evidence of both arms under bones of each of these lengths, metres."""
+        count = lengths.shape[1]
+        stiff = torch.zeros_like(lengths[:, 0, :2])
+        arm = _arm_input(frame, root, shoulders, lengths[:, 0], stiff)
+        arm = arm._replace(
+            shoulder=arm.shoulder.expand(-1, -1, count, -1),
+            lengths=lengths[:, None, :, :2].expand(-1, 2, -1, -1),
+        )
+        return self._coarse(arm).log_evidence.sum(1)
+
+    def _coarse(self, arm: ArmInput) -> Arms:
+        """Return fewer hypotheses about both arms, enough to compare roots and lengths by."""
+        return self.chain.hypotheses(arm, angles=_COARSE_ANGLES, around=_COARSE_AROUND)
 
 
-def covs_of_roots(
-    frame: UprightFrame, roots: Roots, lengths: Float[Tensor, "B 4"]
-) -> Float[Tensor, "B 4 3 3"]:
+def covs_of_roots(roots: Roots, lengths: Float[Tensor, "B 4"]) -> Float[Tensor, "B 4 3 3"]:
     """Return the covariances of both elbows, then both hands, over the hypotheses of the root.
 
     They are the second moments about the mean of the hypotheses near the likeliest turn.
     """
-    _, root, near, arms, middle = roots
-    shoulder = shoulder_places(frame, root, middle, lengths[:, 2]) - middle[:, None]
-    bones = bones_of(arms.mean_directions, upright_axes(root.turn)[:, None], lengths)
+    root, near = roots.root, roots.near
+    shoulder = roots.shoulders - roots.middle[:, None]
+    bones = bones_of(roots.directions, upright_axes(root.turn)[:, None], lengths)
     ends = shoulder[..., None, :] + bones.cumsum(-2)
     used = (near[:, None, :, None, None] * ends).sum(2, keepdim=True)
     off = (ends - used).permute(0, 3, 1, 2, 4).flatten(1, 2)
@@ -165,34 +152,23 @@ def covs_of_roots(
 def _arm_input(
     frame: UprightFrame,
     root: Root,
-    middle: Float[Tensor, "B M 3"],
+    shoulders: Float[Tensor, "B 2 M 3"],
     lengths: Float[Tensor, "B 4"],
     slack: Float[Tensor, "B 2"],
 ) -> ArmInput:
     """Return the measurements of both arms given each hypothesis of the root."""
-    flip = root.depth.new_tensor(SIDES)
-    shoulder = shoulder_places(frame, root, middle, lengths[:, 2]) * flip[:, None]
-    rays = torch.stack([frame.rays[:, ELBOWS], frame.rays[:, HANDS]], 2) * flip[:, None]
-    std = _noise_along(frame, root)
-    known = torch.stack([frame.known[:, ELBOWS], frame.known[:, HANDS]], -1)
+    given, depth = frame.given, shoulders[..., 2:].clamp_min(0.1)
+    noise = given.own + given.stiff / root.depth.mean(1).square()[:, None, None]
+    loose = (slack.square() + _SLACK**2)[:, None, None]
     axes = upright_axes(root.turn)
-    axes = torch.stack([axes, flip[1, :, None] * axes * flip[1]], 1)
+    turned = axes.mT[:, None]
+    shoulder = mirrored((shoulders[..., None, :] @ turned)[..., 0, :])
+    rays = mirrored(frame.limbs[:, :, None] @ turned)
     bones = lengths[:, None, None, :2].expand(*shoulder.shape[:3], 2)
-    return ArmInput(shoulder, rays, known, std, axes, bones, slack)
-
-
-def _noise_along(frame: UprightFrame, root: Root) -> Float[Tensor, "B 2 2"]:
-    """Return the standard deviation of elbow and hand over the focal length, with their near ends'.
-
-    A shoulder that is not measured is as uncertain as its place in a stiff torso, and an elbow that is
-    not measured as uncertain as its shoulder.
-    """
-    joints = [SHOULDERS, ELBOWS, HANDS]
-    seen, known = frame.std[:, joints].square(), frame.known[:, joints]
-    stiff = (STIFF_SHOULDER / root.depth.mean(1)).square()[:, None]
-    shoulder = torch.where(known[:, 0], seen[:, 0], stiff)
-    elbow = torch.where(known[:, 1], seen[:, 1], shoulder)
-    return torch.stack([shoulder + seen[:, 1], elbow + seen[:, 2]], -1).sqrt()
+    return ArmInput(
+        shoulder, rays, given.limbs, frame.facts.patterns,
+        noise[:, :, None] * depth.square() + loose, axes, bones,
+    )  # fmt: skip
 
 
 def _shares_of_mode(root: Root) -> Float[Tensor, "B M"]:
@@ -202,12 +178,3 @@ def _shares_of_mode(root: Root) -> Float[Tensor, "B M"]:
     off = within_half_turn(root.turn - best)
     near = weight * (-0.5 * (off / _MODE).square()).exp()
     return near / near.sum(1, keepdim=True)
-
-
-def _extrapolates(frame: UprightFrame) -> Bool[Tensor, " B"]:
-    """Return whether the evidence of the hypotheses is extrapolated to the depths beyond them.
-
-    It is where hands are the only limbs, since elbows are sharper than a trend. A torso of one joint has
-    no size in the image, and arms alone are a poor witness of how far it is.
-    """
-    return (frame.torso.known.sum(1) > 1) & ~frame.known[:, ELBOWS].any(1)

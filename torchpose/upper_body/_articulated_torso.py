@@ -8,8 +8,7 @@ from torch import Tensor
 
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.skeleton._torso import KINECT_NECK
-from torchpose.upper_body._articulated_frame import UprightFrame
-from torchpose.upper_body._articulated_poses import SHOULDERS
+from torchpose.upper_body._articulated_frame import SHOULDERS, UprightFrame
 from torchpose.upper_body._face_points import head_in_face
 from torchpose.upper_body._torso_likelihood import (
     Root,
@@ -36,15 +35,18 @@ def shoulder_places(
     half = half_widths(width, frame.torso.raised(root.depth)) * root.size[..., None]
     offsets = shoulder_offsets(root.turn, half)
     inferred = (middle[..., None, :] + offsets).transpose(1, 2)
-    ray = frame.rays[:, SHOULDERS, None]
+    if not frame.torso.sided:
+        return inferred
+    ray = frame.torso.rays[:, :2, None]
     on_ray = ray / ray[..., 2:] * inferred[..., 2:]
-    return torch.where(frame.known[:, SHOULDERS, None, None], on_ray, inferred)
+    return torch.where(frame.torso.known[:, :2, None, None], on_ray, inferred)
 
 
 def torso_joints(
     frame: UprightFrame,
     root: Root,
     middle: Float[Tensor, "B 1 3"],
+    shoulders: Float[Tensor, "B 2 3"],
     lengths: TorsoLengths,
     angles: Float[Tensor, " P"],
     neck_between: bool,
@@ -53,11 +55,11 @@ def torso_joints(
 
     Args:
         frame: the measurements. root: the hypothesis. middle: the middle of the shoulders.
-        lengths: the lengths of the torso. angles: the turns of heads that are tried (`head_in_face`).
+        shoulders: their places. lengths: the lengths of the torso.
+        angles: the turns of heads that are tried (`head_in_face`).
         neck_between: whether the neck was measured as the middle of the shoulders, so that it is put
             between that and the head.
     """
-    shoulders = shoulder_places(frame, root, middle, lengths.width)[:, :, 0]
     neck, head = _spine(frame, root, middle, lengths, angles)
     if neck_between:
         neck = shoulders.mean(1).lerp(head, KINECT_NECK.fraction)
@@ -74,10 +76,10 @@ def _spine(
     upright = middle + spine_places(lengths) * root.size[..., None]
     ray = frame.rays[:, _SPINE]
     on_ray = ray / ray[..., 2:] * upright[..., 2:]
-    known = frame.known[:, _SPINE, None]
+    known = frame.given.known[:, _SPINE, None]
     neck, head = torch.where(known, on_ray, upright).unbind(1)
     if frame.face is not None:
-        std, depth, turn = frame.std.amin(1), upright[:, 1, 2], root.turn[:, 0]
+        std, depth, turn = frame.given.std.amin(1), upright[:, 1, 2], root.turn[:, 0]
         of_face, visible = head_in_face(frame.face, std, depth, turn, angles)
         head = torch.where(visible[:, None] & ~known[:, 1], of_face, head)
     return neck, head

@@ -23,7 +23,7 @@ from torchpose.upper_body._torso_likelihood import (
     inward_shares,
 )
 
-__all__ = ["BODY_LENGTHS", "BodyLengths", "KnownBody", "Lengths"]
+__all__ = ["BODY_LENGTHS", "BodyLengths", "KnownBody", "Lengths", "Sizes"]
 
 BODY_LENGTHS = ("upper_arm", "forearm", "shoulder_width", "head_height")
 """Lengths that may be given: shoulder to elbow, elbow to the measured hand or wrist, between the
@@ -73,6 +73,19 @@ class Lengths(NamedTuple):
     precision: Tensor
 
 
+class Sizes(NamedTuple):
+    """Lengths of a body, metres.
+
+    Attributes:
+        metres: of `BODY_LENGTHS`, [B, 4]. slack: the standard deviations of both bones of an arm, [B, 2];
+            0 of the surest length. torso: the lengths of the torso with their standard deviations.
+    """
+
+    metres: Tensor
+    slack: Tensor
+    torso: TorsoLengths
+
+
 class BodyLengths:
     """Assumed-density filter of the lengths of a body.
 
@@ -109,6 +122,10 @@ class BodyLengths:
         if known.lengths is not None:
             self._measure(known.lengths)
         self.surest = int(self.spread.argmin())
+        # the surest length is that of the common scale, which moves no pixel
+        self._unsure = like.new_tensor([float(i != self.surest) for i in range(2)])
+        steps = torch.eye(2, 4, dtype=like.dtype, device=like.device) * _NUDGE
+        self._nudges = torch.cat([torch.zeros_like(steps[:1]), steps, -steps])
 
     def _grow(self, height: float) -> None:
         """Expect the lengths of a person of this height."""
@@ -216,34 +233,25 @@ class BodyLengths:
         metres = self.metres(lengths) * size[:, None] ** torso
         return Bones(self.names, metres - self.lower, metres[:, :, None] * logs * metres[:, None])
 
-    def slack(self, lengths: Lengths) -> Float[Tensor, "B 2"]:
-        """Return the standard deviations of both bones of an arm, metres; 0 of the surest length.
-
-        The surest length is that of the common scale, which moves no pixel.
-        """
-        std = self.metres(lengths) * lengths.precision.rsqrt()
-        rows = torch.arange(len(BODY_LENGTHS), device=std.device)
-        return torch.where(rows == self.surest, 0.0, std)[:, :2]
-
-    def torso(self, lengths: Lengths) -> TorsoLengths:
-        """Return the lengths of the torso with their standard deviations."""
-        metres = self.metres(lengths)[:, 2:]
-        std = metres * lengths.precision[:, 2:].rsqrt()
-        (width, height), (width_std, height_std) = metres.unbind(1), std.unbind(1)
-        return TorsoLengths(width, height, width_std, height_std, self.neck)
+    def sizes(self, lengths: Lengths) -> Sizes:
+        """Return the lengths as other filters take them."""
+        metres = self.metres(lengths)
+        std = metres * lengths.precision.rsqrt()
+        torso = TorsoLengths(metres[:, 2], metres[:, 3], std[:, 2], std[:, 3], self.neck)
+        return Sizes(metres, std[:, :2] * self._unsure, torso)
 
     def learn(
         self,
         lengths: Lengths,
         torso: Torso,
         root: Root,
-        evidence: Callable[[Float[Tensor, "B 4"]], Float[Tensor, " B"]],
+        evidence: Callable[[Float[Tensor, "B N 4"]], Float[Tensor, "B N"]],
     ) -> Lengths:
         """Return the lengths after a frame: one Newton step on their log-evidence.
 
         Args:
             lengths: the belief before the frame. torso: the measured torso. root: one hypothesis about it.
-            evidence: maps lengths, metres, to the log-evidence of the arms.
+            evidence: maps some lengths, metres, to the log-evidence of the arms under each.
         """
         slope, bend = self._slopes_of_arms(lengths, evidence)
         width, height = self._slopes_of_torso(lengths, torso, root)
@@ -262,16 +270,9 @@ class BodyLengths:
 
         The curvature is the negative second derivative; both are central differences.
         """
-        nudges = lengths.mean.new_tensor(
-            [[0, 0, 0, 0], [1, 0, 0, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0]]
-        )
-        at, *pairs = (
-            evidence(self.metres(lengths._replace(mean=lengths.mean + nudge)))
-            for nudge in nudges * _NUDGE
-        )
-        slope = [(pairs[i] - pairs[i + 1]) / (2 * _NUDGE) for i in (0, 2)]
-        bend = [(2 * at - pairs[i] - pairs[i + 1]) / _NUDGE**2 for i in (0, 2)]
-        return torch.stack(slope, 1), torch.stack(bend, 1)
+        found = evidence(self.usual * (lengths.mean[:, None] + self._nudges).exp())
+        at, more, less = found[:, :1], found[:, 1:3], found[:, 3:]
+        return (more - less) / (2 * _NUDGE), (2 * at - more - less) / _NUDGE**2
 
     def _slopes_of_torso(
         self, lengths: Lengths, torso: Torso, root: Root

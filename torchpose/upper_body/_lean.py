@@ -11,7 +11,7 @@ from torch import Tensor
 from torchpose.skeleton._joint_sets import UPPER_BODY
 from torchpose.upper_body._torso_likelihood import with_axes
 
-__all__ = ["lean_angle", "rolled", "seen_lean"]
+__all__ = ["lean_angle", "roll", "rolled", "seen_lean"]
 
 _LEFT, _RIGHT = (UPPER_BODY.index(f"shoulder_{side}") for side in ("left", "right"))
 _MEMORY = 0.5  # seconds
@@ -57,6 +57,13 @@ def lean_angle(moments: Float[Tensor, "B 2"]) -> Float[Tensor, " B"]:
     first = torch.where(seen, moments[:, 0], torch.ones_like(moments[:, 0]))
     angle = torch.atan2(moments[:, 1], first) / 2
     return angle**3 / (angle.square() + _LEVEL**2)
+
+
+def roll(angle: Float[Tensor, " B"]) -> Float[Tensor, "B 3 3"]:
+    """Return the rotation by an angle about the camera's optical axis."""
+    cos, sin, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
+    rows = [cos, -sin, zero, sin, cos, zero, zero, zero, torch.ones_like(angle)]
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
 def rolled(

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
+
+from torchpose._core.module_state import outside_inference
 
 __all__ = ["LimbNodes", "nodes_anywhere", "nodes_on_ray", "sphere_points"]
 
@@ -19,22 +22,28 @@ class LimbNodes(NamedTuple):
     """Hypotheses about one limb.
 
     Attributes:
-        ends: the far ends of the limb, camera axes, [..., G, 3]. directions: unit vectors from its near
-            end to them.
+        start: the near end of the limb, [..., 3]. length: its length, [...].
+        directions: unit vectors from there to the far end, [..., G, 3].
         log_weight: the log of the likelihood of the pixel times the node's share of the sphere of
             directions, [..., G]. A sum over nodes, times a density over directions, is its integral.
     """
 
-    ends: Tensor
+    start: Tensor
+    length: Tensor
     directions: Tensor
     log_weight: Tensor
 
+    @property
+    def ends(self) -> Float[Tensor, "*batch G 3"]:
+        """Return the far ends of the limb."""
+        return self.start[..., None, :] + self.length[..., None, None] * self.directions
+
 
 def nodes_on_ray(
-    start: Float[Tensor, "*batch 3"],
-    ray: Float[Tensor, "*batch 3"],
-    length: Float[Tensor, "*batch"],
-    std: Float[Tensor, "*batch"],
+    start: Float[Tensor, "*#batch 3"],
+    ray: Float[Tensor, "*#batch 3"],
+    length: Float[Tensor, "*#batch"],
+    std: Float[Tensor, "*#batch"],
     n_nodes: int,
 ) -> LimbNodes:
     """Return nodes at even angles phi between the limb and the plane square to its end's ray.
@@ -55,33 +64,42 @@ def nodes_on_ray(
     """
     along = normalize(ray, dim=-1)
     across = (start * along).sum(-1, keepdim=True) * along - start
-    rho = torch.linalg.vector_norm(across, dim=-1)
-    angles = torch.linspace(-_STEEPEST, _STEEPEST, n_nodes, dtype=start.dtype, device=start.device)
-    phi = torch.deg2rad(angles)
-    inward = across / rho.clamp_min(1e-6)[..., None]
-    directions = (
-        inward[..., None, :] * phi.cos()[:, None] + along[..., None, :] * phi.sin()[:, None]
-    )
-    off = (rho[..., None] - length[..., None] * phi.cos()) / std[..., None]
+    rho = torch.linalg.vector_norm(across, dim=-1, keepdim=True)
+    cos, sin = _even_angles(n_nodes, start.dtype, start.device)
+    inward = across / rho.clamp_min(1e-6)
+    directions = torch.addcmul(along[..., None, :] * sin, inward[..., None, :], cos)
+    off = (rho - length[..., None] * cos[:, 0]) / std[..., None]
     step = math.log(math.radians(2 * _STEEPEST / (n_nodes - 1)))
-    constant = step - 0.5 * math.log(2 * math.pi) - std.log() - length.log()
-    ends = start[..., None, :] + length[..., None, None] * directions
-    return LimbNodes(ends, directions, constant[..., None] - 0.5 * off.square())
+    constant = step - 0.5 * math.log(2 * math.pi) - (std * length).log()
+    log_weight = constant[..., None] - 0.5 * off.square()
+    return LimbNodes(start, length, directions, log_weight)
 
 
 def nodes_anywhere(
-    start: Float[Tensor, "*batch 3"], length: Float[Tensor, "*batch"], n_nodes: int
+    start: Float[Tensor, "*batch 3"],
+    length: Float[Tensor, "*#batch"],
+    directions: Float[Tensor, "*#batch G 3"],
 ) -> LimbNodes:
-    """Return nodes evenly over the sphere of directions, for a limb whose end is not measured.
+    """Return nodes over the sphere of directions, for a limb whose end is not measured.
 
     Args:
-        start: the near end of the limb, metres. length: L. n_nodes: G.
+        start: the near end of the limb, metres. length: L. directions: unit vectors spread evenly
+            (`sphere_points`).
     """
-    points = sphere_points(n_nodes).to(start)
-    directions = points.expand(*start.shape[:-1], -1, -1)
-    ends = start[..., None, :] + length[..., None, None] * directions
-    weight = start.new_full(directions.shape[:-1], math.log(4 * math.pi / n_nodes))
-    return LimbNodes(ends, directions, weight)
+    n_nodes = directions.shape[-2]
+    weight = start.new_full((), math.log(4 * math.pi / n_nodes))
+    return LimbNodes(start, length, directions, weight.expand(*start.shape[:-1], n_nodes))
+
+
+@cache
+def _even_angles(
+    n_nodes: int, dtype: torch.dtype, device: torch.device
+) -> tuple[Float[Tensor, "G 1"], Float[Tensor, "G 1"]]:
+    """Return cosine and sine of the angles phi of nodes on a ray."""
+    with outside_inference():
+        angles = torch.linspace(-_STEEPEST, _STEEPEST, n_nodes, dtype=dtype, device=device)
+        phi = torch.deg2rad(angles)[:, None]
+        return phi.cos(), phi.sin()
 
 
 def sphere_points(n_points: int) -> Float[Tensor, "G 3"]:

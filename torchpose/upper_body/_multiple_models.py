@@ -20,7 +20,7 @@ from torchpose.math._rotations import (
 )
 from torchpose.priors._arms import ArmPrior
 from torchpose.upper_body._articulated import ArticulatedFilter, ArticulatedState
-from torchpose.upper_body._articulated_poses import ELBOWS, HANDS
+from torchpose.upper_body._articulated_frame import ELBOWS, HANDS
 from torchpose.upper_body._estimator import (
     ArmGenerators,
     ArmJoints,

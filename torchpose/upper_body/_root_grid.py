@@ -21,6 +21,7 @@ _TURN_STEP, _TURN_STD = 15.0, 20.0  # degrees
 _BROAD_TURN = 0.2  # share of the turns that are all alike likely
 _SPEED, _TURN_SPEED = 0.08, 60.0  # share of the depth, and degrees, after one second
 _MOST_SAID = 0.1  # nats of extrapolated evidence
+_MOST = 500.0  # nats by which a cell may gain, which has next to no belief then
 _LOST = 1e-6  # share of a frame's belief that restarts from the prior
 
 
@@ -57,6 +58,7 @@ class RootGrid:
         steps = torch.arange(-beyond, n_depths + beyond, dtype=like.dtype, device=like.device)
         self._relative = _NEAREST * (_DEPTH_STEP * steps).exp()
         self.depth = self._relative[beyond:-beyond]
+        self._log_depth = self.depth.log()
         self.log_size = _CELLS * _DEPTH_STEP * (steps[:_SIZES] - steps[_SIZES // 2])
         n_turns = round(360.0 / _TURN_STEP)
         degrees = _TURN_STEP * (torch.arange(n_turns, dtype=like.dtype) - n_turns // 2)
@@ -66,6 +68,7 @@ class RootGrid:
             -0.5 * ((self.depth.log() - math.log(_DEPTH)) / _DEPTH_STD).square(), 0
         )
         self.prior = ((1 - _BROAD_TURN) * usual + _BROAD_TURN / n_turns) * near[:, None]
+        self._sides = torch.arange(2, device=like.device)[:, None]
         self._spread = (
             _share_that_moves(_SPEED / math.sqrt(fps), _DEPTH_STEP),
             _share_that_moves(_TURN_SPEED / math.sqrt(fps), _TURN_STEP),
@@ -88,38 +91,51 @@ class RootGrid:
         """
         along, round_ = self._spread
         moved = _diffused(belief, along)
-        moved = moved + round_ * (moved.roll(1, -1) + moved.roll(-1, -1) - 2 * moved)
-        anew = belief.sum((-2, -1), keepdim=True) * self.prior
-        return (1 - _LOST) * moved + _LOST * anew
+        beside = moved.roll(1, -1) + moved.roll(-1, -1)
+        stays = (1 - _LOST) * (1 - 2 * round_)
+        moved = torch.add(stays * moved, beside, alpha=(1 - _LOST) * round_)
+        anew = belief.sum((-2, -1), keepdim=True)
+        return torch.addcmul(moved, anew, self.prior, value=_LOST)
 
-    def evidence(self, torso: Torso, lengths: TorsoLengths) -> Float[Tensor, "B S Z P"]:
-        """Return the log-likelihood of the torso's joints at every size, depth and turn of the grid."""
-        shape = (len(torso.rays), len(self._relative), len(self.turn))
+    def likelihood(
+        self, torso: Torso, lengths: TorsoLengths, power: float = 1.0
+    ) -> Float[Tensor, "B S Z #P"]:
+        """Return the likelihood of the torso's joints at every size, depth and turn, of largest value 1.
+
+        Args:
+            torso: the measured joints. lengths: the lengths of the torso. power: its exponent.
+        """
+        turn = self.turn if torso.sided else self.turn[:1]
+        shape = (len(torso.rays), len(self._relative), len(turn))
         relative = self._relative[:, None].expand(shape)
-        found = torso_log_likelihood(torso, relative, self.turn.expand(shape), lengths)
+        logs = torso_log_likelihood(torso, relative, turn.expand(shape), lengths)
+        found = (power * (logs - logs.amax((1, 2), keepdim=True))).exp()
         return found.unfold(1, len(self.depth), _CELLS).flip(1).mT
 
-    def best(self, log_belief: Float[Tensor, "B S Z P"], count: int) -> Root:
+    def best(self, weight: Float[Tensor, "B S Z P"], count: int) -> Root:
         """Return the likeliest depths and turns, half of them turned to either side.
 
         A turn and its mirror image look alike, so that the wrong one may be the likelier for a while.
+
+        Args:
+            weight: the belief, of any sum. count: the number of both halves.
         """
         n_turns, half = len(self.turn), len(self.turn) // 2
-        whole = torch.logsumexp(log_belief, 1)
-        sides = []
-        for first in (0, half):
-            index = whole[:, :, first : first + half].flatten(1).topk(count // 2, 1).indices
-            sides.append(index // half * n_turns + index % half + first)
-        index = torch.cat(sides, 1)
-        values = whole.flatten(1).gather(1, index)
+        whole = weight.sum(1)
+        halves = whole.unflatten(-1, (2, half)).movedim(2, 1).flatten(2)
+        index = halves.topk(count // 2, -1).indices
+        index = (index // half * n_turns + index % half + half * self._sides).flatten(1)
         of_sizes = index[:, None].expand(-1, len(self.log_size), -1)
-        share = torch.softmax(log_belief.flatten(2).gather(2, of_sizes), 1)
-        size = (share.mT @ self.log_size).exp()
-        return Root(self.depth[index // n_turns], self.turn[index % n_turns], size, values, index)
+        share = weight.flatten(2).gather(2, of_sizes)
+        total = share.sum(1)
+        size = ((share.mT @ self.log_size) / total).exp()
+        return Root(
+            self.depth[index // n_turns], self.turn[index % n_turns], size, total.log(), index
+        )
 
     def belief(
         self,
-        log_belief: Float[Tensor, "B S Z P"],
+        weight: Float[Tensor, "B S Z P"],
         root: Root,
         evidence: Float[Tensor, "B M"],
         trend: Bool[Tensor, " B"],
@@ -130,16 +146,16 @@ class RootGrid:
         evidence extrapolated linearly in log depth: hypotheses lie close together.
 
         Args:
-            log_belief: the log of the belief before. root: the hypotheses that were evaluated.
+            weight: the belief before, of any sum. root: the hypotheses that were evaluated.
             evidence: the log-evidence of the arms given each. trend: whether to extrapolate.
         """
         share = torch.log_softmax(root.log_weight, 1)
         usual = torch.logsumexp(share + evidence, 1, keepdim=True)
         more = trend[:, None].to(evidence) * self._trend(root, share.exp(), evidence)
         more = more[..., None].expand(-1, -1, len(self.turn))
-        more = more.flatten(1).scatter(1, root.cell, evidence - usual)
-        weighed = (log_belief.flatten(2) + more[:, None]).flatten(1)
-        return torch.softmax(weighed, 1).view_as(log_belief)
+        more = more.flatten(1).scatter(1, root.cell, (evidence - usual).clamp_max(_MOST))
+        weighed = (weight.flatten(2) * more.exp()[:, None]).flatten(1)
+        return (weighed / weighed.sum(1, keepdim=True)).view_as(weight)
 
     def _trend(
         self, root: Root, share: Float[Tensor, "B M"], evidence: Float[Tensor, "B M"]
@@ -149,13 +165,14 @@ class RootGrid:
         mean = (share * logs).sum(1, keepdim=True)
         off = share * (logs - mean)
         slope = (off * evidence).sum(1) / ((off * (logs - mean)).sum(1) + _DEPTH_STEP**2)
-        along = slope[:, None] * (self.depth.log() - mean)
+        along = slope[:, None] * (self._log_depth - mean)
         return along.clamp(-_MOST_SAID, _MOST_SAID)
 
     def moments(self, belief: Float[Tensor, "B S Z P"]) -> Moments:
         """Return the moments of depth and size."""
-        depth, of_depth = _mean_and_variance(belief.sum((1, 3)), self.depth.log())
-        size, of_size = _mean_and_variance(belief.sum((2, 3)), self.log_size)
+        both = belief.sum(-1)
+        depth, of_depth = _mean_and_variance(both.sum(1), self._log_depth)
+        size, of_size = _mean_and_variance(both.sum(2), self.log_size)
         return Moments(depth.exp(), size.exp(), of_depth, of_size)
 
 
@@ -174,8 +191,6 @@ def _share_that_moves(std: float, step: float) -> float:
 
 def _diffused(belief: Float[Tensor, "B S Z P"], share: float) -> Float[Tensor, "B S Z P"]:
     """Return the belief after a share of each depth went to either neighbour; the ends keep theirs."""
-    flow = share * belief.diff(dim=-2)
-    moved = belief.clone()
-    moved[..., :-1, :] += flow
-    moved[..., 1:, :] -= flow
-    return moved
+    wider = torch.cat([belief[..., :1, :], belief, belief[..., -1:, :]], -2)
+    beside = wider[..., :-2, :] + wider[..., 2:, :]
+    return torch.add((1 - 2 * share) * belief, beside, alpha=share)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
+from torchpose._core.module_state import outside_inference
 from torchpose.skeleton._joint_sets import UPPER_BODY
 
 __all__ = [
     "NECK_HEIGHT",
+    "NOT_RAISED",
+    "REACH",
     "STIFF_SHOULDER",
     "Root",
     "Torso",
@@ -40,9 +44,11 @@ _STIFF = ((0.03, 0.035), (0.03, 0.035), (0.03, 0.035), (0.05, 0.035))
 # As in UTD-MHAD (s1 to s6): from 0.165 m to 0.140.
 _INWARD, _INWARD_STD, _UPWARD_STD = 0.15, 0.2, 0.03
 _HANGING, _RAISED = -0.7, 0.2  # sines of the elevation from which, and to which, they do
-# Metres to the elbow and to the hand; the elevation does not have to be exact.
-_REACH = (0.27, 0.48)
-_NOT_RAISED = -1e3  # where no arm is seen
+REACH = (0.27, 0.48)
+"""Metres from a shoulder to the elbow and to the hand; the elevation does not have to be exact."""
+
+NOT_RAISED = -1e3
+"""The rise of an arm that is not seen."""
 
 _ARMS = tuple(
     tuple(UPPER_BODY.index(f"{joint}_{side}") for joint in ("shoulder", "elbow", "hand"))
@@ -91,12 +97,14 @@ class Torso(NamedTuple):
         known: whether each is measured, [B, 4].
         std: the standard deviation of a pixel over the focal length, [B, 4].
         rise: the sine of each arm's elevation above its shoulder over the depth, 1 / m, [B, 2].
+        sided: whether any shoulder may be measured.
     """
 
     rays: Tensor
     known: Tensor
     std: Tensor
     rise: Tensor
+    sided: bool = True
 
     def raised(self, depth: Float[Tensor, "B *grid"]) -> Float[Tensor, "B *grid 2"]:
         """Return the elevation of each arm on a scale from 0 (hanging) to 1 (raised)."""
@@ -116,9 +124,9 @@ def see_torso(
 def _rise(rays: Tensor, known: Tensor, shoulder: int, elbow: int, hand: int) -> Float[Tensor, " B"]:
     """Return the height of an elbow, or else of a hand, above its shoulder in the image, over its reach."""
     end = torch.where(known[:, elbow], rays[:, elbow, 1], rays[:, hand, 1])
-    reach = torch.where(known[:, elbow], end.new_tensor(_REACH[0]), end.new_tensor(_REACH[1]))
+    reach = torch.where(known[:, elbow], end.new_tensor(REACH[0]), end.new_tensor(REACH[1]))
     there = known[:, shoulder] & (known[:, elbow] | known[:, hand])
-    return torch.where(there, (rays[:, shoulder, 1] - end) / reach, _NOT_RAISED)
+    return torch.where(there, (rays[:, shoulder, 1] - end) / reach, NOT_RAISED)
 
 
 def half_widths(
@@ -142,9 +150,9 @@ def shoulder_offsets(turn: Float[Tensor, "*batch"], half: Float[Tensor, "*batch 
     Args:
         turn: psi, radians. half: h of both shoulders, metres (`half_widths`).
     """
-    level = torch.stack([turn.cos(), torch.zeros_like(turn), -turn.sin()], -1)
-    signed = half * half.new_tensor([1.0, -1.0])
-    return signed[..., None] * level[..., None, :]
+    cos, sin, zero = turn.cos(), turn.sin(), torch.zeros_like(turn)
+    level = torch.stack([cos, zero, -sin, -cos, zero, sin], -1).unflatten(-1, (2, 3))
+    return half[..., None] * level
 
 
 def torso_places(
@@ -172,8 +180,8 @@ def spine_places(lengths: TorsoLengths) -> Float[Tensor, "B 2 3"]:
 def middle_of_shoulders(torso: Torso, root: Root, lengths: TorsoLengths) -> Float[Tensor, "B M 3"]:
     """Return the middle of the shoulders given depth, turn and size; on the optical axis if unknown."""
     depth = root.depth / root.size  # what is larger is as if nearer
-    u, v = _middles(torso, depth, root.turn, lengths)
-    return torch.stack([u.mean, v.mean, depth], -1) * root.size[..., None]
+    mean = _middles(torso, depth, root.turn, lengths).mean
+    return torch.cat([mean, depth[..., None]], -1) * root.size[..., None]
 
 
 def torso_log_likelihood(
@@ -181,21 +189,21 @@ def torso_log_likelihood(
 ) -> Float[Tensor, "B *grid"]:
     """Return the log-likelihood of the torso's joints, whose middle may be anywhere in the image."""
     count = with_axes(torso.known.sum(-1).to(depth), depth.ndim - 1)
-    total = torch.zeros_like(depth)
-    for value, precision, mean in _middles(torso, depth, turn, lengths):
-        off = (precision * (value - mean[..., None]).square()).sum(-1)
-        logs = torch.where(precision > 0, precision, 1.0).log().sum(-1)
-        mass = torch.where(count > 0, precision.sum(-1), 1.0)
-        total = total + heavy_tail(off) + 0.5 * (logs - mass.log())
-    return total + 2 * (count - 1).clamp_min(0) * depth.log()
+    value, precision, mean = _middles(torso, depth, turn, lengths)
+    off = (precision * (value - mean[..., None, :]).square()).sum(-2)
+    logs = torch.where(precision > 0, precision, 1.0).log().sum(-2)
+    mass = torch.where(count[..., None] > 0, precision.sum(-2), 1.0)
+    both = heavy_tail(off) + 0.5 * (logs - mass.log())
+    return both.sum(-1) + 2 * (count - 1).clamp_min(0) * depth.log()
 
 
 class _Middle(NamedTuple):
-    """Estimates of the middle of the shoulders along one axis of the image, one by each torso joint.
+    """Estimates of x and y of the middle of the shoulders, one by each torso joint.
 
     Attributes:
-        value: the estimate by each joint, metres, [..., 4]. precision: of each, 0 where it is not measured.
-        mean: the mean of all, weighted by their precisions, [...].
+        value: the estimate by each of J joints, metres, [..., J, 2].
+        precision: of each, 0 where it is not measured, [..., J, 2].
+        mean: the mean of all, weighted by their precisions, [..., 2].
     """
 
     value: Tensor
@@ -203,34 +211,54 @@ class _Middle(NamedTuple):
     mean: Tensor
 
 
-def _middles(torso: Torso, depth: Tensor, turn: Tensor, lengths: TorsoLengths) -> list[_Middle]:
-    """Return the middle of the shoulders along x and y, given depth and turn [B, ...]."""
+def _middles(torso: Torso, depth: Tensor, turn: Tensor, lengths: TorsoLengths) -> _Middle:
+    """Return x and y of the middle of the shoulders, given depth and turn [B, ...].
+
+    Without shoulders it is told by neck and head alone, for which the turn does not matter.
+    """
     rays, known, std = (with_axes(x, depth.ndim - 1) for x in torso[:3])
-    raised = torso.raised(depth)
-    place = torso_places(turn, half_widths(lengths.width, raised), lengths)
-    away = depth[..., None] + place[..., 2]
-    stiff = _stiffness(lengths, raised)
-    found = []
-    for axis in (0, 1):
-        value = rays[..., axis] * away - place[..., axis]
-        precision = known.to(depth) / (stiff[..., axis] + (std * away).square())
-        mean = (precision * value).sum(-1) / precision.sum(-1).clamp_min(1e-12)
-        found.append(_Middle(value, precision, mean))
-    return found
+    stiff = with_axes(_stiffness(lengths), depth.ndim - 1)
+    if torso.sided:
+        raised = torso.raised(depth)
+        place = torso_places(turn, half_widths(lengths.width, raised), lengths)
+        away = depth[..., None] + place[..., 2]
+        stiff = torch.cat(
+            [
+                stiff[..., :2, :] + _loose(lengths, raised),
+                stiff[..., 2:, :].expand(*raised.shape, 2),
+            ],
+            -2,
+        )
+    else:
+        rays, known, std, stiff = rays[..., 2:, :], known[..., 2:], std[..., 2:], stiff[..., 2:, :]
+        place, away = with_axes(spine_places(lengths), depth.ndim - 1), depth[..., None]
+    value = rays[..., :2] * away[..., None] - place[..., :2]
+    precision = known[..., None].to(depth) / (stiff + (std * away).square()[..., None])
+    mean = (precision * value).sum(-2) / precision.sum(-2).clamp_min(1e-12)
+    return _Middle(value, precision, mean)
 
 
-def _stiffness(
+def _stiffness(lengths: TorsoLengths) -> Float[Tensor, "B 4 2"]:
+    """Return the variance of each torso joint about its place in x and y, metres squared, arms hanging."""
+    across, up = lengths.width_std / 2, lengths.height_std
+    zero = torch.zeros_like(up)
+    spread = torch.stack([across, zero, across, zero, zero, zero, zero, up], -1)
+    return spread.square().unflatten(-1, (4, 2)) + _stiff(up.dtype, up.device)
+
+
+@cache
+def _stiff(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "4 2"]:
+    with outside_inference():
+        return torch.tensor(_STIFF, dtype=dtype, device=device).square()
+
+
+def _loose(
     lengths: TorsoLengths, raised: Float[Tensor, "B *grid 2"]
-) -> Float[Tensor, "B *grid 4 2"]:
-    """Return the variance of each torso joint about its place in x and y, metres squared."""
-    stiff = raised.new_tensor(_STIFF).square().expand(*raised.shape[:-1], 4, 2).clone()
-    sizes = (lengths.width, lengths.width_std, lengths.height_std)
-    width, width_std, height_std = (with_axes(x, raised.ndim - 2) for x in sizes)
-    stiff[..., :2, 0] += (width_std / 2).square()[..., None]
-    stiff[..., :2, 0] += (raised * _INWARD_STD * width[..., None] / 2).square()
-    stiff[..., :2, 1] += (raised * _UPWARD_STD).square()
-    stiff[..., 3, 1] += height_std.square()
-    return stiff
+) -> Float[Tensor, "B *grid 2 2"]:
+    """Return the variance in x and y that shoulders have for raised arms, metres squared."""
+    across = lengths.width * (_INWARD_STD / 2)
+    moved = torch.stack([across, torch.full_like(across, _UPWARD_STD)], -1)
+    return (raised[..., None] * with_axes(moved, raised.ndim - 1)).square()
 
 
 def with_axes(values: Shaped[Tensor, "B *rest"], count: int) -> Tensor:
