@@ -36,7 +36,7 @@ def keypoints():
 @pytest.fixture(scope="module")
 def few(keypoints):
     """The first frames of these: for what is the same in every frame."""
-    return keypoints[:, :25]
+    return keypoints[:, :20]
 
 
 def stream(tracker, keypoints, generator=None, confidence=None, mask=None, names=NAMES):
