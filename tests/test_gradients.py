@@ -92,13 +92,13 @@ def test_poses_of_shoulders_whose_neck_is_placed():
 @pytest.mark.parametrize("method", ["articulated", "multiple-model"])
 @pytest.mark.parametrize("frames", [1, 2])
 def test_poses_of_bones(method, frames):
-    """Their density of directions is worked out in float32, so that differences are to a hundredth.
+    """Exponentials of their density are float32, so that differences are to a hundredth.
 
-    Where other hypotheses are chosen poses jump, by less the more there are: few frames have no such place
-    within these steps.
+    Where other hypotheses are chosen poses jump, by less the more there are: small steps and few frames
+    have no such place.
     """
     function = poses(make_tracker(method=method))
-    assert_differentiable(function, keypoints(frames=frames), step=1e-3, tolerance=1e-2)
+    assert_differentiable(function, keypoints(frames=frames), step=1e-4, tolerance=1e-2)
 
 
 @pytest.mark.parametrize("method", ["mkf-sampled", "mkf-split"])
