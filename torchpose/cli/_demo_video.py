@@ -53,7 +53,7 @@ def demo_video(
     truth = performance.joints[person.first_frame :][: len(person)]
     scores = {name: score(track, truth) for name, track in tracks.items()}
     scores[MEAN_POSE] = score_mean_pose(prior, truth)
-    print(report(scores, "measured in the video: head and neck from the face, and the hands"))
+    print(report(scores, "measured in the video: head and neck from the face, hands and elbows"))
     print(f"\n{_seen(person)}; {n_frames / elapsed:.0f} frames a second, drawing apart")
     overlay = stage / "overlay.mp4"
     with open_video(clip) as source:
