@@ -25,13 +25,41 @@ from torchpose.math._gaussian import LOG_2PI, mended_cholesky, spare_columns
 from torchpose.math._geometric_median import geometric_median, median_columns
 
 __all__ = [
+    "FrameNoise",
     "MeasuredParts",
     "OwnFrames",
     "condition_own",
+    "frame_noise",
     "measured_parts",
     "own_moments",
-    "own_noise",
 ]
+
+
+class FrameNoise(NamedTuple):
+    """Holds the noise of frames with gaps, S = R' + b C, of any number of frames [..., Z, Z].
+
+    Attributes:
+        noise: R', R with the rows and columns of the identity where something is missing.
+        both: b, 1 where both dimensions are measured; None where nothing is missing in any frame.
+        mask: 1 where measured, [..., Z]. log_norm: -1/2 log 2 pi for each measured dimension, [..., 1].
+    """
+
+    noise: Tensor
+    both: Tensor | None
+    mask: Tensor
+    log_norm: Tensor
+
+
+def frame_noise(cov: Float[Tensor, "*#frames Z Z"], mask: Bool[Tensor, "*frames Z"]) -> FrameNoise:
+    """Return the noise of frames in float64.
+
+    Args:
+        cov: R of every frame, or one for all. mask: True where measured.
+    """
+    noise, both = _own_noise(cov.to(torch.float64), mask)
+    count = mask.sum(-1, keepdim=True).to(noise)
+    complete = bool(mask.all())
+    return FrameNoise(noise, None if complete else both, mask.to(noise), -0.5 * LOG_2PI * count)
 
 
 class MeasuredParts(NamedTuple):
@@ -70,7 +98,7 @@ def condition_own(
     Args:
         parts: from `measured_parts`. z: 0 where missing. mask: True where measured. noise: R.
     """
-    noise, both = own_noise(noise, mask)
+    noise, both = _own_noise(noise, mask)
     factor, jitter = mended_cholesky(torch.addcmul(noise[:, None], parts.block, both[:, None]))
     log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     log_norm = -0.5 * LOG_2PI * mask.sum(-1, keepdim=True).to(log_det) - log_det
@@ -81,7 +109,7 @@ def condition_own(
     return OwnFrames(factor, white, log_likelihood, jitter, mask)
 
 
-def own_noise(
+def _own_noise(
     noise: Float[Tensor, "... Z Z"], mask: Bool[Tensor, "... Z"]
 ) -> tuple[Float[Tensor, "... Z Z"], Float[Tensor, "... Z Z"]]:
     """Return R' and b of S = R' + b C: b is 1 where both are measured; R' is the identity elsewhere."""

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchpose._core.module_state import derived
-from torchpose.filters._frame_noise import own_noise
+from torchpose.filters._frame_noise import frame_noise
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._outputs import (
@@ -31,7 +31,7 @@ from torchpose.filters._outputs import (
     stacked_mending,
 )
 from torchpose.filters._weights import estimate_of
-from torchpose.math._gaussian import LOG_2PI, mended_cholesky, spare_columns, symmetrise
+from torchpose.math._gaussian import mended_cholesky, spare_columns, symmetrise
 
 __all__ = [
     "TRACK_NUMBERS",
@@ -62,8 +62,8 @@ class JointProblem(NamedTuple):
     """Holds what is measured in one frame by B elements.
 
     Attributes:
-        z: [B, 1, Z], 0 where missing. noise, both: of `own_noise` [B, 1, Z, Z]; `both` is None where
-            nothing is missing. mask: [B, 1, Z, 1]. log_norm: constant of the likelihood [B, 1].
+        z: [B, 1, Z], 0 where missing. noise, both: of `FrameNoise` [B, 1, Z, Z]. mask:
+            [B, 1, Z, 1]. log_norm: constant of the likelihood [B, 1].
     """
 
     z: Tensor
@@ -114,18 +114,13 @@ def joint_model(model: MixtureKalmanFilter, time: int) -> JointModel:
 
 def joint_problems(frames: Measurements) -> list[JointProblem]:
     """Return what is measured in every frame, for `JointTracks.correct`."""
-    complete = bool(frames.mask.all())
-    noise = frames.cov[None, None] if frames.cov.ndim == 2 else frames.cov
-    noise, both = own_noise(noise.to(torch.float64), frames.mask)
-    count = -0.5 * LOG_2PI * frames.mask.sum(-1, keepdim=True).to(noise)
-    parts = frames.z[:, :, None].to(noise), noise[:, :, None], both[:, :, None]
-    mask = frames.mask[:, :, None, :, None].to(noise)
-    return [
-        JointProblem(z, r, None if complete else b, seen, n)
-        for z, r, b, seen, n in zip(
-            *(part.unbind(1) for part in (*parts, mask, count)), strict=True
-        )
-    ]
+    cov = frames.cov[None, None] if frames.cov.ndim == 2 else frames.cov
+    noise, both, mask, log_norm = frame_noise(cov, frames.mask)
+    n_frames = frames.z.shape[1]
+    gaps = [None] * n_frames if both is None else both[:, :, None].unbind(1)
+    parts = frames.z[:, :, None].to(noise), noise[:, :, None], mask[:, :, None, :, None], log_norm
+    rows = zip(*(part.unbind(1) for part in parts), gaps, strict=True)
+    return [JointProblem(z, r, gap, seen, norm) for z, r, seen, norm, gap in rows]
 
 
 class JointTracks:
@@ -152,6 +147,10 @@ class JointTracks:
         self.state[..., : self.dim, : self.dim] = cov
         self.state[..., : self.dim, self.dim] = mean
         self.state[..., self.dim, : self.dim] = mean
+        self._make_room()
+
+    def _make_room(self) -> None:
+        """Allocate the memory that every step uses again."""
         self._other, self._matrix, self._moved = (torch.empty_like(self.state) for _ in range(3))
 
     @property
@@ -170,9 +169,7 @@ class JointTracks:
         index = parent + n_tracks * torch.arange(batch, device=parent.device)[:, None]
         if parent.shape[1] != n_tracks:
             self.state = self.state.flatten(0, 1)[index]
-            self._other, self._matrix, self._moved = (
-                torch.empty_like(self.state) for _ in range(3)
-            )
+            self._make_room()
             return
         torch.index_select(
             self.state.flatten(0, 1), 0, index.flatten(), out=self._other.flatten(0, 1)

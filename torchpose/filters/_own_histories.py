@@ -19,13 +19,13 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchpose.filters._diagonal_model import DiagonalModel, DiagonalMoves, diagonal_moves
-from torchpose.filters._frame_noise import own_noise
+from torchpose.filters._frame_noise import frame_noise
 from torchpose.filters._measurements import Measurements
 from torchpose.filters._memoryless import frame_log_likelihood
 from torchpose.filters._mkf import MixtureKalmanFilter
 from torchpose.filters._outputs import FilterOutput, Mending, finish_output, mending
 from torchpose.filters._weights import WeightRule, sequence_weights
-from torchpose.math._gaussian import LOG_2PI, mended_cholesky, symmetrise
+from torchpose.math._gaussian import mended_cholesky, spare_columns, symmetrise
 
 __all__ = ["run_own_histories"]
 
@@ -77,7 +77,7 @@ def run_own_histories(
     batch, n_frames = frames.z.shape[:2]
     marginal = frame_log_likelihood(model, rule, frames)
     results = _empty_results(model, frames, return_cov)
-    width = diagonal_moves(model, diagonal, model.burn_in).factor.shape[-1]
+    width = model.dim + spare_columns(model.dim)
     n_chunks = math.ceil(batch * model.n_tracks * width**2 / _STATE_NUMBERS)
     at_a_time = math.ceil(batch / n_chunks)
     bar = tqdm(total=batch * n_frames, disable=not progress, unit="frame")
@@ -124,7 +124,7 @@ def _spans(
 ) -> Iterator[tuple[slice, _Span]]:
     """Yield the tracks of some sequences, a span of frames at a time."""
     batch, n_frames, _ = frames.z.shape
-    width = diagonal_moves(model, diagonal, model.burn_in).factor.shape[-1]
+    width = model.dim + spare_columns(model.dim)
     state = diagonal.basis.new_zeros(batch, model.n_tracks, width, width)
     state[..., : model.dim, : model.dim] = diagonal.start
     before = torch.empty_like(state)
@@ -150,8 +150,8 @@ class _Problem(NamedTuple):
     """Holds what is measured in T frames, time first.
 
     Attributes:
-        residual: z - H mu [T, B M, Z], 0 where missing. noise, both: of `own_noise`, [T, B, 1, Z, Z];
-            `both` is None where nothing is missing. mask: [T, B, 1, Z, 1]. log_norm: [T, B, 1], the
+        residual: z - H mu [T, B M, Z], 0 where missing. noise, both: of `FrameNoise`, [T, B, 1, Z, Z].
+            mask: [T, B, 1, Z, 1]. log_norm: [T, B, 1], the
             constant of the likelihood.
     """
 
@@ -164,17 +164,13 @@ class _Problem(NamedTuple):
 
 def _problem(model: MixtureKalmanFilter, frames: Measurements, span: slice) -> _Problem:
     mask = frames.mask[:, span].transpose(0, 1)
-    noise = frames.cov if frames.cov.ndim == 2 else frames.cov[:, span].transpose(0, 1)
-    noise, both = own_noise(noise.to(torch.float64), mask)
-    complete = bool(mask.all())
+    cov = frames.cov if frames.cov.ndim == 2 else frames.cov[:, span].transpose(0, 1)
+    noise, both, seen, log_norm = frame_noise(cov, mask)
     z = frames.z[:, span].transpose(0, 1).to(noise)[:, :, None]
-    residual = (z - model.means.to(noise)[:, model.observed]) * mask[:, :, None]
+    residual = (z - model.means.to(noise)[:, model.observed]) * seen[:, :, None]
+    both = None if both is None else both[:, :, None]
     return _Problem(
-        residual.flatten(1, 2),
-        noise[:, :, None],
-        None if complete else both[:, :, None],
-        mask[:, :, None, :, None].to(noise),
-        -0.5 * LOG_2PI * mask.sum(-1, keepdim=True).to(noise),
+        residual.flatten(1, 2), noise[:, :, None], both, seen[:, :, None, :, None], log_norm
     )
 
 
