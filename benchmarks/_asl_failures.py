@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from benchmarks._asl_materials import Material
+from benchmarks._sheets import sheet
 from torchpose.measure._edges import edge_map
 
 
@@ -32,11 +33,9 @@ def draw_failures(
     for kind, places in kinds.items():
         some = places[:: max(1, -(-len(places) // 8))][:8]
         views = [_view(clip, t, materials[clip], found[clip][t]) for clip, t in some]
-        views += [np.full_like(views[0], 255)] * (-len(views) % 4)
-        sheet = np.vstack([np.hstack(views[i : i + 4]) for i in range(0, len(views), 4)])
         name = f"{kind.replace(' ', '-')}.jpg"
         quality = [cv2.IMWRITE_JPEG_QUALITY, 80]
-        cv2.imwrite(str(folder / name), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR), quality)
+        cv2.imwrite(str(folder / name), cv2.cvtColor(sheet(views), cv2.COLOR_RGB2BGR), quality)
         yield kind, len(places), folder / name
 
 

@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks._sheets import sheet
 from benchmarks.hand_network.clips import BURN_IN, Labels
 
-_PER_KIND, _COLUMNS = 8, 4
+_PER_KIND = 8
 _WIDTH, _HEIGHT = 280, 240  # pixels of a drawing
 _COLOURS = ((0, 140, 0), (210, 0, 0))  # of left and right
 _INK, _PAPER = (90, 90, 90), 255
@@ -80,10 +81,8 @@ def draw_failures(
     folder.mkdir(parents=True, exist_ok=True)
     for kind, clips in sorted(kinds.items()):
         views = [_drawing(clip, t, *found[clip]) for clip, t in _spread(clips)]
-        views += [np.full_like(views[0], _PAPER)] * (-len(views) % _COLUMNS)
-        rows = [np.hstack(views[i : i + _COLUMNS]) for i in range(0, len(views), _COLUMNS)]
         path = folder / f"{kind.replace(' ', '-')}.png"
-        cv2.imwrite(str(path), cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))
+        cv2.imwrite(str(path), cv2.cvtColor(sheet(views), cv2.COLOR_RGB2BGR))
         yield kind, sum(len(frames) for frames in clips.values()), path
 
 
