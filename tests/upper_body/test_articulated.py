@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import torchpose
+from tests.upper_body.seen import see_torso
 from torchpose.errors import InputError
 from torchpose.math import euler_to_matrix
 from torchpose.priors._arms import LENGTHS, shipped_arm_prior
@@ -17,7 +18,7 @@ from torchpose.upper_body._arm_chain import Arms
 from torchpose.upper_body._articulated import ArticulatedFilter
 from torchpose.upper_body._articulated_poses import _trust
 from torchpose.upper_body._estimator import TrackerModel
-from torchpose.upper_body._torso_likelihood import half_widths, see_torso
+from torchpose.upper_body._torso_likelihood import half_widths
 
 CAMERA = torchpose.PinholeCamera(525.0, 525.0, 319.5, 239.5)
 ROW = {name: i for i, name in enumerate(UPPER_BODY)}
@@ -263,7 +264,7 @@ def test_shoulders_without_arms_keep_their_width_at_any_distance():
     uv = pixels(body(1, depth=0.6))
     rays = torch.cat([(uv - torch.tensor([319.5, 239.5])) / 525, torch.ones(1, 8, 1)], -1).double()
     shoulders = torch.tensor([[name.startswith("shoulder") for name in UPPER_BODY]])
-    torso = see_torso(rays, shoulders, torch.full((1, 8), 0.006, dtype=torch.float64))
+    torso = see_torso(rays, shoulders, 0.006)
     depth = torch.tensor([[0.4, 0.6, 3.0]], dtype=torch.float64)
     assert float(torso.raised(depth).abs().max()) == 0.0
     width = torch.tensor([0.33], dtype=torch.float64)

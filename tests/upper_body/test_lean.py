@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.upper_body.test_articulated import ROW, body, pixels, tracker
-from torchpose.upper_body._lean import lean_angle, rolled, seen_lean
+from torchpose.upper_body._lean import lean_angle, roll, seen_lean
 
 KNOWN = torch.ones(1, 8, dtype=torch.bool)
 DEPTH = torch.tensor([2.0], dtype=torch.float64)
@@ -24,7 +24,7 @@ def turned_about_the_axis(joints, degrees):
     """Return joints [T, 8, 3] turned about an axis along the view through the first neck."""
     neck = joints[:1, [ROW["neck"]]]
     angle = torch.full((len(joints),), math.radians(degrees), dtype=torch.float64)
-    return rolled(joints - neck, angle) + neck
+    return (joints - neck) @ roll(angle).mT + neck
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.5, math.pi])

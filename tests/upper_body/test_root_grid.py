@@ -3,8 +3,9 @@
 import pytest
 import torch
 
+from tests.upper_body.seen import see_torso
 from torchpose.upper_body._root_grid import RootGrid
-from torchpose.upper_body._torso_likelihood import TorsoLengths, see_torso, torso_places
+from torchpose.upper_body._torso_likelihood import TorsoLengths, torso_places
 
 LIKE = torch.zeros((), dtype=torch.float64)
 STD = 2.0 / 525.0
@@ -28,10 +29,11 @@ def seen(depth, size=1.0, turn=0.0):
     place[2:] *= size
     place[:, 2] += depth
     rays = torch.zeros(1, 8, 3, dtype=torch.float64)
+    rays[..., 2] = 1.0
     rays[0, [2, 5, 4, 3]] = place / place[:, 2:]
     known = torch.zeros(1, 8, dtype=torch.bool)
     known[:, [2, 3, 4, 5]] = True
-    return see_torso(rays, known, torch.full((1, 8), STD, dtype=torch.float64))
+    return see_torso(rays, known, STD)
 
 
 def test_larger_torsos_look_like_nearer_ones(grid):

@@ -9,9 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchpose.skeleton._joint_sets import UPPER_BODY
-from torchpose.upper_body._torso_likelihood import with_axes
 
-__all__ = ["lean_angle", "roll", "rolled", "seen_lean"]
+__all__ = ["lean_angle", "roll", "seen_lean"]
 
 _LEFT, _RIGHT = (UPPER_BODY.index(f"shoulder_{side}") for side in ("left", "right"))
 _MEMORY = 0.5  # seconds
@@ -64,13 +63,3 @@ def roll(angle: Float[Tensor, " B"]) -> Float[Tensor, "B 3 3"]:
     cos, sin, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
     rows = [cos, -sin, zero, sin, cos, zero, zero, zero, torch.ones_like(angle)]
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
-
-
-def rolled(
-    vectors: Float[Tensor, "B *batch D"], angle: Float[Tensor, " B"]
-) -> Float[Tensor, "B *batch D"]:
-    """Return vectors, or points of the image, turned by an angle about the camera's optical axis."""
-    angle = with_axes(angle, vectors.ndim - 2)
-    cos, sin = angle.cos(), angle.sin()
-    x, y, *rest = vectors.unbind(-1)
-    return torch.stack([cos * x - sin * y, sin * x + cos * y, *rest], -1)

@@ -6,11 +6,10 @@ from functools import cache
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from torchpose._core.module_state import outside_inference
-from torchpose.skeleton._joint_sets import UPPER_BODY
 
 __all__ = [
     "NECK_HEIGHT",
@@ -24,7 +23,6 @@ __all__ = [
     "heavy_tail",
     "inward_shares",
     "middle_of_shoulders",
-    "see_torso",
     "shoulder_offsets",
     "spine_places",
     "torso_log_likelihood",
@@ -32,14 +30,13 @@ __all__ = [
     "with_axes",
 ]
 
-_TORSO = tuple(UPPER_BODY.index(n) for n in ("shoulder_left", "shoulder_right", "neck", "head"))
 NECK_HEIGHT = 0.105
 """Metres of Kinect's neck above the middle of the shoulders."""
 
 STIFF_SHOULDER = 0.03
 """Standard deviation of a shoulder about its place in a stiff torso, metres."""
-# Of each torso joint, x and y.
-_STIFF = ((0.03, 0.035), (0.03, 0.035), (0.03, 0.035), (0.05, 0.035))
+# Of both shoulders, neck and head, x and y.
+_STIFF = ((STIFF_SHOULDER, 0.035), (STIFF_SHOULDER, 0.035), (0.03, 0.035), (0.05, 0.035))
 # Shoulders of raised arms move in, by a share of half the width that differs from one to the next, and up.
 # As in UTD-MHAD (s1 to s6): from 0.165 m to 0.140.
 _INWARD, _INWARD_STD, _UPWARD_STD = 0.15, 0.2, 0.03
@@ -50,10 +47,6 @@ REACH = (0.27, 0.48)
 NOT_RAISED = -1e3
 """The rise of an arm that is not seen."""
 
-_ARMS = tuple(
-    tuple(UPPER_BODY.index(f"{joint}_{side}") for joint in ("shoulder", "elbow", "hand"))
-    for side in ("left", "right")
-)
 _FREEDOM = 4.0  # of the heavy tails of detectors' points
 
 
@@ -110,23 +103,6 @@ class Torso(NamedTuple):
         """Return the elevation of each arm on a scale from 0 (hanging) to 1 (raised)."""
         rise = with_axes(self.rise, depth.ndim - 1)
         return ((rise * depth[..., None] - _HANGING) / (_RAISED - _HANGING)).clamp(0.0, 1.0)
-
-
-def see_torso(
-    rays: Float[Tensor, "B 8 3"], known: Bool[Tensor, "B 8"], std: Float[Tensor, "B 8"]
-) -> Torso:
-    """Return the torso joints among the rays of all joints of `UPPER_BODY`."""
-    chosen = list(_TORSO)
-    rise = torch.stack([_rise(rays, known, *arm) for arm in _ARMS], 1)
-    return Torso(rays[:, chosen], known[:, chosen], std[:, chosen], rise)
-
-
-def _rise(rays: Tensor, known: Tensor, shoulder: int, elbow: int, hand: int) -> Float[Tensor, " B"]:
-    """Return the height of an elbow, or else of a hand, above its shoulder in the image, over its reach."""
-    end = torch.where(known[:, elbow], rays[:, elbow, 1], rays[:, hand, 1])
-    reach = torch.where(known[:, elbow], end.new_tensor(REACH[0]), end.new_tensor(REACH[1]))
-    there = known[:, shoulder] & (known[:, elbow] | known[:, hand])
-    return torch.where(there, (rays[:, shoulder, 1] - end) / reach, NOT_RAISED)
 
 
 def half_widths(
