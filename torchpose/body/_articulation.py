@@ -1,0 +1,320 @@
+"""Compute joints of an articulated body and how they move with every number of its state.
+
+The state of the Kalman filter is a point on a manifold, `BodyPoint`; errors and covariances live in its
+tangent space. In the order of the tangent's columns, N of them:
+
+    position     3         root, metres, world axes
+    rotations    R         radians about the axes of every part, each in the part's own axes
+    velocities   3 + R     of these, per second
+    scales       G         logarithms of bone lengths over the standard ones, left and right together
+    shifts       3 S       of the joints that rigid parts carry (neck, shoulders, hips), metres, part axes
+
+Pelvis and torso have three axes. Limbs and head have the two across their bone: nothing measures their twist,
+which is zero about the part's centre (`Body`).
+"""
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from torchpose.body._kinematics import Body
+from torchpose.body._skeleton import BODY_15, BodySkeleton
+from torchpose.math._rotations import (
+    compose,
+    matrix_to_quaternion_vector,
+    minimal_rotation,
+    quaternion_vector_to_matrix,
+    rotvec_to_matrix,
+)
+
+__all__ = ["Articulation", "BodyPoint", "JointJacobian"]
+
+# Where the bone of a limb points at its centre, in the axes of the part above: opposite to where no
+# bone can point, since a swing by half a turn has no single axis. x left, y up, z forward.
+_CENTRES = {
+    "head": (0.0, 1.0, 0.0),
+    "left_upper_arm": (0.5, -0.5, 0.7),
+    "right_upper_arm": (-0.5, -0.5, 0.7),
+    "left_forearm": (0.0, -0.5, 0.8),
+    "right_forearm": (0.0, -0.5, 0.8),
+    "left_thigh": (0.2, -1.0, 0.6),
+    "right_thigh": (-0.2, -1.0, 0.6),
+    "left_shank": (0.0, -1.0, -0.8),
+    "right_shank": (0.0, -1.0, -0.8),
+}
+
+
+class BodyPoint(NamedTuple):
+    """Holds points on the manifold of body states.
+
+    Attributes:
+        position: [..., 3], metres. rotations: [..., P, 3, 3], the root's to world axes, the others' relative to
+            their centre and the part above. velocity: [..., 3 + R]. scales: [..., G]. shifts: [..., S, 3].
+    """
+
+    position: Tensor
+    rotations: Tensor
+    velocity: Tensor
+    scales: Tensor
+    shifts: Tensor
+
+    def map(self, change) -> "BodyPoint":  # noqa: ANN001
+        """Return the point with a function applied to every tensor."""
+        return BodyPoint(*(change(value) for value in self))
+
+
+class JointJacobian(NamedTuple):
+    """Holds joints [..., J, 3], metres, world axes, and their derivative [..., J, 3, N] by the tangent."""
+
+    joints: Tensor
+    jacobian: Tensor
+
+
+class Articulation(nn.Module):
+    """Computes joints and their derivatives for bodies of a skeleton, whose lengths are part of the state.
+
+    Args:
+        height: metres, of the standard body whose lengths the scales are relative to.
+        skeleton: of the body.
+        dtype: of buffers.
+    """
+
+    def __init__(
+        self,
+        height: float = 1.75,
+        skeleton: BodySkeleton = BODY_15,
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        super().__init__()
+        self.skeleton = skeleton
+        standard = Body.of_height(skeleton, height)
+        names = [name.removeprefix("left_").removeprefix("right_") for name in skeleton.names]
+        groups = list(dict.fromkeys(names[1:]))
+        self.groups = tuple(groups)
+        parts, parents = torch.tensor(skeleton.part_of), skeleton.part_parents
+        limbs = [skeleton.part_of.count(p) == 1 for p in range(len(skeleton.parts))]
+        self.shifted = tuple(j for j, p in enumerate(skeleton.part_of) if j and not limbs[p])
+        axes = [(p, a) for p, limb in enumerate(limbs) for a in ((0, 2) if limb else (0, 1, 2))]
+        self.n_rotations, self.n_pose = len(axes), 3 + len(axes)
+        self.limb_parts = tuple(p for p, limb in enumerate(limbs) if limb)
+        self.dim = 2 * self.n_pose + len(groups) + 3 * len(self.shifted)
+        path = _paths(skeleton.parents)
+        above = _paths(parents)
+        moved = above[:, parts]  # [P, J], whether the rotation of a part moves a joint
+        buffers = {
+            "offsets": standard.offsets,
+            "path": path.double(),
+            "group": torch.tensor([0] + [groups.index(n) for n in names[1:]]),
+            "part_of": parts,
+            "axis_part": torch.tensor([p for p, _ in axes]),
+            "axis": torch.tensor([a for _, a in axes]),
+            "pivot": torch.tensor([_pivot(skeleton, p) for p, _ in axes]),
+            "moves": moved[[p for p, _ in axes]].double(),
+            "centres": _centre_rotations(skeleton),
+        }
+        for name, value in buffers.items():
+            value = value.to(dtype) if value.is_floating_point() else value
+            self.register_buffer(name, value, persistent=False)
+        self.register_buffer("carriers", self._carriers().to(dtype), persistent=False)
+        in_group = torch.nn.functional.one_hot(self.group, len(groups)).to(dtype)
+        in_group[0] = 0
+        self.register_buffer("in_group", in_group, persistent=False)
+
+    @cached_property
+    def columns(self) -> dict[str, slice]:
+        """Return which columns of the tangent hold what."""
+        sizes = {
+            "position": 3,
+            "rotations": self.n_rotations,
+            "velocity": self.n_pose,
+            "scales": len(self.groups),
+            "shifts": 3 * len(self.shifted),
+        }
+        slices, start = {}, 0
+        for name, size in sizes.items():
+            slices[name] = slice(start, start + size)
+            start += size
+        return slices
+
+    @property
+    def relative_columns(self) -> slice:
+        """Return the columns of the angles of all parts but the root."""
+        rotations = self.columns["rotations"]
+        root = int((self.axis_part == 0).sum())
+        return slice(rotations.start + root, rotations.stop)
+
+    def relative_angles(self, point: BodyPoint) -> Float[Tensor, "*batch Q"]:
+        """Return the rotation vectors of all parts but the root about their centres, on their axes, radians."""
+        turns = _rotation_vectors(point.rotations)
+        root = int((self.axis_part == 0).sum())
+        return turns[..., self.axis_part[root:], self.axis[root:]]
+
+    def _carriers(self) -> Float[Tensor, "J N"]:
+        """Return which columns directly move a joint: the angles and shift of its bone, and their velocity."""
+        n, at = len(self.skeleton.names), self.columns
+        carriers = torch.zeros(n, self.dim)
+        turned = (self.part_of[:, None] == self.axis_part).float()
+        carriers[:, at["rotations"]] = turned
+        carriers[:, at["velocity"]][:, 3:] = turned
+        carriers[0, :3] = carriers[0, at["velocity"]][:3] = 1
+        for k, j in enumerate(self.shifted):
+            carriers[j, at["shifts"].start + 3 * k : at["shifts"].start + 3 * k + 3] = 1
+        return carriers
+
+    # --- the manifold -----------------------------------------------------------------------------
+
+    def moved(self, point: BodyPoint, step: Float[Tensor, "*batch N"]) -> BodyPoint:
+        """Return the point that a step in the tangent space leads to."""
+        at = self.columns
+        turn = self._turns(step[..., at["rotations"]])
+        return BodyPoint(
+            point.position + step[..., at["position"]],
+            point.rotations @ turn,
+            point.velocity + step[..., at["velocity"]],
+            point.scales + step[..., at["scales"]],
+            point.shifts + step[..., at["shifts"]].unflatten(-1, (-1, 3)),
+        )
+
+    def difference(self, a: BodyPoint, b: BodyPoint) -> Float[Tensor, "*batch N"]:
+        """Return the step that leads from b to a, to first order where both axes of a limb turn."""
+        turns = _rotation_vectors(b.rotations.mT @ a.rotations)
+        return torch.cat(
+            [
+                a.position - b.position,
+                turns[..., self.axis_part, self.axis],
+                a.velocity - b.velocity,
+                a.scales - b.scales,
+                (a.shifts - b.shifts).flatten(-2),
+            ],
+            -1,
+        )
+
+    def untwisted(self, point: BodyPoint) -> BodyPoint:
+        """Return the same joints with limbs that have no twist about their centres."""
+        rotations = point.rotations
+        limbs = list(self.limb_parts)
+        joints = [self.skeleton.part_of.index(p) for p in limbs]
+        bones = self.offsets[joints]
+        seen = (rotations[..., limbs, :, :] @ bones[..., None]).squeeze(-1)
+        swing = quaternion_vector_to_matrix(minimal_rotation(bones.expand_as(seen), seen))
+        twist = swing.mT @ rotations[..., limbs, :, :]
+        changed = rotations.clone()
+        changed[..., limbs, :, :] = swing
+        for limb, parent in ((p, self.skeleton.part_parents[p]) for p in limbs):
+            if parent in limbs:  # what the part above has lost in twist, this part gets
+                centre = self.centres[limb]
+                lost = centre.mT @ twist[..., limbs.index(parent), :, :] @ centre
+                seen = (
+                    lost
+                    @ rotations[..., limb, :, :]
+                    @ self.offsets[self.skeleton.part_of.index(limb)][:, None]
+                )[..., 0]
+                bone = self.offsets[self.skeleton.part_of.index(limb)]
+                changed[..., limb, :, :] = quaternion_vector_to_matrix(
+                    minimal_rotation(bone.expand_as(seen), seen)
+                )
+        return point._replace(rotations=changed)
+
+    def _turns(self, angles: Tensor) -> Tensor:
+        """Return rotation matrices [..., P, 3, 3] of the parts' turns by angles [..., R]."""
+        vectors = angles.new_zeros(*angles.shape[:-1], len(self.skeleton.parts), 3)
+        vectors[..., self.axis_part, self.axis] = angles
+        return rotvec_to_matrix(vectors)
+
+    # --- joints -----------------------------------------------------------------------------------
+
+    def world_rotations(self, point: BodyPoint) -> Float[Tensor, "*batch P 3 3"]:
+        """Return the rotation of every part, from part axes to world axes."""
+        turns = self.centres @ point.rotations
+        levels, order = [turns[..., :1, :, :]], [0]
+        for level in self.skeleton.part_levels[1:]:
+            above = [order.index(self.skeleton.part_parents[p]) for p in level]
+            levels.append(torch.cat(levels, -3)[..., above, :, :] @ turns[..., list(level), :, :])
+            order += level
+        back = sorted(range(len(order)), key=order.__getitem__)
+        return torch.cat(levels, -3)[..., back, :, :]
+
+    def bones(self, point: BodyPoint) -> Float[Tensor, "*batch J 3"]:
+        """Return the bones from each joint's parent to it in the axes of the part that carries it."""
+        scaled = self.offsets * point.scales[..., self.group].exp()[..., None]
+        shifts = point.shifts.new_zeros(*point.shifts.shape[:-2], len(self.offsets), 3)
+        shifts[..., list(self.shifted), :] = point.shifts
+        return scaled + shifts
+
+    def joints(self, point: BodyPoint) -> Float[Tensor, "*batch J 3"]:
+        """Return the positions of all joints, metres, world axes."""
+        rotations = self.world_rotations(point)[..., self.part_of, :, :]
+        bones = (rotations @ self.bones(point)[..., None]).squeeze(-1)
+        return point.position[..., None, :] + self.path.mT @ bones
+
+    def linearise(self, point: BodyPoint) -> JointJacobian:
+        """Return joints and their derivative by the tangent.
+
+        A turn of a part by a small angle about its own axis a moves the joints beyond its pivot by
+        (R a) x (p - p_pivot); a bone's scale and shift move its joint and all beyond it.
+        """
+        rotations = self.world_rotations(point)
+        carried = rotations[..., self.part_of, :, :]
+        bones = (carried @ self.bones(point)[..., None]).squeeze(-1)
+        joints = point.position[..., None, :] + self.path.mT @ bones
+        axes = rotations.mT.flatten(-3, -2)[..., 3 * self.axis_part + self.axis, :]
+        levers = joints[..., None, :, :] - joints[..., self.pivot, None, :]
+        turned = torch.linalg.cross(axes[..., None, :].expand_as(levers), levers)
+        turned = turned * self.moves[..., None]  # [..., R, J, 3]
+        scaled = (
+            carried @ (self.offsets * point.scales[..., self.group].exp()[..., None])[..., None]
+        ).squeeze(-1)
+        by_scale = torch.einsum("bn,bg,...bi->...nig", self.path, self.in_group, scaled)
+        shifted = list(self.shifted)
+        by_shift = torch.einsum(
+            "sn,...sij->...nisj", self.path[shifted], carried[..., shifted, :, :]
+        )
+        lead = joints.shape[:-2]
+        n = joints.shape[-2]
+        eye = torch.eye(3, dtype=joints.dtype, device=joints.device).expand(*lead, n, 3, 3)
+        none = joints.new_zeros(*lead, n, 3, self.n_pose)
+        jacobian = torch.cat(
+            [eye, turned.movedim(-3, -1), none, by_scale, by_shift.flatten(-2)], -1
+        )
+        return JointJacobian(joints, jacobian)
+
+
+def _rotation_vectors(rotations: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Return axis times angle, radians."""
+    quaternion = matrix_to_quaternion_vector(rotations)
+    length = quaternion.norm(dim=-1, keepdim=True).clamp(1e-12, 1.0)
+    return 2 * quaternion * (length.asin() / length)
+
+
+def _paths(parents: Sequence[int]) -> Tensor:
+    """Return [K, K] bool: whether the row's node is the column's or above it."""
+    n = len(parents)
+    path = torch.zeros(n, n, dtype=torch.bool)
+    for node in range(n):
+        above = node
+        while above >= 0:
+            path[above, node] = True
+            above = parents[above]
+    return path
+
+
+def _pivot(skeleton: BodySkeleton, part: int) -> int:
+    """Return the joint about which a part turns."""
+    if part == 0:
+        return 0
+    return skeleton.parents[skeleton.part_of.index(part)]
+
+
+def _centre_rotations(skeleton: BodySkeleton) -> Tensor:
+    """Return the rotations [P, 3, 3] of the parts' centres relative to the part above."""
+    rest = torch.tensor(skeleton.directions, dtype=torch.float64)
+    vectors = torch.zeros(len(skeleton.parts), 3, dtype=torch.float64)
+    for name, direction in _CENTRES.items():
+        part = skeleton.parts.index(name)
+        bone = rest[skeleton.part_of.index(part)]
+        vectors[part] = minimal_rotation(bone, torch.tensor(direction, dtype=torch.float64))
+    return quaternion_vector_to_matrix(vectors)

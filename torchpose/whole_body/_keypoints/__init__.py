@@ -1,0 +1,1 @@
+"""Track whole bodies from keypoints by a Kalman filter over the articulated body."""

@@ -1,0 +1,315 @@
+"""Filter the state of an articulated body from keypoints by an iterated extended Kalman filter.
+
+Prediction: position and angles go on with velocities that decay (an Ornstein-Uhlenbeck process), bone scales
+are nearly constant, shifts of joints decay to zero (`body_transition`). A pose prior pulls angles with the
+share dt / T of its information, so that alone it would decide about them within its time T.
+
+Correction, iterated at x_i with d = x_i - x_predicted in the tangent space:
+
+    delta = P H^T y',   y' = (I + W G)^-1 (b + W H d),   G = H P H^T,
+    P' = P - P H^T (I + W G)^-1 W H P,
+
+with H the derivative of the joints and W, b the information of all keypoints about them
+(`keypoint_likelihood`), so the cost hardly depends on the number of cameras. With W = L L^T all factors are
+Cholesky factors of I + L^T G L.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from torchpose.body._articulation import BodyPoint
+from torchpose.priors._body_motion import BodyMotion
+from torchpose.whole_body._keypoints.body_transition import jump_variance, transition
+from torchpose.whole_body._keypoints.keypoint_likelihood import (
+    Beliefs,
+    KeypointFrame,
+    RigMaps,
+    Seen,
+    Weighed,
+    exchange_of,
+    information,
+    see,
+    squared_errors,
+    weigh,
+)
+
+__all__ = ["BodyGaussian", "BodyKalmanFilter", "CorrectedBody"]
+
+_JITTER = (
+    1e-9  # share of a joint's information that is added along every axis, for its Cholesky factor
+)
+_LEAST_INFORMATION = 1e-9  # per square metre, of joints that no camera measures
+_JUMP = 0.3  # metres, standard deviation of a joint that is elsewhere than predicted
+_NO_DOUBT = -12.0
+_ODDS = 1e-6  # least probability of exchanged sides, and of the opposite
+_RECOVERY = (
+    100.0,
+    50.0,
+    25.0,
+    12.0,
+    6.0,
+    3.0,
+    1.5,
+    1.0,
+)  # factors of the noise where a joint has jumped
+_DECIDED = 2.0  # factor of the noise above which keypoints do not tell which side they are of
+_SCALES = (0.3, 20.0)  # factors of a camera's noise
+_SCALE_TIME = 2.0  # seconds over which they are estimated
+_SCALE_COUNT = 10.0  # values of a frame, at most, that count for it as a whole
+
+
+class BodyGaussian(NamedTuple):
+    """Holds Gaussians over body states, and beliefs about cameras and joints.
+
+    Attributes:
+        mean: points, [B]. cov: [B, N, N], in the tangent spaces of the means.
+        log_odds: [B, C, 2], of exchanged sides of arms and legs. scale: [B, C], of the cameras' noise.
+        doubt: [B, J], log-odds of a joint elsewhere than the prediction has it.
+    """
+
+    mean: BodyPoint
+    cov: Tensor
+    log_odds: Tensor
+    scale: Tensor
+    doubt: Tensor
+
+    @property
+    def beliefs(self) -> Beliefs:
+        """Return what is believed of cameras."""
+        return Beliefs(self.log_odds, self.scale)
+
+    def take(self, index: Int[Tensor, " N"]) -> Self:
+        """Return some elements of the batch."""
+        mean = BodyPoint(*(value[index] for value in self.mean))
+        return type(self)(mean, *(value[index] for value in self[1:]))
+
+    def put(self, index: Int[Tensor, " N"], other: Self) -> Self:
+        """Return the batch with some elements replaced."""
+
+        def put(value: Tensor, new: Tensor) -> Tensor:
+            return value.index_copy(0, index, new)
+
+        mean = BodyPoint(*map(put, self.mean, other.mean))
+        return type(self)(mean, *map(put, self[1:], other[1:]))
+
+
+class CorrectedBody(NamedTuple):
+    """Holds what a correction gives.
+
+    Attributes:
+        state: the posterior. joints: [B, J, 3], metres. joint_cov: [B, J, 3, 3], metres squared.
+        weighed: of the keypoints, by the posterior mean. log_evidence: [B], by Laplace's approximation.
+        widened: [B, N], variances that the prediction got where joints had jumped.
+    """
+
+    state: BodyGaussian
+    joints: Tensor
+    joint_cov: Tensor
+    weighed: Weighed
+    log_evidence: Tensor
+    widened: Tensor
+
+    def take(self, index: Int[Tensor, " N"]) -> Self:
+        """Return some elements of the batch."""
+        weighed = Weighed(*(value[index] for value in self.weighed))
+        joints, joint_cov, evidence, widened = (
+            value[index] for value in (self.joints, self.joint_cov, self.log_evidence, self.widened)
+        )
+        return type(self)(self.state.take(index), joints, joint_cov, weighed, evidence, widened)
+
+
+class _Linearised(NamedTuple):
+    """Holds H [B, 3 J, N], H P, G = H P H^T, joints as seen, and the weights of keypoints."""
+
+    H: Tensor
+    HP: Tensor
+    G: Tensor
+    seen: Seen
+    weighed: Weighed
+
+
+class _Step(NamedTuple):
+    """Holds a step of an iteration: d [B, N], y' [B, 3 J], Cholesky factor, U with P' = P - U^T U."""
+
+    step: Tensor
+    pulled: Tensor
+    chol: Tensor
+    U: Tensor
+
+
+class BodyKalmanFilter(nn.Module):
+    """Filters Gaussians over body states from keypoints in C cameras.
+
+    Args:
+        motion: how bodies move. maps: the cameras. fps: frames per second. n_iterations: of a correction.
+    """
+
+    def __init__(
+        self, motion: BodyMotion, maps: RigMaps, fps: float, n_iterations: int = 3
+    ) -> None:
+        super().__init__()
+        self.motion, self.maps, self.fps, self.n_iterations = motion, maps, fps, n_iterations
+        self.articulation = motion.articulation
+        self.exchange = exchange_of(self.articulation.skeleton)
+        self.transition = transition(motion, 1 / fps)
+        self._jump_variance = jump_variance(motion)
+
+    def predict(self, state: BodyGaussian) -> BodyGaussian:
+        """Return the Gaussian one frame later."""
+        model = self.transition
+        mean = self.articulation.moved(state.mean, model.step(self.articulation, state.mean))
+        cov = model.matrix @ state.cov @ model.matrix.mT + model.noise
+        log_odds, doubt = model.next_log_odds(state.log_odds), model.next_doubt(state.doubt)
+        return self.pulled(BodyGaussian(mean, cov, log_odds, state.scale, doubt), model.share)
+
+    def pulled(self, state: BodyGaussian, share: float) -> BodyGaussian:
+        """Return the Gaussian after a share of the pose prior's information."""
+        a, columns = self.articulation, self.articulation.relative_columns
+        pull = self.motion.pull(a.relative_angles(state.mean), state.cov[..., columns, columns])
+        HP = state.cov[..., columns, :]
+        G = HP[..., columns]
+        L = torch.linalg.cholesky(share * pull.curvature)
+        chol = torch.linalg.cholesky(_plus_one(L.mT @ G @ L))
+        U = torch.linalg.solve_triangular(chol, L.mT @ HP, upper=False)
+        y = share * pull.slope
+        solved = torch.cholesky_solve(L.mT @ (G @ y[..., None]), chol)
+        step = (HP.mT @ (y[..., None] - L @ solved)).squeeze(-1)
+        return state._replace(mean=a.moved(state.mean, step), cov=state.cov - U.mT @ U)
+
+    def correct(
+        self, state: BodyGaussian, frame: KeypointFrame, widths: Sequence[float] | None = None
+    ) -> CorrectedBody:
+        """Return the posterior given the keypoints of a frame.
+
+        Args:
+            state: the prediction. frame: the keypoints.
+            widths: factor of the noise's variance in every iteration, for a start far from the solution;
+                by default 1, and more only where a joint has jumped.
+        """
+        a, found = self.articulation, None
+        widened = torch.zeros_like(state.cov[..., 0])
+        if widths is None:
+            widths = (1.0,) * self.n_iterations
+            found = self._linearised(state, state.mean, frame)
+            doubt, jumped = self._doubts(state, frame, found)
+            if bool(jumped.any()):
+                widths, found = _RECOVERY, None
+                widened = (jumped.to(doubt) @ self.articulation.carriers) * self._jump_variance
+                state = state._replace(cov=state.cov + torch.diag_embed(widened))
+            state = state._replace(doubt=doubt)
+        point, d, joint_cov = state.mean, torch.zeros_like(state.cov[..., 0]), None
+        for width in widths:
+            if found is None:
+                found = self._linearised(state, point, frame, joint_cov, width)
+            step = self._step(frame, found, d)
+            d = step.step
+            point = a.moved(state.mean, d)
+            UH = step.U @ found.H.mT
+            joint_cov, G, found = _blocks(found.G - UH.mT @ UH), found.G, None
+        return self._corrected(state, frame, point, joint_cov, step, G)._replace(widened=widened)
+
+    def _linearised(
+        self,
+        state: BodyGaussian,
+        point: BodyPoint,
+        frame: KeypointFrame,
+        joint_cov: Tensor | None = None,
+        width: float = 1.0,
+    ) -> _Linearised:
+        """Linearise about a point; weights by the prediction, or by an estimate with its covariance."""
+        joints, jacobian = self.articulation.linearise(point)
+        H = jacobian.flatten(-3, -2)
+        HP = H @ state.cov
+        G = HP @ H.mT
+        seen = see(self.maps, joints)
+        weighed = weigh(
+            frame, seen, self.maps, state.beliefs, self.exchange,
+            _blocks(G) if joint_cov is None else joint_cov,
+            marginal=joint_cov is None, decide=width < _DECIDED, width=width,
+        )  # fmt: skip
+        return _Linearised(H, HP, G, seen, weighed)
+
+    def _step(self, frame: KeypointFrame, found: _Linearised, d: Float[Tensor, "B N"]) -> _Step:
+        """Return one step of Gauss and Newton from the prediction."""
+        H, HP, G, seen, weighed = found
+        W, b = information(frame, seen, weighed, self.exchange)
+        L = _factors(W)
+        LHP = (L.mT @ HP.unflatten(-2, (-1, 3))).flatten(-3, -2)
+        LGL = ((LHP @ H.mT).unflatten(-1, (-1, 3)).transpose(-3, -2) @ L).transpose(-3, -2)
+        chol = torch.linalg.cholesky(_plus_one(LGL.flatten(-2)))
+        U = torch.linalg.solve_triangular(chol, LHP, upper=False)
+        moved = (H @ d[..., None]).unflatten(-2, (-1, 3))
+        y = (b[..., None] + W @ moved).flatten(-3, -2)
+        Gy = (G @ y).unflatten(-2, (-1, 3))
+        solved = torch.cholesky_solve((L.mT @ Gy).flatten(-3, -2), chol)
+        pulled = y - (L @ solved.unflatten(-2, (-1, 3))).flatten(-3, -2)
+        return _Step((HP.mT @ pulled).squeeze(-1), pulled.squeeze(-1), chol, U)
+
+    def _corrected(
+        self,
+        state: BodyGaussian,
+        frame: KeypointFrame,
+        point: BodyPoint,
+        joint_cov: Tensor,
+        step: _Step,
+        G: Tensor,
+    ) -> CorrectedBody:
+        a = self.articulation
+        cov = state.cov - step.U.mT @ step.U
+        joints = a.joints(point)
+        seen = see(self.maps, joints)
+        weighed = weigh(frame, seen, self.maps, state.beliefs, self.exchange)
+        off = (step.pulled * (G @ step.pulled[..., None]).squeeze(-1)).sum(-1)
+        fit = -0.5 * off - step.chol.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        after = BodyGaussian(
+            a.untwisted(point),
+            (cov + cov.mT) / 2,
+            torch.logit(weighed.exchanged, _ODDS),
+            self._next_scale(state.scale, frame, seen, weighed, joint_cov),
+            state.doubt,
+        )
+        return CorrectedBody(after, joints, joint_cov, weighed, weighed.log_evidence + fit, off)
+
+    def _next_scale(
+        self, scale: Tensor, frame: KeypointFrame, seen: Seen, weighed: Weighed, joint_cov: Tensor
+    ) -> Float[Tensor, "B C"]:
+        """Return the factors of the cameras' noise, averaged over the last seconds."""
+        sums, count = squared_errors(frame, seen, weighed, joint_cov)
+        share = (count / _SCALE_COUNT).clamp_max(1) / (_SCALE_TIME * self.fps)
+        ratio = sums / count.clamp_min(1e-6)
+        return (scale * (1 + share * (ratio - 1))).clamp(*_SCALES)
+
+    # --- joints elsewhere than predicted ------------------------------------------------------------
+
+    def _doubts(
+        self, state: BodyGaussian, frame: KeypointFrame, found: _Linearised
+    ) -> tuple[Float[Tensor, "B J"], Bool[Tensor, "B J"]]:
+        """Return the log-odds of joints elsewhere than predicted, given the keypoints, and which are."""
+        far = _blocks(found.G) + _JUMP**2 * torch.eye(3).to(found.G)
+        at_large = weigh(
+            frame, found.seen, self.maps, state.beliefs, self.exchange, far, marginal=True
+        )
+        doubt = state.doubt + (at_large.log_joint - found.weighed.log_joint).sum(-2)
+        jumped = doubt > 0
+        return torch.where(jumped, _NO_DOUBT, doubt), jumped
+
+
+def _plus_one(matrix: Tensor) -> Tensor:
+    """Return the symmetric part of a matrix plus the unit matrix."""
+    return (matrix + matrix.mT) / 2 + torch.eye(matrix.shape[-1]).to(matrix)
+
+
+def _factors(W: Float[Tensor, "B J 3 3"]) -> Tensor:
+    """Return Cholesky factors of information that may be singular."""
+    least = _JITTER * W.diagonal(dim1=-2, dim2=-1).sum(-1) + _LEAST_INFORMATION
+    return torch.linalg.cholesky(W + least[..., None, None] * torch.eye(3).to(W))
+
+
+def _blocks(matrix: Float[Tensor, "B J3 J3"]) -> Float[Tensor, "B J 3 3"]:
+    """Return the diagonal blocks of three rows."""
+    blocks = matrix.unflatten(-1, (-1, 3)).unflatten(-3, (-1, 3))
+    return blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)

@@ -1,0 +1,99 @@
+"""Predict the state of an articulated body one frame ahead, by the motion learnt from recordings."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.body._articulation import Articulation, BodyPoint
+from torchpose.priors._body_motion import BodyMotion
+
+__all__ = ["Transition", "jump_variance", "transition"]
+
+_SCALE_DRIFT = 0.002  # of the log of a bone's length, per root of a second
+_EXCHANGES = 0.1  # per second and camera, sides begin to be exchanged
+_RETURNS = 3.0  # and end to be, while they are
+_LOST = 0.2  # per second, a joint is elsewhere than predicted
+_STAYS_LOST = 0.6  # share of such joints that a frame does not find again
+_ODDS = 1e-6  # least probability
+_JUMPS = {"position": 0.1, "rotations": 0.7, "velocity": 5.0, "shifts": 0.05}
+_ROOT_JUMP = 1.0  # metres per second
+
+
+class Transition(NamedTuple):
+    """Holds the model of one frame.
+
+    Attributes:
+        matrix, noise: [N, N], of the tangent. share: of the pose prior's information that a frame adds.
+        begin, end: probabilities that an exchange of sides begins, and ends. lost: that a joint is.
+    """
+
+    matrix: Tensor
+    noise: Tensor
+    share: float
+    begin: float
+    end: float
+    lost: float
+
+    def step(self, articulation: Articulation, point: BodyPoint) -> Float[Tensor, "*batch N"]:
+        """Return the step of the mean in the tangent space."""
+        at = articulation.columns
+        moving = point.velocity.new_zeros(*point.velocity.shape[:-1], articulation.dim)
+        moving[..., at["velocity"]] = point.velocity
+        moving[..., at["shifts"]] = point.shifts.flatten(-2)
+        return moving @ self.matrix.mT - moving
+
+    def next_log_odds(self, log_odds: Float[Tensor, "*batch C 2"]) -> Float[Tensor, "*batch C 2"]:
+        """Return the log-odds of exchanged sides one frame later."""
+        p = log_odds.sigmoid()
+        return torch.logit(p * (1 - self.end) + (1 - p) * self.begin, _ODDS)
+
+    def next_doubt(self, doubt: Float[Tensor, "*batch J"]) -> Float[Tensor, "*batch J"]:
+        """Return the log-odds of joints elsewhere than predicted one frame later."""
+        return torch.logit(_STAYS_LOST * doubt.sigmoid() + self.lost, _ODDS)
+
+
+def transition(motion: BodyMotion, dt: float) -> Transition:
+    """Return the model of a frame of dt seconds.
+
+    Position and angles: x' = x + (1 - a) / decay v,  v' = a v,  a = exp(-decay dt), with the noise of white
+    acceleration, q^2 [dt^3 / 3, dt^2 / 2; dt^2 / 2, dt].
+    """
+    body = motion.articulation
+    at = body.columns
+    matrix = torch.eye(body.dim, dtype=torch.float64)
+    noise = torch.zeros_like(matrix)
+    pose, velocity = torch.arange(body.n_pose), _index(at["velocity"])
+    keep = torch.exp(-motion.decay * dt)
+    matrix[pose, velocity] = (1 - keep) / motion.decay
+    matrix[velocity, velocity] = keep
+    power = motion.acceleration.square()
+    noise[pose, pose] = power * dt**3 / 3
+    noise[pose, velocity] = noise[velocity, pose] = power * dt**2 / 2
+    noise[velocity, velocity] = power * dt
+    shifts = _index(at["shifts"])
+    held = torch.exp(-dt / motion.shift_time)
+    matrix[shifts, shifts] = held
+    noise[shifts, shifts] = motion.shift_std.repeat_interleave(3).square() * (1 - held.square())
+    scales = _index(at["scales"])
+    noise[scales, scales] = _SCALE_DRIFT**2 * dt
+    begin, end, lost = (1 - math.exp(-rate * dt) for rate in (_EXCHANGES, _RETURNS, _LOST))
+    device = motion.acceleration.device
+    share = dt / float(motion.pull_time)
+    return Transition(matrix.to(device), noise.to(device), share, begin, end, lost)
+
+
+def jump_variance(motion: BodyMotion) -> Float[Tensor, " N"]:
+    """Return the variances that a part gets whose joint is elsewhere than predicted."""
+    body = motion.articulation
+    std = torch.zeros(body.dim, dtype=torch.float64)
+    for name, value in _JUMPS.items():
+        std[body.columns[name]] = value
+    std[body.columns["velocity"]][:3] = _ROOT_JUMP
+    return std.square().to(motion.acceleration.device)
+
+
+def _index(columns: slice) -> Tensor:
+    return torch.arange(columns.start, columns.stop)

@@ -1,0 +1,254 @@
+"""Weigh keypoints by how likely they are: of their joint, of the joint on the other side, or of nothing.
+
+A keypoint z of joint j in camera c is, with probability pi, the joint plus Gaussian noise, and else
+anywhere in an area a:
+
+    p(z | x) = pi N(z; h_c(p_j(x)), R) + (1 - pi) / a.
+
+The noise has a part in pixels and one that a detector makes relative to the body, whose size in the image goes
+with the depth: R = s_c (r + m f^2 / depth^2) I, with a factor s_c of the camera that the filter estimates. In each
+camera left and right of the arms, and of the legs, may be exchanged; whether they are is a two-state chain over
+time. All of it is marginalised: expected information about joints is what the filter gets.
+"""
+
+import math
+from typing import NamedTuple, Self
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchpose.body._skeleton import BodySkeleton, other_side
+from torchpose.camera._rig import CameraRig
+
+__all__ = [
+    "Beliefs",
+    "Exchange",
+    "KeypointFrame",
+    "RigMaps",
+    "Seen",
+    "Weighed",
+    "exchange_of",
+    "information",
+    "see",
+    "squared_errors",
+    "weigh",
+]
+
+_LEAST_DEPTH = 0.05  # metres in front of a camera; nearer points are not seen by it
+_LEAST = 1e-30  # probability
+_LEGS = ("hip", "knee", "ankle")
+
+
+class RigMaps(NamedTuple):
+    """Holds the maps from world axes to the homogeneous pixels of C cameras, M p + m.
+
+    Attributes:
+        matrix: K R, [C, 3, 3]. shift: K t, [C, 3]. log_area: [C], of the area of outliers, pixels squared.
+    """
+
+    matrix: Tensor
+    shift: Tensor
+    log_area: Tensor
+
+    @classmethod
+    def of(cls, rig: CameraRig) -> Self:
+        """Return the maps of a rig; outliers lie in a quarter of the image, as large as the person's surroundings."""
+        shift = (rig.matrix @ rig.translation[..., None]).squeeze(-1)
+        focal = rig.matrix[:, 0, 0] * rig.matrix[:, 1, 1]
+        areas = [
+            float(f) if size is None else size[0] * size[1]
+            for f, size in zip(focal, rig.sizes, strict=True)
+        ]
+        log_area = torch.tensor(areas, dtype=shift.dtype).div(4).log().to(shift.device)
+        return cls(rig.matrix @ rig.rotation, shift, log_area)
+
+
+class KeypointFrame(NamedTuple):
+    """Holds the keypoints of one frame.
+
+    Attributes:
+        pixels: [B, C, J, 2], undistorted; anything finite where there is none.
+        variance: [B, C, J], r in pixels squared. relative: [B, C, J], m in metres squared.
+        inlier: [B, C, J], prior probability pi; 0 where there is no keypoint.
+    """
+
+    pixels: Tensor
+    variance: Tensor
+    relative: Tensor
+    inlier: Tensor
+
+    def take(self, index: Int[Tensor, " N"]) -> Self:
+        """Return the keypoints of some elements of the batch."""
+        return type(self)(*(value[index] for value in self))
+
+
+class Seen(NamedTuple):
+    """Holds pixels [B, C, J, 2] of joints, their derivative [B, C, J, 2, 3] and whether they are in front."""
+
+    pixels: Tensor
+    by_joint: Tensor
+    in_front: Tensor
+
+
+class Exchange(NamedTuple):
+    """Describes groups of joints whose sides may be exchanged.
+
+    Attributes:
+        mirror: [J], the joint on the other side. groups: [2, J], 1 for joints of the arms, of the legs.
+    """
+
+    mirror: Tensor
+    groups: Tensor
+
+
+class Beliefs(NamedTuple):
+    """Holds what is believed of cameras: log_odds [B, C, 2] of exchanged sides, and scale s_c [B, C]."""
+
+    log_odds: Tensor
+    scale: Tensor
+
+
+class Weighed(NamedTuple):
+    """Holds expected weights of the two readings of every keypoint.
+
+    Attributes:
+        own, other: [B, C, J], probability that the keypoint is of its joint and an inlier; that the keypoint of
+            the other side is of this joint and an inlier.
+        variance, other_variance: [B, C, J], of the noise of both.
+        exchanged: [B, C, 2], probability that sides of arms and of legs are exchanged.
+        log_joint: [B, C, J], log density of the keypoints that would be of the joint, 0 where there is none.
+        log_evidence: [B].
+    """
+
+    own: Tensor
+    other: Tensor
+    variance: Tensor
+    other_variance: Tensor
+    exchanged: Tensor
+    log_joint: Tensor
+    log_evidence: Tensor
+
+
+def exchange_of(skeleton: BodySkeleton) -> Exchange:
+    """Return the groups of joints whose sides may be exchanged: arms, legs."""
+    names = skeleton.names
+    mirror = torch.tensor([names.index(other_side(n)) for n in names])
+    sided = mirror != torch.arange(len(names))
+    legs = torch.tensor([n.endswith(_LEGS) for n in names])
+    return Exchange(mirror, torch.stack([sided & ~legs, sided & legs]).double())
+
+
+def see(maps: RigMaps, joints: Float[Tensor, "B J 3"]) -> Seen:
+    """Return joints as cameras see them, u = (M p + m)_12 / (M p + m)_3, and how they move there.
+
+    Args:
+        maps: the cameras. joints: metres, world axes.
+    """
+    homogeneous = joints.unsqueeze(-3) @ maps.matrix.mT + maps.shift[:, None]
+    depth = homogeneous[..., 2]
+    in_front = depth > _LEAST_DEPTH
+    depth = torch.where(in_front, depth, 1.0)[..., None]
+    pixels = homogeneous[..., :2] / depth
+    rows = maps.matrix[:, None, :2] - pixels[..., None] * maps.matrix[:, None, 2:]
+    return Seen(pixels, rows / depth[..., None], in_front)
+
+
+def weigh(
+    frame: KeypointFrame,
+    seen: Seen,
+    maps: RigMaps,
+    beliefs: Beliefs,
+    exchange: Exchange,
+    joint_cov: Float[Tensor, "B J 3 3"] | None = None,
+    *,
+    marginal: bool = False,
+    decide: bool = True,
+    width: float = 1.0,
+) -> Weighed:
+    """Return the weights of keypoints by joints and their covariance.
+
+    Args:
+        joint_cov: of the joints; None is none. marginal: whether densities are N(r; 0, A P A^T + R), of a
+            prediction, and not exp E[log N(r; 0, R)], of an estimate that the same keypoints made.
+        decide: whether keypoints tell about exchanged sides; else the prior alone does.
+        width: factor of the noise's variance.
+    """
+    spread = None
+    if joint_cov is not None:
+        spread = seen.by_joint @ joint_cov.unsqueeze(-4) @ seen.by_joint.mT
+    size = 0.5 * seen.by_joint.square().sum((-2, -1))  # about f^2 / depth^2
+    scale = (width * beliefs.scale)[..., None]
+
+    def read(pixels: Tensor, variance: Tensor, relative: Tensor, inlier: Tensor) -> list[Tensor]:
+        variance = scale * (variance + relative * size)
+        inlier = torch.where(seen.in_front, inlier, 0.0)
+        density = _log_density(pixels - seen.pixels, spread, variance, marginal)
+        log_in = inlier.clamp_min(_LEAST).log() + density
+        both = torch.logaddexp(log_in, torch.log1p(-inlier) - maps.log_area[:, None])
+        present = inlier > 0
+        weight = torch.where(present, (log_in - both).exp(), 0.0)
+        return [weight, variance, torch.where(present, both, 0.0)]
+
+    own, variance, log_own = read(*frame)
+    other, other_variance, log_other = read(*(value[:, :, exchange.mirror] for value in frame))
+    gain = (log_other - log_own) @ exchange.groups.mT
+    log_odds = beliefs.log_odds
+    exchanged = (log_odds + gain if decide else log_odds).sigmoid()
+    swapped = exchanged @ exchange.groups
+    logsigmoid = torch.nn.functional.logsigmoid
+    mixed = torch.logaddexp(logsigmoid(-log_odds), logsigmoid(log_odds) + gain)
+    return Weighed(
+        own * (1 - swapped),
+        other * swapped,
+        variance,
+        other_variance,
+        exchanged,
+        torch.lerp(log_own, log_other, swapped),
+        log_own.sum((-2, -1)) + mixed.sum((-2, -1)),
+    )
+
+
+def _log_density(
+    residual: Tensor, spread: Tensor | None, variance: Tensor, marginal: bool
+) -> Tensor:
+    """Return log N(r; 0, spread + R), or log N(r; 0, R) expected over the spread; R = variance I."""
+    if spread is None or not marginal:
+        square = residual.square().sum(-1)
+        if spread is not None:
+            square = square + spread.diagonal(dim1=-2, dim2=-1).sum(-1)
+        return -0.5 * square / variance - (2 * math.pi * variance).log()
+    a, b, d = spread[..., 0, 0] + variance, spread[..., 0, 1], spread[..., 1, 1] + variance
+    det = a * d - b * b
+    x, y = residual.unbind(-1)
+    square = (d * x * x - 2 * b * x * y + a * y * y) / det
+    return -0.5 * square - 0.5 * det.log() - math.log(2 * math.pi)
+
+
+def information(
+    frame: KeypointFrame, seen: Seen, weighed: Weighed, exchange: Exchange
+) -> tuple[Float[Tensor, "B J 3 3"], Float[Tensor, "B J 3"]]:
+    """Return the information W_j = sum w A^T R^-1 A about joints, and the pull b_j = sum w A^T R^-1 r."""
+    own, other = weighed.own / weighed.variance, weighed.other / weighed.other_variance
+    weighted = seen.by_joint * (own + other)[..., None, None]
+    matrix = (weighted.mT @ seen.by_joint).sum(1)
+    force = own[..., None] * (frame.pixels - seen.pixels)
+    force = force + other[..., None] * (frame.pixels[:, :, exchange.mirror] - seen.pixels)
+    return matrix, (seen.by_joint.mT @ force[..., None]).squeeze(-1).sum(1)
+
+
+def squared_errors(
+    frame: KeypointFrame, seen: Seen, weighed: Weighed, joint_cov: Float[Tensor, "B J 3 3"]
+) -> tuple[Float[Tensor, "B C"], Float[Tensor, "B C"]]:
+    """Return sums over joints of expected squared errors over the noise's variance, and their count.
+
+    Only keypoints read as of their own joint count, by their weights: E[|r|^2] = |r|^2 + tr A P A^T.
+    """
+    spread = (seen.by_joint @ joint_cov.unsqueeze(-4) * seen.by_joint).sum((-2, -1))
+    square = (frame.pixels - seen.pixels).square().sum(-1) + spread
+    return (weighed.own * square / weighed.variance).sum(-1), 2 * weighed.own.sum(-1)
+
+
+def measured(weighed: Weighed) -> Bool[Tensor, "B C J"]:
+    """Return which joints have a keypoint that is likely theirs."""
+    return weighed.own + weighed.other > 0.5

@@ -1,0 +1,174 @@
+"""Find the state in which a body begins: from the keypoints of one frame, without a guess.
+
+Joints are triangulated by the cameras that agree on them, or put at the depth at which a person has the image's
+size where there is one camera. They tell where the trunk is and its axis. The filter's own correction then begins
+at several headings, with noise that is wide at first; evidence tells which heading is right.
+"""
+
+import math
+from collections.abc import Sequence
+from itertools import combinations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchpose.body._articulation import Articulation, BodyPoint
+from torchpose.math._rotations import rotvec_to_matrix
+from torchpose.priors._body_motion import BodyMotion
+from torchpose.whole_body._keypoints.body_kalman import (
+    BodyGaussian,
+    BodyKalmanFilter,
+    CorrectedBody,
+)
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, see
+
+__all__ = ["N_HEADINGS", "start", "triangulate"]
+
+N_HEADINGS = 8
+_WIDTHS = (
+    400.0,
+    200.0,
+    100.0,
+    50.0,
+    25.0,
+    12.0,
+    6.0,
+    3.0,
+    1.5,
+    1.0,
+    1.0,
+)  # factors of the noise's variance
+_AGREE = 6.0  # standard deviations of the noise within which a camera agrees
+_POSITION, _ROOT_TURN, _TURN = 0.3, 0.5, 0.8  # metres and radians: how unsure a start is
+_SPEED, _TURN_SPEED = 1.5, 5.0  # per second
+_LOG_ODDS, _DOUBT = -6.0, -5.0
+_TRUNK = (("left_shoulder", "right_shoulder", "neck", "head"), ("left_hip", "right_hip", "pelvis"))
+_TRUNK_SHARE, _BODY_SHARE = 0.28, 0.9  # of the height: from hips to shoulders, from ankles to head
+_DEFAULT_HEIGHT = 1.7
+
+
+def start(filter: BodyKalmanFilter, frame: KeypointFrame) -> CorrectedBody:
+    """Return the corrected hypotheses [B * N_HEADINGS] of a start, those of an element one after the other.
+
+    Args:
+        filter: that tracks on. frame: the first keypoints, of B persons.
+    """
+    maps = filter.maps
+    one_camera = len(maps.shift) == 1
+    joints = (
+        _at_one_depth(maps, frame, filter.articulation) if one_camera else triangulate(maps, frame)
+    )
+    points = _points(filter.articulation, filter.motion, maps, joints)
+    count = len(points.position)
+    names = filter.articulation.skeleton.names
+    state = BodyGaussian(
+        points,
+        _initial_cov(filter.motion).expand(count, -1, -1),
+        joints.new_full((count, len(maps.shift), 2), _LOG_ODDS),
+        joints.new_ones(count, len(maps.shift)),
+        joints.new_full((count, len(names)), _DOUBT),
+    )
+    every = torch.arange(len(joints), device=joints.device).repeat_interleave(N_HEADINGS)
+    return filter.correct(filter.pulled(state, 1.0), frame.take(every), _WIDTHS)
+
+
+def triangulate(maps: RigMaps, frame: KeypointFrame) -> Float[Tensor, "B J 3"]:
+    """Return joints by the cameras that agree, NaN where no two do.
+
+    The pair of cameras that most others agree with decides; all that agree then count (linear least squares of
+    u (M p + m)_3 = (M p + m)_12).
+    """
+    rows = maps.matrix[:, None, 2:] * frame.pixels[..., None] - maps.matrix[:, None, :2]
+    right = maps.shift[:, None, :2] - maps.shift[:, None, 2:] * frame.pixels
+    size = maps.matrix[:, 2].norm(dim=-1)[:, None, None]
+    rows, right = rows / size[..., None], right / size
+    there = frame.inlier > 0
+
+    def solve(use: Tensor) -> Tensor:
+        scaled = rows * use.to(rows)[..., None, None]
+        normal = (scaled.mT @ rows).sum(1) + 1e-9 * torch.eye(3).to(rows)
+        return torch.linalg.solve(normal, (scaled.mT @ right[..., None]).sum(1)).squeeze(-1)
+
+    best = torch.full_like(rows[:, 0, :, 0, 0], -1.0)
+    chosen = torch.zeros_like(there)
+    for pair in combinations(range(len(maps.shift)), 2):
+        use = torch.zeros_like(there)
+        use[:, list(pair)] = there[:, list(pair)].all(1, keepdim=True)
+        seen = see(maps, solve(use))
+        variance = frame.variance + frame.relative * seen.by_joint.square().sum((-2, -1)) / 2
+        error = (seen.pixels - frame.pixels).square().sum(-1) / variance
+        agree = there & seen.in_front & (error < _AGREE**2)
+        score = (
+            agree.to(error) - torch.where(agree, error, 0.0) / _AGREE**2 / len(maps.shift)
+        ).sum(1)
+        score = torch.where((agree & use).sum(1) == 2, score, -1.0)
+        chosen = torch.where((score > best)[:, None], agree, chosen)
+        best = torch.maximum(best, score)
+    return torch.where((chosen.sum(1) >= 2)[..., None], solve(chosen), torch.nan)
+
+
+def _at_one_depth(
+    maps: RigMaps, frame: KeypointFrame, articulation: Articulation
+) -> Float[Tensor, "B J 3"]:
+    """Return the keypoints of the first camera at the depth at which a person has their size."""
+    there = (frame.inlier[:, 0] > 0)[..., None]
+    pixels = torch.where(there, frame.pixels[:, 0], torch.nan)
+    top, low = (_middle(articulation, pixels, names) for names in _TRUNK)
+    trunk = (top - low).norm(dim=-1) / _TRUNK_SHARE
+    high = torch.where(there, frame.pixels[:, 0], -math.inf).amax(1)
+    deep = torch.where(there, frame.pixels[:, 0], math.inf).amin(1)
+    box = (high - deep).amax(-1) / _BODY_SHARE
+    size = torch.where(trunk.isfinite(), torch.maximum(trunk, box), box).clamp_min(1.0)
+    focal = torch.linalg.det(maps.matrix[0]).abs().sqrt()
+    depth = focal * _DEFAULT_HEIGHT / size
+    homogeneous = torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1) * depth[:, None, None]
+    return torch.linalg.solve(maps.matrix[0], (homogeneous - maps.shift[0]).mT).mT
+
+
+def _middle(
+    articulation: Articulation, points: Float[Tensor, "B J d"], names: Sequence[str]
+) -> Float[Tensor, "B d"]:
+    """Return the mean of the known ones of some joints, NaN if there is none."""
+    return points[:, [articulation.skeleton.joint(name) for name in names]].nanmean(1)
+
+
+def _points(
+    articulation: Articulation, motion: BodyMotion, maps: RigMaps, joints: Float[Tensor, "B J 3"]
+) -> BodyPoint:
+    """Return upright bodies at the joints, with the limbs at their centres, at every heading."""
+    top, low = (_middle(articulation, joints, names) for names in _TRUNK)
+    image_up = -torch.linalg.solve(maps.matrix[0], torch.eye(3).to(joints))[:, 1]
+    up = torch.where((top - low).isfinite(), top - low, image_up)
+    up = torch.nn.functional.normalize(up, dim=-1)
+    position = torch.where(low.isfinite(), low, joints.nanmean(1)).nan_to_num()
+    least = torch.nn.functional.one_hot(up.abs().argmin(-1), 3).to(up)
+    side = torch.nn.functional.normalize(torch.linalg.cross(least, up), dim=-1)
+    trunk = torch.stack([side, up, torch.linalg.cross(side, up)], -1)
+    angles = torch.arange(N_HEADINGS).to(up) * (2 * math.pi / N_HEADINGS)
+    headings = rotvec_to_matrix(angles[:, None] * torch.tensor([0.0, 1.0, 0.0]).to(up))
+    count = len(joints) * N_HEADINGS
+    rotations = torch.eye(3).to(up).repeat(count, len(articulation.skeleton.parts), 1, 1)
+    rotations[:, 0] = (trunk[:, None] @ headings).flatten(0, 1)
+    return BodyPoint(
+        position.repeat_interleave(N_HEADINGS, 0),
+        rotations,
+        up.new_zeros(count, articulation.n_pose),
+        motion.scale_mean.to(up).expand(count, -1),
+        up.new_zeros(count, len(articulation.shifted), 3),
+    )
+
+
+def _initial_cov(motion: BodyMotion) -> Float[Tensor, "N N"]:
+    """Return the covariance of a start before any keypoint."""
+    a, at = motion.articulation, motion.articulation.columns
+    std = torch.zeros(a.dim).to(motion.acceleration)
+    std[at["position"]] = _POSITION
+    std[at["rotations"]] = _TURN
+    std[at["rotations"]][:3] = _ROOT_TURN
+    std[at["velocity"]] = _TURN_SPEED
+    std[at["velocity"]][:3] = _SPEED
+    std[at["shifts"]] = motion.shift_std.repeat_interleave(3)
+    cov = torch.diag(std.square())
+    cov[at["scales"], at["scales"]] = motion.scale_cov
+    return cov

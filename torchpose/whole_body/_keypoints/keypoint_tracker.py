@@ -1,0 +1,236 @@
+"""Track bodies through keypoints: begin, filter, begin anew where a person was lost, smooth."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from torchpose.body._articulation import BodyPoint
+from torchpose.camera._rig import CameraRig
+from torchpose.priors._body_motion import BodyMotion
+from torchpose.whole_body._keypoints.body_kalman import (
+    BodyGaussian,
+    BodyKalmanFilter,
+    CorrectedBody,
+)
+from torchpose.whole_body._keypoints.body_smoothing import smooth
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
+from torchpose.whole_body._keypoints.keypoint_start import N_HEADINGS, start
+
+__all__ = ["KeypointPoses", "KeypointStream", "KeypointTracker"]
+
+_LEAST_JOINTS = 6  # that are measured where tracking begins
+_HYPOTHESES = 4  # headings that one camera keeps until it knows better
+_SETTLED = 1.0  # second after which the likeliest one is taken
+_LOST = 0.3  # share of keypoints below which the person is somewhere else
+_LOST_TIME = 0.5  # seconds of that after which tracking begins anew
+
+
+class KeypointStream(NamedTuple):
+    """Holds the state of tracking between two frames, of M hypotheses for each of B persons.
+
+    Attributes:
+        state: Gaussians of [B * M]. log_weights: [B, M], of the hypotheses, not normalised.
+        begun: [B], whether the person was found. age: [B], frames since then. lost: [B], frames in a row in
+            which most keypoints were of something else.
+    """
+
+    state: BodyGaussian
+    log_weights: Tensor
+    begun: Tensor
+    age: Tensor
+    lost: Tensor
+
+
+class KeypointPoses(NamedTuple):
+    """Holds the poses of B persons; of T frames [B, T, ...], or of one [B, ...].
+
+    Attributes:
+        joints: [..., J, 3], metres, world axes. covariance: [..., J, 3, 3], metres squared.
+        point: the states, on the manifold. state_cov: [..., N, N], in their tangent spaces.
+        inlier: [..., C, J], probability that a keypoint was a joint's. exchanged: [..., C, 2], of sides of arms,
+            legs. log_evidence: [...]. coasting: [...], where nothing was measured. started: [...], where
+            tracking began.
+    """
+
+    joints: Tensor
+    covariance: Tensor
+    point: BodyPoint
+    state_cov: Tensor
+    inlier: Tensor
+    exchanged: Tensor
+    log_evidence: Tensor
+    coasting: Tensor
+    started: Tensor
+
+
+class KeypointTracker(nn.Module):
+    """Tracks bodies through frames of keypoints with a `BodyKalmanFilter`.
+
+    Args:
+        rig: the cameras. fps: frames per second. motion: how bodies move. n_iterations: of a correction.
+    """
+
+    def __init__(
+        self, rig: CameraRig, fps: float, motion: BodyMotion, n_iterations: int = 3
+    ) -> None:
+        super().__init__()
+        self.filter = BodyKalmanFilter(motion, RigMaps.of(rig), fps, n_iterations)
+        self.n_hypotheses = _HYPOTHESES if len(rig) == 1 else 1
+
+    def forward(
+        self, frames: KeypointFrame, smoothing: bool = False, progress: bool = False
+    ) -> KeypointPoses:
+        """Track whole sequences.
+
+        Args:
+            frames: [B, T, C, J, ...]. smoothing: whether later frames count too. progress: show a bar.
+        """
+        n_frames = frames.pixels.shape[1]
+        stream, poses, corrected = None, [], []
+        for t in tqdm(range(n_frames), disable=not progress, unit="frame"):
+            frame = KeypointFrame(*(value[:, t] for value in frames))
+            stream, pose, found = self.advance(stream, frame)
+            poses.append(pose)
+            corrected.append(found)
+        filtered = _stacked(poses)
+        return self._smoothed(filtered, corrected) if smoothing else filtered
+
+    def advance(
+        self, stream: KeypointStream | None, frame: KeypointFrame
+    ) -> tuple[KeypointStream, KeypointPoses, CorrectedBody]:
+        """Track one more frame; the first one begins where there is no stream yet.
+
+        Returns:
+            The next stream, the poses of the frame [B, ...], and the corrected likeliest hypotheses.
+        """
+        n_joints = (frame.inlier > 0).any(-2).sum(-1)
+        enough = n_joints >= _LEAST_JOINTS
+        if stream is None:
+            due = torch.ones_like(enough)
+            stream, found = self._started(frame)
+            stream = stream._replace(begun=enough)
+        else:
+            stream, found = self._followed(stream, frame)
+            due = enough & (~stream.begun | (stream.lost > _LOST_TIME * self.filter.fps))
+            if bool(due.any()):
+                stream, found = self._begun_anew(stream, found, frame, due)
+        best = self._best(stream)
+        chosen = found.take(best)
+        inlier = chosen.weighed.own + chosen.weighed.other
+        stream = stream._replace(lost=self._lost(stream, frame, inlier))
+        pose = KeypointPoses(
+            chosen.joints, chosen.joint_cov, chosen.state.mean, chosen.state.cov, inlier,
+            chosen.weighed.exchanged, chosen.log_evidence,
+            ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, due & enough,
+        )  # fmt: skip
+        if stream.log_weights.shape[1] > 1 and bool(
+            (stream.age > _SETTLED * self.filter.fps).all()
+        ):
+            stream = stream._replace(
+                state=stream.state.take(best),
+                log_weights=torch.zeros_like(stream.log_weights[:, :1]),
+            )
+        return stream, pose, chosen
+
+    # --- one frame --------------------------------------------------------------------------------
+
+    def _followed(
+        self, stream: KeypointStream, frame: KeypointFrame
+    ) -> tuple[KeypointStream, CorrectedBody]:
+        count, n_each = stream.log_weights.shape
+        every = torch.arange(count, device=frame.pixels.device).repeat_interleave(n_each)
+        found = self.filter.correct(self.filter.predict(stream.state), frame.take(every))
+        weights = stream.log_weights + found.log_evidence.view(count, n_each)
+        weights = weights - weights.amax(-1, keepdim=True)
+        stream = stream._replace(state=found.state, log_weights=weights, age=stream.age + 1)
+        return stream, found
+
+    def _started(self, frame: KeypointFrame) -> tuple[KeypointStream, CorrectedBody]:
+        """Return the likeliest hypotheses of a start."""
+        found = start(self.filter, frame)
+        count = len(frame.pixels)
+        evidence = found.log_evidence.view(count, N_HEADINGS)
+        weights, index = evidence.topk(self.n_hypotheses, -1)
+        first = torch.arange(count, device=index.device)[:, None] * N_HEADINGS
+        found = found.take((first + index).flatten())
+        zero = torch.zeros(count, dtype=torch.long, device=index.device)
+        begun = torch.ones_like(zero, dtype=torch.bool)
+        return KeypointStream(found.state, weights - weights[:, :1], begun, zero, zero), found
+
+    def _begun_anew(
+        self,
+        stream: KeypointStream,
+        found: CorrectedBody,
+        frame: KeypointFrame,
+        due: Bool[Tensor, " B"],
+    ) -> tuple[KeypointStream, CorrectedBody]:
+        """Return the stream with the elements that are due begun with this frame."""
+        persons = due.nonzero().squeeze(-1)
+        new, new_found = self._started(frame.take(persons))
+        n_old, n_new = stream.log_weights.shape[1], self.n_hypotheses
+        if n_old < n_new:  # those who go on do so with the hypothesis that they have
+            count = len(due)
+            every = torch.arange(count, device=due.device).repeat_interleave(n_new)
+            weights = stream.log_weights.new_full((count, n_new), -torch.inf)
+            weights[:, 0] = 0
+            found = found.take(every)
+            stream = stream._replace(state=stream.state.take(every), log_weights=weights)
+        rows = (persons[:, None] * n_new + torch.arange(n_new, device=due.device)).flatten()
+        stream = KeypointStream(
+            stream.state.put(rows, new.state),
+            stream.log_weights.index_copy(0, persons, new.log_weights),
+            stream.begun | due,
+            torch.where(due, 0, stream.age),
+            torch.where(due, 0, stream.lost),
+        )
+        return stream, _put(found, rows, new_found)
+
+    def _best(self, stream: KeypointStream) -> Int[Tensor, " B"]:
+        count, n_each = stream.log_weights.shape
+        first = torch.arange(count, device=stream.log_weights.device) * n_each
+        return first + stream.log_weights.argmax(-1)
+
+    def _lost(
+        self, stream: KeypointStream, frame: KeypointFrame, inlier: Float[Tensor, "B C J"]
+    ) -> Int[Tensor, " B"]:
+        """Return the frames in a row in which most keypoints were of something else."""
+        expected = frame.inlier.sum((-2, -1))
+        astray = inlier.sum((-2, -1)) < _LOST * expected
+        return torch.where(expected > 0, torch.where(astray, stream.lost + 1, 0), stream.lost)
+
+    # --- whole sequences --------------------------------------------------------------------------
+
+    def _smoothed(
+        self, filtered: KeypointPoses, corrected: Sequence[CorrectedBody]
+    ) -> KeypointPoses:
+        widened = torch.stack([found.widened for found in corrected])
+        states = [found.state for found in corrected]
+        result = smooth(self.filter, states, widened, filtered.started.mT)
+        point = result.mean.map(lambda value: value.transpose(0, 1))
+        cov = result.cov.transpose(0, 1)
+        joints, jacobian = self.filter.articulation.linearise(point)
+        joint_cov = (jacobian @ cov.unsqueeze(-3)) @ jacobian.mT
+        return filtered._replace(joints=joints, covariance=joint_cov, point=point, state_cov=cov)
+
+
+def _put(found: CorrectedBody, rows: Tensor, new: CorrectedBody) -> CorrectedBody:
+    """Return the batch with some elements replaced."""
+
+    def put(a: Any, b: Any) -> Any:
+        if isinstance(a, Tensor):
+            return a.index_copy(0, rows, b)
+        return type(a)(*map(put, a, b))
+
+    return put(found, new)
+
+
+def _stacked(poses: Sequence[Any]) -> Any:
+    """Return named tuples of tensors [B, ...] as one of tensors [B, T, ...]."""
+    first = poses[0]
+    if isinstance(first, Tensor):
+        return torch.stack(list(poses), 1)
+    return type(first)(*(_stacked(values) for values in zip(*poses, strict=True)))
