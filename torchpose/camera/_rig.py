@@ -200,6 +200,33 @@ class CameraRig(nn.Module):
         out = out.reshape(array.shape)
         return torch.from_numpy(out).to(images.device) if isinstance(images, Tensor) else out
 
+    def undistort_points(
+        self, points: Float[Tensor, "*batch C N 2"]
+    ) -> Float[Tensor, "*batch C N 2"]:
+        """Return pixels as cameras without distortion would have them; the matrix K stays.
+
+        Args:
+            points: [..., C, N, 2], pixels of the C cameras; NaN stays NaN.
+
+        Returns:
+            [..., C, N, 2], pixels; the same tensor where no camera is distorted.
+
+        Raises:
+            CameraError: another number of cameras. ShapeError: no such points.
+        """
+        check_shape("points", points, ["...", "C", "N", 2])
+        if points.shape[-3] != len(self):
+            raise CameraError(
+                f"points must be of {len(self)} cameras ({', '.join(self.names)}), got "
+                f"{points.shape[-3]}"
+            )
+        if not bool(self.distortions.any()):
+            return points
+        straight = points.clone()
+        for c in range(len(self)):
+            straight[..., c, :, :] = self._straightened(c, points[..., c, :, :])
+        return straight
+
     def check_images(self, name: str, shape: Sequence[int]) -> None:
         """Check that images have the number and the size of this rig's cameras.
 
@@ -231,6 +258,27 @@ class CameraRig(nn.Module):
             f"{n}: {'size unknown' if s is None else f'{s[1]}x{s[0]}'}"
             for n, s in zip(self.names, self.sizes, strict=True)
         )
+
+    def _straightened(self, camera: int, points: Tensor) -> Tensor:
+        """Return the undistorted pixels [..., N, 2] of one camera."""
+        import cv2
+
+        d, K = self.distortions[camera].double().cpu(), self.matrix[camera].double().cpu()
+        known = torch.isfinite(points).all(-1)
+        if not bool(d.any()) or not bool(known.any()):
+            return points
+        pixels = points[known].double().cpu()
+        rays = torch.linalg.solve(K, torch.cat([pixels, torch.ones_like(pixels[:, :1])], -1).mT).mT
+        source = np.ascontiguousarray(rays[:, :2].numpy())[:, None]
+        eye = np.eye(3)
+        if self.fisheye[camera]:
+            found = cv2.fisheye.undistortPoints(source, eye, d[:4].numpy())
+        else:
+            found = cv2.undistortPoints(source, eye, d.numpy())
+        rays[:, :2] = torch.from_numpy(np.asarray(found)[:, 0])
+        straight = points.clone()
+        straight[known] = (rays @ K.mT)[:, :2].to(points)
+        return straight
 
     def _undistorted(self, camera: int, images: np.ndarray) -> np.ndarray:
         """Return the images [T, H, W] or [T, H, W, 3] of one camera."""

@@ -40,6 +40,7 @@ _BODY = {
     "centres": "f P 3",
 }
 _APART = 1e-3  # metres between joints and where the states put them
+_APART_OF = {"kalman": 0.3}  # whose joints shift, and whose bones adapt over time
 _HEIGHTS = (0.3, 5.0)  # metres; between them is everybody, and what is no person is outside
 
 
@@ -56,17 +57,20 @@ class BodyTrack:
         body: the body of the person, to which the states belong.
         state: [T, D], the estimates.
         state_std: [T, D], their standard deviations, in the units of a step (`Body.difference`).
-        joints3d: [T, J, 3], the joints of the estimates, metres, world axes.
+        joints3d: [T, J, 3], the joints of the estimates, metres, world axes. Those of "kalman" may be
+            centimetres from where `state` has them, since its shoulders and hips shift and bones adapt.
         covariance3d: [T, J, 3, 3], the second moment of the particles' joints about them, metres squared;
-            filters with Gaussians within particles include these.
+            filters with Gaussians include these.
         log_evidence: [T], the increments log p(z_t | z_1:t-1).
-        effective_sample_size: [T], 1 / sum_j w_j^2 of the particles.
+        effective_sample_size: [T], 1 / sum_j w_j^2 of the particles; NaN where there are none.
         coasting: [T], True where no camera saw the person.
         respread: [T], True where all particles had died and were spread about the last estimate.
         fps: the number of frames per second, or None. notes: the assumptions, in plain words.
         first_frame: the frame of the videos that the first pose belongs to.
         details: what only some filters report, by name, [T, ...] each (`BodyFilterOutput.details`), such
-            as "acceptance", "clamped" and "actions" of `ConstrainedParticleFilter`.
+            as "acceptance", "clamped" and "actions" of `ConstrainedParticleFilter`; of "kalman" "inlier"
+            [T, C, J] (probability that a camera's keypoint was the joint's), "exchanged" [T, C, 2] (that
+            left and right were exchanged, of arms and of legs) and "bone_lengths" [T, J], metres.
         action_names: the names of the columns of ``details["actions"]``.
         method: the name of the filter that ran, one of `torchpose.whole_body.METHODS`; "unknown" in files
             of older releases.
@@ -193,7 +197,7 @@ class BodyTrack:
             )
         joints = self.body.joints(self.state.to(self.body.bone_lengths))
         apart = float((joints - self.joints3d.to(joints)).abs().amax())
-        if not apart <= _APART:
+        if not apart <= _APART_OF.get(self.method, _APART):
             raise FileFormatError(
                 f"{path}: expected joints3d where state puts them, they are {apart:.3g} m apart"
             )

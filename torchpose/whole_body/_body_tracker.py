@@ -1,6 +1,6 @@
-"""Track whole bodies: from the silhouettes of calibrated cameras to the poses of one person."""
+"""Track whole bodies: from keypoints or silhouettes in calibrated cameras to the poses of one person."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple, Unpack
@@ -36,9 +36,16 @@ from torchpose.whole_body._filters.body_particles import BodyFilterState
 from torchpose.whole_body._filters.motion import std_of_covariance
 from torchpose.whole_body._first_pose import find_first_pose
 from torchpose.whole_body._following import all_see, follow
+from torchpose.whole_body._keypoints.keypoint_body_tracker import (
+    KEYPOINT_METHOD,
+    KeypointBodyTracker,
+    KeypointOptions,
+)
+from torchpose.whole_body._keypoints.keypoint_tracker import KeypointStream
 
 __all__ = ["BodyStream", "BodyTracker"]
 
+_HEIGHT = 1.75  # metres, of a person of unknown height
 _LOOK_AHEAD = 0.5  # seconds that decide where the person looks at first
 
 
@@ -46,21 +53,25 @@ class BodyStream(NamedTuple):
     """Holds the state of `BodyTracker.step` between two frames.
 
     Attributes:
-        filter: state of the filter. frame: number of the next frame. generator: of random numbers.
+        filter: state of the filter; None before the first keypoints. frame: number of the next frame.
+        generator: of random numbers.
     """
 
-    filter: BodyFilterState
+    filter: BodyFilterState | KeypointStream | None
     frame: int
     generator: torch.Generator | None
 
 
 class BodyTracker(nn.Module):
-    """Tracks one person's whole body through the silhouettes of calibrated cameras, in 3D.
+    """Tracks one person's whole body through keypoints or silhouettes of calibrated cameras, in 3D.
 
     `forward` tracks a whole sequence and finds the first pose by itself; `init` and `step` track live,
     `advance` some frames at a time, with the same numbers.
 
-    The method is a particle filter:
+    ``kalman`` takes the keypoints of any detector in one camera or more: an iterated extended Kalman filter
+    over root, rotations, their velocities and bone lengths, in which every keypoint is its joint's, that of the
+    other side, or nobody's (docs/keypoint-bodies.md). The other methods take silhouettes, and are particle
+    filters:
 
     - ``mrpf``: also weighted by the distance from a manifold of poses of the same action
       (`ManifoldParticleFilter`); needs `manifold`.
@@ -72,11 +83,12 @@ class BodyTracker(nn.Module):
       needs `action`.
 
     Args:
-        cameras: the cameras of the silhouettes, undistorted: a `CameraRig`, or what makes one.
-        method: a name of `torchpose.whole_body.METHODS`; by default that of the model given, else "apf".
+        cameras: a `CameraRig`, or what makes one; silhouettes are undistorted, keypoints are as detected.
+        method: "kalman", or a name of `torchpose.whole_body.METHODS`; by default that of the model given,
+            else "apf".
         body: the person's body, or a body.npz (`BodyTrack`) whose bone lengths and shape the person has;
             then the height is not used.
-        height: the height of the person, metres.
+        height: the height of the person, metres; by default 1.75 with silhouettes, and estimated from keypoints.
         manifold: the poses of an action, by a name that `torchpose info` lists, or a file; in Python also
             the model itself. Every method finds the first pose with it.
         conditionals: the rotations of limbs relative to each other and over time, by name, or a file.
@@ -89,11 +101,13 @@ class BodyTracker(nn.Module):
             default what suits the method.
         initial_cov: the variances of the particles about the first pose, as `process_cov`; by default
             four times those.
+        keypoint_std: of "kalman", how far a detector's joints are from the body's, metres along each axis;
+            keypoints of low confidence are farther. pixel_std: the same in pixels, on top of it.
         **options: the options of the method's filter (`torchpose.whole_body._filter_table.method_options`),
             such as sharpness, limits, leg_swap or n_layers.
 
     Attributes:
-        filter: the filter that runs. method: its name.
+        filter: the filter that runs on silhouettes. method: its name.
         upright: the body with which the first pose is found.
 
     Raises:
@@ -124,7 +138,7 @@ class BodyTracker(nn.Module):
         method: str | None = None,
         *,
         body: Body | str | Path | None = None,
-        height: float = 1.75,
+        height: float | None = None,
         manifold: BackConstrainedGPLVM | str | Path | None = None,
         conditionals: LimbConditionals | str | Path | None = None,
         action: ActionSpace | ActionBank | str | Path | None = None,
@@ -132,12 +146,38 @@ class BodyTracker(nn.Module):
         fps: float = 60.0,
         process_cov: Tensor | None = None,
         initial_cov: Tensor | None = None,
+        keypoint_std: float | None = None,
+        pixel_std: float | None = None,
         **options: Unpack[BodyTrackerOptions],
     ) -> None:
         super().__init__()
         check_rate("fps", fps)
         given = {"manifold": manifold, "conditionals": conditionals, "action": action}
         given = {kind: value for kind, value in given.items() if value is not None}
+        self.by_keypoints: KeypointBodyTracker | None = None
+        noises = {"keypoint_std": keypoint_std, "pixel_std": pixel_std}
+        noises = {name: value for name, value in noises.items() if value is not None}
+        if method == KEYPOINT_METHOD:
+            unused = [*given, *options]
+            unused += ["process_cov"] * (process_cov is not None)
+            unused += ["initial_cov"] * (initial_cov is not None)
+            if unused:
+                raise InputError(
+                    f"{', '.join(unused)} does nothing for method {method}; leave it out"
+                )
+            self.method, self.fps = method, float(fps)
+            person = body if body is None or isinstance(body, Body) else load_body(body)
+            self.by_keypoints = KeypointBodyTracker(
+                as_rig(cameras), fps, body=person, height=height,
+                options=KeypointOptions(**noises),
+            )  # fmt: skip
+            self.cameras, self.n_particles, self.notes = self.by_keypoints.rig, 0, ()
+            return
+        if noises:
+            raise InputError(
+                f"{', '.join(noises)} does nothing without method={KEYPOINT_METHOD!r}, which takes keypoints"
+            )
+        height = _HEIGHT if height is None else height
         self.method = choose_method(method, given)
         models = {kind: _model(kind, value, fps) for kind, value in given.items()}
         needs = METHODS[self.method].needs
@@ -199,18 +239,29 @@ class BodyTracker(nn.Module):
     @torch.no_grad()
     def forward(
         self,
-        silhouettes: Iterable[Bool[Tensor, "C H W"]],
+        silhouettes: Iterable[Bool[Tensor, "C H W"]] | None = None,
         initial_state: Float[Tensor, " D"] | None = None,
         *,
+        keypoints: Float[Tensor, "*B T C J 2"] | None = None,
+        confidence: Float[Tensor, "*B T C J"] | None = None,
+        names: Sequence[str] | None = None,
+        covariance: Float[Tensor, "*B T C J"] | None = None,
+        smoothing: str = "none",
         generator: torch.Generator | None = None,
         lengths: Int[Tensor, "1"] | None = None,
         facing: Float[Tensor, "3"] | None = None,
         n_frames: int | None = None,
         progress: bool = False,
-    ) -> BodyTrack:
-        """Track one person from the first frame whose silhouettes all show a person.
+    ) -> BodyTrack | list[BodyTrack]:
+        """Track one person from the first frame whose silhouettes all show a person, or from the first keypoints.
 
         Args:
+            keypoints: [T, C, J, 2] or [B, T, C, J, 2], pixels as detected, NaN where there is none; for
+                "kalman", which takes these five arguments and `progress`.
+            confidence: [..., C, J], from 0 (no keypoint) to 1; all 1 by default.
+            names: of the J joints, of any known set; those of `BODY_15` by default.
+            covariance: [..., C, J], variance along u and v, pixels squared, in place of the usual noise.
+            smoothing: "full" lets later frames count too; "none" filters.
             silhouettes: bool [T, C, H, W], or frames [C, H, W] one after the other, of which memory then
                 holds those that the first pose is found in, and one more.
             initial_state: the pose before that frame [D], of `body`; found in half a second of frames
@@ -222,13 +273,24 @@ class BodyTracker(nn.Module):
             n_frames: the expected number of frames, for the bar. progress: whether to show one.
 
         Returns:
-            `BodyTrack`, from frame `first_frame`.
+            `BodyTrack`, from frame `first_frame`; of keypoints [B, T, ...] a list of B.
 
         Raises:
-            NobodySeenError: by all cameras in any frame. InputError: silhouettes that are not bool, or
+            NobodySeenError: by all cameras in any frame, or no keypoint. InputError: silhouettes that are not bool, or
             lengths outside 1..T.
             ShapeError, CameraError: of other sizes than the cameras' images.
         """
+        if self.by_keypoints is not None:
+            if keypoints is None:
+                raise InputError(f"method {self.method} takes keypoints, got none")
+            return self.by_keypoints(
+                keypoints, confidence, names, covariance=covariance, smoothing=smoothing,
+                progress=progress,
+            )  # fmt: skip
+        if keypoints is not None or silhouettes is None:
+            raise InputError(
+                f"method {self.method} takes silhouettes; keypoints need method={KEYPOINT_METHOD!r}"
+            )
         source = iter(silhouettes)
         frames = source if lengths is None else islice(source, _whole(lengths))
         seen = next(((t, masks) for t, masks in enumerate(frames) if all_see(masks)), None)
@@ -267,6 +329,8 @@ class BodyTracker(nn.Module):
     ) -> BodyStream:
         """Begin to track a live stream, whose first frame is the first of these, or the one after a pose.
 
+        A stream of keypoints begins with the first frame that has enough of them, and needs no argument.
+
         Args:
             silhouettes: bool, half a second in which the first pose is found; they are to be tracked
                 afterwards, with `step` or `advance`. initial_state: the pose before the first frame [D], of
@@ -279,6 +343,8 @@ class BodyTracker(nn.Module):
             InputError: neither silhouettes nor a pose, nobody seen in the first frame. ShapeError,
             CameraError: as `forward`.
         """
+        if self.by_keypoints is not None:
+            return BodyStream(None, 0, None)
         if initial_state is None:
             if silhouettes is None:
                 raise InputError(
@@ -299,13 +365,21 @@ class BodyTracker(nn.Module):
 
     @torch.no_grad()
     def step(
-        self, state: BodyStream, silhouettes: Bool[Tensor, "C H W"]
+        self,
+        state: BodyStream,
+        silhouettes: Bool[Tensor, "C H W"] | None = None,
+        *,
+        keypoints: Float[Tensor, "C J 2"] | None = None,
+        confidence: Float[Tensor, "C J"] | None = None,
+        names: Sequence[str] | None = None,
+        covariance: Float[Tensor, "C J"] | None = None,
     ) -> tuple[BodyStream, BodyTrack]:
         """Track one more frame: the same numbers as that frame of `forward`.
 
         Args:
             state: the state from `init` or the step before; it is not changed (but a generator goes on).
             silhouettes: the silhouettes of one frame, bool [C, H, W].
+            keypoints, confidence, names, covariance: of one frame, as in `forward`, for "kalman".
 
         Returns:
             The next state, and the `BodyTrack` of this one frame.
@@ -313,7 +387,17 @@ class BodyTracker(nn.Module):
         Raises:
             ShapeError, InputError, CameraError: as `forward`.
         """
-        return self.advance(state, [silhouettes])
+        if self.by_keypoints is None:
+            if silhouettes is None:
+                raise InputError(f"method {self.method} takes silhouettes, got none")
+            return self.advance(state, [silhouettes])
+        if keypoints is None:
+            raise InputError(f"method {self.method} takes keypoints, got none")
+        after, pose = self.by_keypoints.step(
+            state.filter, keypoints, confidence, names, covariance=covariance
+        )
+        pose.first_frame = state.frame
+        return BodyStream(after, state.frame + 1, None), pose
 
     @torch.no_grad()
     def advance(
@@ -330,6 +414,8 @@ class BodyTracker(nn.Module):
         Raises:
             ShapeError, InputError, CameraError: as `forward`.
         """
+        if self.by_keypoints is not None:
+            raise InputError(f"method {self.method} takes keypoints, one frame at a time, by step")
         after, poses = follow(
             self.filter, state.filter, silhouettes, self.cameras, state.generator, state.frame
         )

@@ -15,7 +15,7 @@ Cholesky factors of I + L^T G L.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -84,17 +84,11 @@ class BodyGaussian(NamedTuple):
 
     def take(self, index: Int[Tensor, " N"]) -> Self:
         """Return some elements of the batch."""
-        mean = BodyPoint(*(value[index] for value in self.mean))
-        return type(self)(mean, *(value[index] for value in self[1:]))
+        return _taken(self, index)
 
     def put(self, index: Int[Tensor, " N"], other: Self) -> Self:
         """Return the batch with some elements replaced."""
-
-        def put(value: Tensor, new: Tensor) -> Tensor:
-            return value.index_copy(0, index, new)
-
-        mean = BodyPoint(*map(put, self.mean, other.mean))
-        return type(self)(mean, *map(put, self[1:], other[1:]))
+        return _put(self, index, other)
 
 
 class CorrectedBody(NamedTuple):
@@ -115,11 +109,11 @@ class CorrectedBody(NamedTuple):
 
     def take(self, index: Int[Tensor, " N"]) -> Self:
         """Return some elements of the batch."""
-        weighed = Weighed(*(value[index] for value in self.weighed))
-        joints, joint_cov, evidence, widened = (
-            value[index] for value in (self.joints, self.joint_cov, self.log_evidence, self.widened)
-        )
-        return type(self)(self.state.take(index), joints, joint_cov, weighed, evidence, widened)
+        return _taken(self, index)
+
+    def put(self, index: Int[Tensor, " N"], other: Self) -> Self:
+        """Return the batch with some elements replaced."""
+        return _put(self, index, other)
 
 
 class _Linearised(NamedTuple):
@@ -190,27 +184,48 @@ class BodyKalmanFilter(nn.Module):
             widths: factor of the noise's variance in every iteration, for a start far from the solution;
                 by default 1, and more only where a joint has jumped.
         """
-        a, found = self.articulation, None
-        widened = torch.zeros_like(state.cov[..., 0])
-        if widths is None:
-            widths = (1.0,) * self.n_iterations
-            found = self._linearised(state, state.mean, frame)
-            doubt, jumped = self._doubts(state, frame, found)
-            if bool(jumped.any()):
-                widths, found = _RECOVERY, None
-                widened = (jumped.to(doubt) @ self.articulation.carriers) * self._jump_variance
-                state = state._replace(cov=state.cov + torch.diag_embed(widened))
-            state = state._replace(doubt=doubt)
+        if widths is not None:
+            return self._iterated(state, frame, widths)
+        found = self._linearised(state, state.mean, frame)
+        doubt, jumped = self._doubts(state, frame, found)
+        state = state._replace(doubt=doubt)
+        corrected = self._iterated(state, frame, (1.0,) * self.n_iterations, found)
+        rows = jumped.any(-1).nonzero().squeeze(-1)
+        return self._recovered(corrected, state, frame, jumped, rows) if len(rows) else corrected
+
+    def _recovered(
+        self,
+        corrected: CorrectedBody,
+        state: BodyGaussian,
+        frame: KeypointFrame,
+        jumped: Bool[Tensor, "B J"],
+        rows: Int[Tensor, " N"],
+    ) -> CorrectedBody:
+        """Return the posteriors, of elements with jumped joints from a prediction that is wide there."""
+        widened = (jumped[rows].to(state.cov) @ self.articulation.carriers) * self._jump_variance
+        wide = state.take(rows)
+        wide = wide._replace(cov=wide.cov + torch.diag_embed(widened))
+        again = self._iterated(wide, frame.take(rows), _RECOVERY)
+        return corrected.put(rows, again._replace(widened=widened))
+
+    def _iterated(
+        self,
+        state: BodyGaussian,
+        frame: KeypointFrame,
+        widths: Sequence[float],
+        found: _Linearised | None = None,
+    ) -> CorrectedBody:
+        """Return the posterior after steps of Gauss and Newton, the first from what was found already."""
         point, d, joint_cov = state.mean, torch.zeros_like(state.cov[..., 0]), None
         for width in widths:
             if found is None:
                 found = self._linearised(state, point, frame, joint_cov, width)
             step = self._step(frame, found, d)
             d = step.step
-            point = a.moved(state.mean, d)
+            point = self.articulation.moved(state.mean, d)
             UH = step.U @ found.H.mT
             joint_cov, G, found = _blocks(found.G - UH.mT @ UH), found.G, None
-        return self._corrected(state, frame, point, joint_cov, step, G)._replace(widened=widened)
+        return self._corrected(state, frame, point, joint_cov, step, G)
 
     def _linearised(
         self,
@@ -272,7 +287,8 @@ class BodyKalmanFilter(nn.Module):
             self._next_scale(state.scale, frame, seen, weighed, joint_cov),
             state.doubt,
         )
-        return CorrectedBody(after, joints, joint_cov, weighed, weighed.log_evidence + fit, off)
+        evidence = weighed.log_evidence + fit
+        return CorrectedBody(after, joints, joint_cov, weighed, evidence, torch.zeros_like(step.step))
 
     def _next_scale(
         self, scale: Tensor, frame: KeypointFrame, seen: Seen, weighed: Weighed, joint_cov: Tensor
@@ -296,6 +312,20 @@ class BodyKalmanFilter(nn.Module):
         doubt = state.doubt + (at_large.log_joint - found.weighed.log_joint).sum(-2)
         jumped = doubt > 0
         return torch.where(jumped, _NO_DOUBT, doubt), jumped
+
+
+def _taken(value: Any, index: Tensor) -> Any:
+    """Return some elements of a tensor, or of named tuples of tensors."""
+    if isinstance(value, Tensor):
+        return value[index]
+    return type(value)(*(_taken(part, index) for part in value))
+
+
+def _put(value: Any, index: Tensor, other: Any) -> Any:
+    """Return a tensor, or named tuples of tensors, with some elements replaced."""
+    if isinstance(value, Tensor):
+        return value.index_copy(0, index, other)
+    return type(value)(*(_put(a, index, b) for a, b in zip(value, other, strict=True)))
 
 
 def _plus_one(matrix: Tensor) -> Tensor:

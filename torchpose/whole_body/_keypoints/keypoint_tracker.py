@@ -187,7 +187,7 @@ class KeypointTracker(nn.Module):
             torch.where(due, 0, stream.age),
             torch.where(due, 0, stream.lost),
         )
-        return stream, _put(found, rows, new_found)
+        return stream, found.put(rows, new_found)
 
     def _best(self, stream: KeypointStream) -> Int[Tensor, " B"]:
         count, n_each = stream.log_weights.shape
@@ -215,17 +215,6 @@ class KeypointTracker(nn.Module):
         joints, jacobian = self.filter.articulation.linearise(point)
         joint_cov = (jacobian @ cov.unsqueeze(-3)) @ jacobian.mT
         return filtered._replace(joints=joints, covariance=joint_cov, point=point, state_cov=cov)
-
-
-def _put(found: CorrectedBody, rows: Tensor, new: CorrectedBody) -> CorrectedBody:
-    """Return the batch with some elements replaced."""
-
-    def put(a: Any, b: Any) -> Any:
-        if isinstance(a, Tensor):
-            return a.index_copy(0, rows, b)
-        return type(a)(*map(put, a, b))
-
-    return put(found, new)
 
 
 def _stacked(poses: Sequence[Any]) -> Any:

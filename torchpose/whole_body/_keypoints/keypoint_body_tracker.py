@@ -1,0 +1,260 @@
+"""Track one person or several recordings through keypoints of calibrated cameras, to `BodyTrack`."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from torchpose._core.checks import check_positive, check_shape
+from torchpose.body._kinematics import Body
+from torchpose.body._skeleton import BODY_15, body_joints
+from torchpose.camera._rig import CameraRig
+from torchpose.errors import CameraError, InputError, NobodySeenError, ShapeError
+from torchpose.priors._body_motion import BodyMotion, shipped_body_motion
+from torchpose.whole_body._body_track import BodyTrack
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame
+from torchpose.whole_body._keypoints.keypoint_notes import notes_of
+from torchpose.whole_body._keypoints.keypoint_tracker import (
+    KeypointPoses,
+    KeypointStream,
+    KeypointTracker,
+)
+from torchpose.whole_body._keypoints.known_person import with_body, with_height
+
+__all__ = ["KEYPOINT_METHOD", "KeypointBodyTracker", "KeypointOptions"]
+
+KEYPOINT_METHOD = "kalman"
+SMOOTHING = ("none", "full")
+_INLIER = (0.05, 0.97)  # least and largest prior probability that a keypoint is its joint's
+_LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
+_FARTHEST = 200.0  # metres from the origin; no room with cameras is larger
+
+
+class KeypointOptions(NamedTuple):
+    """Holds the options of tracking by keypoints.
+
+    Attributes:
+        keypoint_std: metres, how far a detector's joints are from the body's, along each axis.
+        pixel_std: pixels, how far they are apart from that.
+    """
+
+    keypoint_std: float = 0.012
+    pixel_std: float = 1.0
+
+
+class KeypointBodyTracker(nn.Module):
+    """Tracks whole bodies through keypoints of calibrated cameras; see `BodyTracker` with "kalman".
+
+    Args:
+        rig: the cameras. fps: frames per second. body: the person's, whose bone lengths are kept, or None.
+        height: of the person, metres, or None. motion: how bodies move, the shipped one by default.
+        options: of the noise.
+
+    Raises:
+        InputError: values out of range. CameraError: cameras farther away than any room is large.
+    """
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        fps: float,
+        *,
+        body: Body | None = None,
+        height: float | None = None,
+        motion: BodyMotion | None = None,
+        options: KeypointOptions | None = None,
+    ) -> None:
+        super().__init__()
+        self.rig, self.fps, self.options = rig, float(fps), options or KeypointOptions()
+        for name, value in self.options._asdict().items():
+            check_positive(name, value)
+        far = rig.translation.norm(dim=-1)
+        if bool((far > _FARTHEST).any()):
+            raise CameraError(
+                f"cameras must be given in metres, got camera {rig.names[int(far.argmax())]!r} "
+                f"{float(far.max()):g} m from the origin; divide translations in millimetres by 1000"
+            )
+        motion = shipped_body_motion() if motion is None else motion
+        if body is not None:
+            motion = with_body(motion, body)
+        elif height is not None:
+            motion = with_height(motion, check_positive("height", height))
+        self.sized = body is not None or height is not None
+        self.tracker = KeypointTracker(rig, self.fps, motion)
+
+    @torch.no_grad()
+    def forward(
+        self,
+        keypoints: Float[Tensor, "*B T C J 2"],
+        confidence: Float[Tensor, "*B T C J"] | None = None,
+        names: Sequence[str] | None = None,
+        *,
+        covariance: Float[Tensor, "*B T C J"] | None = None,
+        smoothing: str = "none",
+        progress: bool = False,
+    ) -> BodyTrack | list[BodyTrack]:
+        """Track whole sequences; see `BodyTracker.forward`."""
+        if smoothing not in SMOOTHING:
+            raise InputError(f"smoothing must be one of {', '.join(SMOOTHING)}, got {smoothing!r}")
+        check_shape("keypoints", keypoints, ["...", "T", len(self.rig), None, 2])
+        if keypoints.ndim not in (4, 5):
+            raise ShapeError(
+                f"keypoints must have shape [T, C, J, 2] or [B, T, C, J, 2], got {list(keypoints.shape)}"
+            )
+        frames = self._frames(keypoints, confidence, names, covariance)
+        single = keypoints.ndim == 4
+        if single:
+            frames = KeypointFrame(*(value[None] for value in frames))
+        self._check_seen(frames)
+        poses = self.tracker(frames, smoothing == "full", progress)
+        tracks = [self._track(poses, frames, b) for b in range(len(frames.pixels))]
+        return tracks[0] if single else tracks
+
+    @torch.no_grad()
+    def step(
+        self,
+        stream: KeypointStream | None,
+        keypoints: Float[Tensor, "C J 2"],
+        confidence: Float[Tensor, "C J"] | None = None,
+        names: Sequence[str] | None = None,
+        *,
+        covariance: Float[Tensor, "C J"] | None = None,
+    ) -> tuple[KeypointStream, BodyTrack]:
+        """Track one more frame; see `BodyTracker.step`."""
+        check_shape("keypoints", keypoints, [len(self.rig), None, 2])
+        frame = self._frames(keypoints, confidence, names, covariance)
+        frame = KeypointFrame(*(value[None] for value in frame))
+        stream, pose, _ = self.tracker.advance(stream, frame)
+        poses = _with_time(pose)
+        frames = KeypointFrame(*(value[:, None] for value in frame))
+        return stream, self._track(poses, frames, 0, summed_up=False)
+
+    # --- keypoints --------------------------------------------------------------------------------
+
+    def _frames(
+        self,
+        keypoints: Tensor,
+        confidence: Tensor | None,
+        names: Sequence[str] | None,
+        covariance: Tensor | None,
+    ) -> KeypointFrame:
+        """Return keypoints of `BODY_15`'s joints, undistorted, with their noise and trust."""
+        names = BODY_15.names if names is None else tuple(names)
+        shape = keypoints.shape[:-1]
+        check_shape("keypoints", keypoints, ["...", len(names), 2])
+        for name, value in (("confidence", confidence), ("covariance", covariance)):
+            if value is not None:
+                check_shape(name, value, list(shape))
+        points = keypoints.to(self.rig.matrix)
+        trust = torch.ones_like(points[..., 0]) if confidence is None else confidence.to(points)
+        if not bool((trust.nan_to_num(0) >= 0).all()):
+            raise InputError(f"confidence must not be negative, got {float(trust.min()):g}")
+        trust = trust.nan_to_num(0.0).clamp_max(1.0)
+        own = self.options.pixel_std**2 * torch.ones_like(trust)
+        relative = self.options.keypoint_std**2 / trust.clamp_min(_LEAST_CONFIDENCE)
+        if covariance is not None:
+            own, relative = covariance.to(points), torch.zeros_like(trust)
+            if not bool((own[trust > 0] > 0).all()):
+                raise InputError("covariance must be positive, pixels squared")
+        there = torch.isfinite(points).all(-1) & (trust > 0)
+        inlier = torch.where(there, trust.clamp(*_INLIER), 0.0)
+        table = torch.cat([points, torch.stack([own, relative, inlier], -1)], -1)
+        table = body_joints(table, names, middles=False)
+        pixels = torch.where((table[..., 4:] > 0), table[..., :2], torch.nan)
+        self._check_inside(pixels)
+        pixels = self.rig.undistort_points(pixels).nan_to_num()
+        own, relative, inlier = table[..., 2:].nan_to_num(1.0).unbind(-1)
+        inlier = torch.where(table[..., 4].isfinite(), inlier, 0.0)
+        return KeypointFrame(pixels, own, relative, inlier)
+
+    def _check_inside(self, pixels: Float[Tensor, "*batch C J 2"]) -> None:
+        """Refuse keypoints most of which lie far outside an image: they are of another size."""
+        for c, (name, size) in enumerate(zip(self.rig.names, self.rig.sizes, strict=True)):
+            if size is None:
+                continue
+            points = pixels[..., c, :, :].reshape(-1, 2)
+            points = points[torch.isfinite(points).all(-1)]
+            side = torch.tensor([size[1], size[0]]).to(points)
+            outside = ((points < -side / 2) | (points > 1.5 * side)).any(-1)
+            if len(points) and float(outside.double().mean()) > 0.5:
+                raise CameraError(
+                    f"most keypoints of camera {name!r} lie outside its image of {size[1]} x "
+                    f"{size[0]} pixels; if they are of a video of another size, take "
+                    "rig.scaled(height, width)"
+                )
+
+    def _check_seen(self, frames: KeypointFrame) -> None:
+        """Refuse sequences without a keypoint."""
+        seen = (frames.inlier > 0).flatten(1).any(-1)
+        if not bool(seen.all()):
+            raise NobodySeenError(
+                f"sequence {int((~seen).nonzero()[0])} has no keypoint in any camera and frame"
+            )
+
+    # --- poses ------------------------------------------------------------------------------------
+
+    def _track(
+        self, poses: KeypointPoses, frames: KeypointFrame, b: int, summed_up: bool = True
+    ) -> BodyTrack:
+        """Return the track of one element of the batch."""
+        body = self.tracker.filter.articulation
+        point = poses.point.map(lambda value: value[b])
+        bones = body.bones(point)
+        lengths = bones.norm(dim=-1)
+        rigid = _rigid_body(bones)
+        state = rigid.state_of(point.position, body.world_rotations(point))
+        frame = KeypointFrame(*(value[b] for value in frames))
+        nobody = ~poses.coasting[b]
+        return BodyTrack(
+            rigid,
+            state,
+            self._state_std(poses.state_cov[b]),
+            poses.joints[b],
+            poses.covariance[b],
+            poses.log_evidence[b],
+            torch.full_like(poses.log_evidence[b], torch.nan),
+            poses.coasting[b],
+            poses.started[b] & (torch.arange(len(nobody), device=nobody.device) > 0) & summed_up,
+            self.fps,
+            notes=self._notes(poses, frame, b) if summed_up else (),
+            details={
+                "inlier": poses.inlier[b],
+                "exchanged": poses.exchanged[b],
+                "bone_lengths": lengths,
+            },
+            method=KEYPOINT_METHOD,
+        )
+
+    def _state_std(self, cov: Float[Tensor, "T N N"]) -> Float[Tensor, "T 36"]:
+        """Return standard deviations in the units of a state: metres, and sines of half angles."""
+        body = self.tracker.filter.articulation
+        std = cov.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+        turns = std.new_zeros(len(std), len(BODY_15.parts), 3)
+        turns[:, body.axis_part, body.axis] = std[:, body.columns["rotations"]] / 2
+        return torch.cat([std[:, body.columns["position"]], turns.flatten(1)], -1)
+
+    def _notes(self, poses: KeypointPoses, frame: KeypointFrame, b: int) -> tuple[str, ...]:
+        return notes_of(
+            self.rig.names, frame.inlier > 0, poses.inlier[b], poses.exchanged[b],
+            poses.coasting[b], self.sized,
+        )  # fmt: skip
+
+
+def _rigid_body(bones: Float[Tensor, "T J 3"]) -> Body:
+    """Return the body of a track: the median bone of every joint in the axes of the part that carries it."""
+    middle = bones.median(0).values
+    middle[0] = 0
+    lengths = middle.norm(dim=-1)
+    height = BODY_15.height(lengths)
+    radii = BODY_15.standard_radii(height).to(lengths)
+    return Body(BODY_15, lengths, radii, directions=middle)
+
+
+def _with_time(pose: KeypointPoses) -> KeypointPoses:
+    """Return the poses of one frame as those of a sequence of one."""
+    point = pose.point.map(lambda value: value[:, None])
+    return KeypointPoses(
+        *(point if name == "point" else getattr(pose, name)[:, None] for name in pose._fields)
+    )

@@ -1,0 +1,70 @@
+"""Say in plain words what the keypoints of cameras betray: mirrored videos, cameras that disagree, gaps."""
+
+from collections.abc import Sequence
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+__all__ = ["notes_of"]
+
+_DISAGREES = 0.5  # share of a camera's keypoints that are nobody's, above which it is said
+_MIRRORED = 0.5  # share of frames in which a camera's sides are exchanged
+_GAP = 30  # frames without keypoints that are worth a word
+
+
+def notes_of(
+    cameras: Sequence[str],
+    there: Bool[Tensor, "T C J"],
+    inlier: Float[Tensor, "T C J"],
+    exchanged: Float[Tensor, "T C 2"],
+    coasting: Bool[Tensor, " T"],
+    sized: bool,
+) -> tuple[str, ...]:
+    """Return notes on the keypoints of a track.
+
+    Args:
+        cameras: their names. there: which keypoints there were. inlier: probability that each was a joint's.
+        exchanged: probability that sides were exchanged. coasting: frames without a measurement.
+        sized: whether the person's size was given.
+    """
+    notes = []
+    for c, name in enumerate(cameras):
+        count = int(there[:, c].sum())
+        if count == 0:
+            notes.append(f"camera {name} has no keypoint in any frame")
+            continue
+        astray = 1 - float(inlier[:, c][there[:, c]].mean())
+        if astray > _DISAGREES:
+            notes.append(
+                f"{100 * astray:.0f} % of the keypoints of camera {name} do not agree with the body; check "
+                "its calibration, its delay against the others, and whether its video is mirrored"
+            )
+        swapped = float((exchanged[:, c] > 0.5).all(-1)[there[:, c].any(-1)].double().mean())
+        if swapped > _MIRRORED:
+            notes.append(
+                f"left and right of camera {name} are exchanged in {100 * swapped:.0f} % of the frames; "
+                "is its video mirrored?"
+            )
+    if len(cameras) == 1 and not sized:
+        notes.append(
+            "one camera does not tell how large a person is: size and distance are those of the persons "
+            "of the prior; give height or body if they are known"
+        )
+    notes += [
+        f"nothing was measured in frames {first} to {last}; the poses there are predictions"
+        for first, last in _runs(coasting)
+        if last - first + 1 >= _GAP
+    ]
+    return tuple(notes)
+
+
+def _runs(flags: Bool[Tensor, " T"]) -> list[tuple[int, int]]:
+    """Return first and last index of each run of True."""
+    runs, begin = [], None
+    for t, flag in enumerate([*flags.tolist(), False]):
+        if flag and begin is None:
+            begin = t
+        if not flag and begin is not None:
+            runs.append((begin, t - 1))
+            begin = None
+    return runs

@@ -1,0 +1,56 @@
+"""Put what is known of a person into the prior over bodies: bone lengths, or the height."""
+
+import copy
+
+import torch
+from torch import Tensor
+
+from torchpose.body._articulation import Articulation
+from torchpose.body._kinematics import Body
+from torchpose.body._skeleton import BODY_15
+from torchpose.errors import SkeletonError
+from torchpose.priors._body_motion import BodyMotion
+
+__all__ = ["with_body", "with_height"]
+
+_LENGTH_STD = 0.01  # of the log of a given bone length
+_HEIGHT_STD = 0.03  # of the log of the legs' length of a person of given height
+
+
+def with_body(motion: BodyMotion, body: Body) -> BodyMotion:
+    """Return the prior of a person whose bone lengths are known.
+
+    Raises:
+        SkeletonError: a body of another skeleton.
+    """
+    if body.skeleton != BODY_15:
+        raise SkeletonError(f"expected a body of 'body-15', got {body.skeleton.name!r}")
+    scales = _scales(motion.articulation, body.bone_lengths.to(motion.scale_mean))
+    cov = _LENGTH_STD**2 * torch.eye(len(scales)).to(scales)
+    return _with_scales(motion, scales, cov)
+
+
+def with_height(motion: BodyMotion, height: float) -> BodyMotion:
+    """Return the prior of a person whose height is known: it tells the scale of the legs, and all that goes with it."""
+    body = motion.articulation
+    told = torch.tensor([name in ("knee", "ankle") for name in body.groups]).to(motion.scale_mean)
+    told = told / told.sum()
+    wanted = _scales(body, BODY_15.standard_lengths(height).to(motion.scale_mean)) @ told
+    cross = motion.scale_cov @ told
+    gain = cross / (told @ cross + _HEIGHT_STD**2)
+    mean = motion.scale_mean + gain * (wanted - told @ motion.scale_mean)
+    cov = motion.scale_cov - gain[:, None] * cross
+    return _with_scales(motion, mean, (cov + cov.mT) / 2)
+
+
+def _scales(body: Articulation, lengths: Tensor) -> Tensor:
+    """Return the logs [G] of bone lengths [J] over the standard ones, both sides averaged."""
+    logs = (lengths[1:] / body.offsets[1:].norm(dim=-1)).log()
+    members = body.in_group[1:]
+    return (logs @ members) / members.sum(0)
+
+
+def _with_scales(motion: BodyMotion, mean: Tensor, cov: Tensor) -> BodyMotion:
+    other = copy.copy(motion)
+    other._buffers = {**motion._buffers, "scale_mean": mean, "scale_cov": cov}
+    return other
