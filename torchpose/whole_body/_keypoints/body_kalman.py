@@ -288,7 +288,9 @@ class BodyKalmanFilter(nn.Module):
             state.doubt,
         )
         evidence = weighed.log_evidence + fit
-        return CorrectedBody(after, joints, joint_cov, weighed, evidence, torch.zeros_like(step.step))
+        return CorrectedBody(
+            after, joints, joint_cov, weighed, evidence, torch.zeros_like(step.step)
+        )
 
     def _next_scale(
         self, scale: Tensor, frame: KeypointFrame, seen: Seen, weighed: Weighed, joint_cov: Tensor

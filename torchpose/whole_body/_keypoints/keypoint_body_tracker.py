@@ -21,7 +21,7 @@ from torchpose.whole_body._keypoints.keypoint_tracker import (
     KeypointStream,
     KeypointTracker,
 )
-from torchpose.whole_body._keypoints.known_person import with_body, with_height
+from torchpose.whole_body._keypoints.known_person import of_one_camera, with_body, with_height
 
 __all__ = ["KEYPOINT_METHOD", "KeypointBodyTracker", "KeypointOptions"]
 
@@ -29,6 +29,10 @@ KEYPOINT_METHOD = "kalman"
 SMOOTHING = ("none", "full")
 _INLIER = (0.05, 0.97)  # least and largest prior probability that a keypoint is its joint's
 _LEAST_CONFIDENCE = 0.1  # the variance goes with 1 / confidence down to this
+_KEYPOINT_STD = 0.012  # metres
+_KEYPOINT_STD_OF_ONE = (
+    0.03  # where errors of one frame are those of the next and no other camera corrects them
+)
 _FARTHEST = 200.0  # metres from the origin; no room with cameras is larger
 
 
@@ -36,11 +40,12 @@ class KeypointOptions(NamedTuple):
     """Holds the options of tracking by keypoints.
 
     Attributes:
-        keypoint_std: metres, how far a detector's joints are from the body's, along each axis.
+        keypoint_std: metres, how far a detector's joints are from the body's, along each axis; None is the
+            usual one.
         pixel_std: pixels, how far they are apart from that.
     """
 
-    keypoint_std: float = 0.012
+    keypoint_std: float | None = None
     pixel_std: float = 1.0
 
 
@@ -69,7 +74,11 @@ class KeypointBodyTracker(nn.Module):
         super().__init__()
         self.rig, self.fps, self.options = rig, float(fps), options or KeypointOptions()
         for name, value in self.options._asdict().items():
-            check_positive(name, value)
+            if value is not None:
+                check_positive(name, value)
+        alone = len(rig) == 1
+        usual = _KEYPOINT_STD_OF_ONE if alone else _KEYPOINT_STD
+        self.keypoint_std = self.options.keypoint_std or usual
         far = rig.translation.norm(dim=-1)
         if bool((far > _FARTHEST).any()):
             raise CameraError(
@@ -81,6 +90,8 @@ class KeypointBodyTracker(nn.Module):
             motion = with_body(motion, body)
         elif height is not None:
             motion = with_height(motion, check_positive("height", height))
+        if alone:
+            motion = of_one_camera(motion, body is None)
         self.sized = body is not None or height is not None
         self.tracker = KeypointTracker(rig, self.fps, motion)
 
@@ -153,7 +164,7 @@ class KeypointBodyTracker(nn.Module):
             raise InputError(f"confidence must not be negative, got {float(trust.min()):g}")
         trust = trust.nan_to_num(0.0).clamp_max(1.0)
         own = self.options.pixel_std**2 * torch.ones_like(trust)
-        relative = self.options.keypoint_std**2 / trust.clamp_min(_LEAST_CONFIDENCE)
+        relative = self.keypoint_std**2 / trust.clamp_min(_LEAST_CONFIDENCE)
         if covariance is not None:
             own, relative = covariance.to(points), torch.zeros_like(trust)
             if not bool((own[trust > 0] > 0).all()):

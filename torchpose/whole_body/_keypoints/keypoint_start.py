@@ -8,12 +8,14 @@ at several headings, with noise that is wide at first; evidence tells which head
 import math
 from collections.abc import Sequence
 from itertools import combinations
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchpose.body._articulation import Articulation, BodyPoint
+from torchpose.body._skeleton import BODY_15
 from torchpose.math._rotations import rotvec_to_matrix
 from torchpose.priors._body_motion import BodyMotion
 from torchpose.whole_body._keypoints.body_kalman import (
@@ -23,9 +25,9 @@ from torchpose.whole_body._keypoints.body_kalman import (
 )
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, see
 
-__all__ = ["N_HEADINGS", "start", "triangulate"]
+__all__ = ["Start", "start", "triangulate"]
 
-N_HEADINGS = 8
+_HEADINGS, _HEADINGS_OF_ONE = 8, 12
 _WIDTHS = (
     400.0,
     200.0,
@@ -48,29 +50,78 @@ _TRUNK_SHARE, _BODY_SHARE = 0.28, 0.9  # of the height: from hips to shoulders, 
 _DEFAULT_HEIGHT = 1.7
 
 
-def start(filter: BodyKalmanFilter, frame: KeypointFrame) -> CorrectedBody:
-    """Return the corrected hypotheses [B * N_HEADINGS] of a start, those of an element one after the other.
+class Start(NamedTuple):
+    """Holds hypotheses of a start, [B * M] corrected, and their log-evidence [B, M], the best first."""
+
+    found: CorrectedBody
+    log_weights: Tensor
+
+
+def start(filter: BodyKalmanFilter, frame: KeypointFrame, count: int) -> Start:
+    """Return the likeliest hypotheses of a start.
+
+    Several cameras see the pose, so that it is corrected from limbs at their centres, at `_HEADINGS` headings. One
+    camera does not: there every component of the pose prior is a hypothesis of its own, and the best heading of
+    each is kept.
 
     Args:
-        filter: that tracks on. frame: the first keypoints, of B persons.
+        filter: that tracks on. frame: the first keypoints, of B persons. count: of hypotheses for each, at most.
     """
-    maps = filter.maps
-    one_camera = len(maps.shift) == 1
-    joints = (
-        _at_one_depth(maps, frame, filter.articulation) if one_camera else triangulate(maps, frame)
-    )
-    points = _points(filter.articulation, filter.motion, maps, joints)
-    count = len(points.position)
-    names = filter.articulation.skeleton.names
-    state = BodyGaussian(
+    maps, body, motion = filter.maps, filter.articulation, filter.motion
+    if len(maps.shift) > 1:
+        points = _points(body, motion, maps, triangulate(maps, frame), _HEADINGS)
+        kinds, log_prior = 1, points.position.new_zeros(1)
+        state = filter.pulled(_state(points, _initial_cov(motion)[None], maps), 1.0)
+    else:
+        points = _points(body, motion, maps, _at_one_depth(maps, frame, body), _HEADINGS_OF_ONE)
+        kinds, log_prior = len(motion.poses.weights), motion.poses.weights.log()
+        state = _state(_posed(body, motion, points), _posed_covs(motion), maps)
+    n_each = len(state.scale) // len(frame.pixels)
+    every = torch.arange(len(frame.pixels), device=state.scale.device).repeat_interleave(n_each)
+    found = filter.correct(state, frame.take(every), _WIDTHS)
+    evidence = found.log_evidence.view(len(frame.pixels), -1, kinds) + log_prior
+    if kinds > 1:
+        evidence, heading = evidence.max(1)
+        index = heading * kinds + torch.arange(kinds, device=heading.device)
+    else:
+        evidence = evidence.squeeze(-1)
+        index = torch.arange(n_each, device=every.device).expand_as(evidence)
+    weights, best = evidence.topk(min(count, evidence.shape[1]), -1)
+    first = torch.arange(len(index), device=index.device)[:, None] * n_each
+    return Start(found.take((first + index.gather(1, best)).flatten()), weights)
+
+
+def _state(points: BodyPoint, covs: Float[Tensor, "#B N N"], maps: RigMaps) -> BodyGaussian:
+    """Return Gaussians about points, which take the covariances in turn; nothing is known of the cameras."""
+    count, n_cameras = len(points.position), len(maps.shift)
+    new = points.position.new_full
+    return BodyGaussian(
         points,
-        _initial_cov(filter.motion).expand(count, -1, -1),
-        joints.new_full((count, len(maps.shift), 2), _LOG_ODDS),
-        joints.new_ones(count, len(maps.shift)),
-        joints.new_full((count, len(names)), _DOUBT),
+        covs.repeat(count // len(covs), 1, 1),
+        new((count, n_cameras, 2), _LOG_ODDS),
+        new((count, n_cameras), 1.0),
+        new((count, len(BODY_15.names)), _DOUBT),
     )
-    every = torch.arange(len(joints), device=joints.device).repeat_interleave(N_HEADINGS)
-    return filter.correct(filter.pulled(state, 1.0), frame.take(every), _WIDTHS)
+
+
+def _posed(body: Articulation, motion: BodyMotion, points: BodyPoint) -> BodyPoint:
+    """Return the points with every component's mean pose, those of a point one after the other."""
+    means = motion.poses.means
+    angles = means.new_zeros(len(means), body.n_rotations)
+    angles[:, body.n_rotations - means.shape[1] :] = means
+    step = means.new_zeros(len(means), body.dim)
+    step[:, body.columns["rotations"]] = angles
+    every = torch.arange(len(points.position), device=means.device)
+    repeated = points.map(lambda value: value[every.repeat_interleave(len(means))])
+    return body.moved(repeated, step.repeat(len(points.position), 1))
+
+
+def _posed_covs(motion: BodyMotion) -> Float[Tensor, "K N N"]:
+    """Return the covariances of a start in every component of the pose prior."""
+    covs = _initial_cov(motion).repeat(len(motion.poses.weights), 1, 1)
+    columns = motion.articulation.relative_columns
+    covs[:, columns, columns] = motion.poses.covariances
+    return covs
 
 
 def triangulate(maps: RigMaps, frame: KeypointFrame) -> Float[Tensor, "B J 3"]:
@@ -134,7 +185,11 @@ def _middle(
 
 
 def _points(
-    articulation: Articulation, motion: BodyMotion, maps: RigMaps, joints: Float[Tensor, "B J 3"]
+    articulation: Articulation,
+    motion: BodyMotion,
+    maps: RigMaps,
+    joints: Float[Tensor, "B J 3"],
+    n_headings: int,
 ) -> BodyPoint:
     """Return upright bodies at the joints, with the limbs at their centres, at every heading."""
     top, low = (_middle(articulation, joints, names) for names in _TRUNK)
@@ -145,13 +200,13 @@ def _points(
     least = torch.nn.functional.one_hot(up.abs().argmin(-1), 3).to(up)
     side = torch.nn.functional.normalize(torch.linalg.cross(least, up), dim=-1)
     trunk = torch.stack([side, up, torch.linalg.cross(side, up)], -1)
-    angles = torch.arange(N_HEADINGS).to(up) * (2 * math.pi / N_HEADINGS)
+    angles = torch.arange(n_headings).to(up) * (2 * math.pi / n_headings)
     headings = rotvec_to_matrix(angles[:, None] * torch.tensor([0.0, 1.0, 0.0]).to(up))
-    count = len(joints) * N_HEADINGS
+    count = len(joints) * n_headings
     rotations = torch.eye(3).to(up).repeat(count, len(articulation.skeleton.parts), 1, 1)
     rotations[:, 0] = (trunk[:, None] @ headings).flatten(0, 1)
     return BodyPoint(
-        position.repeat_interleave(N_HEADINGS, 0),
+        position.repeat_interleave(n_headings, 0),
         rotations,
         up.new_zeros(count, articulation.n_pose),
         motion.scale_mean.to(up).expand(count, -1),

@@ -18,13 +18,12 @@ from torchpose.whole_body._keypoints.body_kalman import (
 )
 from torchpose.whole_body._keypoints.body_smoothing import smooth
 from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
-from torchpose.whole_body._keypoints.keypoint_start import N_HEADINGS, start
+from torchpose.whole_body._keypoints.keypoint_start import start
 
 __all__ = ["KeypointPoses", "KeypointStream", "KeypointTracker"]
 
 _LEAST_JOINTS = 6  # that are measured where tracking begins
-_HYPOTHESES = 4  # headings that one camera keeps until it knows better
-_SETTLED = 1.0  # second after which the likeliest one is taken
+_HYPOTHESES = 16  # that are tracked from one camera, which does not see the depth of limbs
 _LOST = 0.3  # share of keypoints below which the person is somewhere else
 _LOST_TIME = 0.5  # seconds of that after which tracking begins anew
 
@@ -34,14 +33,13 @@ class KeypointStream(NamedTuple):
 
     Attributes:
         state: Gaussians of [B * M]. log_weights: [B, M], of the hypotheses, not normalised.
-        begun: [B], whether the person was found. age: [B], frames since then. lost: [B], frames in a row in
-            which most keypoints were of something else.
+        begun: [B], whether the person was found. lost: [B], frames in a row in which most keypoints were of
+            something else.
     """
 
     state: BodyGaussian
     log_weights: Tensor
     begun: Tensor
-    age: Tensor
     lost: Tensor
 
 
@@ -127,13 +125,6 @@ class KeypointTracker(nn.Module):
             chosen.weighed.exchanged, chosen.log_evidence,
             ~(inlier > 0.5).any(-1).any(-1) | ~stream.begun, due & enough,
         )  # fmt: skip
-        if stream.log_weights.shape[1] > 1 and bool(
-            (stream.age > _SETTLED * self.filter.fps).all()
-        ):
-            stream = stream._replace(
-                state=stream.state.take(best),
-                log_weights=torch.zeros_like(stream.log_weights[:, :1]),
-            )
         return stream, pose, chosen
 
     # --- one frame --------------------------------------------------------------------------------
@@ -146,20 +137,16 @@ class KeypointTracker(nn.Module):
         found = self.filter.correct(self.filter.predict(stream.state), frame.take(every))
         weights = stream.log_weights + found.log_evidence.view(count, n_each)
         weights = weights - weights.amax(-1, keepdim=True)
-        stream = stream._replace(state=found.state, log_weights=weights, age=stream.age + 1)
+        stream = stream._replace(state=found.state, log_weights=weights)
         return stream, found
 
     def _started(self, frame: KeypointFrame) -> tuple[KeypointStream, CorrectedBody]:
         """Return the likeliest hypotheses of a start."""
-        found = start(self.filter, frame)
-        count = len(frame.pixels)
-        evidence = found.log_evidence.view(count, N_HEADINGS)
-        weights, index = evidence.topk(self.n_hypotheses, -1)
-        first = torch.arange(count, device=index.device)[:, None] * N_HEADINGS
-        found = found.take((first + index).flatten())
-        zero = torch.zeros(count, dtype=torch.long, device=index.device)
+        found, weights = start(self.filter, frame, self.n_hypotheses)
+        count = len(weights)
+        zero = torch.zeros(count, dtype=torch.long, device=weights.device)
         begun = torch.ones_like(zero, dtype=torch.bool)
-        return KeypointStream(found.state, weights - weights[:, :1], begun, zero, zero), found
+        return KeypointStream(found.state, weights - weights[:, :1], begun, zero), found
 
     def _begun_anew(
         self,
@@ -171,20 +158,12 @@ class KeypointTracker(nn.Module):
         """Return the stream with the elements that are due begun with this frame."""
         persons = due.nonzero().squeeze(-1)
         new, new_found = self._started(frame.take(persons))
-        n_old, n_new = stream.log_weights.shape[1], self.n_hypotheses
-        if n_old < n_new:  # those who go on do so with the hypothesis that they have
-            count = len(due)
-            every = torch.arange(count, device=due.device).repeat_interleave(n_new)
-            weights = stream.log_weights.new_full((count, n_new), -torch.inf)
-            weights[:, 0] = 0
-            found = found.take(every)
-            stream = stream._replace(state=stream.state.take(every), log_weights=weights)
+        n_new = stream.log_weights.shape[1]
         rows = (persons[:, None] * n_new + torch.arange(n_new, device=due.device)).flatten()
         stream = KeypointStream(
             stream.state.put(rows, new.state),
             stream.log_weights.index_copy(0, persons, new.log_weights),
             stream.begun | due,
-            torch.where(due, 0, stream.age),
             torch.where(due, 0, stream.lost),
         )
         return stream, found.put(rows, new_found)

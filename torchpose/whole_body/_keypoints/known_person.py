@@ -11,9 +11,10 @@ from torchpose.body._skeleton import BODY_15
 from torchpose.errors import SkeletonError
 from torchpose.priors._body_motion import BodyMotion
 
-__all__ = ["with_body", "with_height"]
+__all__ = ["of_one_camera", "with_body", "with_height"]
 
 _LENGTH_STD = 0.01  # of the log of a given bone length
+_PULL_TIME_OF_ONE = 0.1  # seconds
 _HEIGHT_STD = 0.03  # of the log of the legs' length of a person of given height
 
 
@@ -41,6 +42,23 @@ def with_height(motion: BodyMotion, height: float) -> BodyMotion:
     mean = motion.scale_mean + gain * (wanted - told @ motion.scale_mean)
     cov = motion.scale_cov - gain[:, None] * cross
     return _with_scales(motion, mean, (cov + cov.mT) / 2)
+
+
+def of_one_camera(motion: BodyMotion, lengths_fixed: bool) -> BodyMotion:
+    """Return the prior for one camera, in which neither sizes nor the depths of limbs are seen.
+
+    Bone lengths stay those that are expected: corrections that are linear in them would shrink the body
+    frame by frame, since a bone that is seen shorter is mostly turned and not short. Poses are pulled to
+    the mixture more strongly.
+
+    Args:
+        lengths_fixed: whether lengths are to be fixed; a given body's are already.
+    """
+    other = copy.copy(motion)
+    cov = _LENGTH_STD**2 * torch.eye(len(motion.scale_mean)).to(motion.scale_cov)
+    pull_time = torch.full_like(motion.pull_time, _PULL_TIME_OF_ONE)
+    other._buffers = {**motion._buffers, "pull_time": pull_time}
+    return _with_scales(other, other.scale_mean, cov) if lengths_fixed else other
 
 
 def _scales(body: Articulation, lengths: Tensor) -> Tensor:
