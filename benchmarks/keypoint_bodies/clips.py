@@ -61,6 +61,7 @@ RIGS = (4, 3, 2, 1)
 """Numbers of cameras: the first ones of each ring."""
 
 FASTEST, LONGEST = 60.0, 300  # frames per second, frames
+_QUICK_FRAMES = 40
 _AZIMUTHS, _JITTER = (35.0, 125.0, 215.0, 305.0), 10.0  # degrees from the front to the left
 _DISTANCE, _CAMERA_HEIGHT, _NEAREST = (3.0, 5.0), (1.0, 2.5), 2.0  # metres
 _LONGEST_FOCAL, _MARGIN = 1500.0, 60.0  # pixels
@@ -179,6 +180,12 @@ def see(clip: MocapClip, seed: int = 0, faults: Faults = FAULTS) -> Clip:
     return Clip(clip.trial, clip.fps, joints, up, rig, detect(pixels, generator, faults))
 
 
+def begun(clip: Clip, frames: int = _QUICK_FRAMES) -> Clip:
+    """Return the first frames of a clip."""
+    seen = Detections(*(values[:frames] for values in clip.seen))
+    return clip._replace(joints=clip.joints[:frames], seen=seen)
+
+
 # --- cameras
 
 
@@ -238,7 +245,8 @@ def _aimed(
     focal = min(float((half / widest).min()), _LONGEST_FOCAL)
     return PinholeCamera(
         focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT, name,
-        rotation=cv2.Rodrigues(rotation.numpy())[0].ravel().tolist(), translation=(-rotation @ place).tolist(),
+        rotation=cv2.Rodrigues(rotation.numpy())[0].ravel().tolist(),
+        translation=(-rotation @ place).tolist(),
     )  # fmt: skip
 
 

@@ -6,11 +6,11 @@ second, and returns an `Estimate`.
 
 from __future__ import annotations
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from benchmarks.keypoint_bodies.joint_filters import Settings, filter_pixels, filter_points
+from benchmarks.keypoint_bodies.least_squares import fit_bodies
 from benchmarks.keypoint_bodies.scoring import Estimate
 from benchmarks.keypoint_bodies.triangulation import (
     held,
@@ -58,3 +58,11 @@ def pixels_filter(
 ) -> Estimate:
     """Filter pixels, every joint by itself at a constant velocity."""
     return Estimate(*filter_pixels(rig, keypoints, confidence, fps, PIXELS))
+
+
+def least_squares(
+    rig: CameraRig, keypoints: Pixels, confidence: Confidence, fps: float
+) -> Estimate:
+    """Triangulate, then minimise the terms of aniposelib over the whole clip."""
+    points = triangulate_subsets(rig, keypoints, confidence).points
+    return Estimate(fit_bodies(rig, keypoints, confidence, points))
