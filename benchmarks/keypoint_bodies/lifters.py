@@ -28,6 +28,7 @@ _STEPS, _FRAMES = 4_000, 48
 _SEQUENCES = {MLP: 64, GRU: 32}
 _RINGS, _LONGEST = 6, 600  # of every recording; frames
 _TARGET = 0.3  # metres
+_PASSES, _CLOSE = 4, 0.1  # metres, from where on an error counts less
 _JOINTS = len(BODY_15.names)
 _PELVIS = BODY_15.joint("pelvis")
 _INPUTS = 4 * _JOINTS + 4  # of `features`
@@ -73,7 +74,7 @@ class BodyLifter:
     def __call__(
         self, rig: CameraRig, keypoints: Tensor, confidence: Tensor, fps: float
     ) -> Estimate:
-        """Return joints relative to the pelvis, in the axes of the room.
+        """Return joints in the axes of the room, put where they fit the keypoints.
 
         Args:
             rig: of one camera. keypoints: [T, 1, 15, 2]. confidence: [T, 1, 15]. fps: frames per second.
@@ -81,7 +82,7 @@ class BodyLifter:
         seen = features(rig, keypoints, confidence, fps)
         with torch.inference_mode():
             joints = self.net(seen[None])[0].unflatten(-1, (_JOINTS, 3)).double()
-        return Estimate(_TARGET * (joints - joints[:, [_PELVIS]]) @ rig.rotation[0])
+        return Estimate(placed(_TARGET * joints, rig, keypoints, confidence))
 
 
 class MeanPose:
@@ -98,7 +99,38 @@ class MeanPose:
         self, rig: CameraRig, keypoints: Tensor, confidence: Tensor, fps: float
     ) -> Estimate:
         """Return the mean pose in every frame; arguments as those of `BodyLifter`."""
-        return Estimate((self.joints @ rig.rotation[0]).expand(len(keypoints), -1, -1))
+        joints = self.joints.expand(len(keypoints), -1, -1)
+        return Estimate(placed(joints, rig, keypoints, confidence))
+
+
+def placed(
+    joints: Float[Tensor, "T 15 3"], rig: CameraRig, keypoints: Float[Tensor, "T 1 15 2"],
+    confidence: Float[Tensor, "T 1 15"],
+) -> Float[Tensor, "T 15 3"]:  # fmt: skip
+    """Return joints in the axes of the room, moved so that they lie near the rays of their keypoints.
+
+    Of the place p of a joint at x and its ray (u, v, 1), u (x_z + p_z) = x_x + p_x and so for v are solved
+    by least squares, weighted by confidence and, from the second time on, less where the error is large.
+
+    Args:
+        joints: anywhere, camera axes. rig: of one camera. keypoints: pixels, undistorted.
+        confidence: of a detector.
+    """
+    matrix = rig.matrix[0]
+    rays = (keypoints[:, 0] - matrix[:2, 2]) / matrix.diagonal()[:2]
+    weights = torch.where(rays.isfinite().all(-1), confidence[:, 0], 0)
+    rays = rays.nan_to_num()
+    aim = torch.cat([torch.eye(2).expand(*rays.shape, 2).to(rays), -rays[..., None]], -1)
+    wanted = rays * joints[..., 2:] - joints[..., :2]
+    small = 1e-6 * torch.eye(3, dtype=rays.dtype)
+    robust = torch.ones_like(weights)
+    for _ in range(_PASSES):
+        weighed = (weights * robust)[..., None, None] * aim
+        normal = (weighed.mT @ aim).sum(1) + small
+        place = torch.linalg.solve(normal, (weighed.mT @ wanted[..., None]).sum(1))[..., 0]
+        off = ((aim @ place[:, None, :, None])[..., 0] - wanted).norm(dim=-1)
+        robust = 1 / (1 + (off / _CLOSE).square())
+    return (joints + place[:, None] - rig.translation[0]) @ rig.rotation[0]
 
 
 def load_lifters(data: Path, file: Path | None, quick: bool) -> Mapping[str, BodyLifter | MeanPose]:
@@ -189,4 +221,3 @@ def _train(net: nn.Module, name: str, examples: Examples, steps: int, seed: int 
         return (off.square().sum(-1) + 1e-6).sqrt()[known].mean()
 
     train_lifter(net, loss, steps, name)
-

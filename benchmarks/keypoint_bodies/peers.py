@@ -28,7 +28,7 @@ Confidence = Float[Tensor, "T C J"]
 POINTS = Settings(acceleration=30.0, noise=0.03)
 """Noise of the filter over points, chosen on `clips.CHOOSING`."""
 
-PIXELS = Settings(acceleration=30.0, noise=6.0)
+PIXELS = Settings(acceleration=10.0, noise=12.0)
 """Noise of the filter over pixels, chosen on `clips.CHOOSING`."""
 
 
