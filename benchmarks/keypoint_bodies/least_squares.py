@@ -102,8 +102,8 @@ def _minimised(problem: _Problem, guess: _Guess) -> _Guess:
     for _ in range(_STEPS):
         normal, gradient = (slope.T @ slope).tocsc(), slope.T @ residual
         scale = normal.diagonal().mean()
-        factor = splu(normal + damping * scale * identity(len(gradient), format="csc"),
-                      permc_spec="MMD_AT_PLUS_A")  # fmt: skip
+        damped = normal + damping * scale * identity(len(gradient), format="csc")
+        factor = splu(damped, "MMD_AT_PLUS_A", 0.0, options={"SymmetricMode": True})
         step = torch.from_numpy(factor.solve(-gradient))
         n = guess.points.numel()
         new = _Guess(guess.points + step[:n].reshape(guess.points.shape), guess.lengths + step[n:])

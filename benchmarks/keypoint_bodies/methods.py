@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
@@ -20,7 +21,7 @@ Method = Callable[[CameraRig, Tensor, Tensor, float], Estimate]
 
 
 def track(
-    rig: CameraRig, keypoints: Tensor, confidence: Tensor, fps: float, **options: object
+    rig: CameraRig, keypoints: Tensor, confidence: Tensor, fps: float, **options: Any
 ) -> Estimate:
     """Track the body with torchpose.
 

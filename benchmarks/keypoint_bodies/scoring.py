@@ -67,9 +67,9 @@ def score(estimate: Estimate, clip: Clip) -> Score:
     rigid = align(joints, truth, joints=None).points
     known = truth.isfinite().all(-1)
     unseen = clip.cameras_that_see < min(2, len(clip.rig))
-    inside = [torch.nan, torch.nan]
+    half, most = torch.nan, torch.nan
     if estimate.covariance is not None:
-        inside = (100 * coverage(joints, estimate.covariance, truth).overall).tolist()
+        half, most = (100 * coverage(joints, estimate.covariance, truth).overall).tolist()
     return Score(
         _mean(errors),
         1000 * _mean(joint_errors(rigid, truth)),
@@ -77,7 +77,8 @@ def score(estimate: Estimate, clip: Clip) -> Score:
         _mean(errors, unseen),
         _mean(errors, clip.seen.exchanged.any(1)),
         relative_jitter(joints, truth, clip.fps),
-        *inside,
+        half,
+        most,
         bone_spread(joints),
         bone_spread(truth),
         100 * float(joints.isnan().any(-1)[known].double().mean()),

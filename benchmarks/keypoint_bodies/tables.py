@@ -54,7 +54,7 @@ def add_table(
     title = f"{cameras} cameras (mm)" if several else "One camera (mm)"
     table = report.table(
         title, title, [*(_SETS[name] for name in clips), *_MEASURES],
-        digits=_DIGITS[len(_SETS) - len(clips) :], note=(_SEVERAL if several else _ONE) + _NOTE,
+        digits=_DIGITS, note=(_SEVERAL if several else _ONE) + _NOTE,
     )  # fmt: skip
     able = {name: method for name, method in methods.items() if takes(name, cameras)}
     for name, method in tqdm(able.items(), desc=title):
