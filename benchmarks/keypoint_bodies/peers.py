@@ -25,7 +25,7 @@ from torchpose.camera import CameraRig
 Pixels = Float[Tensor, "T C J 2"]
 Confidence = Float[Tensor, "T C J"]
 
-POINTS = Settings(acceleration=300.0, noise=0.16)
+POINTS = Settings(acceleration=30.0, noise=0.04)
 """Noise of the filter over points, chosen on `clips.CHOOSING`."""
 
 PIXELS = Settings(acceleration=10.0, noise=12.0)
