@@ -6,9 +6,9 @@ frame and L its length, which is sought as well,
     sum (2 p (sqrt(1 + |e| / p) - 1))^2 + s^2 sum |x_(t+1) - x_t|^2 + sum (200 (l - L) / L)^2
 
 where s is 4 over the mean step of the median-filtered start: the defaults of `optim_points` of aniposelib
-0.8. That has numerical derivatives and an iterative solver, stops when a step brings less than a thousandth
-and starts at plain triangulation; here derivatives are exact, steps are those of Levenberg and Marquardt
-with a direct solver, and the start is what `triangulate_subsets` gives.
+0.8. That has numerical derivatives and an iterative solver, stops when a step brings less than a thousandth;
+here derivatives are exact, and steps are those of Levenberg and Marquardt with a direct solver. Both start at
+plain triangulation, and leave out keypoints that are not sure.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from torchpose.camera import CameraRig
 
 _SMOOTH, _LENGTH = 4.0, 200.0  # weights; aniposelib's 100 for percent times 2
 _MEDIAN = 7  # frames
-_STEPS, _ENOUGH = 30, 1e-3
+_STEPS, _ENOUGH = 50, 1e-4
 
 
 class _Problem(NamedTuple):
@@ -56,18 +56,18 @@ class _Guess(NamedTuple):
 def fit_bodies(
     rig: CameraRig,
     keypoints: Float[Tensor, "T C 15 2"],
-    confidence: Float[Tensor, "T C 15"],
+    weights: Float[Tensor, "T C 15"],
     points: Float[Tensor, "T 15 3"],
 ) -> Float[Tensor, "T 15 3"]:
     """Return joints of least squares, NaN where a joint never had a point.
 
     Args:
-        rig: cameras. keypoints: pixels, undistorted. confidence: of a detector. points: triangulated,
-            where it starts.
+        rig: cameras. keypoints: pixels, undistorted. weights: confidence, 0 where there is none.
+            points: triangulated, where it starts.
     """
     kept = points.isfinite().all(-1).any(0).nonzero()[:, 0].tolist()
     start = interpolated(points[:, kept])
-    weights = torch.where(keypoints.isfinite().all(-1), confidence, 0)[:, :, kept]
+    weights = weights[:, :, kept]
     parents = [(joint, parent) for joint, parent in enumerate(BODY_15.parents)]
     bones = [(kept.index(a), kept.index(b)) for a, b in parents if a in kept and b in kept]
     problem = _Problem(

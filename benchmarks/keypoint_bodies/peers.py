@@ -64,5 +64,6 @@ def least_squares(
     rig: CameraRig, keypoints: Pixels, confidence: Confidence, fps: float
 ) -> Estimate:
     """Triangulate, then minimise the terms of aniposelib over the whole clip."""
-    points = triangulate_subsets(rig, keypoints, confidence).points
-    return Estimate(fit_bodies(rig, keypoints, confidence, points))
+    sure = sure_keypoints(keypoints, confidence)
+    points = triangulate(rig, keypoints, sure.to(confidence))
+    return Estimate(fit_bodies(rig, keypoints, confidence * sure, points))
