@@ -19,6 +19,7 @@ from benchmarks.keypoint_bodies.triangulation import (
     sure_keypoints,
     triangulate,
     triangulate_subsets,
+    without_outliers,
 )
 from torchpose.camera import CameraRig
 
@@ -41,9 +42,13 @@ def standing_still(
 
 
 def pose2sim(rig: CameraRig, keypoints: Pixels, confidence: Confidence, fps: float) -> Estimate:
-    """Triangulate as Pose2Sim does: cameras that disagree are left out, gaps filled, 6 Hz low-pass."""
+    """Triangulate as Pose2Sim does by default, and fill gaps of any length.
+
+    Cameras that disagree are left out, outliers over time replaced, and a low-pass of 6 Hz smooths. Pose2Sim
+    holds the last value in gaps of more than 20 frames.
+    """
     points = interpolated(triangulate_subsets(rig, keypoints, confidence).points)
-    return Estimate(low_pass(points, fps))
+    return Estimate(low_pass(without_outliers(points), fps))
 
 
 def points_filter(

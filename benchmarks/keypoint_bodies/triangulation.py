@@ -18,6 +18,8 @@ THRESHOLD = 15.0
 LEAST_CONFIDENCE = 0.3
 """Keypoints below it are not used, as by Pose2Sim."""
 
+_NORMAL_QUARTILE = 0.6745
+
 
 class Triangulated(NamedTuple):
     """Points, NaN where there are none.
@@ -130,3 +132,25 @@ def low_pass(
     b, a = butter(order / 2, cutoff / (fps / 2))
     smooth = filtfilt(b, a, points.numpy(), axis=0)
     return torch.from_numpy(smooth.copy())
+
+
+def without_outliers(
+    points: Float[Tensor, "T *rest"], window: int = 7, limit: float = 2.0
+) -> Float[Tensor, "T *rest"]:
+    """Return values, with the median of the frames around in place of outliers: the Hampel filter.
+
+    Args:
+        points: over time, without gaps; the first and last frames stay. window: frames. limit: of the
+            distance from the median, in robust standard deviations.
+    """
+    if len(points) < window:
+        return points
+    half = window // 2
+    around = points.unfold(0, window, 1)  # [T - window + 1, ..., window]
+    median = around.median(-1).values
+    spread = (around - median[..., None]).abs().median(-1).values
+    inner = points[half : len(points) - half]
+    wild = (_NORMAL_QUARTILE * (inner - median).abs() > limit * spread) & (spread > 0)
+    found = points.clone()
+    found[half : len(points) - half] = torch.where(wild, median, inner)
+    return found

@@ -22,7 +22,12 @@ from benchmarks.keypoint_bodies.lifters import placed
 from benchmarks.keypoint_bodies.methods import METHODS, OURS
 from benchmarks.keypoint_bodies.real import predicted, read_filmed
 from benchmarks.keypoint_bodies.scoring import Estimate, bone_spread, score
-from benchmarks.keypoint_bodies.triangulation import held, interpolated, triangulate_subsets
+from benchmarks.keypoint_bodies.triangulation import (
+    held,
+    interpolated,
+    triangulate_subsets,
+    without_outliers,
+)
 from tests.data import data_dir_or_skip
 from torchpose.demo._rendering.walk import walk, walk_clip
 
@@ -113,6 +118,15 @@ def test_gaps_are_filled():
     values = torch.tensor([math.nan, 1.0, math.nan, 3.0, math.nan], dtype=torch.float64)[:, None]
     assert interpolated(values)[:, 0].tolist() == [1, 1, 2, 3, 3]
     assert held(values)[1:, 0].tolist() == [1, 1, 3, 3]
+
+
+def test_one_wild_frame_becomes_the_median():
+    values = torch.arange(20, dtype=torch.float64).square()[:, None].expand(20, 2).clone()
+    wild = values.clone()
+    wild[9, 1] = 900
+    found = without_outliers(wild)
+    assert torch.equal(found[:, 0], values[:, 0])
+    assert found[9, 1] == 100
 
 
 def test_scores_of_known_estimates(clean):
