@@ -44,19 +44,21 @@ def score_clips(method: Method, clips: Sequence[Clip], cameras: int) -> list[Sco
 def add_table(
     report: Report, methods: Mapping[str, Method], clips: Mapping[str, Sequence[Clip]], cameras: int
 ) -> None:
-    """Add the table of a number of cameras.
+    """Add the table of a number of cameras, if a method takes so many.
 
     Args:
-        report: gets the table. methods: by name; those that do not take so many cameras are left out.
+        report: gets the table. methods: by name; those that take another number are left out.
         clips: by set. cameras: how many.
     """
+    able = {name: method for name, method in methods.items() if takes(name, cameras)}
+    if not able:
+        return
     several = cameras > 1
     title = f"{cameras} cameras (mm)" if several else "One camera (mm)"
     table = report.table(
         title, title, [*(_SETS[name] for name in clips), *_MEASURES],
         digits=_DIGITS, note=(_SEVERAL if several else _ONE) + _NOTE,
     )  # fmt: skip
-    able = {name: method for name, method in methods.items() if takes(name, cameras)}
     for name, method in tqdm(able.items(), desc=title):
         groups = [torch.tensor(score_clips(method, group, cameras)) for group in clips.values()]
         mean = Score(*torch.cat(groups).nanmean(0).tolist())
