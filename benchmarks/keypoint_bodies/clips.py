@@ -1,8 +1,8 @@
 """Recorded bodies seen by a ring of cameras, as a detector of keypoints would see them.
 
 Recordings are split by person into those on which constants may be chosen and those that are scored. The
-actions of CMU are on one skeleton and say no person: they are split by action, and so that the persons of
-whom the index of CMU has these actions (basketball 6, soccer 10 and 11, running 9, 16 and 35) walk on the
+actions of CMU name no person and are all on one skeleton, whose bone lengths are thus no stranger's: they are
+split by action, and the walkers 10, 16 and 35, who probably play soccer and run as well, are on the
 same side of the split. Each of their files begins with a frame in the rest pose, which is left out, and one
 file in which the body falls apart is not used. Berkeley MHAD has no head.
 """
