@@ -11,7 +11,7 @@ the small set. Targets are the vectors of both bones of both arms in camera axes
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -24,9 +24,10 @@ from torchpose.math import euler_to_matrix
 from torchpose.priors._arms import LENGTHS, ArmPrior
 from torchpose.skeleton._upper_body import LEFT_ARM, RIGHT_ARM
 
-__all__ = ["FEW", "LIFTERS", "Lifter", "fit_lifter"]
+__all__ = ["FEW", "LIFTERS", "Lifter", "Recurrent", "fit_lifter", "multilayer", "train_lifter"]
 
 LIFTERS = ("nearest neighbour", "MLP", "GRU, causal")
+_BONES = 12  # numbers: two bones of two arms
 _STEPS, _SEQUENCES, _FRAMES, _WIDTH = 4_000, 32, 48, 128
 _NEIGHBOURS = 60_000  # frames that are kept
 _TARGET = 0.2  # metres
@@ -67,16 +68,20 @@ class Lifter(NamedTuple):
         return _TARGET * bones.double().unflatten(-1, (2, 2, 3))
 
 
-class _Recurrent(nn.Module):
-    """Two causal layers of gated recurrent units, and a linear one."""
+class Recurrent(nn.Module):
+    """Two causal layers of gated recurrent units, and a linear one.
 
-    def __init__(self, n_inputs: int) -> None:
+    Args:
+        n_inputs, n_outputs: of each frame.
+    """
+
+    def __init__(self, n_inputs: int, n_outputs: int = _BONES) -> None:
         super().__init__()
         self.cells = nn.GRU(n_inputs, _WIDTH, 2, batch_first=True)
-        self.out = nn.Linear(_WIDTH, 12)
+        self.out = nn.Linear(_WIDTH, n_outputs)
 
-    def forward(self, seen: Float[Tensor, "B T F"]) -> Float[Tensor, "B T 12"]:
-        """Return bones."""
+    def forward(self, seen: Float[Tensor, "B T F"]) -> Float[Tensor, "B T O"]:
+        """Return what the features of every frame and those before it stand for."""
         out: Tensor = self.out(self.cells(seen)[0])
         return out
 
@@ -106,27 +111,40 @@ def fit_lifter(
         )
         return Lifter(known=(torch.cat(seen)[:, 0], torch.cat(bones)[:, 0]))
     n_inputs = draw(frames=1, count=1)[0].shape[-1]
-    net: nn.Module = _Recurrent(n_inputs) if kind == LIFTERS[2] else _multilayer(n_inputs)
-    steps = 2 if quick else _STEPS
-    optimiser = torch.optim.AdamW(net.parameters(), lr=2e-3, weight_decay=1e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=steps)
-    for _ in tqdm(range(steps), desc=kind):
+    net: nn.Module = Recurrent(n_inputs) if kind == LIFTERS[2] else multilayer(n_inputs)
+
+    def loss() -> Tensor:
         seen, bones = draw(_FRAMES, _SEQUENCES)
         off = (net(seen) - bones).unflatten(-1, (2, 2, 3))
         each, whole = (x.square().sum(-1) + 1e-6 for x in (off, off.sum(-2)))
-        loss = each.sqrt().mean() + whole.sqrt().mean()
+        return each.sqrt().mean() + whole.sqrt().mean()
+
+    return Lifter(train_lifter(net, loss, 2 if quick else _STEPS, kind))
+
+
+def train_lifter(net: nn.Module, loss: Callable[[], Tensor], steps: int, name: str) -> nn.Module:
+    """Return a net after so many steps of AdamW, for evaluation.
+
+    Args:
+        net: to be trained. loss: of a new batch. steps: number of batches. name: on the bar.
+    """
+    optimiser = torch.optim.AdamW(net.parameters(), lr=2e-3, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=steps)
+    for _ in tqdm(range(steps), desc=name):
         optimiser.zero_grad()
-        loss.backward()
+        loss().backward()
         nn.utils.clip_grad_norm_(net.parameters(), 1.0)
         optimiser.step()
         schedule.step()
-    return Lifter(net.eval())
+    return net.eval()
 
 
-def _multilayer(n_inputs: int) -> nn.Module:
+def multilayer(n_inputs: int, n_outputs: int = _BONES) -> nn.Module:
+    """Return a net of two hidden layers."""
     return nn.Sequential(
-        nn.Linear(n_inputs, 512), nn.ReLU(), nn.Linear(512, 512), nn.ReLU(), nn.Linear(512, 12)
-    )
+        nn.Linear(n_inputs, 512), nn.ReLU(), nn.Linear(512, 512), nn.ReLU(),
+        nn.Linear(512, n_outputs),
+    )  # fmt: skip
 
 
 class _Examples:

@@ -1,0 +1,223 @@
+"""Networks that lift keypoints of one camera to joints: of single frames, and causal.
+
+They are trained on all recordings of the persons of `clips.CHOOSING`, each in the first camera of several
+rings, with the detector's faults. Inputs are rays relative to the median of those of the frame, in units of
+their extent, which of them are there and how sure, that median and extent, and the frame rate. Outputs are
+joints relative to the pelvis in camera axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from benchmarks._lifters import Recurrent, multilayer, train_lifter
+from benchmarks.keypoint_bodies.clips import TRAINING, Clip, recorded, see
+from benchmarks.keypoint_bodies.scoring import Estimate
+from torchpose.body import BODY_15
+from torchpose.camera import CameraRig
+
+MLP, GRU, MEAN = "mlp", "gru", "mean-pose"
+_STEPS, _FRAMES = 4_000, 48
+_SEQUENCES = {MLP: 64, GRU: 32}
+_RINGS, _LONGEST = 6, 600  # of every recording; frames
+_TARGET = 0.3  # metres
+_PASSES, _CLOSE = 4, 0.1  # metres, from where on an error counts less
+_JOINTS = len(BODY_15.names)
+_PELVIS = BODY_15.joint("pelvis")
+_INPUTS = 4 * _JOINTS + 4  # of `features`
+
+
+class Examples(NamedTuple):
+    """Sequences of features and of joints relative to the pelvis in units of `_TARGET`.
+
+    Attributes:
+        seen: [T, F] of each. joints: [T, 15, 3] of each, camera axes, NaN where unknown.
+    """
+
+    seen: list[Tensor]
+    joints: list[Tensor]
+
+    def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return pieces of sequences, which are drawn by their length.
+
+        Args:
+            count: pieces. generator: of random numbers.
+        """
+        lengths = torch.tensor([float(len(x)) for x in self.seen])
+        picked = torch.multinomial(lengths, count, True, generator=generator).tolist()
+        starts = [int(torch.randint(max(1, len(self.seen[i]) - _FRAMES), (1,), generator=generator))
+                  for i in picked]  # fmt: skip
+        rows = [(start + torch.arange(_FRAMES)).clamp_max(len(self.seen[i]) - 1)
+                for i, start in zip(picked, starts, strict=True)]  # fmt: skip
+        pairs = list(zip(picked, rows, strict=True))
+        return (torch.stack([self.seen[i][r] for i, r in pairs]),
+                torch.stack([self.joints[i][r] for i, r in pairs]))  # fmt: skip
+
+
+class BodyLifter:
+    """Lifts keypoints of one camera.
+
+    Args:
+        net: from features [B, T, F] to joints [B, T, 45].
+    """
+
+    def __init__(self, net: nn.Module) -> None:
+        self.net = net
+
+    def __call__(
+        self, rig: CameraRig, keypoints: Tensor, confidence: Tensor, fps: float
+    ) -> Estimate:
+        """Return joints in the axes of the room, put where they fit the keypoints.
+
+        Args:
+            rig: of one camera. keypoints: [T, 1, 15, 2]. confidence: [T, 1, 15]. fps: frames per second.
+        """
+        seen = features(rig, keypoints, confidence, fps)
+        with torch.inference_mode():
+            joints = self.net(seen[None])[0].unflatten(-1, (_JOINTS, 3)).double()
+        return Estimate(placed(_TARGET * joints, rig, keypoints, confidence))
+
+
+class MeanPose:
+    """Has one pose, whatever it sees.
+
+    Args:
+        joints: [15, 3], relative to the pelvis, camera axes, metres.
+    """
+
+    def __init__(self, joints: Tensor) -> None:
+        self.joints = joints
+
+    def __call__(
+        self, rig: CameraRig, keypoints: Tensor, confidence: Tensor, fps: float
+    ) -> Estimate:
+        """Return the mean pose in every frame; arguments as those of `BodyLifter`."""
+        joints = self.joints.expand(len(keypoints), -1, -1)
+        return Estimate(placed(joints, rig, keypoints, confidence))
+
+
+def placed(
+    joints: Float[Tensor, "T 15 3"], rig: CameraRig, keypoints: Float[Tensor, "T 1 15 2"],
+    confidence: Float[Tensor, "T 1 15"],
+) -> Float[Tensor, "T 15 3"]:  # fmt: skip
+    """Return joints in the axes of the room, moved so that they lie near the rays of their keypoints.
+
+    Of the place p of a joint at x and its ray (u, v, 1), u (x_z + p_z) = x_x + p_x and so for v are solved
+    by least squares, weighted by confidence and, from the second time on, less where the error is large.
+
+    Args:
+        joints: anywhere, camera axes. rig: of one camera. keypoints: pixels, undistorted.
+        confidence: of a detector.
+    """
+    matrix = rig.matrix[0]
+    rays = (keypoints[:, 0] - matrix[:2, 2]) / matrix.diagonal()[:2]
+    weights = torch.where(rays.isfinite().all(-1), confidence[:, 0], 0)
+    rays = rays.nan_to_num()
+    aim = torch.cat([torch.eye(2).expand(*rays.shape, 2).to(rays), -rays[..., None]], -1)
+    wanted = rays * joints[..., 2:] - joints[..., :2]
+    small = 1e-6 * torch.eye(3, dtype=rays.dtype)
+    robust = torch.ones_like(weights)
+    for _ in range(_PASSES):
+        weighed = (weights * robust)[..., None, None] * aim
+        normal = (weighed.mT @ aim).sum(1) + small
+        place = torch.linalg.solve(normal, (weighed.mT @ wanted[..., None]).sum(1))[..., 0]
+        off = ((aim @ place[:, None, :, None])[..., 0] - wanted).norm(dim=-1)
+        robust = 1 / (1 + (off / _CLOSE).square())
+    return (joints + place[:, None] - rig.translation[0]) @ rig.rotation[0]
+
+
+def load_lifters(data: Path, file: Path | None, quick: bool) -> Mapping[str, BodyLifter | MeanPose]:
+    """Return the mean pose and both networks, trained unless a file has them.
+
+    Args:
+        data: folder with the sets. file: for their weights, read if it is there, else written; None
+            trains anew. quick: few recordings and steps, to see that it works.
+    """
+    torch.manual_seed(0)
+    nets: dict[str, nn.Module] = {
+        MLP: multilayer(_INPUTS, 3 * _JOINTS),
+        GRU: Recurrent(_INPUTS, 3 * _JOINTS),
+    }
+    if file is not None and file.is_file():
+        kept = load_file(file)
+        for name, net in nets.items():
+            net.load_state_dict(
+                {k.removeprefix(name): v for k, v in kept.items() if k.startswith(name)}
+            )
+        mean = kept["mean"]
+    else:
+        examples = make_examples(data, quick)
+        mean = torch.cat(examples.joints).nanmean(0)
+        for name, net in nets.items():
+            _train(net, name, examples, 2 if quick else _STEPS)
+        if file is not None:
+            weights = {f"{n}{k}": v for n, net in nets.items() for k, v in net.state_dict().items()}
+            save_file({**weights, "mean": mean}, file)
+    return {MEAN: MeanPose(_TARGET * mean.double())} | {
+        name: BodyLifter(net.eval()) for name, net in nets.items()
+    }
+
+
+def make_examples(data: Path, quick: bool = False) -> Examples:
+    """Return the recordings of `clips.TRAINING`, each in the first camera of several rings.
+
+    Args:
+        data: folder with the sets. quick: one recording of each set in one ring.
+    """
+    pairs: list[tuple[Tensor, Tensor]] = []
+    for folder, patterns in TRAINING.items():
+        for i, clip in enumerate(recorded(data / folder, patterns, _LONGEST)):
+            if quick and i:
+                break
+            for seed in range(1, 2 if quick else 1 + _RINGS):
+                pairs.append(_example(see(clip, seed).of_cameras(1)))
+    seen, joints = zip(*pairs, strict=True)
+    return Examples(list(seen), list(joints))
+
+
+def features(
+    rig: CameraRig, keypoints: Float[Tensor, "T 1 15 2"], confidence: Float[Tensor, "T 1 15"],
+    fps: float,
+) -> Float[Tensor, "T F"]:  # fmt: skip
+    """Return the inputs of the networks; see the module.
+
+    Args:
+        rig: of one camera. keypoints: pixels, undistorted. confidence: of a detector. fps: frames per
+            second.
+    """
+    matrix = rig.matrix[0]
+    rays = (keypoints[:, 0] - matrix[:2, 2]) / matrix.diagonal()[:2]
+    middle = rays.nanmedian(1, keepdim=True).values.nan_to_num()
+    extent = (rays - middle).norm(dim=-1).nanmedian(1).values.nan_to_num(0.1).clamp_min(1e-3)
+    apart = ((rays - middle) / extent[:, None, None]).nan_to_num().clamp(-5, 5)
+    there = rays.isfinite().all(-1)
+    rate = torch.full_like(extent, fps / 60.0)[:, None]
+    parts = (apart.flatten(1), there, confidence[:, 0], middle[:, 0], extent.log()[:, None], rate)
+    return torch.cat([part.float() for part in parts], -1)
+
+
+def _example(clip: Clip) -> tuple[Tensor, Tensor]:
+    """Return features and targets of a clip in one camera."""
+    local = (clip.joints - clip.joints[:, [_PELVIS]]) @ clip.rig.rotation[0].T
+    seen = features(clip.rig, clip.seen.keypoints, clip.seen.confidence, clip.fps)
+    return seen, (local / _TARGET).float()
+
+
+def _train(net: nn.Module, name: str, examples: Examples, steps: int, seed: int = 0) -> None:
+    """Train a network on the mean distance of joints that are known."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def loss() -> Tensor:
+        seen, joints = examples.draw(_SEQUENCES[name], generator)
+        off = net(seen).unflatten(-1, (_JOINTS, 3)) - joints.nan_to_num()
+        known = joints.isfinite().all(-1)
+        return (off.square().sum(-1) + 1e-6).sqrt()[known].mean()
+
+    train_lifter(net, loss, steps, name)

@@ -1,0 +1,180 @@
+"""Clips come from their seed, triangulation is exact, scores have known values, and tables are printed."""
+
+import math
+
+import pytest
+import torch
+
+from benchmarks.keypoint_bodies.clips import (
+    ACTIONS,
+    CHOOSING,
+    CLEAN,
+    FAULTS,
+    MHAD,
+    SCORED,
+    WALKS,
+    bursts,
+    draw_ring,
+    see,
+)
+from benchmarks.keypoint_bodies.joint_filters import project_one
+from benchmarks.keypoint_bodies.lifters import placed
+from benchmarks.keypoint_bodies.methods import METHODS, OURS
+from benchmarks.keypoint_bodies.real import predicted, read_filmed
+from benchmarks.keypoint_bodies.scoring import Estimate, bone_spread, score
+from benchmarks.keypoint_bodies.triangulation import (
+    held,
+    interpolated,
+    triangulate_subsets,
+    without_outliers,
+)
+from tests.data import data_dir_or_skip
+from torchpose.demo._rendering.walk import walk, walk_clip
+
+PEERS = [name for name in METHODS if name not in OURS]
+
+
+@pytest.fixture(scope="module")
+def walker():
+    return walk_clip(walk(seconds=1.0))
+
+
+@pytest.fixture(scope="module")
+def clean(walker):
+    return see(walker, faults=CLEAN)
+
+
+def test_nobody_is_in_both_lists():
+    for folder in (WALKS, MHAD):
+        persons = [{name[:3] for name in names[folder]} for names in (CHOOSING, SCORED)]
+        assert not persons[0] & persons[1]
+    actions = [{name.split("_t")[0] for name in names[ACTIONS]} for names in (CHOOSING, SCORED)]
+    assert not actions[0] & actions[1]
+
+
+def test_clips_come_from_their_seed(walker):
+    clips = [see(walker, seed) for seed in (0, 0, 1)]
+    first, again, other = (torch.cat([clip.rig.matrix.flatten(),
+                                      clip.seen.keypoints.nan_to_num().flatten(),
+                                      clip.seen.confidence.flatten()]) for clip in clips)  # fmt: skip
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_everybody_is_in_view_of_all_cameras(walker):
+    rig = draw_ring(walker.joints.double(), walker.up.double(), torch.Generator().manual_seed(3))
+    view = rig(walker.joints.double())
+    assert bool((view.pixels > 0).all() & (view.pixels < torch.tensor([1920, 1080])).all())
+    assert float(view.depth.min()) > 1.5 and float(view.depth.max()) < 8
+
+
+def test_faults_have_their_shares(walker):
+    long = torch.cat([walker.joints] * 20)
+    clip = see(type(walker)(long, long, (), walker.up, walker.fps, trial="long"))
+    seen = clip.seen
+    assert float(seen.missing.double().mean()) == pytest.approx(FAULTS.missing, abs=0.02)
+    assert float(seen.outlier.double().mean()) == pytest.approx(0.9 * FAULTS.outliers, abs=0.01)
+    assert bool(seen.keypoints[seen.missing].isnan().all())
+    assert bool((seen.confidence[seen.missing] == 0).all())
+    off = (seen.keypoints - clip.rig(clip.joints).pixels).norm(dim=-1)
+    inlier = ~(seen.missing | seen.outlier | seen.exchanged)
+    assert float(off[inlier].square().mean().sqrt()) == pytest.approx(math.sqrt(2) * 4, rel=0.03)
+
+
+def test_bursts_last_as_long_as_they_should():
+    on = bursts((4000, 20), 0.1, 10.0, torch.Generator().manual_seed(0))
+    begun = (on[1:] & ~on[:-1]).sum()
+    assert float(on.double().mean()) == pytest.approx(0.1, abs=0.01)
+    assert float(on.sum() / begun) == pytest.approx(10, rel=0.1)
+
+
+def test_triangulation_is_exact_and_leaves_a_wild_camera_out(clean):
+    keypoints = clean.seen.keypoints.clone()
+    keypoints[:, 1] += 80
+    found = triangulate_subsets(clean.rig, keypoints, clean.seen.confidence)
+    assert float((found.points - clean.joints).abs().max()) < 1e-8
+    assert bool((found.used.sum(1) == 3).all()) and not bool(found.used[:, 1].any())
+    assert bool(found.points.isfinite().all())
+
+
+def test_pixels_have_the_derivatives_of_autograd(clean):
+    points = clean.joints[0]
+    pixels, slope = project_one(clean.rig, 2, points)
+    assert torch.allclose(pixels, clean.rig(points).pixels[2])
+    each = torch.func.vmap(torch.func.jacrev(lambda x: project_one(clean.rig, 2, x)[0]))(points)
+    assert torch.allclose(slope, each)
+
+
+@pytest.mark.parametrize("name", PEERS)
+def test_peers_find_joints_without_noise(name, clean):
+    seen = clean.seen
+    estimate = METHODS[name](clean.rig, seen.keypoints, seen.confidence, clean.fps)
+    scored = score(estimate, clean)
+    assert scored.error < (25 if name == "points-filter" else 12)
+    assert scored.without == 0
+
+
+def test_gaps_are_filled():
+    values = torch.tensor([math.nan, 1.0, math.nan, 3.0, math.nan], dtype=torch.float64)[:, None]
+    assert interpolated(values)[:, 0].tolist() == [1, 1, 2, 3, 3]
+    assert held(values)[1:, 0].tolist() == [1, 1, 3, 3]
+
+
+def test_one_wild_frame_becomes_the_median():
+    values = torch.arange(20, dtype=torch.float64).square()[:, None].expand(20, 2).clone()
+    wild = values.clone()
+    wild[9, 1] = 900
+    found = without_outliers(wild)
+    assert torch.equal(found[:, 0], values[:, 0])
+    assert found[9, 1] == 100
+
+
+def test_scores_of_known_estimates(clean):
+    moved = clean.joints + torch.tensor([0.03, 0.0, 0.04], dtype=torch.float64)
+    covariance = 0.05**2 / 3 * torch.eye(3, dtype=torch.float64).expand(*moved.shape, 3)
+    scored = score(Estimate(moved, covariance), clean)
+    assert scored.error == pytest.approx(50)
+    assert (scored.rigid, scored.similar) == pytest.approx((0, 0), abs=1e-6)
+    assert (scored.inside_50, scored.inside_90) == (0, 100)  # 3 is between 2.37 and 6.25
+    assert scored.jitter == pytest.approx(1)
+    assert scored.bones == pytest.approx(scored.true_bones)
+    larger = score(Estimate(1.1 * clean.joints), clean)
+    assert larger.similar == pytest.approx(0, abs=1e-6)
+    assert larger.rigid > 10
+    assert score(Estimate(moved), clean.of_cameras(1)).error == pytest.approx(0, abs=1e-9)
+    moved[:10, 3] = math.nan
+    assert score(Estimate(moved), clean).without == pytest.approx(
+        1000 / clean.joints[..., 0].numel()
+    )
+
+
+def test_bones_of_two_lengths_have_a_spread():
+    joints = torch.randn(1, 15, 3, dtype=torch.float64)
+    assert bone_spread(torch.cat([joints, 3 * joints])) == pytest.approx(50)
+
+
+def test_a_lifted_body_is_put_where_its_keypoints_are(clean):
+    alone = clean.of_cameras(1)
+    local = (alone.joints - alone.joints[:, [0]]) @ alone.rig.rotation[0].T
+    found = placed(local, alone.rig, alone.seen.keypoints, alone.seen.confidence)
+    assert float((found - alone.joints).abs().max()) < 1e-4
+
+
+def test_a_real_camera_is_predicted_from_the_others():
+    filmed = read_filmed(data_dir_or_skip("multicam_pose2sim").parent)
+    errors = predicted(METHODS["pose2sim"], filmed, 3)
+    assert 5 < float(errors.nanmedian()) < 30
+
+
+def test_quick_run_prints_every_peer(run_here, tmp_path):
+    data = data_dir_or_skip("mocap_cmu_walk").parent
+    for name in (ACTIONS, MHAD, "multicam_pose2sim"):
+        data_dir_or_skip(name)
+    weights = tmp_path / "lifters.safetensors"
+    names = [*PEERS, "gru", "mlp", "mean-pose"]
+    options = ("--data", str(data), "--out", str(tmp_path), "--lifters", str(weights))
+    printed = run_here("keypoint_bodies.__main__", "--quick", *options, "--methods", *names)
+    assert weights.is_file()
+    assert printed.count("| pose2sim |") == 4
+    assert printed.count("| gru * |") == 2
+    assert (tmp_path / "keypoint_bodies.md").read_text().split() == printed.split()
