@@ -21,16 +21,23 @@ Method = Callable[[CameraRig, Tensor, Tensor, float], Estimate]
 
 
 def track(
-    rig: CameraRig, keypoints: Tensor, confidence: Tensor, fps: float, **options: Any
+    rig: CameraRig,
+    keypoints: Tensor,
+    confidence: Tensor,
+    fps: float,
+    smoothing: str = "none",
+    **options: Any,
 ) -> Estimate:
     """Track the body with torchpose.
 
     Args:
         rig: cameras. keypoints: pixels, undistorted. confidence: of a detector. fps: frames per
-            second. options: of the tracker.
+            second. smoothing: of the poses. options: of the tracker.
     """
     tracker = torchpose.BodyTracker(rig, method="kalman", fps=fps, **options)
-    poses = tracker(keypoints=keypoints, confidence=confidence, names=BODY_15.names)
+    poses = tracker(
+        keypoints=keypoints, confidence=confidence, names=BODY_15.names, smoothing=smoothing
+    )
     return Estimate(poses.joints3d, poses.covariance3d)
 
 

@@ -17,7 +17,7 @@ from torchpose.whole_body._keypoints.body_kalman import (
     CorrectedBody,
 )
 from torchpose.whole_body._keypoints.body_smoothing import smooth
-from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps
+from torchpose.whole_body._keypoints.keypoint_likelihood import KeypointFrame, RigMaps, Weighed
 from torchpose.whole_body._keypoints.keypoint_start import start
 
 __all__ = ["KeypointPoses", "KeypointStream", "KeypointTracker"]
@@ -33,8 +33,8 @@ class KeypointStream(NamedTuple):
 
     Attributes:
         state: Gaussians of [B * M]. log_weights: [B, M], of the hypotheses, not normalised.
-        begun: [B], whether the person was found. lost: [B], frames in a row in which most keypoints were of
-            something else.
+        begun: [B], whether the person was found. lost: [B], for how many frames in a row most keypoints have
+            been of something else.
     """
 
     state: BodyGaussian
@@ -119,7 +119,7 @@ class KeypointTracker(nn.Module):
         best = self._best(stream)
         chosen = found.take(best)
         inlier = chosen.weighed.own + chosen.weighed.other
-        stream = stream._replace(lost=self._lost(stream, frame, inlier))
+        stream = stream._replace(lost=self._lost(stream, frame, chosen.weighed))
         pose = KeypointPoses(
             chosen.joints, chosen.joint_cov, chosen.state.mean, chosen.state.cov, inlier,
             chosen.weighed.exchanged, chosen.log_evidence,
@@ -144,8 +144,8 @@ class KeypointTracker(nn.Module):
         """Return the likeliest hypotheses of a start."""
         found, weights = start(self.filter, frame, self.n_hypotheses)
         count = len(weights)
-        zero = torch.zeros(count, dtype=torch.long, device=weights.device)
-        begun = torch.ones_like(zero, dtype=torch.bool)
+        zero = weights.new_zeros(count)
+        begun = torch.ones(count, dtype=torch.bool, device=weights.device)
         return KeypointStream(found.state, weights - weights[:, :1], begun, zero), found
 
     def _begun_anew(
@@ -164,7 +164,7 @@ class KeypointTracker(nn.Module):
             stream.state.put(rows, new.state),
             stream.log_weights.index_copy(0, persons, new.log_weights),
             stream.begun | due,
-            torch.where(due, 0, stream.lost),
+            torch.where(due, 0.0, stream.lost),
         )
         return stream, found.put(rows, new_found)
 
@@ -174,12 +174,18 @@ class KeypointTracker(nn.Module):
         return first + stream.log_weights.argmax(-1)
 
     def _lost(
-        self, stream: KeypointStream, frame: KeypointFrame, inlier: Float[Tensor, "B C J"]
-    ) -> Int[Tensor, " B"]:
-        """Return the frames in a row in which most keypoints were of something else."""
+        self, stream: KeypointStream, frame: KeypointFrame, weighed: Weighed
+    ) -> Float[Tensor, " B"]:
+        """Return for how many frames in a row keypoints have been of something else, or of the other side.
+
+        A camera that seems to exchange all sides counts half: where it goes on, the body is turned round.
+        """
         expected = frame.inlier.sum((-2, -1))
-        astray = inlier.sum((-2, -1)) < _LOST * expected
-        return torch.where(expected > 0, torch.where(astray, stream.lost + 1, 0), stream.lost)
+        found = (weighed.own + weighed.other).sum((-2, -1))
+        turned = (weighed.exchanged > 0.5).all(-1).any(-1)
+        grown = stream.lost + torch.where(found < _LOST * expected, 1.0, 0.5)
+        astray = (found < _LOST * expected) | turned
+        return torch.where(expected > 0, torch.where(astray, grown, 0.0), stream.lost)
 
     # --- whole sequences --------------------------------------------------------------------------
 
