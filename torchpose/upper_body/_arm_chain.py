@@ -28,7 +28,9 @@ _RATE = 30.0
 _NOTHING = -60.0
 _LEAST = 1e-30  # density
 _LIKELIEST = 32  # hypotheses of an arm that are compared with the other arm's
-_ROWS = 2048  # directions at a time, so that intermediate results stay in the cache
+# Directions, and arms of which all pairs of directions are compared, at a time: so that intermediate
+# results stay in the cache.
+_ROWS, _ARMS = 2048, 2
 
 
 class ArmInput(NamedTuple):
@@ -111,12 +113,12 @@ class DirectionDensity:
         logs = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         constant = weights.log() - 0.5 * dim * LOG_2PI - logs - log_mass
         constant = constant - 0.5 * (means * pulled).sum(-1)
-        self._constant = constant + math.log1p(-prior.broad)
+        constant = constant + math.log1p(-prior.broad)
         self._pairs = torch.triu_indices(dim, dim, device=device)
         first, second = self._pairs
         twice = torch.where(first == second, 0.5, 1.0)  # either order of two coordinates counts
         squares = -twice * precision[:, first, second]
-        self._slopes = torch.cat([pulled, squares], 1).mT.contiguous()
+        self._slopes = torch.cat([pulled, squares, constant[:, None]], 1).mT.contiguous()
         self.broad = math.log(prior.broad) - 2 * math.log(4 * math.pi)
         apart = (weights[:, None] * weights).clamp_min(_LEAST)
         tied = prior.together.to(device).double() / apart
@@ -140,15 +142,16 @@ class DirectionDensity:
         """
         columns = rows.double().mT.contiguous()
         first, second = self._pairs
-        terms = torch.cat([columns, columns[first] * columns[second]])
-        return torch.addmm(self._constant, terms.mT, self._slopes)
+        products = columns.index_select(0, first) * columns.index_select(0, second)
+        terms = torch.cat([columns, products, torch.ones_like(columns[:1])])
+        return terms.mT @ self._slopes
 
     def _known(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, " N"]:
         """Return the log-density of the mixture, without its broad part; exponentials are float32."""
         logs = self._logs(rows)
-        most = logs.amax(-1, keepdim=True).detach()
+        most = logs.detach().amax(-1, keepdim=True)
         # exp of what is far below is slow where it is denormal, and adds nothing
-        near = (logs - most).float().clamp_min(_NOTHING).exp()
+        near = logs.sub_(most).float().clamp_min_(_NOTHING).exp_()
         return near.sum(-1).log() + most[:, 0]
 
 
@@ -249,8 +252,7 @@ class ArmChain:
     def update(self, state: ArmState, arms: Arms) -> ArmState:
         """Return the posterior after one more frame."""
         prior = arms.log_prior[:, :, 0].exp()
-        walk = self._walk(state.directions, arms.directions[:, :, 0])
-        moved = (state.weight[..., None, :] @ walk)[..., 0, :]
+        moved = self._moved(state.weight, state.directions, arms.directions[:, :, 0])
         return _belief(arms, prior, (1 - self.anew) * moved + self.anew * prior)
 
     def smoothed(
@@ -287,21 +289,31 @@ class ArmChain:
             after: the backward message at the next frame.
         """
         ratio = later.weight / later.predicted.clamp_min(_LEAST) * after
-        walk = self._walk(state.directions, later.directions)
-        moved = (walk @ ratio[..., None])[..., 0]
+        moved = self._moved(ratio, later.directions, state.directions)
         anew = (later.prior * ratio).sum(-1, keepdim=True)
         message = (1 - self.anew) * moved + self.anew * anew
         return message / message.amax(-1, keepdim=True).clamp_min(_LEAST)
 
-    def _walk(self, before: Tensor, after: Tensor) -> Float[Tensor, "B 2 N M"]:
+    def _moved(
+        self, weight: Float[Tensor, "B 2 N"], before: Tensor, after: Float[Tensor, "B 2 M 6"]
+    ) -> Float[Tensor, "B 2 M"]:
+        """Return sum_n w_n t_4(x'_m; x_n, s^2) for the directions x of two frames."""
+        arms = (part.flatten(0, 1).split(_ARMS) for part in (weight[:, :, None], before, after))
+        moved = [torch.bmm(share, self._walk(*pair)) for share, *pair in zip(*arms, strict=True)]
+        return torch.cat(moved).view(*after.shape[:-1])
+
+    def _walk(
+        self, before: Float[Tensor, "A N 6"], after: Float[Tensor, "A M 6"]
+    ) -> Float[Tensor, "A N M"]:
         """Return the density t_4(x'; x, s^2) of all pairs of directions of two frames."""
         scale = self.step**2
         most = 6 / (16 * math.pi**2 * scale**2)
         unit = most**-0.25
         # of two pairs of unit vectors the product is 2 where they agree
-        alike = (before * (-unit / (2 * scale))) @ after.mT
-        far = (alike + unit * (1 + 1 / scale)).clamp_min(unit)
-        return far.square().pow(-2)
+        same = before.new_full((1, 1, 1), unit * (1 + 1 / scale))
+        far = torch.baddbmm(same, before, after.mT, alpha=-unit / (2 * scale))
+        # in place: memory for as many numbers again takes longer than the arithmetic
+        return far.clamp_min_(unit).square_().pow_(-2)
 
     @staticmethod
     def mean_directions(state: ArmState, seen: Bool[Tensor, "B 2"]) -> Float[Tensor, "B 2 2 3"]:

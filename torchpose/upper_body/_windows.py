@@ -13,7 +13,8 @@ from torch import Tensor
 from torchpose._core.module_state import derived
 from torchpose.camera._virtual_camera import memory_frames
 from torchpose.errors import InputError
-from torchpose.filters._mkf import MixtureKalmanFilter
+from torchpose.filters._fixed_tracks import FixedTrackFilter
+from torchpose.filters._memoryless import frame_evidence
 from torchpose.filters._outputs import FilterOutput
 from torchpose.priors._arm_state import STATE_DIM
 from torchpose.priors._gaussian_mixture import GaussianMixture
@@ -168,19 +169,19 @@ class WindowMixture(Estimator):
             if self.of_limbs:
                 context, told = self._torso(seen, side, joints[side], lengths), arm[:_N_LIMB]
             else:
-                context, told = self._filter(side, ())(*hands, None, lengths=lengths), arm
+                context, told = _evidence(self._filter(side, ()), *hands, None, lengths), arm
             arms[side] = _pose_of_window(in_double(out), context, seen, told, self.window.layout)
         return Estimates(arms["left"], arms["right"], seen.view)
 
     def _torso(
         self, seen: SeenInView, side: str, joints: tuple[str, ...], lengths: Tensor | None
-    ) -> FilterOutput:
-        """Return the estimates of an arm given its torso and the hands of the window alone."""
+    ) -> Float[Tensor, "B T"]:
+        """Return the log-evidence of an arm's torso and the hands of the window alone."""
         torso = tuple(joint for joint in joints if joint not in ARM_JOINTS[:_N_LIMB])
         both, noise, _ = _window_inputs(seen, self.window, side, torso, self.model.measurement_cov)
-        return self._filter(side, torso)(*both, noise, lengths=lengths)
+        return _evidence(self._filter(side, torso), *both, noise, lengths)
 
-    def _filter(self, side: str, joints: tuple[str, ...]) -> MixtureKalmanFilter:
+    def _filter(self, side: str, joints: tuple[str, ...]) -> FixedTrackFilter:
         """Return the filter of an arm; made once for its prior, noise and settings."""
         window, cov = self.window, self.model.measurement_cov
         mixture: GaussianMixture = getattr(window, side)
@@ -221,13 +222,13 @@ def _window_filter(
     measurement_cov: Float[Tensor, "8 2 2"],
     likelihood_power: float,
     dtype: torch.dtype,
-) -> MixtureKalmanFilter:
+) -> FixedTrackFilter:
     """Return the filter of fixed tracks over windows that measures these joints and a window's hands."""
     arm, layout = ARMS[side], window.layout
     blocks = [measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
     blocks += [_hand_cov(window, side, measurement_cov)] * layout.n_hands
     # Poses of consecutive frames are tied by the window itself: no memory beyond it.
-    return MixtureKalmanFilter(
+    return FixedTrackFilter(
         getattr(window, side),
         torch.ones(layout.dim, dtype=torch.float64),
         torch.block_diag(*blocks),
@@ -239,6 +240,14 @@ def _window_filter(
         likelihood_power=likelihood_power,
         dtype=dtype,
     )
+
+
+def _evidence(
+    model: FixedTrackFilter, z: Tensor, mask: Tensor, noise: Tensor | None, lengths: Tensor | None
+) -> Float[Tensor, "B T"]:
+    """Return the log-evidence of measurements."""
+    frames = model.check(z, mask, noise, lengths, None)
+    return frame_evidence(model, model.weight_rule, frames)
 
 
 def _hand_cov(window: WindowPrior, side: str, measurement_cov: Tensor) -> Tensor:
@@ -267,7 +276,7 @@ def _window_inputs(
 
 def _pose_of_window(
     out: FilterOutput,
-    context: FilterOutput,
+    context: Float[Tensor, "B T"],
     seen: SeenInView,
     arm: tuple[int, ...],
     layout: WindowLayout,
@@ -278,7 +287,7 @@ def _pose_of_window(
     density over pixels of the prior's camera, not of the virtual one.
     """
     measured = seen.measured.mask[:, :, list(arm)]
-    evidence = out.log_evidence - context.log_evidence
+    evidence = out.log_evidence - context
     evidence = evidence + (seen.log_scale[:, :, list(arm)] * measured).sum(-1)
     evidence = torch.where(measured.any(-1), evidence, torch.zeros_like(evidence))
     kept = torch.tensor([*range(STATE_DIM), *layout.in_torso], device=out.mean.device)
