@@ -119,7 +119,7 @@ def _estimate(
         own = condition_own(model, shared, group.z, group.mask, group.noise)
         log_likelihood, jitter = own.log_likelihood, own.jitter
     else:
-        means, log_likelihood, jitter = _condition(model, group, gain[0])
+        means, log_likelihood, jitter = _condition(model, shared, group, gain[0])
     log_weights, evidence = _weighed(rule, group, log_likelihood)
     if gain is None:
         mean, total = own_moments(model, shared, own, log_weights, medians, return_cov)
@@ -226,28 +226,27 @@ def _groups_of_own(z: Tensor, mask: Tensor, noise: Tensor) -> Iterator[_Group]:
 
 
 def _log_likelihood(model: MixtureKalmanFilter, group: _Group) -> Float[Tensor, "N M"]:
-    if group.shares_gain:
-        return _whitened(model, group, _gain(model, group)[0])[1]
     shared = measured_parts(model)
+    if group.shares_gain:
+        return _whitened(shared, group, _gain(model, group)[0])[1]
     return condition_own(model, shared, group.z, group.mask, group.noise).log_likelihood
 
 
 def _condition(
-    model: MixtureKalmanFilter, group: _Group, gain: Gain
+    model: MixtureKalmanFilter, shared: MeasuredParts, group: _Group, gain: Gain
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Return every component given a frame: means [N, M, D], log-likelihoods [N, M], and jitter."""
-    white, log_likelihood = _whitened(model, group, gain)
+    white, log_likelihood = _whitened(shared, group, gain)
     means = torch.baddbmm(model.means.to(model.dtype)[:, None], white.mT, gain.white)
     jitter = None if gain.jitter is None else gain.jitter.expand(len(group.rows), -1)
     return means.transpose(0, 1), log_likelihood, jitter
 
 
 def _whitened(
-    model: MixtureKalmanFilter, group: _Group, gain: Gain
+    shared: MeasuredParts, group: _Group, gain: Gain
 ) -> tuple[Float[Tensor, "M Z N"], Float[Tensor, "N M"]]:
     """Return the innovations over their standard deviations, and log-likelihoods."""
-    centres = measured_parts(model).centre.to(model.dtype)
-    residual = (group.z[:, None] - centres) * group.mask
+    residual = (group.z[:, None] - shared.centre.to(group.z)) * group.mask
     white = torch.linalg.solve_triangular(gain.factor, residual.permute(1, 2, 0), upper=False)
     return white, (gain.log_norm[:, None] - 0.5 * white.square().sum(1)).mT
 
