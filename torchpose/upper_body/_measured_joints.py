@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchpose._core.checks import check_covariance, check_finite, check_floating, check_shape
+from torchpose._core.module_state import derived
 from torchpose.camera._pinhole import PinholeCamera
-from torchpose.camera._projection import map_pixel_covariance, map_pixels
+from torchpose.camera._projection import PixelMap, map_pixel_covariance
 from torchpose.errors import InputError
 from torchpose.priors._upper_body_prior import UpperBodyPrior
 from torchpose.skeleton._joint_sets import UPPER_BODY
@@ -28,6 +29,7 @@ __all__ = [
     "check_sequences",
     "in_prior_pixels",
     "joint_covariances",
+    "kept_pixel_maps",
     "known_covariances",
     "measure_joints",
     "pixel_indices",
@@ -186,6 +188,18 @@ def measure_joints(
     return MeasuredJoints(uv, measured, cov)
 
 
+def kept_pixel_maps(camera: PinholeCamera, prior: UpperBodyPrior) -> tuple[PixelMap, PixelMap]:
+    """Return the maps from a camera's pixels to the prior's and back, the same ones as long as they hold."""
+    info = prior.info
+
+    def make() -> tuple[PixelMap, PixelMap]:
+        own, wanted = camera.matrix, info.matrix.to(camera.matrix)
+        return PixelMap.between(own, wanted), PixelMap.between(wanted, own)
+
+    name = ("pixel maps", info.fx, info.fy, info.cx, info.cy)
+    return derived(camera, name, (camera.matrix,), make)
+
+
 def in_prior_pixels(
     keypoints: Float[Tensor, "B T J 2"],
     confidence: Float[Tensor, "B T J"] | None,
@@ -207,17 +221,16 @@ def in_prior_pixels(
     Raises:
         ShapeError, InputError: as `measure_joints`. CovarianceError: a covariance that is none.
     """
-    own, wanted = camera.matrix.to(keypoints), prior.info.matrix.to(keypoints)
+    to_prior, _ = kept_pixel_maps(camera, prior)
     if covariance is not None:
-        covariance = known_covariances(covariance, keypoints)
-        covariance = map_pixel_covariance(covariance, own, wanted)
+        covariance = to_prior.covariances(known_covariances(covariance, keypoints))
     measured = measure_joints(
         keypoints, confidence, mask, picked.indices, measurement_cov, covariance
     )
-    measured = measured._replace(uv=map_pixels(measured.uv, own, wanted))
+    measured = measured._replace(uv=to_prior.points(measured.uv))
     if max(picked.face) >= 0:
         face = measure_face(keypoints, confidence, mask, picked.face)
-        face = face._replace(places=map_pixels(face.places, own, wanted))
+        face = face._replace(places=to_prior.points(face.places))
         measured = measured._replace(face=face)
     if not picked.middle:
         return measured
