@@ -8,7 +8,7 @@ from functools import cache
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
@@ -183,38 +183,58 @@ class ArmChain:
         both = min(around, _BOTH)
         sizes = {(True, True): (angles, angles), (True, False): (angles, around),
                  (False, True): (around, angles), (False, False): (both, both)}  # fmt: skip
-        first, *others = arm.patterns
-        arms = self._weighed(arm, first, sizes[first], count)
-        for ends in others:
-            elbow, hand = (arm.known[..., i] == seen for i, seen in enumerate(ends))
-            found = self._weighed(arm, ends, sizes[ends], count)
-            arms = _where((elbow & hand)[..., None], found, arms)
-        return arms
+        if len(arm.patterns) == 1:
+            (ends,) = arm.patterns
+            return self._weighed(arm, ends, sizes[ends], count)
+        # each arm for its own pattern alone
+        known = arm.known.flatten(0, 1)
+        parts = []
+        for ends in arm.patterns:
+            rows = (known == known.new_tensor(ends)).all(-1).nonzero()[:, 0]
+            parts.append((rows, self._weighed(arm, ends, sizes[ends], count, rows)))
+        order = torch.cat([rows for rows, _ in parts]).argsort()
+        joined = (
+            torch.cat(values, 1)[:, order] for values in zip(*(x for _, x in parts), strict=True)
+        )
+        return Arms(*(value.view(*arm.known.shape[:2], *value.shape[2:]) for value in joined))
 
     def _weighed(
-        self, arm: ArmInput, ends: tuple[bool, bool], sizes: tuple[int, int], count: int
+        self,
+        arm: ArmInput,
+        ends: tuple[bool, bool],
+        sizes: tuple[int, int],
+        count: int,
+        rows: Int[Tensor, " A"] | None = None,
     ) -> Arms:
-        """Return the `count` hypotheses of largest weight, of arms whose elbow and hand are measured so."""
+        """Return the `count` hypotheses of largest weight, of arms whose elbow and hand are measured so.
+
+        Args:
+            arm: the measurements of all arms. ends: whether elbow and hand are measured.
+            sizes: the number of nodes of either bone. count: that of hypotheses. rows: the arms that are
+                meant, which come as those of a single body; None is all of them.
+        """
         elbow, hand = ends
-        lengths, variance = arm.lengths, arm.variance
+
+        def meant(values: Float[Tensor, "B 2 *rest"]) -> Tensor:
+            return values if rows is None else values.flatten(0, 1)[rows][None]
+
+        shoulder, rays, lengths, variance = map(
+            meant, (arm.shoulder, arm.rays, arm.lengths, arm.variance)
+        )
         if elbow:
-            upper = nodes_on_ray(
-                arm.shoulder,
-                arm.rays[..., 0, :],
-                lengths[..., 0],
-                variance[..., 0].sqrt(),
-                sizes[0],
-            )
+            std = variance[..., 0].sqrt()
+            upper = nodes_on_ray(shoulder, rays[..., 0, :], lengths[..., 0], std, sizes[0])
         else:  # the elbow is known as well as its directions are dense
-            upper = nodes_anywhere(arm.shoulder, lengths[..., 0], _sphere(arm.axes, sizes[0]))
+            upper = nodes_anywhere(shoulder, lengths[..., 0], meant(_sphere(arm.axes, sizes[0])))
             grain = (4 * math.pi / sizes[0] / 12) * lengths[..., :1].square()
             variance = variance + grain
         start, length = upper.ends, lengths[..., 1, None]
         if hand:
             std = variance[..., 1, None].sqrt()
-            lower = nodes_on_ray(start, arm.rays[..., None, 1, :], length, std, sizes[1])
+            lower = nodes_on_ray(start, rays[..., None, 1, :], length, std, sizes[1])
         else:
-            lower = nodes_anywhere(start, length, _sphere(arm.axes, sizes[1])[..., None, :, :])
+            sphere = meant(_sphere(arm.axes, sizes[1]))
+            lower = nodes_anywhere(start, length, sphere[..., None, :, :])
         shape = *start.shape[:-1], sizes[1], 3
         bones = upper.directions[..., None, :], lower.directions
         directions = torch.cat([bone.expand(shape) for bone in bones], -1).flatten(-3, -2)
@@ -222,9 +242,9 @@ class ArmChain:
         prior = self.density(directions)
         if weight.shape[-1] <= count:
             return Arms(directions, weight, prior)
-        rows = (weight + prior).topk(count, -1).indices
-        chosen = directions.gather(-2, rows[..., None].expand(*rows.shape, 6))
-        return Arms(chosen, weight.gather(-1, rows), prior.gather(-1, rows))
+        best = (weight + prior).topk(count, -1).indices
+        chosen = directions.gather(-2, best[..., None].expand(*best.shape, 6))
+        return Arms(chosen, weight.gather(-1, best), prior.gather(-1, best))
 
     def evidence_of_both(self, arms: Arms) -> Float[Tensor, "B M"]:
         """Return the log of the prior predictive density of the measurements of both arms together.
@@ -361,8 +381,3 @@ def _signs(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "2 3"]:
     """Return the signs of the axes by which right arms are mirrored."""
     with outside_inference():
         return torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]], dtype=dtype, device=device)
-
-
-def _where(here: Bool[Tensor, "B 2 1"], new: Arms, old: Arms) -> Arms:
-    picks = zip((here[..., None, None], here[..., None], here[..., None]), new, old, strict=True)
-    return Arms(*(torch.where(mask, a, b) for mask, a, b in picks))
