@@ -164,9 +164,9 @@ def turned(
     reading: ReadOut, rotation: Float[Tensor, "*batch 3 3"], place: Tensor | None = None
 ) -> ReadOut:
     """Return the result of `in_camera_axes` for the rotation matrices of the angles."""
-    rotation = rotation[..., None, :, :]
     at = reading.place if place is None else place.to(reading.place).expand_as(reading.place)
-    joints = (rotation @ reading.joints[..., None])[..., 0] + at[..., None, :]
+    joints = reading.joints @ rotation.mT + at[..., None, :]
+    rotation = rotation[..., None, :, :]
     return reading._replace(joints=joints, covs=rotation @ reading.covs @ rotation.mT)
 
 

@@ -23,8 +23,8 @@ from torchpose.upper_body._picked import pick_joints as pick_joints  # for `torc
 
 __all__ = [
     "MeasuredJoints",
-    "append_blocks",
     "arm_measurements",
+    "block_diagonal",
     "check_gaps",
     "check_sequences",
     "in_prior_pixels",
@@ -367,19 +367,12 @@ def arm_measurements(
     rows = [arm[ARM_JOINTS.index(joint)] for joint in joints]
     z = measured.uv[:, :, rows].flatten(-2)
     mask = measured.mask[:, :, rows].repeat_interleave(2, -1)
-    return z, mask, _block_diagonal(measured.cov[..., rows, :, :])
+    return z, mask, block_diagonal(measured.cov[..., rows, :, :])
 
 
-def _block_diagonal(blocks: Float[Tensor, "*batch N 2 2"]) -> Float[Tensor, "*batch Z Z"]:
+def block_diagonal(blocks: Float[Tensor, "*batch N 2 2"]) -> Float[Tensor, "*batch Z Z"]:
+    """Return matrices with these blocks on their diagonals, Z = 2 N."""
     n = blocks.shape[-3]
     eye = torch.eye(n, dtype=blocks.dtype, device=blocks.device)
-    return torch.einsum("...nij,nm->...nimj", blocks, eye).flatten(-2).flatten(-3, -2)
-
-
-def append_blocks(cov: Float[Tensor, "*batch Z Z"], block: Tensor, count: int) -> Tensor:
-    """Return R with `count` more diagonal blocks."""
-    blocks = torch.block_diag(*[block] * count)
-    n, extra = cov.shape[-1], blocks.shape[-1]
-    whole = cov.new_zeros(*cov.shape[:-2], n + extra, n + extra)
-    whole[..., :n, :n], whole[..., n:, n:] = cov, blocks
-    return whole
+    spread = blocks[..., :, :, None, :] * eye[:, None, :, None]
+    return spread.flatten(-2).flatten(-3, -2)

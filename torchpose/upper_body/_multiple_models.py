@@ -237,7 +237,7 @@ def _averaged(
     back = rotation.mT[..., None, :, :]
     joints, covs = _moments(share, *((reading.joints, reading.covs) for reading in seen))
     uv, uv_covs = _moments(share, *((reading.uv, reading.uv_covs) for reading in (ours, theirs)))
-    joints = (back @ (joints - place[..., None, :])[..., None])[..., 0]
+    joints = (joints - place[..., None, :]) @ rotation
     angles = matrix_to_euler(rotation, order)
     return ReadOut(joints, back @ covs @ back.mT, angles, place, uv, uv_covs)
 

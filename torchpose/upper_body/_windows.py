@@ -34,8 +34,7 @@ from torchpose.upper_body._estimator import (
 )
 from torchpose.upper_body._measured_joints import (
     MeasuredJoints,
-    append_blocks,
-    arm_measurements,
+    block_diagonal,
     pixel_indices,
 )
 from torchpose.upper_body._window_view import SeenInView, see_in_view, suitable_window
@@ -161,25 +160,32 @@ class WindowMixture(Estimator):
         """Return the estimates of frames; their evidence is that of each frame given its window."""
         arms = {}
         for side, arm in ARMS.items():
-            both, noise, hands = _window_inputs(
-                seen, self.window, side, joints[side], self.model.measurement_cov
-            )
+            given = self._given(seen, side, joints[side])
             model = self._filter(side, joints[side])
-            out = model(*both, noise, lengths=lengths, return_cov=True, progress=progress)
+            out = model(*given, lengths=lengths, return_cov=True, progress=progress)
             if self.of_limbs:
-                context, told = self._torso(seen, side, joints[side], lengths), arm[:_N_LIMB]
+                torso = tuple(x for x in joints[side] if x not in ARM_JOINTS[:_N_LIMB])
+                context, told = self._evidence(seen, side, torso, lengths), arm[:_N_LIMB]
             else:
-                context, told = _evidence(self._filter(side, ()), *hands, None, lengths), arm
+                context, told = self._evidence(seen, side, (), lengths), arm
             arms[side] = _pose_of_window(in_double(out), context, seen, told, self.window.layout)
         return Estimates(arms["left"], arms["right"], seen.view)
 
-    def _torso(
+    def _evidence(
         self, seen: SeenInView, side: str, joints: tuple[str, ...], lengths: Tensor | None
     ) -> Float[Tensor, "B T"]:
-        """Return the log-evidence of an arm's torso and the hands of the window alone."""
-        torso = tuple(joint for joint in joints if joint not in ARM_JOINTS[:_N_LIMB])
-        both, noise, _ = _window_inputs(seen, self.window, side, torso, self.model.measurement_cov)
-        return _evidence(self._filter(side, torso), *both, noise, lengths)
+        """Return the log-evidence of some joints of an arm and the hands of the window."""
+        model = self._filter(side, joints)
+        frames = model.check(*self._given(seen, side, joints), lengths, None)
+        return frame_evidence(model, model.weight_rule, frames)
+
+    def _given(
+        self, seen: SeenInView, side: str, joints: tuple[str, ...]
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return values, mask and R of some joints of an arm and of the hands of the window."""
+        cov = self.model.measurement_cov
+        noise = _window_noise(seen, self.window, side, joints, cov) if joints else None
+        return *_window_inputs(seen, side, joints), noise
 
     def _filter(self, side: str, joints: tuple[str, ...]) -> FixedTrackFilter:
         """Return the filter of an arm; made once for its prior, noise and settings."""
@@ -224,8 +230,8 @@ def _window_filter(
     dtype: torch.dtype,
 ) -> FixedTrackFilter:
     """Return the filter of fixed tracks over windows that measures these joints and a window's hands."""
-    arm, layout = ARMS[side], window.layout
-    blocks = [measurement_cov[arm[ARM_JOINTS.index(joint)]] for joint in joints]
+    layout = window.layout
+    blocks = [*measurement_cov[_rows(side, joints)]]
     blocks += [_hand_cov(window, side, measurement_cov)] * layout.n_hands
     # Poses of consecutive frames are tied by the window itself: no memory beyond it.
     return FixedTrackFilter(
@@ -242,14 +248,6 @@ def _window_filter(
     )
 
 
-def _evidence(
-    model: FixedTrackFilter, z: Tensor, mask: Tensor, noise: Tensor | None, lengths: Tensor | None
-) -> Float[Tensor, "B T"]:
-    """Return the log-evidence of measurements."""
-    frames = model.check(z, mask, noise, lengths, None)
-    return frame_evidence(model, model.weight_rule, frames)
-
-
 def _hand_cov(window: WindowPrior, side: str, measurement_cov: Tensor) -> Tensor:
     """Return R of a hand of the window: that of a hand of this frame, and the spread that moving it adds."""
     own = measurement_cov[ARMS[side][0]]
@@ -257,21 +255,35 @@ def _hand_cov(window: WindowPrior, side: str, measurement_cov: Tensor) -> Tensor
 
 
 def _window_inputs(
+    seen: SeenInView, side: str, joints: tuple[str, ...]
+) -> tuple[Float[Tensor, "B T Z"], Bool[Tensor, "B T Z"]]:
+    """Return values and mask of some joints of an arm, and of the hands of the window."""
+    rows = _rows(side, joints)
+    hands, known = seen.hands[side]
+    z, mask = seen.measured.uv[:, :, rows], seen.measured.mask[:, :, rows]
+    mask = mask[..., None].expand(z.shape).flatten(-2)
+    return torch.cat([z.flatten(-2), hands], -1), torch.cat([mask, known], -1)
+
+
+def _window_noise(
     seen: SeenInView,
     window: WindowPrior,
     side: str,
     joints: tuple[str, ...],
     measurement_cov: Float[Tensor, "8 2 2"],
-) -> tuple[
-    tuple[Float[Tensor, "B T Z"], Bool[Tensor, "B T Z"]],
-    Tensor,
-    tuple[Float[Tensor, "B T H"], Bool[Tensor, "B T H"]],
-]:
-    """Return values and mask of joints and hands, their R, and values and mask of the hands alone."""
-    z, mask, cov = arm_measurements(ARMS[side], joints, seen.measured)
-    hands, known = seen.hands[side]
-    noise = append_blocks(cov, _hand_cov(window, side, measurement_cov), hands.shape[-1] // 2)
-    return (torch.cat([z, hands], -1), torch.cat([mask, known], -1)), noise, (hands, known)
+) -> Tensor | None:
+    """Return R of `_window_inputs`; None where it is that of the filter."""
+    if seen.measured.cov is measurement_cov:
+        return None
+    own = seen.measured.cov[..., _rows(side, joints), :, :]
+    hand = _hand_cov(window, side, measurement_cov)
+    hands = hand.expand(*own.shape[:-3], window.layout.n_hands, 2, 2)
+    return block_diagonal(torch.cat([own, hands], -3))
+
+
+def _rows(side: str, joints: tuple[str, ...]) -> list[int]:
+    """Return which of the eight joints these of an arm are."""
+    return [ARMS[side][ARM_JOINTS.index(joint)] for joint in joints]
 
 
 def _pose_of_window(
