@@ -114,12 +114,17 @@ class DirectionDensity:
         constant = weights.log() - 0.5 * dim * LOG_2PI - logs - log_mass
         constant = constant - 0.5 * (means * pulled).sum(-1)
         constant = constant + math.log1p(-prior.broad)
-        self._pairs = torch.triu_indices(dim, dim, device=device)
-        first, second = self._pairs
+        first, second = torch.triu_indices(dim, dim, device=device)
         twice = torch.where(first == second, 0.5, 1.0)  # either order of two coordinates counts
         squares = -twice * precision[:, first, second]
-        self._slopes = torch.cat([pulled, squares, constant[:, None]], 1).mT.contiguous()
+        # the terms: products of two coordinates, of one with 1, and 1
+        alone = torch.arange(dim + 1, device=device)
+        self._first = torch.cat([first, alone])
+        self._second = torch.cat([second, torch.full_like(alone, dim)])
+        self._slopes = torch.cat([squares, pulled, constant[:, None]], 1).mT.contiguous()
         self.broad = math.log(prior.broad) - 2 * math.log(4 * math.pi)
+        self._slopes_of_all = pad(self._slopes, (0, 1))
+        self._slopes_of_all[-1, -1] = self.broad
         apart = (weights[:, None] * weights).clamp_min(_LEAST)
         tied = prior.together.to(device).double() / apart
         self.together = pad(tied, (0, 1, 0, 1), value=1.0)  # the broad part is tied to nothing
@@ -132,23 +137,20 @@ class DirectionDensity:
 
     def shares(self, directions: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch K"]:
         """Return the posterior of each component, the broad one last."""
-        logs = pad(self._logs(directions.reshape(-1, 6)), (0, 1), value=self.broad)
+        logs = self._terms(directions.reshape(-1, 6)).mT @ self._slopes_of_all
         return torch.softmax(logs, -1).to(directions.dtype).view(*directions.shape[:-1], -1)
 
-    def _logs(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, "N K"]:
-        """Return the log-density of each component of the mixture, times its weight.
+    def _terms(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, "T N"]:
+        """Return the terms of the polynomials that are the log-densities of the components.
 
-        Its terms cancel, some of a thousand to a few: they are float64.
+        They cancel, some of a thousand to a few: they are float64.
         """
-        columns = rows.double().mT.contiguous()
-        first, second = self._pairs
-        products = columns.index_select(0, first) * columns.index_select(0, second)
-        terms = torch.cat([columns, products, torch.ones_like(columns[:1])])
-        return terms.mT @ self._slopes
+        columns = pad(rows.double(), (0, 1), value=1.0).mT.contiguous()
+        return columns.index_select(0, self._first) * columns.index_select(0, self._second)
 
     def _known(self, rows: Float[Tensor, "N 6"]) -> Float[Tensor, " N"]:
         """Return the log-density of the mixture, without its broad part; exponentials are float32."""
-        logs = self._logs(rows)
+        logs = self._terms(rows).mT @ self._slopes
         most = logs.detach().amax(-1, keepdim=True)
         # exp of what is far below is slow where it is denormal, and adds nothing
         near = logs.sub_(most).float().clamp_min_(_NOTHING).exp_()
@@ -243,8 +245,7 @@ class ArmChain:
         if weight.shape[-1] <= count:
             return Arms(directions, weight, prior)
         best = (weight + prior).topk(count, -1).indices
-        chosen = directions.gather(-2, best[..., None].expand(*best.shape, 6))
-        return Arms(chosen, weight.gather(-1, best), prior.gather(-1, best))
+        return Arms(_rows_of(directions, best), weight.gather(-1, best), prior.gather(-1, best))
 
     def evidence_of_both(self, arms: Arms) -> Float[Tensor, "B M"]:
         """Return the log of the prior predictive density of the measurements of both arms together.
@@ -258,7 +259,7 @@ class ArmChain:
         """
         logs = arms.log_weight + arms.log_prior
         logs, rows = logs.topk(min(_LIKELIEST, logs.shape[-1]), -1)
-        chosen = arms.directions.gather(-2, rows[..., None].expand(*rows.shape, 6))
+        chosen = _rows_of(arms.directions, rows)
         weight = torch.softmax(logs, -1)[..., None, :]
         left, right = (weight @ self.density.shares(chosen))[..., 0, :].unbind(1)
         tied = ((left @ self.density.together) * right).sum(-1)
@@ -352,6 +353,16 @@ def _belief(arms: Arms, prior: Tensor, predicted: Float[Tensor, "B 2 N"]) -> Arm
     evidence = torch.logsumexp(log_weight, -1)
     weight = (log_weight - evidence[..., None]).exp()
     return ArmState(arms.directions[:, :, 0], weight, evidence, prior, predicted)
+
+
+def _rows_of(
+    directions: Float[Tensor, "*batch N 6"], rows: Int[Tensor, "*batch K"]
+) -> Float[Tensor, "*batch K 6"]:
+    """Return some directions of each batch element; whole rows are taken faster than by `gather`."""
+    n = directions.shape[-2]
+    flat = directions.reshape(-1, 6)
+    start = torch.arange(0, len(flat), n, device=rows.device).view(*rows.shape[:-1], 1)
+    return flat.index_select(0, (rows + start).flatten()).view(*rows.shape, 6)
 
 
 def _sphere(axes: Float[Tensor, "B M 3 3"], n_points: int) -> Float[Tensor, "B 2 M G 3"]:
