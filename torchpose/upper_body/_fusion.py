@@ -96,10 +96,8 @@ def _on_torso(
 
     The states say where head, neck and shoulders are there (BL 5), which takes no covariances.
     """
-    mean, cov = (
-        torch.stack([left.mean, right.mean]),
-        torch.stack([*map(require_cov, (left, right))]),
-    )
+    mean = torch.stack([left.mean, right.mean])
+    cov = torch.stack([require_cov(left), require_cov(right)])
     rotation = euler_to_matrix(mean[..., 15:18], order)
     joints = mean[..., :15].unflatten(-1, (5, 3))
     lifted = lift(joints, matrix, rotation, mean[..., 18:STATE_DIM])
@@ -134,9 +132,8 @@ def on_their_rays(
     projected = (hand & ~observed)[..., None] & before
     uv = torch.where(projected, seen[..., :2], reading.uv)
     moved = lift(torch.cat([uv, seen[..., 2:]], -1), matrix, rotation, reading.place)
-    joints = torch.where(
-        _limb_ends(uv.device) & observed[..., None] & before, moved, reading.joints
-    )
+    limb = _limb_ends(uv.device) & observed[..., None]
+    joints = torch.where(limb & before, moved, reading.joints)
     return reading._replace(joints=joints, uv=uv)
 
 

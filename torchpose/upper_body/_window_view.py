@@ -86,6 +86,7 @@ def see_in_view(
         frames = torch.arange(mask.shape[1], device=mask.device)
         mask = mask & (frames < lengths.to(mask.device)[:, None])[..., None]
     start = start % mask.shape[1]
+    regression: Regression | None
     model, regression = _kept_path(prior, layout, measurement_cov, uv)
     noise = None
     if measured.cov.ndim > 3:
@@ -114,11 +115,11 @@ def see_in_view(
 
 def _kept_path(
     prior: UpperBodyPrior, layout: WindowLayout, measurement_cov: Tensor, like: Tensor
-) -> tuple[PathModel, Regression | None]:
+) -> tuple[PathModel, Regression]:
     """Return the model of head and neck with its regression, the same ones as long as they hold."""
     sources = (*prior.left.parameters_tuple(), *prior.right.parameters_tuple(), measurement_cov)
 
-    def make() -> tuple[PathModel, Regression | None]:
+    def make() -> tuple[PathModel, Regression]:
         model = _path_model(prior, measurement_cov, like)
         return model, path_regression(layout.lags, layout.ahead, layout.fps, model, like)
 
